@@ -35,8 +35,8 @@ from tqdm import tqdm
 
 import shapespace
 from shapespace.errors import ShapespaceError
-from shapespace.fit.fit import FitConfig, fit_scan
-from shapespace.fit.methods import METHODS
+from shapespace.fit.fit_scan import FitConfig, fit_scan
+from shapespace.fit.method_choices import METHODS
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh
 

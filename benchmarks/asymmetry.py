@@ -23,10 +23,10 @@ from shapespace.cohort.cohort import Cohort, Fitted
 from shapespace.datasets.faces import load_faces
 from shapespace.datasets.simulated_scan import Hole, random_similarity, simulate_scan
 from shapespace.datasets.warp import Warp
-from shapespace.fit.fit import FitConfig, fit_scan
-from shapespace.geometry.mirror import FLIP, mirrored
+from shapespace.fit.fit_scan import FitConfig, fit_scan
+from shapespace.geometry.mirror_plane import FLIP, mirrored
+from shapespace.geometry.normals import vertex_normals
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.geometry.surface import vertex_normals
 from shapespace.model.shape_model import ShapeModel
 from shapespace.statistics.asymmetry import Asymmetry, measure_asymmetry
 from shapespace.types import FloatArray, IntArray, Mesh

@@ -1,7 +1,7 @@
 """Measure whether `b_stddev` says what it says: how often the true coefficients lie within 1 and 1.96 of them.
 
 Models are aligned by their gauge, as users build them. The truth b* is `ShapeModel.project` of the true surface. The
-constants of `fit/posterior.py` were chosen on the split "dev"; "test" judges them.
+constants of `fit/robust/posterior.py` were chosen on the split "dev"; "test" judges them.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from shapespace import fit_scan
 from shapespace.datasets.simulated_scan import random_similarity, simulate_scan
-from shapespace.fit.posterior import variance_of_new_shapes
+from shapespace.fit.robust.posterior import variance_of_new_shapes
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh
 

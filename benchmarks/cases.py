@@ -27,7 +27,7 @@ from shapespace.datasets.simulated_scan import simulate_scan
 from shapespace.errors import ShapespaceError
 from shapespace.geometry.closest import build_engine, on_boundary
 from shapespace.geometry.distance import surface_distances
-from shapespace.geometry.surface import boundary_vertices, face_areas, face_vectors
+from shapespace.geometry.normals import boundary_vertices, face_areas, face_vectors
 from shapespace.model.floor import floor_mm as floor_of
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import MM_PER_UNIT, BoolArray, FloatArray, Mesh, Similarity
@@ -205,7 +205,7 @@ def _hash_of(*names: str) -> str:
 
 
 # What is kept on disk is named by the code it came from, so that no change leaves an old scan behind.
-_SCAN_SOURCES = _hash_of("datasets/simulated_scan.py", "datasets/ict.py", "geometry/surface.py")
+_SCAN_SOURCES = _hash_of("datasets/simulated_scan.py", "datasets/ict.py", "geometry/normals.py")
 _MODEL_SOURCES = _hash_of(
     "datasets/ict.py", "model/shape_model.py", "model/pca.py", "geometry/procrustes.py", "geometry/similarity.py"
 )

@@ -39,9 +39,9 @@ from shapespace.cohort.read import CohortOptions, read_cohort
 from shapespace.datasets.faces import load_faces
 from shapespace.datasets.organs import Organ, raw_surface
 from shapespace.datasets.simulated_scan import Hole, random_similarity, simulate_scan
-from shapespace.geometry.surface import vertex_normals
-from shapespace.io.landmarks import write_landmark_indices
-from shapespace.io.meshes import write_mesh
+from shapespace.geometry.normals import vertex_normals
+from shapespace.io.landmarks.landmark_io import write_landmark_indices
+from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.statistics.change import Change, change
 from shapespace.statistics.change_found import ChangeSettings
 from shapespace.statistics.change_maps import volume_mm3

@@ -25,8 +25,8 @@ from shapespace.cohort.cohort import Cohort, Fitted
 from shapespace.cohort.table import Table
 from shapespace.datasets.simulated_scan import Cut
 from shapespace.errors import FitError
-from shapespace.fit.fit import FitConfig
-from shapespace.geometry.surface import vertex_normals
+from shapespace.fit.fit_scan import FitConfig
+from shapespace.geometry.normals import vertex_normals
 from shapespace.statistics.compare import CompareOptions, Comparison, compare
 from shapespace.types import BoolArray, FloatArray, Mesh
 

@@ -28,14 +28,14 @@ import numpy as np
 from reliability import Femora
 
 from shapespace.batch.execution import ExecutionConfig
-from shapespace.batch.rounds import KeptRounds
-from shapespace.correspondence.rounds import Correspondence, CorrespondSettings, correspond, run_here
+from shapespace.batch.parallel_rounds import KeptRounds
+from shapespace.correspondence.groupwise import Correspondence, CorrespondSettings, correspond, run_here
 from shapespace.datasets.faces import load_faces
 from shapespace.datasets.ict import EXPRESSIONS, LANDMARK_VERTICES, load_ict
 from shapespace.datasets.simulated_scan import Cut, Hole, random_similarity, simulate_scan
 from shapespace.geometry.closest import build_engine
-from shapespace.geometry.surface import vertex_normals
-from shapespace.io.meshes import read_mesh
+from shapespace.geometry.normals import vertex_normals
+from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
 
 FACE_MM = 95.0

@@ -29,15 +29,15 @@ import peers
 from shapespace.batch.execution import ExecutionConfig
 from shapespace.commands.correspond import CorrespondFiles, correspond_files
 from shapespace.commands.surface import write_surfaces
-from shapespace.correspondence.rounds import CorrespondSettings
+from shapespace.correspondence.groupwise import CorrespondSettings
 from shapespace.correspondence.template import choose, clean, resampled
 from shapespace.datasets.simulated_scan import random_similarity
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.distortion import Distortion
 from shapespace.geometry.doctor import repair
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.io.meshes import read_mesh, write_mesh
-from shapespace.model.quality import Curve, ModelQuality, QualitySettings, measure_quality
+from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
+from shapespace.model.model_quality import Curve, ModelQuality, QualitySettings, measure_quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh, Similarity
 

@@ -24,8 +24,8 @@ from trivial import Nothing
 from shapespace.batch.executors import Executor, Local
 from shapespace.batch.on_dask import OnDask
 from shapespace.batch.run import fit_files, make_jobs
-from shapespace.fit.fit import FitConfig
-from shapespace.io.meshes import write_mesh
+from shapespace.fit.fit_scan import FitConfig
+from shapespace.io.meshes.mesh_io import write_mesh
 
 
 def resident_mb() -> float:

@@ -27,8 +27,8 @@ from identity_scans import Condition
 
 from shapespace.datasets.ict import landmark_vertices
 from shapespace.errors import ShapespaceError
-from shapespace.fit.fit import FitConfig, fit_scan
-from shapespace.geometry.mirror import mirror_vertices, mirrored
+from shapespace.fit.fit_scan import FitConfig, fit_scan
+from shapespace.geometry.mirror_plane import mirror_vertices, mirrored
 from shapespace.io.files import make_folder, read_bytes, write_bytes
 from shapespace.model.additive import AdditiveModel
 from shapespace.statistics.identity.scores import SCORES

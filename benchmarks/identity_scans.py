@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from shapespace.errors import ShapespaceError
-from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.io.files import make_folder, read_bytes, write_bytes
 from shapespace.model.additive import AdditiveModel
 from shapespace.types import FloatArray, IntArray

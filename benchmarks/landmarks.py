@@ -17,11 +17,11 @@ from shapespace.datasets.faces import load_faces
 from shapespace.datasets.ict import load_ict
 from shapespace.datasets.simulated_scan import random_similarity, simulate_scan
 from shapespace.errors import ShapespaceError
-from shapespace.fit.fit import FitConfig, fit_scan
-from shapespace.geometry.landmarks import place_landmarks
-from shapespace.geometry.surface import rms_size
-from shapespace.io.landmarks import LANDMARK_FORMATS, read_landmarks
-from shapespace.io.meshes import read_mesh
+from shapespace.fit.fit_scan import FitConfig, fit_scan
+from shapespace.geometry.landmark_placement import place_landmarks
+from shapespace.geometry.normals import rms_size
+from shapespace.io.landmarks.landmark_io import LANDMARK_FORMATS, read_landmarks
+from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh, SurfaceLandmarks
 

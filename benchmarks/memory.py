@@ -22,7 +22,7 @@ import numpy as np
 from accuracy import FIT_FIELDS, machine_facts
 from cases import Bench, run
 
-from shapespace.fit.methods import METHODS
+from shapespace.fit.method_choices import METHODS
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh
 
@@ -46,7 +46,7 @@ def measure(method: str, dense: bool, model_path: Path, scan_path: Path, given: 
     import igl  # noqa: F401  # imported where used, and an import all the same
 
     import shapespace.compiled  # noqa: F401
-    from shapespace.fit.fit import FitConfig, fit_scan
+    from shapespace.fit.fit_scan import FitConfig, fit_scan
     from shapespace.types import Similarity
 
     imports = peak_mb()

@@ -27,9 +27,9 @@ from scipy.sparse.csgraph import dijkstra
 
 from shapespace.datasets.faces import load_faces
 from shapespace.errors import ShapespaceError
+from shapespace.geometry.normals import faces_of
 from shapespace.geometry.procrustes import align_in_place
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.geometry.surface import faces_of
 from shapespace.model.holes import fill_holes
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, Mesh

@@ -39,10 +39,10 @@ from shapespace import FitConfig, ShapeModel, fit_scan
 from shapespace.datasets.faces import load_faces
 from shapespace.datasets.simulated_scan import Collar, Hair, simulate_scan
 from shapespace.errors import ShapespaceError
-from shapespace.fit.reliability import FAILED_SHARE
+from shapespace.fit.diagnostics.reliability import FAILED_SHARE
 from shapespace.geometry import remesh
-from shapespace.geometry.surface import face_areas, faces_of, rms_size
-from shapespace.io.meshes import read_mesh
+from shapespace.geometry.normals import face_areas, faces_of, rms_size
+from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.types import MM_PER_UNIT, FloatArray, Mesh, Similarity
 
 Kind = Literal["odd", "good"]

@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from shapespace.geometry.procrustes import Streamed, align_streamed, scale_to_tangent_streamed
-from shapespace.io.spill import Spill
+from shapespace.io.containers.row_spill import Spill
 from shapespace.model import large_pca
 from shapespace.model.large_pca import large_components
 from shapespace.model.pca import syrk

@@ -2,11 +2,11 @@
 
 Fits whose truth is known, of faces, the bundled heads and femora, over noise, outliers, few triangles or points alone,
 missing parts, expressions, two of the kind in one scan, things of another kind, and models of few or many shapes, too
-narrow or too wide. The three splits share no shape, no model and no seed: the coefficients of `fit/reliability.py` are
-learnt on "dev", its intervals set on "calibration", and "test" judges them.
+narrow or too wide. The three splits share no shape, no model and no seed: the coefficients of
+`fit/diagnostics/reliability.py` are learnt on "dev", its intervals set on "calibration", and "test" judges them.
 
     python benchmarks/reliability.py --fits 240            # of each split; goes on where it was cut short
-    python benchmarks/reliability.py --tune                # prints the constants of fit/reliability.py
+    python benchmarks/reliability.py --tune                # prints the constants of fit/diagnostics/reliability.py
     python benchmarks/reliability.py --report docs/images  # tables and the figure, of the split "test"
 """
 
@@ -37,8 +37,8 @@ from shapespace.datasets.faces import load_faces
 from shapespace.datasets.ict import EXPRESSIONS, load_ict
 from shapespace.datasets.simulated_scan import simulate_scan
 from shapespace.errors import ShapespaceError
-from shapespace.fit import reliability
-from shapespace.geometry.surface import face_areas, rms_size
+from shapespace.fit.diagnostics import reliability
+from shapespace.geometry.normals import face_areas, rms_size
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh, Similarity
 
@@ -326,7 +326,7 @@ def failed(record: Mapping[str, Any]) -> bool:
 
 
 def tune(found: list[dict[str, Any]]) -> str:
-    """Return the constants of `shapespace.fit.reliability`.
+    """Return the constants of `shapespace.fit.diagnostics.reliability`.
 
     Weights: a regression of the logarithm of the error on "dev", by Huber's loss with a small ridge on standardised
     inputs and no weight below zero. Offset and interval: quantiles of what that leaves on "calibration". The

@@ -16,7 +16,7 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort, Fitted
 from shapespace.cohort.table import Table
-from shapespace.fit.posterior import new_shapes
+from shapespace.fit.robust.posterior import new_shapes
 from shapespace.model.shape_model import ShapeModel
 from shapespace.statistics.score import ScoreOptions, Scores, score
 from shapespace.types import FloatArray

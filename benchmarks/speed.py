@@ -32,12 +32,12 @@ from peers import paper_numpy
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from shapespace.fit.fit import FitConfig, fit_scan
-from shapespace.fit.methods import METHODS
-from shapespace.fit.paper_method import Paper
+from shapespace.fit.fit_scan import FitConfig, fit_scan
+from shapespace.fit.method_choices import METHODS
+from shapespace.fit.paper.paper_method import Paper
+from shapespace.fit.paper.shape_icp import shape_icp
+from shapespace.fit.paper.similarity_icp import similarity_icp
 from shapespace.fit.result import FitResult
-from shapespace.fit.shape_icp import shape_icp
-from shapespace.fit.similarity_icp import similarity_icp
 from shapespace.geometry.closest import ENGINES, build_engine
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh

@@ -23,8 +23,8 @@ from cases import CASES, Bench, error_mm, run, surface_figures
 from tqdm import tqdm
 
 from shapespace.errors import ShapespaceError
-from shapespace.fit.fit import FitConfig, fit_scan
-from shapespace.fit.robust_method import Robust
+from shapespace.fit.fit_scan import FitConfig, fit_scan
+from shapespace.fit.robust.robust_method import Robust
 
 CASES_SWEPT = ("complete", "holes", "outside", "outside_holes", "missing40", "coarse", "noise1", "jaw")
 VALUES: Mapping[str, tuple[Any, ...]] = {

@@ -21,8 +21,8 @@ from accuracy import machine_facts
 from cases import Bench, run
 from tqdm import tqdm
 
-from shapespace.fit.methods import METHODS
-from shapespace.io.meshes import write_mesh
+from shapespace.fit.method_choices import METHODS
+from shapespace.io.meshes.mesh_io import write_mesh
 
 LEAST = 1.9
 ENV = {**os.environ, **dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")}

@@ -33,8 +33,8 @@ from shapespace import FitConfig, fit_scan
 from shapespace.datasets.ict import EXPRESSIONS
 from shapespace.datasets.simulated_scan import Collar, Hair, retriangulate, simulate_scan
 from shapespace.errors import ShapespaceError
-from shapespace.fit.trust import INPUTS
-from shapespace.geometry.surface import face_areas
+from shapespace.fit.diagnostics.trust import INPUTS
+from shapespace.geometry.normals import face_areas
 from shapespace.types import MM_PER_UNIT, FloatArray, Mesh, Similarity
 
 FITS = 500
@@ -283,7 +283,7 @@ def table(outcomes: Sequence[Outcome]) -> str:
 
 
 def tune(records: Sequence[Mapping[str, Any]]) -> str:
-    """Return offset, usual values and weights of the inputs of `shapespace.fit.trust` that judge `records` best.
+    """Return offset, usual values and weights of the inputs of `shapespace.fit.diagnostics.trust` that suit `records`.
 
     A logistic regression with a small ridge on standardised inputs and no negative weights; the bound is where 5 % of
     the good fits are doubted, each judged by the four fifths it is not in.

@@ -21,7 +21,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from skimage.measure import marching_cubes
 
-from shapespace.geometry.surface import face_vectors
+from shapespace.geometry.normals import face_vectors
 from shapespace.geometry.volume_surface import surface_of_volume
 from shapespace.types import BoolArray, FloatArray, IntArray, LabelVolume
 

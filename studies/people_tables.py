@@ -10,7 +10,7 @@ import approaches
 from approaches import Rows
 from maker import HIGH, Maker, TextArray, neutral_of
 from shapespace.io.files import make_folder
-from shapespace.io.meshes import write_mesh
+from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.model.additive import AdditiveModel
 from shapespace.recognise import evaluate
 from shapespace.schemas import MeshesPart, Part, RowOfMeshes, Still

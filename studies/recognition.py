@@ -27,7 +27,7 @@ from shapespace.batch.progress import telling_of_compiling
 from shapespace.batch.workers import cores
 from shapespace.errors import ShapespaceError
 from shapespace.io.files import read_bytes, write_text
-from shapespace.report.html import require_report_extra, write_report
+from shapespace.report.pages.write_html import require_report_extra, write_report
 from shapespace.schemas import Part
 from simulated import StudyConfig, prepare_folder, run_fits, run_jobs
 from study_people import StudyPeople

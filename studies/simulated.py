@@ -24,10 +24,10 @@ from shapespace.datasets.fetch import present_folder
 from shapespace.datasets.ict import IctFaces, landmark_vertices, load_ict
 from shapespace.datasets.simulated_scan import SimulatedScan
 from shapespace.errors import FileFormatError, FitError, InputError, ShapespaceError
-from shapespace.fit.fit import FitConfig, fit_scan
-from shapespace.fit.robust_method import Robust
-from shapespace.fit.settings import Level
-from shapespace.geometry.mirror import mirror_vertices, mirrored
+from shapespace.fit.fit_scan import FitConfig, fit_scan
+from shapespace.fit.robust.robust_method import Robust
+from shapespace.fit.robust.robust_settings import Level
+from shapespace.geometry.mirror_plane import mirror_vertices, mirrored
 from shapespace.io.files import make_folder, read_bytes, write_bytes, write_text
 from shapespace.model.additive import AdditiveModel, Told
 from shapespace.model.shape_model import ShapeModel

@@ -7,7 +7,7 @@ normal n, by a small rotation, translation and log scale of the model and by the
 
 import numpy as np
 
-from shapespace.fit.robust import Iterate, Problem, WeightedMatches
+from shapespace.fit.robust.robust_icp import Iterate, Problem, WeightedMatches
 from shapespace.geometry.similarity import POSE
 from shapespace.types import FloatArray
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from shapespace.geometry.distortion import Distortion
 from shapespace.io.files import make_folder, sha256_of_file, write_text
-from shapespace.io.meshes import write_mesh
+from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.schemas import CorrespondenceRecord, CorrespondRecord, json_text
 from shapespace.types import Mesh, Similarity
 from synthetic_shapes import blob, similarity, sphere

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from shapespace.io.meshes import write_mesh
+from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.model.shape_model import ShapeModel
 from synthetic_shapes import blob_model
 

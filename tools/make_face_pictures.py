@@ -14,8 +14,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 import shapespace as ss
 from shapespace.datasets.simulated_scan import Cut, Hair, Hole, SimulatedScan, random_similarity
-from shapespace.report.colours import SEQUENTIAL
-from shapespace.report.render import Camera, Layer, render
+from shapespace.report.render.palette import SEQUENTIAL
+from shapespace.report.render.renderer import Camera, Layer, render
 from shapespace.types import FloatArray, Mesh
 
 SIZE, BAND, HEIGHT_MM, LIMIT_MM = (300, 330), 40, 320.0, 5.0

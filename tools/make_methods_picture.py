@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.model.shape_model import ShapeModel
-from shapespace.report.render import Camera, Layer, render
+from shapespace.report.render.renderer import Camera, Layer, render
 from shapespace.types import Mesh
 
 ROOT = Path(__file__).resolve().parent.parent

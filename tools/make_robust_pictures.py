@@ -18,11 +18,11 @@ from scipy.spatial.transform import Rotation
 
 from shapespace.datasets.faces import load_faces
 from shapespace.datasets.simulated_scan import Cut, Hole, simulate_scan
-from shapespace.fit.equations import Estimate
-from shapespace.fit.moving_model import prepare
-from shapespace.fit.robust import Look, Problem
+from shapespace.fit.robust.normal_equations import Estimate
+from shapespace.fit.robust.prepared_model import prepare
+from shapespace.fit.robust.robust_icp import Look, Problem
+from shapespace.fit.robust.robust_settings import RobustSettings
 from shapespace.fit.scan_target import ScanTarget
-from shapespace.fit.settings import RobustSettings
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh, Similarity

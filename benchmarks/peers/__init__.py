@@ -16,8 +16,8 @@ import importlib.util
 from collections.abc import Mapping
 from types import ModuleType
 
-from shapespace.fit.similarity_icp import similarity_icp
-from shapespace.fit.state import StopRule
+from shapespace.fit.iteration_state import StopRule
+from shapespace.fit.paper.similarity_icp import similarity_icp
 from shapespace.geometry.closest import build_engine
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh, Similarity

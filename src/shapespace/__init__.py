@@ -8,23 +8,23 @@ from shapespace.version import __version__
 if TYPE_CHECKING:
     from shapespace.cohort.cohort import Cohort
     from shapespace.cohort.read import CohortOptions, read_cohort
-    from shapespace.correspondence.rounds import CorrespondSettings, correspond
+    from shapespace.correspondence.groupwise import CorrespondSettings, correspond
     from shapespace.datasets.faces import load_faces
     from shapespace.datasets.simulated_scan import simulate_scan
     from shapespace.errors import ShapespaceError
-    from shapespace.fit.fit import FitConfig, fit_scan
-    from shapespace.fit.paper_method import Paper
+    from shapespace.fit.fit_scan import FitConfig, fit_scan
+    from shapespace.fit.paper.paper_method import Paper
     from shapespace.fit.result import FitResult
-    from shapespace.fit.robust_method import Robust
+    from shapespace.fit.robust.robust_method import Robust
     from shapespace.geometry.distance import surface_distances
-    from shapespace.geometry.landmarks import place_landmarks
+    from shapespace.geometry.landmark_placement import place_landmarks
     from shapespace.geometry.volume_surface import VolumeSurface, surface_of_volume
     from shapespace.io.interop import as_mesh
-    from shapespace.io.landmarks import read_landmarks
-    from shapespace.io.meshes import read_mesh, write_mesh
-    from shapespace.io.volumes import read_volume
+    from shapespace.io.landmarks.landmark_io import read_landmarks
+    from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
+    from shapespace.io.volumes.volume_io import read_volume
     from shapespace.model.additive import AdditiveModel
-    from shapespace.model.quality import ModelQuality, QualitySettings, measure_quality
+    from shapespace.model.model_quality import ModelQuality, QualitySettings, measure_quality
     from shapespace.model.shape_model import ShapeModel
     from shapespace.recognise.classifiers import CLASSIFIERS
     from shapespace.recognise.predict import train_classifier
@@ -108,19 +108,19 @@ _HOMES = {
     "CohortOptions": "cohort.read",
     "CompareOptions": "statistics.compare",
     "Comparison": "statistics.compare",
-    "CorrespondSettings": "correspondence.rounds",
-    "FitConfig": "fit.fit",
+    "CorrespondSettings": "correspondence.groupwise",
+    "FitConfig": "fit.fit_scan",
     "FitResult": "fit.result",
     "IdentityOptions": "statistics.identity.rounds",
     "LabelVolume": "types",
     "Mesh": "types",
-    "ModelQuality": "model.quality",
-    "Paper": "fit.paper_method",
+    "ModelQuality": "model.model_quality",
+    "Paper": "fit.paper.paper_method",
     "Predictor": "statistics.predictor",
-    "QualitySettings": "model.quality",
+    "QualitySettings": "model.model_quality",
     "Regression": "statistics.regression",
     "Results": "store.results",
-    "Robust": "fit.robust_method",
+    "Robust": "fit.robust.robust_method",
     "ScoreOptions": "statistics.score",
     "Scores": "statistics.score",
     "ShapeModel": "model.shape_model",
@@ -131,18 +131,18 @@ _HOMES = {
     "as_mesh": "io.interop",
     "change": "statistics.change",
     "compare": "statistics.compare",
-    "correspond": "correspondence.rounds",
+    "correspond": "correspondence.groupwise",
     "VolumeSurface": "geometry.volume_surface",
-    "fit_scan": "fit.fit",
+    "fit_scan": "fit.fit_scan",
     "identify": "statistics.identity.identify",
     "load_faces": "datasets.faces",
     "measure_asymmetry": "statistics.asymmetry",
-    "measure_quality": "model.quality",
-    "place_landmarks": "geometry.landmarks",
+    "measure_quality": "model.model_quality",
+    "place_landmarks": "geometry.landmark_placement",
     "read_cohort": "cohort.read",
-    "read_landmarks": "io.landmarks",
-    "read_mesh": "io.meshes",
-    "read_volume": "io.volumes",
+    "read_landmarks": "io.landmarks.landmark_io",
+    "read_mesh": "io.meshes.mesh_io",
+    "read_volume": "io.volumes.volume_io",
     "regress": "statistics.regression",
     "score": "statistics.score",
     "simulate_scan": "datasets.simulated_scan",
@@ -150,7 +150,7 @@ _HOMES = {
     "surface_of_volume": "geometry.volume_surface",
     "train_classifier": "recognise.predict",
     "verify": "statistics.identity.verify",
-    "write_mesh": "io.meshes",
+    "write_mesh": "io.meshes.mesh_io",
 }
 
 

@@ -20,22 +20,22 @@ import numpy as np
 from tqdm import tqdm
 
 from shapespace.batch.execution import ExecutionConfig
-from shapespace.batch.results import read_record
+from shapespace.batch.fit_records import read_record
 from shapespace.batch.run import fit_files, make_jobs
 from shapespace.datasets.faces import LICENSE, FaceGenerator, load_faces
 from shapespace.datasets.ict import ict_available, landmark_vertices, load_ict
 from shapespace.datasets.james import james_available, load_james
 from shapespace.datasets.simulated_scan import Collar, Hair, Hole, SimulatedScan, random_similarity, simulate_scan
-from shapespace.fit.fit import FitConfig
-from shapespace.fit.paper_method import Paper
-from shapespace.fit.robust_method import Robust
-from shapespace.fit.state import IcpState
+from shapespace.fit.fit_scan import FitConfig
+from shapespace.fit.iteration_state import IcpState
+from shapespace.fit.paper.paper_method import Paper
+from shapespace.fit.robust.robust_method import Robust
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.files import make_folder, write_text
-from shapespace.io.meshes import write_mesh
+from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.recognise.line_structure import disjointness, line_scores
-from shapespace.report.html import require_report_extra, write_report
+from shapespace.report.pages.write_html import require_report_extra, write_report
 from shapespace.schemas import (
     Case,
     Claim,

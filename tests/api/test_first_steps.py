@@ -11,10 +11,10 @@ import pytest
 
 import shapespace as ss
 from shapespace import cli
-from shapespace.batch.results import read_record
+from shapespace.batch.fit_records import read_record
 from shapespace.lazy import LAZY_FUNCTIONS, lazy_import
-from shapespace.report.saved import Folder, find_fits, model_of
-from shapespace.report.saved import raw_scan as saved_scan
+from shapespace.report.inputs.saved_fits import Folder, find_fits, model_of
+from shapespace.report.inputs.saved_fits import raw_scan as saved_scan
 from synthetic_shapes import blob_model, raw_scan, training_meshes
 
 LONGEST_REPR = 700

@@ -293,7 +293,7 @@ def test_nothing_that_a_file_holds_gets_into_a_page_unescaped(result: ss.FitResu
 def test_without_what_draws_a_notebook_shows_the_line_and_the_command(
     result: ss.FitResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("shapespace.report.html.find_spec", lambda _: None)
+    monkeypatch.setattr("shapespace.report.pages.write_html.find_spec", lambda _: None)
     told = replace(result, scan_name="<b>")._repr_html_()
     assert told.startswith("<pre>&lt;FitResult of") and "pip install &#x27;shapespace[report]&#x27;" in told
 

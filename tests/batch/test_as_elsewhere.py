@@ -12,10 +12,10 @@ import pytest
 from shapespace.batch import workers
 from shapespace.batch.executors import Local
 from shapespace.batch.run import fit_files, make_jobs
-from shapespace.fit.fit import FitConfig
-from shapespace.io.meshes import write_mesh
-from shapespace.report.saved import Folder, find_fits
-from shapespace.report.saved import raw_scan as saved_scan
+from shapespace.fit.fit_scan import FitConfig
+from shapespace.io.meshes.mesh_io import write_mesh
+from shapespace.report.inputs.saved_fits import Folder, find_fits
+from shapespace.report.inputs.saved_fits import raw_scan as saved_scan
 from synthetic_shapes import blob_model, raw_scan
 
 SRC = Path(__file__).resolve().parents[2] / "src" / "shapespace"

@@ -9,11 +9,11 @@ import pytest
 
 from raw_blobs import marked, raw_blob
 from shapespace.batch.execution import ExecutionConfig
-from shapespace.batch.rounds import KeptRounds
+from shapespace.batch.parallel_rounds import KeptRounds
+from shapespace.correspondence.groupwise import CorrespondSettings, correspond
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.place import Placed, PlaceTask, Workbench
 from shapespace.correspondence.register import ElasticSettings
-from shapespace.correspondence.rounds import CorrespondSettings, correspond
 from shapespace.correspondence.template import Glance, resampled
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model

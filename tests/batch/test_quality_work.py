@@ -12,7 +12,7 @@ from shapespace.batch.execution import ExecutionConfig
 from shapespace.batch.executors import Serial
 from shapespace.batch.quality_work import QualityElsewhere, QualityWork
 from shapespace.errors import FitError
-from shapespace.model.quality import Curve, ModelQuality, Part, QualitySettings, Shapes, measure_quality
+from shapespace.model.model_quality import Curve, ModelQuality, Part, QualitySettings, Shapes, measure_quality
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model
 

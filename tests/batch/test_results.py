@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from shapespace.batch.folder import names_for
-from shapespace.batch.results import (
+from shapespace.batch.fit_records import (
     Source,
     coefficient_row,
     failed_record,
@@ -21,10 +20,11 @@ from shapespace.batch.results import (
     write_record,
     write_stages,
 )
+from shapespace.batch.result_folder import names_for
 from shapespace.errors import FileError, FileFormatError
-from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.result import FitResult
-from shapespace.io.meshes import read_mesh
+from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model, raw_scan, similarity
 

@@ -16,9 +16,9 @@ from shapespace.batch.fit_work import Job
 from shapespace.batch.on_dask import OnDask
 from shapespace.batch.run import Plan, fit_files, make_jobs
 from shapespace.errors import FileError
-from shapespace.fit.fit import FitConfig
+from shapespace.fit.fit_scan import FitConfig
 from shapespace.io.files import atomic_path
-from shapespace.io.meshes import write_mesh
+from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.model.shape_model import ShapeModel
 from synthetic_shapes import blob_model, raw_scan, similarity
 

@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shapespace.batch.results import Source, coefficient_row, fit_record
-from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.batch.fit_records import Source, coefficient_row, fit_record
+from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.result import FitResult
-from shapespace.geometry.surface import face_areas
+from shapespace.geometry.normals import face_areas
 from shapespace.store.rows import coefficient_columns
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model, raw_scan, similarity

@@ -22,7 +22,7 @@ STATE = """
 import os, signal, sys, threadpoolctl
 def state():
     threads = [pool["num_threads"] for pool in threadpoolctl.threadpool_info() if pool["user_api"] == "blas"]
-    return threads, "shapespace.fit.robust" in sys.modules, signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    return threads, "shapespace.fit.robust.robust_icp" in sys.modules, signal.getsignal(signal.SIGINT) is signal.SIG_IGN
 """
 
 
@@ -99,7 +99,7 @@ from shapespace.batch.warm import warm_up, _hill
 from shapespace.compiled import on_compiling
 from numba.core.dispatcher import Dispatcher
 warm_up(tell=False)
-from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh
 loaded, compile = [], Dispatcher.compile

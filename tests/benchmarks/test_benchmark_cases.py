@@ -8,8 +8,8 @@ import pytest
 
 from shapespace.datasets.ict import load_ict
 from shapespace.geometry.closest import build_engine
+from shapespace.geometry.normals import face_areas
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.geometry.surface import face_areas
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 import cases

@@ -14,7 +14,7 @@ from pages import DESKTOP, WICKED, World
 from shapespace.cli import main
 from shapespace.datasets.faces import load_faces
 from shapespace.datasets.simulated_scan import Hair, Hole, simulate_scan
-from shapespace.io.meshes import write_mesh
+from shapespace.io.meshes.mesh_io import write_mesh
 
 FLAGS = [
     "--no-sandbox",

@@ -7,7 +7,7 @@ import pytest
 from pages import DESKTOP, PHONE
 from pictures import change, drawn_share
 
-from shapespace.report.html import write_report
+from shapespace.report.pages.write_html import write_report
 from shapespace.schemas import Counts as CountsOf
 from shapespace.schemas import HistogramPart, MorphPart, SurfaceMapPart
 from shapespace.statistics.answer import Answer

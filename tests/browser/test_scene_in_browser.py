@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shapespace.fit.fit import FitConfig, fit_scan
-from shapespace.report import scene
-from shapespace.report.staged import StagedFit
+from shapespace.fit.fit_scan import FitConfig, fit_scan
+from shapespace.report.inputs.staged_fit import StagedFit
+from shapespace.report.render import scene
 from synthetic_shapes import blob_model, raw_scan
 
 SHELL = """<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>scene</title>
@@ -85,7 +85,7 @@ def test_the_browser_unpacks_and_moves_the_model_as_numpy_does(page_of, small: b
             assert np.abs(shown.reshape(-1, 3) - model.reconstruct(z * model.stddev)).max() < 1e-3
             assert np.array_equal(faces.reshape(-1, 3), model.faces)
     outwards = tab.page.evaluate("(z) => Array.from(model.displacement(Float32Array.from(z)))", z.tolist())
-    from shapespace.geometry.surface import vertex_normals
+    from shapespace.geometry.normals import vertex_normals
     from shapespace.types import Mesh
 
     normals = vertex_normals(Mesh(mean.reshape(-1, 3), faces.reshape(-1, 3)))

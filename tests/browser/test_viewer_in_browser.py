@@ -17,9 +17,9 @@ import pytest
 from pages import DESKTOP, PHONE, WINDOWS, World
 from pictures import change, drawn_share, same_as_kept
 
-from shapespace.batch.results import read_record
+from shapespace.batch.fit_records import read_record
 from shapespace.cli import main
-from shapespace.io.meshes import read_mesh
+from shapespace.io.meshes.mesh_io import read_mesh
 
 VERDICT_MS = 120_000
 MOVE = "(slider, value) => { slider.value = value; slider.dispatchEvent(new Event('input', {bubbles: true})); }"

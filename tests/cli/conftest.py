@@ -12,8 +12,8 @@ import pytest
 from shapespace.batch import progress
 from shapespace.batch.warm import COMPILING
 from shapespace.cli import main
-from shapespace.io.landmarks import write_landmark_indices
-from shapespace.io.meshes import write_mesh
+from shapespace.io.landmarks.landmark_io import write_landmark_indices
+from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.types import FloatArray, Mesh
 from synthetic_shapes import blob_model, raw_scan, similarity, training_meshes
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shapespace.io.meshes import write_mesh
+from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.types import Mesh
 from symmetric_object import posed, symmetric_object
 

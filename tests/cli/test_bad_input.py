@@ -17,7 +17,7 @@ from shapespace.batch import fit_work
 from shapespace.batch.fit_work import Job, fit_file
 from shapespace.commands import fit
 from shapespace.errors import FileError, FileFormatError
-from shapespace.io.meshes import probe_mesh, read_mesh, write_mesh
+from shapespace.io.meshes.mesh_io import probe_mesh, read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh
 
@@ -542,7 +542,7 @@ def test_a_folder_without_meshes_is_named(run: Run, world: World, tmp_path: Path
 
 
 def test_a_crafted_model_file_is_checked_as_a_whole(run: Run, world: World, tmp_path: Path) -> None:
-    from shapespace.io.hdf5 import read_hdf5, write_hdf5
+    from shapespace.io.containers.hdf5 import read_hdf5, write_hdf5
 
     arrays, attributes = read_hdf5(world.model)
     for name, changed_arrays, changed_attributes in (

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from shapespace.io.landmarks import write_landmark_indices
-from shapespace.io.meshes import write_mesh
+from shapespace.io.landmarks.landmark_io import write_landmark_indices
+from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.types import Mesh
 from synthetic_shapes import blob, sphere
 

@@ -15,8 +15,8 @@ from shapespace import __version__
 from shapespace.cli import parser
 from shapespace.datasets.faces import EXPRESSIONS
 from shapespace.io.files import sha256_of_file
-from shapespace.io.landmarks import write_landmarks
-from shapespace.io.meshes import read_mesh, write_mesh
+from shapespace.io.landmarks.landmark_io import write_landmarks
+from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import MM_PER_UNIT, Mesh
 

@@ -9,7 +9,7 @@ import pytest
 from conftest import Run
 from shapespace.datasets.face_files import chin_of
 from shapespace.datasets.faces import load_faces
-from shapespace.io.meshes import read_mesh
+from shapespace.io.meshes.mesh_io import read_mesh
 
 pytest.importorskip("formulaic", reason="the extra `statistics` is not installed")
 

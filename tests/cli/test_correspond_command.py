@@ -12,8 +12,8 @@ from raw_blobs import LANDMARKS, marked, raw_blob
 from shapespace.cli import main
 from shapespace.commands import correspond
 from shapespace.errors import InputError
-from shapespace.io.landmarks import read_surface_landmarks, write_landmarks
-from shapespace.io.meshes import read_mesh, write_mesh
+from shapespace.io.landmarks.landmark_io import read_surface_landmarks, write_landmarks
+from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh
 from synthetic_shapes import sphere

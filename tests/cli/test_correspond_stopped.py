@@ -11,11 +11,11 @@ import pytest
 
 from conftest import Run
 from raw_blobs import raw_blob
-from shapespace.batch import rounds
+from shapespace.batch import parallel_rounds as rounds
 from shapespace.cli import main
 from shapespace.commands import correspond
 from shapespace.correspondence import generic
-from shapespace.io.meshes import write_mesh
+from shapespace.io.meshes.mesh_io import write_mesh
 
 SCANS = 3
 QUICK = ("--vertices", "300", "--rounds", "2", "--jobs", "1", "--quiet")

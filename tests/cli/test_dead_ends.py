@@ -12,7 +12,7 @@ import pytest
 import shapespace
 from conftest import Run, World
 from shapespace.cli import parser
-from shapespace.io.meshes import read_mesh, write_mesh
+from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
 

@@ -9,7 +9,7 @@ import pytest
 from conftest import Run, World
 from shapespace.cli import main
 from shapespace.geometry.closest import build_engine
-from shapespace.io.meshes import read_mesh, write_mesh
+from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh
 from synthetic_shapes import blob, raw_scan, similarity, sphere

@@ -12,8 +12,8 @@ import pytest
 from conftest import Run, World
 from shapespace.batch import progress
 from shapespace.batch.progress import FIRST_LOG_LINE_S
-from shapespace.io.landmarks import write_landmark_indices
-from shapespace.io.meshes import read_mesh, write_mesh
+from shapespace.io.landmarks.landmark_io import write_landmark_indices
+from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
 from synthetic_shapes import raw_scan, similarity
 

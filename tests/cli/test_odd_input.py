@@ -16,7 +16,7 @@ import pytest
 from conftest import Run, World, leftovers
 from shapespace.batch.execution import EXECUTORS
 from shapespace.errors import FitError
-from shapespace.io.meshes import MESH_FORMATS, write_mesh
+from shapespace.io.meshes.mesh_io import MESH_FORMATS, write_mesh
 from shapespace.types import Mesh
 
 FAST = ("--max-iterations", 2)
@@ -148,7 +148,7 @@ def test_workers_that_are_killed_end_in_one_sentence_and_a_table(
     assert leftovers(tmp_path) == []
 
 
-@pytest.mark.parametrize("where", ["shapespace.io.meshes.read_bytes", "shapespace.batch.fit_work.fit_scan"])
+@pytest.mark.parametrize("where", ["shapespace.io.meshes.mesh_io.read_bytes", "shapespace.batch.fit_work.fit_scan"])
 def test_too_little_memory_for_one_scan_fails_that_scan(
     where: str, run: Run, world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -177,7 +177,7 @@ def test_too_little_memory_to_build_ends_in_one_sentence(
 def test_ctrl_c_ends_with_130_and_whole_files(
     command: str, run: Run, world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from shapespace.io.meshes import read_mesh
+    from shapespace.io.meshes.mesh_io import read_mesh
 
     seen: list[Path] = []
 

@@ -18,7 +18,7 @@ import pytest
 
 from conftest import World, leftovers, without_waiting
 from shapespace.cli import main
-from shapespace.io.meshes import read_mesh
+from shapespace.io.meshes.mesh_io import read_mesh
 
 COMMAND = [sys.executable, "-m", "shapespace"]
 # Buffered output, as users have it, meets a full disk only when it is flushed.

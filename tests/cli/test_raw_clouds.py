@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from shapespace.cli import main
-from shapespace.io.meshes import read_mesh, write_mesh
+from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.types import Mesh, Similarity
 from synthetic_shapes import blob, blob_model, similarity, sphere
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from conftest import Run, World
-from shapespace.io.meshes import read_mesh
+from shapespace.io.meshes.mesh_io import read_mesh
 
 FAST = ("--max-iterations", 2)
 

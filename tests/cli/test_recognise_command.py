@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from conftest import Run, World
-from shapespace.batch.results import Source, coefficient_row, failed_record, write_coefficients, write_record
+from shapespace.batch.fit_records import Source, coefficient_row, failed_record, write_coefficients, write_record
 from shapespace.errors import InputError
-from shapespace.io.tables import write_rows
+from shapespace.io.tables.table_io import write_rows
 from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
 
@@ -194,7 +194,7 @@ def test_expression_alone_is_seen_where_the_model_parts_it(run: Run, tmp_path: P
     assert run(*told, "-o", tmp_path / "a.csv").code == 0
     # What identity does to all coefficients must not be seen by a classifier of e alone.
     rotation = AdditiveModel.load(tmp_path / "m.h5").rotation
-    from shapespace.recognise.saved import load_classifier
+    from shapespace.recognise.classifier_file import load_classifier
 
     saved, shift = load_classifier(tmp_path / "c.skops"), rotation[:2].sum(axis=0)
     z = np.random.default_rng(0).standard_normal((5, 4))

@@ -41,7 +41,7 @@ def test_a_region_is_kept_by_name_and_fits_are_held_to_it_or_to_the_same_file(
 
 
 def test_regions_follow_vertices_that_are_taken_out(run: Run, world: World, tmp_path: Path) -> None:
-    from shapespace.io.meshes import read_mesh, write_mesh
+    from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 
     vertices = front(world)
     lost = vertices[:5]
@@ -76,7 +76,7 @@ def test_what_cannot_be_a_region_or_a_crop_is_one_sentence(run: Run, world: Worl
 
 
 def test_a_crop_is_told_in_the_record(run: Run, world: World, tmp_path: Path) -> None:
-    from shapespace.io.meshes import read_mesh
+    from shapespace.io.meshes.mesh_io import read_mesh
 
     x = read_mesh(world.scan).vertices
     crop = "box:" + ",".join(str(v) for v in (*(x.min(axis=0) - 1), *(x.max(axis=0) + 1)))

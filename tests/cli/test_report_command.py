@@ -27,7 +27,7 @@ def test_it_writes_one_file_and_says_where(run: Run, folder: Path, tmp_path: Pat
 def test_it_opens_the_report_unless_told_not_to(run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[str] = []
     monkeypatch.setattr(webbrowser, "open", opened.append)
-    monkeypatch.setattr("shapespace.report.folder_page.FolderPage.html", lambda self: "<!DOCTYPE html>")
+    monkeypatch.setattr("shapespace.report.pages.folder_page.FolderPage.html", lambda self: "<!DOCTYPE html>")
     assert run("report", folder).out == f"The report is {folder / 'report.html'}\n"
     assert run("report", folder, "--no-open").code == 0
     assert opened == [(folder / "report.html").absolute().as_uri()]

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shapespace.batch.results import coefficient_row, read_record, write_coefficients
+from shapespace.batch.fit_records import coefficient_row, read_record, write_coefficients
 from shapespace.cohort.cohort import Cohort, Fitted, ShapeSource, with_columns
 from shapespace.cohort.read import CohortOptions, read_cohort
 from shapespace.cohort.table import Table
 from shapespace.errors import CorrespondenceError, FileError, FileFormatError, InputError
 from shapespace.geometry.procrustes import Gauge, centroid_size
 from shapespace.io.files import write_text
-from shapespace.io.meshes import read_mesh, write_mesh
+from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh
 from stored_fits import MODES, VERTICES, model, write_fit

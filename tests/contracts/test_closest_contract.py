@@ -5,7 +5,7 @@ import pytest
 
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.closest import ENGINES, build_engine, on_boundary
-from shapespace.geometry.surface import boundary_vertices
+from shapespace.geometry.normals import boundary_vertices
 from shapespace.types import FloatArray, Mesh
 from synthetic_shapes import sphere
 

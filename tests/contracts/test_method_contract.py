@@ -5,11 +5,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from shapespace.fit.iteration_state import IcpState
 from shapespace.fit.method import Limits
-from shapespace.fit.methods import METHODS, method_named
+from shapespace.fit.method_choices import METHODS, method_named
 from shapespace.fit.scan_target import ScanTarget
-from shapespace.fit.start import Start
-from shapespace.fit.state import IcpState
+from shapespace.fit.search.initialisation import Start
 from synthetic_shapes import blob_model, raw_scan, similarity
 
 Z = np.array([1.5, -1.8, 1.3, 1.6, -1.4])

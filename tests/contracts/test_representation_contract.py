@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.model.representation import REPRESENTATIONS, Representation
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from shapespace.errors import InputError
-from shapespace.fit import methods
-from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.fit import method_choices as methods
+from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.method import Method
 from synthetic_shapes import blob_model, raw_scan, similarity
 

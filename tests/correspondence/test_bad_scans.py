@@ -11,14 +11,14 @@ from scipy.spatial import Delaunay
 import shapespace as ss
 from raw_blobs import dispersion_mm, raw_blob, without_ball
 from shapespace.cli import main
+from shapespace.correspondence.groupwise import Correspondence, CorrespondSettings
 from shapespace.correspondence.register import ElasticSettings
-from shapespace.correspondence.rounds import Correspondence, CorrespondSettings
-from shapespace.correspondence.scans import copies, unit_ratios
+from shapespace.correspondence.scan_set import copies, unit_ratios
 from shapespace.correspondence.template import clean, resampled
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.closest import build_engine
+from shapespace.geometry.normals import faces_of
 from shapespace.geometry.remesh import is_sheet
-from shapespace.geometry.surface import faces_of
 from shapespace.types import FloatArray, Mesh
 from synthetic_shapes import sphere
 

@@ -9,16 +9,16 @@ from scipy.spatial.transform import Rotation
 
 import shapespace as ss
 from raw_blobs import LANDMARKS, RawBlob, dispersion_mm, marked, raw_blob
+from shapespace.correspondence.groupwise import CorrespondSettings, correspond, first_template
 from shapespace.correspondence.harmonics import Harmonics
-from shapespace.correspondence.landmarks import Marks, agreed, astray
-from shapespace.correspondence.mirror import Mirror
+from shapespace.correspondence.landmark_guide import Marks, agreed, astray
+from shapespace.correspondence.mirror_image import Mirror
 from shapespace.correspondence.place import Placed, PlaceTask, Workbench
 from shapespace.correspondence.register import ElasticSettings
-from shapespace.correspondence.rounds import CorrespondSettings, correspond, first_template
 from shapespace.correspondence.template import Glance, choose
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.closest import build_engine
-from shapespace.geometry.landmarks import place_landmarks
+from shapespace.geometry.landmark_placement import place_landmarks
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.types import FloatArray, Mesh, Similarity, SurfaceLandmarks
 from synthetic_shapes import blob, sphere, training_meshes

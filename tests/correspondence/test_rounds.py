@@ -5,8 +5,8 @@ import pytest
 
 import shapespace as ss
 from raw_blobs import RawBlob, dispersion_mm, raw_blob, without_ball
+from shapespace.correspondence.groupwise import Correspondence, CorrespondSettings
 from shapespace.correspondence.register import ElasticSettings
-from shapespace.correspondence.rounds import Correspondence, CorrespondSettings
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.closest import build_engine
 from shapespace.types import Mesh

@@ -10,8 +10,8 @@ from shapespace.cli import main
 from shapespace.datasets.bones import EFFECT_MM, LEFT_ARCH_MM, Bone, write_bones
 from shapespace.errors import InputError
 from shapespace.geometry.doctor import examine
-from shapespace.geometry.mirror import FLIP
-from shapespace.io.meshes import read_mesh
+from shapespace.geometry.mirror_plane import FLIP
+from shapespace.io.meshes.mesh_io import read_mesh
 
 TIP, ARCH = np.array([[0.0, -0.1, 1.0]]), np.array([[0.9, -0.15, 0.2]])
 

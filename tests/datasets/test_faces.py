@@ -11,7 +11,7 @@ from shapespace.datasets.face_files import write_faces
 from shapespace.datasets.faces import EXPRESSIONS, Expression, Person, load_faces
 from shapespace.datasets.warp import Warp
 from shapespace.errors import DataError, InputError
-from shapespace.io.meshes import read_mesh
+from shapespace.io.meshes.mesh_io import read_mesh
 
 DATA = importlib.resources.files("shapespace.datasets") / "data"
 

@@ -7,10 +7,10 @@ import pytest
 
 from shapespace.datasets import ict, ict_files
 from shapespace.errors import DataError, FileFormatError, InputError
+from shapespace.geometry.normals import face_areas
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.geometry.surface import face_areas
-from shapespace.io.landmarks import read_landmarks
-from shapespace.io.meshes import read_mesh
+from shapespace.io.landmarks.landmark_io import read_landmarks
+from shapespace.io.meshes.mesh_io import read_mesh
 
 
 @pytest.fixture(scope="module")

@@ -11,10 +11,10 @@ from shapespace.datasets.organs import Organ, label_volume, raw_surface, write_o
 from shapespace.errors import InputError
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.doctor import examine
+from shapespace.geometry.normals import faces_of
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.geometry.surface import faces_of
 from shapespace.geometry.volume_surface import surface_of_volume
-from shapespace.io.meshes import read_mesh
+from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.types import Mesh
 
 

@@ -13,7 +13,7 @@ from shapespace.datasets.simulated_scan import (
 )
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.closest import build_engine
-from shapespace.geometry.surface import boundary_edges, face_vectors
+from shapespace.geometry.normals import boundary_edges, face_vectors
 from shapespace.types import Mesh
 
 

@@ -3,7 +3,7 @@ import json
 import numpy as np
 import pytest
 
-from shapespace.batch.results import read_record
+from shapespace.batch.fit_records import read_record
 from shapespace.demo import DemoScale, run_demo
 from shapespace.model.shape_model import ShapeModel
 

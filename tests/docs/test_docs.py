@@ -531,8 +531,8 @@ def test_the_reference_lists_every_command_and_every_option_and_no_other() -> No
 
 
 def test_the_reference_lists_every_key_of_a_fit_record() -> None:
-    from shapespace.batch.results import Source, fit_record
-    from shapespace.fit.fit import fit_scan
+    from shapespace.batch.fit_records import Source, fit_record
+    from shapespace.fit.fit_scan import fit_scan
     from synthetic_shapes import blob_model, raw_scan
 
     model = blob_model()
@@ -544,7 +544,7 @@ def test_the_reference_lists_every_key_of_a_fit_record() -> None:
 
 
 def test_the_reference_lists_every_column_of_the_table(tmp_path: Path) -> None:
-    from shapespace.batch.results import write_coefficients
+    from shapespace.batch.fit_records import write_coefficients
 
     write_coefficients(tmp_path / "c.csv", [], 2)
     header = (tmp_path / "c.csv").read_text().strip().split(",")

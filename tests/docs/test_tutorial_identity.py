@@ -12,7 +12,7 @@ from test_docs import ROOT, arguments, run, workplace
 
 from shapespace import cli
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.io.meshes import read_mesh
+from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.model.shape_model import ShapeModel
 from stored_fits import record
 

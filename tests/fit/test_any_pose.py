@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 from shapespace.datasets.faces import load_faces
 from shapespace.datasets.ict import load_ict
 from shapespace.errors import FitError
-from shapespace.fit import any_pose
-from shapespace.fit.start import Start, find_unit, start_from_any_pose
+from shapespace.fit.search import pose_search as any_pose
+from shapespace.fit.search.initialisation import Start, find_unit, start_from_any_pose
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import MM_PER_UNIT, FloatArray, Mesh

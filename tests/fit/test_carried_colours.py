@@ -6,16 +6,16 @@ from pathlib import Path
 
 import numpy as np
 
-from shapespace.batch.results import write_fitted_mesh
-from shapespace.fit.colours import carried_colours
-from shapespace.fit.fit import FitConfig, fit_scan
-from shapespace.fit.regions import MATCHED
+from shapespace.batch.fit_records import write_fitted_mesh
+from shapespace.fit.fit_colours import carried_colours
+from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.result import FitResult
 from shapespace.fit.stages import stage_arrays
+from shapespace.fit.vertex_regions import MATCHED
 from shapespace.geometry.closest import build_engine
-from shapespace.io.meshes import read_mesh
-from shapespace.report.scene import pack_fit
-from shapespace.report.staged import StagedFit
+from shapespace.io.meshes.mesh_io import read_mesh
+from shapespace.report.inputs.staged_fit import StagedFit
+from shapespace.report.render.scene import pack_fit
 from shapespace.types import GREY, FloatArray, Mesh
 from synthetic_shapes import blob_model, raw_scan, similarity
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from shapespace.errors import FitError, InputError
-from shapespace.fit.dense import _field, _laplacian, dense_surface, unfolded
-from shapespace.fit.fit import FitConfig, fit_scan
-from shapespace.fit.moving_model import prepare
+from shapespace.fit.dense.dense_fit import _field, _laplacian, dense_surface, unfolded
+from shapespace.fit.fit_scan import FitConfig, fit_scan
+from shapespace.fit.robust.prepared_model import prepare
+from shapespace.fit.robust.robust_settings import DenseSettings
 from shapespace.fit.scan_target import ScanTarget
-from shapespace.fit.settings import DenseSettings
 from shapespace.geometry.closest import build_engine
-from shapespace.geometry.surface import face_vectors, vertex_areas, vertex_normals
+from shapespace.geometry.normals import face_vectors, vertex_areas, vertex_normals
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh, Similarity
 from synthetic_shapes import blob, blob_model, raw_scan, similarity, sphere

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from shapespace.errors import FileFormatError, FitError, InputError, ModelFileError
-from shapespace.fit.fit import FitConfig, FitResult, fit_scan
-from shapespace.fit.regions import UNSEEN
-from shapespace.io.regions import read_region
+from shapespace.fit.fit_scan import FitConfig, FitResult, fit_scan
+from shapespace.fit.vertex_regions import UNSEEN
+from shapespace.io.meshes.region_files import read_region
 from shapespace.model.region import Part
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh
@@ -124,7 +124,7 @@ def test_regions_are_kept_in_the_file_and_old_files_have_none(tmp_path: Path) ->
 
 
 def test_regions_that_do_not_belong_to_their_names_are_refused(tmp_path: Path) -> None:
-    from shapespace.io.hdf5 import read_hdf5, write_hdf5
+    from shapespace.io.containers.hdf5 import read_hdf5, write_hdf5
 
     replace(MODEL, regions={"front": np.array(FRONT)}).save(tmp_path / "m.h5")
     arrays, attributes = read_hdf5(tmp_path / "m.h5")

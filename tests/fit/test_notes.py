@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from shapespace.fit.fit import fit_scan
+from shapespace.fit.fit_scan import fit_scan
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model
 

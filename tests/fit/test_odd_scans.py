@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from shapespace.datasets.simulated_scan import simulate_scan
-from shapespace.fit.chirality import is_asymmetric
-from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.fit.diagnostics.trust import chirality_of, doubts_of_reliability
+from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.result import FitResult
-from shapespace.fit.trust import chirality_of, doubts_of_reliability
+from shapespace.fit.search.chirality import is_asymmetric
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh
 from synthetic_shapes import blob_model, sphere, training_meshes

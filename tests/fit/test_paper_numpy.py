@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from shapespace.fit.method import Limits
-from shapespace.fit.paper_method import Paper
+from shapespace.fit.paper.paper_method import Paper
 from shapespace.fit.scan_target import ScanTarget
-from shapespace.fit.start import Start
+from shapespace.fit.search.initialisation import Start
 from shapespace.types import Similarity
 from synthetic_shapes import blob_model, raw_scan, similarity
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from shapespace.errors import FitError, InputError
-from shapespace.fit.fit import FitConfig, fit_scan
-from shapespace.fit.paper_method import Paper
-from shapespace.fit.shape_icp import shape_icp
-from shapespace.fit.similarity_icp import similarity_icp
-from shapespace.fit.state import IcpState, StopRule
+from shapespace.fit.fit_scan import FitConfig, fit_scan
+from shapespace.fit.iteration_state import IcpState, StopRule
+from shapespace.fit.paper.paper_method import Paper
+from shapespace.fit.paper.shape_icp import shape_icp
+from shapespace.fit.paper.similarity_icp import similarity_icp
 from shapespace.geometry.closest import ENGINES, build_engine
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.shape_model import ShapeModel

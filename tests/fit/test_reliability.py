@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from shapespace.datasets.simulated_scan import simulate_scan
-from shapespace.fit.fit import fit_scan
-from shapespace.fit.posterior import lack_of_new_shapes
-from shapespace.fit.reliability import INPUTS, WEIGHTS, reliability
+from shapespace.fit.diagnostics.reliability import INPUTS, WEIGHTS, reliability
+from shapespace.fit.fit_scan import fit_scan
+from shapespace.fit.robust.posterior import lack_of_new_shapes
 from shapespace.model.shape_model import ShapeModel
 from synthetic_shapes import blob_model, training_meshes
 

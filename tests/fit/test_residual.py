@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from shapespace.fit import residual
-from shapespace.fit.residual import ResidualModes, residual_modes
-from shapespace.fit.settings import ResidualSettings
+from shapespace.fit.dense import residual_modes as residual
+from shapespace.fit.dense.residual_modes import ResidualModes, residual_modes
+from shapespace.fit.robust.robust_settings import ResidualSettings
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh
 from synthetic_shapes import blob_model, sphere

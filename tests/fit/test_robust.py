@@ -7,18 +7,18 @@ import pytest
 
 from robust_reference import gauss_newton_step
 from shapespace.errors import FitError, InputError
-from shapespace.fit.equations import Estimate
-from shapespace.fit.fit import FitConfig, fit_scan
-from shapespace.fit.matching import Matcher, MatchHint
-from shapespace.fit.methods import method_named
-from shapespace.fit.moving_model import LinearShape, ModelSurface, prepare
-from shapespace.fit.robust import Iterate, Problem
+from shapespace.fit.dense.model_span import in_span
+from shapespace.fit.fit_scan import FitConfig, fit_scan
+from shapespace.fit.method_choices import method_named
+from shapespace.fit.robust.matching import Matcher, MatchHint
+from shapespace.fit.robust.normal_equations import Estimate
+from shapespace.fit.robust.prepared_model import LinearShape, ModelSurface, prepare
+from shapespace.fit.robust.robust_icp import Iterate, Problem
+from shapespace.fit.robust.robust_settings import Level, RobustSettings
 from shapespace.fit.scan_target import ScanTarget
-from shapespace.fit.settings import Level, RobustSettings
-from shapespace.fit.span import in_span
 from shapespace.geometry.closest import build_engine
+from shapespace.geometry.normals import vertex_normals
 from shapespace.geometry.similarity import POSE
-from shapespace.geometry.surface import vertex_normals
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh, Similarity
 from synthetic_shapes import blob_model, raw_scan, similarity, training_meshes

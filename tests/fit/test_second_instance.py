@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from shapespace.datasets.simulated_scan import simulate_scan
-from shapespace.fit.fit import fit_scan
+from shapespace.fit.diagnostics.trust import doubts_of_layers
+from shapespace.fit.fit_scan import fit_scan
 from shapespace.fit.result import FitResult
-from shapespace.fit.trust import doubts_of_layers
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model, sphere
 

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from shapespace.fit import shape_search as search
+from shapespace.fit.search import shape_search as search
 from shapespace.geometry.kdtree import KdTree
-from shapespace.geometry.surface import vertex_normals
+from shapespace.geometry.normals import vertex_normals
 from synthetic_shapes import angle_deg, blob_model
 
 Z = np.array([0.8, -1.0, 0.5, 1.0, -0.7])

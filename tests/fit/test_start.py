@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 from shapespace.datasets.ict import load_ict
 from shapespace.datasets.james import load_james
 from shapespace.errors import FitError
-from shapespace.fit.fit import FitConfig, fit_scan
-from shapespace.fit.start import find_unit, start_from_any_pose, start_from_landmarks
+from shapespace.fit.fit_scan import FitConfig, fit_scan
+from shapespace.fit.search.initialisation import find_unit, start_from_any_pose, start_from_landmarks
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import MM_PER_UNIT, FloatArray, Mesh

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from shapespace.datasets.simulated_scan import Cut, simulate_scan
-from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.fit.diagnostics.trust import doubts_of_robust, score
+from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.result import FitResult
-from shapespace.fit.trust import doubts_of_robust, score
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model
 

@@ -17,7 +17,7 @@ import scipy.sparse
 from own_file_fuzz import damaged_bytes, fuzzed
 from shapespace.errors import ModelFileError, ShapespaceError
 from shapespace.formats.registry import read_linear
-from shapespace.io.pickled_arrays import PickleRefusedError, pickled_array, pickled_dict
+from shapespace.io.containers.pickled_arrays import PickleRefusedError, pickled_array, pickled_dict
 from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
 

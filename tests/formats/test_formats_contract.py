@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from shapespace.errors import ModelFileError, ShapespaceError
-from shapespace.formats.parts import LinearModel, ModelFormat, Modes
+from shapespace.formats.model_parts import LinearModel, ModelFormat, Modes
 from shapespace.formats.registry import MODEL_FORMATS, READ_ONLY_MODELS, read_linear
 from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel

@@ -13,9 +13,9 @@ import trimesh
 
 from shapespace.commands.convert import convert
 from shapespace.errors import ShapespaceError
-from shapespace.formats.gltf import Gltf
+from shapespace.formats.gltf_model import Gltf
 from shapespace.formats.registry import is_known
-from shapespace.io.meshes import read_mesh, write_mesh
+from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh

@@ -10,12 +10,12 @@ from scipy.spatial import cKDTree
 from shapespace import cli
 from shapespace.commands.convert import convert
 from shapespace.errors import ModelFileError
-from shapespace.fit.fit import FitConfig, fit_scan
-from shapespace.formats.parts import ModelFormat
+from shapespace.fit.fit_scan import FitConfig, fit_scan
+from shapespace.formats.model_parts import ModelFormat
 from shapespace.formats.registry import MODEL_FORMATS
-from shapespace.io.meshes import read_mesh, write_mesh
+from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
-from shapespace.report.saved import Folder, find_fits, model_of
+from shapespace.report.inputs.saved_fits import Folder, find_fits, model_of
 from shapespace.viewer.shown import Shown
 
 MODELS = Path(os.environ.get("SHAPESPACE_DATA", "/nowhere")) / "models"

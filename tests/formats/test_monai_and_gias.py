@@ -12,7 +12,7 @@ from shapespace.errors import InputError, ShapespaceError
 from shapespace.formats.gias import Gias
 from shapespace.formats.monai import Monai
 from shapespace.formats.registry import READ_ONLY_MODELS, format_to_write, is_known, read_linear
-from shapespace.io.meshes import write_mesh
+from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model

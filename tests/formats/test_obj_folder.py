@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from shapespace.errors import InputError, ModelFileError
+from shapespace.formats.model_parts import Modes
 from shapespace.formats.obj_folder import ObjFolder
-from shapespace.formats.parts import Modes
 from shapespace.formats.registry import is_known
 from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel

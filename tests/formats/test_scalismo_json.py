@@ -12,7 +12,7 @@ from statismo_by_hand import truth
 
 from own_file_fuzz import damaged_bytes, damaged_json, fuzzed
 from shapespace.errors import ModelFileError, ShapespaceError
-from shapespace.formats.parts import LinearModel, Modes
+from shapespace.formats.model_parts import LinearModel, Modes
 from shapespace.formats.scalismo_json import ScalismoJson
 from shapespace.model.shape_model import ShapeModel
 

@@ -14,7 +14,7 @@ from scipy.interpolate import RBFInterpolator
 
 from shapespace.errors import InputError, ModelFileError, ShapespaceError
 from shapespace.formats.shapeworks import NEIGHBOURS, ShapeWorks, interpolate_displacements
-from shapespace.io.meshes import write_mesh
+from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh
 from synthetic_shapes import blob, sphere
@@ -253,7 +253,7 @@ def test_what_is_wrong_is_said_in_one_sentence(change: str, said: str, tmp_path:
 def test_a_project_that_names_one_file_many_times_is_refused_before_it_fills_the_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("shapespace.io.limits.SPARE_BYTES", 2**20)
+    monkeypatch.setattr("shapespace.io.read_limits.SPARE_BYTES", 2**20)
     np.savetxt(tmp_path / "big.particles", np.zeros((10_000, 3)), "%d")
     rows = [{"world_particles_1": "big.particles"}] * 4_000
     with pytest.raises(ShapespaceError, match="unfold to more than"):

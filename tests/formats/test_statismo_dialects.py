@@ -14,7 +14,7 @@ from statismo_by_hand import Truth, truth
 
 from shapespace.commands.convert import convert
 from shapespace.errors import ModelFileError
-from shapespace.formats.parts import LinearModel, Modes
+from shapespace.formats.model_parts import LinearModel, Modes
 from shapespace.formats.registry import read_linear
 from shapespace.formats.statismo import Statismo
 from shapespace.io import sandbox_child

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from own_file_fuzz import VALUES, damaged_bytes, damaged_json, fuzzed
-from shapespace.batch.results import (
+from shapespace.batch.fit_records import (
     Source,
     coefficient_row,
     failed_record,
@@ -30,15 +30,15 @@ from shapespace.batch.results import (
     write_stages,
 )
 from shapespace.errors import FileFormatError, ModelFileError, ShapespaceError
-from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.formats.flame import Flame
 from shapespace.formats.gias import Gias
 from shapespace.model.shape_model import ShapeModel
+from shapespace.recognise.classifier_file import FACTS, SavedClassifier, load_classifier, software_versions
 from shapespace.recognise.classifiers import CLASSIFIERS
-from shapespace.recognise.saved import FACTS, SavedClassifier, load_classifier, software_versions
-from shapespace.recognise.scans import from_record, read_coefficients
-from shapespace.report.saved import Folder, find_fits
-from shapespace.report.staged import StagedFit
+from shapespace.recognise.labelled_scans import from_record, read_coefficients
+from shapespace.report.inputs.saved_fits import Folder, find_fits
+from shapespace.report.inputs.staged_fit import StagedFit
 from shapespace.schemas import (
     CORRESPOND_AGAIN,
     Analysis,

@@ -348,7 +348,7 @@ def test_forty_thousand_triangles_take_well_under_a_second():
 
 
 def test_james_is_sound(shared_data):
-    from shapespace.io.meshes import read_mesh
+    from shapespace.io.meshes.mesh_io import read_mesh
 
     james = read_mesh(shared_data / "james" / "james.obj")
     report = examine(james)

@@ -4,7 +4,7 @@ from scipy.spatial import Delaunay
 
 from shapespace.errors import MeshError
 from shapespace.geometry.flatten import cylinder_map, disc_map, folded_triangles
-from shapespace.geometry.surface import face_areas
+from shapespace.geometry.normals import face_areas
 from shapespace.types import FloatArray, Mesh
 from synthetic_shapes import similarity, sphere
 

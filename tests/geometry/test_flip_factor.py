@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from shapespace.geometry.distortion import factor_to_draw, flip_factor
-from shapespace.geometry.surface import face_vectors
+from shapespace.geometry.normals import face_vectors
 from synthetic_shapes import training_meshes
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from shapespace.errors import InputError
-from shapespace.geometry.mirror import mirror_vertices, mirrored
+from shapespace.geometry.mirror_plane import mirror_vertices, mirrored
 
 
 def symmetric() -> np.ndarray:

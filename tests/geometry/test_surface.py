@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from shapespace.errors import MeshError
-from shapespace.geometry.surface import (
+from shapespace.geometry.normals import (
     boundary_edges,
     boundary_vertices,
     face_areas,

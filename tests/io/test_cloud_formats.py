@@ -13,9 +13,9 @@ from hand_made import pcd
 from refusals import refusal_of
 from shapespace.commands.look import check
 from shapespace.errors import FileFormatError
-from shapespace.io import limits
-from shapespace.io.folders import mesh_files
-from shapespace.io.meshes import MESH_ENDINGS, ending_of, probe_mesh, read_mesh, stem_of, write_mesh
+from shapespace.io import read_limits as limits
+from shapespace.io.meshes.mesh_folders import mesh_files
+from shapespace.io.meshes.mesh_io import MESH_ENDINGS, ending_of, probe_mesh, read_mesh, stem_of, write_mesh
 from shapespace.types import Mesh
 
 POINTS = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32).astype(np.float64)
@@ -158,7 +158,7 @@ def test_a_bomb_is_refused_before_it_is_unpacked(write, monkeypatch: pytest.Monk
     data = bomb(30_000_000)
     assert len(data) < 100_000
     assert "unpacks to more than" in refusal(write("a.xyz.gz", data))
-    monkeypatch.setattr("shapespace.io.meshes.LARGEST_MESH_FILE_BYTES", 2000)
+    monkeypatch.setattr("shapespace.io.meshes.mesh_io.LARGEST_MESH_FILE_BYTES", 2000)
     assert "unpacks to more than" in refusal(write("b.xyz.gz", bomb(3000)))
 
 

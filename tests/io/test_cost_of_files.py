@@ -22,10 +22,12 @@ from hand_made import gltf_tree, ply_header
 
 from shapespace.commands.look import check
 from shapespace.errors import FileError, FileFormatError, ShapespaceError
-from shapespace.io import landmarks, limits, meshes
+from shapespace.io import read_limits as limits
 from shapespace.io.files import sha256_of_file
-from shapespace.io.landmarks import LANDMARK_FORMATS, READ_ONLY_LANDMARKS, read_landmarks, write_landmarks
-from shapespace.io.meshes import MESH_ENDINGS, read_mesh, write_mesh
+from shapespace.io.landmarks import landmark_io as landmarks
+from shapespace.io.landmarks.landmark_io import LANDMARK_FORMATS, READ_ONLY_LANDMARKS, read_landmarks, write_landmarks
+from shapespace.io.meshes import mesh_io as meshes
+from shapespace.io.meshes.mesh_io import MESH_ENDINGS, read_mesh, write_mesh
 from shapespace.types import Mesh
 
 MOST_FOR_A_BYTE = 100
@@ -390,7 +392,7 @@ def test_buffers_on_one_file_are_read_once(tmp_path: Path, monkeypatch: pytest.M
     )
     assert len(read_mesh(path).vertices) == count
     assert memory(path) < 2**23
-    monkeypatch.setattr("shapespace.io.gltf.LARGEST_MESH_FILE_BYTES", 2**20)
+    monkeypatch.setattr("shapespace.io.meshes.gltf_mesh.LARGEST_MESH_FILE_BYTES", 2**20)
     assert "too long" in str(read(path))
 
 

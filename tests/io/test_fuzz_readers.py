@@ -25,8 +25,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from shapespace.errors import ShapespaceError
-from shapespace.io.landmarks import LANDMARK_FORMATS, READ_ONLY_LANDMARKS, read_landmark_indices, read_landmarks
-from shapespace.io.meshes import MESH_ENDINGS, MESH_FORMATS, read_mesh
+from shapespace.io.landmarks.landmark_io import (
+    LANDMARK_FORMATS,
+    READ_ONLY_LANDMARKS,
+    read_landmark_indices,
+    read_landmarks,
+)
+from shapespace.io.meshes.mesh_io import MESH_ENDINGS, MESH_FORMATS, read_mesh
 from shapespace.types import Mesh
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="memory is bounded by what Linux tells of a process")

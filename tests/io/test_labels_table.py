@@ -1,7 +1,7 @@
 import pytest
 
 from shapespace.errors import FileFormatError
-from shapespace.io.labels import Label, label_of, read_labels
+from shapespace.io.tables.label_table import Label, label_of, read_labels
 
 
 def test_labels_are_read_by_the_name_of_the_scan_without_folder_and_ending(tmp_path):

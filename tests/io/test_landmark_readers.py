@@ -8,7 +8,7 @@ import pytest
 from hand_made import FCSV, TPS
 
 from refusals import refusal_of
-from shapespace.io.landmarks import read_landmarks, write_landmarks
+from shapespace.io.landmarks.landmark_io import read_landmarks, write_landmarks
 
 refusal = partial(refusal_of, read_landmarks)
 

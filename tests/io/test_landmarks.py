@@ -7,7 +7,7 @@ import pytest
 
 from refusals import refusal_of
 from shapespace.errors import FileError, FileFormatError, InputError
-from shapespace.io.landmarks import (
+from shapespace.io.landmarks.landmark_io import (
     LANDMARK_FORMATS,
     read_landmark_indices,
     read_landmarks,

@@ -12,7 +12,7 @@ from hand_made import POINTS, gltf_tree, ply_header, vtp
 
 from shapespace.errors import FileError, FileFormatError, InputError, MeshError, ShapespaceError
 from shapespace.geometry.doctor import examine
-from shapespace.io.meshes import MESH_FORMATS, read_mesh, write_mesh
+from shapespace.io.meshes.mesh_io import MESH_FORMATS, read_mesh, write_mesh
 from shapespace.types import Mesh
 
 ENDINGS = list(MESH_FORMATS)

@@ -12,7 +12,7 @@ from test_fuzz_readers import MESHES
 
 from refusals import refusal_of
 from shapespace.errors import InputError, ShapespaceError
-from shapespace.io.meshes import MESH_ENDINGS, MESH_FORMATS, read_mesh, write_mesh
+from shapespace.io.meshes.mesh_io import MESH_ENDINGS, MESH_FORMATS, read_mesh, write_mesh
 from shapespace.types import Mesh
 
 MARK = b"\xef\xbb\xbf"

@@ -14,17 +14,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shapespace.batch.folder import records_in
-from shapespace.batch.results import read_record
+from shapespace.batch.fit_records import read_record
+from shapespace.batch.result_folder import records_in
 from shapespace.errors import FileError, FileFormatError
-from shapespace.io.archives import read_arrays
-from shapespace.io.arrays import read_arrays as kept_arrays
-from shapespace.io.json_files import plain_json, read_json
-from shapespace.io.labels import read_labels
+from shapespace.io.containers.archives import read_arrays
+from shapespace.io.containers.arrays import read_arrays as kept_arrays
+from shapespace.io.containers.json_files import plain_json, read_json
+from shapespace.io.tables.label_table import read_labels
 from shapespace.model.shape_model import ShapeModel
-from shapespace.recognise.saved import load_classifier
-from shapespace.recognise.scans import read_coefficients
-from shapespace.report.saved import Folder, find_fits
+from shapespace.recognise.classifier_file import load_classifier
+from shapespace.recognise.labelled_scans import read_coefficients
+from shapespace.report.inputs.saved_fits import Folder, find_fits
 
 AGAIN = "make it again"
 READERS: list[Callable[[Path], object]] = [

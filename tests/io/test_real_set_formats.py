@@ -8,8 +8,8 @@ import pytest
 from hand_made import BND, FACE, LM3, NONE, bnt
 
 from shapespace.errors import FileError, FileFormatError, MeshError
-from shapespace.io.landmarks import LANDMARK_FORMATS, READ_ONLY_LANDMARKS, read_landmarks, write_landmarks
-from shapespace.io.meshes import MESH_ENDINGS, MESH_FORMATS, READ_ONLY_FORMATS, read_mesh, write_mesh
+from shapespace.io.landmarks.landmark_io import LANDMARK_FORMATS, READ_ONLY_LANDMARKS, read_landmarks, write_landmarks
+from shapespace.io.meshes.mesh_io import MESH_ENDINGS, MESH_FORMATS, READ_ONLY_FORMATS, read_mesh, write_mesh
 from shapespace.types import Mesh
 
 ENDINGS = list(READ_ONLY_FORMATS)

@@ -17,9 +17,9 @@ from hand_made import gltf_tree, ply_header
 
 from shapespace.errors import MeshError
 from shapespace.geometry.doctor import repair
-from shapespace.io import textures
 from shapespace.io.files import read_bytes
-from shapespace.io.meshes import MESH_FORMATS, read_mesh, write_mesh
+from shapespace.io.meshes import textures
+from shapespace.io.meshes.mesh_io import MESH_FORMATS, read_mesh, write_mesh
 from shapespace.types import GREY, Mesh
 
 Image = pytest.importorskip("PIL.Image", reason="the extra 'report' is not installed")
@@ -168,7 +168,7 @@ def test_materials_without_a_picture_say_nothing(tmp_path: Path) -> None:
 
 
 def test_without_pillow_a_note_says_what_to_install(tmp_path: Path) -> None:
-    code = "import sys; sys.modules['PIL'] = None\nfrom shapespace.io.meshes import read_mesh\n"
+    code = "import sys; sys.modules['PIL'] = None\nfrom shapespace.io.meshes.mesh_io import read_mesh\n"
     code += "print(read_mesh(sys.argv[1]).notes)"
     done = subprocess.run([sys.executable, "-c", code, folder_of(tmp_path)], capture_output=True, text=True, check=True)
     assert "pip install 'shapespace[report]'" in done.stdout

@@ -9,9 +9,9 @@ import pytest
 
 from shapespace.cohort.table import read_table
 from shapespace.errors import FileFormatError
-from shapespace.io.labels import Label, read_labels
-from shapespace.io.tables import CHECKSUM, checked_table_text, table_rows, table_text
-from shapespace.io.workbook import sheet_rows
+from shapespace.io.tables.label_table import Label, read_labels
+from shapespace.io.tables.table_io import CHECKSUM, checked_table_text, table_rows, table_text
+from shapespace.io.tables.workbook import sheet_rows
 
 HARMFUL = ["=1+1", "+cmd|' /C calc'!A0", "-2+3", "@SUM(1)", "\t=1", "\r=1", "'=1", "''+x", "-", '=LINK("x","y")']
 PLAIN = ["", "a", "-1.5", "+3", "-1e-05", "-inf", "a=b", "'quoted'", "don't", "ä", 'say "a, b"', "two\nlines"]

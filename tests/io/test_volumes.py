@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from shapespace.errors import FileError, FileFormatError, InputError, ShapespaceError
-from shapespace.io.volumes import read_volume, volume_name
+from shapespace.io.volumes.volume_io import read_volume, volume_name
 from shapespace.types import LabelVolume
 
 nib = pytest.importorskip("nibabel", reason="the extra `volumes` is not installed")
@@ -307,7 +307,7 @@ def test_damage_ends_in_a_volume_or_in_a_sentence(name: str, data: st.DataObject
 
 
 def test_the_sentence_says_how_to_get_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shapespace.io.volumes.find_spec", lambda name: None)
+    monkeypatch.setattr("shapespace.io.volumes.volume_io.find_spec", lambda name: None)
     with pytest.raises(ShapespaceError, match=r"pip install 'shapespace\[volumes\]'"):
         read_volume(write_nifti(tmp_path / "a.nii"))
 

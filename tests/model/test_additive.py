@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from shapespace.errors import InputError, ModelFileError
-from shapespace.fit.fit import FitConfig, fit_scan
-from shapespace.fit.posterior import variance_of_new_shapes
+from shapespace.fit.fit_scan import FitConfig, fit_scan
+from shapespace.fit.robust.posterior import variance_of_new_shapes
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.additive import AdditiveModel, still_vertices
 from shapespace.model.shape_model import ShapeModel

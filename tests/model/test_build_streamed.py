@@ -14,7 +14,7 @@ import pytest
 
 from shapespace import cli
 from shapespace.batch import progress
-from shapespace.io.meshes import write_mesh
+from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.model import streamed
 from shapespace.model.missing import MIN_SEEN
 from shapespace.model.shape_model import ShapeModel
@@ -24,7 +24,7 @@ COUNT, OLD = 40, 30
 SLOW = """
 import sys, time
 from shapespace import cli
-from shapespace.io.spill import Spill
+from shapespace.io.containers.row_spill import Spill
 from shapespace.model import large_pca
 large_pca.EXACT, large_pca._LEAST_BLOCK = 10, 5
 for owner, name, wait in ((large_pca._Covariance, "__call__", 0.1), (Spill, "to_disk", 0.3)):

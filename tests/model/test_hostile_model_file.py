@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from shapespace.errors import FileFormatError, ModelFileError
-from shapespace.io.hdf5 import content_hash, write_hdf5
+from shapespace.io.containers.hdf5 import content_hash, write_hdf5
 from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
 from synthetic_shapes import blob_model

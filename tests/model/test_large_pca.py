@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from shapespace.errors import FileFormatError, InputError
-from shapespace.io import spill
-from shapespace.io.spill import Spill
+from shapespace.io.containers import row_spill as spill
+from shapespace.io.containers.row_spill import Spill
 from shapespace.model import krylov, large_pca
 from shapespace.model.krylov import KeptPasses, Stop, leading
 from shapespace.model.large_pca import large_components

@@ -9,12 +9,12 @@ import pytest
 from shapespace import cli
 from shapespace.errors import InputError
 from shapespace.geometry.procrustes import align_in_place
-from shapespace.io.landmarks import write_landmark_indices
-from shapespace.io.meshes import write_mesh
+from shapespace.io.landmarks.landmark_io import write_landmark_indices
+from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.model.missing import Kept, with_estimates
+from shapespace.model.model_quality import QualitySettings, measure_quality
 from shapespace.model.pca import principal_components
 from shapespace.model.ppca import ppca
-from shapespace.model.quality import QualitySettings, measure_quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, Mesh
 from synthetic_shapes import similarity, training_meshes

@@ -8,8 +8,8 @@ import pytest
 
 from shapespace import cli
 from shapespace.errors import CorrespondenceError, InputError
-from shapespace.io.meshes import write_mesh
-from shapespace.model.quality import Curve, ModelQuality, QualitySettings, measure_quality
+from shapespace.io.meshes.mesh_io import write_mesh
+from shapespace.model.model_quality import Curve, ModelQuality, QualitySettings, measure_quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import Quality
 from shapespace.types import Mesh

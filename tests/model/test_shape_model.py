@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from shapespace.errors import CorrespondenceError, FileError, InputError, ModelFileError
 from shapespace.geometry.procrustes import centroid_size
-from shapespace.io.hdf5 import write_hdf5
+from shapespace.io.containers.hdf5 import write_hdf5
 from shapespace.model.choose_modes import choose_modes
+from shapespace.model.model_quality import QualitySettings
 from shapespace.model.pca import principal_components
-from shapespace.model.quality import QualitySettings
 from shapespace.model.shape_model import ShapeModel
 from shapespace.store.results import Results
 from shapespace.types import Mesh

@@ -20,7 +20,7 @@ from shapespace.geometry.procrustes import (
     scale_to_tangent_streamed,
 )
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.io.spill import Spill
+from shapespace.io.containers.row_spill import Spill
 from shapespace.model import choose_modes as choosing
 from shapespace.model import large_pca, shape_model, streamed
 from shapespace.model.shape_model import ShapeModel

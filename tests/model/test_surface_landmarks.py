@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from shapespace.errors import FileFormatError, InputError, MeshError, ModelFileError
 from shapespace.formats.registry import MODEL_FORMATS
-from shapespace.geometry.landmarks import far_landmarks, place_landmarks
-from shapespace.geometry.surface import rms_size
-from shapespace.io.hdf5 import read_hdf5, write_hdf5
-from shapespace.io.landmarks import read_landmark_indices, read_surface_landmarks, write_surface_landmarks
+from shapespace.geometry.landmark_placement import far_landmarks, place_landmarks
+from shapespace.geometry.normals import rms_size
+from shapespace.io.containers.hdf5 import read_hdf5, write_hdf5
+from shapespace.io.landmarks.landmark_io import read_landmark_indices, read_surface_landmarks, write_surface_landmarks
 from shapespace.model.additive import AdditiveModel
 from shapespace.model.region import Part
 from shapespace.model.shape_model import ShapeModel

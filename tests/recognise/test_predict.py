@@ -3,12 +3,11 @@ import csv
 import numpy as np
 import pytest
 
-from shapespace.batch.results import Source, coefficient_row, failed_record, write_coefficients
+from shapespace.batch.fit_records import Source, coefficient_row, failed_record, write_coefficients
 from shapespace.errors import FileError, FileFormatError, InputError
-from shapespace.io.labels import Label
+from shapespace.io.tables.label_table import Label
 from shapespace.recognise.classifiers import CLASSIFIERS
-from shapespace.recognise.predict import predict_scans, train_classifier, write_answers
-from shapespace.recognise.scans import (
+from shapespace.recognise.labelled_scans import (
     ScanCoefficients,
     from_record,
     labelled,
@@ -16,6 +15,7 @@ from shapespace.recognise.scans import (
     read_coefficients,
     relative_to_neutral,
 )
+from shapespace.recognise.predict import predict_scans, train_classifier, write_answers
 
 HASH = "a" * 64
 NAMES = ("anger", "fear", "smile")

@@ -13,8 +13,8 @@ from sklearn.naive_bayes import GaussianNB
 from sklearn.pipeline import make_pipeline
 
 from shapespace.errors import FileError, FileFormatError, InputError
+from shapespace.recognise.classifier_file import FACTS, TRUSTED, SavedClassifier, load_classifier, software_versions
 from shapespace.recognise.classifiers import CLASSIFIERS
-from shapespace.recognise.saved import FACTS, TRUSTED, SavedClassifier, load_classifier, software_versions
 
 HASH = "a" * 64
 

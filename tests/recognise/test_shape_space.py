@@ -4,9 +4,9 @@ from sklearn.base import clone
 from sklearn.pipeline import make_pipeline
 
 import shapespace as ss
-from shapespace.batch.results import Source, failed_record, fit_record
+from shapespace.batch.fit_records import Source, failed_record, fit_record
 from shapespace.errors import CorrespondenceError, FileFormatError, InputError
-from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.recognise.classifiers import CLASSIFIERS
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model, raw_scan, similarity, training_meshes

@@ -12,8 +12,8 @@ import pytest
 
 from shapespace.datasets.faces import load_faces
 from shapespace.datasets.simulated_scan import Cut, Hole, random_similarity, simulate_scan
-from shapespace.fit.fit import FitConfig, fit_scan
-from shapespace.fit.robust_method import Robust
+from shapespace.fit.fit_scan import FitConfig, fit_scan
+from shapespace.fit.robust.robust_method import Robust
 from shapespace.model.floor import floor_mm
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh

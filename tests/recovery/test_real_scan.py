@@ -6,8 +6,8 @@ import pytest
 from shapespace.datasets.faces import load_faces
 from shapespace.datasets.ict import landmark_vertices, load_ict
 from shapespace.datasets.james import load_james
-from shapespace.fit.fit import FitConfig, fit_scan
-from shapespace.fit.trust import doubts_of_robust
+from shapespace.fit.diagnostics.trust import doubts_of_robust
+from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.shape_model import ShapeModel
 

@@ -7,10 +7,10 @@ import pytest
 
 from shapespace.datasets.ict import load_ict
 from shapespace.datasets.simulated_scan import Hole, random_similarity, simulate_scan
-from shapespace.fit.fit import FitConfig, FitResult, fit_scan
-from shapespace.fit.methods import method_named
-from shapespace.fit.similarity_icp import similarity_icp
-from shapespace.fit.state import StopRule
+from shapespace.fit.fit_scan import FitConfig, FitResult, fit_scan
+from shapespace.fit.iteration_state import StopRule
+from shapespace.fit.method_choices import method_named
+from shapespace.fit.paper.similarity_icp import similarity_icp
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.shape_model import ShapeModel

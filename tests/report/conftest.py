@@ -11,9 +11,9 @@ import pytest
 from report_page import edit
 
 from shapespace.batch.run import fit_files, make_jobs
-from shapespace.fit.fit import FitConfig
-from shapespace.io.meshes import write_mesh
-from shapespace.io.tables import write_rows
+from shapespace.fit.fit_scan import FitConfig
+from shapespace.io.meshes.mesh_io import write_mesh
+from shapespace.io.tables.table_io import write_rows
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model, raw_scan, training_meshes
 

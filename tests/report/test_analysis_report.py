@@ -14,11 +14,11 @@ from report_page import Page
 from test_recognition_report import EVIL, words_under
 
 from shapespace.errors import FileFormatError, InputError
-from shapespace.geometry.surface import vertex_normals
+from shapespace.geometry.normals import vertex_normals
 from shapespace.report import figures
-from shapespace.report.html import LARGEST_REPORT_BYTES, write_report
-from shapespace.report.recognition import MOST_ANALYSES
-from shapespace.report.scene import pack_morph
+from shapespace.report.pages.recognition_page import MOST_ANALYSES
+from shapespace.report.pages.write_html import LARGEST_REPORT_BYTES, write_report
+from shapespace.report.render.scene import pack_morph
 from shapespace.schemas import (
     Counts,
     CurvePart,

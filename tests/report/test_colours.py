@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from shapespace.errors import InputError
-from shapespace.report import colours
+from shapespace.report.render import palette as colours
 
 # Machado, Oliveira and Fernandes 2009: what those without one kind of cone see, in linear RGB.
 BLIND = {

@@ -2,8 +2,8 @@
 
 import pytest
 
-from shapespace.report.blocks import Figure, Group, Image
-from shapespace.report.sections import in_columns
+from shapespace.report.blocks.blocks import Figure, Group, Image
+from shapespace.report.blocks.sections import in_columns
 
 
 def picture(height: int) -> Figure:

@@ -12,13 +12,13 @@ from report_page import Page, edit
 
 from same_blobs import ASIDE, EVIL, FAR, FOLDED, HIDDEN, NAMES, VERTICES, mean_blob, surface, write_same
 from shapespace.errors import FileError, FileFormatError, InputError
-from shapespace.io.meshes import read_mesh, write_mesh
-from shapespace.report import correspondence_page
-from shapespace.report.checker import checker_layer, checker_places
-from shapespace.report.corresponded import Corresponded, upright
-from shapespace.report.html import LARGEST_REPORT_BYTES, write_report
-from shapespace.report.render import Camera, Layer, render, squares
-from shapespace.report.triage import concerns_of
+from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
+from shapespace.report.inputs.correspondence_folder import Corresponded, upright
+from shapespace.report.inputs.triage import concerns_of
+from shapespace.report.pages import correspondence_page
+from shapespace.report.pages.write_html import LARGEST_REPORT_BYTES, write_report
+from shapespace.report.render.checkerboard import checker_layer, checker_places
+from shapespace.report.render.renderer import Camera, Layer, render, squares
 from shapespace.types import Mesh
 from synthetic_shapes import similarity
 

@@ -13,7 +13,7 @@ from test_recognition_report import contents
 
 from shapespace.errors import ShapespaceError
 from shapespace.report import figures
-from shapespace.report.html import write_report
+from shapespace.report.pages.write_html import write_report
 
 VALUES: list[Any] = [
     None, True, 0, 3, -1, 1e308, -2.5, "", "text", "\0", "../..", [], {}, [None], [[]], [1, [2]], [1.5, 2.5],

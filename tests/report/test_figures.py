@@ -10,12 +10,12 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from shapespace.errors import InputError
-from shapespace.fit.fit import FitConfig, fit_scan
-from shapespace.fit.regions import UNSEEN
+from shapespace.fit.fit_scan import FitConfig, fit_scan
+from shapespace.fit.vertex_regions import UNSEEN
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report import figures
 from shapespace.report.figures import draw
-from shapespace.report.staged import Moment, StagedFit
+from shapespace.report.inputs.staged_fit import Moment, StagedFit
 from shapespace.types import Mesh, Similarity
 from synthetic_shapes import blob_model, raw_scan
 

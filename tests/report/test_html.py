@@ -16,7 +16,7 @@ from PIL import Image
 from report_page import Page, edit
 
 from shapespace.errors import FileFormatError, ShapespaceError
-from shapespace.report.html import LARGEST_REPORT_BYTES, require_report_extra, write_report
+from shapespace.report.pages.write_html import LARGEST_REPORT_BYTES, require_report_extra, write_report
 
 
 @pytest.fixture
@@ -203,7 +203,8 @@ def test_a_damaged_demo_is_refused_in_one_sentence(tmp_path: Path) -> None:
 
 def test_without_matplotlib_the_sentence_says_how_to_install_it(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = importlib.util.find_spec
-    monkeypatch.setattr("shapespace.report.html.find_spec", lambda name: None if name == "matplotlib" else found(name))
+    missing = lambda name: None if name == "matplotlib" else found(name)  # noqa: E731
+    monkeypatch.setattr("shapespace.report.pages.write_html.find_spec", missing)
     for action in (require_report_extra, lambda: write_report(folder)):
         with pytest.raises(ShapespaceError, match=r"pip install 'shapespace\[report\]'"):
             action()
@@ -211,11 +212,12 @@ def test_without_matplotlib_the_sentence_says_how_to_install_it(folder: Path, mo
 
 def test_the_report_module_loads_without_matplotlib() -> None:
     code = (
-        "import sys; sys.modules['matplotlib'] = None; sys.modules['PIL'] = None; import shapespace.report.html as h; "
+        "import sys; sys.modules['matplotlib'] = None; sys.modules['PIL'] = None; "
+        "import shapespace.report.pages.write_html as h; "
         "print(h.__name__)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.stdout.strip() == "shapespace.report.html", done.stderr
+    assert done.stdout.strip() == "shapespace.report.pages.write_html", done.stderr
 
 
 def test_drawing_leaves_pyplot_alone() -> None:

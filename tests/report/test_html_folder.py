@@ -17,9 +17,10 @@ import pytest
 from report_page import Page, edit
 
 from shapespace.errors import FileError, FileFormatError, InputError
-from shapespace.io.tables import write_rows
-from shapespace.report import folder_page, scene
-from shapespace.report.html import LARGEST_REPORT_BYTES, write_report
+from shapespace.io.tables.table_io import write_rows
+from shapespace.report.pages import folder_page
+from shapespace.report.pages.write_html import LARGEST_REPORT_BYTES, write_report
+from shapespace.report.render import scene
 
 EVIL = "</script><script>alert(1)</script>"
 
@@ -269,7 +270,7 @@ def test_many_fits_stay_below_the_limit_and_the_rest_is_told(fits: Path, sketche
 def test_what_turns_becomes_a_still_where_the_file_would_grow_too_large(
     fits: Path, sketched: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("shapespace.report.page.LARGEST_REPORT_BYTES", 1_600_000)
+    monkeypatch.setattr("shapespace.report.pages.page.LARGEST_REPORT_BYTES", 1_600_000)
     monkeypatch.setattr(
         scene, "payload_html", lambda name, payload: f'<script type="x" id="{name}">{"A" * 300_000}</script>'
     )

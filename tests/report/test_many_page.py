@@ -11,9 +11,11 @@ from report_page import Page
 
 from shapespace.batch.store import Store
 from shapespace.errors import InputError
-from shapespace.report import figures, many_page, population
-from shapespace.report.html import LARGEST_REPORT_BYTES, write_report
-from shapespace.report.population import Listed, Population
+from shapespace.report import figures
+from shapespace.report.inputs import fit_population as population
+from shapespace.report.inputs.fit_population import Listed, Population
+from shapespace.report.pages import many_page
+from shapespace.report.pages.write_html import LARGEST_REPORT_BYTES, write_report
 from shapespace.store.results import Results
 from shapespace.viewer import shown as shown_module
 from shapespace.viewer.shown import Shown

@@ -11,7 +11,7 @@ import shapespace as ss
 from identity_people import cohort as people_cohort
 from shapespace.cohort.cohort import Cohort
 from shapespace.errors import InputError
-from shapespace.io.meshes import write_mesh
+from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.report.figures import spectrum_figure
 from shapespace.statistics.predictor import Predictions
 from symmetric_object import symmetric_object

@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from report_page import Page
 
 from shapespace.errors import FileFormatError, InputError
-from shapespace.io.meshes import write_mesh
+from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.report import figures
-from shapespace.report.html import LARGEST_REPORT_BYTES, write_report
+from shapespace.report.pages.write_html import LARGEST_REPORT_BYTES, write_report
 from shapespace.types import Mesh
 
 EVIL = "</script><script>alert(1)</script>"

@@ -10,8 +10,8 @@ from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from shapespace.report import figures
-from shapespace.report.colours import DIVERGING, MODEL_COLOUR, REGION_COLOURS, SCAN_COLOUR, SEQUENTIAL
-from shapespace.report.render import Camera, Layer, render_series
+from shapespace.report.render.palette import DIVERGING, MODEL_COLOUR, REGION_COLOURS, SCAN_COLOUR, SEQUENTIAL
+from shapespace.report.render.renderer import Camera, Layer, render_series
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model
 
@@ -73,7 +73,7 @@ def test_every_picture_has_its_reference(pictures: dict[str, np.ndarray]) -> Non
 def test_the_comparison_fails_when_something_changes(
     pictures: dict[str, np.ndarray], change: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from shapespace.report import render
+    from shapespace.report.render import renderer as render
 
     model = blob_model()
     b = np.array([1.5, -1.0, 0.5, 0.8, -0.4]) * model.stddev

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from shapespace.errors import InputError
-from shapespace.report.render import Camera, Layer, covered, render, render_series
+from shapespace.report.render.renderer import Camera, Layer, covered, render, render_series
 from shapespace.types import FloatArray, Mesh
 
 SIZE = (57, 43)

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from shapespace.errors import InputError
-from shapespace.fit.fit import FitConfig, fit_scan
-from shapespace.report import scene
-from shapespace.report.staged import StagedFit
+from shapespace.fit.fit_scan import FitConfig, fit_scan
+from shapespace.report.inputs.staged_fit import StagedFit
+from shapespace.report.render import scene
 from shapespace.types import Mesh, SurfaceLandmarks
 from synthetic_shapes import blob_model, raw_scan
 

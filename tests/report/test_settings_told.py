@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import shapespace as ss
-from shapespace.fit.fit import FitConfig
-from shapespace.fit.paper_method import Paper
-from shapespace.fit.settings import DenseSettings, ResidualSettings, RobustSettings
-from shapespace.report.blocks import Block, Facts, Folded, Table
-from shapespace.report.evidence import EVIDENCE, evidence_facts
-from shapespace.report.settings import described, settings_told
+from shapespace.fit.fit_scan import FitConfig
+from shapespace.fit.paper.paper_method import Paper
+from shapespace.fit.robust.robust_settings import DenseSettings, ResidualSettings, RobustSettings
+from shapespace.report.blocks.blocks import Block, Facts, Folded, Table
+from shapespace.report.blocks.evidence_text import EVIDENCE, evidence_facts
+from shapespace.report.blocks.settings_text import described, settings_told
 from synthetic_shapes import blob_model, raw_scan
 
 
@@ -63,7 +63,7 @@ def test_damaged_settings_break_nothing(damaged: Mapping[str, Any]) -> None:
 
 def test_all_that_the_verdict_goes_by_is_told_in_words() -> None:
     result = ss.fit_scan(blob_model(), raw_scan(np.array([1.0, -1.0, 0.5, 0.0, 0.3]), vertices=900).scan)
-    assert set(result.evidence) <= set(EVIDENCE), "a new key needs its words in report/evidence.py"
+    assert set(result.evidence) <= set(EVIDENCE), "a new key needs its words in report/blocks/evidence_text.py"
     told = evidence_facts({**result.evidence, "key_of_later": 2.5}, "Evidence").rows
     assert len(told) == len(result.evidence) + 1 and told[-1] == ("key of later", "2.5")
     assert not any("_" in what or what.endswith(" mm") for what, _ in told)

@@ -10,10 +10,10 @@ import pytest
 
 from shapespace.batch.run import fit_files, make_jobs
 from shapespace.errors import FileFormatError, InputError
-from shapespace.fit.fit import FitConfig, fit_scan
-from shapespace.io.meshes import read_mesh, write_mesh
+from shapespace.fit.fit_scan import FitConfig, fit_scan
+from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
-from shapespace.report.saved import (
+from shapespace.report.inputs.saved_fits import (
     Folder,
     ScanNotFoundError,
     find_fits,
@@ -21,7 +21,7 @@ from shapespace.report.saved import (
     saved_surfaces,
     staged_fit,
 )
-from shapespace.report.staged import StagedFit
+from shapespace.report.inputs.staged_fit import StagedFit
 from synthetic_shapes import blob_model, raw_scan
 
 CONFIG = FitConfig(method="paper", max_iterations=4)

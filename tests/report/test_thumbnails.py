@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from shapespace.fit.fit import FitConfig, fit_scan
-from shapespace.report import thumbnails
-from shapespace.report.staged import StagedFit
+from shapespace.fit.fit_scan import FitConfig, fit_scan
+from shapespace.report.inputs.staged_fit import StagedFit
+from shapespace.report.render import thumbnails
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model, raw_scan
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from shapespace import schemas
-from shapespace.batch.results import Source, fit_record, read_record, write_record
+from shapespace.batch.fit_records import Source, fit_record, read_record, write_record
 from shapespace.errors import FileFormatError
-from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.schemas import FitRecord
 from synthetic_shapes import blob_model, raw_scan
 

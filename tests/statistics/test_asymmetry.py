@@ -15,8 +15,8 @@ from shapespace.cohort.table import Table
 from shapespace.datasets.faces import load_faces
 from shapespace.datasets.organs import Organ, raw_surface
 from shapespace.errors import FileFormatError, InputError
-from shapespace.geometry.mirror import find_mirror, mirror_pairs
-from shapespace.geometry.surface import face_vectors, vertex_normals
+from shapespace.geometry.mirror_plane import find_mirror, mirror_pairs
+from shapespace.geometry.normals import face_vectors, vertex_normals
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import read_part
 from shapespace.statistics.asymmetry import ERROR_ASYMMETRIC, ERROR_SYMMETRIC, Scores, first_pattern, measure_asymmetry

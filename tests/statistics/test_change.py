@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from shapespace.cohort.cohort import Cohort, Fitted
 from shapespace.cohort.table import Table
 from shapespace.errors import InputError
+from shapespace.geometry.normals import face_vectors, vertex_areas, vertex_normals
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.geometry.surface import face_vectors, vertex_areas, vertex_normals
 from shapespace.schemas import Analysis, MorphPart, SurfaceMapPart, TablePart, read, read_part
 from shapespace.statistics.change import Change, change
 from shapespace.statistics.change_align import align_by, align_robustly

@@ -13,7 +13,7 @@ import pytest
 from shapespace.cohort.cohort import Cohort, Fitted
 from shapespace.cohort.table import Table
 from shapespace.errors import InputError
-from shapespace.geometry.surface import vertex_normals
+from shapespace.geometry.normals import vertex_normals
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import PARTS, Analysis, TextPart, json_text
 from shapespace.statistics import compare_maps

@@ -12,10 +12,10 @@ from shapespace.cohort.cohort import Cohort, Fitted
 from shapespace.cohort.read import CohortOptions, read_cohort
 from shapespace.cohort.table import Table
 from shapespace.errors import CorrespondenceError, InputError
-from shapespace.fit.posterior import new_shapes
-from shapespace.geometry.surface import vertex_normals
+from shapespace.fit.robust.posterior import new_shapes
+from shapespace.geometry.normals import vertex_normals
 from shapespace.io.files import write_text
-from shapespace.io.meshes import write_mesh
+from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.schemas import Analysis
 from shapespace.statistics.score import ScoreOptions, Scores, score
 from shapespace.types import FloatArray, Mesh

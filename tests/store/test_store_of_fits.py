@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 
 from shapespace import cli
-from shapespace.batch.folder import CoefficientTable
-from shapespace.batch.results import read_record
+from shapespace.batch.fit_records import read_record
+from shapespace.batch.result_folder import CoefficientTable
 from shapespace.batch.store import Store
 from shapespace.commands.export import export
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
-from shapespace.io.meshes import read_mesh
-from shapespace.io.ply import ply_comment, write_ply
+from shapespace.io.meshes.mesh_io import read_mesh
+from shapespace.io.meshes.ply import ply_comment, write_ply
 from shapespace.store import manifest as manifests
 from shapespace.store.manifest import read_manifest
 from shapespace.store.results import Results, mesh_at
@@ -195,7 +195,7 @@ def test_surfaces_of_other_models_go_to_shards_of_their_own(tmp_path: Path) -> N
     other = type(mesh)(mesh.vertices[:-1], mesh.faces[(mesh.faces < VERTICES - 1).all(axis=1)])  # type: ignore[index]
     for kind in ("fitted", "dense"):
         cli_path = tmp_path / f"scan000.{kind}.ply"
-        from shapespace.io.meshes import write_mesh
+        from shapespace.io.meshes.mesh_io import write_mesh
 
         write_mesh(cli_path, other)
     assert len(Store(tmp_path).compact().moved) == 3

@@ -114,7 +114,7 @@ def test_a_damaged_file_is_named(done: Path, tmp_path: Path) -> None:
 
 @of_a_study
 def test_every_table_is_made_and_the_report_shows_it(done: Path, tmp_path: Path) -> None:
-    from shapespace.report.html import write_report
+    from shapespace.report.pages.write_html import write_report
 
     folder = tmp_path / "s"
     shutil.copytree(done, folder)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from shapespace import cli
-from shapespace.io.tables import write_rows
+from shapespace.io.tables.table_io import write_rows
 from shapespace.model.additive import AdditiveModel
 
 

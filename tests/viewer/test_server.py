@@ -16,9 +16,9 @@ from viewer_world import Start, drop, model, scan_file, sentence, start, told, u
 
 from shapespace.batch.fit_work import Job, fit_file
 from shapespace.errors import InputError, ShapespaceError
-from shapespace.fit.fit import FitConfig
-from shapespace.io.meshes import read_mesh
-from shapespace.io.ply import read_ply
+from shapespace.fit.fit_scan import FitConfig
+from shapespace.io.meshes.mesh_io import read_mesh
+from shapespace.io.meshes.ply import read_ply
 from shapespace.model.shape_model import ShapeModel
 from shapespace.viewer import guard
 from shapespace.viewer.fitting import Upload

@@ -15,11 +15,11 @@ from viewer_world import enter, served, unpacked
 
 from same_blobs import ASIDE, FAR, FOLDED, HIDDEN, NAMES, VERTICES, surface, write_same
 from shapespace.errors import FileFormatError, InputError
-from shapespace.viewer import surfaces as module
+from shapespace.viewer import corresponding_surfaces as module
+from shapespace.viewer.corresponding_surfaces import Surfaces
 from shapespace.viewer.guard import SECURITY_HEADERS, Access
 from shapespace.viewer.limits import Limits
 from shapespace.viewer.serve import serve
-from shapespace.viewer.surfaces import Surfaces
 from shapespace.viewer.surfaces_server import make_surfaces_app
 
 

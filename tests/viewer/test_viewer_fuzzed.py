@@ -20,11 +20,11 @@ from viewer_world import VERTICES, enter, served
 
 from same_blobs import write_same
 from shapespace.viewer import sessions as sessions_module
+from shapespace.viewer.corresponding_surfaces import Surfaces
 from shapespace.viewer.guard import Access
 from shapespace.viewer.limits import Limits
 from shapespace.viewer.server import make_app
 from shapespace.viewer.shown import Shown
-from shapespace.viewer.surfaces import Surfaces
 from shapespace.viewer.surfaces_server import make_surfaces_app
 from synthetic_shapes import blob_model
 

@@ -17,7 +17,7 @@ import pytest
 import uvicorn
 
 from shapespace.batch.workers import start_loading
-from shapespace.io.meshes import write_mesh
+from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.viewer.connections import server_config
 from shapespace.viewer.fitting import Worker, fit_upload

@@ -1,1 +1,4 @@
-"""One job, many scans: fits over files, with results that survive an interruption."""
+"""Work on many scans: jobs, executors, sinks, records that a later run reuses.
+
+Entry points: `run`, `executors`. Imported by `commands` and above.
+"""

@@ -11,8 +11,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-from shapespace.batch.folder import RECORD
-from shapespace.batch.results import (
+from shapespace.batch.fit_records import (
     Source,
     failed_record,
     fit_record,
@@ -22,15 +21,16 @@ from shapespace.batch.results import (
     write_record,
     write_stages,
 )
+from shapespace.batch.result_folder import RECORD
 from shapespace.errors import FileError, ShapespaceError
-from shapespace.fit.fit import OPTIONS, FitConfig, fit_scan
+from shapespace.fit.fit_scan import OPTIONS, FitConfig, fit_scan
+from shapespace.fit.iteration_state import IcpState
 from shapespace.fit.result import FitResult
-from shapespace.fit.state import IcpState
-from shapespace.io.fiducials import FIDUCIAL_ENDINGS, fiducial_texts
 from shapespace.io.files import sha256_of_file, write_text, write_together
-from shapespace.io.landmarks import read_landmarks
-from shapespace.io.limits import LARGEST_MESH_FILE_BYTES
-from shapespace.io.meshes import read_mesh
+from shapespace.io.landmarks.fiducials import FIDUCIAL_ENDINGS, fiducial_texts
+from shapespace.io.landmarks.landmark_io import read_landmarks
+from shapespace.io.meshes.mesh_io import read_mesh
+from shapespace.io.read_limits import LARGEST_MESH_FILE_BYTES
 from shapespace.io.remote import fetched, is_address, name_of, version_of
 from shapespace.model.shape_model import ShapeModel
 from shapespace.store.results import wrote_landmarks

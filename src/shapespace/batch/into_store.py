@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from shapespace.batch.executors import Executor, Serial
+from shapespace.batch.fit_records import fit_identity
 from shapespace.batch.fit_work import FitTask, FitWork, Job, is_same_scan
 from shapespace.batch.lock import only_writer
-from shapespace.batch.results import fit_identity
 from shapespace.batch.run import Plan
 from shapespace.batch.store import Store
 from shapespace.errors import FileError
-from shapespace.fit.fit import FitConfig
+from shapespace.fit.fit_scan import FitConfig
 from shapespace.io.files import make_folder, sha256_of_file
 from shapespace.model.shape_model import ShapeModel
 from shapespace.store.results import Results

@@ -14,10 +14,10 @@ import numpy.typing as npt
 from shapespace.batch.execution import ExecutionConfig
 from shapespace.batch.executors import Serial
 from shapespace.errors import FitError
-from shapespace.io.archives import read_arrays
-from shapespace.io.arrays import write_arrays
+from shapespace.io.containers.archives import read_arrays
+from shapespace.io.containers.arrays import write_arrays
 from shapespace.io.files import make_folder, temporary_folder
-from shapespace.model.quality import Part, QualitySettings, Shapes
+from shapespace.model.model_quality import Part, QualitySettings, Shapes
 from shapespace.types import FloatArray, Mesh
 
 _AGAIN = "run the command again"

@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from shapespace.batch.executors import Executor, Serial
+from shapespace.batch.fit_records import write_record
 from shapespace.batch.fit_work import FitTask, FitWork, Job, has_surface, resumed
-from shapespace.batch.folder import RECORD, CoefficientTable, names_for
 from shapespace.batch.lock import only_writer
-from shapespace.batch.results import write_record
-from shapespace.fit.fit import FitConfig
-from shapespace.fit.state import IcpState
+from shapespace.batch.result_folder import RECORD, CoefficientTable, names_for
+from shapespace.fit.fit_scan import FitConfig
+from shapespace.fit.iteration_state import IcpState
 from shapespace.io.files import make_folder
 from shapespace.model.shape_model import ShapeModel
 

@@ -6,10 +6,10 @@ import hashlib
 import re
 from pathlib import Path
 
+from shapespace.batch.fit_records import Source, fit_record
 from shapespace.batch.fit_work import publish
-from shapespace.batch.folder import RECORD, CoefficientTable, names_for
 from shapespace.batch.lock import only_writer
-from shapespace.batch.results import Source, fit_record
+from shapespace.batch.result_folder import RECORD, CoefficientTable, names_for
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.fit.result import FitResult
 from shapespace.io.files import make_folder, sha256_of_file

@@ -16,9 +16,9 @@ from typing import Any, cast
 import numpy as np
 
 from shapespace.errors import FileFormatError, ShapespaceError
-from shapespace.io.fiducials import FIDUCIAL_ENDINGS
 from shapespace.io.files import atomic_path, make_folder, remove_file, sha256_of_file, sweep, write_error
-from shapespace.io.tables import CHECKSUM
+from shapespace.io.landmarks.fiducials import FIDUCIAL_ENDINGS
+from shapespace.io.tables.table_io import CHECKSUM
 from shapespace.schemas import FitRecord
 from shapespace.store import results as reading
 from shapespace.store.manifest import (

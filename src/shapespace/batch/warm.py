@@ -13,9 +13,9 @@ import numpy as np
 from shapespace.batch.said import is_first_to_say
 from shapespace.compiled import on_compiling
 from shapespace.errors import ShapespaceError
-from shapespace.fit.fit import FitConfig, fit_scan
-from shapespace.fit.residual import residual_modes
-from shapespace.fit.settings import ResidualSettings
+from shapespace.fit.dense.residual_modes import residual_modes
+from shapespace.fit.fit_scan import FitConfig, fit_scan
+from shapespace.fit.robust.robust_settings import ResidualSettings
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh
 

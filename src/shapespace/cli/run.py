@@ -214,7 +214,7 @@ def correspond(arguments: argparse.Namespace) -> int:
 
         start_loading(tell=not arguments.quiet)
     from shapespace.commands.correspond import CorrespondFiles, correspond_files
-    from shapespace.correspondence.rounds import CorrespondSettings
+    from shapespace.correspondence.groupwise import CorrespondSettings
     from shapespace.schemas import to_json
 
     settings = CorrespondSettings(
@@ -289,7 +289,7 @@ def build(arguments: argparse.Namespace) -> int:
 def quality(arguments: argparse.Namespace) -> int:
     """How good a shape space is."""
     from shapespace.commands.quality import QualityOptions, quality
-    from shapespace.model.quality import QualitySettings
+    from shapespace.model.model_quality import QualitySettings
     from shapespace.schemas import to_json
 
     settings = QualitySettings(
@@ -367,8 +367,8 @@ def fit(arguments: argparse.Namespace) -> int:
         # While this process loads its own code; half of the time that many scans take to start.
         start_loading(tell=not arguments.quiet)
     from shapespace.commands.fit import BatchSettings, fit_scans
-    from shapespace.fit.fit import FitConfig
-    from shapespace.fit.methods import method_named
+    from shapespace.fit.fit_scan import FitConfig
+    from shapespace.fit.method_choices import method_named
 
     config = FitConfig(
         method=method_named(arguments.method, **({} if arguments.search == "auto" else {"search": arguments.search})),
@@ -408,7 +408,7 @@ def fit(arguments: argparse.Namespace) -> int:
 def _region(region: str | None) -> str | tuple[int, ...] | None:
     if region is None or not Path(region).is_file():
         return region
-    from shapespace.io.regions import read_region
+    from shapespace.io.meshes.region_files import read_region
 
     return read_region(region)
 
@@ -616,7 +616,7 @@ def _print_correspondence(summary: CorrespondenceRecord, records: Sequence[Corre
 
 
 def _print_fit(name: str, record: Mapping[str, Any]) -> None:
-    from shapespace.io.meshes import stem_of
+    from shapespace.io.meshes.mesh_io import stem_of
 
     file = str(record["scan"]["name"])
     # A scan that shares its file's name with others goes by the name of its results.

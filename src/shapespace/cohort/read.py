@@ -15,7 +15,7 @@ from shapespace.cohort.cohort import Cohort, Fitted, ShapeSource
 from shapespace.cohort.table import Table, named, read_table
 from shapespace.errors import InputError
 from shapespace.geometry.procrustes import Gauge
-from shapespace.io.meshes import stem_of
+from shapespace.io.meshes.mesh_io import stem_of
 from shapespace.model.additive import AdditiveModel, load_model
 from shapespace.model.shape_model import ShapeModel
 from shapespace.store.corresponding import SURFACE, surface_files, surface_stem

@@ -12,10 +12,10 @@ from typing import Literal
 import numpy as np
 
 from shapespace.errors import FileFormatError, InputError
+from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import read_bytes
-from shapespace.io.json_files import check_file
-from shapespace.io.meshes import stem_of
-from shapespace.io.tables import CHECKSUM, KEYS, MISSING, key_column, table_rows
+from shapespace.io.meshes.mesh_io import stem_of
+from shapespace.io.tables.table_io import CHECKSUM, KEYS, MISSING, key_column, table_rows
 from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, read_only
 

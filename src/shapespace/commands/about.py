@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from shapespace.io.containers.json_files import read_json
 from shapespace.io.files import write_text
-from shapespace.io.json_files import read_json
 
 ABOUT = "about.json"
 

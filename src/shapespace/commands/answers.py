@@ -24,7 +24,7 @@ def keep_answer(answer: Answer, output: Path, *, quiet: bool) -> tuple[Path | No
     Raises:
         FileError: the folder cannot be written.
     """
-    from shapespace.report.html import require_report_extra
+    from shapespace.report.pages.write_html import require_report_extra
 
     with waiting("writing the results", quiet=quiet):
         answer.save(output)

@@ -10,25 +10,25 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 
+from shapespace.batch.fit_records import read_record
 from shapespace.batch.fit_work import naming
-from shapespace.batch.folder import RECORD
 from shapespace.batch.progress import progress, waiting
-from shapespace.batch.results import read_record
+from shapespace.batch.result_folder import RECORD
 from shapespace.commands.about import ABOUT, read_about
 from shapespace.errors import InputError, MeshError, ShapespaceError
-from shapespace.geometry.landmarks import far_landmarks, place_landmarks
+from shapespace.geometry.landmark_placement import far_landmarks, place_landmarks
+from shapespace.geometry.normals import without_estimates
 from shapespace.geometry.procrustes import Gauge
-from shapespace.geometry.surface import without_estimates
 from shapespace.io.files import make_folder, read_error
-from shapespace.io.labels import label_of, read_labels
-from shapespace.io.landmarks import is_of_vertices, read_landmarks, read_surface_landmarks
-from shapespace.io.regions import read_region
+from shapespace.io.landmarks.landmark_io import is_of_vertices, read_landmarks, read_surface_landmarks
+from shapespace.io.meshes.region_files import read_region
+from shapespace.io.tables.label_table import label_of, read_labels
 from shapespace.model.choose_modes import MOST_SHAPES
 from shapespace.model.missing import MIN_SEEN, Kept
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel, region_vertices
 from shapespace.model.streamed import Scratch, bytes_in_memory, too_large
-from shapespace.recognise.scans import NEUTRAL
+from shapespace.recognise.labelled_scans import NEUTRAL
 from shapespace.store.corresponding import surface_files
 from shapespace.store.results import is_result, mesh_at
 from shapespace.types import MM_PER_UNIT, Mesh, SurfaceLandmarks, common_faces

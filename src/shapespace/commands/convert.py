@@ -6,7 +6,7 @@ from pathlib import Path
 
 from shapespace.batch.progress import waiting
 from shapespace.errors import InputError
-from shapespace.formats.parts import ModelFormat
+from shapespace.formats.model_parts import ModelFormat
 from shapespace.formats.registry import MODEL_FORMATS, format_to_write
 from shapespace.model.additive import AdditiveModel, load_model, model_of_foreign
 from shapespace.model.foreign import OWN_ENDINGS, is_foreign, load_foreign

@@ -14,17 +14,15 @@ import numpy as np
 from msgspec import structs
 
 from shapespace.batch.execution import ExecutionConfig
+from shapespace.batch.fit_records import Source
 from shapespace.batch.fit_work import Job
-from shapespace.batch.folder import names_for
 from shapespace.batch.lock import only_writer
+from shapespace.batch.parallel_rounds import KeptRounds
 from shapespace.batch.progress import progress, telling_of_compiling, waiting
-from shapespace.batch.results import Source
-from shapespace.batch.rounds import KeptRounds
+from shapespace.batch.result_folder import names_for
 from shapespace.commands.inputs import Given, given_scans, with_ids
 from shapespace.commands.landmark_files import LandmarkFiles
-from shapespace.correspondence.landmarks import astray, without_astray
-from shapespace.correspondence.place import Placed, PlaceTask, Workbench
-from shapespace.correspondence.rounds import (
+from shapespace.correspondence.groupwise import (
     ENOUGH_TO_JUDGE,
     Correspondence,
     Corresponding,
@@ -32,16 +30,18 @@ from shapespace.correspondence.rounds import (
     correspond,
     first_template,
 )
-from shapespace.correspondence.scans import copies, unit_ratios
+from shapespace.correspondence.landmark_guide import astray, without_astray
+from shapespace.correspondence.place import Placed, PlaceTask, Workbench
+from shapespace.correspondence.scan_set import copies, unit_ratios
 from shapespace.errors import ShapespaceError
 from shapespace.geometry.distortion import Distortion
 from shapespace.geometry.doctor import NON_FINITE, repair
-from shapespace.geometry.landmarks import far_landmarks, place_landmarks
-from shapespace.geometry.surface import face_areas, rms_size, without_estimates
+from shapespace.geometry.landmark_placement import far_landmarks, place_landmarks
+from shapespace.geometry.normals import face_areas, rms_size, without_estimates
+from shapespace.io.containers.json_files import read_json
 from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_text
-from shapespace.io.json_files import read_json
-from shapespace.io.landmarks import write_surface_landmarks
-from shapespace.io.meshes import ending_of, read_mesh, write_mesh
+from shapespace.io.landmarks.landmark_io import write_surface_landmarks
+from shapespace.io.meshes.mesh_io import ending_of, read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, json_text, read
 from shapespace.store.corresponding import LANDMARKS, MEAN, RECORD, SUMMARY, SURFACE

@@ -13,10 +13,10 @@ import numpy.typing as npt
 
 from shapespace.batch.progress import progress
 from shapespace.errors import InputError, ShapespaceError
-from shapespace.io.fiducials import fiducial_texts
 from shapespace.io.files import atomic_path, make_folder, write_bytes, write_error, write_text
-from shapespace.io.meshes import write_mesh
-from shapespace.io.tables import CHECKSUM, write_checked
+from shapespace.io.landmarks.fiducials import fiducial_texts
+from shapespace.io.meshes.mesh_io import write_mesh
+from shapespace.io.tables.table_io import CHECKSUM, write_checked
 from shapespace.store.results import ENDING, ENDINGS, Results, modes_of
 from shapespace.store.rows import META, coefficient_columns, kind_of
 

@@ -13,19 +13,19 @@ from tqdm import tqdm
 
 from shapespace.batch.execution import ExecutionConfig
 from shapespace.batch.fit_work import Job
-from shapespace.batch.folder import RECORD
 from shapespace.batch.into_store import FROM, fit_into_store
 from shapespace.batch.progress import progress, telling_of_compiling
+from shapespace.batch.result_folder import RECORD
 from shapespace.batch.run import Plan, fit_files, make_jobs
 from shapespace.commands.inputs import Given, given_scans, with_ids
 from shapespace.commands.landmark_files import LandmarkFiles
 from shapespace.errors import InputError, ShapespaceError
-from shapespace.fit.fit import FitConfig
-from shapespace.fit.state import IcpState
+from shapespace.fit.fit_scan import FitConfig
+from shapespace.fit.iteration_state import IcpState
 from shapespace.geometry.doctor import NON_FINITE
-from shapespace.io.fiducials import FIDUCIAL_ENDINGS
 from shapespace.io.files import make_folder, remove_file, write_bytes
-from shapespace.io.meshes import probe_mesh, read_mesh
+from shapespace.io.landmarks.fiducials import FIDUCIAL_ENDINGS
+from shapespace.io.meshes.mesh_io import probe_mesh, read_mesh
 from shapespace.io.remote import is_address
 from shapespace.model.shape_model import ShapeModel
 from shapespace.store.manifest import read_manifest

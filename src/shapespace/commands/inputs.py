@@ -10,12 +10,12 @@ from pathlib import Path
 
 from shapespace.batch.fit_work import Job
 from shapespace.errors import FileError, InputError
+from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import read_bytes
-from shapespace.io.folders import mesh_files
-from shapespace.io.json_files import check_file
-from shapespace.io.meshes import MESH_FILE_ENDINGS, stem_of
+from shapespace.io.meshes.mesh_folders import mesh_files
+from shapespace.io.meshes.mesh_io import MESH_FILE_ENDINGS, stem_of
 from shapespace.io.remote import addresses, is_address
-from shapespace.io.tables import decoded_text, key_column, table_rows
+from shapespace.io.tables.table_io import decoded_text, key_column, table_rows
 
 _LISTS = (".csv", ".tsv", ".txt", ".xlsx")
 _PLACES = ("scan", "file", "path", "specimen", "name", "id")

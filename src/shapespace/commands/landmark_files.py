@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from shapespace.errors import FileError, InputError, ShapespaceError
-from shapespace.io.fiducials import FIDUCIAL_ENDINGS
-from shapespace.io.landmarks import LANDMARK_FORMATS, READ_ONLY_LANDMARKS, read_landmarks
-from shapespace.io.meshes import stem_of
+from shapespace.io.landmarks.fiducials import FIDUCIAL_ENDINGS
+from shapespace.io.landmarks.landmark_io import LANDMARK_FORMATS, READ_ONLY_LANDMARKS, read_landmarks
+from shapespace.io.meshes.mesh_io import stem_of
 from shapespace.types import Mesh
 
 _LISTED = 5

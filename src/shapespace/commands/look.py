@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from shapespace.batch.fit_records import read_record
 from shapespace.batch.fit_work import naming
-from shapespace.batch.results import read_record
 from shapespace.errors import FileError, ShapespaceError
 from shapespace.geometry.doctor import examine
-from shapespace.geometry.surface import faces_of
-from shapespace.io.folders import mesh_files
-from shapespace.io.meshes import read_mesh
+from shapespace.geometry.normals import faces_of
+from shapespace.io.meshes.mesh_folders import mesh_files
+from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.model.additive import load_model
 from shapespace.model.foreign import looks_like_model
 from shapespace.model.shape_model import ShapeModel
@@ -119,8 +119,8 @@ def correspondence_facts(folder: Path) -> dict[str, Any]:
     Raises:
         FileError: it is none, or it cannot be read.
     """
-    from shapespace.report.corresponded import Corresponded
-    from shapespace.report.triage import concerns_of, distance_share, known, median
+    from shapespace.report.inputs.correspondence_folder import Corresponded
+    from shapespace.report.inputs.triage import concerns_of, distance_share, known, median
 
     if not (folder / CorrespondenceRecord.FILE).is_file():
         raise FileError(

@@ -16,10 +16,10 @@ from shapespace.batch.quality_work import QualityElsewhere
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.files import make_folder, write_text
-from shapespace.io.folders import mesh_files
-from shapespace.io.meshes import read_mesh
+from shapespace.io.meshes.mesh_folders import mesh_files
+from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.model.foreign import looks_like_model
-from shapespace.model.quality import Curve, ModelQuality, QualitySettings, Runner, measure_quality
+from shapespace.model.model_quality import Curve, ModelQuality, QualitySettings, Runner, measure_quality
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import BySize, Measured, Quality, json_text

@@ -10,15 +10,15 @@ from typing import Any, cast
 import numpy as np
 
 from shapespace.batch.execution import ExecutionConfig
-from shapespace.batch.folder import RECORD
+from shapespace.batch.fit_records import read_record
 from shapespace.batch.progress import telling_of_compiling
-from shapespace.batch.results import read_record
+from shapespace.batch.result_folder import RECORD
 from shapespace.cohort.classes import notes_on_classes
 from shapespace.errors import InputError
 from shapespace.io.files import make_folder, read_bytes, read_error
-from shapespace.io.labels import read_labels
-from shapespace.io.meshes import write_mesh
-from shapespace.recognise.scans import (
+from shapespace.io.meshes.mesh_io import write_mesh
+from shapespace.io.tables.label_table import read_labels
+from shapespace.recognise.labelled_scans import (
     ScanCoefficients,
     from_record,
     from_results,
@@ -122,8 +122,8 @@ def recognise_predict(
         InputError: the fits are of another model than the classifier, or labels are needed.
         ShapespaceError: the extra `recognise` is not installed.
     """
+    from shapespace.recognise.classifier_file import load_classifier
     from shapespace.recognise.predict import UNSURE, predict_scans, write_answers
-    from shapespace.recognise.saved import load_classifier
 
     saved = load_classifier(classifier)
     if saved.relative_to_neutral and labels is None:

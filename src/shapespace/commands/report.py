@@ -15,7 +15,7 @@ def write_report(folder: Path, output: Path | None, *, model: Path | None, label
         InputError: the folder holds no results, or `model` is not of its fits.
         ShapespaceError: the extra `report` is not installed.
     """
-    from shapespace.report import html
+    from shapespace.report.pages import write_html as html
 
     with progress(None, "drawing", "picture", quiet=quiet) as bar:
 

@@ -1,1 +1,4 @@
-"""Surfaces in correspondence from raw scans, with no model to begin with."""
+"""Dense correspondence from raw scans, without a model.
+
+Entry point: `groupwise.correspond`. Imported by `batch`, `report` and above.
+"""

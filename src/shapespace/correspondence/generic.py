@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from shapespace.correspondence.harmonics import Harmonics
+from shapespace.geometry.normals import rms_size
 from shapespace.geometry.similarity import small_poses
-from shapespace.geometry.surface import rms_size
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh
 

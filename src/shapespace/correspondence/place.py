@@ -12,18 +12,18 @@ from threadpoolctl import threadpool_limits
 
 from shapespace.correspondence.generic import generic_model
 from shapespace.correspondence.harmonics import Harmonics
-from shapespace.correspondence.landmarks import Marks
+from shapespace.correspondence.landmark_guide import Marks
 from shapespace.correspondence.register import ElasticSettings, Template, register
 from shapespace.correspondence.template import Glance
 from shapespace.errors import FitError, InputError, ShapespaceError
-from shapespace.fit.dense import DenseSurface, dense_surface
-from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.fit.dense.dense_fit import DenseSurface, dense_surface
+from shapespace.fit.fit_scan import FitConfig, fit_scan
+from shapespace.fit.robust.robust_settings import DenseSettings
 from shapespace.fit.scan_target import ScanTarget
-from shapespace.fit.settings import DenseSettings
-from shapespace.fit.start import Start
+from shapespace.fit.search.initialisation import Start
 from shapespace.geometry.closest import ClosestPoints, build_engine, on_boundary
-from shapespace.geometry.mirror import FLIP
-from shapespace.geometry.surface import boundary_edges, boundary_vertices, rms_size, vertex_normals
+from shapespace.geometry.mirror_plane import FLIP
+from shapespace.geometry.normals import boundary_edges, boundary_vertices, rms_size, vertex_normals
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
 

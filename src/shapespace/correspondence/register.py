@@ -18,12 +18,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from shapespace.correspondence.harmonics import Harmonics
-from shapespace.correspondence.landmarks import Marks
-from shapespace.fit.kernels import normals_into
-from shapespace.fit.moving_model import Topology
+from shapespace.correspondence.landmark_guide import Marks
+from shapespace.fit.robust.kernels import normals_into
+from shapespace.fit.robust.prepared_model import Topology
 from shapespace.fit.scan_target import ScanTarget
+from shapespace.geometry.normals import rms_size
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.geometry.surface import rms_size
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
 
 _NEAR = 3

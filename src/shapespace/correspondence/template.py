@@ -12,10 +12,10 @@ from scipy.sparse.csgraph import connected_components
 from shapespace.correspondence.generic import generic_model
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.errors import MeshError, ShapespaceError
-from shapespace.fit.start import Start, start_from_any_pose
+from shapespace.fit.search.initialisation import Start, start_from_any_pose
 from shapespace.geometry import remesh
 from shapespace.geometry.doctor import repair
-from shapespace.geometry.surface import boundary_edges, face_areas, faces_of, rms_size, without_vertices
+from shapespace.geometry.normals import boundary_edges, face_areas, faces_of, rms_size, without_vertices
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 

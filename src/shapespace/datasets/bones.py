@@ -15,11 +15,11 @@ import numpy as np
 
 from shapespace.datasets.organs import raw_surface
 from shapespace.errors import InputError
-from shapespace.geometry.mirror import FLIP
-from shapespace.geometry.surface import without_vertices
+from shapespace.geometry.mirror_plane import FLIP
+from shapespace.geometry.normals import without_vertices
 from shapespace.io.files import make_folder
-from shapespace.io.meshes import write_mesh
-from shapespace.io.tables import write_rows
+from shapespace.io.meshes.mesh_io import write_mesh
+from shapespace.io.tables.table_io import write_rows
 from shapespace.types import FloatArray, Mesh
 
 TABLE = "bones.csv"

@@ -17,8 +17,8 @@ from types import MappingProxyType
 
 from shapespace.errors import InputError
 from shapespace.io.files import read_bytes, read_error
-from shapespace.io.meshes import MESH_ENDINGS
-from shapespace.io.tables import table_rows
+from shapespace.io.meshes.mesh_io import MESH_ENDINGS
+from shapespace.io.tables.table_io import table_rows
 
 EXPRESSIONS = ("neutral", "anger", "disgust", "fear", "smile", "sadness", "surprise")
 """The words of the studies, in the order in which they are listed."""

@@ -10,11 +10,11 @@ import numpy as np
 from shapespace.datasets.faces import EXPRESSIONS, FaceGenerator, load_faces
 from shapespace.datasets.simulated_scan import plain_scan
 from shapespace.errors import InputError
-from shapespace.geometry.surface import vertex_normals
+from shapespace.geometry.normals import vertex_normals
 from shapespace.io.files import make_folder
-from shapespace.io.landmarks import write_landmark_indices
-from shapespace.io.meshes import write_mesh
-from shapespace.io.tables import write_rows
+from shapespace.io.landmarks.landmark_io import write_landmark_indices
+from shapespace.io.meshes.mesh_io import write_mesh
+from shapespace.io.tables.table_io import write_rows
 from shapespace.types import FloatArray, Mesh
 
 _LARGEST_EFFECT_MM = 20.0

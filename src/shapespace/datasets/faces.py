@@ -23,7 +23,7 @@ import numpy.typing as npt
 from shapespace.datasets.loop import loop_operator
 from shapespace.datasets.warp import Warp
 from shapespace.errors import DataError, InputError
-from shapespace.geometry.surface import faces_of
+from shapespace.geometry.normals import faces_of
 from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, IntArray, Mesh, read_only
 

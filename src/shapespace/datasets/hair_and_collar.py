@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from shapespace.geometry.surface import face_vectors
+from shapespace.geometry.normals import face_vectors
 from shapespace.types import FloatArray, Mesh
 
 LongArray: TypeAlias = npt.NDArray[np.int64]

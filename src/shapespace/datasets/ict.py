@@ -21,9 +21,9 @@ from shapespace.datasets import fetch, ict_files
 from shapespace.datasets.simulated_scan import plain_scan
 from shapespace.errors import DataError, InputError
 from shapespace.io.files import make_folder
-from shapespace.io.landmarks import write_landmark_indices
-from shapespace.io.meshes import write_mesh
-from shapespace.io.tables import write_rows
+from shapespace.io.landmarks.landmark_io import write_landmark_indices
+from shapespace.io.meshes.mesh_io import write_mesh
+from shapespace.io.tables.table_io import write_rows
 from shapespace.types import MM_PER_UNIT, FloatArray, IntArray, Mesh, read_only
 
 Area: TypeAlias = Literal["face", "face_and_head"]

@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import DataError, FileFormatError
-from shapespace.io.archives import npy_header
+from shapespace.io.containers.archives import npy_header
 from shapespace.io.files import atomic_path, read_bytes, read_error
 from shapespace.types import FloatArray, IntArray
 

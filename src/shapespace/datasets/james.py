@@ -6,8 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from shapespace.datasets import fetch
-from shapespace.io.landmarks import read_landmarks
-from shapespace.io.meshes import read_mesh
+from shapespace.io.landmarks.landmark_io import read_landmarks
+from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.types import Mesh
 
 NAME = "james"

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from shapespace.datasets.hair_and_collar import Collar, Hair, LongArray, collar_part, hair_parts
 from shapespace.errors import InputError
 from shapespace.geometry import remesh
-from shapespace.geometry.surface import faces_of, vertex_normals
+from shapespace.geometry.normals import faces_of, vertex_normals
 from shapespace.reprs import short_repr
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity, read_only, require
 

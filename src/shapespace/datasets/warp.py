@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shapespace.geometry.mirror import FLIP
+from shapespace.geometry.mirror_plane import FLIP
 from shapespace.types import FloatArray, IntArray
 
 _WAVES = 96

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shapespace.errors import FitError, InputError
-from shapespace.geometry.surface import part_of, rms_size
+from shapespace.geometry.normals import part_of, rms_size
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import MM_PER_UNIT, BoolArray, FloatArray, Mesh
 

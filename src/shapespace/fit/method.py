@@ -6,10 +6,10 @@ from collections.abc import Generator, Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
+from shapespace.fit.iteration_state import Fitted, IcpState
 from shapespace.fit.result import Stage
 from shapespace.fit.scan_target import ScanTarget
-from shapespace.fit.start import Start
-from shapespace.fit.state import Fitted, IcpState
+from shapespace.fit.search.initialisation import Start
 from shapespace.model.shape_model import ShapeModel
 
 

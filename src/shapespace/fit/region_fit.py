@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from shapespace.fit.regions import UNSEEN
-from shapespace.fit.state import Fitted, IcpState
+from shapespace.fit.iteration_state import Fitted, IcpState
+from shapespace.fit.vertex_regions import UNSEEN
 from shapespace.model.region import Part
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import IntArray, SurfaceLandmarks
@@ -58,7 +58,7 @@ class RegionFit:
 
     def fitted(self, fitted: Fitted, modes: int | None) -> Fitted:
         """Return where the fit ended with the first `modes` coefficients of the whole, None for all."""
-        from shapespace.fit.posterior import new_shapes  # compiled, and loads SciPy
+        from shapespace.fit.robust.posterior import new_shapes  # compiled, and loads SciPy
 
         whole, part, k = self.whole, self.part, modes
         b = part.to_b(fitted.b, whole)

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import numpy as np
 
 from shapespace.errors import InputError
-from shapespace.fit.colours import carried_colours
-from shapespace.fit.regions import MATCHED, SHOWN
-from shapespace.fit.state import IcpState
-from shapespace.fit.trust import Chirality, chirality_of
+from shapespace.fit.diagnostics.trust import Chirality, chirality_of
+from shapespace.fit.fit_colours import carried_colours
+from shapespace.fit.iteration_state import IcpState
+from shapespace.fit.vertex_regions import MATCHED, SHOWN
 from shapespace.geometry.closest import ClosestPoints
 from shapespace.geometry.distance import DistanceSummary, SurfaceDistances
 from shapespace.lazy import OpenViewer, lazy_import

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from shapespace.geometry.closest import ClosestPointEngine, ClosestPoints, build_engine, finest_engine
-from shapespace.geometry.surface import boundary_vertices
+from shapespace.geometry.normals import boundary_vertices
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
 
 _ROUNDS = 4
@@ -54,7 +54,7 @@ class ScanTarget:
 
     @cached_property
     def _normals_and_areas(self) -> tuple[FloatArray, FloatArray]:
-        from shapespace.fit.kernels import areas_into, normals_into  # compiled
+        from shapespace.fit.robust.kernels import areas_into, normals_into  # compiled
 
         normals, areas = np.zeros(self.mesh.vertices.shape), np.zeros(len(self.mesh.vertices))
         if self.mesh.faces is None:

@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import ModelFileError
-from shapespace.formats.parts import LinearModel, Modes, orthonormal, scaled
+from shapespace.formats.model_parts import LinearModel, Modes, orthonormal, scaled
+from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import read_bytes, write_bytes
-from shapespace.io.json_files import check_file
 from shapespace.types import FloatArray, SurfaceLandmarks
 
 _AGAIN = "give a model that eos has saved"

@@ -9,7 +9,7 @@ from typing import Any, Final, cast
 
 import numpy as np
 
-from shapespace.formats.parts import LinearModel
+from shapespace.formats.model_parts import LinearModel
 from shapespace.types import SurfaceLandmarks
 
 KEY: Final = "shapespace"

@@ -11,11 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import ModelFileError
-from shapespace.formats.parts import LinearModel, Modes
-from shapespace.io.archives import read_arrays
+from shapespace.formats.model_parts import LinearModel, Modes
+from shapespace.io.containers.archives import read_arrays
+from shapespace.io.containers.json_files import check_file
+from shapespace.io.containers.pickled_arrays import PickleRefusedError, pickled_array, pickled_dict
 from shapespace.io.files import read_bytes
-from shapespace.io.json_files import check_file
-from shapespace.io.pickled_arrays import PickleRefusedError, pickled_array, pickled_dict
 
 _AGAIN = "give the file as it was downloaded"
 _LARGEST_BYTES = 2**30

@@ -10,11 +10,11 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from shapespace.errors import ModelFileError
-from shapespace.formats.parts import LinearModel, Modes, scaled
-from shapespace.io.archives import LARGEST_BYTES, npy_array, zip_members
+from shapespace.formats.model_parts import LinearModel, Modes, scaled
+from shapespace.io.containers.archives import LARGEST_BYTES, npy_array, zip_members
+from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import open_file
-from shapespace.io.json_files import check_file
-from shapespace.io.meshes import MESH_ENDINGS, read_mesh
+from shapespace.io.meshes.mesh_io import MESH_ENDINGS, read_mesh
 from shapespace.types import FloatArray, IntArray
 
 _AGAIN = "save the principal components again"

@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import ModelFileError
-from shapespace.formats.parts import LinearModel, Modes, are_measurable, scaled
+from shapespace.formats.model_parts import LinearModel, Modes, are_measurable, scaled
+from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import open_file
-from shapespace.io.json_files import check_file
 from shapespace.io.sandbox import HDF5_SIGNATURE, ApartError, Tree, read_hdf5_apart, read_matlab_apart
 from shapespace.types import FloatArray
 

@@ -10,10 +10,10 @@ import numpy.typing as npt
 
 from shapespace.errors import FileFormatError, ModelFileError
 from shapespace.formats.facts import json_object
-from shapespace.formats.parts import LinearModel, Modes, scaled
+from shapespace.formats.model_parts import LinearModel, Modes, scaled
+from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import read_bytes
-from shapespace.io.json_files import check_file
-from shapespace.io.meshes import read_mesh
+from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.io.parsing import json_value
 from shapespace.types import FloatArray
 

@@ -12,12 +12,12 @@ import numpy as np
 
 from shapespace.errors import ModelFileError, ShapespaceError
 from shapespace.formats.facts import KEY, facts_of, json_object, with_facts
-from shapespace.formats.folder import write_folder
-from shapespace.formats.parts import LinearModel, Modes
+from shapespace.formats.model_folder import write_folder
+from shapespace.formats.model_parts import LinearModel, Modes
+from shapespace.io.containers.json_files import read_json
 from shapespace.io.files import read_bytes
-from shapespace.io.json_files import read_json
-from shapespace.io.meshes import read_mesh
-from shapespace.io.obj import write_obj
+from shapespace.io.meshes.mesh_io import read_mesh
+from shapespace.io.meshes.obj import write_obj
 from shapespace.types import FloatArray, IntArray, Mesh
 
 _ICT: Final = "generic_neutral_mesh"

@@ -12,16 +12,16 @@ from shapespace.errors import InputError, ModelFileError
 from shapespace.formats.eos import Eos
 from shapespace.formats.flame import Flame
 from shapespace.formats.gias import Gias
-from shapespace.formats.gltf import Gltf
+from shapespace.formats.gltf_model import Gltf
 from shapespace.formats.matlab import Matlab
+from shapespace.formats.model_parts import LinearModel, ModelFormat, ModelReader
 from shapespace.formats.monai import Monai
 from shapespace.formats.obj_folder import ObjFolder
-from shapespace.formats.parts import LinearModel, ModelFormat, ModelReader
 from shapespace.formats.scalismo_json import ScalismoJson
 from shapespace.formats.shapeworks import ShapeWorks
 from shapespace.formats.statismo import Statismo
+from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import open_file
-from shapespace.io.json_files import check_file
 
 MODEL_FORMATS: Mapping[str, ModelFormat] = {
     one.name: one for one in (Eos(), Statismo(), ScalismoJson(), Gltf(), ObjFolder(), ShapeWorks())

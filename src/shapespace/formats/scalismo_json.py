@@ -14,11 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import ModelFileError
-from shapespace.formats.parts import LinearModel
+from shapespace.formats.model_parts import LinearModel
 from shapespace.formats.statismo import model_of
 from shapespace.formats.statismo_tree import tree_of
+from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import atomic_path, read_bytes
-from shapespace.io.json_files import check_file
 from shapespace.io.sandbox import ApartError, Tree
 
 _AGAIN = "export it again from where it was made"

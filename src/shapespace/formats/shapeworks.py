@@ -21,17 +21,17 @@ from scipy.spatial import KDTree
 
 from shapespace.errors import InputError, ModelFileError, ShapespaceError
 from shapespace.formats.facts import KEY, facts_of, json_object, with_facts
-from shapespace.formats.folder import write_folder
-from shapespace.formats.parts import LinearModel, Modes
+from shapespace.formats.model_folder import write_folder
+from shapespace.formats.model_parts import LinearModel, Modes
 from shapespace.geometry.procrustes import align_in_place
 from shapespace.geometry.similarity import fit_similarity
+from shapespace.io.containers.json_files import check_file, json_of
 from shapespace.io.files import read_bytes, write_text
-from shapespace.io.json_files import check_file, json_of
-from shapespace.io.limits import LARGEST_MESH_FILE_BYTES, Allowance
-from shapespace.io.meshes import MESH_ENDINGS, read_mesh
+from shapespace.io.meshes.mesh_io import MESH_ENDINGS, read_mesh
+from shapespace.io.meshes.vtk import write_vtk
 from shapespace.io.parsing import floats_of, number_lines
-from shapespace.io.vtk import write_vtk
-from shapespace.io.workbook import sheet_rows
+from shapespace.io.read_limits import LARGEST_MESH_FILE_BYTES, Allowance
+from shapespace.io.tables.workbook import sheet_rows
 from shapespace.types import FloatArray, IntArray, Mesh
 
 _AGAIN = "run optimize in ShapeWorks again, or copy its folder of particles beside the project"

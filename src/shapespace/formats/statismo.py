@@ -16,14 +16,14 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import ModelFileError, ShapespaceError
-from shapespace.formats.parts import ORTHOGONAL, LinearModel, Modes, are_measurable, are_triangles, scaled
+from shapespace.formats.model_parts import ORTHOGONAL, LinearModel, Modes, are_measurable, are_triangles, scaled
 from shapespace.formats.statismo_tree import PARAMETERS, hdf5_of, tree_of
-from shapespace.geometry.landmarks import place_landmarks
+from shapespace.geometry.landmark_placement import place_landmarks
+from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import write_bytes
-from shapespace.io.json_files import check_file
-from shapespace.io.landmarks import LANDMARK_FORMATS
+from shapespace.io.landmarks.landmark_io import LANDMARK_FORMATS
+from shapespace.io.meshes.vtk import read_vtk
 from shapespace.io.sandbox import HDF5_SIGNATURE, ApartError, Tree, read_hdf5_apart
-from shapespace.io.vtk import read_vtk
 from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks
 
 _AGAIN = "export it again from where it was made"

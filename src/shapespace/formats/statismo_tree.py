@@ -11,8 +11,8 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.formats.parts import LinearModel, orthonormal
-from shapespace.io.landmarks import LANDMARK_FORMATS
+from shapespace.formats.model_parts import LinearModel, orthonormal
+from shapespace.io.landmarks.landmark_io import LANDMARK_FORMATS
 from shapespace.io.sandbox import Tree
 from shapespace.types import FloatArray
 

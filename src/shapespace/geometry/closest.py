@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from shapespace.errors import InputError, MeshError
-from shapespace.geometry.surface import faces_of
+from shapespace.geometry.normals import faces_of
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
 
 if TYPE_CHECKING:

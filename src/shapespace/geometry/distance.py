@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from shapespace.geometry.closest import ClosestPointEngine, ClosestPoints, build_engine, on_boundary
-from shapespace.geometry.surface import boundary_vertices, part_of, vertex_normals
+from shapespace.geometry.normals import boundary_vertices, part_of, vertex_normals
 from shapespace.reprs import short_repr
 from shapespace.types import BoolArray, FloatArray, Mesh, require
 

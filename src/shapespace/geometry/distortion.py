@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shapespace.geometry.surface import face_vectors, faces_of
+from shapespace.geometry.normals import face_vectors, faces_of
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
 
 

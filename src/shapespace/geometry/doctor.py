@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import MeshError
-from shapespace.geometry.surface import without_vertices
+from shapespace.geometry.normals import without_vertices
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
 
 NON_FINITE = "coordinates that are NaN or infinite"

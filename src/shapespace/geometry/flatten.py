@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import MeshError
-from shapespace.geometry.surface import faces_of
+from shapespace.geometry.normals import faces_of
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
 
 _ROUNDNESS = 4.0

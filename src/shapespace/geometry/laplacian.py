@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from shapespace.geometry.surface import faces_of, vertex_areas
+from shapespace.geometry.normals import faces_of, vertex_areas
 from shapespace.types import FloatArray, Mesh
 
 WELL_SHAPED = 0.05

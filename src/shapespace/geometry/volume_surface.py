@@ -19,8 +19,8 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from shapespace.errors import InputError, MeshError, ShapespaceError
+from shapespace.geometry.normals import boundary_edges
 from shapespace.geometry.remesh import is_sheet
-from shapespace.geometry.surface import boundary_edges
 from shapespace.lazy import lazy_import
 from shapespace.reprs import short_repr
 from shapespace.types import MAX_MEMORY_BYTES, BoolArray, FloatArray, IntArray, LabelVolume, Mesh, require

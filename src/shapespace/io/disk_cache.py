@@ -18,7 +18,7 @@ import numpy.typing as npt
 from platformdirs import user_cache_path
 
 from shapespace.errors import FileError
-from shapespace.io.archives import arrays_in
+from shapespace.io.containers.archives import arrays_in
 from shapespace.io.files import atomic_path
 
 MOST_BYTES = 500_000_000

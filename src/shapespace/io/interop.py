@@ -10,7 +10,7 @@ from typing import Any, TypeAlias, cast, overload
 import numpy as np
 
 from shapespace.errors import InputError, MeshError
-from shapespace.io.meshes import read_mesh
+from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.lazy import other_package
 from shapespace.types import ByteArray, IntArray, Mesh
 

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import FileFormatError
-from shapespace.io.limits import MOST_PARTS
+from shapespace.io.read_limits import MOST_PARTS
 from shapespace.types import BoolArray, ByteArray, FloatArray, Mesh
 
 IndexArray = npt.NDArray[np.int64]

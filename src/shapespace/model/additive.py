@@ -17,11 +17,11 @@ import numpy.typing as npt
 from scipy.linalg import eigh
 
 from shapespace.errors import InputError, ModelFileError
-from shapespace.formats.parts import LinearModel
+from shapespace.formats.model_parts import LinearModel
+from shapespace.geometry.normals import without_estimates
 from shapespace.geometry.procrustes import Gauge, align_in_place
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.geometry.surface import without_estimates
-from shapespace.io.hdf5 import read_hdf5
+from shapespace.io.containers.hdf5 import read_hdf5
 from shapespace.io.interop import as_meshes
 from shapespace.lazy import lazy_import
 from shapespace.model import model_file

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from shapespace.errors import ModelFileError
-from shapespace.formats.parts import ORTHOGONAL, LinearModel, Modes, orthonormal
-from shapespace.io.hdf5 import is_ours
+from shapespace.formats.model_parts import ORTHOGONAL, LinearModel, Modes, orthonormal
+from shapespace.io.containers.hdf5 import is_ours
 from shapespace.model.model_file import ModelFields
 from shapespace.types import FloatArray
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shapespace.io.arrays import read_arrays, write_arrays
+from shapespace.io.containers.arrays import read_arrays, write_arrays
 from shapespace.types import FloatArray
 
 _DEPENDENT = 1e-13

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import eigh
 
-from shapespace.geometry.surface import rms_size
+from shapespace.geometry.normals import rms_size
 from shapespace.types import FloatArray, IntArray
 
 _CENTRES = 40

@@ -16,9 +16,9 @@ import numpy as np
 from scipy.linalg import eigh
 
 from shapespace.errors import InputError
+from shapespace.geometry.normals import part_of
 from shapespace.geometry.procrustes import Gauge, align_in_place, centroid_size, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.geometry.surface import part_of
 from shapespace.model.choose_modes import choose_modes
 from shapespace.model.pca import PrincipalComponents, checked_modes, fix_signs, modes_for_variance, principal_components
 from shapespace.model.ppca import Ppca, ppca

@@ -18,8 +18,8 @@ from msgspec import Struct
 
 from shapespace.errors import FileFormatError, ModelFileError
 from shapespace.geometry.procrustes import Gauge
-from shapespace.io.hdf5 import Attribute, content_hash, read_hdf5, write_hdf5
-from shapespace.io.json_files import plain_json
+from shapespace.io.containers.hdf5 import Attribute, content_hash, read_hdf5, write_hdf5
+from shapespace.io.containers.json_files import plain_json
 from shapespace.types import FloatArray, IntArray, SurfaceLandmarks
 from shapespace.version import __version__
 

@@ -13,7 +13,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from shapespace.errors import InputError
-from shapespace.geometry.surface import without_vertices
+from shapespace.geometry.normals import without_vertices
 from shapespace.model.shape_model import ShapeModel, region_vertices
 from shapespace.types import BoolArray, FloatArray
 

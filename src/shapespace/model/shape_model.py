@@ -16,10 +16,10 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import CorrespondenceError, InputError, ModelFileError
-from shapespace.formats.parts import LinearModel
+from shapespace.formats.model_parts import LinearModel
+from shapespace.geometry.normals import without_estimates
 from shapespace.geometry.procrustes import Gauge, align_in_place, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.geometry.surface import without_estimates
 from shapespace.io.interop import MeshLike, as_meshes
 from shapespace.lazy import OpenViewer, lazy_import
 from shapespace.model import model_file

@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import FileError, FileFormatError, InputError
+from shapespace.geometry.normals import without_estimates
 from shapespace.geometry.procrustes import (
     Gauge,
     Poses,
@@ -30,11 +31,10 @@ from shapespace.geometry.procrustes import (
     scale_to_tangent_streamed,
 )
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.geometry.surface import without_estimates
-from shapespace.io.arrays import read_arrays, write_arrays
+from shapespace.io.containers.arrays import read_arrays, write_arrays
+from shapespace.io.containers.row_spill import Spill
 from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_error, write_text
 from shapespace.io.memory import available_bytes
-from shapespace.io.spill import Spill
 from shapespace.model.choose_modes import choose_modes, drawn
 from shapespace.model.krylov import KeptPasses
 from shapespace.model.large_pca import checked_large_modes, large_components

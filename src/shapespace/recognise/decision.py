@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from shapespace.errors import InputError
-from shapespace.recognise.scores import IndexArray
+from shapespace.recognise.classification_scores import IndexArray
 from shapespace.types import FloatArray
 
 

@@ -4,6 +4,17 @@
 tests against shuffled labels and curves, `decision` where on the face classes differ.
 """
 
+from shapespace.recognise.classification_scores import (
+    Calibration,
+    ClassScores,
+    calibrated,
+    calibration,
+    confusion,
+    fit_temperature,
+    macro_accuracy,
+    per_class,
+    subject_bootstrap,
+)
 from shapespace.recognise.decision import decision_map, region_shares
 from shapespace.recognise.predictions import (
     MODES,
@@ -23,17 +34,6 @@ from shapespace.recognise.resampling import (
     learning_curve,
     mode_importance,
     permutation_test,
-)
-from shapespace.recognise.scores import (
-    Calibration,
-    ClassScores,
-    calibrated,
-    calibration,
-    confusion,
-    fit_temperature,
-    macro_accuracy,
-    per_class,
-    subject_bootstrap,
 )
 
 __all__ = [

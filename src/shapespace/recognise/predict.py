@@ -12,12 +12,12 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from shapespace.errors import InputError
-from shapespace.io.tables import write_rows
+from shapespace.io.tables.table_io import write_rows
+from shapespace.recognise.classification_scores import fit_temperature, macro_accuracy
+from shapespace.recognise.classifier_file import SavedClassifier, software_versions
 from shapespace.recognise.classifiers import CLASSIFIERS
+from shapespace.recognise.labelled_scans import NEUTRAL, ScanCoefficients, one_model, relative_to_neutral
 from shapespace.recognise.predictions import left_out, subject_folds
-from shapespace.recognise.saved import SavedClassifier, software_versions
-from shapespace.recognise.scans import NEUTRAL, ScanCoefficients, one_model, relative_to_neutral
-from shapespace.recognise.scores import fit_temperature, macro_accuracy
 from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, require
 
@@ -90,7 +90,10 @@ def train_classifier(
         raise InputError(f"The confidence must lie from 0 to 1, not {confidence!r}.")
     for scan in scans:
         require(
-            scan, ScanCoefficients, "train_classifier", "read them with shapespace.recognise.scans.read_coefficients"
+            scan,
+            ScanCoefficients,
+            "train_classifier",
+            "read them with shapespace.recognise.labelled_scans.read_coefficients",
         )
     model_hash = one_model(scans)
     used, left_out_counts, notes = _with_labels(scans)

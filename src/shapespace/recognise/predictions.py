@@ -16,9 +16,9 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from shapespace.errors import InputError
+from shapespace.recognise.classification_scores import IndexArray, calibrated, fit_temperature, macro_accuracy
 from shapespace.recognise.classifiers import CLASSIFIERS, GRIDS
 from shapespace.recognise.learn import StratifiedGroupKFold
-from shapespace.recognise.scores import IndexArray, calibrated, fit_temperature, macro_accuracy
 from shapespace.reprs import short_repr
 from shapespace.types import FloatArray
 

@@ -11,9 +11,9 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from shapespace.errors import InputError
+from shapespace.recognise.classification_scores import IndexArray, macro_accuracy
 from shapespace.recognise.classifiers import CLASSIFIERS, LDA_SHRINKAGE, linear_rule
 from shapespace.recognise.predictions import Fold, answers_of, classes_of, predict_probabilities, refuse_unknown, usable
-from shapespace.recognise.scores import IndexArray, macro_accuracy
 from shapespace.types import FloatArray
 
 

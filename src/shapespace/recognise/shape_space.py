@@ -11,12 +11,12 @@ from typing import Any, Literal, TypeAlias, cast
 import numpy as np
 
 from shapespace.errors import InputError, ShapespaceError
-from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.result import FitResult
 from shapespace.geometry.procrustes import Gauge
 from shapespace.model.shape_model import ShapeModel
+from shapespace.recognise.labelled_scans import from_record
 from shapespace.recognise.learn import BaseEstimator, TransformerMixin, check_is_fitted
-from shapespace.recognise.scans import from_record
 from shapespace.types import FloatArray, IntArray, Mesh
 
 Surface: TypeAlias = Mesh | FitResult | Mapping[str, Any]

@@ -1,1 +1,4 @@
-"""Saved results become pictures and one HTML file; nothing is computed here that a result file should hold."""
+"""Pictures, pages and notebook views of saved results; no result is computed here.
+
+Entry points: `pages.write_html.write_report`, `notebook`. Imported by `commands`, `demo` and `viewer`.
+"""

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.io.arrays import write_arrays
+from shapespace.io.containers.arrays import write_arrays
 from shapespace.io.files import make_folder, write_text
-from shapespace.io.meshes import write_mesh
-from shapespace.io.tables import write_rows
+from shapespace.io.meshes.mesh_io import write_mesh
+from shapespace.io.tables.table_io import write_rows
 from shapespace.reprs import short_repr
 from shapespace.schemas import Analysis, Methods, Part, TableColumn, Target, json_text
 from shapespace.types import Mesh

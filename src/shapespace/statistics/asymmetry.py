@@ -20,9 +20,9 @@ import numpy.typing as npt
 
 from shapespace.cohort.cohort import Cohort, subjects_of
 from shapespace.errors import InputError
+from shapespace.geometry.normals import vertex_normals
 from shapespace.geometry.procrustes import align_in_place, centroid_size, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.geometry.surface import vertex_normals
 from shapespace.lazy import lazy_import
 from shapespace.reprs import listed_briefly, short_repr
 from shapespace.schemas import Methods, SampleSize, TestScheme

@@ -9,7 +9,7 @@ import numpy as np
 
 from shapespace.errors import InputError
 from shapespace.geometry.distortion import factor_to_draw, flip_factor
-from shapespace.geometry.surface import rms_size
+from shapespace.geometry.normals import rms_size
 from shapespace.schemas import (
     Counts,
     HistogramPart,

@@ -13,8 +13,8 @@ from scipy.stats import t as student
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.table import named
 from shapespace.errors import InputError
+from shapespace.geometry.normals import boundary_edges, vertex_areas
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.geometry.surface import boundary_edges, vertex_areas
 from shapespace.lazy import lazy_import
 from shapespace.model.shape_model import region_vertices
 from shapespace.statistics.answer import Answer

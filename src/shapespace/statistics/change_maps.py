@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from shapespace.cohort.cohort import Cohort
+from shapespace.geometry.normals import face_vectors, vertex_areas, vertex_normals
 from shapespace.geometry.similarity import fit_similarity, small_poses
-from shapespace.geometry.surface import face_vectors, vertex_areas, vertex_normals
 from shapespace.statistics.change_align import align_by
 from shapespace.statistics.change_visits import Visit
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, SurfaceLandmarks

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from shapespace.geometry.normals import vertex_areas
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.geometry.surface import vertex_areas
 from shapespace.reprs import short_repr
 from shapespace.statistics.change_maps import Aligned, swept_mm3
 from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks

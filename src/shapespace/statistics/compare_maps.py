@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from shapespace.cohort.cohort import Cohort
-from shapespace.geometry.surface import vertex_normals
+from shapespace.geometry.normals import vertex_normals
 from shapespace.lazy import other_package
 from shapespace.reprs import short_repr
 from shapespace.statistics.compare_formula import INSTALL

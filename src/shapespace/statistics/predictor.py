@@ -21,9 +21,9 @@ from shapespace.cohort.table import named
 from shapespace.errors import CorrespondenceError, FileFormatError, InputError
 from shapespace.geometry.procrustes import Gauge
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.io.archives import read_arrays
-from shapespace.io.arrays import write_arrays
-from shapespace.io.json_files import plain_json
+from shapespace.io.containers.archives import read_arrays
+from shapespace.io.containers.arrays import write_arrays
+from shapespace.io.containers.json_files import plain_json
 from shapespace.lazy import lazy_import
 from shapespace.reprs import short_repr, told_briefly
 from shapespace.statistics.linear_regressors import IndexArray

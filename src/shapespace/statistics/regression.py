@@ -13,7 +13,7 @@ from shapespace.cohort.cohort import Cohort, subjects_of
 from shapespace.cohort.proportions import widen_share
 from shapespace.cohort.table import named
 from shapespace.errors import InputError
-from shapespace.geometry.surface import vertex_normals
+from shapespace.geometry.normals import vertex_normals
 from shapespace.lazy import lazy_import
 from shapespace.reprs import listed_briefly, told_briefly
 from shapespace.schemas import Methods, TestScheme

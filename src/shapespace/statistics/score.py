@@ -17,9 +17,9 @@ from scipy.stats import f as f_distribution
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.table import named
 from shapespace.errors import CorrespondenceError, InputError
-from shapespace.fit.posterior import new_shapes
+from shapespace.fit.robust.posterior import new_shapes
+from shapespace.geometry.normals import vertex_normals
 from shapespace.geometry.procrustes import centroid_size
-from shapespace.geometry.surface import vertex_normals
 from shapespace.lazy import lazy_import
 from shapespace.reprs import listed_briefly
 from shapespace.schemas import Methods, SampleSize, TestScheme

@@ -13,12 +13,12 @@ import numpy as np
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.table import named
 from shapespace.errors import FileFormatError, InputError
-from shapespace.geometry.mirror import FLIP, find_mirror, mirror_pairs
+from shapespace.geometry.mirror_plane import FLIP, find_mirror, mirror_pairs
+from shapespace.geometry.normals import rms_size
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.geometry.surface import rms_size
+from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import read_bytes
-from shapespace.io.json_files import check_file
-from shapespace.io.tables import table_rows
+from shapespace.io.tables.table_io import table_rows
 from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, IntArray, Mesh
 

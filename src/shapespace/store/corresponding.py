@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from shapespace.errors import InputError
-from shapespace.io.folders import mesh_files
-from shapespace.io.json_files import read_json
-from shapespace.io.meshes import stem_of
+from shapespace.io.containers.json_files import read_json
+from shapespace.io.meshes.mesh_folders import mesh_files
+from shapespace.io.meshes.mesh_io import stem_of
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord
 from shapespace.store.results import ENDINGS, results_at, surfaces_of
 

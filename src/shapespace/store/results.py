@@ -16,11 +16,11 @@ import msgspec
 import numpy.typing as npt
 
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
-from shapespace.io.archives import arrays_in, read_arrays
+from shapespace.io.containers.archives import arrays_in, read_arrays
+from shapespace.io.containers.json_files import LARGEST_BYTES, json_of, read_json
 from shapespace.io.files import read_bytes, read_error
-from shapespace.io.json_files import LARGEST_BYTES, json_of, read_json
-from shapespace.io.meshes import read_mesh
-from shapespace.io.tables import CHECKSUM
+from shapespace.io.meshes.mesh_io import read_mesh
+from shapespace.io.tables.table_io import CHECKSUM
 from shapespace.lazy import lazy_import, other_package
 from shapespace.reprs import told_briefly
 from shapespace.schemas import FIT_AGAIN, FitRecord

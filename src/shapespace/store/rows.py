@@ -7,7 +7,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from shapespace.io.tables import CHECKSUM
+from shapespace.io.tables.table_io import CHECKSUM
 
 _DIRECTIONS = ("model_to_scan", "scan_to_model")
 _DISTANCE_COLUMNS = ("mean", "median", "rms", "p95", "max", "count")

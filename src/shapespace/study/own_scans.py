@@ -19,13 +19,13 @@ from shapespace.batch.progress import progress
 from shapespace.batch.run import fit_files, make_jobs
 from shapespace.datasets.expression_sets import ScanEntry, scan_set
 from shapespace.errors import InputError
-from shapespace.fit.fit import FitConfig
+from shapespace.fit.fit_scan import FitConfig
 from shapespace.io.files import make_folder, write_text
 from shapespace.model.additive import AdditiveModel, load_model
 from shapespace.model.shape_model import ShapeModel
 from shapespace.recognise import evaluate
 from shapespace.recognise.classifiers import CLASSIFIERS
-from shapespace.report.html import require_report_extra, write_report
+from shapespace.report.pages.write_html import require_report_extra, write_report
 from shapespace.schemas import Part, TextPart
 from shapespace.study import parts
 from shapespace.types import BoolArray, FloatArray

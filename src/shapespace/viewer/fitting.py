@@ -22,7 +22,7 @@ from shapespace.batch.workers import context
 
 if TYPE_CHECKING:
     from shapespace.model.shape_model import ShapeModel
-    from shapespace.report.staged import StagedFit
+    from shapespace.report.inputs.staged_fit import StagedFit
 
 PREVIEW = "preview.bin"
 PICTURE = "fit.bin"
@@ -75,11 +75,11 @@ Message: TypeAlias = Mapping[str, Any]
 def fit_upload(pipe: Connection, upload: Upload) -> None:
     """Fit `upload` and tell of it: the scan, each state of the loop, the verdict; runs in a worker process."""
     _step_back()
+    from shapespace.batch.fit_records import write_record
     from shapespace.batch.fit_work import Job, fit_file
-    from shapespace.batch.results import write_record
     from shapespace.errors import ShapespaceError
-    from shapespace.fit.fit import FitConfig
-    from shapespace.fit.state import IcpState
+    from shapespace.fit.fit_scan import FitConfig
+    from shapespace.fit.iteration_state import IcpState
     from shapespace.model.shape_model import ShapeModel
 
     def tell(event: str, **facts: Any) -> None:
@@ -126,10 +126,10 @@ def _preview(model: ShapeModel, upload: Upload) -> dict[str, Any]:
 
     from shapespace.errors import FitError
     from shapespace.fit.scan_target import mm_frame
-    from shapespace.fit.start import find_unit
+    from shapespace.fit.search.initialisation import find_unit
     from shapespace.geometry.doctor import repair
-    from shapespace.io.meshes import read_mesh
-    from shapespace.report.scene import pack, thinned
+    from shapespace.io.meshes.mesh_io import read_mesh
+    from shapespace.report.render.scene import pack, thinned
     from shapespace.types import MM_PER_UNIT
 
     scan, _ = repair(read_mesh(upload.scan))
@@ -153,7 +153,7 @@ def _preview(model: ShapeModel, upload: Upload) -> dict[str, Any]:
 
 
 def _picture(upload: Upload) -> None:
-    from shapespace.report.saved import Folder, find_fits, staged_fit
+    from shapespace.report.inputs.saved_fits import Folder, find_fits, staged_fit
 
     folder = Folder(upload.folder)
     (found,) = find_fits(folder)
@@ -162,7 +162,7 @@ def _picture(upload: Upload) -> None:
 
 def packed(staged: StagedFit) -> bytes:
     """Return a fit for the page, with all its iterations; a scan of very many triangles is thinned."""
-    from shapespace.report.scene import pack_fit
+    from shapespace.report.render.scene import pack_fit
 
     return pack_fit(staged, most_sent=LARGEST_SHOWN)
 

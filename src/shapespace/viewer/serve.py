@@ -116,7 +116,7 @@ def _of_surfaces(path: Path, model: Path | None) -> Callable[[], _Build]:
         raise InputError(f"{path} is a correspondence without fits; leave --model out.")
 
     def open_() -> _Build:
-        from shapespace.viewer.surfaces import Surfaces
+        from shapespace.viewer.corresponding_surfaces import Surfaces
         from shapespace.viewer.surfaces_server import make_surfaces_app
 
         shown = Surfaces(path)

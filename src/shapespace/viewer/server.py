@@ -23,9 +23,9 @@ from starlette.types import ASGIApp
 
 from shapespace.errors import FileError
 from shapespace.io.files import read_bytes
-from shapespace.io.landmarks import write_landmarks
-from shapespace.io.meshes import MESH_ENDINGS, read_mesh, write_mesh
-from shapespace.report import colours
+from shapespace.io.landmarks.landmark_io import write_landmarks
+from shapespace.io.meshes.mesh_io import MESH_ENDINGS, read_mesh, write_mesh
+from shapespace.report.render import palette as colours
 from shapespace.schemas import to_json
 from shapespace.types import Mesh
 from shapespace.version import __version__

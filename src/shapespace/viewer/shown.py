@@ -15,8 +15,9 @@ import numpy as np
 from shapespace.errors import FileError, FileFormatError, InputError, ShapespaceError
 from shapespace.model.foreign import looks_like_model
 from shapespace.model.shape_model import ShapeModel
-from shapespace.report.population import neediest
-from shapespace.report.saved import (
+from shapespace.report.blocks.wording import without_folders
+from shapespace.report.inputs.fit_population import neediest
+from shapespace.report.inputs.saved_fits import (
     Folder,
     SavedFit,
     ScanNotFoundError,
@@ -27,8 +28,7 @@ from shapespace.report.saved import (
     saved_surfaces,
     staged_fit,
 )
-from shapespace.report.scene import pack_model, pack_surfaces
-from shapespace.report.wording import without_folders
+from shapespace.report.render.scene import pack_model, pack_surfaces
 from shapespace.schemas import FIT_AGAIN, FitRecord, to_json
 from shapespace.store.manifest import Manifest
 from shapespace.store.results import results_at

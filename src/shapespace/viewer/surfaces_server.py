@@ -15,8 +15,8 @@ from starlette.routing import Route
 from starlette.types import ASGIApp
 
 from shapespace.viewer.answers import PAGES, answer, application, asset, binary
+from shapespace.viewer.corresponding_surfaces import Surfaces
 from shapespace.viewer.guard import Access, Guard
-from shapespace.viewer.surfaces import Surfaces
 
 _LONGEST = 2000
 

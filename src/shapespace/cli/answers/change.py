@@ -48,7 +48,7 @@ def add(sub: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Measure the changes, and write the report."""
     from shapespace.batch.progress import steps
-    from shapespace.io.regions import read_region
+    from shapespace.io.meshes.region_files import read_region
     from shapespace.statistics.change import change
     from shapespace.statistics.change_found import ChangeSettings
 
@@ -79,7 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _landmarks(path: Path, n_vertices: int) -> SurfaceLandmarks:
     from shapespace.errors import InputError
-    from shapespace.io.landmarks import read_surface_landmarks
+    from shapespace.io.landmarks.landmark_io import read_surface_landmarks
 
     found = read_surface_landmarks(path)
     for name, vertex in zip(found.names, found.corners.max(axis=1).tolist(), strict=True):

@@ -12,7 +12,7 @@
   };
   const UNKNOWN = -32768; // the int16 that stands for NaN
 
-  /** Return {facts, arrays} of the bytes that shapespace.report.scene.pack made. */
+  /** Return {facts, arrays} of the bytes that shapespace.report.render.scene.pack made. */
   Shapespace.unpack = function (buffer) {
     const damaged = new Error("These data are cut short or damaged; make the page again.");
     if (!(buffer instanceof ArrayBuffer) || buffer.byteLength < 4) throw damaged;

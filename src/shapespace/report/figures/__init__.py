@@ -2,7 +2,7 @@
 
     import shapespace as ss
     from shapespace.report import figures
-    from shapespace.report.staged import StagedFit
+    from shapespace.report.inputs.staged_fit import StagedFit
 
     result = ss.fit_scan(model, scan)
     figures.signed_maps(StagedFit.of(model, result)).savefig("distances.png")
@@ -11,9 +11,9 @@ Pictures of one row share camera and light, one figure has one scale, and the ma
 readers. Importing this package needs the extra `report`.
 """
 
-from shapespace.report.figures.analysis import histogram_figure, looked_at, morph_figure, surface_map_figure
-from shapespace.report.figures.coefficients import Coefficients, b_plane, b_space, scatter_matrix
-from shapespace.report.figures.correspondence import (
+from shapespace.report.figures.analysis_figures import histogram_figure, looked_at, morph_figure, surface_map_figure
+from shapespace.report.figures.coefficient_figures import Coefficients, b_plane, b_space, scatter_matrix
+from shapespace.report.figures.correspondence_figures import (
     SIDE_DEG,
     checkerboard_figure,
     missing_figure,
@@ -21,7 +21,7 @@ from shapespace.report.figures.correspondence import (
     nearness_figure,
 )
 from shapespace.report.figures.draw import STAGE_WORDS, encode_webp
-from shapespace.report.figures.fit import (
+from shapespace.report.figures.fit_figures import (
     THRESHOLDS_MM,
     coefficients_figure,
     distance_histograms,
@@ -32,14 +32,14 @@ from shapespace.report.figures.fit import (
     stages_figure,
     threshold_figure,
 )
-from shapespace.report.figures.many import (
+from shapespace.report.figures.many_fit_figures import (
     aligned_grid,
     distance_maps,
     error_curves,
     faces_grid,
     portrait_figure,
 )
-from shapespace.report.figures.model import (
+from shapespace.report.figures.model_figures import (
     mean_figure,
     mode_animation,
     modes_figure,
@@ -47,14 +47,14 @@ from shapespace.report.figures.model import (
     save_figure,
     spectrum_figure,
 )
-from shapespace.report.figures.population import (
+from shapespace.report.figures.population_figures import (
     coefficients_spread,
     density_figure,
     distributions_figure,
     levels_figure,
     over_time_figure,
 )
-from shapespace.report.figures.recognition import (
+from shapespace.report.figures.recognition_figures import (
     calibration_figure,
     confusion_figure,
     curve_figure,
@@ -63,7 +63,7 @@ from shapespace.report.figures.recognition import (
     learning_curve_figure,
     mesh_rows_figure,
 )
-from shapespace.report.staged import StagedFit
+from shapespace.report.inputs.staged_fit import StagedFit
 
 __all__ = [
     "SIDE_DEG",

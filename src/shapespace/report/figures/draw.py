@@ -24,14 +24,14 @@ from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 
 from shapespace.errors import InputError
-from shapespace.report.colours import DIVERGING, SCAN_COLOUR, SEQUENTIAL, Colour
-from shapespace.report.render import Camera, Image, Layer, point_spacing
-from shapespace.report.staged import StagedFit, measured_mm
-from shapespace.report.thumbnails import Still, encoded
-from shapespace.report.wording import counted as counted
-from shapespace.report.wording import mm as mm
-from shapespace.report.wording import percent as percent
-from shapespace.report.wording import printable
+from shapespace.report.blocks.wording import counted as counted
+from shapespace.report.blocks.wording import mm as mm
+from shapespace.report.blocks.wording import percent as percent
+from shapespace.report.blocks.wording import printable
+from shapespace.report.inputs.staged_fit import StagedFit, measured_mm
+from shapespace.report.render.palette import DIVERGING, SCAN_COLOUR, SEQUENTIAL, Colour
+from shapespace.report.render.renderer import Camera, Image, Layer, point_spacing
+from shapespace.report.render.thumbnails import Still, encoded
 from shapespace.types import FloatArray, Mesh
 
 if TYPE_CHECKING:

@@ -1,0 +1,211 @@
+"""A folder of results: which record is of which scan, what new results are called, and the table of all of them."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+from collections import Counter
+from collections.abc import Container, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import msgspec
+
+from shapespace.batch.fit_records import Source, coefficient_row, read_record, write_coefficients
+from shapespace.errors import FileError, ShapespaceError
+from shapespace.io.containers.json_files import LARGEST_BYTES, check_file
+from shapespace.io.files import sha256_of_file
+from shapespace.io.meshes.mesh_io import stem_of
+from shapespace.schemas import FIT_AGAIN, File
+from shapespace.store.results import results_at
+
+COEFFICIENTS = "coefficients.csv"
+RECORD = ".fit.json"
+_LONGEST_NAME = 200
+_OF_SCANS = ("scan", "scan_name", "path", "scan_hash")
+
+
+def records_in(folder: Path, without: Container[str] = ()) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield NAME and record of each NAME.fit.json directly in `folder` that can be read, in order of the names."""
+    for file in sorted(folder.glob(f"*{RECORD}")):
+        if file.name.removesuffix(RECORD) in without:
+            continue
+        try:
+            yield file.name.removesuffix(RECORD), read_record(file)
+        except ShapespaceError:
+            continue  # a report names it
+
+
+@dataclass(frozen=True)
+class _Scan:
+    """Where a scan is; two are the same if these are.
+
+    Args:
+        name: of the file.
+        path: as records of the folder have it.
+    """
+
+    name: str
+    path: str
+
+    @staticmethod
+    def of(source: Mapping[str, Any]) -> _Scan:
+        return _Scan(str(source.get("name", "")), str(source.get("path", "")))
+
+
+def names_for(
+    scans: Sequence[Path], folder: Path | None = None, addresses: Mapping[Path, str] | None = None
+) -> list[str]:
+    """Return NAME of the result files of each scan: its file name without its ending, where that is free.
+
+    A scan that has results in `folder` keeps their name. Scans that share a name, with each other or with results of
+    another scan, get as much of their path before it as tells them apart. So no name depends on the order of `scans`.
+
+    Args:
+        scans: paths; one that is given twice has one name.
+        folder: where results go; None if nothing can be there.
+        addresses: of scans that lie elsewhere, by what their paths would be.
+    """
+    taken: dict[str, _Scan] = {}
+    hashes: dict[str, str] = {}
+    for name, told in _sources_in(folder) if folder is not None else ():
+        if isinstance(told, dict):
+            source = cast(dict[str, Any], told)
+            taken[name] = _Scan.of(source)
+            hashes[name] = str(source.get("hash", ""))
+    own = {scan: name for name, scan in reversed(taken.items())}
+    keys = {scan: _key(scan, folder, (addresses or {}).get(scan, "")) for scan in scans}
+    names = {key: own[key] for key in keys.values() if key in own}
+    groups: dict[str, dict[_Scan, Path]] = {}
+    for scan, key in keys.items():
+        if key not in names:
+            groups.setdefault(_stem(scan).casefold(), {})[key] = scan
+    used = {name.casefold() for name in (*taken, *names.values())}
+    # Names that stand alone come first, so that none is taken from its owner.
+    for _, group in sorted(groups.items(), key=lambda item: (len(item[1]) > 1, item[0])):
+        (key, scan), *others = group.items()
+        stem = _stem(scan)
+        if not others and (stem.casefold() not in used or _is_same(scan, taken.get(stem), hashes.get(stem), folder)):
+            found = {key: stem}
+        else:
+            found = _told_apart(group, used)
+        names |= found
+        used |= {name.casefold() for name in found.values()}
+    return [names[keys[scan]] for scan in scans]
+
+
+def _sources_in(folder: Path) -> Iterator[tuple[str, object]]:
+    """Yield NAME of each result in `folder`, of a store too, and what its record says of the scan."""
+    if (results := results_at(folder)) is not None:
+        for rows in results.iter_rows(_OF_SCANS):
+            for name, called, path, content_hash in zip(*(rows[column] for column in _OF_SCANS), strict=True):
+                yield name, {"name": called, "path": path, "hash": content_hash}
+    else:
+        for file in sorted(folder.glob(f"*{RECORD}")):
+            with contextlib.suppress(ShapespaceError, msgspec.MsgspecError, ValueError):  # a report names it
+                check_file(file, LARGEST_BYTES, FIT_AGAIN)
+                told = msgspec.json.decode(file.read_bytes(), type=_OfScan).scan
+                yield file.name.removesuffix(RECORD), {"name": told.name, "path": told.path, "hash": told.hash}
+
+
+class _OfScan(msgspec.Struct, frozen=True):
+    """What is read of a record to know of which scan it is: the rest is passed over, twenty times as fast."""
+
+    scan: File = File()
+
+
+def _key(scan: Path, folder: Path | None, address: str) -> _Scan:
+    if address:
+        return _Scan(scan.name, address)
+    if folder is None:
+        return _Scan(scan.name, str(scan.parent.resolve()))
+    return _Scan(scan.name, Source.at(scan, "", folder).path)
+
+
+def _stem(scan: Path) -> str:
+    return _shortened(stem_of(scan) or scan.name)
+
+
+def _is_same(scan: Path, of_record: _Scan | None, content_hash: str | None, folder: Path | None) -> bool:
+    """Return whether results of the same name are of `scan`, which has moved since, or do not say of what they are."""
+    if of_record is None or folder is None:
+        return False
+    if not of_record.path:
+        return of_record.name == scan.name
+    try:
+        return not (folder / of_record.path).exists() and sha256_of_file(scan) == content_hash
+    except FileError:
+        return False
+
+
+def _told_apart(group: Mapping[_Scan, Path], used: set[str]) -> dict[_Scan, str]:
+    folders = {key: scan.parent.resolve().parts[1:] for key, scan in group.items()}
+    ends = {key: stem_of(scan) or scan.name for key, scan in group.items()}
+    if len({(folders[key], end) for key, end in ends.items()}) < len(group):
+        ends = {key: scan.name for key, scan in group.items()}
+    for depth in range(1, 1 + max(map(len, folders.values()))):
+        names = {key: "_".join((*folders[key][-depth:], ends[key])) for key in group}
+        counts = Counter(name.casefold() for name in names.values())
+        short = all(len(os.fsencode(name)) <= _LONGEST_NAME for name in names.values())
+        if short and max(counts.values()) == 1 and not counts.keys() & used:
+            return names
+    return {
+        key: f"{_shortened(stem_of(scan), 180)}_{hashlib.sha256(os.fsencode(scan.resolve())).hexdigest()[:12]}"
+        for key, scan in group.items()
+    }
+
+
+def _shortened(stem: str, most: int = _LONGEST_NAME) -> str:
+    # File names end at 255 bytes, and the results add theirs.
+    content = os.fsencode(stem)
+    return stem if len(content) <= most else content[:most].decode("utf-8", "ignore")
+
+
+class CoefficientTable:
+    """coefficients.csv of a folder: a row for each record in it, those of this run last.
+
+    Those of this run come by `add` and `catch_up`, the others are read at once.
+
+    Args:
+        folder: of the results.
+        names: of the results of this run, in order.
+        n_modes: of the model that is fitted; the table has as many coefficients as the largest record at least.
+    """
+
+    def __init__(self, folder: Path, names: Sequence[str], n_modes: int) -> None:
+        self._folder = folder
+        self._names = tuple(dict.fromkeys(names))
+        self._n_modes = n_modes
+        self._rows: dict[str, dict[str, Any]] = {}
+        of_this_run = set(self._names)
+        for name, record in records_in(folder, without=of_this_run):
+            self._add_earlier(name, record)
+
+    def add(self, name: str, record: Mapping[str, Any]) -> None:
+        """Put in the row of a record, in place of an earlier one of that name."""
+        self._rows[name] = coefficient_row(name, record)
+        self._n_modes = max(self._n_modes, len(record.get("b", ())))
+
+    def catch_up(self, names: Sequence[str]) -> None:
+        """Put in the records of `names` that are there: of earlier runs, or written by workers that were stopped."""
+        for name in names:
+            with contextlib.suppress(ShapespaceError):  # never written
+                self._add_earlier(name, read_record(self._folder / f"{name}{RECORD}"))
+
+    def save(self) -> None:
+        """Write the table.
+
+        Raises:
+            FileError: the folder cannot be written, or the disk is full.
+        """
+        others = [row for name, row in self._rows.items() if name not in self._names]
+        rows = [*others, *(self._rows[name] for name in self._names if name in self._rows)]
+        write_coefficients(self._folder / COEFFICIENTS, rows, self._n_modes)
+
+    def _add_earlier(self, name: str, record: Mapping[str, Any]) -> None:
+        try:
+            self.add(name, record)
+        except (KeyError, TypeError, AttributeError, ValueError):
+            self._rows.pop(name, None)  # damaged; a report names it

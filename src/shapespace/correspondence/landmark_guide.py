@@ -1,0 +1,176 @@
+"""Landmarks in a correspondence: where on the template each named point lies, and how it pulls a registration.
+
+A landmark is a soft constraint. After each step of (1) in `register`, what is left between the landmarks y of a scan
+and their places x on the surface is spread over the surface as a Gaussian process would, whose covariance is the heat
+kernel H_r of the range r, and whose observations have the landmarks' own uncertainty:
+
+    d <- d + H_r(., x) (H_r(x, x) + (s / a)^2 h I)^-1 (y - x)                         (2)
+
+h is the mean of the kernel's diagonal, s the uncertainty, a = r / 2 how far a surface is thought off at that range.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from shapespace.correspondence.harmonics import Harmonics
+from shapespace.errors import InputError, MeshError
+from shapespace.geometry.closest import build_engine
+from shapespace.geometry.landmark_placement import place_landmarks
+from shapespace.geometry.mirror_plane import FLIP
+from shapespace.geometry.normals import faces_of, rms_size
+from shapespace.geometry.similarity import fit_similarity
+from shapespace.types import FloatArray, IntArray, Mesh, Similarity, SurfaceLandmarks
+
+FEWEST = 3
+"""So many give a pose."""
+_OFF_SHARE = 0.5
+_AGREE = 0.2
+"""Landmarks whose RMS distance from those of the template, posed, is beyond this share of their spread are others."""
+_MIRROR_SHARE = 0.5
+_FIRMEST = 1e-3
+"""Two landmarks in one place leave (2) without a solution where s / a is 0."""
+_SURE = 3.0
+"""Landmarks on a line, but for less than this many times their uncertainty, do not tell how a shape is turned."""
+_ASTRAY = 0.25
+"""A landmark that lies farther than this share of a scan's size off its surface is none of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Marks:
+    """The landmarks of one scan that the template has too.
+
+    Args:
+        places: on the template, L of them.
+        points: (L, 3) in the scan's frame.
+        uncertainty: standard deviation, as a share of the template's size.
+    """
+
+    places: SurfaceLandmarks
+    points: FloatArray
+    uncertainty: float
+
+    @staticmethod
+    def shared(places: SurfaceLandmarks, scan: Mesh, uncertainty: float) -> Marks | None:
+        """Return those that `scan` has of `places`; None where it has none."""
+        names = [name for name in places.names if name in scan.landmarks]
+        if not names:
+            return None
+        return Marks(places.select(names), np.stack([scan.landmarks[name] for name in names]), uncertainty)
+
+    def moved(self, T: Similarity) -> Marks:
+        """Return the same landmarks with their points moved by `T`."""
+        return Marks(self.places, T.apply(self.points), self.uncertainty)
+
+    def pose(self, vertices: FloatArray) -> Similarity | None:
+        """Return T_scan_template by the landmarks, or None where they are too few, or as good as on a line.
+
+        Raises:
+            InputError: they are those of a mirror image, or of something else.
+        """
+        if len(self.points) < FEWEST:
+            return None
+        own = self.places.interpolate(vertices)
+        across = np.linalg.svd(own - own.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(own))
+        if across < _SURE * self.uncertainty * rms_size(vertices):
+            return None
+        try:
+            T = fit_similarity(own, self.points)
+            mirrored = fit_similarity(own * FLIP, self.points)
+        except InputError:
+            return None
+        spread = float(np.sqrt(((self.points - self.points.mean(axis=0)) ** 2).sum(axis=1).mean()))
+        off = _rms(T.apply(own) - self.points) / spread
+        other = _rms(mirrored.apply(own * FLIP) - self.points) / spread
+        if len(self.points) > FEWEST and off > _AGREE:
+            if other < _MIRROR_SHARE * off:
+                raise InputError(
+                    "mirrored: its landmarks are those of a mirror image of the other scans; turn it over, or check "
+                    "their names"
+                )
+            raise InputError(
+                f"its landmarks lie {100 * off:.0f} % of their spread from those of the others; check their names"
+            )
+        return T
+
+    def pull(self, x: FloatArray, harmonics: Harmonics, range_mm: float, size_mm: float) -> FloatArray:
+        """Return (V, 3) the movement (2) of the surface `x` (V, 3), in whose frame the points must be."""
+        functions = self.places.interpolate(harmonics.functions)
+        spread = functions * harmonics.kept(range_mm)
+        kernel = spread @ functions.T
+        ratio = max(self.uncertainty * size_mm / (_OFF_SHARE * range_mm), _FIRMEST)
+        loaded = kernel + ratio**2 * np.diag(kernel).mean() * np.eye(len(kernel))
+        left = self.points - self.places.interpolate(x)
+        pulled: FloatArray = np.asarray(np.linalg.solve(loaded, left), dtype=np.float64)
+        return harmonics.functions @ (spread.T @ pulled)
+
+    def rms(self, vertices: FloatArray) -> float:
+        """Return the RMS distance between the points and their places on `vertices` (V, 3), in one frame."""
+        return _rms(self.places.interpolate(vertices) - self.points)
+
+
+def on_triangles(mesh: Mesh, points: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Return (M, 3) corners of the triangles of `mesh` that lie nearest to `points` (M, 3), and weights (M, 3)."""
+    near = build_engine(mesh).query(points)
+    if near.triangle is None or near.barycentric is None:
+        raise MeshError(f"{mesh.name} has no triangles, so no points can be placed on it; give a surface.")
+    return np.asarray(faces_of(mesh)[near.triangle], dtype=np.int32), near.barycentric
+
+
+def astray(scan: Mesh) -> dict[str, float]:
+    """Return the landmarks of `scan` that are none of it: name -> distance off its surface, as a share of its size."""
+    if not scan.landmarks:
+        return {}
+    off = build_engine(scan).query(np.stack(list(scan.landmarks.values()))).distance / rms_size(scan.vertices)
+    return {name: float(share) for name, share in zip(scan.landmarks, off, strict=True) if share > _ASTRAY}
+
+
+def without_astray(scan: Mesh) -> Mesh:
+    """Return `scan` without the landmarks that are `astray`."""
+    off = astray(scan)
+    return replace(scan, landmarks={name: point for name, point in scan.landmarks.items() if name not in off})
+
+
+def unlike_most(template: Mesh, scans: Iterable[Mesh], uncertainty: float) -> bool:
+    """Return whether most of the `scans` whose landmarks can be compared with those of `template` contradict them."""
+    places = place_landmarks(template, template.landmarks)
+    told = [marks for scan in scans if (marks := Marks.shared(places, scan, uncertainty)) is not None]
+    refused, agreeing = 0, 0
+    for marks in told:
+        try:
+            agreeing += marks.pose(template.vertices) is not None
+        except InputError:
+            refused += 1
+    return refused > agreeing
+
+
+def _rms(difference: FloatArray) -> float:
+    return float(np.sqrt((difference**2).sum(axis=1).mean()))
+
+
+def agreed(mean: Mesh, shapes: Sequence[tuple[FloatArray, Mapping[str, FloatArray]]]) -> SurfaceLandmarks:
+    """Return where on `mean` the landmarks of shapes lie: the middle of where those have them that agree with most.
+
+    Args:
+        mean: with triangles.
+        shapes: (V, 3) vertices of each, and its landmarks in the same frame.
+    """
+    placed = [(place_landmarks(mean.with_vertices(vertices), points), points) for vertices, points in shapes if points]
+    names = list(dict.fromkeys(name for _, points in placed for name in points))
+    if not names:
+        return SurfaceLandmarks()
+    at = np.full((len(placed), len(names), 3), np.nan)
+    for own, (places, points) in zip(at, placed, strict=True):
+        own[[names.index(name) for name in points]] = places.interpolate(mean.vertices)
+    off = np.sqrt(np.array([np.nansum((at - own) ** 2, axis=(1, 2)) for own in at]))
+    shared = np.array([np.isfinite(at + own).all(axis=2).sum(axis=1) for own in at])
+    contrary = off > _AGREE * rms_size(mean.vertices) * np.sqrt(shared)
+    kept = ~contrary[((shared > 0) & ~contrary).sum(axis=1).argmax()]
+    middle: dict[str, FloatArray] = {}
+    for name, points in zip(names, at[kept].swapaxes(0, 1), strict=True):
+        if np.isfinite(points).any():
+            middle[name] = np.asarray(np.nanmedian(points, axis=0), dtype=np.float64)
+    return place_landmarks(mean, middle)

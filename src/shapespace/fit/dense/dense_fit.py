@@ -1,0 +1,303 @@
+"""From the fitted surface the rest of the way to the scan, by smooth fields on the model's own triangles.
+
+The field d is a Gaussian process of the Matern kind, written as a stochastic differential equation on the surface
+(Lindgren, Rue and Lindstrom, J. R. Stat. Soc. B 73, 2011), so that its precision is sparse. Its posterior mean given
+the matches minimises
+
+    sum_i w_i (n_i^T (x_i + d_i - q_i))^2 / noise^2  +  |(kappa^2 - Laplacian) d|^2 / (4 pi kappa^2 amplitude^2)
+
+with the matches of `robust` (both directions, without borders and disagreeing normals, robustly weighted), each
+gathered on the vertices that carry it. Only distances along the normals are matched: sideways the surface goes with its
+neighbours. First d is a field of vectors whose amplitude goes by what the fit left unexplained; then one along the
+normals takes up the details. Where nothing is seen both fade, and the surface stays what the model says.
+"""
+
+from __future__ import annotations
+
+import weakref
+from dataclasses import dataclass
+
+import numpy as np
+
+from shapespace.errors import FitError
+from shapespace.fit.dense.field_kernels import compare_triangles, solve_field
+from shapespace.fit.robust.kernels import normals_into
+from shapespace.fit.robust.matching import Matcher, Matches, MatchHint, Weights
+from shapespace.fit.robust.prepared_model import ModelSurface, Topology, prepare
+from shapespace.fit.robust.robust_settings import DenseSettings
+from shapespace.fit.robust.weights import spread
+from shapespace.fit.scan_target import ScanTarget
+from shapespace.geometry.laplacian import half_cotangents, owned_areas
+from shapespace.geometry.normals import face_vectors, rms_size
+from shapespace.model.shape_model import ShapeModel
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
+
+_FEWEST_MATCHES = 30
+_FEWEST_PAIRS = 100
+_HALVINGS = 8
+_SEEN = 0.1
+"""Matches that together weigh as much show a vertex; a good one weighs 1."""
+
+
+@dataclass(frozen=True, eq=False)
+class DenseSurface:
+    """The model's surface on the scan.
+
+    Args:
+        vertices_scan_mm: (V, 3) in the scan's mm frame.
+        seen: (V,) False where the scan shows nothing and the model stands in.
+        noise_mm: of the scan as found, mm of the model's frame.
+        unexplained_mm: RMS of what the fit left that is no noise, mm of the model's frame.
+        damped: how many vertices were held back so that no triangle folds.
+        moved_mm: RMS of how far what is seen moved along the normals, mm of the model's frame.
+    """
+
+    vertices_scan_mm: FloatArray
+    seen: BoolArray
+    noise_mm: float
+    unexplained_mm: float
+    damped: int
+    moved_mm: float
+
+
+def dense_surface(
+    model: ShapeModel,
+    target: ScanTarget,
+    vertices_scan_mm: FloatArray,
+    T_scan_model: Similarity,
+    settings: DenseSettings,
+) -> DenseSurface:
+    """Return the surface `vertices_scan_mm` moved onto the scan where the scan shows it.
+
+    No triangle folds: none turns over, or against its neighbours, that does not in `vertices_scan_mm`.
+
+    Args:
+        model: gives the triangles, and the mean on which the field is smooth.
+        target: the scan in its mm frame.
+        vertices_scan_mm: (V, 3) the fitted surface in that frame.
+        T_scan_model: from the model's frame to the scan's mm frame; settings are in mm of the former.
+        settings: of this stage.
+
+    Raises:
+        InputError: the model has no triangles.
+        FitError: hardly anything of the scan matches the surface.
+    """
+    topology, T = prepare(model).topology, T_scan_model
+    start = T.inverse().apply(vertices_scan_mm)
+    surface = ModelSurface.of(topology, start)
+    up = surface.normals
+    matcher = _matcher(target, topology, settings)
+    size_mm = rms_size(model.mean_vertices)
+    now = _match(matcher, surface, T, matcher.first_hint(surface, T), settings)
+    noise_mm, left_mm = now.noise_mm, now.unexplained_mm
+    moved = np.zeros_like(start)
+    if left_mm > settings.least_unexplained_mm:
+        coarse = _field(model, settings.range_share * size_mm, settings.amplitude * left_mm)
+        for _ in range(settings.rounds):
+            seen_at, pull_at = now.gathered(max(noise_mm, now.spread_mm))
+            want = seen_at * np.einsum("vd,vd->v", surface.normals, moved) - pull_at
+            coarse.solve(seen_at, want, surface.normals, moved, settings)
+            surface = ModelSurface.of(topology, start + moved)
+            now = _match(matcher, surface, T, now.matches.hint, settings)
+            # Neighbours also disagree where the surface is steep beside the scan, so the last is the best.
+            noise_mm = min(noise_mm, now.noise_mm)
+
+    fine = _field(model, settings.fine_range_share * size_mm, settings.fine_amplitude_mm)
+    base, held = unfolded(start, start, start + moved, topology, settings.turn_cosine)
+    out, along, normals = np.zeros((len(start), 1)), np.ones((len(start), 1)), surface.normals
+    seen_at = np.zeros(len(start))
+    for round_ in range(settings.fine_rounds):
+        if round_:
+            surface = ModelSurface.of(topology, base + out * normals)
+            now = _match(matcher, surface, T, now.matches.hint, settings)
+        seen_at, pull_at = now.gathered(noise_mm)
+        fine.solve(seen_at, seen_at * out[:, 0] - pull_at, along, out, settings)
+    kept, held_back = unfolded(start, base, base + out * normals, topology, settings.turn_cosine)
+    seen, damped = seen_at * noise_mm**2 > _SEEN, int((held | held_back).sum())
+    along_mm = np.einsum("vd,vd->v", up[seen], (kept - start)[seen])
+    moved_mm = float(np.sqrt((along_mm**2).sum() / max(len(along_mm), 1)))
+    return DenseSurface(T.apply(kept), seen, noise_mm, left_mm, damped, moved_mm)
+
+
+@dataclass(frozen=True, eq=False)
+class WeightedMatches:
+    """Matches of the surface, with the spread and the noise of their residuals.
+
+    Args:
+        matches: both ways.
+        faces: (F, 3) of the surface,
+        vertices: how many it has.
+        settings: of the stage.
+        spread_mm: of the residuals of the scan's points.
+        noise_mm: of the scan.
+    """
+
+    matches: Matches
+    faces: IntArray
+    vertices: int
+    settings: DenseSettings
+    spread_mm: float
+    noise_mm: float
+
+    def _weights(self, spread_mm: float) -> Weights:
+        s = self.settings
+        width_mm = s.width * max(spread_mm, s.least_noise_mm)
+        return self.matches.weights(s.weight, width_mm, s.reach * width_mm + s.reach_mm, s.vertex_share)
+
+    @property
+    def unexplained_mm(self) -> float:
+        """RMS of the residuals' part that is no noise."""
+        weights = self._weights(self.spread_mm)
+        left = self.matches.unexplained_variance(weights, self.faces, self.vertices, self.settings.seed)
+        return float(np.sqrt(max(left, 0.0)))
+
+    def gathered(self, spread_mm: float) -> tuple[FloatArray, FloatArray]:
+        """Return the precision (V,), mm^-2, of what the scan says of each vertex, and the same times the residual."""
+        gathered = self.matches.gathered(self._weights(spread_mm), self.faces, self.vertices)
+        return gathered.weight / spread_mm**2, gathered.pull / spread_mm**2
+
+
+def _matcher(target: ScanTarget, topology: Topology, settings: DenseSettings) -> Matcher:
+    count = len(target.mesh.vertices)
+    chosen = np.arange(count, dtype=np.int32)
+    if count > settings.scan_points:
+        chosen = np.sort(np.random.default_rng(settings.seed).choice(chosen, settings.scan_points, replace=False))
+    return Matcher.of(target, chosen, topology.used, target.engine, settings.normal_cosine, bulging=True)
+
+
+def _match(
+    matcher: Matcher, surface: ModelSurface, T: Similarity, hint: MatchHint, settings: DenseSettings
+) -> WeightedMatches:
+    """Return the matches of the surface, and the spread and the noise of their residuals.
+
+    Raises:
+        FitError: hardly anything of the scan matches the surface.
+    """
+    matches = matcher.match(surface, T, hint)
+    points = np.flatnonzero(matches.points.allowed)
+    if len(points) < _FEWEST_MATCHES:
+        raise FitError(f"{matcher.target.mesh.name}: too little of it matches the fitted surface to go on from there.")
+    residual = matches.points.residual
+    spread_mm = spread(residual[points])
+    # How much points that lie next to each other disagree is noise.
+    nearest = matches.points.nearest
+    points = points[np.argsort(nearest[points], kind="stable")]
+    pairs = nearest[points[1:]] == nearest[points[:-1]]
+    apart = np.diff(residual[points])[pairs]
+    noise_mm = spread(apart) / np.sqrt(2.0) if len(apart) >= _FEWEST_PAIRS else spread_mm
+    return WeightedMatches(
+        matches, surface.topology.faces, len(surface.vertices), settings, spread_mm,
+        max(noise_mm, settings.least_noise_mm),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Field:
+    """A Matern field on a surface: its precision is A M^-1 A.
+
+    Args:
+        topology: whose rings the off-diagonal entries follow.
+        off_diagonal: (R,) of A.
+        diagonal: (V,) of A.
+        inverse_mass: (V,) of M.
+        stiffness: (V,) the diagonal of A M^-1 A.
+    """
+
+    topology: Topology
+    off_diagonal: FloatArray
+    diagonal: FloatArray
+    inverse_mass: FloatArray
+    stiffness: FloatArray
+
+    def solve(
+        self, seen_at: FloatArray, pull_at: FloatArray, along: FloatArray, x: FloatArray, settings: DenseSettings
+    ) -> int:
+        """Bring `x` (V, C) to the posterior mean given precisions `seen_at` (V,) and pulls along `along` (V, C)."""
+        t = self.topology
+        return solve_field(
+            t.ring_start, t.ring, self.off_diagonal, self.diagonal, self.inverse_mass, self.stiffness,
+            seen_at, pull_at, along, x, settings.tolerance, settings.iterations,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Laplacian:
+    off_diagonal: FloatArray
+    diagonal: FloatArray
+    area: FloatArray
+
+
+_LAPLACIANS: weakref.WeakKeyDictionary[ShapeModel, _Laplacian] = weakref.WeakKeyDictionary()
+
+
+def _field(model: ShapeModel, range_mm: float, amplitude_mm: float) -> Field:
+    """Return the field with that standard deviation and range on the mean of `model`."""
+    t = prepare(model).topology
+    if model not in _LAPLACIANS:
+        _LAPLACIANS[model] = _laplacian(model.mean_vertices, t)
+    laplacian = _LAPLACIANS[model]
+    kappa = np.sqrt(8.0) / range_mm
+    tau = 1.0 / (np.sqrt(4.0 * np.pi) * kappa * amplitude_mm)
+    off = tau * laplacian.off_diagonal
+    diagonal = tau * (laplacian.diagonal + kappa**2 * laplacian.area)
+    inverse = 1.0 / laplacian.area
+    rows = np.repeat(np.arange(len(diagonal)), np.diff(t.ring_start))
+    stiffness = diagonal**2 * inverse + np.bincount(rows, off**2 * inverse[t.ring], len(diagonal))
+    return Field(t, off, diagonal, inverse, stiffness)
+
+
+def _laplacian(x: FloatArray, topology: Topology) -> _Laplacian:
+    """Return the cotangent Laplacian (positive) of the surface `x` (V, 3) and the area of each vertex."""
+    faces, count = topology.faces.astype(np.int64), len(x)
+    keys = np.repeat(np.arange(count), np.diff(topology.ring_start)) * count + topology.ring
+    off = np.zeros(len(keys))
+    for k in range(3):
+        i, j, o = faces[:, k], faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]
+        half = half_cotangents(x, i, j, o)
+        for a, b in ((i, j), (j, i)):
+            off -= np.bincount(np.searchsorted(keys, a * count + b), half, len(keys))
+    rows = np.repeat(np.arange(count), np.diff(topology.ring_start))
+    diagonal: FloatArray = np.asarray(-np.bincount(rows, off, count), dtype=np.float64)
+    return _Laplacian(off, diagonal, owned_areas(Mesh(x, topology.faces)))
+
+
+def unfolded(
+    start: FloatArray, base: FloatArray, moved: FloatArray, topology: Topology, turn_cosine: float
+) -> tuple[FloatArray, BoolArray]:
+    """Return `moved` (V, 3) held back towards `base` where triangles would fold, and (V,) where that is.
+
+    A triangle folds when it turns over, or against its neighbours, and did not do so in `start`.
+
+    Args:
+        start: (V, 3) the surface to compare with.
+        base: (V, 3) one on which nothing is folded.
+        moved: (V, 3) the one that is wanted.
+        topology: its triangles.
+        turn_cosine: cosine of the angle that no triangle turns further than.
+    """
+    faces = topology.faces
+    before = face_vectors(start, faces)
+    before /= np.maximum(np.linalg.norm(before, axis=1, keepdims=True), 1e-300)
+    normals = np.empty_like(start)
+    cosine, was_even, even = np.empty(len(faces)), np.empty(len(faces), np.bool_), np.empty(len(faces), np.bool_)
+    normals_into(start, faces, normals)
+    compare_triangles(start, normals, faces, before, cosine, was_even)
+    share, out, halvings = np.ones(len(start)), moved, 0
+    can_turn = cosine > turn_cosine  # all but those without area
+    while True:
+        normals_into(out, faces, normals)
+        compare_triangles(out, normals, faces, before, cosine, even)
+        folded = (can_turn & (cosine < turn_cosine)) | (was_even & ~even)
+        if not folded.any():
+            return out, share < 1.0
+        held, beside = np.zeros(len(start), dtype=np.bool_), np.zeros(len(start), dtype=np.bool_)
+        held[faces[folded]] = True
+        beside[faces[held[faces].any(axis=1)]] = True
+        halvings += 1
+        if halvings <= _HALVINGS:
+            share[held] *= 0.5
+            share[beside & ~held] *= 0.75
+        else:
+            # A triangle is as it is by its neighbours' corners, so with all of them on `base` it is no longer folded.
+            share[beside] = 0.0
+        out = base + share[:, None] * (moved - base)

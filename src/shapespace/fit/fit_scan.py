@@ -1,0 +1,465 @@
+"""The whole fit of a scan: place, drive, measure, judge."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from shapespace.errors import FitError, InputError
+from shapespace.fit.crop import Crop
+from shapespace.fit.diagnostics.verdict import verdict
+from shapespace.fit.iteration_state import Fitted, IcpState
+from shapespace.fit.landmark_terms import SHARE, Marks
+from shapespace.fit.method import Ended, Limits, Method
+from shapespace.fit.method_choices import method_named
+from shapespace.fit.region_fit import RegionFit
+from shapespace.fit.result import FitResult, Stage
+from shapespace.fit.robust.robust_settings import DenseSettings
+from shapespace.fit.scan_target import ScanTarget, mm_frame
+from shapespace.fit.search.initialisation import Start, find_unit, start_from_any_pose, start_from_landmarks
+from shapespace.geometry.closest import ClosestPoints
+from shapespace.geometry.distance import SurfaceDistances, surface_distances
+from shapespace.geometry.doctor import repair
+from shapespace.geometry.normals import rms_size
+from shapespace.io.interop import MeshLike, as_mesh
+from shapespace.io.landmarks.landmark_io import read_landmarks
+from shapespace.model.shape_model import ShapeModel
+from shapespace.types import MM_PER_UNIT, BoolArray, FloatArray, Mesh, Similarity
+from shapespace.version import __version__
+
+if TYPE_CHECKING:
+    from shapespace.model.additive import AdditiveModel
+
+_FAR_OUT = 3.0
+_FAR_OUT_BY_CHANCE = 0.01
+_ALL_BUT_THE_RIM = 0.95
+_VANISHED = 0.05
+"""Share of the start's scale below which nothing is left to fit."""
+
+OPTIONS = ("landmark_stddev_mm", "crop", "region", "strict")
+"""Settings that a record tells only where they are given."""
+
+OnState: TypeAlias = Callable[[IcpState], None]
+PathTo: TypeAlias = str | os.PathLike[str]
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """What is common to fits by any method.
+
+    Args:
+        method: how the placed model is fitted: an object such as `Robust(...)` or `Paper(...)`, or a name of `METHODS`
+            for its default settings.
+        modes: how many coefficients to report, from the first; None for all. The robust method fits with all in any
+            case; the paper's fits with these alone.
+        unit: of the scan: a name of `MM_PER_UNIT`, or `auto` to find it.
+        scale: `free` fits a similarity, `fixed` a rigid motion; `auto` is `free` for a model with the gauge `shape`.
+        max_iterations: cap of each phase.
+        seed: of the subsample that the start is searched on.
+        landmark_stddev_mm: of landmarks that are given, mm of the scan: how well they are placed. The robust method is
+            held to them by it; infinity takes them for the start alone. None for 3 % of the model's size (RMS distance
+            from its centre).
+        dense: whether the surface is then taken the rest of the way to the scan, as the stage `dense`.
+        dense_settings: settings of that.
+        crop: what of the scan is fitted, such as `sphere:0,0,0,90`, see `fit.crop.Crop`; empty for all of it.
+        region: the part of the model that fit, distances and verdict are held to: a name of `ShapeModel.regions`, or
+            vertices; None for all of it.
+        strict: whether a scan with triangles that use vertices with non-finite coordinates is refused; otherwise these
+            triangles are removed, and a note says so.
+
+    Raises:
+        InputError: a name that does not exist, numbers below one, or a dense stage after a method that has none.
+    """
+
+    method: Method | str = "robust"
+    modes: int | None = None
+    unit: str = "auto"
+    scale: Literal["auto", "free", "fixed"] = "auto"
+    max_iterations: int = 500
+    seed: int = 0
+    dense: bool = False
+    dense_settings: DenseSettings = field(default_factory=DenseSettings)
+    landmark_stddev_mm: float | None = None
+    crop: str = ""
+    region: str | tuple[int, ...] | None = None
+    strict: bool = False
+
+    def __post_init__(self) -> None:
+        for value, choices, what in (
+            (self.unit, ["auto", *MM_PER_UNIT], "unit"),
+            (self.scale, ("auto", "free", "fixed"), "scale"),
+        ):
+            if value not in choices:
+                raise InputError(f"There is no {what} {value!r}; choose one of {', '.join(choices)}.")
+        fitting = self.fitting
+        if self.dense and not fitting.goes_on_densely:
+            raise InputError(
+                f"The dense stage needs the robust method; leave out dense, or the method {fitting.name!r}."
+            )
+        if self.landmark_stddev_mm is not None and not self.landmark_stddev_mm > 0:
+            raise InputError(f"Landmarks need a positive standard deviation in mm, not {self.landmark_stddev_mm}.")
+        if self.crop:
+            object.__setattr__(self, "crop", Crop.of(self.crop).text)
+        if self.region is not None and not isinstance(self.region, str):
+            object.__setattr__(self, "region", tuple(sorted({int(vertex) for vertex in self.region})))
+        if self.dense and self.region is not None:
+            raise InputError("The dense stage follows all of a scan; leave out dense, or the region.")
+        if self.modes is not None and self.modes < 1:
+            raise InputError(f"A fit must report at least one mode, not {self.modes}.")
+        if self.max_iterations < 1:
+            raise InputError(f"A fit needs at least one iteration, not {self.max_iterations}.")
+
+    @property
+    def fitting(self) -> Method:
+        """The method itself, where it was given by name too."""
+        return method_named(self.method) if isinstance(self.method, str) else self.method
+
+    def limits(self, model: ShapeModel) -> Limits:
+        """Return what the method is told; a scale that goes by the gauge is free where size was divided out."""
+        with_scale = model.gauge == "shape" if self.scale == "auto" else self.scale == "free"
+        return Limits(with_scale, self.modes, self.max_iterations)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all settings as plain data for a record, those of the method under its name."""
+        # Not `asdict` of the whole: a method given by name has settings too.
+        common = {name: getattr(self, name) for name in ("modes", "unit", "scale", "max_iterations", "seed", "dense")}
+        method = self.fitting
+        # Options that are left out are not told, so that such fits are those of versions that did not know them.
+        if self.landmark_stddev_mm is not None:
+            # JSON has no infinity.
+            common["landmark_stddev_mm"] = self.landmark_stddev_mm if np.isfinite(self.landmark_stddev_mm) else "inf"
+        if self.crop:
+            common["crop"] = self.crop
+        if self.region is not None:
+            common["region"] = self.region if isinstance(self.region, str) else _told_vertices(self.region)
+        if self.strict:
+            common["strict"] = True
+        return {
+            "method": method.name, **common, "dense_settings": asdict(self.dense_settings),
+            method.name: asdict(method),  # type: ignore[call-overload]
+        }  # fmt: skip
+
+
+def fit_scan(
+    model: ShapeModel | AdditiveModel | PathTo,
+    scan: MeshLike,
+    config: FitConfig | None = None,
+    *,
+    landmarks: Mapping[str, FloatArray] | PathTo | None = None,
+    T_scan_model: Similarity | None = None,
+    on_state: OnState | None = None,
+) -> FitResult:
+    """Fit `model` to a raw scan of any topology, pose and unit, and return its coefficients and how far to trust them.
+
+    Args:
+        model: the shape space, or the path of its file.
+        scan: a mesh or point cloud, in its own frame and unit; its path; or whatever else `as_mesh` takes.
+        config: settings; None for the defaults.
+        landmarks: name -> (3,) in the scan's frame and unit, or the path of their file, to start from and, by the
+            robust method, to be held to (`FitConfig.landmark_stddev_mm`); None to use none.
+        T_scan_model: a start, from the model's frame (mm) to the scan's frame and unit; None to find one.
+        on_state: called with each state of the loop, for progress bars and viewers.
+
+    Raises:
+        MeshError: the scan cannot be used at all.
+        FitError: no start can be found, or the fit diverged.
+        InputError: the search needs triangles that the scan lacks; or `model` or `scan` is something else.
+        FileError: a file cannot be read.
+    """
+    config = config or FitConfig()
+    given = {"model": model, "scan": scan, "landmarks": landmarks}
+    files = {
+        what: Path(cast(PathTo, path)).absolute() for what, path in given.items() if isinstance(path, str | os.PathLike)
+    }
+    model, scan = _as_model(model), as_mesh(scan)
+    if "landmarks" in files:
+        landmarks = read_landmarks(files["landmarks"])
+    landmarks = cast("Mapping[str, FloatArray] | None", landmarks)
+    # Products this small go slower by several threads, and many fits at a time share the cores anyway.
+    with threadpool_limits(limits=1, user_api="blas"):
+        clock = [time.perf_counter()]
+        held = None if config.region is None else RegionFit.of(model, config.region)
+        own = model if held is None else held.part.model
+        placed = _place(model, own, scan, config, landmarks, T_scan_model)
+        clock.append(time.perf_counter())
+        limits = config.limits(model)
+        if held is not None:
+            limits, on_state = (
+                replace(limits, modes=None, part=True),
+                None if on_state is None else held.telling(on_state),
+            )
+        driven = _drive(own, placed, config, limits, on_state)
+        clock.append(time.perf_counter())
+        stages = _measure(own, placed, driven, config)
+        clock.append(time.perf_counter())
+        ended = Ended(own, placed.start, driven.fitted, stages, driven.ended, rms_size(own.mean_vertices))
+        status, reason = verdict(config.fitting, ended)
+        if held is not None:
+            driven = replace(
+                driven,
+                history=[held.state(state) for state in driven.history],
+                ended={phase: held.state(state) for phase, state in driven.ended.items()},
+                fitted=held.fitted(driven.fitted, config.modes),
+            )
+            stages = _measure(model, placed, driven, config, held.part.inside)
+        clock.append(time.perf_counter())
+    fitted = driven.fitted
+    return FitResult(
+        scan_name=placed.scan.name,
+        status=status,
+        reason=reason,
+        T_scan_model=stages["final"].T_scan_model,
+        mm_per_scan_unit=placed.mm_per_scan_unit,
+        b=fitted.b,
+        b_stddev=fitted.b_stddev,
+        shrinkage=fitted.shrinkage,
+        z=fitted.b / model.stddev[: len(fitted.b)],
+        z_covariance=_in_standard_deviations(fitted.b_covariance, model),
+        stages=stages,
+        history=driven.history,
+        method=config.fitting.name,
+        calibrated=config.fitting.calibrated,
+        config={
+            **config.as_dict(),
+            "scale_in_effect": "free" if config.limits(model).with_scale else "fixed",
+            "version": __version__,
+        },
+        start=placed.start.how,
+        evidence=fitted.evidence,
+        notes=[
+            *placed.findings,
+            *([] if held is None else [held.note(config.region)]),
+            *_far_out(model, fitted.b),
+            *_no_triangles(placed.scan),
+            *_not_all_seen(stages),
+            *fitted.notes,
+        ],
+        seconds={
+            "start": clock[1] - clock[0],
+            "phase_1": driven.phase_2_from - clock[1],
+            "phase_2": clock[2] - driven.phase_2_from,
+            **({"dense": clock[3] - clock[2]} if config.dense else {}),
+            "distances": clock[4] - clock[3],
+        },
+        model=model,
+        scan=placed.scan,
+        find_regions=fitted.regions,
+        find_closest=partial(_closest, placed.target, placed.T_scan_mm.inverse()),
+        landmark_stddev_mm=_landmark_stddev_mm(model, fitted, held, dense=config.dense),
+        files=files,
+    )
+
+
+def _as_model(model: ShapeModel | AdditiveModel | PathTo) -> ShapeModel:
+    if isinstance(model, str | os.PathLike):
+        return ShapeModel.load(Path(model))
+    if isinstance(model, ShapeModel):
+        return model
+    shape = getattr(model, "shape", None)  # of an additive model
+    if not isinstance(shape, ShapeModel):
+        raise InputError(f"A scan is fitted by a ShapeModel or by the file of one, not by {type(model).__name__}.")
+    return shape
+
+
+@dataclass(frozen=True, eq=False)
+class _Placed:
+    """A scan in its mm frame, and where the model begins there."""
+
+    scan: Mesh
+    mm_per_scan_unit: float
+    T_scan_mm: Similarity
+    target: ScanTarget
+    start: Start
+    findings: Sequence[str]
+
+
+@dataclass(frozen=True, eq=False)
+class _Driven:
+    """What a method went through: every state, the last of each phase, the end."""
+
+    history: Sequence[IcpState]
+    ended: Mapping[int, IcpState]
+    phase_2_from: float
+    fitted: Fitted
+
+
+def _place(
+    whole: ShapeModel,
+    model: ShapeModel,
+    scan: Mesh,
+    config: FitConfig,
+    landmarks: Mapping[str, FloatArray] | None,
+    T_scan_model: Similarity | None,
+) -> _Placed:
+    """Crop and repair the scan, find its unit, and find where to begin; landmarks are those of the `whole` model."""
+    said: list[str] = []
+    if config.crop:
+        scan, cropped = Crop.of(config.crop).cut(scan, whole, landmarks, config.unit)
+        said.append(cropped)
+    scan, findings = repair(scan, strict=config.strict)
+    mm = MM_PER_UNIT[find_unit(model, scan) if config.unit == "auto" else config.unit]
+    T_mm_scan = mm_frame(scan, mm)
+    scan_mm = scan.with_vertices(T_mm_scan.apply(scan.vertices))
+    with_scale = config.limits(model).with_scale
+    marks_mm = {name: T_mm_scan.apply(point) for name, point in (landmarks or {}).items()}
+    if T_scan_model is not None:
+        start = Start(T_mm_scan @ T_scan_model, "given", float("nan"))
+    elif landmarks:
+        start = start_from_landmarks(whole, marks_mm, scan.name, with_scale=with_scale)
+    else:
+        start = start_from_any_pose(model, scan_mm.vertices, seed=config.seed, with_scale=with_scale)
+    if landmarks:
+        stddev_mm = config.landmark_stddev_mm or SHARE * rms_size(whole.mean_vertices) * start.T_scan_model.scale
+        start = replace(start, marks=Marks.of(model, marks_mm, stddev_mm))
+    said += [*scan.notes, *(f"{finding.what} {finding.action}".strip() for finding in findings)]
+    return _Placed(scan, mm, T_mm_scan.inverse(), ScanTarget(scan_mm), start, said)
+
+
+def _drive(model: ShapeModel, placed: _Placed, config: FitConfig, limits: Limits, on_state: OnState | None) -> _Driven:
+    """Run the method to its end.
+
+    Raises:
+        FitError: it diverged, or shrank to a point.
+    """
+    history: list[IcpState] = []
+    ended: dict[int, IcpState] = {}
+    phase_2_from, name = time.perf_counter(), placed.scan.name
+    states = config.fitting.states(model, placed.target, placed.start, limits)
+    try:
+        while True:
+            state = next(states)
+            if state.phase == 2 and 2 not in ended:
+                phase_2_from = time.perf_counter()
+            history.append(state)
+            ended[state.phase] = state
+            if on_state is not None:
+                on_state(state)
+            if state.T_scan_model.scale < _VANISHED * placed.start.T_scan_model.scale:
+                raise FitError(
+                    f"{name}: the model shrank to a point, as the plain method does when a large part of the "
+                    "scan is missing; hold the scale (--scale fixed), or fit only the part that it shows (--region)."
+                )
+    except StopIteration as end:
+        return _Driven(history, ended, phase_2_from, end.value)
+    except InputError as error:
+        raise FitError(
+            f"{name}: the fit diverged ({error}); give landmarks (--landmarks), or crop the scan (--crop)."
+        ) from error
+
+
+def _measure(
+    model: ShapeModel, placed: _Placed, driven: _Driven, config: FitConfig, region: BoolArray | None = None
+) -> dict[str, Stage]:
+    """Return the surface at each stage, with its distances, held to `region` (V,), when they are asked for."""
+    target, fitted, T_scan_mm = placed.target, driven.fitted, placed.T_scan_mm
+    together = target.mesh.vertices.mean(axis=0) - model.mean_vertices.mean(axis=0)
+    moments = {
+        "before": (Similarity(1.0, np.eye(3), together), np.zeros(model.n_modes)),
+        "initial": (driven.ended[1].T_scan_model, driven.ended[1].b),
+        "final": (fitted.T_scan_model, fitted.b),
+    }
+    stages = {
+        name: Stage(T_scan_mm @ T, b, partial(_distances, model, target, T, b, None, region))
+        for name, (T, b) in moments.items()
+    }
+    if config.dense:
+        stages["dense"] = _dense_stage(model, target, T_scan_mm, fitted, config)
+    return stages
+
+
+def _landmark_stddev_mm(
+    model: ShapeModel, fitted: Fitted, held: RegionFit | None, *, dense: bool
+) -> dict[str, FloatArray] | None:
+    """Return name -> (3,) of where each of the model's landmarks lies, mm of the scan."""
+    if fitted.landmark_covariance is None:
+        return None
+    variance = np.einsum("lii->li", fitted.landmark_covariance).copy()
+    landmarks = model.landmarks if held is None else held.landmarks(model)
+    if not dense:
+        # The surface was told in the model's modes, and what that moved a landmark by is an error of it.
+        in_modes = landmarks.interpolate(fitted.T_scan_model.apply(model.reconstruct(fitted.b)))
+        variance += (in_modes - landmarks.interpolate(fitted.vertices_scan_mm)) ** 2
+    return dict(zip(landmarks, np.sqrt(variance), strict=True))
+
+
+def _told_vertices(vertices: tuple[int, ...]) -> dict[str, Any]:
+    """Return what a record says of a region that no model has by name."""
+    numbers = np.array(vertices, dtype="<i8").tobytes()
+    return {"vertices": len(vertices), "hash": hashlib.sha256(numbers).hexdigest()}
+
+
+def _in_standard_deviations(b_covariance: FloatArray | None, model: ShapeModel) -> FloatArray | None:
+    if b_covariance is None:
+        return None
+    stddev = model.stddev[: len(b_covariance)]
+    return b_covariance / (stddev[:, None] * stddev)
+
+
+def _not_all_seen(stages: Mapping[str, Stage]) -> list[str]:
+    dense = stages.get("dense")
+    if dense is None or dense.seen is None or dense.seen.mean() > _ALL_BUT_THE_RIM:
+        return []
+    return [
+        f"The dense surface follows the scan at {100 * dense.seen.mean():.0f} % of its vertices; where the scan shows "
+        "nothing the model stands in."
+    ]
+
+
+def _no_triangles(scan: Mesh) -> list[str]:
+    if scan.faces is not None:
+        return []
+    return ["It has no triangles, so distances are to its points and larger than to the surface they stand for."]
+
+
+def _far_out(model: ShapeModel, b: FloatArray) -> list[str]:
+    """Say when more coefficients lie far out than chance would have it; without a prior faint modes chase details."""
+    far = int((np.abs(b) > _FAR_OUT * model.stddev[: len(b)]).sum())
+    if far <= 1 + _FAR_OUT_BY_CHANCE * len(b):
+        return []
+    return [
+        f"{far} of {len(b)} coefficients lie over {_FAR_OUT:g} standard deviations out; the faint modes follow "
+        "details of the scan that the model does not know, so build it with fewer modes (--modes) for plausible ones."
+    ]
+
+
+def _dense_stage(
+    model: ShapeModel, target: ScanTarget, T_scan_mm: Similarity, fitted: Fitted, config: FitConfig
+) -> Stage:
+    from shapespace.fit.dense.dense_fit import dense_surface  # compiled
+
+    T = fitted.T_scan_model
+    dense = dense_surface(model, target, fitted.vertices_scan_mm, fitted.T_scan_fitted, config.dense_settings)
+    return Stage(
+        T_scan_mm @ T,
+        fitted.b,
+        partial(_distances, model, target, T, fitted.b, dense.vertices_scan_mm),
+        vertices=T_scan_mm.apply(dense.vertices_scan_mm),
+        seen=dense.seen,
+        moved_mm=dense.moved_mm,
+    )
+
+
+def _closest(target: ScanTarget, T_mm_scan: Similarity, points: FloatArray) -> ClosestPoints:
+    return target.engine.query(T_mm_scan.apply(points))
+
+
+def _distances(
+    model: ShapeModel, target: ScanTarget, T: Similarity, b: FloatArray, vertices_scan_mm: FloatArray | None = None,
+    region: BoolArray | None = None,
+) -> SurfaceDistances:  # fmt: skip
+    """Measure the shape with coefficients `b` at `T`, or the surface `vertices_scan_mm` (V, 3) that was made of it.
+
+    Only the vertices of `region` (V,) count where there is one.
+    """
+    vertices = T.apply(model.reconstruct(b)) if vertices_scan_mm is None else vertices_scan_mm
+    placed = Mesh(vertices, model.faces, name="model")
+    return surface_distances(placed, target.mesh, scan_engine=target.engine, mm_per_length=1.0 / T.scale, region=region)

@@ -1,0 +1,154 @@
+"""The paper's modified ICP as a method: its settings, its two phases, its doubts."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass
+from functools import partial
+from typing import ClassVar
+
+import numpy as np
+
+from shapespace.errors import InputError
+from shapespace.fit.iteration_state import Fitted, IcpState, StopRule
+from shapespace.fit.method import Ended, Limits
+from shapespace.fit.paper.shape_icp import shape_icp
+from shapespace.fit.paper.similarity_icp import similarity_icp
+from shapespace.fit.scan_target import ScanTarget
+from shapespace.fit.search.initialisation import Start
+from shapespace.fit.vertex_regions import all_followed
+from shapespace.geometry.closest import ENGINES
+from shapespace.model.pca import modes_for_variance
+from shapespace.model.shape_model import ShapeModel
+from shapespace.types import FloatArray
+
+# Set on simulated scans: clean ones stay far from each bound, cut ones cross at least one.
+_SHRUNK_BY_SHAPE = 0.85
+_SHRUNK_IN_ALL = 0.7
+_LEADING_SHARE = 0.9
+_IMPLAUSIBLE = 1e-5
+_CLOSE_SHARE = 0.01
+_FAR_SHARE = 0.05
+_GAP_RATIO = 4.0
+_GAP_SHARE = 0.02
+_SEEN_SHARE = 0.05
+
+
+@dataclass(frozen=True)
+class Paper:
+    """The paper's method, as corrected: phase 1 moves the mean, phase 2 alternates matches, pose and projection.
+
+    Args:
+        search: `vertices` (its closest points) or `surface` (closest points on the triangles).
+        stop_rate: the paper's tau: stop when the RMS changes by at most this share,
+        stop_motion_mm: and no vertex moves more than this, mm of the model's frame.
+
+    Raises:
+        InputError: a search that does not exist, or a rule that cannot stop.
+    """
+
+    search: str = "vertices"
+    stop_rate: float = 1e-4
+    stop_motion_mm: float = 1e-3
+
+    name: ClassVar[str] = "paper"
+    calibrated: ClassVar[bool] = False
+    goes_on_densely: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        if self.search not in ENGINES:
+            raise InputError(f"There is no search {self.search!r}; choose one of {', '.join(ENGINES)}.")
+        self.stop_rule(1)
+
+    def stop_rule(self, max_iterations: int) -> StopRule:
+        """Return the stopping rule of both phases."""
+        return StopRule(self.stop_rate, self.stop_motion_mm, max_iterations)
+
+    def states(
+        self, model: ShapeModel, scan: ScanTarget, start: Start, limits: Limits
+    ) -> Generator[IcpState, None, Fitted]:
+        """Yield the states of phase 1, then those of phase 2 from where it ended; only the modes asked for are used."""
+        model = model if limits.modes is None else model.truncate(limits.modes)
+        stop, engine, T_scan_model = self.stop_rule(limits.max_iterations), scan.search(self.search), start.T_scan_model
+        for state in similarity_icp(model, engine, T_scan_model, stop, with_scale=limits.with_scale):
+            T_scan_model = state.T_scan_model
+            yield state
+        b, rms_mm = np.zeros(model.n_modes), np.inf
+        for state in shape_icp(model, engine, T_scan_model, stop, with_scale=limits.with_scale):
+            T_scan_model, b, rms_mm = state.T_scan_model, state.b, state.rms_mm
+            yield state
+        b_stddev = posterior_stddev(model, rms_mm**2 / 3.0)
+        return Fitted(
+            T_scan_model=T_scan_model,
+            b=b,
+            b_stddev=b_stddev,
+            shrinkage=1.0 - (b_stddev / model.stddev) ** 2,
+            T_scan_fitted=T_scan_model,
+            vertices_scan_mm=T_scan_model.apply(model.reconstruct(b)),
+            outside_mm=0.0,
+            regions=partial(all_followed, model.n_vertices),
+        )
+
+    def reason(self, ended: Ended) -> str:
+        """Return why it stopped."""
+        return (
+            f"Converged; RMS closest distance {ended.phases[2].rms_mm:.2f} mm: its relative change is below "
+            f"{self.stop_rate:g} and no vertex moved more than {self.stop_motion_mm:g} mm."
+        )
+
+    def doubts(self, ended: Ended) -> list[str]:
+        """Return what the distances, the scale and the main coefficients say against the fit."""
+        model, final, initial = ended.model, ended.stages["final"], ended.stages["initial"]
+        forward, backward = final.distances.model_to_scan, final.distances.scan_to_model
+        size_mm = ended.size_mm
+        found: list[str] = []
+        shrunk = min(
+            final.T_scan_model.scale / initial.T_scan_model.scale / _SHRUNK_BY_SHAPE,
+            ended.fitted.T_scan_model.scale / ended.start.T_scan_model.scale / _SHRUNK_IN_ALL,
+        )
+        if shrunk < 1.0:
+            found.append("the model shrank while it was fitted, as it does when parts of the scan are missing")
+        if forward.rms > _FAR_SHARE * size_mm:
+            found.append(f"the model stays {forward.rms:.1f} mm (RMS) away from the scan")
+        if backward.fraction < _SEEN_SHARE:
+            found.append(f"the model covers only {100 * backward.fraction:.0f} % of the scan")
+        elif backward.median > _GAP_RATIO * forward.median and backward.median > _GAP_SHARE * size_mm:
+            found.append(
+                f"half of the scan lies over {backward.median:.1f} mm from the model, while half of the model lies "
+                f"within {forward.median:.1f} mm of the scan"
+            )
+        leading = min(modes_for_variance(model.stddev**2, _LEADING_SHARE), len(final.b))
+        z2 = float(((final.b[:leading] / model.stddev[:leading]) ** 2).mean())
+        # An extreme shape that lies on the scan all over is what the scan shows.
+        if z2 > _hotelling_bound(leading, model.n_training) and forward.rms > _CLOSE_SHARE * size_mm:
+            found.append(
+                f"the shape is implausible: its {leading} main coefficients lie {np.sqrt(z2):.1f} standard deviations "
+                "out on average, where about 1 is usual"
+            )
+        return found
+
+
+def posterior_stddev(model: ShapeModel, residual_variance: float) -> FloatArray:
+    """Return the standard deviation (K,), mm, of the coefficients given a complete surface.
+
+    Probabilistic PCA with orthonormal modes: var_k = lam_k v / (lam_k + v) (Tipping and Bishop, 1999). It takes the
+    residuals of the coordinates for independent, which they are not, so it is too small.
+
+    Args:
+        model: gives lam_k = stddev_k^2.
+        residual_variance: v, mm^2 per coordinate.
+    """
+    variance = model.stddev**2
+    return np.sqrt(variance * residual_variance / (variance + residual_variance))
+
+
+def _hotelling_bound(k: int, n: int) -> float:
+    """Return the mean z^2 of k coefficients that a new shape exceeds with probability `_IMPLAUSIBLE`.
+
+    The variances come from n training shapes, so the bound is Hotelling's for a new sample, not chi-square's.
+    """
+    from scipy.special import fdtri  # takes a moment; scipy.stats would take half a second
+
+    if n <= k + 1:
+        return float("inf")
+    return float((n**2 - 1) / (n * (n - k)) * fdtri(k, n - k, 1.0 - _IMPLAUSIBLE))

@@ -1,0 +1,265 @@
+"""Matches between a surface on the model's triangles and the scan, both ways: of every stage of a fit the same.
+
+Each scan point goes to the closest point of the moving surface, which a walk from the last answer finds, and each
+vertex of the surface to the closest point of the scan. Equation numbers are those of docs/robust.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from shapespace.fit.robust.kernels import gather_into
+from shapespace.fit.robust.prepared_model import ModelSurface
+from shapespace.fit.robust.weights import match_weights
+from shapespace.fit.scan_target import ScanTarget
+from shapespace.geometry.closest import ClosestPointEngine, ClosestPoints, on_boundary
+from shapespace.geometry.kdtree import KdTree
+from shapespace.types import BoolArray, FloatArray, IntArray, Similarity
+
+
+@dataclass(frozen=True, eq=False)
+class PointMatches:
+    """Scan points matched to the moving surface, (M,) each; residuals and distances in mm of the model's frame.
+
+    Args:
+        triangle: of the model, where each point is matched,
+        barycentric: (M, 3) and where on it.
+        nearest: vertex where the walk to it ended.
+        residual: how far the model lies beyond each point along the model's normal.
+        distance: to its match.
+        allowed: False where the model ends, and where the normals disagree.
+    """
+
+    triangle: IntArray
+    barycentric: FloatArray
+    nearest: IntArray
+    residual: FloatArray
+    distance: FloatArray
+    allowed: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class VertexMatches:
+    """Model vertices matched to the scan, (N,) each; residuals and distances in mm of the model's frame.
+
+    Args:
+        vertex: which vertices.
+        residual: how far each lies beyond its match along the model's normal.
+        distance: to its match.
+        allowed: False on the border of the scan, and where the normals disagree.
+        near: the matches themselves, for the next search to begin with.
+    """
+
+    vertex: IntArray
+    residual: FloatArray
+    distance: FloatArray
+    allowed: BoolArray
+    near: ClosestPoints
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """What is matched at one moment of a fit, both ways.
+
+    Args:
+        points: scan points on the model (eq 4).
+        vertices: model vertices on the scan (eq 5).
+        winding: -1 where the scan's normals are reversed, else 1.
+    """
+
+    points: PointMatches
+    vertices: VertexMatches
+    winding: float
+
+    @property
+    def hint(self) -> MatchHint:
+        """For the next search of the same points and vertices."""
+        return MatchHint(self.points.nearest, self.points.triangle, self.vertices.near, self.winding)
+
+    def residuals(self) -> FloatArray:
+        """Return the residuals of all matches that are allowed, both ways."""
+        p, v = self.points, self.vertices
+        return np.concatenate([p.residual[p.allowed], v.residual[v.allowed]])
+
+    def weights(self, name: str, width_mm: float, far_mm: float, vertex_share: float) -> Weights:
+        """Return how much each counts (eqs 8 and 9): residuals against a width, distances against how far is far."""
+        p, v = self.points, self.vertices
+        return Weights(
+            match_weights(name, p.residual, p.distance, p.allowed, width_mm, far_mm),
+            vertex_share * match_weights(name, v.residual, v.distance, v.allowed, width_mm, far_mm),
+            width_mm,
+            far_mm,
+        )
+
+    def gathered(self, weights: Weights, faces: IntArray, vertices: int) -> Gathered:
+        """Return weight and pull of the matches at the model vertices that carry them (eq 10)."""
+        p, v = self.points, self.vertices
+        weight_at, pull_at = np.zeros(vertices), np.zeros(vertices)
+        gather_into(p.triangle, p.barycentric, faces, weights.points, p.residual, weight_at, pull_at)
+        seen = weight_at > 0.0
+        weight_at[v.vertex] += weights.vertices
+        pull_at[v.vertex] += weights.vertices * v.residual
+        return Gathered(weight_at, pull_at, seen)
+
+    def unexplained_variance(self, weights: Weights, faces: IntArray, vertices: int, seed: int) -> float:
+        """Return the variance, mm^2, of the part of the residuals that is no noise (eq 17); it can be below zero.
+
+        Scan points fall into two halves at random. Noise is independent between them, so the product of what the two
+        say of the same vertex is the variance of the shape that is left.
+        """
+        p, w = self.points, weights.points
+        half = np.random.default_rng(seed).random(len(w)) < 0.5
+        seen, pull = np.zeros((2, vertices)), np.zeros((2, vertices))
+        for i, part in enumerate((half, ~half)):
+            gather_into(p.triangle, p.barycentric, faces, w * part, p.residual, seen[i], pull[i])
+        both = np.minimum(seen[0], seen[1])
+        mean = pull / np.maximum(seen, 1e-12)
+        return float((both * mean[0] * mean[1]).sum() / max(both.sum(), 1e-12))
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """How much each match counts.
+
+    Args:
+        points: (M,) of the scan's points,
+        vertices: (N,) and of the model's vertices.
+        width_mm: scale of the residuals that made them,
+        far_mm: and of the distances.
+    """
+
+    points: FloatArray
+    vertices: FloatArray
+    width_mm: float
+    far_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class Gathered:
+    """The matches as the model's vertices carry them, (V,) each.
+
+    Args:
+        weight: of all matches at each vertex.
+        pull: the same times the residuals, mm.
+        seen: where a scan point that counts is matched.
+    """
+
+    weight: FloatArray
+    pull: FloatArray
+    seen: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class MatchHint:
+    """Where the last search ended. It shortens the next search of the same points and vertices.
+
+    Args:
+        vertex: (M,) of the model, near each scan point.
+        triangle: (M,) of the model, near each scan point; -1 where none is known.
+        near: closest points of the scan to the vertices; None where none are known.
+        winding: -1 where the scan's normals are reversed, else 1; None where it is not known.
+    """
+
+    vertex: IntArray
+    triangle: IntArray
+    near: ClosestPoints | None
+    winding: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Matcher:
+    """Matches a sample of scan points and a sample of model vertices, both ways.
+
+    Args:
+        target: the scan.
+        points_mm: (M, 3) sample of its points, mm of the scan's frame.
+        point_normals: (M, 3) their normals.
+        vertex: (N,) sample of the model's vertices.
+        engine: the scan's search structure.
+        normal_cosine: matches whose normals disagree more than this are not allowed.
+        bulging: whether flat triangles stand for the smooth surface through their corners.
+    """
+
+    target: ScanTarget
+    points_mm: FloatArray
+    point_normals: FloatArray
+    vertex: IntArray
+    engine: ClosestPointEngine
+    normal_cosine: float
+    bulging: bool = False
+
+    @staticmethod
+    def of(
+        target: ScanTarget, points: IntArray, vertex: IntArray, engine: ClosestPointEngine, normal_cosine: float,
+        *, bulging: bool = False,
+    ) -> Matcher:  # fmt: skip
+        """Return the matcher of the scan points `points` (M,) and the model vertices `vertex` (N,)."""
+        return Matcher(
+            target, target.mesh.vertices[points], target.normals[points], vertex, engine, normal_cosine, bulging
+        )
+
+    def first_hint(
+        self, surface: ModelSurface, T_scan_model: Similarity, tree: KdTree | None = None, winding: float | None = None
+    ) -> MatchHint:
+        """Return a hint for the first search.
+
+        Args:
+            surface: of the model.
+            T_scan_model: its pose.
+            tree: of the vertices of a similar surface; None to build one.
+            winding: of the scan where it is known.
+        """
+        tree = tree or surface.vertex_tree()
+        vertex: IntArray = surface.topology.used[tree.nearest(self._in_model(T_scan_model))[0]]
+        return MatchHint(vertex, np.full_like(vertex, -1), None, winding)
+
+    def _in_model(self, T: Similarity) -> FloatArray:
+        return ((self.points_mm - T.translation) @ T.rotation) / T.scale
+
+    def match(self, surface: ModelSurface, T_scan_model: Similarity, hint: MatchHint) -> Matches:
+        """Return the matches of `surface` at a pose (eqs 4 to 6); their `hint` is that of the next search."""
+        q, n = self._in_model(T_scan_model), self.point_normals @ T_scan_model.rotation
+        nearest, triangle, barycentric = surface.closest(q, hint.vertex, hint.triangle)
+        residual, distance, cosine, covered = surface.meet(q, n, triangle, barycentric, bulging=self.bulging)
+        winding = _winding_of(cosine, covered) if hint.winding is None else hint.winding
+        agree = winding * cosine > self.normal_cosine
+        points = PointMatches(triangle, barycentric, nearest, residual, distance, covered & agree)
+        vertices = match_vertices(
+            self.target, self.engine, T_scan_model, surface, self.vertex, hint.near,
+            winding=winding, normal_cosine=self.normal_cosine,
+        )  # fmt: skip
+        return Matches(points, vertices, winding)
+
+
+def match_vertices(
+    target: ScanTarget, engine: ClosestPointEngine, T_scan_model: Similarity, surface: ModelSurface, vertex: IntArray,
+    near: ClosestPoints | None, *, winding: float, normal_cosine: float,
+) -> VertexMatches:  # fmt: skip
+    """Match some of the surface's vertices to the scan (eqs 5 and 6).
+
+    Args:
+        target: the scan.
+        engine: one of its search structures.
+        T_scan_model: from the model's frame to the scan's mm frame.
+        surface: in the model's frame.
+        vertex: (N,) which to match.
+        near: what the last search for the same vertices found; None for the first.
+        winding: -1 where the scan's normals are reversed, else 1.
+        normal_cosine: matches whose normals disagree more than this are not allowed.
+    """
+    T, x, n = T_scan_model, surface.vertices[vertex], surface.normals[vertex]
+    near = engine.query(T.apply(x), near)
+    to_scan = x - ((near.points - T.translation) @ T.rotation) / T.scale
+    allowed = ~on_boundary(near, target.mesh, target.rim)
+    if target.mesh.faces is not None:
+        n_scan = target.normals_at(near) @ T.rotation
+        cosine = winding * np.einsum("md,md->m", n, n_scan)
+        allowed &= cosine > normal_cosine * np.linalg.norm(n_scan, axis=1)
+    return VertexMatches(vertex, np.einsum("md,md->m", to_scan, n), near.distance / T.scale, allowed, near)
+
+
+def _winding_of(cosine: FloatArray, covered: BoolArray) -> float:
+    """Return -1 where most normals of model and scan are opposed: a scan wound the wrong way round has all reversed."""
+    return 1.0 if np.median(cosine[covered] if covered.any() else cosine) >= 0 else -1.0

@@ -1,0 +1,192 @@
+"""A shape model with precomputed data for fitting, and its surfaces, on which closest points are found by walking."""
+
+from __future__ import annotations
+
+import weakref
+from dataclasses import dataclass
+
+import numpy as np
+
+from shapespace.errors import InputError
+from shapespace.fit.robust.kernels import Float32Array, less_sag, meet_into, normals_into, walk_into
+from shapespace.geometry.kdtree import KdTree
+from shapespace.geometry.normals import boundary_vertices
+from shapespace.geometry.similarity import small_poses
+from shapespace.model.shape_model import ShapeModel
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
+
+
+@dataclass(frozen=True, eq=False)
+class Topology:
+    """Who neighbours whom on the model's surface.
+
+    Args:
+        faces: (F, 3) int32.
+        ring_start: (V + 1,) where each vertex's neighbours start in `ring`.
+        ring: (R,) vertices.
+        fan_start: (V + 1,) where each vertex's triangles start in `fan`.
+        fan: (3F,) triangles.
+        rim: (V,) True on the border of the surface.
+        used: indices of the vertices that some triangle has.
+    """
+
+    faces: IntArray
+    ring_start: IntArray
+    ring: IntArray
+    fan_start: IntArray
+    fan: IntArray
+    rim: BoolArray
+    used: IntArray
+
+    @staticmethod
+    def of(mesh: Mesh) -> Topology:
+        """Return the topology of `mesh`, which must have triangles."""
+        faces = np.array(mesh.faces)
+        count = len(mesh.vertices)
+        flat = faces.ravel()
+        order = np.argsort(flat, kind="stable")
+        fan_start = np.zeros(count + 1, dtype=np.int32)
+        np.cumsum(np.bincount(flat, minlength=count), out=fan_start[1:])
+        edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+        keys = np.unique(np.concatenate([edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]]))
+        ring_start = np.zeros(count + 1, dtype=np.int32)
+        np.cumsum(np.bincount(keys // count, minlength=count), out=ring_start[1:])
+        return Topology(
+            faces,
+            ring_start,
+            (keys % count).astype(np.int32),
+            fan_start,
+            (order // 3).astype(np.int32),
+            boundary_vertices(mesh),
+            np.unique(flat).astype(np.int32),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedModel:
+    """What a fit needs of a model and every fit with it shares.
+
+    Args:
+        model: the shape space.
+        topology: of its surface.
+        tree: of the mean's vertices that some triangle has: entry i is vertex `used[i]` of the topology.
+        modes: (V, 3, K) float32 basis vectors: the rows of the normal equations are made from them.
+        pose: (3V, 7) what a small rotation, translation and scaling do to the mean.
+        pose_in_span: (K, 7) what of that the modes can do.
+    """
+
+    model: ShapeModel
+    topology: Topology
+    tree: KdTree
+    modes: Float32Array
+    pose: FloatArray
+    pose_in_span: FloatArray
+
+
+_PREPARED: weakref.WeakKeyDictionary[ShapeModel, PreparedModel] = weakref.WeakKeyDictionary()
+
+
+def prepare(model: ShapeModel) -> PreparedModel:
+    """Return `model` ready for the robust fit; it is prepared once and then kept as long as the model lives.
+
+    Raises:
+        InputError: it has no triangles, so it has no normals.
+    """
+    if model not in _PREPARED:
+        if model.faces is None:
+            raise InputError(
+                "The robust method needs a model with triangles; this one has none, so use --method paper."
+            )
+        modes = np.ascontiguousarray(model.vertex_basis.reshape(model.n_vertices, 3, -1), dtype=np.float32)
+        pose = small_poses(model.mean_vertices)
+        topology = Topology.of(model.mesh())
+        tree = KdTree(model.mean_vertices[topology.used])
+        _PREPARED[model] = PreparedModel(model, topology, tree, modes, pose, model.vertex_basis.T @ pose)
+    return _PREPARED[model]
+
+
+@dataclass(frozen=True, eq=False)
+class ModelSurface:
+    """A surface on the model's triangles, in the model's frame.
+
+    Args:
+        topology: its triangles.
+        vertices: (V, 3) mm.
+        normals: (V, 3) unit normals of the vertices.
+        modes: (V, 3, K) float32 in which it deforms; K is 0 where it is moved vertex by vertex.
+    """
+
+    topology: Topology
+    vertices: FloatArray
+    normals: FloatArray
+    modes: Float32Array
+
+    @staticmethod
+    def of(topology: Topology, vertices: FloatArray, modes: Float32Array | None = None) -> ModelSurface:
+        """Return the surface with these vertices (V, 3) mm, and the normals that follow from them."""
+        normals = np.empty_like(vertices)
+        normals_into(vertices, topology.faces, normals)
+        modes = np.empty((len(vertices), 3, 0), dtype=np.float32) if modes is None else modes
+        return ModelSurface(topology, vertices, normals, modes)
+
+    def vertex_tree(self) -> KdTree:
+        """Return a tree of the vertices that some triangle has: entry i is vertex `used[i]`."""
+        return KdTree(self.vertices[self.topology.used])
+
+    def closest(
+        self, points: FloatArray, vertex: IntArray, triangle: IntArray
+    ) -> tuple[IntArray, IntArray, FloatArray]:
+        """Find the closest points by walking over the surface from a vertex and a triangle near each.
+
+        Args:
+            points: (M, 3) mm.
+            vertex: (M,) where each walk begins.
+            triangle: (M,) near it; -1 where none is known.
+
+        Returns:
+            (M,) vertex where each walk ends, (M,) triangle of the closest point, (M, 3) barycentric coordinates.
+        """
+        vertex, triangle, weights, t = vertex.copy(), triangle.copy(), np.empty((len(points), 3)), self.topology
+        walk_into(
+            points, vertex, self.vertices, t.faces, t.ring_start, t.ring, t.fan_start, t.fan, triangle, weights
+        )  # fmt: skip
+        return vertex, triangle, weights
+
+    def meet(
+        self, points: FloatArray, point_normals: FloatArray, triangle: IntArray, weights: FloatArray, *, bulging: bool
+    ) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+        """Return (M,) residuals along the model's normal, distances, cosines of the normals, and what is no rim.
+
+        With `bulging` residuals are from the smooth surface through the corners of each triangle.
+        """
+        residual, distance, cosine = np.empty(len(points)), np.empty(len(points)), np.empty(len(points))
+        covered = np.empty(len(points), dtype=np.bool_)
+        meet_into(
+            points, point_normals, triangle, weights, self.vertices, self.normals, self.topology.faces,
+            self.topology.rim, residual, distance, cosine, covered,
+        )  # fmt: skip
+        if bulging:
+            less_sag(triangle, weights, self.vertices, self.normals, self.topology.faces, residual)
+        return residual, distance, cosine, covered
+
+
+@dataclass(frozen=True, eq=False)
+class LinearShape:
+    """A linear shape model on fixed triangles (eq 1).
+
+    Args:
+        topology: of all of them.
+        mean: (V, 3) mm.
+        modes: (V, 3, K) float32.
+    """
+
+    topology: Topology
+    mean: FloatArray
+    modes: Float32Array
+
+    def surface(self, b: FloatArray) -> ModelSurface:
+        """Return the surface with coefficients `b` (k,) mm of the first k modes (eq 1)."""
+        k = len(b)
+        flat = self.modes.reshape(-1, self.modes.shape[2])
+        offset = (flat if k == flat.shape[1] else flat[:, :k]) @ b.astype(np.float32)
+        return ModelSurface.of(self.topology, self.mean + offset.reshape(-1, 3), self.modes)

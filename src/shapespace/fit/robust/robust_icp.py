@@ -1,0 +1,510 @@
+"""Phase 2 as we would do it: pose and shape at once, from both directions, robustly, with the prior.
+
+One step minimises, over a small change of the pose and over the coefficients b, in the model's frame,
+
+    sum_i w_i r_i^2 / sigma^2  +  prior (sum_k b_k^2 / lam_k  +  log(s / s_0)^2 / sd_s^2)
+
+where r_i is how far the model lies from a match along the model's own normal (Chen and Medioni, 1992), and `prior` is
+the weight of what is known beforehand beside that of one match. Matches go both ways: each scan point to the closest
+point of the moving surface, and each model vertex to the closest point of the scan. Those on a border, with normals
+that disagree, or far off for the spread of the rest count little or nothing (Zhang, Yao and Deng, PAMI 2022). The
+second term is the prior (Blanz et al., 2004); the third keeps a scale that the scan hardly shows. Few modes are free
+at first and all in the end; where the scan then shows a shape that the model cannot make, the modes of `residual`
+join in, so that what the model lacks does not bend what it has. docs/robust.md derives it; equation numbers are those
+of that page.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass, replace
+from itertools import islice
+
+import numpy as np
+from scipy.linalg import LinAlgError
+
+from shapespace.errors import FitError
+from shapespace.fit.dense.model_span import in_span
+from shapespace.fit.dense.residual_modes import residual_modes
+from shapespace.fit.iteration_state import Fitted, IcpState
+from shapespace.fit.landmark_terms import Marks, worth
+from shapespace.fit.robust.final_matches import FinalMatches
+from shapespace.fit.robust.matching import Gathered, Matcher, Matches, MatchHint, Weights
+from shapespace.fit.robust.normal_equations import Estimate, NormalEquations, Prior, normal_equations
+from shapespace.fit.robust.posterior import (
+    Posterior,
+    covariance_of_landmarks,
+    lack_of_new_shapes,
+    new_shapes,
+    posterior,
+)
+from shapespace.fit.robust.prepared_model import LinearShape, ModelSurface, PreparedModel, prepare
+from shapespace.fit.robust.robust_settings import Level, RobustSettings
+from shapespace.fit.robust.weights import spread, tails
+from shapespace.fit.scan_target import ScanTarget
+from shapespace.fit.search.initialisation import Start
+from shapespace.geometry.kdtree import KdTree
+from shapespace.geometry.normals import rms_size
+from shapespace.model.shape_model import ShapeModel
+from shapespace.types import FloatArray, IntArray, Similarity
+
+_MOTION_STRIDE = 7
+_FEWEST_MATCHES = 30
+_FLICKER = 10.0
+_CLEARLY_BETTER = 0.95
+_FARTHEST = 5.0
+_HALF, _LEADING, _NEAR = 0.5, 10, 0.05
+"""A match counts at half weight; so many modes lead; near is this share of the model's size."""
+_LACK_LEFT = 0.5
+"""Of the variance outside the model, so that landmarks lie within their standard deviations (docs/landmarks.md)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Iterate:
+    """Current state of the fit.
+
+    Args:
+        estimate: pose and coefficients.
+        surface: of the model, with these coefficients (eq 1).
+    """
+
+    estimate: Estimate
+    surface: ModelSurface
+
+    @property
+    def T_scan_model(self) -> Similarity:
+        """From the model's frame to the scan's mm frame."""
+        return self.estimate.T_scan_model
+
+    @property
+    def b(self) -> FloatArray:
+        """Coefficients (K,), mm."""
+        return self.estimate.b
+
+
+@dataclass(frozen=True, eq=False)
+class WeightedMatches:
+    """Matches of an iterate with their weights.
+
+    Args:
+        matches: both ways.
+        weights: of the matches.
+        sigma_mm: spread of their residuals.
+    """
+
+    matches: Matches
+    weights: Weights
+    sigma_mm: float
+
+    @property
+    def rms_mm(self) -> float:
+        """RMS closest distance of the sampled vertices of the model, mm of the model's frame."""
+        return float(np.sqrt((self.matches.vertices.distance**2).mean()))
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One Gauss-Newton step.
+
+    Args:
+        weighted: the matches that the step used.
+        iterate: where it led.
+        motion_mm: largest movement of a vertex, mm of the model's frame.
+    """
+
+    weighted: WeightedMatches
+    iterate: Iterate
+    motion_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """The constants of the fit.
+
+    Args:
+        prepared: the model.
+        target: the scan.
+        settings: of the method.
+        prior: of pose and shape.
+        shape: the surfaces that the coefficients give.
+        marks: landmarks, if any.
+    """
+
+    prepared: PreparedModel
+    target: ScanTarget
+    settings: RobustSettings
+    prior: Prior
+    shape: LinearShape
+    marks: Marks | None = None
+
+    @staticmethod
+    def of(
+        prepared: PreparedModel, target: ScanTarget, settings: RobustSettings, start_scale: float, *, with_scale: bool,
+        marks: Marks | None = None,
+    ) -> Problem:  # fmt: skip
+        """Return the problem with the model's own modes."""
+        prior = Prior(prepared.model.stddev, settings.prior, start_scale, settings.scale_stddev if with_scale else 0.0)
+        shape = LinearShape(prepared.topology, prepared.model.mean_vertices, prepared.modes)
+        return Problem(prepared, target, settings, prior, shape, marks)
+
+    def with_residual_modes(self) -> Problem:
+        """Return the problem with the residual modes as well, which `beyond_prior` weighs."""
+        prepared, s = self.prepared, self.settings
+        extra = residual_modes(prepared.model, s.residual)
+        prior = replace(self.prior, stddev=np.concatenate([self.prior.stddev, extra.stddev]), weight=s.beyond_prior)
+        return replace(self, prior=prior, shape=replace(self.shape, modes=extra.modes))
+
+    def iterate(self, estimate: Estimate) -> Iterate:
+        """Return the iterate with this pose and these coefficients (eq 1)."""
+        return Iterate(estimate, self.shape.surface(estimate.b))
+
+    def matcher(self, level: Level) -> Matcher:
+        """Return the matcher of the points and vertices that `level` samples."""
+        s, target, rng = self.settings, self.target, np.random.default_rng(self.settings.seed)
+        points = target.draw(level.scan_points, rng)
+        vertex = _some(self.prepared.topology.used, level.vertices, rng)
+        engine = target.engine if level.triangles else target.vertex_engine
+        return Matcher.of(target, points, vertex, engine, s.normal_cosine)
+
+    def match(self, matcher: Matcher, iterate: Iterate, hint: MatchHint) -> WeightedMatches:
+        """Return the matches of an iterate with their weights (eqs 4 to 9).
+
+        Raises:
+            FitError: hardly anything matches.
+        """
+        return self.weigh(matcher.match(iterate.surface, iterate.T_scan_model, hint))
+
+    def weigh(self, matches: Matches) -> WeightedMatches:
+        """Return the matches with their weights (eqs 7 to 9).
+
+        Raises:
+            FitError: hardly anything matches.
+        """
+        s = self.settings
+        residual = matches.residuals()
+        if len(residual) < _FEWEST_MATCHES:
+            raise FitError(
+                f"{self.target.mesh.name}: hardly any of it matches the model from this start; give landmarks "
+                "(--landmarks), or check that it shows what the model does."
+            )
+        sigma_mm = max(spread(residual), s.least_spread_mm)
+        width_mm = sigma_mm * min(s.wide, max(s.narrow, s.wide / tails(residual, sigma_mm) ** 2))  # eq 7
+        fineness = min(1.0, len(self.target.mesh.vertices) / len(self.shape.mean))
+        weights = matches.weights(
+            s.weight, width_mm, s.reach * width_mm + s.reach_mm, s.vertex_share * fineness**2
+        )  # eqs 8, 9
+        return WeightedMatches(matches, weights, sigma_mm)
+
+    def equations(self, weighted: WeightedMatches, iterate: Iterate, modes: int) -> tuple[Gathered, NormalEquations]:
+        """Return what each vertex carries of the matches, and the normal equations of a step (eqs 10 to 14)."""
+        surface = iterate.surface
+        gathered = weighted.matches.gathered(weighted.weights, self.prepared.topology.faces, len(surface.vertices))
+        equations = normal_equations(surface, gathered, self.prior, weighted.sigma_mm, iterate.estimate, modes)
+        if self.marks is None:
+            return gathered, equations
+        hessian, gradient = self.marks.equations(surface, iterate.T_scan_model, modes)
+        weights = weighted.weights
+        gain = weighted.sigma_mm**2 * worth(float(weights.points.sum() + weights.vertices.sum()))
+        return gathered, replace(equations, gradient=equations.gradient + gain * gradient, marks=gain * hessian)
+
+    def step(self, matcher: Matcher, iterate: Iterate, hint: MatchHint, modes: int) -> Step:
+        """Return one Gauss-Newton step on the pose and the first `modes` coefficients.
+
+        Raises:
+            FitError: hardly anything matches, or the fit diverged.
+        """
+        weighted = self.match(matcher, iterate, hint)  # eqs 4 to 9
+        _, equations = self.equations(weighted, iterate, modes)  # eqs 10 to 14
+        try:
+            delta = equations.step()  # eq 15
+        except LinAlgError as error:
+            raise FitError(
+                f"{self.target.mesh.name}: the fit diverged; give landmarks (--landmarks), or crop the scan to "
+                "what the model shows (--crop)."
+            ) from error
+        estimate = iterate.estimate.moved_by(delta)  # eq 16
+        # Without free modes the shape stays as it is.
+        following = self.iterate(estimate) if modes else replace(iterate, estimate=estimate)
+        some = slice(None, None, _MOTION_STRIDE)
+        before = iterate.T_scan_model.apply(iterate.surface.vertices[some])
+        moved = estimate.T_scan_model.apply(following.surface.vertices[some]) - before
+        return Step(weighted, following, float(np.linalg.norm(moved, axis=1).max()) / estimate.T_scan_model.scale)
+
+    def descent(self, matcher: Matcher, iterate: Iterate, hint: MatchHint, level: Level) -> Generator[Step]:
+        """Yield steps with the modes that are free on `level`, until hardly anything moves.
+
+        Raises:
+            FitError: hardly anything matches, or the fit diverged.
+        """
+        modes = level.free(len(iterate.b))
+        for _ in range(level.iterations):
+            step = self.step(matcher, iterate, hint, modes)
+            iterate, hint = step.iterate, step.weighted.matches.hint
+            yield step
+            if step.motion_mm < level.stop_motion_mm:
+                return
+
+    def unexplained_variance(self, weighted: WeightedMatches) -> float:
+        """Return the variance, mm^2, of the part of the residuals that is not noise (eq 17)."""
+        return weighted.matches.unexplained_variance(
+            weighted.weights, self.prepared.topology.faces, len(self.shape.mean), self.settings.seed
+        )
+
+    def in_model(self, iterate: Iterate, surface_mm: float, modes: int) -> Estimate:
+        """Return the pose and the first `modes` of the model's own coefficients of an iterate (eqs 18 and 19).
+
+        Args:
+            iterate: of the fit, with residual modes or without.
+            surface_mm: uncertainty of its surface, RMS over the vertices.
+            modes: number of coefficients.
+        """
+        own = self.prepared.model.n_modes
+        if len(iterate.b) == modes == own:
+            return iterate.estimate
+        return in_span(
+            self.prepared, iterate.surface.vertices, iterate.estimate, np.sqrt(new_shapes(self.prepared.model)),
+            surface_mm, modes, with_scale=not self.prior.holds_scale,
+        )  # fmt: skip
+
+    def mismatch_mm(self, matches: Matches) -> float:
+        """Return the mean distance in both directions, mm, each distance cut at the reach."""
+        most = _FARTHEST * self.settings.reach_mm
+        return sum(float(np.minimum(way.distance, most).mean()) for way in (matches.points, matches.vertices))
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """Where the iterations of the levels led.
+
+    Args:
+        iterate: the last one.
+        state: of it, which is not yielded yet.
+        matcher: of the last level.
+        hint: for its next search.
+    """
+
+    iterate: Iterate
+    state: IcpState
+    matcher: Matcher
+    hint: MatchHint
+
+
+def robust_icp(
+    model: ShapeModel,
+    target: ScanTarget,
+    start: Start,
+    settings: RobustSettings,
+    *,
+    with_scale: bool = True,
+    modes: int | None = None,
+    max_iterations: int = 500,
+) -> Generator[IcpState, None, Fitted]:
+    """Yield the states of the robust fit: phase 1 with the pose alone, phase 2 with pose and shape together.
+
+    Args:
+        model: the shape space, with triangles.
+        target: the scan.
+        start: a pose of the mean near the scan, and coefficients where it has some.
+        settings: of the method.
+        with_scale: False holds the scale of the start.
+        modes: how many coefficients to report; None for all. The fit uses all in any case: modes left out of the fit
+            bend those that stay.
+        max_iterations: cap of each phase.
+
+    Raises:
+        InputError: the model has no triangles.
+        FitError: hardly anything matches, or the fit diverged.
+    """
+    scale = start.T_scan_model.scale
+    problem = Problem.of(prepare(model), target, settings, scale, with_scale=with_scale, marks=start.marks)
+    course, tree = yield from _coarse_to_fine(problem, start, max_iterations)
+    weighted = problem.match(course.matcher, course.iterate, course.hint)
+    unexplained_mm2 = problem.unexplained_variance(weighted)  # eq 17
+    least_mm2 = max(settings.beyond_share * weighted.sigma_mm**2, settings.beyond_mm**2)
+    if unexplained_mm2 >= least_mm2 and course.state.iteration < max_iterations:
+        problem = problem.with_residual_modes()
+        course = yield from _extended(problem, course, tree, max_iterations)
+        weighted = problem.match(course.matcher, course.iterate, course.hint)
+    yield course.state
+    return _summary(problem, course.iterate, weighted, unexplained_mm2, modes)
+
+
+def _coarse_to_fine(
+    problem: Problem, start: Start, max_iterations: int
+) -> Generator[IcpState, None, tuple[Course, KdTree]]:
+    """Fit on all levels with the model's modes; return where that led, and a tree of the vertices for hints."""
+    prepared, levels = problem.prepared, problem.settings.levels
+    iterate = problem.iterate(Estimate(start.T_scan_model, np.zeros(prepared.model.n_modes)))
+    tree, tree_fits, matcher = prepared.tree, False, problem.matcher(levels[0])
+    hint = matcher.first_hint(iterate.surface, iterate.T_scan_model, tree)
+    first = problem.match(matcher, iterate, hint)
+    start_state = IcpState(1, 0, iterate.T_scan_model, iterate.b, first.rms_mm, float("inf"))
+    course = Course(iterate, start_state, matcher, first.matches.hint)
+    for level in levels:
+        begins = level.modes != 0 and course.state.phase == 1
+        if begins:
+            yield replace(course.state, stopped=course.state.stopped or "rate")
+            course = replace(course, state=replace(course.state, phase=2, iteration=0, stopped=None))
+        iterate = course.iterate
+        # The surface changes little from level to level; the walks make up for it.
+        if level.modes is None and not tree_fits:
+            tree, tree_fits = tree.moved(iterate.surface.vertices[prepared.topology.used]), True
+        matcher = problem.matcher(level)
+        hint = matcher.first_hint(iterate.surface, iterate.T_scan_model, tree, first.matches.winding)
+        steps = problem.descent(matcher, iterate, hint, level)
+        course = yield from _states(steps, replace(course, matcher=matcher, hint=hint), level, max_iterations)
+        if begins and len(start.b) and course.state.iteration < max_iterations:
+            course = replace(course, iterate=_preferred(problem, course, start, level, tree))
+    return course, tree
+
+
+def _preferred(problem: Problem, course: Course, start: Start, level: Level, tree: KdTree) -> Iterate:
+    """Return where `level` leads from `start` and its coefficients if that matches clearly better, else the iterate."""
+
+    def mismatch_mm(iterate: Iterate, matcher: Matcher, hint: MatchHint) -> float:
+        return problem.mismatch_mm(matcher.match(iterate.surface, iterate.T_scan_model, hint))
+
+    limit_mm = _CLEARLY_BETTER * mismatch_mm(course.iterate, course.matcher, course.hint)
+    free, b = level.free(len(course.iterate.b)), np.zeros(len(course.iterate.b))
+    b[: min(len(start.b), free)] = start.b[:free]
+    other, matcher = problem.iterate(Estimate(start.T_scan_model, b)), problem.matcher(level)
+    hint = matcher.first_hint(other.surface, other.T_scan_model, tree)
+    for step in problem.descent(matcher, other, hint, level):
+        other, hint = step.iterate, step.weighted.matches.hint
+    return other if mismatch_mm(other, matcher, hint) <= limit_mm else course.iterate
+
+
+def _extended(problem: Problem, course: Course, tree: KdTree, max_iterations: int) -> Generator[IcpState, None, Course]:
+    """Continue with the residual modes of `problem`, whose coefficients begin at zero."""
+    level, own = problem.settings.beyond, course.iterate.b
+    b = np.pad(own, (0, len(problem.prior.stddev) - len(own)))
+    iterate, matcher = problem.iterate(Estimate(course.iterate.T_scan_model, b)), problem.matcher(level)
+    hint = matcher.first_hint(iterate.surface, iterate.T_scan_model, tree, course.hint.winding)
+    steps = problem.descent(matcher, iterate, hint, level)
+    return (yield from _states(steps, Course(iterate, course.state, matcher, hint), level, max_iterations))
+
+
+def _summary(
+    problem: Problem, iterate: Iterate, weighted: WeightedMatches, unexplained_mm2: float, modes: int | None
+) -> Fitted:
+    """Return the result: coefficients of the model, their covariance, regions and evidence.
+
+    Args:
+        problem: of the fit.
+        iterate: the last one.
+        weighted: its matches.
+        unexplained_mm2: variance of the residuals that is not noise, before residual modes joined (eq 17).
+        modes: how many coefficients to report; None for all.
+    """
+    model, target, settings = problem.prepared.model, problem.target, problem.settings
+    gathered, equations = problem.equations(weighted, iterate, len(iterate.b))
+    surface, vertices, T = iterate.surface, weighted.matches.vertices, iterate.T_scan_model
+    beyond_mm = float(np.sqrt(max(unexplained_mm2, 0.0)))
+    try:
+        known = posterior(
+            model, surface, problem.prior, equations, weighted.weights, weighted.sigma_mm,
+            beyond_model_mm=beyond_mm, allowed_share=float(vertices.allowed.mean()),
+        )  # fmt: skip
+    except LinAlgError as error:
+        raise FitError(
+            f"{target.mesh.name}: the matches do not determine the pose; check the scan's unit (--unit), or give "
+            "landmarks (--landmarks)."
+        ) from error
+    # Modes that are not reported are no reason to doubt the fit, so the verdict is on all of them.
+    whole = reported = problem.in_model(iterate, known.surface_mm, model.n_modes)
+    wanted = model.n_modes if modes is None else min(modes, model.n_modes)
+    if wanted < model.n_modes:
+        reported = problem.in_model(iterate, known.surface_mm, wanted)
+    in_model = (T.inverse() @ whole.T_scan_model).apply(model.reconstruct(whole.b))
+    left_out_mm2 = float(((surface.vertices - in_model) ** 2).sum(axis=1).mean())
+    return Fitted(
+        T_scan_model=reported.T_scan_model,
+        b=reported.b,
+        b_stddev=known.b_stddev(wanted),
+        b_covariance=known.b_covariance(wanted),
+        shrinkage=known.shrinkage(wanted),
+        T_scan_fitted=T,
+        vertices_scan_mm=T.apply(surface.vertices),
+        outside_mm=float(np.linalg.norm(iterate.b[wanted:]) / np.sqrt(len(surface.vertices))),
+        regions=FinalMatches(
+            target, T, ModelSurface.of(surface.topology, surface.vertices), weighted.matches.winding,
+            settings.normal_cosine, settings.weight, weighted.weights.width_mm, weighted.weights.far_mm,
+        ),
+        evidence={
+            **_matched(weighted, gathered, iterate, model, known.prior_variance[: model.n_modes]),
+            "beyond_model_mm": beyond_mm,
+            "left_out_mm": float(np.sqrt(left_out_mm2)),
+            "model_spread_mm": float(np.sqrt((model.stddev**2).sum() / model.n_vertices)),
+            "model_lack_mm": lack_of_new_shapes(model),
+            **_of_marks(problem, iterate),
+            "posterior_error_mm": float(np.hypot(known.surface_mm, np.sqrt(left_out_mm2))),
+        },
+        notes=() if problem.marks is None else problem.marks.notes(surface, T),
+        landmark_covariance=_of_landmarks(model, known, surface, T),
+    )  # fmt: skip
+
+
+def _of_marks(problem: Problem, iterate: Iterate) -> dict[str, float]:
+    """Return the standard deviation of landmarks that were given, and how far off they are (RMS), mm of the scan."""
+    if problem.marks is None:
+        return {}
+    off_mm = problem.marks.off_mm(iterate.surface, iterate.T_scan_model)
+    return {"marks_stddev_mm": problem.marks.stddev_mm, "marks_rms_mm": float(np.sqrt((off_mm**2).mean()))}
+
+
+def _of_landmarks(model: ShapeModel, known: Posterior, surface: ModelSurface, T: Similarity) -> FloatArray:
+    """Return the covariance (L, 3, 3) of the model's landmarks in the frame that `T` leads to, mm^2."""
+    covariance = covariance_of_landmarks(known, surface, model.landmarks)
+    # No mode moves a landmark by what new shapes have outside the model, of which the scan shows about a half.
+    covariance += np.eye(3) * _LACK_LEFT * lack_of_new_shapes(model) ** 2 / 3.0
+    return T.scale**2 * T.rotation @ covariance @ T.rotation.T
+
+
+def _matched(
+    weighted: WeightedMatches, gathered: Gathered, iterate: Iterate, model: ShapeModel, variance: FloatArray
+) -> dict[str, float]:
+    """Return how much of model and scan found a match, and how plausible pose and shape are.
+
+    Args:
+        weighted: matches of the last iterate.
+        gathered: what each vertex carries of them.
+        iterate: the last one.
+        model: the shape space.
+        variance: (K,) of the coefficients of new shapes, mm^2.
+    """
+    points, vertices, v = weighted.matches.points, weighted.matches.vertices, weighted.weights.vertices
+    size_mm, z2 = rms_size(model.mean_vertices), iterate.b[: model.n_modes] ** 2 / variance
+    return {
+        "size_mm": size_mm,
+        "seen_share": float(gathered.seen.mean()),
+        "model_matched_share": float((v > _HALF * v.max()).mean()),
+        "model_allowed_share": float(vertices.allowed.mean()),
+        "scan_allowed_share": float(points.allowed.mean()),
+        "scan_near_share": float((points.distance < _NEAR * size_mm).mean()),
+        "model_near_share": float((vertices.distance < _NEAR * size_mm).mean()),
+        "z2": float(z2.mean()),
+        "z2_leading": float(z2[:_LEADING].mean()),
+        "log_scale": float(np.log(iterate.T_scan_model.scale)),
+        "spread_mm": weighted.sigma_mm,
+    }
+
+
+def _states(
+    steps: Iterator[Step], course: Course, level: Level, max_iterations: int
+) -> Generator[IcpState, None, Course]:
+    """Yield each state when the next one is known; return where the steps led, with the last state."""
+    state = course.state
+    left = max_iterations - state.iteration
+    for step in islice(steps, left):
+        yield replace(state, stopped=None)
+        T, b = step.iterate.T_scan_model, step.iterate.b[: len(state.b)].copy()
+        # Where parts of the scan match now one way and now another, the last bit of motion never ends.
+        still = step.motion_mm < _FLICKER * level.stop_motion_mm
+        stopped = "rate" if still else "cap"
+        state = IcpState(state.phase, state.iteration + 1, T, b, step.weighted.rms_mm, step.motion_mm, stopped)
+        course = replace(course, iterate=step.iterate, hint=step.weighted.matches.hint)
+    return replace(course, state=state if left > 0 else replace(state, stopped="cap"))
+
+
+def _some(index: IntArray, count: int | None, rng: np.random.Generator) -> IntArray:
+    return index if count is None or count >= len(index) else np.sort(rng.choice(index, count, replace=False))

@@ -1,0 +1,152 @@
+"""Where to begin: the scan's unit, and a pose of the model from landmarks or from anywhere.
+
+A start with centroids together holds to about 45 degrees. Beyond that, and where it does not fit clearly, many
+rotations are tried (`any_pose`), and what they reach with the leading modes free is compared both ways.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from shapespace.errors import FitError, InputError
+from shapespace.fit.landmark_terms import Marks
+from shapespace.geometry.similarity import fit_similarity
+from shapespace.model.shape_model import ShapeModel
+from shapespace.types import MM_PER_UNIT, FloatArray, Mesh, Similarity
+
+_SAME_TURN_TRACE = 1 + 2 * np.cos(np.radians(25.0))
+_TYPICAL_COVER = 1.2
+_INCH_IS_RARE = 0.5
+_PLAUSIBLE_COVER = (0.45, 2.6)
+_LIKELIER_BY_FAR = 0.5
+_STANDS_OUT = 0.8
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """A pose to begin from.
+
+    Args:
+        T_scan_model: from the model's frame to the scan's frame in mm.
+        how: `landmarks`, `upright` (no rotation), `rotations` (another of the rotations tried was better), `given`.
+        score_mm: two-way capped distance of the adapted model there, mm of the model; not-a-number for landmarks and
+            `given`.
+        b: (K',) coefficients of the leading modes found there, mm; (0,) where none were.
+        runner_up_score_mm: `score_mm` of the best pose that is another one; infinite where none was tried.
+        alternatives: up to three such other poses, best first, without alternatives of their own.
+        marks: landmarks of the scan that the fit is held to; None without any.
+    """
+
+    T_scan_model: Similarity
+    how: str
+    score_mm: float
+    b: FloatArray = field(default_factory=lambda: np.zeros(0))
+    runner_up_score_mm: float = float("inf")
+    alternatives: tuple[Start, ...] = ()
+    marks: Marks | None = None
+
+
+def start_evidence(start: Start) -> dict[str, float]:
+    """Return what the search for a start says, by name; not a number, or infinite, where nothing was searched."""
+    return {"start_score_mm": start.score_mm, "start_runner_up_score_mm": start.runner_up_score_mm}
+
+
+def find_unit(model: ShapeModel, scan: Mesh) -> str:
+    """Return the unit, a name of `MM_PER_UNIT`, that makes the scan's size most like the model's.
+
+    Where two units are about as likely by size, as centimetres and inches are for a part of a face, the likelier one in
+    which a pose of the model stands out wins, else the one in which the model fits better.
+
+    Raises:
+        FitError: no unit brings the sizes within a factor of five.
+    """
+    ratio = _size(scan.vertices) / _size(model.mean_vertices)
+    with np.errstate(divide="ignore"):
+        penalty = {
+            unit: abs(float(np.log(ratio * mm / _TYPICAL_COVER))) + (_INCH_IS_RARE if unit == "inch" else 0.0)
+            for unit, mm in MM_PER_UNIT.items()
+        }
+    best, second = sorted(penalty, key=lambda name: penalty[name])[:2]
+    if not 0.2 < ratio * MM_PER_UNIT[best] < 5.0:
+        raise FitError(
+            f"{scan.name}: in no unit (um, mm, cm, inch, m) is it of the model's size; give its unit (--unit), or crop "
+            "it to what the model shows (--crop)."
+        )
+    low, high = _PLAUSIBLE_COVER
+    if not low < ratio * MM_PER_UNIT[second] < high or penalty[second] > penalty[best] + _LIKELIER_BY_FAR:
+        return best
+    centred = scan.vertices - np.median(scan.vertices, axis=0)
+    found: dict[str, float] = {}
+    for unit in (best, second):
+        start = start_from_any_pose(model, MM_PER_UNIT[unit] * centred, seed=0)
+        # In a wrong unit no pose stands out from the others.
+        if start.score_mm <= _STANDS_OUT * start.runner_up_score_mm:
+            return unit
+        found[unit] = start.score_mm
+    return min(found, key=lambda unit: found[unit])
+
+
+def start_from_landmarks(
+    model: ShapeModel, scan_landmarks_mm: Mapping[str, FloatArray], scan_name: str, *, with_scale: bool
+) -> Start:
+    """Return the least-squares pose of the model's landmarks on those of the scan that share their names.
+
+    Raises:
+        FitError: the model has no landmarks, or fewer than three names are shared.
+    """
+    if not model.landmarks:
+        raise FitError(
+            f"The model has no landmarks, so those given for {scan_name} cannot be used; leave them out, or build it "
+            "with --landmarks."
+        )
+    names = [name for name in model.landmarks if name in scan_landmarks_mm]
+    if len(names) < 3:
+        raise FitError(
+            f"{scan_name}: only {len(names)} of its landmarks share a name with the model's, and three are needed; "
+            f"the model has {', '.join(list(model.landmarks)[:5])} and so on, the scan "
+            f"{', '.join(list(scan_landmarks_mm)[:5]) or 'none'}."
+        )
+    source = model.landmarks.select(names).interpolate(model.mean_vertices)
+    target = np.stack([scan_landmarks_mm[name] for name in names])
+    try:
+        T = fit_similarity(source, target, with_scale=with_scale)
+    except InputError as error:
+        raise FitError(
+            f"{scan_name}: its landmarks give no pose, since they lie on a line or are not finite; check them."
+        ) from error
+    return Start(T, "landmarks", float("nan"))
+
+
+def start_from_any_pose(
+    model: ShapeModel, scan_vertices_mm: FloatArray, *, seed: int, with_scale: bool | None = None
+) -> Start:
+    """Return the best pose over all rotations, with the leading modes adapted, and the best of the others.
+
+    A scan that clearly fits without a rotation is not searched further. Another rotation wins only when it is clearly
+    better, since scans mostly come upright and some objects look the same from several sides.
+
+    Args:
+        model: what is placed.
+        scan_vertices_mm: (S, 3), at least one.
+        seed: of the subsample that is searched.
+        with_scale: whether the pose has a free scale; None goes by the model's gauge.
+    """
+    from shapespace.fit.search.pose_search import search  # numba takes a while to import
+
+    scaled = model.gauge == "shape" if with_scale is None else with_scale
+    upright, poses = search(model, scan_vertices_mm, with_scale=scaled, seed=seed)
+    turned = [float(np.trace(upright.T_scan_model.rotation @ pose.T_scan_model.rotation.T)) for pose in poses]
+    starts = [
+        Start(pose.T_scan_model, "upright" if trace > _SAME_TURN_TRACE else "rotations", pose.score_mm, pose.b)
+        for pose, trace in zip(poses, turned, strict=True)
+    ]
+    best, others = starts[0], tuple(starts[1:])
+    runner_up = min((other.score_mm for other in others), default=float("inf"))
+    return replace(best, runner_up_score_mm=runner_up, alternatives=others)
+
+
+def _size(points: FloatArray) -> float:
+    return float(np.sqrt(((points - np.median(points, axis=0)) ** 2).sum(axis=1).mean()))

@@ -1,0 +1,364 @@
+"""The search for a pose from nowhere: many rotations coarsely, the best of them with scale and leading modes.
+
+The mean shape alone cannot tell a face from the back of a bald head: what tells them apart is how close, both ways, the
+model comes once its leading modes have adapted. So poses are narrowed down in four steps, each dearer and sharper than
+the one before, and compared by that. Lengths in the settings are shares of the model's size, so any object will do.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from shapespace.fit.search.rigid_search import NearGrid, edge_of, rigid_search
+from shapespace.fit.search.shape_search import ShapePoints, shape_search
+from shapespace.geometry.kdtree import KdTree
+from shapespace.geometry.normals import rms_size, vertex_normals
+from shapespace.model.shape_model import ShapeModel
+from shapespace.types import FloatArray, IntArray, Mesh, Similarity
+
+
+class Step(NamedTuple):
+    """One step of the search.
+
+    Args:
+        points: how many points of each side look for the other.
+        widest: reach of the weights in the first iteration, share of the model's size,
+        narrowest: and in the last,
+        iterations: of these many; the reach falls geometrically.
+        modes: how many modes are free.
+        kept: how many distinct poses go on to the next step.
+    """
+
+    points: int
+    widest: float
+    narrowest: float
+    iterations: int
+    modes: int
+    kept: int
+
+    def reaches(self, size: float) -> FloatArray:
+        """Return the reach in each iteration, mm."""
+        return np.geomspace(self.widest * size, self.narrowest * size, self.iterations)
+
+
+# Chosen on simulated scans of other people than those of the tests.
+GLANCE = Step(points=250, widest=0.3, narrowest=0.04, iterations=14, modes=10, kept=1)
+FLIPS = Step(points=90, widest=0.3, narrowest=0.06, iterations=6, modes=3, kept=1)
+COARSE = Step(points=250, widest=0.5, narrowest=0.1, iterations=10, modes=0, kept=30)
+RIGID = Step(points=500, widest=0.2, narrowest=0.06, iterations=14, modes=0, kept=24)
+MIDDLE = Step(points=200, widest=0.3, narrowest=0.06, iterations=12, modes=3, kept=5)
+FINE = Step(points=400, widest=0.1, narrowest=0.03, iterations=10, modes=10, kept=2)
+LONG = Step(points=400, widest=0.15, narrowest=0.03, iterations=30, modes=10, kept=4)
+ROTATIONS = 96
+
+_MODEL_CELL, _SCAN_CELL = 0.07, 0.04
+_MAX_THINNING_CELLS = 4_000_000
+_RIGID_CAP, _CAP = 0.1, 0.06
+_PRIOR = 10.0
+_SCALE_STDDEV = 0.15
+_SAME_TURN, _SAME_PLACE = math.cos(math.radians(20.0)), 0.3
+_OTHER_TURN = math.cos(math.radians(40.0))
+_CLEARLY_CLOSE, _CLEARLY_BETTER = 0.45, 0.75
+_SURE = 0.85
+_CLEARLY_WORSE, _WORTH = 0.93, 0.05
+_MORE_ROUNDS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """A pose of the adapted model, and how well it fits there.
+
+    Args:
+        T_scan_model: from the model's frame to the scan's, mm.
+        b: (K,) of the leading modes, mm.
+        score_mm: two-way distance, mm of the model, each match counted up to a cap; infinite where nothing fits.
+        covered: share of the model's points that have the scan where they are.
+    """
+
+    T_scan_model: Similarity
+    b: FloatArray
+    score_mm: float
+    covered: float
+
+
+def search(model: ShapeModel, scan_vertices_mm: FloatArray, *, with_scale: bool, seed: int) -> tuple[Pose, list[Pose]]:
+    """Return the pose that begins from no rotation, and distinct poses, best first, from everywhere.
+
+    Where no rotation is clearly right, nothing more than its likeliest confusions is tried; where another one is not
+    clearly better, it comes first.
+
+    Args:
+        model: the shape space.
+        scan_vertices_mm: (S, 3).
+        with_scale: whether the pose has a free scale.
+        seed: of the subsample that is searched.
+    """
+    sides = _Sides.of(model, scan_vertices_mm, with_scale, seed)
+    upright = sides.upright()
+    if sides.is_close(upright):
+        flipped = sides.flips(upright)
+        if upright.score_mm <= _CLEARLY_BETTER * min(pose.score_mm for pose in flipped):
+            return upright, _best_distinct([upright, *flipped])
+    return upright, sides.upright_unless_clearly_worse(upright, sides.everywhere(upright))
+
+
+def refine(
+    model: ShapeModel,
+    scan_vertices_mm: FloatArray,
+    starts: Sequence[Similarity],
+    *,
+    with_scale: bool,
+    step: Step = LONG,
+    seed: int = 0,
+) -> list[Pose]:
+    """Return the poses after one step of the search from each of `starts`, in their order.
+
+    Args:
+        model: the shape space.
+        scan_vertices_mm: (S, 3).
+        starts: from the model's frame to the scan's, mm.
+        with_scale: whether the pose has a free scale.
+        step: of the search.
+        seed: of the subsample that is searched.
+    """
+    sides = _Sides.of(model, scan_vertices_mm, with_scale, seed)
+    return [sides.refined(step, T.rotation, T.translation, T.scale) for T in starts]
+
+
+def _score(pose: Pose) -> float:
+    return pose.score_mm
+
+
+@dataclass(frozen=True, eq=False)
+class _ModelSide:
+    """What the search needs of a model; kept while the model lives."""
+
+    size: float
+    spacing: float
+    shapes: dict[int, ShapePoints]
+    grid: NearGrid
+    outward: FloatArray
+    front: float
+    axes: FloatArray
+
+    @staticmethod
+    def of(model: ShapeModel) -> _ModelSide:
+        mean = np.array(model.mean_vertices)
+        size = rms_size(mean)
+        chosen = np.random.default_rng(0).permutation(_evenly(mean, _MODEL_CELL * size, size))
+        points = np.ascontiguousarray(mean[chosen])
+        normals = _normals(points) if model.faces is None else vertex_normals(Mesh(mean, model.faces))[chosen]
+        tree, shapes = KdTree(points).arrays, dict[int, ShapePoints]()
+        rows = (3 * chosen[:, None] + np.arange(3)).ravel()
+        for modes in {min(step.modes, model.n_modes) for step in (GLANCE, FLIPS, MIDDLE, FINE, LONG)}:
+            basis = np.ascontiguousarray(model.vertex_basis[rows, :modes]).reshape(-1, 3, modes)
+            precision = 1.0 / model.stddev[:modes] ** 2
+            shapes[modes] = ShapePoints(points, np.ascontiguousarray(normals), basis, precision, tree)
+        centre = points.mean(axis=0)
+        # An open shell bulges away from the centre of the sphere that fits it best.
+        columns = np.column_stack([2 * points, np.ones(len(points))])
+        ball = np.asarray(np.linalg.lstsq(columns, (points**2).sum(axis=1), rcond=None)[0], dtype=np.float64)
+        outward = centre - ball[:3]
+        outward = outward / max(float(np.linalg.norm(outward)), 1e-12)
+        return _ModelSide(
+            size=size,
+            spacing=1.2 * _MODEL_CELL * size,
+            shapes=shapes,
+            grid=NearGrid.of(points, size),
+            outward=outward,
+            front=float(np.quantile((points - centre) @ outward, 0.95)),
+            axes=np.linalg.eigh((points - centre).T @ (points - centre))[1].T,
+        )
+
+    @property
+    def points(self) -> FloatArray:
+        return next(iter(self.shapes.values())).points
+
+
+_MODEL_SIDES: WeakKeyDictionary[ShapeModel, _ModelSide] = WeakKeyDictionary()
+
+
+@dataclass(frozen=True, eq=False)
+class _Sides:
+    """A model and a scan to be brought together."""
+
+    model: _ModelSide
+    scan: FloatArray
+    tree: KdTree
+    slack: FloatArray
+    with_scale: bool
+
+    @staticmethod
+    def of(model: ShapeModel, scan_mm: FloatArray, with_scale: bool, seed: int) -> _Sides:
+        side = _MODEL_SIDES.get(model)
+        if side is None:
+            side = _MODEL_SIDES[model] = _ModelSide.of(model)
+        scan_mm = np.array(scan_mm)
+        cell = _SCAN_CELL * side.size
+        scan = np.array(scan_mm[np.random.default_rng(seed).permutation(_evenly(scan_mm, cell, side.size))])
+        # A surface crosses about 1.5 cells per squared edge, so the coarser count tells the area.
+        spacing = 2 * cell * math.sqrt(len(_evenly(scan, 2 * cell, side.size)) / 1.5 / len(scan))
+        slack = np.array([1.5 * max(spacing, 0.5 * side.spacing), 1.2 * side.spacing])
+        return _Sides(side, scan, KdTree(scan), slack, with_scale)
+
+    def upright(self) -> Pose:
+        """Return the better of two poses without rotation: centres together, or the outermost parts."""
+        R, t = self._placed(np.eye(3)[None])
+        pose = self.refined(GLANCE, R[0], t[0])
+        return pose if self.is_close(pose) else min(pose, self.refined(GLANCE, R[1], t[1]), key=_score)
+
+    def is_close(self, pose: Pose) -> bool:
+        """Return whether the model fits so well there that it is worth asking whether anything else fits better."""
+        return pose.score_mm <= _CLEARLY_CLOSE * _CAP * self.model.size
+
+    def flips(self, pose: Pose) -> list[Pose]:
+        """Return the poses turned by half a turn about each axis of the model: what it is likeliest mistaken for."""
+        out: list[Pose] = []
+        T, centre = pose.T_scan_model, self.model.points.mean(axis=0)
+        for axis in self.model.axes:
+            R = T.rotation @ (2 * np.outer(axis, axis) - np.eye(3))
+            out.append(self.refined(FLIPS, R, T.apply(centre) - T.scale * R @ centre, T.scale))
+        return out
+
+    def everywhere(self, upright: Pose) -> list[Pose]:
+        """Return distinct poses, best first, of a search over all rotations."""
+        grid, size = NearGrid.of(self.scan, self.model.size), self.model.size
+        R, t = self._placed(_even_rotations(ROTATIONS))
+        T = upright.T_scan_model
+        R, t = np.concatenate([T.rotation[None], R]), np.concatenate([T.translation[None], t])
+        for step in (COARSE, RIGID):
+            R, t, score = rigid_search(
+                R, t, self.model.points[: step.points], self.scan[: step.points], self.model.grid, grid,
+                step.reaches(size), _RIGID_CAP * size,
+            )  # fmt: skip
+            order = np.argsort(score)
+            kept = order[_distinct_rows(R[order], t[order], step.kept, _SAME_TURN, _SAME_PLACE * size)]
+            R, t = R[kept], t[kept]
+        coarse = sorted((self.refined(MIDDLE, *start) for start in zip(R, t, strict=True)), key=_score)
+        coarse = _distinct(coarse, len(coarse), _SAME_TURN)
+        poses = [self._again(FINE, pose) for pose in coarse[: MIDDLE.kept]]
+        poses = sorted([upright, *poses], key=_score)
+        poses = [self._again(LONG, pose) for pose in poses[: FINE.kept]] + poses[FINE.kept :]
+        found = _best_distinct(poses)
+        if not _is_sure(found):
+            late = coarse[MIDDLE.kept : 2 * MIDDLE.kept]
+            poses = poses[: FINE.kept] + [self._again(LONG, pose) for pose in [*poses[FINE.kept :], *late]]
+            found = _best_distinct(poses)
+        # A large part missing lets the model slide for long before it locks in.
+        for _ in range(_MORE_ROUNDS):
+            if _is_sure(found):
+                break
+            found = _best_distinct([self._again(LONG, pose) for pose in found[: FINE.kept]] + found[FINE.kept :])
+        return found
+
+    def upright_unless_clearly_worse(self, upright: Pose, found: list[Pose]) -> list[Pose]:
+        """Return `found` with the pose nearest to `upright` first, unless the best is clearly better."""
+        limit = max(found[0].score_mm / _CLEARLY_WORSE, found[0].score_mm + _WORTH * _CAP * self.model.size)
+        near = [pose for pose in found if len(_distinct([upright, pose], 2, _SAME_TURN)) == 1]
+        first = min([upright, *near], key=_score)
+        if first.score_mm > limit:
+            return found
+        return _distinct([first, *found], LONG.kept, _OTHER_TURN)
+
+    def _placed(self, rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return two poses for each of `rotations` (N, 3, 3): centres together, and the model's front at the scan's."""
+        centre, towards = self.scan.mean(axis=0), rotations @ self.model.outward
+        translation = centre - rotations @ self.model.points.mean(axis=0)
+        ahead = np.quantile((self.scan[:1000] - centre) @ towards.T, 0.95, axis=0) - self.model.front
+        return np.concatenate([rotations, rotations]), np.concatenate(
+            [translation, translation + ahead[:, None] * towards]
+        )
+
+    def _again(self, step: Step, pose: Pose) -> Pose:
+        T = pose.T_scan_model
+        return self.refined(step, T.rotation, T.translation, T.scale, pose.b)
+
+    def refined(
+        self, step: Step, R: FloatArray, t: FloatArray, scale: float = 1.0, b: FloatArray | None = None
+    ) -> Pose:
+        """Return the pose after `step`, from a pose and the coefficients `b` of the leading modes."""
+        begun = Similarity(scale, R, t)
+        shape = self.model.shapes[min(step.modes, max(self.model.shapes))]
+        R, t, out = np.array(R), np.array(t), np.empty(3)
+        free = np.zeros(len(shape.precision))
+        if b is not None:
+            free[: len(b)] = b[: len(free)]
+        counts = np.array([min(step.points, len(shape.points)), min(step.points, len(self.scan))], dtype=np.int32)
+        try:
+            scale = shape_search(
+                R, t, scale, free, shape, self.scan, self.tree.arrays, counts, step.reaches(self.model.size), _PRIOR,
+                1.0 / _SCALE_STDDEV**2 if self.with_scale else math.inf, self.slack, _CAP * self.model.size, out,
+            )  # fmt: skip
+        except np.linalg.LinAlgError:
+            return Pose(begun, np.zeros(len(free)), math.inf, 0.0)
+        return Pose(Similarity(scale, R, t), free, 0.5 * float(out[0] + out[1]), float(out[2]))
+
+
+def _best_distinct(poses: Sequence[Pose]) -> list[Pose]:
+    return _distinct(sorted(poses, key=_score), LONG.kept, _OTHER_TURN)
+
+
+def _is_sure(found: Sequence[Pose]) -> bool:
+    return len(found) < 2 or found[0].score_mm <= _SURE * found[1].score_mm
+
+
+def _distinct(poses: Sequence[Pose], limit: int, same_turn: float) -> list[Pose]:
+    """Return up to `limit` of `poses`, without those that turn as an earlier one does."""
+    R = np.stack([pose.T_scan_model.rotation for pose in poses])
+    return [poses[i] for i in _distinct_rows(R, np.zeros((len(R), 3)), limit, same_turn, math.inf)]
+
+
+def _distinct_rows(R: FloatArray, t: FloatArray, limit: int, same_turn: float, same_place: float) -> list[int]:
+    cosine = 0.5 * (R.reshape(-1, 9) @ R.reshape(-1, 9).T - 1.0)
+    kept: list[int] = []
+    for i in range(len(R)):
+        near = np.linalg.norm(t[kept] - t[i], axis=1) <= same_place
+        if not (near & (cosine[i, kept] >= same_turn)).any():
+            kept.append(i)
+            if len(kept) == limit:
+                break
+    return kept
+
+
+def _evenly(points: FloatArray, cell: float, size: float) -> IntArray:
+    """Return the indices of one point for each cell of edge `cell`; lone points far outside are left out."""
+    columns = np.ascontiguousarray(points.T)
+    low, high = np.quantile(columns[:, :: max(1, len(points) // 4000)], [0.005, 0.995], axis=1)
+    low, high = np.maximum(columns.min(axis=1), low - size), np.minimum(columns.max(axis=1), high + size)
+    cell = max(cell, edge_of(high - low + cell, _MAX_THINNING_CELLS))
+    cells, dims = np.rint((columns - low[:, None]) / cell), np.rint((high - low) / cell) + 1
+    inside = np.flatnonzero(((cells >= 0) & (cells < dims[:, None])).all(axis=0))
+    at = (cells[0] * dims[1] + cells[1])[inside] * dims[2] + cells[2, inside]
+    at = at.astype(np.int64)
+    holder = np.empty(int(dims.prod()), dtype=np.int64)
+    holder[at] = inside
+    return inside[holder[at] == inside].astype(np.int32)
+
+
+def _normals(points: FloatArray) -> FloatArray:
+    """Return the directions (N, 3) in which the neighbourhoods of `points` are thinnest."""
+    _, near = cKDTree(points).query(points, k=min(9, len(points)))
+    around = points[np.asarray(near).reshape(len(points), -1)]
+    around = around - around.mean(axis=1, keepdims=True)
+    return np.linalg.eigh(around.transpose(0, 2, 1) @ around)[1][:, :, 0]
+
+
+def _even_rotations(count: int) -> FloatArray:
+    """Return (count, 3, 3) rotations spread evenly over SO(3): super-Fibonacci spirals (Alexa, CVPR 2022)."""
+    s = np.arange(count) + 0.5
+    inner, outer = np.sqrt(s / count), np.sqrt(1 - s / count)
+    alpha, beta = 2 * np.pi * s / math.sqrt(2), 2 * np.pi * s / 1.533751168755204288118041
+    x, y, z, w = inner * np.sin(alpha), inner * np.cos(alpha), outer * np.sin(beta), outer * np.cos(beta)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=1) for row in rows], axis=1)

@@ -1,0 +1,219 @@
+"""glTF 2.0 morph targets: a mesh and what each mode adds to it, which Blender, three.js and game engines move."""
+
+from __future__ import annotations
+
+import mmap
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from shapespace.errors import InputError
+from shapespace.formats.facts import KEY, facts_of, json_object, with_facts
+from shapespace.formats.model_parts import LinearModel, Modes
+from shapespace.geometry.normals import vertex_normals
+from shapespace.io.containers.json_files import check_file
+from shapespace.io.files import read_bytes, write_bytes
+from shapespace.io.meshes.gltf_mesh import Morphs, glb_bytes, gltf_bytes, read_morphs
+from shapespace.io.read_limits import LARGEST_MESH_FILE_BYTES
+from shapespace.types import FloatArray, IntArray, Mesh
+
+_MM: Final = 1000.0
+"""In one unit of glTF, which is a metre."""
+_AGAIN = "export it again"
+_TARGETS = b'"targets"'
+_FLOAT, _INDEX = 5126, 5125
+_VERTICES, _TRIANGLES = 34962, 34963
+_POINT_CLOUD, _SURFACE = 0, 4
+_IDENTITY = re.compile(r"identity[ _.-]?\d+", re.IGNORECASE)
+_FAR = 16.0
+"""Times its own size; from there on single precision is too coarse, so that the centre goes into the node."""
+
+
+class Gltf:
+    """A mesh with morph targets, `.glb` or `.gltf`: a weight of one is one standard deviation."""
+
+    name = "gltf"
+    title = "glTF morph targets"
+    suffixes: Sequence[str] = (".glb", ".gltf")
+
+    def recognises(self, path: Path, head: bytes) -> bool:
+        """Whether it is glTF and speaks of morph targets."""
+        if path.suffix.lower() not in self.suffixes or not path.is_file():
+            return False
+        try:
+            with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+                if head[:4] == b"glTF":
+                    return content.find(_TARGETS, 20, 20 + int.from_bytes(head[12:16], "little")) >= 0
+                return content.find(_TARGETS) >= 0
+        except (OSError, ValueError):
+            return False
+
+    def read(self, path: Path) -> LinearModel:
+        """As `ModelReader.read`."""
+        check_file(path, LARGEST_MESH_FILE_BYTES, _AGAIN)
+        found = read_morphs(read_bytes(path, LARGEST_MESH_FILE_BYTES), path)
+        facts = json_object(json_object(found.extras).get(KEY))
+        mean, faces = found.vertices, None if found.faces is None else found.faces.astype(np.int32)
+        moved = found.targets.reshape(len(found.targets), -1).T
+        notes: list[str] = []
+        if facts.get("vertices") != len(mean):
+            mean, moved, faces, merged = _without_seams(mean, moved, faces)
+            if merged:
+                notes.append(f"{merged} vertices that lie and move with another, as seams have them, are joined to it.")
+        if found.n_others:
+            notes.append(f"{found.n_others} more meshes of the scene are left out.")
+        if any(found.weights):
+            notes.append("Its weights are not zero; the mean is the shape without them.")
+        if not facts:
+            notes.append("A weight of one is taken as one standard deviation.")
+        shape, expression = _parted(moved, found, facts.get("n_identity"))
+        return with_facts(
+            LinearModel(
+                mean=mean,
+                shape=shape,
+                expression=expression,
+                faces=faces,
+                mm=_MM,
+                licence=found.copyright,
+                notes=tuple(notes),
+            ),
+            facts,
+        )
+
+    def write(self, model: LinearModel, path: Path) -> Sequence[str]:
+        """As `ModelFormat.write`; single precision, metres, normals of mean and targets."""
+        tree, binary = _content(model, path)
+        write_bytes(path, (gltf_bytes if path.suffix.lower() == ".gltf" else glb_bytes)(tree, binary))
+        said = [
+            "Lengths are in metres, as glTF demands, and numbers in single precision.",
+            "A weight of one is one standard deviation; weights run both ways, so widen the sliders to -3 to 3.",
+        ]
+        if model.faces is None:
+            said.append("It is a point model, so there are no normals.")
+        return said
+
+
+def _without_seams(
+    mean: FloatArray, moved: FloatArray, faces: IntArray | None
+) -> tuple[FloatArray, FloatArray, IntArray | None, int]:
+    """Return them with vertices joined that are equal in all, and how many that were; in order of first appearance."""
+    if faces is None:
+        return mean, moved, faces, 0
+    n = len(mean)
+    rows = np.ascontiguousarray(np.concatenate([mean, moved.reshape(n, -1)], axis=1) + 0.0)
+    whole = rows.view([("", np.void, rows.shape[1] * 8)]).ravel()
+    _, first, where = np.unique(whole, return_index=True, return_inverse=True)
+    if len(first) == n:
+        return mean, moved, faces, 0
+    order = np.argsort(first)
+    rank = np.empty(len(first), dtype=np.int32)
+    rank[order] = np.arange(len(first), dtype=np.int32)
+    kept = first[order]
+    joined = rank[where.reshape(-1)[faces]]
+    flat = (joined[:, 0] == joined[:, 1]) | (joined[:, 1] == joined[:, 2]) | (joined[:, 2] == joined[:, 0])
+    columns = moved.reshape(n, 3, -1)[kept].reshape(3 * len(kept), -1)
+    return mean[kept], columns, joined[~flat], n - len(kept)
+
+
+def _parted(moved: FloatArray, found: Morphs, n_identity: object) -> tuple[Modes, Modes | None]:
+    """Return the modes of identity and of expression, or all of them and None."""
+    k = moved.shape[1]
+    identity = [bool(_IDENTITY.fullmatch(name)) for name in found.names]
+    if not identity and isinstance(n_identity, int):
+        identity = [number < n_identity for number in range(k)]
+    if not 0 < sum(identity) < k:
+        return Modes(moved, found.names), None
+    chosen = [[number for number in range(k) if identity[number] is part] for part in (True, False)]
+    names = [tuple(found.names[number] for number in part) if found.names else () for part in chosen]
+    return Modes(moved[:, chosen[0]], names[0]), Modes(moved[:, chosen[1]], names[1])
+
+
+def target_names(model: LinearModel) -> list[str]:
+    """Return a name for each mode, those of identity before those of expression."""
+    if model.expression is None:
+        return list(model.shape.names) or [f"mode {k + 1}" for k in range(model.shape.moved.shape[1])]
+    identity = [f"identity {k + 1}" for k in range(model.shape.moved.shape[1])]
+    count = model.expression.moved.shape[1]
+    return identity + (list(model.expression.names) or [f"expression {k + 1}" for k in range(count)])
+
+
+def _content(model: LinearModel, path: Path) -> tuple[dict[str, Any], bytes]:
+    scale = (model.mm or 1.0) / _MM
+    mean = model.mean * scale
+    blocks = [model.shape] if model.expression is None else [model.shape, model.expression]
+    moved = np.concatenate([block.moved for block in blocks], axis=1) * scale
+    low, high = mean.min(axis=0), mean.max(axis=0)
+    far = bool(np.abs([low, high]).max() > _FAR * float((high - low).max()))
+    centre = (low + high) / 2 if far else np.zeros(3)
+    buffer = _Buffer()
+    attributes = {"POSITION": buffer.vectors(mean - centre)}
+    steps = [column.reshape(-1, 3) for column in moved.T]
+    targets = [{"POSITION": buffer.vectors(step)} for step in steps]
+    primitive: dict[str, Any] = {"attributes": attributes, "targets": targets, "mode": _POINT_CLOUD}
+    if model.faces is not None:
+        attributes["NORMAL"] = buffer.vectors(_normals(mean, model.faces, upright=True), bounds=False)
+        for target, step in zip(targets, steps, strict=True):
+            # As much to either side, since weights run both ways.
+            turned = (_normals(mean + step, model.faces) - _normals(mean - step, model.faces)) / 2
+            target["NORMAL"] = buffer.vectors(turned, bounds=False)
+        primitive |= {"mode": _SURFACE, "indices": buffer.indices(model.faces)}
+    if not buffer.is_finite:
+        raise InputError(f"{path} cannot be written: glTF is of single precision, and the model is too large for it.")
+    node: dict[str, Any] = {"mesh": 0, "name": path.stem}
+    if far:
+        node["translation"] = centre.tolist()
+    extras = {"targetNames": target_names(model), KEY: facts_of(model)}
+    asset = {"version": "2.0", "generator": "shapespace"}
+    if model.licence:
+        asset["copyright"] = model.licence
+    return {
+        "asset": asset,
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [node],
+        "meshes": [{"name": path.stem, "primitives": [primitive], "weights": [0.0] * len(targets), "extras": extras}],
+        "accessors": buffer.accessors,
+        "bufferViews": buffer.views,
+    }, b"".join(buffer.parts)
+
+
+def _normals(vertices: FloatArray, faces: IntArray, *, upright: bool = False) -> FloatArray:
+    normals = vertex_normals(Mesh(vertices, faces))
+    if upright:
+        # glTF asks for unit vectors, also where no triangle gives one.
+        normals[~normals.any(axis=1)] = (0.0, 0.0, 1.0)
+    return normals
+
+
+class _Buffer:
+    """The numbers of a file, and where each array lies."""
+
+    def __init__(self) -> None:
+        self.parts: list[bytes] = []
+        self.views: list[dict[str, Any]] = []
+        self.accessors: list[dict[str, Any]] = []
+        self.is_finite = True
+        self._at = 0
+
+    def vectors(self, values: FloatArray, *, bounds: bool = True) -> int:
+        """Add (V, 3) vectors and return the number of their accessor; those of positions say their bounds."""
+        with np.errstate(over="ignore"):
+            single = values.astype("<f4")
+        self.is_finite &= bool(np.isfinite(single).all())
+        said = {"min": single.min(axis=0).tolist(), "max": single.max(axis=0).tolist()} if bounds else {}
+        return self._add(single.tobytes(), _VERTICES, {"componentType": _FLOAT, "type": "VEC3", **said}, len(single))
+
+    def indices(self, faces: IntArray) -> int:
+        """Add triangles and return the number of their accessor."""
+        kind = {"componentType": _INDEX, "type": "SCALAR"}
+        return self._add(faces.astype("<u4").tobytes(), _TRIANGLES, kind, faces.size)
+
+    def _add(self, data: bytes, target: int, kind: Mapping[str, Any], count: int) -> int:
+        self.views.append({"buffer": 0, "byteOffset": self._at, "byteLength": len(data), "target": target})
+        self.accessors.append({"bufferView": len(self.views) - 1, "count": count, **kind})
+        self.parts.append(data)
+        self._at += len(data)
+        return len(self.accessors) - 1

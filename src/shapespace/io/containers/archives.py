@@ -1,0 +1,145 @@
+"""Zip archives of arrays, .npz among them, from whoever sent them: no pickles, and memory in proportion to the file."""
+
+from __future__ import annotations
+
+import io
+import math
+import zipfile
+from collections.abc import Callable, Collection, Generator, Mapping
+from pathlib import Path
+from typing import IO, Any, BinaryIO, Final
+
+import numpy as np
+import numpy.typing as npt
+from numpy.lib import format as npy
+
+from shapespace.errors import FileFormatError
+from shapespace.io.containers.json_files import check_file
+from shapespace.io.files import read_error
+
+LARGEST_BYTES: Final = 2**30
+_MOST_MEMBERS = 4096
+_MOST_PACKED = 100
+"""Times its own size that an archive may unpack to; what we write unpacks to a few times."""
+_SMALL = 2**20
+_PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_TOLD = 80
+_PLAIN_KINDS = "biufU"
+_LONGEST_AXIS = 2**31 - 1
+_HEADER_READERS: Final[Mapping[tuple[int, int], Callable[[IO[bytes]], tuple[Any, Any, Any]]]] = {
+    (1, 0): npy.read_array_header_1_0,
+    (2, 0): npy.read_array_header_2_0,
+}
+
+
+def read_arrays(path: Path, again: str, wanted: Collection[str] | None = None) -> dict[str, npt.NDArray[Any]]:
+    """Return the arrays of an .npz file by name.
+
+    Args:
+        path: of the file.
+        again: what a reader can do about a file that is wrong.
+        wanted: names of arrays; others are not looked at. None for all.
+
+    Raises:
+        FileError: it cannot be read.
+        FileFormatError: it is damaged, holds other things than arrays, or unpacks to far more than its size.
+    """
+    check_file(path, LARGEST_BYTES, again)
+    try:
+        with path.open("rb") as stream:
+            return arrays_in(stream, path.stat().st_size, wanted)
+    except OSError as error:
+        raise read_error(path, error) from error
+    except ValueError as error:
+        raise FileFormatError(
+            f"{path} is not an .npz file of arrays, or it is cut short ({error}); {again}."
+        ) from error
+
+
+def arrays_in(stream: BinaryIO, size: int, wanted: Collection[str] | None = None) -> dict[str, npt.NDArray[Any]]:
+    """Return the arrays of an .npz in `stream`, of `size` bytes, by name, those of `wanted` or all.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: as `read_arrays` refuses.
+    """
+    arrays: dict[str, npt.NDArray[Any]] = {}
+    for name, content in _members(stream, size, None if wanted is None else {f"{name}.npy" for name in wanted}):
+        try:
+            arrays[name.removesuffix(".npy")] = npy_array(content)
+        except ValueError as error:
+            raise ValueError(f"{name[:60]!r} in it {error}") from error
+    return arrays
+
+
+def zip_members(stream: BinaryIO, size: int, wanted: Collection[str] | None = None) -> dict[str, bytes]:
+    """Return the members of the archive in `stream`, of `size` bytes, by name, those of `wanted` or all.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is no archive, is damaged, or would unpack to far more than its size.
+    """
+    return dict(_members(stream, size, wanted))
+
+
+def _members(stream: BinaryIO, size: int, wanted: Collection[str] | None) -> Generator[tuple[str, bytes]]:
+    """Yield name and content of each member, so that one at a time is in memory."""
+    try:
+        with zipfile.ZipFile(stream) as archive:
+            infos = archive.infolist()
+            names = [info.filename for info in infos]
+            if len(names) > _MOST_MEMBERS or len(set(names)) != len(names):
+                raise ValueError("it has too many or repeated members")
+            if sum(info.file_size for info in infos) > max(_SMALL, _MOST_PACKED * size):
+                raise ValueError("it would unpack to far more than its size")
+            if any(info.compress_type not in _PACKED for info in infos):
+                raise ValueError("it is packed in a way that we do not use")
+            for name in names:
+                if wanted is None or name in wanted:
+                    yield name, archive.read(name)
+    except OSError:
+        raise
+    except Exception as error:  # a damaged archive may raise anything at all
+        raise ValueError(" ".join(str(error).split())[:_TOLD] or "it is damaged") from error
+
+
+def npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Read the header of a .npy file; all readers of such headers use this function.
+
+    Args:
+        stream: the file, at its first byte; afterwards at the first byte of the numbers.
+
+    Returns:
+        The shape, whether the first axis varies fastest, and the type of the elements.
+
+    Raises:
+        ValueError: the header is damaged, or an axis is not a whole number from 0 to `_LONGEST_AXIS`, as a clause.
+    """
+    try:
+        shape, fortran, dtype = _HEADER_READERS[npy.read_magic(stream)](stream)
+    except Exception as error:  # numpy's own parser of headers may raise anything at all
+        raise ValueError("is not an array") from error
+    # numpy accepts truth values as lengths of axes.
+    if not all(type(length) is int and 0 <= length <= _LONGEST_AXIS for length in shape):
+        raise ValueError("has an axis whose length is not a whole number, is negative or is too large")
+    return tuple(shape), bool(fortran), dtype
+
+
+def npy_array(data: bytes) -> npt.NDArray[Any]:
+    """Return the array in the .npy file `data`, of numbers, truth values or text.
+
+    Raises:
+        ValueError: it is none, or it declares more or less than it holds, as a clause.
+    """
+    stream = io.BytesIO(data)
+    shape, fortran, dtype = npy_header(stream)
+    start = stream.tell()
+    if dtype.kind not in _PLAIN_KINDS or math.prod(shape) * dtype.itemsize != len(data) - start:
+        raise ValueError("is cut short or holds objects, and is not what its header says")
+    # An array without elements takes no memory, but a loop over its longest axis takes time.
+    if len(data) == start and max(shape, default=0) > _SMALL:
+        raise ValueError("is empty and has an axis that is too long")
+    flat: npt.NDArray[Any] = (
+        np.frombuffer(data, dtype, math.prod(shape), start) if len(data) > start else np.empty(0, dtype)
+    )
+    return flat.reshape(shape, order="F" if fortran else "C").copy(order="K")

@@ -1,0 +1,604 @@
+"""Landmarks in and out: named points from the programs that people pick them with."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from shapespace.errors import FileError, FileFormatError, InputError
+from shapespace.io.files import read_bytes, write_text
+from shapespace.io.parsing import damaged, is_number, json_value, xml_root
+from shapespace.io.read_limits import LARGEST_LANDMARK_FILE_BYTES
+from shapespace.io.tables.table_io import as_written, rows_text
+from shapespace.types import FloatArray, SurfaceLandmarks
+
+Pairs = list[tuple[str, FloatArray]]
+# A label names each of its points, so a long one would be there as often as it has points.
+_LONGEST_LABEL = 256
+
+
+@dataclass(frozen=True)
+class LandmarkFormat:
+    """A file format for named points.
+
+    Args:
+        name: what people call it.
+        read: (content, path) -> names and points, in the file's order, names not yet checked.
+        write: names and points -> text.
+    """
+
+    name: str
+    read: Callable[[bytes, Path], Pairs]
+    write: Callable[[Mapping[str, FloatArray]], str]
+
+
+def read_landmarks(path: Path | str) -> dict[str, FloatArray]:
+    """Read named points, in the file's own frame and unit; those marked as absent are left out.
+
+    menpo `.ljson` names groups of points, not points: the points of a label with several are called `label_0`,
+    `label_1`, ... by their position in the label (absent ones count), a label's only point is called as the label,
+    points of no label `point_0`, ... by their position in the file; with several groups, `group_` comes before. 3D
+    Slicer files (`.mrk.json`, `.fcsv`) are returned in LPS, the frame in which Slicer saves meshes: RAS, in which
+    an `.fcsv` is that does not say, is turned by changing the sign of x and y. CSV is `name,x,y,z`, with or without
+    that header, `#` for comments. The points of BU-3DFE (`.bnd`, a vertex number and x y z in each row) have no
+    names: they are called `point_0`, ... by their position in the file, as those of `.tps` are, and of the plain
+    rows `x y z` in `.txt` and `.pts` that have no name before them. Bosphorus (`.lm3`) and scalismo (`.tlms`) name
+    their points.
+
+    Args:
+        path: a file with one of the endings in `LANDMARK_FORMATS` or `READ_ONLY_LANDMARKS`; `.json` is told
+            apart by its content.
+
+    Returns:
+        name -> (3,) float64, in the file's order.
+
+    Raises:
+        FileError: it does not exist, cannot be read, or is longer than `LARGEST_LANDMARK_FILE_BYTES`.
+        FileFormatError: it is not in that format, or has a name twice, numbers that are not finite, or no
+            landmarks at all.
+    """
+    path = Path(path)
+    read = READ_ONLY_LANDMARKS.get(path.suffix.lower()) or _format(path, "read").read
+    pairs = read(_content(path), path)
+    if not pairs:
+        raise damaged(path, "it holds no landmarks")
+    landmarks: dict[str, FloatArray] = {}
+    for name, point in pairs:
+        if not name:
+            raise damaged(path, "it has a landmark without a name, so name them all")
+        if name in landmarks:
+            raise damaged(path, f"it has two landmarks named '{name[:60]}', so rename one")
+        if not np.isfinite(point).all():
+            raise damaged(path, f"landmark '{name[:60]}' has a coordinate that is not finite, so remove it")
+        landmarks[name] = point
+    return landmarks
+
+
+def write_landmarks(path: Path | str, landmarks: Mapping[str, FloatArray]) -> None:
+    """Write named points in the format of the ending of `path`, whole or not at all, exactly.
+
+    3D Slicer files say LPS and mm; a `.json` without `.mrk` is scalismo's; in `.ljson` each point is a label.
+
+    Args:
+        path: the file, with one of the endings in `LANDMARK_FORMATS`.
+        landmarks: name -> (3,) float64; for Slicer in LPS and millimetres.
+
+    Raises:
+        InputError: a point that is not three finite numbers, or a name that is empty.
+        FileFormatError: the ending is unknown.
+        FileError: the folder cannot be written, or the disk is full.
+    """
+    path = Path(path)
+    for name, point in landmarks.items():
+        if not name.strip() or name != name.strip():
+            raise InputError(f"Cannot write {path}: a landmark's name ('{name}') is empty or has outer spaces.")
+        if np.shape(point) != (3,) or not np.isfinite(point).all():
+            raise InputError(f"Cannot write {path}: landmark '{name}' is not three finite numbers.")
+    write_text(path, _format(path, "write").write(landmarks))
+
+
+def read_landmark_indices(path: Path | str) -> dict[str, int]:
+    """Read landmarks given as vertex numbers, from CSV with the header `name,vertex`; `#` for comments.
+
+    Args:
+        path: the file; vertices count from 0.
+
+    Returns:
+        name -> vertex, in the file's order.
+
+    Raises:
+        FileError: it does not exist or cannot be read.
+        FileFormatError: another header, a name twice, or a vertex that is not a whole number from 0.
+    """
+    path = Path(path)
+    rows = csv_rows(_content(path), path)
+    if not _has_vertex_header(rows):
+        raise damaged(path, "it does not start with the header 'name,vertex'")
+    indices: dict[str, int] = {}
+    for row in rows[1:]:
+        if len(row) < 2 or not row[1].isascii() or not row[1].isdecimal() or len(row[1]) > 18:
+            raise damaged(path, f"landmark '{row[0][:60]}' has no vertex number (a whole number from 0)")
+        if not row[0] or row[0] in indices:
+            raise damaged(path, f"it has the name '{row[0][:60]}' twice or empty, so rename it")
+        indices[row[0]] = int(row[1])
+    return indices
+
+
+_CORNER_COLUMNS = (("vertex", "weight"), ("vertex_2", "weight_2"), ("vertex_3", "weight_3"))
+_DISTANCE_COLUMN = "distance_mm"
+
+
+def is_of_vertices(path: Path | str) -> bool:
+    """Return whether a CSV file has the header of landmarks on vertices, `name,vertex`, and not one of points.
+
+    Raises:
+        FileError: it does not exist or cannot be read.
+        FileFormatError: it is empty, or not comma-separated text.
+    """
+    path = Path(path)
+    return _has_vertex_header(csv_rows(_content(path), path))
+
+
+def _has_vertex_header(rows: list[list[str]]) -> bool:
+    return bool(rows) and [cell.lower() for cell in rows[0][:2]] == ["name", "vertex"]
+
+
+def read_surface_landmarks(path: Path | str) -> SurfaceLandmarks:
+    """Read landmarks on surfaces in correspondence, from CSV; `#` for comments.
+
+    The header is `name,vertex`, for landmarks at vertices, or that of `write_surface_landmarks`.
+
+    Args:
+        path: the file; vertices count from 0.
+
+    Raises:
+        FileError: it does not exist or cannot be read.
+        FileFormatError: another header, a name twice, a vertex that is not a whole number from 0, or coordinates that
+            are not barycentric.
+    """
+    path = Path(path)
+    indices = read_landmark_indices(path)
+    rows = csv_rows(_content(path), path)
+    header = [cell.lower() for cell in rows[0]]
+    columns = [name for pair in _CORNER_COLUMNS for name in pair]
+    try:
+        if not set(columns) <= set(header):
+            return SurfaceLandmarks.of(indices)
+        cells = [dict(zip(header, row, strict=False)) for row in rows[1:]]
+        corners = [[_index(row[vertex]) for vertex, _ in _CORNER_COLUMNS] for row in cells]
+        weights = [[float(row[weight]) for _, weight in _CORNER_COLUMNS] for row in cells]
+        distance = [float(row.get(_DISTANCE_COLUMN) or 0.0) for row in cells]
+        return SurfaceLandmarks(
+            tuple(indices), np.reshape(corners, (-1, 3)), np.reshape(weights, (-1, 3)), np.array(distance)
+        )
+    except InputError as error:
+        raise FileFormatError(f"Cannot read {path}: {error}") from error
+    except (KeyError, ValueError, OverflowError) as error:
+        raise damaged(path, "it has a row without three vertices and their weights") from error
+
+
+def _index(cell: str) -> int:
+    if not cell.isascii() or not cell.isdecimal():
+        raise ValueError("not a whole number")
+    return int(cell)
+
+
+def write_surface_landmarks(path: Path | str, landmarks: SurfaceLandmarks) -> None:
+    """Write landmarks on surfaces in correspondence as CSV, exactly, whole or not at all.
+
+    Each row has the vertices of a triangle and their weights, which are barycentric coordinates, the largest first, and
+    how far the given point lay from the surface. Landmarks that are all at vertices are written as `name,vertex`.
+
+    Args:
+        path: the file.
+        landmarks: on the surfaces; vertices count from 0.
+
+    Raises:
+        FileError: the folder cannot be written, or the disk is full.
+    """
+    if landmarks.are_vertices:
+        write_landmark_indices(path, landmarks)
+        return
+    header = ["name", *(name for pair in _CORNER_COLUMNS for name in pair), _DISTANCE_COLUMN]
+    rows = [
+        [name, *(text for pair in zip(corners, weights, strict=True) for text in map(repr, pair)), repr(distance)]
+        for name, corners, weights, distance in zip(
+            landmarks.names,
+            landmarks.corners.tolist(),
+            landmarks.barycentric.tolist(),
+            landmarks.distance_mm.tolist(),
+            strict=True,
+        )
+    ]
+    write_text(Path(path), rows_text([header, *rows]))
+
+
+def write_landmark_indices(path: Path | str, indices: Mapping[str, int]) -> None:
+    """Write landmarks given as vertex numbers, as CSV with the header `name,vertex`, whole or not at all.
+
+    Args:
+        path: the file.
+        indices: name -> vertex, counting from 0.
+
+    Raises:
+        FileError: the folder cannot be written, or the disk is full.
+    """
+    write_text(Path(path), rows_text([["name", "vertex"], *([k, str(int(v))] for k, v in indices.items())]))
+
+
+def _format(path: Path, verb: str) -> LandmarkFormat:
+    # The longest ending first, so that .mrk.json is not taken for .json.
+    for ending in sorted(LANDMARK_FORMATS, key=len, reverse=True):
+        if path.name.lower().endswith(ending):
+            return LANDMARK_FORMATS[ending]
+    endings = [*LANDMARK_FORMATS, *(READ_ONLY_LANDMARKS if verb == "read" else ())]
+    what = "can be read, not written" if path.suffix.lower() in READ_ONLY_LANDMARKS else "is not a landmark format"
+    raise FileFormatError(f"Cannot {verb} {path}: the ending '{path.suffix}' {what}; use one of {', '.join(endings)}.")
+
+
+def _content(path: Path) -> bytes:
+    data = read_bytes(path, LARGEST_LANDMARK_FILE_BYTES)
+    if not data.strip():
+        raise FileFormatError(f"Cannot read {path}: it is empty; export or copy it again.")
+    return data
+
+
+def _point(values: Iterable[Any], what: str, path: Path) -> FloatArray:
+    try:
+        numbers = [float(value) for value in values]
+    except (TypeError, ValueError, OverflowError) as error:
+        raise damaged(path, f"{what} has a coordinate that is not a number") from error
+    if len(numbers) != 3:
+        raise damaged(path, f"{what} has {len(numbers)} coordinates, not 3")
+    return np.array(numbers, dtype=np.float64)
+
+
+def _from_json(read: Callable[[Any, Path], Pairs]) -> Callable[[bytes, Path], Pairs]:
+    """Wrap a reader of parsed JSON: what is missing or of the wrong type there is one clear error here."""
+
+    def wrapped(data: bytes, path: Path) -> Pairs:
+        value = json_value(data, path)
+        try:
+            return read(value, path)
+        except FileError:
+            raise
+        except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError) as error:
+            raise damaged(path, "it is JSON, but not laid out as a landmark file, so export it again") from error
+
+    return wrapped
+
+
+def _ljson(value: Any, path: Path) -> Pairs:
+    version = value["version"]
+    if version == 1:
+        return _ljson_1(value, path)
+    if version == 2:
+        return _ljson_group(value, "", path)
+    if version != 3:
+        raise damaged(path, f"it is LJSON of version {str(version)[:20]}, but only 1 to 3 are known")
+    groups = value["groups"]
+    out: Pairs = []
+    for name, group in groups.items():
+        _label(name, path)
+        out += _ljson_group(group, f"{name}_" if len(groups) > 1 else "", path)
+    return out
+
+
+def _ljson_1(value: Any, path: Path) -> Pairs:
+    out: Pairs = []
+    for group in value["groups"]:
+        points = [entry["point"] for entry in group["landmarks"]]
+        label = _label(group["label"], path)
+        for i, point in enumerate(points):
+            if not _absent(point):
+                name = label if len(points) == 1 else f"{label}_{i}"
+                out.append((name, _point(point, f"landmark '{name[:60]}'", path)))
+    return out
+
+
+def _ljson_group(group: Any, prefix: str, path: Path) -> Pairs:
+    points = group["landmarks"]["points"]
+    names: dict[int, str] = {}
+    for entry in group.get("labels", []):
+        mask, label = entry["mask"], _label(entry["label"], path)
+        for position, index in enumerate(mask):
+            if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index < len(points):
+                raise damaged(path, f"label '{label[:60]}' names a point that is not there")
+            name = label if len(mask) == 1 else f"{label}_{position}"
+            names.setdefault(index, prefix + name)
+    ordered = [*names, *(i for i in range(len(points)) if i not in names)]
+    out: Pairs = []
+    for i in ordered:
+        name = names.get(i, f"{prefix}point_{i}")
+        if not _absent(points[i]):
+            out.append((name, _point(points[i], f"landmark '{name[:60]}'", path)))
+    return out
+
+
+def _label(value: Any, path: Path) -> str:
+    label = str(value)
+    if len(label) > _LONGEST_LABEL:
+        raise damaged(path, f"it has a label of {len(label)} characters ('{label[:60]}...'), so shorten it")
+    return label
+
+
+def _absent(point: Any) -> bool:
+    """Whether LJSON has no point here: null, or null coordinates."""
+    return point is None or all(value is None for value in point)
+
+
+def _write_ljson(landmarks: Mapping[str, FloatArray]) -> str:
+    group = {
+        "labels": [{"label": name, "mask": [i]} for i, name in enumerate(landmarks)],
+        "landmarks": {"connectivity": [], "points": [_numbers(point) for point in landmarks.values()]},
+    }
+    return json.dumps({"groups": {"LJSON": group}, "version": 3}, indent=1) + "\n"
+
+
+def _slicer(value: Any, path: Path) -> Pairs:
+    out: Pairs = []
+    for markup in value["markups"]:
+        system = str(markup.get("coordinateSystem", "LPS")).upper()
+        if system not in ("LPS", "RAS"):
+            raise damaged(path, f"its coordinate system is '{system[:20]}', neither LPS nor RAS")
+        sign = np.array([-1.0, -1.0, 1.0]) if system == "RAS" else np.ones(3)
+        for entry in markup["controlPoints"]:
+            if entry.get("positionStatus", "defined") != "defined":
+                continue
+            name = str(entry.get("label") or entry.get("id") or "").strip()
+            out.append((name, sign * _point(entry["position"], f"landmark '{name[:60]}'", path) + 0.0))
+    return out
+
+
+def _write_slicer(landmarks: Mapping[str, FloatArray]) -> str:
+    points = [
+        {"id": str(i), "label": name, "position": _numbers(point), "positionStatus": "defined"}
+        for i, (name, point) in enumerate(landmarks.items(), start=1)
+    ]
+    schema = (
+        "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/"
+        "markups-schema-v1.0.3.json#"
+    )
+    markup = {"type": "Fiducial", "coordinateSystem": "LPS", "coordinateUnits": "mm", "controlPoints": points}
+    return json.dumps({"@schema": schema, "markups": [markup]}, indent=1) + "\n"
+
+
+def _scalismo(value: Any, path: Path) -> Pairs:
+    return [
+        (str(entry["id"]), _point(entry["coordinates"], f"landmark '{str(entry['id'])[:60]}'", path)) for entry in value
+    ]
+
+
+def _write_scalismo(landmarks: Mapping[str, FloatArray]) -> str:
+    entries = [{"id": name, "coordinates": _numbers(point)} for name, point in landmarks.items()]
+    return json.dumps(entries, indent=1) + "\n"
+
+
+def _any_json(value: Any, path: Path) -> Pairs:
+    if isinstance(value, list):
+        return _scalismo(value, path)
+    if "markups" in value:
+        return _slicer(value, path)
+    return _ljson(value, path)
+
+
+def _numbers(point: FloatArray) -> list[float]:
+    return [float(value) for value in point]
+
+
+def _read_pp(data: bytes, path: Path) -> Pairs:
+    root = xml_root(data, path)
+    if root.tag != "PickedPoints":
+        raise damaged(path, "it is not a MeshLab file of picked points")
+    out: Pairs = []
+    for entry in root.iter("point"):
+        if entry.get("active", "1").strip().lower() not in ("0", "false"):
+            name = (entry.get("name") or "").strip()
+            out.append((name, _point((entry.get(axis) for axis in "xyz"), f"landmark '{name[:60]}'", path)))
+    return out
+
+
+def _write_pp(landmarks: Mapping[str, FloatArray]) -> str:
+    root = ET.Element("PickedPoints")
+    for name, point in landmarks.items():
+        x, y, z = (repr(value) for value in _numbers(point))
+        ET.SubElement(root, "point", {"x": x, "y": y, "z": z, "name": name, "active": "1"})
+    ET.indent(root)
+    return "<!DOCTYPE PickedPoints>\n" + ET.tostring(root, encoding="unicode") + "\n"
+
+
+def csv_rows(data: bytes, path: Path) -> list[list[str]]:
+    """Return the rows of comma-separated UTF-8 text, without white space around cells, empty lines and comments (`#`).
+
+    Raises:
+        FileFormatError: it is something else.
+    """
+    try:
+        text = data.decode("utf-8-sig")
+        lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+        return [[as_written(cell.strip()) for cell in row] for row in csv.reader(lines, strict=True)]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise damaged(path, "it is not comma-separated text") from error
+
+
+def _read_csv(data: bytes, path: Path) -> Pairs:
+    rows = csv_rows(data, path)
+    columns = [1, 2, 3]
+    if rows and not all(is_number(cell) for cell in rows[0][1:4]):
+        header = [cell.lower() for cell in rows[0]]
+        if header[:2] == ["name", "vertex"]:
+            raise damaged(path, "it holds vertex numbers, not coordinates ('name,x,y,z')")
+        if not {"x", "y", "z"} <= set(header[1:]):
+            raise damaged(path, "its first line is neither 'name,x,y,z' nor a landmark")
+        columns = [header.index(axis, 1) for axis in "xyz"]
+        rows = rows[1:]
+    elif rows and len(rows[0]) != 4:
+        raise damaged(path, f"its first line has {len(rows[0])} columns, not the four of 'name,x,y,z'")
+    out: Pairs = []
+    for row in rows:
+        if len(row) <= max(columns):
+            raise damaged(path, f"landmark '{row[0][:60]}' has fewer than 3 coordinates")
+        out.append((row[0], _point((row[c] for c in columns), f"landmark '{row[0][:60]}'", path)))
+    return out
+
+
+def _write_csv(landmarks: Mapping[str, FloatArray]) -> str:
+    rows = [[name, *map(repr, _numbers(point))] for name, point in landmarks.items()]
+    return rows_text([["name", "x", "y", "z"], *rows])
+
+
+def _text_lines(data: bytes) -> list[str]:
+    return [line.strip() for line in data.decode("utf-8-sig", "replace").splitlines()]
+
+
+def _read_bnd(data: bytes, path: Path) -> Pairs:
+    out: Pairs = []
+    for line in filter(None, _text_lines(data)):
+        words = line.replace(",", " ").split()
+        name = f"point_{len(out)}"
+        if len(words) != 4 or not words[0].isascii() or not words[0].isdecimal():
+            raise damaged(path, f"{name} is not a row of a vertex number and x y z; it is damaged or cut short")
+        out.append((name, _point(words[1:], name, path)))
+    return out
+
+
+def _read_lm3(data: bytes, path: Path) -> Pairs:
+    lines = [line for line in _text_lines(data) if line]
+    counted = (re.fullmatch(r"(\d{1,6})(?:\s+landmarks?\s*:?)?", line, re.IGNORECASE) for line in lines)
+    at, count = next(((i, int(m[1])) for i, m in enumerate(counted) if m), (0, -1))
+    if count < 0:
+        raise damaged(path, "it does not say how many landmarks it holds, so it is not an .lm3 file")
+    rest = lines[at + 1 :]
+    if len(rest) != 2 * count:
+        raise damaged(path, f"it says {count} landmarks, but {len(rest)} lines follow; it is damaged or cut short")
+    return [
+        (n, _point(xyz.split(), f"landmark '{n[:60]}'", path)) for n, xyz in zip(rest[::2], rest[1::2], strict=True)
+    ]
+
+
+_FCSV_COLUMNS = "id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID"
+
+
+def _read_fcsv(data: bytes, path: Path) -> Pairs:
+    columns, system = _FCSV_COLUMNS.split(","), "RAS"
+    for line in _text_lines(data):
+        name, found, value = line.lstrip("# ").partition("=")
+        if line.startswith("#") and found:
+            if name.strip().lower() == "columns":
+                columns = [cell.strip() for cell in value.split(",")]
+            elif name.strip().lower() == "coordinatesystem":
+                system = {"0": "RAS", "1": "LPS"}.get(value.strip(), value.strip().upper())
+    if system not in ("LPS", "RAS"):
+        raise damaged(path, f"its coordinate system is '{system[:20]}', neither LPS nor RAS")
+    if not {"x", "y", "z"} <= set(columns):
+        raise damaged(path, "its columns are not those of 3D Slicer's fiducials, so export it again")
+    sign = np.array([-1.0, -1.0, 1.0]) if system == "RAS" else np.ones(3)
+    out: Pairs = []
+    for row in csv_rows(data, path):
+        entry = dict(zip(columns, row, strict=False))
+        name = entry.get("label") or entry.get("id") or ""
+        point = _point((entry.get(axis) for axis in "xyz"), f"landmark '{name[:60]}'", path)
+        out.append((name, sign * point + 0.0))
+    return out
+
+
+def fcsv_text(landmarks: Mapping[str, FloatArray], descriptions: Mapping[str, str] = MappingProxyType({})) -> str:
+    """Return landmarks in LPS as the text of a 3D Slicer fiducial file, with descriptions by name."""
+    head = f"# Markups fiducial file version = 5.6\n# CoordinateSystem = LPS\n# columns = {_FCSV_COLUMNS}\n"
+    rows = (
+        [str(i), *map(repr, _numbers(point)), "0", "0", "0", "1", "1", "1", "0", name, descriptions.get(name, ""), ""]
+        for i, (name, point) in enumerate(landmarks.items(), start=1)
+    )
+    return head + rows_text(rows)
+
+
+def _read_tps(data: bytes, path: Path) -> Pairs:
+    lines = [line for line in _text_lines(data) if line]
+    heads = [re.fullmatch(r"LM(3?)\s*=\s*(\d{1,6})", line, re.IGNORECASE) for line in lines]
+    starts = [at for at, head in enumerate(heads) if head]
+    if len(starts) != 1:
+        what = f"it has {len(starts)} specimens, so save each in a file of its own" if starts else "it has no LM3="
+        raise damaged(path, what)
+    head = heads[starts[0]]
+    if head is None or not head[1]:
+        raise damaged(path, "its landmarks are of two dimensions (LM=), and those of a surface have three (LM3=)")
+    rest = lines[starts[0] + 1 :]
+    points = [line for line in rest if "=" not in line]
+    if len(points) != int(head[2]):
+        raise damaged(path, f"it says {head[2]} landmarks, but {len(points)} rows follow; it is damaged or cut short")
+    return [
+        (f"point_{i}", _point(line.split(), f"point_{i}", path))
+        for i, line in enumerate(points)
+        # As geomorph and tps programs have a point that is not there.
+        if "NA" not in line.upper().split()
+    ]
+
+
+def _read_tlms(data: bytes, path: Path) -> Pairs:
+    out: Pairs = []
+    for line in filter(None, _text_lines(data)):
+        words = line.split()
+        if len(words) != 5 or words[1] not in ("0", "1"):
+            raise damaged(path, "it has a line other than 'name visible x y z', so it is not scalismo's .tlms")
+        if words[1] == "1":
+            out.append((words[0], _point(words[2:], f"landmark '{words[0][:60]}'", path)))
+    return out
+
+
+_POINTS_HEAD = re.compile(r"version\b.*|n_points\s*:\s*(\d{1,6})|(?:s\s+)?(\d{1,6})|[{}]", re.IGNORECASE)
+
+
+def _read_points(data: bytes, path: Path) -> Pairs:
+    """Read rows `x y z` or `name x y z`, after a count or a header perhaps, as landmark editors save them."""
+    out: Pairs = []
+    said = None
+    for line in _text_lines(data):
+        row = line.partition("#")[0].strip()
+        head = _POINTS_HEAD.fullmatch(row)
+        if not row or head:
+            said = int(next(filter(None, head.groups()), 0)) or said if head else said
+            continue
+        words = re.split(r"[\s,;]+", row.rstrip(",;"))
+        name = words[0] if len(words) == 4 else f"point_{len(out)}"
+        if not out and not any(map(is_number, words)):
+            continue  # names of columns
+        if len(words) not in (3, 4):
+            raise damaged(path, f"{name} is not a row of 'x y z' or 'name x y z' but has {len(words)} columns")
+        out.append((name, _point(words[-3:], f"landmark '{name[:60]}'", path)))
+    if said is not None and said != len(out):
+        raise damaged(path, f"it says {said} landmarks, but {len(out)} rows follow; it is damaged or cut short")
+    return out
+
+
+LANDMARK_FORMATS: Mapping[str, LandmarkFormat] = MappingProxyType(
+    {
+        ".ljson": LandmarkFormat("menpo LJSON", _from_json(_ljson), _write_ljson),
+        ".pp": LandmarkFormat("MeshLab picked points", _read_pp, _write_pp),
+        ".mrk.json": LandmarkFormat("3D Slicer markups", _from_json(_slicer), _write_slicer),
+        ".json": LandmarkFormat("scalismo", _from_json(_any_json), _write_scalismo),
+        ".csv": LandmarkFormat("CSV", _read_csv, _write_csv),
+        ".fcsv": LandmarkFormat("3D Slicer fiducials", _read_fcsv, fcsv_text),
+    }
+)
+"""File name ending -> landmark format that is read and written."""
+
+READ_ONLY_LANDMARKS: Mapping[str, Callable[[bytes, Path], Pairs]] = MappingProxyType(
+    {
+        ".bnd": _read_bnd,
+        ".lm3": _read_lm3,
+        ".tps": _read_tps,
+        ".tlms": _read_tlms,
+        ".txt": _read_points,
+        ".pts": _read_points,
+    }
+)
+"""File name ending -> reader (content, path) -> names and points, for formats that are not written."""

@@ -1,0 +1,580 @@
+"""glTF 2.0, as `.gltf` with its buffers and as one `.glb` file; after the Khronos specification.
+
+trimesh reads glTF too, but it decodes textures, merges by material and reports damage by internal errors.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+from urllib.parse import unquote
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.errors import FileError, FileFormatError, InputError
+from shapespace.io.files import read_bytes
+from shapespace.io.meshes.textures import FilesBeside, Pictures, TextureError
+from shapespace.io.parsing import (
+    CUT_SHORT,
+    IndexArray,
+    check_count,
+    damaged,
+    fan_triangles,
+    json_value,
+    mesh_of,
+    strip_triangles,
+)
+from shapespace.io.read_limits import LARGEST_MESH_FILE_BYTES, Allowance
+from shapespace.types import GREY, ByteArray, FloatArray, Mesh
+
+_COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_POINTS, _TRIANGLES, _STRIP, _FAN = 0, 4, 5, 6
+_COMPRESSIONS = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
+# What a file may require without its points and triangles becoming others.
+_HARMLESS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", "KHR_lights_", "EXT_lights_", "KHR_xmp")
+_HARMLESS_TOO = ("KHR_mesh_quantization", "KHR_animation_pointer")
+# Far from the origin float32 is too coarse, so the centre goes into the node, which holds doubles.
+_FAR = 16.0
+
+Values = npt.NDArray[Any]
+Found = TypeVar("Found")
+
+
+@dataclass(frozen=True, eq=False)
+class Morphs:
+    """A mesh with morph targets.
+
+    Args:
+        vertices: (V, 3) where all weights are zero, in the frame of the scene.
+        faces: (F, 3), or None for points.
+        targets: (K, V, 3) what a weight of one adds to the vertices.
+        names: (K,) of the targets, or none.
+        weights: (K,) with which the file shows it.
+        extras: what the mesh says beside.
+        copyright: what the file says of it.
+        n_others: how many more meshes there are in the scene.
+    """
+
+    vertices: FloatArray
+    faces: IndexArray | None
+    targets: FloatArray
+    names: tuple[str, ...]
+    weights: tuple[float, ...]
+    extras: Any
+    copyright: str
+    n_others: int
+
+
+@dataclass
+class _Gltf:
+    """The JSON of a file and the buffers it names."""
+
+    path: Path
+    tree: dict[str, Any]
+    binary: bytes | None
+    allowance: Allowance
+    buffers: dict[str | None, bytes] = field(default_factory=lambda: dict[str | None, bytes]())
+    pictures: Pictures = field(default_factory=Pictures)
+    files: FilesBeside = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.files = FilesBeside(self.path)
+
+    def buffer(self, index: int) -> bytes:
+        entry = self.tree["buffers"][index]
+        uri = entry.get("uri")
+        if uri is None and index != 0:
+            raise self.compressed("a buffer has no data")
+        # By its name, for many buffers may be one file.
+        if uri not in self.buffers:
+            data = self.binary if uri is None else self.fetch(uri)
+            self.buffers[uri] = b"" if data is None else data
+        data = self.buffers[uri]
+        if len(data) < entry["byteLength"]:
+            raise damaged(self.path, f"its buffer {index} is shorter than declared; {CUT_SHORT}")
+        return data
+
+    def fetch(self, uri: str) -> bytes:
+        """Return the bytes of a buffer inside the JSON, or in a file beside it."""
+        if uri.startswith("data:"):
+            head, _, body = uri.partition(",")
+            if not head.endswith(";base64"):
+                raise damaged(self.path, "it has a buffer that is not base64; export it again")
+            return base64.b64decode(body, validate=True)
+        folder = self.path.parent.resolve()
+        try:
+            target = (folder / unquote(uri)).resolve()
+            is_there = target.exists()
+        except OSError as error:  # a name too long for the system
+            raise damaged(self.path, f"it names a buffer '{uri[:80]}' that is no file; {CUT_SHORT}") from error
+        if "://" in uri or not target.is_relative_to(folder):
+            raise damaged(self.path, f"it names a buffer outside its own folder ('{uri[:80]}'), which is not read")
+        if not is_there:
+            raise damaged(self.path, f"its buffer '{uri[:80]}' is missing beside it; copy that file there too")
+        try:
+            data = read_bytes(target, max(LARGEST_MESH_FILE_BYTES - self.allowance.file_bytes, 0))
+        except FileError as error:
+            raise damaged(
+                self.path, f"its buffer '{uri[:80]}' is no file that can be read or it is too long"
+            ) from error
+        self.allowance.more_file(len(data))
+        return data
+
+    def compressed(self, otherwise: str) -> FileFormatError:
+        """Return the error for data that are not there, by compression where the file says that it uses one."""
+        used = self.tree.get("extensionsUsed", [])
+        how = next((name for name in _COMPRESSIONS if name in used), None)
+        if how is None:
+            return damaged(self.path, f"{otherwise}; {CUT_SHORT}")
+        return damaged(self.path, f"it is compressed ({how}), so export it again without compression")
+
+    def view(self, index: int, offset: int, kind: np.dtype[Any], count: int, width: int) -> Values:
+        """Return (count, width) numbers from a buffer view."""
+        view = self.tree["bufferViews"][index]
+        data = self.buffer(view["buffer"])
+        row = kind.itemsize * width
+        stride = view.get("byteStride", row)
+        start = view.get("byteOffset", 0) + offset
+        end = view.get("byteOffset", 0) + view["byteLength"]
+        if min(start, stride, offset, count) < 0 or stride < row or end > len(data):
+            raise ValueError("buffer view")
+        if count == 0:
+            return np.zeros((0, width), dtype=kind)
+        if start + (count - 1) * stride + row > end:
+            check_count(count, stride, end - start, "numbers in an accessor", self.path)
+            raise ValueError("buffer view")
+        return np.ndarray((count, width), kind, data, start, (stride, kind.itemsize))
+
+    def accessor(self, index: int) -> Values:
+        """Return the (count, width) values of an accessor; normalised whole numbers become float64."""
+        if index < 0:
+            raise IndexError(index)
+        entry = self.tree["accessors"][index]
+        kind = np.dtype(_COMPONENTS[entry["componentType"]])
+        width, count = _WIDTHS[entry["type"]], int(entry["count"])
+        if count < 0:
+            raise ValueError("count")
+        # Every array becomes one of eight bytes a number.
+        self.allowance.take(count * width, 8)
+        if "bufferView" in entry:
+            values = self.view(entry["bufferView"], entry.get("byteOffset", 0), kind, count, width).copy()
+        elif "sparse" in entry:
+            values = np.zeros((count, width), dtype=kind)
+        else:
+            raise self.compressed("its points or triangles have no data")
+        if "sparse" in entry:
+            sparse = entry["sparse"]
+            where, what = sparse["indices"], sparse["values"]
+            index_kind = np.dtype(_COMPONENTS[where["componentType"]])
+            n = int(sparse["count"])
+            at = self.view(where["bufferView"], where.get("byteOffset", 0), index_kind, n, 1)[:, 0]
+            values[at] = self.view(what["bufferView"], what.get("byteOffset", 0), kind, n, width)
+        if entry.get("normalized") and kind.kind in "iu":
+            return np.maximum(values / np.iinfo(kind).max, -1.0)
+        return values
+
+
+def read_gltf(data: bytes, path: Path) -> Mesh:
+    """Read glTF or GLB: all meshes of the scene in the order of its nodes, moved by the nodes' transforms.
+
+    Primitives that share their positions share their vertices here too. Morph targets are applied with the
+    weights of the node or mesh; skins, lines and animations are passed over. glTF means metres. Colours are those of
+    the vertices, else of the pictures of base colour; a note says why these are not read.
+
+    Args:
+        data: the whole file.
+        path: its name; buffers beside it are read from its folder and from nowhere else.
+
+    Raises:
+        FileFormatError: it is not glTF 2.0, is cut short, is compressed, requires an extension that is not known,
+            holds no points, or makes more of its bytes than `io.limits` allows.
+        MeshError: faces that point past the end of the vertices.
+    """
+    return _parsed(data, path, _scene)
+
+
+def read_morphs(data: bytes, path: Path) -> Morphs:
+    """Read the mesh with morph targets in glTF or GLB that has most vertices; the others are counted.
+
+    Args:
+        data: the whole file.
+        path: its name; buffers beside it are read as in `read_gltf`.
+
+    Raises:
+        FileFormatError: as `read_gltf`, or no mesh has morph targets.
+    """
+    return _parsed(data, path, _morphs)
+
+
+def _parsed(data: bytes, path: Path, read: Callable[[_Gltf], Found]) -> Found:
+    binary: bytes | None = None
+    if data[:4] == b"glTF":
+        text, binary = _chunks(data, path)
+    else:
+        text = data
+    tree = json_value(text, path)
+    # Any part of the JSON may be missing or of the wrong type, so that is met in this one place.
+    try:
+        if not str(tree["asset"]["version"]).startswith("2"):
+            raise damaged(path, "it is not glTF of version 2")
+        _refuse_unknown(tree.get("extensionsRequired", []), path)
+        return read(_Gltf(path, tree, binary, Allowance(len(data), path)))
+    except (KeyError, IndexError, TypeError, AttributeError, OverflowError, binascii.Error) as error:
+        raise damaged(path, f"it is not valid glTF; {CUT_SHORT}") from error
+    except ValueError as error:
+        if isinstance(error, (FileError, InputError)):
+            raise
+        raise damaged(path, f"it is not valid glTF; {CUT_SHORT}") from error
+
+
+def _refuse_unknown(required: list[Any], path: Path) -> None:
+    for name in map(str, required):
+        if name in _COMPRESSIONS:
+            raise damaged(path, f"it is compressed ({name}), so export it again without compression")
+        if name not in _HARMLESS_TOO and not name.startswith(_HARMLESS):
+            raise damaged(
+                path, f"it requires the extension '{name[:60]}', which is not known here, so export it again without it"
+            )
+
+
+def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes | None]:
+    version, length = int.from_bytes(data[4:8], "little"), int.from_bytes(data[8:12], "little")
+    if version != 2:
+        raise damaged(path, f"it is GLB of version {version}, not 2")
+    if length > len(data):
+        raise damaged(path, f"it declares {length} bytes, but has {len(data)}; {CUT_SHORT}")
+    at = 12
+    found: dict[bytes, bytes] = {}
+    while at + 8 <= length:
+        size, kind = int.from_bytes(data[at : at + 4], "little"), data[at + 4 : at + 8]
+        if at + 8 + size > length:
+            raise damaged(path, f"it ends inside a chunk; {CUT_SHORT}")
+        found.setdefault(kind, data[at + 8 : at + 8 + size])
+        at += 8 + size
+    if b"JSON" not in found:
+        raise damaged(path, f"it has no JSON chunk; {CUT_SHORT}")
+    return found[b"JSON"], found.get(b"BIN\0")
+
+
+def _nodes_with_meshes(gltf: _Gltf) -> Iterator[tuple[dict[str, Any], FloatArray]]:
+    """Yield the nodes of the scene that show a mesh, and the (4, 4) transforms from theirs to the scene's frame."""
+    tree = gltf.tree
+    nodes: list[Any] = tree.get("nodes", [])
+    scenes: list[Any] = tree.get("scenes", [])
+    if scenes:
+        scene: Any = scenes[tree.get("scene", 0)]
+        roots: list[int] = list(scene.get("nodes", []))
+    else:
+        children = {child for node in nodes for child in node.get("children", [])}
+        roots = [i for i in range(len(nodes)) if i not in children]
+    if not nodes and tree.get("meshes"):
+        nodes, roots = [{"mesh": i} for i in range(len(tree["meshes"]))], list(range(len(tree["meshes"])))
+    seen: set[int] = set()
+    stack: list[tuple[int, FloatArray]] = [(int(root), np.eye(4)) for root in reversed(roots)]
+    while stack:
+        index, parent = stack.pop()
+        if index in seen or index < 0:
+            raise damaged(gltf.path, "its nodes do not form a tree; export it again")
+        seen.add(index)
+        gltf.allowance.part()
+        node = nodes[index]
+        matrix = parent @ _local(node)
+        stack += [(int(child), matrix) for child in reversed(node.get("children", []))]
+        if "mesh" in node:
+            yield node, matrix
+
+
+def _scene(gltf: _Gltf) -> Mesh:
+    points: list[FloatArray] = []
+    colours: list[ByteArray | None] = []
+    notes: list[str] = []
+    faces: list[IndexArray] = []
+    before = 0
+    for node, matrix in _nodes_with_meshes(gltf):
+        for vertices, triangles, painted in _primitives(gltf, node, notes):
+            gltf.allowance.take(3 * (len(vertices) + (0 if triangles is None else len(triangles))), 8)
+            points.append(vertices @ matrix[:3, :3].T + matrix[:3, 3])
+            if triangles is not None:
+                # A mirroring transform turns triangles inside out.
+                mirrored = np.linalg.det(matrix[:3, :3]) < 0
+                faces.append((triangles[:, ::-1] if mirrored else triangles) + before)
+            colours.append(painted)
+            before += len(vertices)
+    if not points:
+        raise damaged(gltf.path, "its scene holds no points and no triangles")
+    joined = np.concatenate(faces) if faces else None
+    return mesh_of(
+        np.concatenate(points), joined, gltf.path, _joined_colours(points, colours), tuple(dict.fromkeys(notes))
+    )
+
+
+def _joined_colours(points: list[FloatArray], colours: list[ByteArray | None]) -> ByteArray | None:
+    """Return the colours of all parts, grey where only others have some; None where none has."""
+    if all(part is None for part in colours):
+        return None
+    pairs = zip(points, colours, strict=True)
+    return np.concatenate([np.full(at.shape, GREY, np.uint8) if part is None else part for at, part in pairs])
+
+
+def _morphs(gltf: _Gltf) -> Morphs:
+    """Return the mesh with morph targets of most vertices."""
+    shown = list(_nodes_with_meshes(gltf))
+    sizes = [_morphed_vertices(gltf, node) for node, _ in shown]
+    if not any(sizes):
+        raise damaged(gltf.path, "it has no mesh with morph targets")
+    node, matrix = shown[int(np.argmax(sizes))]
+    mesh = gltf.tree["meshes"][node["mesh"]]
+    count = len(mesh["primitives"][0]["targets"])
+    gltf.allowance.part(count)
+    # Without its weights, so that what is read is the shape from which the targets are counted.
+    parts = _primitives(gltf, {"mesh": node["mesh"], "weights": ()}, [])
+    vertices = np.concatenate([points for points, _, _ in parts])
+    gltf.allowance.take(vertices.size * (count + 1), 8)
+    targets = np.zeros((count, len(vertices), 3))
+    before, done, faces = 0, set[int](), list[IndexArray]()
+    for primitive in mesh["primitives"]:
+        key = primitive["attributes"]["POSITION"]
+        if primitive.get("mode", _TRIANGLES) not in (_POINTS, _TRIANGLES, _STRIP, _FAN) or key in done:
+            continue
+        done.add(key)
+        points, triangles, _ = parts[len(done) - 1]
+        for k, target in enumerate(primitive.get("targets", ())):
+            gltf.allowance.part()
+            if "POSITION" in target:
+                targets[k, before : before + len(points)] = gltf.accessor(target["POSITION"]).reshape(len(points), 3)
+        if triangles is not None:
+            faces.append(triangles + before)
+        before += len(points)
+    turned = matrix[:3, :3]
+    joined_faces = np.concatenate(faces) if faces else None
+    if joined_faces is not None and np.linalg.det(turned) < 0:
+        joined_faces = joined_faces[:, ::-1]
+    extras: Any = mesh.get("extras", {})
+    names = tuple(map(str, extras.get("targetNames", ()) if isinstance(extras, dict) else ()))  # pyright: ignore[reportUnknownMemberType, reportUnknownArgumentType]
+    weights = node.get("weights", mesh.get("weights", []))
+    return Morphs(
+        vertices=vertices @ turned.T + matrix[:3, 3],
+        faces=joined_faces,
+        targets=targets @ turned.T,
+        names=names if len(names) == count else (),
+        weights=tuple(float(weight) for weight in weights),
+        extras=extras,
+        copyright=str(gltf.tree["asset"].get("copyright", "")),
+        n_others=len(shown) - 1,
+    )
+
+
+def _morphed_vertices(gltf: _Gltf, node: dict[str, Any]) -> int:
+    primitives = gltf.tree["meshes"][node["mesh"]]["primitives"]
+    gltf.allowance.part(len(primitives))
+    accessors = gltf.tree["accessors"]
+    return sum(int(accessors[one["attributes"]["POSITION"]]["count"]) for one in primitives if one.get("targets"))
+
+
+def _local(node: dict[str, Any]) -> FloatArray:
+    """Return the (4, 4) transform of a node, from its matrix or its translation, rotation and scale."""
+    if "matrix" in node:
+        return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
+    x, y, z, w = (float(v) for v in node.get("rotation", (0, 0, 0, 1)))
+    out = np.eye(4)
+    out[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    out[:3, :3] *= np.array(node.get("scale", (1, 1, 1)), dtype=np.float64).reshape(1, 3)
+    out[:3, 3] = np.array(node.get("translation", (0, 0, 0)), dtype=np.float64).reshape(3)
+    return out
+
+
+def _primitives(
+    gltf: _Gltf, node: dict[str, Any], notes: list[str]
+) -> list[tuple[FloatArray, IndexArray | None, ByteArray | None]]:
+    """Return points, triangles and colours of a node's mesh; primitives that share their positions come as one."""
+    mesh = gltf.tree["meshes"][node["mesh"]]
+    weights = node.get("weights", mesh.get("weights", []))
+    vertices: dict[int, FloatArray] = {}
+    colours: dict[int, ByteArray | None] = {}
+    triangles: dict[int, list[IndexArray]] = {}
+    for primitive in mesh["primitives"]:
+        gltf.allowance.part()
+        mode = primitive.get("mode", _TRIANGLES)
+        if mode not in (_POINTS, _TRIANGLES, _STRIP, _FAN):
+            continue
+        key = primitive["attributes"]["POSITION"]
+        if key not in vertices:
+            position = gltf.accessor(key).astype(np.float64)
+            if position.shape[1] != 3:
+                raise ValueError("POSITION")
+            for weight, target in zip(weights, primitive.get("targets", []), strict=False):
+                if weight and "POSITION" in target:
+                    position = position + float(weight) * gltf.accessor(target["POSITION"])
+            vertices[key] = position
+            colours[key] = _colours(gltf, primitive, len(position), notes)
+        if mode == _POINTS:
+            continue
+        if "indices" in primitive:
+            corners = gltf.accessor(primitive["indices"])[:, 0].astype(np.int64)
+        else:
+            corners = np.arange(len(vertices[key]), dtype=np.int64)
+        gltf.allowance.take(len(corners) if mode == _TRIANGLES else 3 * len(corners), 8)
+        if mode == _TRIANGLES:
+            if len(corners) % 3:
+                raise damaged(gltf.path, f"its triangles have {len(corners)} corners; {CUT_SHORT}")
+            found = corners.reshape(-1, 3)
+        else:
+            found = (strip_triangles if mode == _STRIP else fan_triangles)([len(corners)], corners)
+        # Checked here: joined, an index past this primitive would point into the next.
+        mesh_of(vertices[key], found, gltf.path)
+        triangles.setdefault(key, []).append(found)
+    return [(v, np.concatenate(triangles[k]) if k in triangles else None, colours[k]) for k, v in vertices.items()]
+
+
+def _colours(gltf: _Gltf, primitive: dict[str, Any], vertices: int, notes: list[str]) -> ByteArray | None:
+    """Return the colours (V, 3) of the points of a primitive; None where it has none, or none that can be read."""
+    attributes = primitive["attributes"]
+    try:
+        if "COLOR_0" in attributes:
+            values = gltf.accessor(attributes["COLOR_0"])
+            return _from_linear(values[:, :3]) if len(values) == vertices and values.shape[1] >= 3 else None
+        if "TEXCOORD_0" not in attributes or "material" not in primitive:
+            return None
+        base = gltf.tree["materials"][primitive["material"]]["pbrMetallicRoughness"]["baseColorTexture"]
+        coordinates = attributes[f"TEXCOORD_{int(base.get('texCoord', 0))}"]
+        number = int(gltf.tree["textures"][base["index"]]["source"])
+        image = gltf.tree["images"][number]
+        uv = gltf.accessor(coordinates).astype(np.float64)
+        if len(uv) != vertices or uv.shape[1] != 2:
+            return None
+        # Of glTF the upper left corner is the origin.
+        uv[:, 1] = 1.0 - uv[:, 1]
+        uri = str(image.get("uri", ""))
+        if not uri or uri.startswith("data:"):
+            return gltf.pictures.sampled(f"{number} in it", partial(_picture, gltf, image), uv)
+        file = gltf.files.find(unquote(uri), "its picture")
+        return gltf.pictures.sampled(file.name, partial(gltf.files.read, file, "its picture"), uv, str(file))
+    except TextureError as reason:
+        notes.append(f"It is read without all of its colours: {reason}.")
+        return None
+    except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError, FileError):
+        return None  # the surface is whole, whatever its material lacks
+
+
+def _picture(gltf: _Gltf, image: dict[str, Any]) -> bytes:
+    """Return the content of a picture that is stored in a buffer or in the JSON."""
+    if "bufferView" in image:
+        length = int(gltf.tree["bufferViews"][image["bufferView"]]["byteLength"])
+        return gltf.view(image["bufferView"], 0, np.dtype(np.uint8), length, 1).tobytes()
+    return base64.b64decode(image["uri"].partition(",")[2], validate=True)
+
+
+def _from_linear(values: Values) -> ByteArray | None:
+    """Return colours (N, 3) that are linear in light, 0 to 1, as screens show them (sRGB)."""
+    light = values.astype(np.float64) / (1.0 if values.dtype.kind == "f" else np.iinfo(values.dtype).max)
+    if not np.isfinite(light).all():
+        return None
+    light = np.clip(light, 0.0, 1.0)
+    shown = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
+    return np.rint(255.0 * shown).astype(np.uint8)
+
+
+def _to_linear(colours: ByteArray) -> Values:
+    """Return (N, 4) uint16 of sRGB colours (N, 3), linear in light and opaque, fine enough to come back as they are."""
+    shown = np.arange(256) / 255.0
+    light = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
+    out = np.full((len(colours), 4), 65535, dtype="<u2")
+    out[:, :3] = np.rint(65535.0 * light).astype(np.uint16)[colours]
+    return out
+
+
+def _content(mesh: Mesh) -> tuple[dict[str, Any], bytes]:
+    if not len(mesh.vertices):
+        raise InputError(f"{mesh.name} has no points, so it cannot be written as glTF.")
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        raise InputError(f"{mesh.name} has points that are not finite, which glTF cannot hold; write it as PLY.")
+    far = np.abs([low, high]).max() > _FAR * max(float((high - low).max()), np.finfo(np.float64).tiny)
+    centre = (low + high) / 2 if far else np.zeros(3)
+    with np.errstate(over="ignore"):
+        positions = (mesh.vertices - centre).astype("<f4")
+    if not np.isfinite(positions).all():
+        raise InputError(f"{mesh.name} has coordinates too large for glTF; write it as PLY instead.")
+    binary = positions.tobytes()
+    views: list[dict[str, Any]] = [{"buffer": 0, "byteOffset": 0, "byteLength": len(binary), "target": 34962}]
+    bounds = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
+    accessors: list[dict[str, Any]] = [
+        {"bufferView": 0, "componentType": 5126, "count": len(positions), "type": "VEC3", **bounds}
+    ]
+    primitive: dict[str, Any] = {"attributes": {"POSITION": 0}, "mode": _POINTS}
+    if mesh.faces is not None:
+        indices = mesh.faces.astype("<u4").tobytes()
+        views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(indices), "target": 34963})
+        count = mesh.faces.size
+        accessors.append({"bufferView": 1, "componentType": 5125, "count": count, "type": "SCALAR"})
+        primitive = {"attributes": {"POSITION": 0}, "indices": 1, "mode": _TRIANGLES}
+        binary += indices
+    if mesh.colours is not None:
+        painted = _to_linear(mesh.colours).tobytes()
+        primitive["attributes"]["COLOR_0"] = len(accessors)
+        views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(painted), "target": 34962})
+        accessors.append({
+            "bufferView": len(views) - 1, "componentType": 5123, "normalized": True, "count": len(mesh.colours),
+            "type": "VEC4",
+        })  # fmt: skip
+        binary += painted
+    node: dict[str, Any] = {"mesh": 0, "name": mesh.name}
+    if far:
+        node["translation"] = centre.tolist()
+    tree: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": "shapespace"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [node],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+    }
+    return tree, binary
+
+
+def write_gltf(mesh: Mesh) -> bytes:
+    """Return `mesh` as one glTF JSON file with its buffer inside, in float32; numbers stay as they are.
+
+    Raises:
+        InputError: no points, or coordinates that are not finite or too large for float32.
+    """
+    return gltf_bytes(*_content(mesh))
+
+
+def write_glb(mesh: Mesh) -> bytes:
+    """Return `mesh` as binary glTF, in float32; numbers are written as they are, though glTF means metres.
+
+    Raises:
+        InputError: no points, or coordinates that are not finite or too large for float32.
+    """
+    return glb_bytes(*_content(mesh))
+
+
+def gltf_bytes(tree: dict[str, Any], binary: bytes) -> bytes:
+    """Return the JSON file of `tree` with `binary`, its only buffer, inside."""
+    uri = "data:application/octet-stream;base64," + base64.b64encode(binary).decode()
+    return json.dumps({**tree, "buffers": [{"byteLength": len(binary), "uri": uri}]}).encode("utf-8")
+
+
+def glb_bytes(tree: dict[str, Any], binary: bytes) -> bytes:
+    """Return the binary file of `tree` and `binary`, its only buffer."""
+    text = json.dumps({**tree, "buffers": [{"byteLength": len(binary)}]}).encode("utf-8")
+    text += b" " * (-len(text) % 4)
+    binary += b"\0" * (-len(binary) % 4)
+    length = 12 + 8 + len(text) + 8 + len(binary)
+    out = b"glTF" + (2).to_bytes(4, "little") + length.to_bytes(4, "little")
+    out += len(text).to_bytes(4, "little") + b"JSON" + text
+    return out + len(binary).to_bytes(4, "little") + b"BIN\0" + binary

@@ -1,0 +1,120 @@
+"""Meshes and other files in folders: which are taken, and what is left out, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from shapespace.errors import InputError
+from shapespace.io.files import read_error
+from shapespace.io.meshes.mesh_io import MESH_ENDINGS, MESH_FILE_ENDINGS
+
+_NAMED = 3
+
+
+@dataclass(frozen=True)
+class MeshFiles:
+    """What `mesh_files` found.
+
+    Args:
+        files: in the order given, those of a folder in the order of their names.
+        left_out: a sentence for each kind of thing that was not taken.
+    """
+
+    files: tuple[Path, ...]
+    left_out: tuple[str, ...]
+
+
+@dataclass
+class _Found:
+    endings: tuple[str, ...]
+    files: list[Path] = field(default_factory=list[Path])
+    folders: list[str] = field(default_factory=list[str])
+    linked: list[str] = field(default_factory=list[str])
+    broken: list[str] = field(default_factory=list[str])
+    packed: list[str] = field(default_factory=list[str])
+
+
+def mesh_files(
+    paths: Sequence[Path],
+    *,
+    recursive: bool = False,
+    apart_from: Path | None = None,
+    endings: Sequence[str] = MESH_FILE_ENDINGS,
+    what: str = "meshes",
+) -> MeshFiles:
+    """Return `paths` with each folder replaced by the meshes in it, or by other files of some kind.
+
+    Args:
+        paths: files, taken as they are, and folders.
+        recursive: whether to take what lies in folders below these too. Links to folders are not followed.
+        apart_from: a folder below that is not looked into, such as that of the results.
+        endings: of the files to take, in small letters.
+        what: they are called.
+
+    Raises:
+        InputError: a folder without meshes.
+        FileError: a folder that cannot be read.
+    """
+    files: list[Path] = []
+    left_out: list[str] = []
+    for path in paths:
+        if not _is_folder(path):
+            files.append(path)
+            continue
+        found = _Found(tuple(endings))
+        _look_into(path, path, found, recursive, None if apart_from is None else apart_from.resolve())
+        if not found.files:
+            below = "; give --recursive for what lies in the folders below it" if found.folders else ""
+            below += "; unpack those that are compressed with gunzip" if found.packed else ""
+            known = MESH_ENDINGS if endings is MESH_FILE_ENDINGS else endings
+            raise InputError(f"{path} holds no {what}{below}; shapespace reads {', '.join(known)}.")
+        files += found.files
+        left_out += _sentences(path, found, what)
+    return MeshFiles(tuple(files), tuple(left_out))
+
+
+def _is_folder(path: Path) -> bool:
+    try:
+        return path.is_dir()
+    except OSError as error:
+        raise read_error(path, error) from error
+
+
+def _look_into(folder: Path, top: Path, found: _Found, recursive: bool, apart_from: Path | None) -> None:
+    try:
+        inside = sorted(p for p in folder.iterdir() if not p.name.startswith("."))
+        for path in inside:
+            name = path.relative_to(top).as_posix()
+            of_kind = path.name.lower().endswith(found.endings)
+            if path.is_dir():
+                if path.resolve() == apart_from:
+                    continue
+                if not recursive:
+                    found.folders.append(name)
+                elif path.is_symlink():
+                    found.linked.append(name)
+                else:
+                    _look_into(path, top, found, recursive, apart_from)
+            elif of_kind and path.is_file():
+                found.files.append(path)
+            elif path.name.lower().endswith(tuple(f"{ending}.gz" for ending in found.endings)):
+                found.packed.append(name)
+            elif path.is_symlink() and not path.exists() and (of_kind or not path.suffix):
+                found.broken.append(name)
+    except OSError as error:
+        raise read_error(folder, error) from error
+
+
+def _sentences(folder: Path, found: _Found, kind: str) -> Iterator[str]:
+    for names, one, several, done, advice in (
+        (found.folders, "folder", "folders", "looked into", f"--recursive takes the {kind} there"),
+        (found.linked, "link to a folder", "links to folders", "followed", "give that folder too"),
+        (found.broken, "broken link", "broken links", "taken", "mend or remove it"),
+        (found.packed, "compressed file", "compressed files", "taken", "unpack them with gunzip first"),
+    ):
+        if names:
+            what = f"1 {one} is" if len(names) == 1 else f"{len(names)} {several} are"
+            shown = ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")
+            yield f"{folder}: {what} not {done} ({shown}); {advice}."

@@ -1,0 +1,205 @@
+"""Meshes and point clouds in and out: one plain dict says which file name ending means which format."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+from types import MappingProxyType
+from typing import TypeAlias
+
+import numpy as np
+
+from shapespace.errors import FileFormatError
+from shapespace.io.containers.gzip_files import GZIP, unpacked
+from shapespace.io.files import open_file, read_bytes, read_error, write_bytes
+from shapespace.io.meshes.bnt import read_bnt
+from shapespace.io.meshes.gltf_mesh import read_gltf, write_glb, write_gltf
+from shapespace.io.meshes.mat_mesh import read_mat_mesh
+from shapespace.io.meshes.obj import read_obj, write_obj
+from shapespace.io.meshes.off import read_off, write_off
+from shapespace.io.meshes.pcd import read_pcd
+from shapespace.io.meshes.ply import probe_ply, read_ply, write_ply
+from shapespace.io.meshes.stl import probe_stl, read_stl, write_stl
+from shapespace.io.meshes.vrml import read_vrml
+from shapespace.io.meshes.vtk import read_vtk, read_vtp, write_vtk, write_vtp
+from shapespace.io.meshes.xyz import read_xyz
+from shapespace.io.parsing import plain_text
+from shapespace.io.read_limits import LARGEST_MESH_FILE_BYTES
+from shapespace.types import Mesh, require
+
+_PACKED = ".gz"
+_PROBED_BYTES = 2**16
+_Probe: TypeAlias = Callable[[bytes, int, Path], None]
+_PROBES: Mapping[str, _Probe] = {".ply": probe_ply, ".stl": probe_stl}
+_CONVERT: Mapping[str, str] = {
+    ".las": "convert it to PLY",
+    ".laz": "convert it to PLY",
+    ".raw": "convert a mesh to PLY, a volume to NRRD or NIfTI",
+}
+"""File name ending -> what to do with a file that is not read."""
+
+
+@dataclass(frozen=True)
+class MeshFormat:
+    """A file format for surfaces.
+
+    Args:
+        name: what people call it.
+        read: (content, path) -> mesh; the path is for messages and for files beside it.
+        write: mesh -> content.
+        exact: whether float64 coordinates survive writing and reading.
+        point_clouds: whether it can hold points without triangles.
+        keeps_vertices: whether order and number of the vertices survive.
+    """
+
+    name: str
+    read: Callable[[bytes, Path], Mesh]
+    write: Callable[[Mesh], bytes]
+    exact: bool = True
+    point_clouds: bool = True
+    keeps_vertices: bool = True
+
+
+def read_mesh(path: Path | str) -> Mesh:
+    """Read a surface or point cloud; its name is the file's name.
+
+    Vertices keep the order and number of the file, its frame and its unit (STL has no vertices, only corners:
+    equal ones are merged in the order of first appearance). Polygons become fans of triangles.
+
+    Args:
+        path: a file with one of the endings in `MESH_ENDINGS` or `NAMED_FORMATS`, in any case, packed by gzip
+            (`.ply.gz`) or not.
+
+    Returns:
+        The mesh as the file has it, with whatever is wrong with it.
+
+    Raises:
+        FileError: it does not exist, cannot be read, is no file, or is longer than `LARGEST_MESH_FILE_BYTES`.
+        FileFormatError: the ending is unknown, or the content is not in that format, cut short, damaged, or out of
+            proportion to the file (`io.limits`).
+        MeshError: faces that point past the end of the vertices.
+    """
+    path = Path(path)
+    ending = ending_of(path)
+    read = READ_ONLY_FORMATS.get(ending) or NAMED_FORMATS.get(ending) or _format(path, "read").read
+    data = read_bytes(path, LARGEST_MESH_FILE_BYTES)
+    if data.startswith(GZIP):
+        data = unpacked(data, path, LARGEST_MESH_FILE_BYTES)
+    if not data.strip():
+        raise FileFormatError(f"Cannot read {path}: it is empty; export or copy it again.")
+    # A NaN or infinity is for the mesh doctor to judge, not for numpy to warn about.
+    with np.errstate(invalid="ignore", over="ignore"):
+        return read(data, path)
+
+
+def probe_mesh(path: Path) -> None:
+    """Check a mesh file by its first 64 KiB and its size, without reading all of it.
+
+    The file must open, have a known ending, not be empty and not be too long; PLY and binary STL must be as long as
+    their header declares. A file that passes may still be damaged further on.
+
+    Raises:
+        FileError: as `read_mesh`.
+        FileFormatError: as `read_mesh`.
+    """
+    ending = ending_of(path)
+    if ending not in READ_ONLY_FORMATS and ending not in NAMED_FORMATS:
+        _format(path, "read")
+    with open_file(path) as stream:
+        try:
+            size, head = os.fstat(stream.fileno()).st_size, stream.read(_PROBED_BYTES)
+        except OSError as error:
+            raise read_error(path, error) from error
+    if size > LARGEST_MESH_FILE_BYTES:
+        read_bytes(path, LARGEST_MESH_FILE_BYTES)  # refuses it
+    if not head.strip():
+        raise FileFormatError(f"Cannot read {path}: it is empty; export or copy it again.")
+    if not head.startswith(GZIP) and ending in _PROBES:
+        _PROBES[ending](head, size, path)
+
+
+def write_mesh(path: Path | str, mesh: Mesh) -> None:
+    """Write `mesh` in the format of the ending of `path`, whole or not at all; landmarks are not written.
+
+    Args:
+        path: the file, with one of the endings in `MESH_FORMATS`.
+        mesh: vertices in whatever unit they are in; PLY, OBJ, OFF, VTK and VTP keep float64 exactly.
+
+    Raises:
+        FileFormatError: the ending is unknown.
+        FileError: the folder cannot be written, or the disk is full.
+        InputError: the format cannot hold this mesh (STL without triangles, float32 overflow).
+    """
+    require(mesh, Mesh, "write_mesh", "convert it with shapespace.as_mesh")
+    path = Path(path)
+    write_bytes(path, _format(path, "write").write(mesh))
+
+
+def ending_of(path: PurePath | str) -> str:
+    """Return the ending that tells the format, in small letters: `.ply` of `a.PLY` and of `a.ply.gz`."""
+    return _unpacked_name(path).suffix.lower()
+
+
+def stem_of(path: PurePath | str) -> str:
+    """Return the name of a scan without its ending: `a` of `a.ply` and of `a.ply.gz`."""
+    return _unpacked_name(path).stem
+
+
+def _unpacked_name(path: PurePath | str) -> PurePath:
+    name = PurePath(path).name
+    return PurePath(name[: -len(_PACKED)] if name.lower().endswith(_PACKED) else name)
+
+
+def _format(path: Path, verb: str) -> MeshFormat:
+    ending = ending_of(path) if verb == "read" else path.suffix.lower()
+    found = MESH_FORMATS.get(ending)
+    if found is None:
+        known = ending in READ_ONLY_FORMATS
+        what = "can be read, not written" if known else "is not a mesh format"
+        endings = MESH_ENDINGS if verb == "read" else MESH_FORMATS
+        advice = _CONVERT.get(ending, f"use one of {', '.join(endings)}")
+        raise FileFormatError(f"Cannot {verb} {path}: the ending '{path.suffix}' {what}; {advice}.")
+    return found
+
+
+def _read_any_vtk(data: bytes, path: Path) -> Mesh:
+    # Both endings are used for both formats, so the content decides.
+    data = plain_text(data)
+    return read_vtp(data, path) if data.lstrip()[:1] == b"<" else read_vtk(data, path)
+
+
+MESH_FORMATS: Mapping[str, MeshFormat] = MappingProxyType(
+    {
+        ".ply": MeshFormat("PLY", read_ply, write_ply),
+        ".obj": MeshFormat("Wavefront OBJ", read_obj, write_obj),
+        ".stl": MeshFormat("STL", read_stl, write_stl, exact=False, point_clouds=False, keeps_vertices=False),
+        ".off": MeshFormat("OFF", read_off, write_off),
+        ".vtk": MeshFormat("legacy VTK", _read_any_vtk, write_vtk),
+        ".vtp": MeshFormat("XML VTK", _read_any_vtk, write_vtp),
+        ".glb": MeshFormat("binary glTF", read_gltf, write_glb, exact=False),
+        ".gltf": MeshFormat("glTF", read_gltf, write_gltf, exact=False),
+    }
+)
+"""File name ending -> format that is read and written."""
+
+READ_ONLY_FORMATS: Mapping[str, Callable[[bytes, Path], Mesh]] = MappingProxyType(
+    {
+        ".wrl": read_vrml,
+        ".bnt": read_bnt,
+        ".xyz": read_xyz,
+        ".pts": read_xyz,
+        ".pcd": read_pcd,
+    }
+)
+"""File name ending -> reader (content, path) -> mesh, for formats that are not written."""
+
+NAMED_FORMATS: Mapping[str, Callable[[bytes, Path], Mesh]] = MappingProxyType({".mat": read_mat_mesh})
+"""The same for endings under which most files are none, so that those are read where they are named, not in folders."""
+
+MESH_ENDINGS = (*MESH_FORMATS, *READ_ONLY_FORMATS)
+"""The endings that `read_mesh` takes."""
+
+MESH_FILE_ENDINGS = (*MESH_ENDINGS, *(f"{ending}{_PACKED}" for ending in MESH_ENDINGS))
+"""With those of files packed by gzip."""

@@ -1,0 +1,132 @@
+"""Wavefront OBJ: its `v` and `f` lines and its colours; texture seams, normals and groups change nothing."""
+
+from __future__ import annotations
+
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+
+from shapespace.errors import FileFormatError
+from shapespace.io.meshes.obj_textures import texture_colours
+from shapespace.io.parsing import (
+    CUT_SHORT,
+    IndexArray,
+    bytes_of_colours,
+    damaged,
+    fan_triangles,
+    floats,
+    ints,
+    joined,
+    line_blocks,
+    mesh_of,
+    number_lines,
+    plain_text,
+)
+from shapespace.types import FloatArray, Mesh
+
+_COLOURED_WORDS = 7
+"""Of a line such as `v x y z r g b`."""
+
+
+def read_obj(data: bytes, path: Path) -> Mesh:
+    """Read OBJ: one vertex for each `v` line, in the file's order, and polygons as fans.
+
+    Negative indices count back from the last `v` line above. Colours are those after `x y z` where all vertices have
+    them, else of the pictures that its materials name; a note says why these are not read. Weights are ignored.
+
+    Args:
+        data: the whole file.
+        path: its name; materials and pictures are read from its folder and from nowhere else.
+
+    Raises:
+        FileFormatError: it has no `v` line, a line with too few numbers, or an index of zero.
+        MeshError: faces that point past the end of the vertices.
+    """
+    data = plain_text(data)
+    if b"\\" in data:
+        data = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
+    vertices: list[FloatArray] = []
+    colours: list[FloatArray | None] = []
+    faces: list[IndexArray] = []
+    count = polygon_count = 0
+    for lines in line_blocks(data):
+        points: list[list[bytes]] = []
+        polygons: list[list[bytes]] = []
+        above: list[int] = []
+        for line in lines:
+            words = line.split()
+            if not words:
+                continue
+            if words[0] == b"v":
+                points.append(words)
+            elif words[0] == b"f":
+                polygons.append(words)
+                above.append(count + len(points))
+        if points:
+            vertices.append(_points(points, count, path))
+            colours.append(_colours(points, path))
+            count += len(points)
+        if polygons:
+            faces.append(_faces(polygons, above, polygon_count, path))
+            polygon_count += len(polygons)
+    if not count:
+        raise damaged(path, "it has no 'v' lines, so it is not an OBJ file or holds no points")
+    own = [part for part in colours if part is not None]
+    painted = bytes_of_colours(np.concatenate(own)) if len(own) == len(colours) else None
+    notes: tuple[str, ...] = ()
+    if painted is None:
+        painted, notes = texture_colours(data, count, path)
+    return mesh_of(np.concatenate(vertices), joined(faces, np.int64, 3), path, painted, notes)
+
+
+def _points(points: list[list[bytes]], before: int, path: Path) -> FloatArray:
+    widths = set(map(len, points))
+    if min(widths) < 4:
+        at = before + next(i for i, words in enumerate(points) if len(words) < 4)
+        raise damaged(path, f"vertex {at + 1} has fewer than three numbers; {CUT_SHORT}")
+    if len(widths) == 1:
+        flat = list(chain.from_iterable(points))
+        return np.stack([floats(flat[axis :: len(points[0])], path) for axis in (1, 2, 3)], axis=1)
+    return floats(chain.from_iterable(words[1:4] for words in points), path).reshape(-1, 3)
+
+
+def _colours(points: list[list[bytes]], path: Path) -> FloatArray | None:
+    """Return what stands after the coordinates, (n, 3), where that is three numbers of each vertex."""
+    if set(map(len, points)) != {_COLOURED_WORDS}:
+        return None
+    try:
+        return floats(chain.from_iterable(words[4:] for words in points), path).reshape(-1, 3)
+    except FileFormatError:
+        return None
+
+
+def _faces(polygons: list[list[bytes]], above: list[int], before: int, path: Path) -> IndexArray:
+    # A comment after the corners is rare, and is looked for only where there is a mark.
+    if any(b"#" in word for words in polygons for word in (words[-1], *words[4:])):
+        polygons = [b" ".join(words).partition(b"#")[0].split() for words in polygons]
+    counts = np.fromiter(map(len, polygons), dtype=np.int64, count=len(polygons)) - 1
+    if counts.min() < 3:
+        at = before + int(np.argmin(counts))
+        raise damaged(path, f"face {at + 1} has fewer than three corners; {CUT_SHORT}")
+    tokens = chain.from_iterable(words[1:] for words in polygons)
+    corners = ints((token.partition(b"/")[0] for token in tokens), path)
+    if (corners == 0).any():
+        raise damaged(path, "a face points at vertex 0, but OBJ counts from 1; export it again")
+    behind = np.repeat(np.array(above, dtype=np.int64), counts)
+    absolute = np.where(corners > 0, corners - 1, corners + behind)
+    if absolute.min() < 0:
+        raise damaged(path, f"a face points back past the first vertex; {CUT_SHORT}")
+    return fan_triangles(counts, absolute)
+
+
+def write_obj(mesh: Mesh) -> bytes:
+    """Return `mesh` as OBJ text with 17 significant digits, so that reading it back is exact, colours after them."""
+    pattern = "v %.17g %.17g %.17g"
+    if mesh.colours is None:
+        text = number_lines(mesh.vertices, pattern)
+    else:
+        text = number_lines(np.hstack([mesh.vertices, mesh.colours / 255.0]), f"{pattern} %.6g %.6g %.6g")
+    if mesh.faces is not None:
+        text += number_lines(mesh.faces.astype(np.int64) + 1, "f %d %d %d")
+    return text.encode("ascii")

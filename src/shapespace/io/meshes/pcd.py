@@ -1,0 +1,157 @@
+"""PCD of the Point Cloud Library: text, binary, and binary packed by LZF.
+
+After "The PCD (Point Cloud Data) file format", https://pointclouds.org/documentation/tutorials/pcd_file_format.html.
+"""
+
+from __future__ import annotations
+
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+
+from shapespace.io.parsing import CUT_SHORT, check_count, damaged, floats, joined, line_blocks, mesh_of, plain_text
+from shapespace.io.read_limits import Allowance
+from shapespace.types import FloatArray, Mesh
+
+_MOST_HEADER = 1 << 16
+_MOST_COUNT = 1 << 14
+_KINDS = {"I": "i", "U": "u", "F": "f"}
+_SIZES = ("1", "2", "4", "8")
+_LITERAL = 32
+_LONG = 7
+
+
+def read_pcd(data: bytes, path: Path) -> Mesh:
+    """Read the points of a PCD file; those that are NaN, which an organised cloud has for nothing seen, are left out.
+
+    Args:
+        data: the whole file.
+        path: its name, for messages and the mesh's name.
+
+    Raises:
+        FileFormatError: it is no PCD, has no x, y and z, or is cut short.
+    """
+    head, at = _header(plain_text(data), path)
+    data = plain_text(data)
+    row, n = _row(head, path)
+    kind = head["DATA"][0].lower()
+    if kind == "ascii":
+        points = _text(data[at:], head, n, path)
+    elif kind == "binary":
+        check_count(n, row.itemsize, len(data) - at, "points", path)
+        table = np.frombuffer(data, row, n, at)
+        points = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    elif kind == "binary_compressed":
+        points = _unpacked(data, at, row, n, path)
+    else:
+        raise damaged(path, f"its data are '{kind[:40]}', but only ascii, binary and binary_compressed are read")
+    seen = ~np.isnan(points).any(axis=1)
+    if not seen.any():
+        raise damaged(path, "none of its points is there")
+    return mesh_of(points[seen], None, path)
+
+
+def _header(data: bytes, path: Path) -> tuple[dict[str, list[str]], int]:
+    """Return the words of each line of the header by the first, and where the data begin."""
+    found: dict[str, list[str]] = {}
+    at = 0
+    while "DATA" not in found:
+        end = data.find(b"\n", at, _MOST_HEADER)
+        if end < 0:
+            raise damaged(path, "it has no header that ends in DATA, so it is not a PCD file")
+        words = data[at:end].decode("ascii", "replace").split()
+        at = end + 1
+        if words and not words[0].startswith("#"):
+            found[words[0].upper()] = words[1:]
+    if not found["DATA"]:
+        raise damaged(path, "its header does not say how the data are written")
+    return found, at
+
+
+def _row(head: dict[str, list[str]], path: Path) -> tuple[np.dtype[np.void], int]:
+    """Return what one point is in the file, with x, y and z by name, and how many points there are."""
+    names = head.get("FIELDS", head.get("COLUMNS", []))
+    sizes, kinds = head.get("SIZE", []), head.get("TYPE", [])
+    counts = head.get("COUNT", ["1"] * len(names))
+    if not {"x", "y", "z"} <= set(names) or not len(names) == len(sizes) == len(kinds) == len(counts):
+        raise damaged(path, "its header does not say where x, y and z are; save it again")
+    if any(names.count(axis) != 1 or counts[names.index(axis)] != "1" for axis in "xyz"):
+        raise damaged(path, "its header has x, y or z more than once; save it again")
+    fields: list[tuple[str, str, tuple[int, ...]]] = []
+    for number, (name, size, kind, count) in enumerate(zip(names, sizes, kinds, counts, strict=True)):
+        if size not in _SIZES or kind not in _KINDS or (kind, size) == ("F", "1") or not count.isdecimal():
+            raise damaged(path, f"its field '{name[:40]}' is of a type that is not known; save it again")
+        if len(count) > 5 or int(count) > _MOST_COUNT:
+            raise damaged(path, f"its field '{name[:40]}' has {count[:20]} numbers a point, far too many")
+        fields.append((name if name in "xyz" else f"{name}/{number}", f"<{_KINDS[kind]}{size}", (int(count),)))
+    plain = [(name, kind, shape if shape != (1,) else ()) for name, kind, shape in fields]
+    try:
+        n = int(head["POINTS"][0]) if "POINTS" in head else int(head["WIDTH"][0]) * int(head["HEIGHT"][0])
+    except (KeyError, IndexError, ValueError) as error:
+        raise damaged(path, "its header does not say how many points there are; save it again") from error
+    return np.dtype(plain), n
+
+
+def _text(text: bytes, head: dict[str, list[str]], n: int, path: Path) -> FloatArray:
+    names = head.get("FIELDS", head.get("COLUMNS", []))
+    counts = [int(count) for count in head.get("COUNT", ["1"] * len(names))]
+    starts = np.cumsum([0, *counts])
+    width = int(starts[-1])
+    columns = [int(starts[names.index(axis)]) for axis in "xyz"]
+    check_count(n, 6, len(text) + 1, "points", path)
+    parts: list[FloatArray] = []
+    found = 0
+    for lines in line_blocks(text):
+        rows = [words for words in (line.split() for line in lines) if words]
+        if rows and min(map(len, rows)) < width:
+            raise damaged(path, f"a row has too few numbers; {CUT_SHORT}")
+        parts.append(floats(chain.from_iterable([row[c] for c in columns] for row in rows), path).reshape(-1, 3))
+        found += len(rows)
+    if found != n:
+        raise damaged(path, f"its header declares {n} points, but {found} follow; {CUT_SHORT}")
+    return joined(parts, np.float64, 3)
+
+
+def _unpacked(data: bytes, at: int, row: np.dtype[np.void], n: int, path: Path) -> FloatArray:
+    """Return the points of packed data, in which each field stands for all points before the next."""
+    sizes = np.frombuffer(data[at : at + 8].ljust(8, b"\0"), "<u4")
+    packed, size = int(sizes[0]), int(sizes[1])
+    if n < 0 or size != n * row.itemsize or at + 8 + packed > len(data):
+        raise damaged(path, f"its packed data have another length than its header says; {CUT_SHORT}")
+    Allowance(len(data), path).take(size, 1)
+    content = _lzf(data[at + 8 : at + 8 + packed], size, path)
+    offsets = {name: n * int(field[1]) for name, field in (row.fields or {}).items()}
+    runs = [np.frombuffer(content, row[axis], n, offsets[axis]).astype(np.float64) for axis in "xyz"]
+    return np.stack(runs, axis=1)
+
+
+def _lzf(data: bytes, size: int, path: Path) -> bytes:
+    """Return the `size` bytes that LZF made of `data`: runs as they are, and copies of what came before."""
+    out = bytearray()
+    at = 0
+    try:
+        while at < len(data) and len(out) <= size:
+            control = data[at]
+            at += 1
+            if control < _LITERAL:
+                out += data[at : at + control + 1]
+                at += control + 1
+                continue
+            length = control >> 5
+            if length == _LONG:
+                length += data[at]
+                at += 1
+            back = len(out) - ((control & 31) << 8) - data[at] - 1
+            at += 1
+            if back < 0:
+                raise IndexError
+            length += 2
+            run = bytes(out[back : back + length])
+            # What is copied may go on into the copy.
+            out += (run * (length // len(run) + 1))[:length]
+    except IndexError as error:
+        raise damaged(path, f"its packed data are wrong; {CUT_SHORT}") from error
+    if len(out) != size:
+        raise damaged(path, f"its packed data have another length than its header says; {CUT_SHORT}")
+    return bytes(out)

@@ -1,0 +1,577 @@
+"""VTK poly data: the legacy `.vtk` text and binary files and the XML `.vtp` files.
+
+After "VTK File Formats" of the VTK documentation: https://docs.vtk.org/en/latest/vtk_file_formats/index.html.
+"""
+
+from __future__ import annotations
+
+import base64
+import re
+import xml.etree.ElementTree as ET
+import zlib
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.errors import FileFormatError
+from shapespace.io.parsing import (
+    CUT_SHORT,
+    IndexArray,
+    check_count,
+    damaged,
+    fan_triangles,
+    floats,
+    floats_of,
+    ints,
+    ints_of,
+    joined,
+    mesh_of,
+    plain_text,
+    strip_triangles,
+    word_block,
+    xml_root,
+)
+from shapespace.io.read_limits import Allowance
+from shapespace.types import ByteArray, FloatArray, Mesh
+
+_LEGACY = {
+    "unsigned_char": "u1", "char": "i1", "signed_char": "i1", "unsigned_short": "u2", "short": "i2",
+    "unsigned_int": "u4", "int": "i4", "unsigned_long": "u8", "long": "i8",
+    "vtktypeint64": "i8", "vtktypeuint64": "u8", "vtktypeint32": "i4", "vtktypeuint32": "u4",
+    "vtkidtype": "i4", "float": "f4", "double": "f8",
+}  # fmt: skip
+_XML = {
+    "Int8": "i1", "UInt8": "u1", "Int16": "i2", "UInt16": "u2", "Int32": "i4", "UInt32": "u4",
+    "Int64": "i8", "UInt64": "u8", "Float32": "f4", "Float64": "f8",
+}  # fmt: skip
+# Fields may hold these too, which no surface needs, so they are passed over.
+_TEXTS = ("string", "utf8_string")
+_LINES = ("variant",)
+_BITS = ("bit",)
+_WORD = re.compile(rb"\s*(\S+)[ \t]*\r?\n?")
+_OFFSETS = re.compile(rb"\s*OFFSETS\s")
+_BLANK_LINE = re.compile(rb"\n[ \t\r]*\n")
+# zlib cannot shrink by more than this (1032 : 1), so a header that promises more lies.
+_MAX_INFLATION = 1040
+_COLOUR_WIDTHS = (3, 4)
+_MOST_ATTRIBUTES = 100
+
+Values = npt.NDArray[Any]
+
+
+class _Cursor(ABC):
+    """Where a legacy file is being read: words here, and numbers as ascii or binary makes them."""
+
+    def __init__(self, data: bytes, path: Path) -> None:
+        self.data, self.at, self.path = data, 0, path
+
+    def word(self) -> bytes:
+        """Return the next word, or nothing at the end."""
+        match = _WORD.match(self.data, self.at)
+        if match is None:
+            return b""
+        self.at = match.end()
+        return match[1]
+
+    @abstractmethod
+    def array(self, count: int, kind: str) -> Values:
+        """Return the next `count` numbers of the numpy `kind`."""
+
+    @abstractmethod
+    def skip_texts(self, count: int) -> None:
+        """Move past `count` pieces of text."""
+
+    @abstractmethod
+    def skip_bits(self, count: int) -> None:
+        """Move past `count` bits."""
+
+    def skip_lines(self, count: int) -> None:
+        """Move past `count` lines, which are text in binary files too."""
+        check_count(count, 1, len(self.data) - self.at + 1, "lines", self.path)
+        for _ in range(count):
+            end = self.data.find(b"\n", self.at)
+            if end < 0:
+                raise damaged(self.path, f"it ends among its fields; {CUT_SHORT}")
+            self.at = end + 1
+
+    def skip_metadata(self) -> None:
+        """Move past a METADATA section, which a blank line ends."""
+        blank = _BLANK_LINE.search(self.data, max(self.at - 1, 0))
+        if blank is None:
+            raise damaged(self.path, f"it ends among its METADATA; {CUT_SHORT}")
+        self.at = blank.end()
+
+    def skip_if_offsets(self) -> bool:
+        """Move past the word OFFSETS if it comes next, and return whether it did."""
+        # As a number, 'OFFS' would be a polygon of a thousand million corners.
+        found = _OFFSETS.match(self.data, self.at)
+        self.at = found.end() if found else self.at
+        return found is not None
+
+
+class _TextCursor(_Cursor):
+    def array(self, count: int, kind: str) -> Values:
+        check_count(count, 2, len(self.data) - self.at + 1, "numbers", self.path)
+        parts: list[Values] = []
+        while count:
+            words, stop = word_block(self.data, self.at, 16 * count)
+            if not words and stop == len(self.data):
+                raise damaged(self.path, f"it ends among its numbers; {CUT_SHORT}")
+            if len(words) > count:
+                # Cut again, to see where the last of them ends.
+                rest = self.data[self.at : stop].split(None, count)[count]
+                words, stop = words[:count], stop - len(rest)
+            parts.append(floats(words, self.path) if kind[0] == "f" else ints(words, self.path))
+            self.at = stop
+            count -= len(words)
+        return joined(parts, np.float64 if kind[0] == "f" else np.int64)
+
+    def skip_texts(self, count: int) -> None:
+        self.skip_lines(count)
+
+    def skip_bits(self, count: int) -> None:
+        self.array(count, "i1")
+
+
+class _BinaryCursor(_Cursor):
+    def array(self, count: int, kind: str) -> Values:
+        big = np.dtype(">" + kind)
+        check_count(count, big.itemsize, len(self.data) - self.at, "numbers", self.path)
+        values = np.frombuffer(self.data, dtype=big, count=count, offset=self.at)
+        self.at += count * big.itemsize
+        return values.astype(np.float64 if kind[0] == "f" else np.int64)
+
+    def skip_texts(self, count: int) -> None:
+        check_count(count, 1, len(self.data) - self.at, "pieces of text", self.path)
+        for _ in range(count):
+            # The two highest bits of the length tell how many bytes it has.
+            width = 8 >> (self.data[self.at] >> 6) if self.at < len(self.data) else 1
+            length = int.from_bytes(self.data[self.at : self.at + width], "big") & ((1 << (8 * width - 2)) - 1)
+            self.at += width + length
+            if self.at > len(self.data):
+                raise damaged(self.path, f"it ends among its fields; {CUT_SHORT}")
+
+    def skip_bits(self, count: int) -> None:
+        self.array(-(-count // 8), "u1")
+
+
+def read_vtk(data: bytes, path: Path) -> Mesh:
+    """Read legacy VTK poly data, ascii or binary, with the cells of VTK before and after 5.1.
+
+    Polygons become fans and triangle strips triangles; vertex and line cells are passed over.
+
+    Args:
+        data: the whole file.
+        path: its name, for messages and the mesh's name.
+
+    Raises:
+        FileFormatError: it is not legacy VTK poly data, or it is cut short.
+        MeshError: faces that point past the end of the vertices.
+    """
+    data = plain_text(data)
+    head = data[:1024].split(b"\n", 3)
+    if len(head) < 4 or not head[0].startswith(b"# vtk DataFile"):
+        raise damaged(path, "it does not start with '# vtk DataFile', so it is not a VTK file")
+    encoding = head[2].strip().upper()
+    body = data[sum(len(line) + 1 for line in head[:3]) :]
+    allowance = Allowance(len(data), path)
+    cursor: _Cursor
+    if encoding == b"ASCII":
+        cursor = _TextCursor(body, path)
+    elif encoding == b"BINARY":
+        cursor = _BinaryCursor(body, path)
+    else:
+        raise damaged(path, "its third line says neither ASCII nor BINARY")
+    dataset = cursor.word() + b" " + cursor.word()
+    if dataset != b"DATASET POLYDATA":
+        kind = dataset.decode("ascii", "replace")[:40]
+        raise damaged(path, f"it has '{kind}', not DATASET POLYDATA; extract its surface first")
+    vertices: FloatArray | None = None
+    faces: list[IndexArray] = []
+    while (word := cursor.word()) not in (b"", b"POINT_DATA", b"CELL_DATA"):
+        allowance.part()
+        if word == b"POINTS":
+            count = _count(cursor, path)
+            vertices = cursor.array(3 * count, _next_kind(cursor, path)).astype(np.float64).reshape(-1, 3)
+        elif word in (b"POLYGONS", b"TRIANGLE_STRIPS", b"LINES", b"VERTICES"):
+            counts, corners = _legacy_cells(cursor, path)
+            if word == b"POLYGONS":
+                faces.append(fan_triangles(counts, corners))
+            elif word == b"TRIANGLE_STRIPS":
+                faces.append(strip_triangles(counts, corners))
+        elif word == b"FIELD":
+            cursor.word()
+            count = _count(cursor, path)
+            allowance.part(max(count, 0))
+            for _ in range(count):
+                _skip_field(cursor, path)
+        elif word == b"METADATA":
+            cursor.skip_metadata()
+        else:
+            name = word.decode("ascii", "replace")[:40]
+            raise damaged(path, f"it has an unknown section '{name}'; {CUT_SHORT}")
+    if vertices is None:
+        raise damaged(path, f"it has no POINTS; {CUT_SHORT}")
+    colours = _legacy_colours(cursor, len(vertices)) if word == b"POINT_DATA" else None
+    return mesh_of(vertices, joined(faces, np.int64, 3), path, colours)
+
+
+def _legacy_colours(cursor: _Cursor, vertices: int) -> ByteArray | None:
+    """Return the first colours among what is known of the points; what comes after the surface is not judged."""
+    try:
+        if _count(cursor, cursor.path) != vertices:
+            return None
+        for _ in range(_MOST_ATTRIBUTES):
+            word = cursor.word()
+            if word == b"SCALARS":
+                cursor.word()
+                kind, width = cursor.word().decode("ascii", "replace").lower(), _width(cursor.word())
+                if cursor.word() != b"LOOKUP_TABLE":
+                    return None
+                cursor.word()
+                values = cursor.array(vertices * width, _kind(kind, cursor.path))
+                if kind == "unsigned_char" and width in _COLOUR_WIDTHS:
+                    return _three_bytes(values, width)
+            elif word == b"COLOR_SCALARS":
+                cursor.word()
+                width = _width(cursor.word())
+                in_text = isinstance(cursor, _TextCursor)
+                values = cursor.array(vertices * width, "f4" if in_text else "u1")
+                if width in _COLOUR_WIDTHS:
+                    return _three_bytes(np.rint(255.0 * values) if in_text else values, width)
+            elif word in (b"NORMALS", b"VECTORS"):
+                cursor.word()
+                cursor.array(3 * vertices, _next_kind(cursor, cursor.path))
+            elif word == b"FIELD":
+                cursor.word()
+                for _ in range(min(_count(cursor, cursor.path), _MOST_ATTRIBUTES)):
+                    while cursor.word() == b"METADATA":
+                        cursor.skip_metadata()
+                    width, rows = _count(cursor, cursor.path), _count(cursor, cursor.path)
+                    kind = cursor.word().decode("ascii", "replace").lower()
+                    values = cursor.array(width * rows, _kind(kind, cursor.path))
+                    if kind == "unsigned_char" and width in _COLOUR_WIDTHS and rows == vertices:
+                        return _three_bytes(values, width)
+            elif word == b"METADATA":
+                cursor.skip_metadata()
+            else:
+                return None
+    except FileFormatError:
+        return None
+    return None
+
+
+def _width(word: bytes) -> int:
+    return int(word) if word in (b"1", b"2", b"3", b"4") else 1
+
+
+def _three_bytes(values: Values, width: int) -> ByteArray | None:
+    rows = values.reshape(-1, width)[:, :3]
+    return rows.astype(np.uint8) if ((rows >= 0) & (rows <= 255)).all() else None
+
+
+def _skip_field(cursor: _Cursor, path: Path) -> None:
+    while cursor.word() == b"METADATA":
+        cursor.skip_metadata()
+    count = _count(cursor, path) * _count(cursor, path)
+    name = cursor.word().decode("ascii", "replace").lower()
+    if name in _TEXTS:
+        cursor.skip_texts(count)
+    elif name in _LINES:
+        cursor.skip_lines(count)
+    elif name in _BITS:
+        cursor.skip_bits(count)
+    else:
+        cursor.array(count, _kind(name, path))
+
+
+def _count(cursor: _Cursor, path: Path) -> int:
+    return int(ints([cursor.word()], path)[0])
+
+
+def _next_kind(cursor: _Cursor, path: Path) -> str:
+    return _kind(cursor.word().decode("ascii", "replace").lower(), path)
+
+
+def _kind(name: str, path: Path) -> str:
+    if name not in _LEGACY:
+        raise damaged(path, f"it has numbers of an unknown type '{name[:40]}'; {CUT_SHORT}")
+    return _LEGACY[name]
+
+
+def _legacy_cells(cursor: _Cursor, path: Path) -> tuple[IndexArray, IndexArray]:
+    first, second = _count(cursor, path), _count(cursor, path)
+    if cursor.skip_if_offsets():
+        offsets = cursor.array(first, _next_kind(cursor, path)).astype(np.int64)
+        if cursor.word() != b"CONNECTIVITY":
+            raise damaged(path, f"its cells have OFFSETS without CONNECTIVITY; {CUT_SHORT}")
+        corners = cursor.array(second, _next_kind(cursor, path)).astype(np.int64)
+        return _from_offsets(offsets, corners, path)
+    packed = cursor.array(second, "i4").astype(np.int64)
+    if first > 0 and second and second % first == 0:
+        table = packed.reshape(first, -1)
+        if (table[:, 0] == table.shape[1] - 1).all():
+            return table[:, 0], table[:, 1:].ravel()
+    sizes: list[int] = []
+    at, values = 0, packed.tolist()
+    while at < second and len(sizes) < first and values[at] >= 0:
+        sizes.append(values[at])
+        at += values[at] + 1
+    if at != second or len(sizes) != first:
+        raise damaged(path, f"its cells do not add up to the size that they declare; {CUT_SHORT}")
+    counts = np.array(sizes, dtype=np.int64)
+    keep = np.ones(second, dtype=np.bool_)
+    keep[np.cumsum(counts + 1) - counts - 1] = False
+    return counts, packed[keep]
+
+
+def _from_offsets(offsets: IndexArray, corners: IndexArray, path: Path) -> tuple[IndexArray, IndexArray]:
+    """Return sizes of cells and their corners, from offsets that run from 0 to the number of corners."""
+    if not len(offsets):
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    counts = np.diff(offsets)
+    if offsets[0] != 0 or offsets[-1] != len(corners) or (counts < 0).any():
+        raise damaged(path, f"the offsets of its cells do not match their corners; {CUT_SHORT}")
+    return counts, corners
+
+
+def write_vtk(mesh: Mesh) -> bytes:
+    """Return `mesh` as binary legacy VTK poly data (version 3.0, known to all readers), with doubles."""
+    n = len(mesh.vertices)
+    head = f"# vtk DataFile Version 3.0\nshapespace\nBINARY\nDATASET POLYDATA\nPOINTS {n} double\n"
+    cells = np.arange(n, dtype=np.int32).reshape(-1, 1) if mesh.faces is None else mesh.faces
+    packed = np.empty((len(cells), cells.shape[1] + 1), dtype=">i4")
+    packed[:, 0], packed[:, 1:] = cells.shape[1], cells
+    section = f"\n{'VERTICES' if mesh.faces is None else 'POLYGONS'} {len(cells)} {packed.size}\n"
+    points = mesh.vertices.astype(">f8").tobytes()
+    surface = head.encode("ascii") + points + section.encode("ascii") + packed.tobytes() + b"\n"
+    if mesh.colours is None:
+        return surface
+    told = f"POINT_DATA {n}\nSCALARS RGB unsigned_char 3\nLOOKUP_TABLE default\n"
+    return surface + told.encode("ascii") + mesh.colours.tobytes() + b"\n"
+
+
+@dataclass(frozen=True)
+class _Xml:
+    """What the arrays of one XML file have in common."""
+
+    path: Path
+    order: str
+    header: str
+    compressed: bool
+    appended: bytes
+    appended_base64: bool
+    allowance: Allowance
+
+
+def read_vtp(data: bytes, path: Path) -> Mesh:
+    """Read XML VTK poly data: ascii, inline base64 or appended, plain or zlib; pieces are joined.
+
+    Args:
+        data: the whole file.
+        path: its name, for messages and the mesh's name.
+
+    Raises:
+        FileFormatError: it is not XML poly data, is cut short, or is compressed otherwise than by zlib.
+        MeshError: faces that point past the end of the vertices.
+    """
+    head, mark, tail = data.partition(b"<AppendedData")
+    appended = b""
+    if mark:
+        # Raw data are not XML, so the XML parser sees only what comes before them.
+        tag, _, rest = tail.partition(b">")
+        head += mark + tag + b"/></VTKFile>"
+        appended = rest.partition(b"_")[2]
+    root = xml_root(head, path)
+    if root.tag != "VTKFile" or root.get("type") != "PolyData":
+        raise damaged(path, "it is not a VTK file of type PolyData; extract its surface first")
+    compressor = root.get("compressor", "")
+    if compressor not in ("", "vtkZLibDataCompressor"):
+        raise damaged(path, f"it is compressed by {compressor[:40]}, so save it with zlib or uncompressed")
+    block = root.find("AppendedData")
+    base = block is not None and block.get("encoding", "base64") == "base64"
+    order = ">" if root.get("byte_order") == "BigEndian" else "<"
+    header = order + ("u8" if root.get("header_type") == "UInt64" else "u4")
+    xml = _Xml(path, order, header, compressor != "", appended, base, Allowance(len(data), path))
+    points: list[FloatArray] = []
+    colours: list[ByteArray | None] = []
+    faces: list[IndexArray] = []
+    before = 0
+    for piece in root.iterfind("PolyData/Piece"):
+        xml.allowance.part()
+        vertices = _piece_points(piece, xml)
+        for section, cut in (("Polys", fan_triangles), ("Strips", strip_triangles)):
+            arrays = {a.get("Name"): a for a in piece.iterfind(f"{section}/DataArray")}
+            if not {"connectivity", "offsets"} <= arrays.keys():
+                continue
+            ends = _data_array(arrays["offsets"], xml).astype(np.int64)
+            corners = _data_array(arrays["connectivity"], xml).astype(np.int64)
+            if not len(ends):
+                continue
+            xml.allowance.take(3 * len(corners), 8)
+            triangles = cut(*_from_offsets(np.concatenate([[0], ends]), corners, path))
+            # Checked piece by piece: joined, an index past one piece would point into the next.
+            faces.append(_faces_of(mesh_of(vertices, triangles, path)) + before)
+        points.append(vertices)
+        colours.append(_piece_colours(piece, len(vertices), xml))
+        before += len(vertices)
+    if not points:
+        raise damaged(path, f"it holds no points; {CUT_SHORT}")
+    own = [part for part in colours if part is not None]
+    painted = np.concatenate(own) if len(own) == len(colours) else None
+    return mesh_of(np.concatenate(points), joined(faces, np.int64, 3), path, painted)
+
+
+def _faces_of(mesh: Mesh) -> IndexArray:
+    return np.zeros((0, 3), dtype=np.int64) if mesh.faces is None else mesh.faces.astype(np.int64)
+
+
+def _piece_points(piece: ET.Element, xml: _Xml) -> FloatArray:
+    declared = int(ints([piece.get("NumberOfPoints", "").encode()], xml.path)[0])
+    array = piece.find("Points/DataArray")
+    if declared == 0:
+        return np.zeros((0, 3))
+    if array is None:
+        raise damaged(xml.path, f"it has a piece without points; {CUT_SHORT}")
+    values = _data_array(array, xml).astype(np.float64)
+    if len(values) != 3 * declared:
+        raise damaged(xml.path, f"it declares {declared} points, but holds {len(values)} numbers for them; {CUT_SHORT}")
+    return values.reshape(-1, 3)
+
+
+def _piece_colours(piece: ET.Element, vertices: int, xml: _Xml) -> ByteArray | None:
+    """Return the first array of bytes, three or four a point, among what is known of the points."""
+    for array in piece.iterfind("PointData/DataArray"):
+        width = _width(array.get("NumberOfComponents", "1").encode("ascii", "replace"))
+        if array.get("type") == "UInt8" and width in _COLOUR_WIDTHS:
+            try:
+                values = _data_array(array, xml)
+            except FileFormatError:
+                return None
+            return _three_bytes(values, width) if len(values) == width * vertices else None
+    return None
+
+
+def _data_array(array: ET.Element, xml: _Xml) -> Values:
+    """Return one DataArray as a flat array of its own type."""
+    path = xml.path
+    name = array.get("type", "")
+    if name not in _XML:
+        raise damaged(path, f"it has numbers of an unknown type '{name[:40]}'")
+    kind = np.dtype(xml.order + _XML[name])
+    form = array.get("format", "ascii")
+    text = (array.text or "").encode("ascii", "replace")
+    if form == "ascii":
+        return floats_of(text, path) if kind.kind == "f" else ints_of(text, path)
+    if form == "binary":
+        raw = _decoded(b"".join(text.split()), 0, True, xml)
+    elif form == "appended":
+        offset = int(ints([array.get("offset", "").encode()], path)[0])
+        if not 0 <= offset < len(xml.appended):
+            raise damaged(path, f"it has data that start past its end; {CUT_SHORT}")
+        raw = _decoded(xml.appended, offset, xml.appended_base64, xml)
+    else:
+        raise damaged(path, f"it has data of an unknown form '{form[:40]}'")
+    if len(raw) % kind.itemsize:
+        raise damaged(path, f"it has data that end inside a number; {CUT_SHORT}")
+    # Every array becomes one of eight bytes a number.
+    xml.allowance.take(len(raw) // kind.itemsize, 8)
+    return np.frombuffer(raw, dtype=kind)
+
+
+def _decoded(data: bytes, at: int, is_base64: bool, xml: _Xml) -> bytes:
+    """Return the bytes of one array that starts at byte `at` of `data`."""
+    width = np.dtype(xml.header).itemsize
+    if not xml.compressed:
+        (length,) = _words(data, at, 1, is_base64, xml)
+        chars = 4 * -(-width // 3)
+        # Some writers encode the length by itself, which leaves padding, and others together with the data.
+        if is_base64 and data[at : at + chars].endswith(b"="):
+            return _stream(data, at + chars, 0, length, True, xml)
+        return _stream(data, at, width, length, is_base64, xml)
+    (blocks,) = _words(data, at, 1, is_base64, xml)
+    check_count(blocks, width, len(data) - at, "compressed blocks", xml.path)
+    xml.allowance.part(blocks)
+    _, size, last, *packed = _words(data, at, 3 + blocks, is_base64, xml)
+    header = (3 + blocks) * width
+    stream = _stream(data, at + (4 * -(-header // 3) if is_base64 else header), 0, sum(packed), is_base64, xml)
+    out: list[bytes] = []
+    begin = 0
+    for i, length in enumerate(packed):
+        want = last if i == len(packed) - 1 and last else size
+        if want > _MAX_INFLATION * (length + 16):
+            raise damaged(xml.path, f"it has a compressed block that claims {want} bytes; {CUT_SHORT}")
+        xml.allowance.take(want, 1)
+        try:
+            piece = zlib.decompressobj().decompress(stream[begin : begin + length], max_length=want or 1)
+        except zlib.error as error:
+            raise damaged(xml.path, f"it has a block that cannot be unpacked; {CUT_SHORT}") from error
+        if len(piece) != want:
+            raise damaged(xml.path, f"it has a compressed block of the wrong length; {CUT_SHORT}")
+        out.append(piece)
+        begin += length
+    return b"".join(out)
+
+
+def _words(data: bytes, at: int, count: int, is_base64: bool, xml: _Xml) -> list[int]:
+    """Return the `count` whole numbers at the start of an array."""
+    kind = np.dtype(xml.header)
+    return np.frombuffer(_stream(data, at, 0, count * kind.itemsize, is_base64, xml), dtype=kind).tolist()
+
+
+def _stream(data: bytes, at: int, start: int, length: int, is_base64: bool, xml: _Xml) -> bytes:
+    """Return `length` bytes from byte `start` of what `data` encodes from byte `at` on."""
+    end = start + length
+    check_count(end, 1, len(data) - at, "bytes of data", xml.path)
+    if not is_base64:
+        return data[at + start : at + end]
+    # Arrays may lie on the same bytes, so that each counts by itself.
+    xml.allowance.take(end, 1)
+    try:
+        raw = base64.b64decode(data[at : at + 4 * -(-end // 3)], validate=True)
+    except ValueError as error:
+        raise damaged(xml.path, f"it has data that are not base64; {CUT_SHORT}") from error
+    if len(raw) < end:
+        raise damaged(xml.path, f"it ends inside its data; {CUT_SHORT}")
+    return raw[start:end]
+
+
+def write_vtp(mesh: Mesh) -> bytes:
+    """Return `mesh` as XML VTK poly data with inline base64, Float64 points, uncompressed."""
+    n = len(mesh.vertices)
+    cells = np.arange(n, dtype=np.int32).reshape(-1, 1) if mesh.faces is None else mesh.faces
+    ends = np.arange(1, len(cells) + 1, dtype="<i8") * cells.shape[1]
+    section, verts, polys = ("Verts", n, 0) if mesh.faces is None else ("Polys", 0, len(cells))
+
+    def array(name: str, kind: str, values: Values, components: str = "") -> str:
+        raw = values.tobytes()
+        packed = base64.b64encode(len(raw).to_bytes(8, "little") + raw).decode("ascii")
+        return f'<DataArray type="{kind}" Name="{name}"{components} format="binary">{packed}</DataArray>'
+
+    colours: list[str] = []
+    if mesh.colours is not None:
+        told = array("RGB", "UInt8", mesh.colours, ' NumberOfComponents="3"')
+        colours = ['<PointData Scalars="RGB">', told, "</PointData>"]
+    lines = [
+        '<?xml version="1.0"?>',
+        '<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt64">',
+        "<PolyData>",
+        f'<Piece NumberOfPoints="{n}" NumberOfVerts="{verts}" NumberOfLines="0" NumberOfStrips="0"'
+        f' NumberOfPolys="{polys}">',
+        "<Points>",
+        array("Points", "Float64", mesh.vertices.astype("<f8"), ' NumberOfComponents="3"'),
+        "</Points>",
+        *colours,
+        f"<{section}>",
+        array("connectivity", "Int64", cells.astype("<i8").ravel()),
+        array("offsets", "Int64", ends),
+        f"</{section}>",
+        "</Piece>",
+        "</PolyData>",
+        "</VTKFile>",
+    ]
+    return ("\n".join(lines) + "\n").encode("ascii")

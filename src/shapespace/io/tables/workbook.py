@@ -1,0 +1,258 @@
+"""Sheets of Excel workbooks (.xlsx, Office Open XML, ECMA-376 part 1) as rows of text, read as a stream and bounded.
+
+Numbers are the text that the file stores, dates are ISO 8601, cells with the error #N/A are empty. Formulas have the
+value that was computed last; nothing is computed.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Mapping
+from datetime import datetime, timedelta
+from typing import Final, Protocol
+
+from shapespace.io.containers.archives import zip_members
+
+WORKBOOK_START: Final = b"PK\x03\x04"
+"""The bytes with which every workbook begins."""
+
+_MOST_UNPACKED = 2**26
+"""Bytes that a workbook may unpack to (64 MiB), a million cells or more."""
+_MOST_CELLS = 2_000_000
+_MOST_TEXT = 2**26
+"""Characters in all cells together; one shared string may stand in many of them."""
+_MOST_COLUMNS = 16_384
+"""Columns of a sheet in Excel (XFD)."""
+_DIGITS = 7
+_CELL = re.compile(r"([A-Z]{1,3})[0-9]{1,7}")
+_RELATIONS = "xl/_rels/workbook.xml.rels"
+_LAST_DAY = 2_958_466
+"""31 December 9999 as Excel counts days."""
+_DATES = frozenset({*range(14, 23), *range(27, 37), *range(45, 48), *range(50, 59)})
+"""Number formats that are dates or times without being defined in the file (ECMA-376 part 1, 18.8.30)."""
+_NO_CODE = re.compile(r'"[^"]*"|\[[^\]]*\]|\\.')
+
+Row = Mapping[int, str]
+"""Column, from 0 -> text of the cells of a row that are not empty."""
+
+
+def sheet_rows(content: bytes, sheet: str | None = None) -> list[Row]:
+    """Return the rows of a sheet of a workbook, those without a cell left out.
+
+    Args:
+        content: of the file.
+        sheet: its name; None for the first.
+
+    Raises:
+        ValueError: it is no workbook, is damaged or too large, or has no such sheet; with a clause on the fault.
+    """
+    try:
+        # The bound of the archive is a multiple of its size, and that of a workbook the same for all.
+        members = zip_members(io.BytesIO(content), min(len(content), _MOST_UNPACKED // 100))
+    except (ValueError, OSError) as error:
+        raise ValueError(f"is no workbook, or it is cut short ({error})") from error
+    book = _Elements(("sheet", "workbookPr"))
+    _parse(members, "xl/workbook.xml", book)
+    sheets = [attributes for tag, attributes in book.found if tag == "sheet"]
+    chosen = next((one for one in sheets if sheet is None or one.get("name") == sheet), None)
+    if chosen is None:
+        raise ValueError(f"has no sheet called {sheet}" if sheet else "has no sheet, so it is no workbook")
+    key = next((value for name, value in chosen.items() if name.endswith("}id")), "")
+    relations = _Elements(("Relationship",))
+    _parse(members, _RELATIONS, relations)
+    targets = {one.get("Id"): one.get("Target", "") for _, one in relations.found}
+    target = targets.get(key, "").removeprefix("/xl/").removeprefix("xl/")
+    shared = _Strings()
+    if "xl/sharedStrings.xml" in members:
+        _parse(members, "xl/sharedStrings.xml", shared)
+    styles = _Elements(("numFmt", "xf", "cellXfs", "cellStyleXfs"))
+    if "xl/styles.xml" in members:
+        _parse(members, "xl/styles.xml", styles)
+    since_1904 = any(tag == "workbookPr" and one.get("date1904") in ("1", "true") for tag, one in book.found)
+    cells = _Cells(shared.strings, _date_styles(styles), since_1904=since_1904)
+    _parse(members, f"xl/{target}", cells)
+    return cells.rows
+
+
+class _Target(Protocol):
+    def start(self, tag: str, attrs: dict[str, str], /) -> object: ...
+
+    def end(self, tag: str, /) -> object: ...
+
+    def data(self, data: str, /) -> object: ...
+
+
+class _Handler:
+    """A target of the XML parser that keeps no tree; document types, and with them entities, are refused."""
+
+    def start(self, tag: str, attrs: dict[str, str], /) -> None: ...
+
+    def end(self, tag: str, /) -> None: ...
+
+    def data(self, data: str, /) -> None: ...
+
+    def close(self) -> None: ...
+
+    def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
+        raise ValueError("declares a document type, which no workbook does")
+
+
+class _Elements(_Handler):
+    """The attributes of all elements of some names, in their order."""
+
+    def __init__(self, names: tuple[str, ...]) -> None:
+        self.names = names
+        self.found: list[tuple[str, dict[str, str]]] = []
+
+    def start(self, tag: str, attrs: dict[str, str], /) -> None:
+        if _local(tag) in self.names:
+            self.found.append((_local(tag), attrs))
+            if len(self.found) > _MOST_CELLS:
+                raise ValueError("has too many styles or sheets")
+
+
+class _Strings(_Handler):
+    """The shared strings."""
+
+    def __init__(self) -> None:
+        self.strings: list[str] = []
+        self._parts: list[str] = []
+        self._in_text = self._phonetic = False
+
+    def start(self, tag: str, attrs: dict[str, str], /) -> None:
+        name = _local(tag)
+        self._in_text = name == "t" and not self._phonetic
+        self._phonetic = self._phonetic or name == "rPh"
+
+    def end(self, tag: str, /) -> None:
+        name = _local(tag)
+        self._in_text = False
+        if name == "rPh":
+            self._phonetic = False
+        elif name == "si":
+            self.strings.append("".join(self._parts))
+            self._parts = []
+            if len(self.strings) > _MOST_CELLS:
+                raise ValueError("has too many shared strings")
+
+    def data(self, data: str, /) -> None:
+        if self._in_text:
+            self._parts.append(data)
+
+
+class _Cells(_Handler):
+    """The cells of a sheet."""
+
+    def __init__(self, strings: list[str], dates: frozenset[str], *, since_1904: bool) -> None:
+        self.rows: list[Row] = []
+        self._strings, self._dates = strings, dates
+        self._first_day = datetime(1904, 1, 1) if since_1904 else datetime(1899, 12, 30)
+        self._row: dict[int, str] = {}
+        self._column, self._kind, self._style = -1, "", ""
+        self._parts: list[str] = []
+        self._in_value = False
+        self._cells = self._characters = 0
+
+    def start(self, tag: str, attrs: dict[str, str], /) -> None:
+        name = _local(tag)
+        if name == "row":
+            self._row, self._column = {}, -1
+        elif name == "c":
+            at = _CELL.fullmatch(attrs.get("r", ""))
+            # A cell without a place follows the one before it.
+            self._column = _column(at[1]) if at else self._column + 1
+            if self._column >= _MOST_COLUMNS:
+                raise ValueError("has more columns than a sheet can have")
+            self._kind, self._style, self._parts = attrs.get("t", "n"), attrs.get("s", "0"), []
+        self._in_value = name in ("v", "t")
+
+    def end(self, tag: str, /) -> None:
+        name = _local(tag)
+        self._in_value = False
+        if name == "c":
+            text = self._text("".join(self._parts))
+            self._cells += 1
+            self._characters += len(text)
+            if self._cells > _MOST_CELLS or self._characters > _MOST_TEXT:
+                raise ValueError("has more cells or text than a table of shapes needs")
+            if text:
+                self._row[self._column] = text
+        elif name == "row" and self._row:
+            self.rows.append(self._row)
+            self._row = {}
+
+    def data(self, data: str, /) -> None:
+        if self._in_value:
+            self._parts.append(data)
+
+    def _text(self, value: str) -> str:
+        if self._kind == "s":
+            # A number of thousands of digits is no index, and takes quadratic time to read.
+            known = value.isascii() and value.isdecimal() and len(value) <= _DIGITS and int(value) < len(self._strings)
+            if value and not known:
+                raise ValueError(f"is damaged: there is no shared string {value[:20]!r}")
+            return self._strings[int(value)] if value else ""
+        if self._kind == "b":
+            return {"1": "TRUE", "0": "FALSE"}.get(value, value)
+        if self._kind == "e":
+            if value == "#N/A":
+                return ""
+            raise ValueError(f"has the error {value[:20]} in a cell; correct the formula")
+        if self._kind == "n" and self._style in self._dates:
+            return self._date(value)
+        return value
+
+    def _date(self, value: str) -> str:
+        try:
+            days = float(value)
+        except ValueError:
+            return value
+        if not 0 <= days < _LAST_DAY:
+            return value
+        seconds = round(days * 86_400)
+        moment = self._first_day + timedelta(seconds=seconds)
+        if days < 1:
+            return moment.time().isoformat()
+        return moment.isoformat(sep=" ") if seconds % 86_400 else moment.date().isoformat()
+
+
+def _parse(members: Mapping[str, bytes], name: str, target: _Target) -> None:
+    feed: Callable[[bytes], object] | None = None
+    try:
+        parser = ET.XMLParser(target=target)
+        feed = parser.feed
+        feed(members.get(name, b""))
+        parser.close()
+    except (ET.ParseError, LookupError) as error:
+        raise ValueError(f"is no workbook, or it is damaged ({name[:60]})") from error
+
+
+def _date_styles(styles: _Elements) -> frozenset[str]:
+    """Return the numbers, as text, of the styles of cells that show dates or times."""
+    codes = {one.get("numFmtId", ""): one.get("formatCode", "") for tag, one in styles.found if tag == "numFmt"}
+    found: set[str] = set()
+    of_cells, number = False, 0
+    for tag, one in styles.found:
+        if tag in ("cellXfs", "cellStyleXfs"):
+            of_cells, number = tag == "cellXfs", 0
+        elif tag == "xf" and of_cells:
+            key = one.get("numFmtId", "0")
+            own = _NO_CODE.sub("", codes.get(key, "")).lower()
+            built_in = key not in codes and key.isascii() and key.isdecimal() and len(key) < _DIGITS
+            if (built_in and int(key) in _DATES) or (own != "general" and re.search(r"[ymdhs]", own)):
+                found.add(str(number))
+            number += 1
+    return frozenset(found)
+
+
+def _column(letters: str) -> int:
+    number = 0
+    for letter in letters:
+        number = number * 26 + ord(letter) - ord("A") + 1
+    return number - 1
+
+
+def _local(tag: str) -> str:
+    return tag.rpartition("}")[2]

@@ -1,0 +1,731 @@
+"""How good a shape space is: compactness, generalisation and specificity over the number of modes, with intervals.
+
+Compactness is the share of the variance that the first modes hold. Generalisation is the error on shapes that the model
+did not see: in each fold poses, mean and modes are found anew without them, and each is told by the first modes in its
+best pose. Specificity is the distance of random shapes of the model from the nearest training shape. Davies, Twining,
+Cootes, Waterton and Taylor, TMI 21(5), 2002; Styner et al., IPMI 2003. Distances are told twice and never mixed:
+`vertices`, from each vertex to the one that corresponds, and `surface`, from vertices to the nearest point of the other
+surface, the mean of both directions: the first flatters shapes whose vertices slid (Ericsson and Karlsson, 2007), the
+second does not see it at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
+
+import numpy as np
+
+from shapespace.errors import CorrespondenceError, InputError
+from shapespace.geometry.closest import ClosestPointEngine, build_engine, on_boundary
+from shapespace.geometry.normals import boundary_vertices, part_of, without_estimates
+from shapespace.geometry.procrustes import Gauge
+from shapespace.geometry.similarity import fit_similarity
+from shapespace.io.interop import MeshLike, as_meshes
+from shapespace.lazy import lazy_import
+from shapespace.model.missing import MIN_SEEN, Kept
+from shapespace.model.representation import representation_named
+from shapespace.model.shape_model import ShapeModel
+from shapespace.reprs import short_repr
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity, common_faces, require_whole
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_FEWEST = 3
+_FEWEST_TO_CHOOSE = 4
+_MOST_COUNTS, _MOST_SPECIFIC = 12, 6
+"""Numbers of modes that are tried; specificity takes longest."""
+_POINTS = 1000
+"""Vertices that distances between surfaces are measured at, spread evenly over their numbers."""
+_POSE_ROUNDS = 3
+_NEAREST = 2
+"""Training shapes nearest by vertices, of which the nearest by surface is taken."""
+_RESAMPLES = 2000
+_PARTS = (0.25, 0.5, 0.75, 1.0)
+_ANY = 1e-9
+"""Share of the shapes that show a vertex: two of them are enough for a model that is measured."""
+_LEAST_NOISE = 1e-6
+"""Share of the variance that is noise where the modes hold all of it."""
+_DRAWN_AT_ONCE = 5
+"""Random shapes of one part of the work."""
+_FAR = 0.05
+"""Of the size of a surface: what lies farther from its scan is no surface of it."""
+
+
+OnStep: TypeAlias = Callable[[int, int], None]
+"""Called with what is done and what there is to do."""
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """A measure by the number of modes, or of training shapes.
+
+    Args:
+        at: (n,) numbers of modes or shapes.
+        mean: (n,) mm, or a share.
+        low: (n,) where its 95 % interval begins.
+        high: (n,) where it ends.
+        each: (S, n) of each shape or sample, where the mean is over them.
+    """
+
+    at: IntArray
+    mean: FloatArray
+    low: FloatArray
+    high: FloatArray
+    each: FloatArray | None = None
+
+    __repr__ = short_repr
+
+    @staticmethod
+    def over(each: FloatArray, at: Sequence[int] | IntArray, seed: int) -> Curve:
+        """Return the mean over the rows of `each` (S, n) with its interval by bootstrap over rows (percentiles)."""
+        draws = np.random.default_rng(seed).integers(len(each), size=(_RESAMPLES, len(each)))
+        weights = np.stack([np.bincount(draw, minlength=len(each)) for draw in draws]) / len(each)
+        low, high = np.percentile(weights @ each, [2.5, 97.5], axis=0)
+        return Curve(np.asarray(at, dtype=np.int32), each.mean(axis=0), np.asarray(low), np.asarray(high), each)
+
+
+@dataclass(frozen=True, eq=False)
+class ModelQuality:
+    """What was measured of a shape space; None where the shapes or the model do not tell.
+
+    Args:
+        compactness: shares of the variance; the interval is by jackknife over shapes, none for a model alone.
+        generalisation: mm, surface to surface, over shapes left out.
+        generalisation_vertices: the same, vertex to vertex.
+        specificity: mm, surface to surface, over random shapes.
+        specificity_vertices: the same, vertex to vertex.
+        reconstruction: mm, surface to surface, over unseen shapes that were given.
+        reconstruction_vertices: the same, vertex to vertex.
+        by_shapes: generalisation (vertices) with all modes by the number of training shapes.
+        supported_modes: the number that `build --modes auto` keeps.
+        shapes: how many there were.
+        folds: in how many parts they were left out.
+        points: at how many vertices distances between surfaces were measured.
+        seed: of all that is drawn.
+        missing_share: of the vertices, over all shapes; nothing is measured there.
+        left_out_vertices: that less than half of the shapes show, so that nothing is measured of them at all.
+    """
+
+    compactness: Curve
+    generalisation: Curve | None = None
+    generalisation_vertices: Curve | None = None
+    specificity: Curve | None = None
+    specificity_vertices: Curve | None = None
+    reconstruction: Curve | None = None
+    reconstruction_vertices: Curve | None = None
+    by_shapes: Curve | None = None
+    supported_modes: int | None = None
+    shapes: int = 0
+    folds: int = 0
+    points: int = 0
+    seed: int = 0
+    missing_share: float = 0.0
+    left_out_vertices: int = 0
+
+    def __repr__(self) -> str:
+        told = [f"compactness {self.compactness.mean[-1]:.3f} with {self.compactness.at[-1]} modes"]
+        for name, curve in (("generalisation", self.generalisation), ("specificity", self.specificity)):
+            told += [] if curve is None else [f"{name} {curve.mean[-1]:.3g} mm with {curve.at[-1]}"]
+        return f"<ModelQuality of {self.shapes} shapes: {', '.join(told)}>"
+
+    def plot(self, **options: Any) -> Figure:
+        """Return a matplotlib figure of all measures that there are, over the number of modes.
+
+        Args:
+            options: of `shapespace.report.figures.quality_figure`.
+
+        Raises:
+            ShapespaceError: the extra `report` is not installed.
+        """
+        return lazy_import("plot_quality")(self, **options)
+
+    def _repr_html_(self) -> str:
+        return lazy_import("html_of_quality")(self)
+
+    def sentences(self) -> tuple[str, ...]:
+        """Return how many modes the shapes support, and whether more shapes would help."""
+        told: list[str] = []
+        if self.supported_modes is not None:
+            what = "1 mode" if self.supported_modes == 1 else f"{self.supported_modes} modes"
+            told.append(
+                f"These {self.shapes} shapes support {what}: with more, hidden vertices of unseen shapes are foretold "
+                "no better."
+            )
+        if self.by_shapes is not None and len(self.by_shapes.at) > 1:
+            told.append(_more_shapes(self.by_shapes, self.seed))
+        return tuple(told)
+
+    def differences(self, other: ModelQuality) -> dict[str, Curve]:
+        """Return what `other` has less what this has, shape by shape, by the names of the measures.
+
+        Raises:
+            InputError: they are not of the same shapes in the same folds.
+        """
+        whole = self.shapes and other.shapes
+        if whole and (self.shapes, self.folds, self.seed) != (other.shapes, other.folds, other.seed):
+            raise InputError(
+                f"Only what was measured on the same shapes in the same folds can be compared, not {self.shapes} "
+                f"shapes in {self.folds} folds with {other.shapes} in {other.folds}."
+            )
+        out: dict[str, Curve] = {}
+        for name in ("generalisation", "generalisation_vertices", "reconstruction", "reconstruction_vertices"):
+            a, b = getattr(self, name), getattr(other, name)
+            if isinstance(a, Curve) and isinstance(b, Curve) and a.each is not None and b.each is not None:
+                at, own, others = np.intersect1d(a.at, b.at, return_indices=True)
+                if len(a.each) == len(b.each) and len(at):
+                    out[name] = Curve.over(b.each[:, others] - a.each[:, own], at.astype(np.int32), self.seed)
+        return out
+
+
+@dataclass(frozen=True)
+class QualitySettings:
+    """How quality is measured.
+
+    Args:
+        folds: in how many parts shapes are left out, at most one each; None for each by itself.
+        modes: the largest number; None for as many as the folds give.
+        samples: random shapes for the specificity.
+        seed: of folds and samples.
+        gauge: as of `ShapeModel.fit`.
+        align: whether to align the shapes.
+        representation: as of `ShapeModel.fit`.
+        control_points: as of `ShapeModel.fit`.
+
+    Raises:
+        InputError: numbers that cannot be.
+    """
+
+    folds: int | None = 10
+    modes: int | None = None
+    samples: int = 100
+    seed: int = 0
+    gauge: Gauge = "shape"
+    align: bool = True
+    representation: str = "vertices"
+    control_points: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        require_whole(self.folds, "folds")
+        if self.folds is not None and self.folds < 2:
+            raise InputError(f"Shapes are left out in at least two folds, not in {self.folds}.")
+        if self.samples < 2 or (self.modes is not None and self.modes < 1):
+            raise InputError("Quality needs at least two samples, and at least one mode.")
+
+    def space(self, meshes: Sequence[Mesh], modes: Literal["auto"] | None = None) -> _Space:
+        """Return the shape space of `meshes`, of the vertices that at least two of them show."""
+        kept = np.ones(len(meshes[0].vertices), dtype=np.bool_)
+        if not representation_named(self.representation, self.control_points).takes_holes:
+            kept = Kept.of(meshes, _ANY).vertices
+        model = ShapeModel.fit(
+            meshes, modes=modes, gauge=self.gauge, align=self.align, representation=self.representation,
+            control_points=self.control_points, min_seen=_ANY, seed=self.seed,
+        )  # fmt: skip
+        return _Space(model, kept)
+
+
+@dataclass(frozen=True, eq=False)
+class _Space:
+    """A model, and which vertices (V,) of the shapes it has: those that its training shapes show."""
+
+    model: ShapeModel
+    kept: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Target:
+    """A shape in correspondence, and the surface that it is judged against: its own, or the scan it was made from.
+
+    Args:
+        shape: with not-a-number where vertices are missing.
+        seen: the numbers of the vertices that are there.
+        surface: what of the shape is there, or its scan.
+        engine: of the surface.
+        is_scan: whether that is a scan, which may show more than the shape covers.
+    """
+
+    shape: Mesh
+    seen: IntArray
+    surface: Mesh
+    engine: ClosestPointEngine
+    is_scan: bool
+
+    @staticmethod
+    def of(shape: Mesh, scan: Mesh | None) -> _Target:
+        seen = np.flatnonzero(np.isfinite(shape.vertices).all(axis=1)).astype(np.int32)
+        surface = scan if scan is not None else _shown(shape, seen)
+        engine = build_engine(surface)
+        if scan is not None:
+            there = shape.vertices[seen]
+            far = float(np.median(engine.query(there[_spread(len(there))]).distance))
+            if far > _FAR * float(np.linalg.norm(np.ptp(there, axis=0))):
+                raise InputError(
+                    f"{shape.name} lies {far:.1f} mm from its scan {scan.name}, so it is no surface of it; give the "
+                    "scans in the pose and unit of the surfaces."
+                )
+        return _Target(shape, seen, surface, engine, scan is not None)
+
+    def cut_to(self, kept: BoolArray) -> _Target:
+        """Return the same of the vertices `kept` (V,) alone."""
+        if kept.all():
+            return self
+        shape = part_of(self.shape, kept)
+        seen = np.flatnonzero(np.isfinite(shape.vertices).all(axis=1)).astype(np.int32)
+        if self.is_scan:
+            return _Target(shape, seen, self.surface, self.engine, True)
+        surface = _shown(shape, seen)
+        return _Target(shape, seen, surface, build_engine(surface), False)
+
+
+def _shown(shape: Mesh, seen: IntArray) -> Mesh:
+    """Return what of a shape is there."""
+    if len(seen) == len(shape.vertices):
+        return shape
+    kept = np.zeros(len(shape.vertices), dtype=np.bool_)
+    kept[seen] = True
+    return part_of(shape, kept)
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of a measurement that needs no other: a fold, or some random shapes.
+
+    Args:
+        held: numbers of the shapes that are left out.
+        order: of all others, of which the first ones make the smaller models.
+        drawn: numbers of the random shapes.
+    """
+
+    held: tuple[int, ...] = ()
+    order: tuple[int, ...] = ()
+    drawn: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Shapes:
+    """What all parts of a measurement share.
+
+    Args:
+        meshes: at least three, in correspondence.
+        scans: one a mesh, or None for the meshes themselves.
+        settings: of the measurement.
+    """
+
+    meshes: Sequence[Mesh]
+    scans: Sequence[Mesh] | None
+    settings: QualitySettings
+
+    @cached_property
+    def folds(self) -> list[IntArray]:
+        """Numbers of the shapes in each fold."""
+        return _folds(len(self.meshes), self.settings)
+
+    @cached_property
+    def counts(self) -> IntArray:
+        """Numbers of modes that are tried."""
+        most = len(self.meshes) - max(len(fold) for fold in self.folds) - 1
+        return _counts(min(self.settings.modes or most, most))
+
+    @cached_property
+    def few_counts(self) -> IntArray:
+        """Those for the specificity."""
+        counts = self.counts
+        picked = np.linspace(0, len(counts) - 1, min(len(counts), _MOST_SPECIFIC))
+        return counts[np.unique(picked.round().astype(int))]
+
+    @cached_property
+    def sizes(self) -> list[int]:
+        """Numbers of training shapes of the smaller models."""
+        least = len(self.meshes) - max(len(fold) for fold in self.folds)
+        return sorted({max(2, round(share * least)) for share in _PARTS})
+
+    @cached_property
+    def space(self) -> _Space:
+        """The shape space of all."""
+        return self.settings.space(self.meshes)
+
+    @cached_property
+    def targets(self) -> list[_Target]:
+        """What each shape is judged against."""
+        return [_Target.of(mesh, None if self.scans is None else self.scans[i]) for i, mesh in enumerate(self.meshes)]
+
+    @cached_property
+    def trained(self) -> list[_Target]:
+        """The same of the vertices that the shape space has."""
+        return [target.cut_to(self.space.kept) for target in self.targets]
+
+    @cached_property
+    def drawn(self) -> FloatArray:
+        """(S, K) coefficients of the random shapes."""
+        return self.space.model.sample(self.settings.samples, np.random.default_rng(self.settings.seed + 2))
+
+    @cached_property
+    def nearest(self) -> _Nearest:
+        """The training shapes in the pose of the model."""
+        return _Nearest.of(_posed(self.space.model, self.trained, self.settings), self.space.model.n_vertices)
+
+    def parts(self) -> list[Part]:
+        """Return all parts of the work, in the order in which they are told."""
+        n, rng = len(self.meshes), np.random.default_rng(self.settings.seed + 1)
+        folds: list[Part] = []
+        for fold in self.folds:
+            order = tuple(int(i) for i in rng.permutation(n) if i not in fold)
+            folds.append(Part(tuple(fold.tolist()), order))
+        samples = range(self.settings.samples)
+        return folds + [Part(drawn=tuple(samples[at : at + _DRAWN_AT_ONCE])) for at in samples[::_DRAWN_AT_ONCE]]
+
+    def do(self, part: Part) -> FloatArray:
+        """Return errors, mm: of shapes left out (H, n + m, 2), the last m of models of fewer shapes; or of random ones.
+
+        Raises:
+            InputError: scans that are not theirs.
+        """
+        return self._left_out(part) if part.held else self._drawn(part)
+
+    def _left_out(self, part: Part) -> FloatArray:
+        held = [self.targets[i] for i in part.held]
+        space = self.settings.space([self.meshes[i] for i in sorted(part.order)])
+        out = np.zeros((len(held), len(self.counts) + len(self.sizes), 2))
+        for row, target in enumerate(held):
+            out[row, : len(self.counts)] = _told(space.model, target.cut_to(space.kept), self.counts)
+        for column, size in enumerate(self.sizes, len(self.counts)):
+            fewer = self.settings.space([self.meshes[i] for i in sorted(part.order[:size])])
+            only = np.array([min(self.settings.modes or size - 1, size - 1)], dtype=np.int32)
+            for row, target in enumerate(held):
+                out[row, column] = _told(fewer.model, target.cut_to(fewer.kept), only, surface=False)[0]
+        return out
+
+    def _drawn(self, part: Part) -> FloatArray:
+        """Return how far random shapes (S, n, 2), mm, lie from the nearest training shape."""
+        model, counts = self.space.model, self.few_counts
+        mean, modes = model.mean_vertices, np.ascontiguousarray(model.vertex_basis.T)
+        out = np.zeros((len(part.drawn), len(counts), 2))
+        for row, b in enumerate(self.drawn[list(part.drawn)]):
+            for column, k in enumerate(counts):
+                out[row, column] = self.nearest.off(mean + (b[:k] @ modes[:k]).reshape(-1, 3))
+        return out
+
+
+class Runner(Protocol):
+    """Does the parts of a measurement, here or elsewhere, and yields them as they end."""
+
+    def __call__(self, shapes: Shapes, parts: Sequence[Part]) -> Iterable[tuple[Part, FloatArray]]:
+        """Yield what came of each of `parts`, in any order."""
+        ...
+
+
+def run_here(shapes: Shapes, parts: Sequence[Part]) -> Iterable[tuple[Part, FloatArray]]:
+    """Do one part after the other in this process."""
+    return ((part, shapes.do(part)) for part in parts)
+
+
+@dataclass
+class _Steps:
+    """Counts what is done for whoever waits."""
+
+    total: int
+    on_step: OnStep | None
+    done: int = field(default=0)
+
+    def step(self, count: int = 1) -> None:
+        self.done += count
+        if self.on_step is not None:
+            self.on_step(self.done, self.total)
+
+
+def measure_quality(
+    target: Sequence[MeshLike] | ShapeModel,
+    settings: QualitySettings | None = None,
+    *,
+    scans: Sequence[MeshLike] | None = None,
+    unseen: Sequence[MeshLike] = (),
+    on_step: OnStep | None = None,
+    run: Runner = run_here,
+) -> ModelQuality:
+    """Measure the shape space of meshes in correspondence, or as much of a model as it tells by itself.
+
+    Args:
+        target: at least three meshes, mm, or whatever else `as_mesh` takes; or a model, of which only compactness and
+            the measures on `unseen` are available, since a model does not keep its training shapes.
+        settings: folds, modes, samples, seed, and what model to make; None for the usual ones.
+        scans: one a mesh, in its pose and unit, to judge surfaces against; None for the meshes themselves.
+        unseen: meshes in correspondence that no model saw.
+        on_step: called with what is done and what there is to do.
+        run: does folds and random shapes, here or elsewhere.
+
+    Raises:
+        CorrespondenceError: meshes differ in vertices or triangles.
+        InputError: too few meshes, all equal, coordinates that are infinite, or scans that are not theirs.
+    """
+    settings = settings or QualitySettings()
+    meshes: Sequence[Mesh] = []
+    if not isinstance(target, ShapeModel):
+        meshes = _checked([without_estimates(mesh) for mesh in as_meshes(target, "measure_quality")])
+    scans = None if scans is None else as_meshes(scans, "measure_quality")
+    new: list[Mesh] = [without_estimates(mesh) for mesh in as_meshes(unseen, "measure_quality")]
+    vertices = target.n_vertices if isinstance(target, ShapeModel) else len(meshes[0].vertices)
+    if scans is not None and len(scans) != len(meshes):
+        raise InputError(f"There must be one scan a mesh, but there are {len(scans)} scans of {len(meshes)} meshes.")
+    for mesh in new:
+        _refuse_other(mesh, vertices)
+    if isinstance(target, ShapeModel):
+        return _of_model(target, new, settings, on_step)
+    whole = representation_named(settings.representation, settings.control_points).takes_holes
+    kept = np.ones(vertices, dtype=np.bool_) if whole else Kept.of(meshes, MIN_SEEN).vertices
+    if not kept.all():
+        meshes, new = [part_of(mesh, kept) for mesh in meshes], [part_of(mesh, kept) for mesh in new]
+    shapes = Shapes(meshes, scans, settings)
+    return _of_meshes(shapes, new, on_step, run, left_out=int((~kept).sum()))
+
+
+def _of_model(
+    model: ShapeModel, unseen: Sequence[Mesh], settings: QualitySettings, on_step: OnStep | None
+) -> ModelQuality:
+    counts = _counts(min(settings.modes or model.n_modes, model.n_modes))
+    share = model.cumulative_variance[counts - 1]
+    space = _Space(model, np.ones(model.n_vertices, dtype=np.bool_))
+    told = _unseen(space, unseen, counts, settings, _Steps(len(unseen), on_step))
+    return ModelQuality(
+        Curve(counts, share, share, share),
+        reconstruction=told[0],
+        reconstruction_vertices=told[1],
+        points=_points(model.n_vertices),
+        seed=settings.seed,
+    )
+
+
+def _of_meshes(
+    shapes: Shapes, unseen: Sequence[Mesh], on_step: OnStep | None, run: Runner, *, left_out: int
+) -> ModelQuality:
+    meshes, settings, counts, few = shapes.meshes, shapes.settings, shapes.counts, shapes.few_counts
+    steps = _Steps(len(meshes) + len(unseen) + settings.samples, on_step)
+    errors = np.zeros((len(meshes), len(counts) + len(shapes.sizes), 2))
+    drawn = np.zeros((settings.samples, len(few), 2))
+    for part, found in run(shapes, shapes.parts()):
+        (errors if part.held else drawn)[list(part.held or part.drawn)] = found
+        steps.step(len(found))
+    general = _curves(errors[:, : len(counts)], counts, settings.seed)
+    specific = _curves(drawn, few, settings.seed)
+    space = shapes.space
+    told = _unseen(space, unseen, counts, settings, steps)
+    there = np.mean([len(target.seen) for target in shapes.targets]) / len(meshes[0].vertices)
+    return ModelQuality(
+        _compactness(space.model, shapes.trained, counts, settings),
+        generalisation=general[0],
+        generalisation_vertices=general[1],
+        specificity=specific[0],
+        specificity_vertices=specific[1],
+        reconstruction=told[0],
+        reconstruction_vertices=told[1],
+        by_shapes=Curve.over(errors[:, len(counts) :, 0], shapes.sizes, settings.seed),
+        supported_modes=settings.space(meshes, "auto").model.n_modes if len(meshes) >= _FEWEST_TO_CHOOSE else None,
+        shapes=len(meshes),
+        folds=len(shapes.folds),
+        points=_points(space.model.n_vertices),
+        seed=settings.seed,
+        missing_share=1.0 - float(there),
+        left_out_vertices=left_out,
+    )
+
+
+def _checked(meshes: list[Mesh]) -> list[Mesh]:
+    if len(meshes) < _FEWEST:
+        raise InputError(
+            f"Quality is measured on shapes left out, which takes at least three meshes, not {len(meshes)}."
+        )
+    common_faces(meshes)
+    for mesh in meshes:
+        if np.isinf(mesh.vertices).any():
+            raise InputError(f"{mesh.name}: it has vertices that are infinite; mark them as missing, or leave it out.")
+    return meshes
+
+
+def _refuse_other(mesh: Mesh, vertices: int) -> None:
+    if len(mesh.vertices) != vertices:
+        raise CorrespondenceError(
+            f"{mesh.name} has {len(mesh.vertices)} vertices but the model has {vertices}; unseen shapes must be in "
+            "correspondence with it, so bring them there by shapespace fit with --dense."
+        )
+
+
+def _curves(errors: FloatArray, counts: IntArray, seed: int) -> tuple[Curve, Curve]:
+    """Return the curves of errors (S, n, 2): of surfaces, and of vertices."""
+    return Curve.over(errors[:, :, 1], counts, seed), Curve.over(errors[:, :, 0], counts, seed)
+
+
+def _unseen(
+    space: _Space, unseen: Sequence[Mesh], counts: IntArray, settings: QualitySettings, steps: _Steps
+) -> tuple[Curve, Curve] | tuple[None, None]:
+    if not unseen:
+        return None, None
+    errors = _over_shapes(space, [_Target.of(m, None) for m in unseen], counts, steps)
+    return _curves(errors, counts, settings.seed)
+
+
+def _counts(most: int) -> IntArray:
+    """Return numbers of modes from 1 to `most`, a few and closer at the start."""
+    spaced = {round(most ** (step / max(_MOST_COUNTS - 1, 1))) for step in range(_MOST_COUNTS)}
+    return np.array(sorted(spaced), dtype=np.int32)
+
+
+def _folds(n: int, settings: QualitySettings) -> list[IntArray]:
+    folds = n if settings.folds is None else min(settings.folds, n)
+    order = np.random.default_rng(settings.seed).permutation(n).astype(np.int32)
+    return [np.asarray(part, dtype=np.int32) for part in np.array_split(order, folds)]
+
+
+def _points(vertices: int) -> int:
+    return min(vertices, _POINTS)
+
+
+def _spread(vertices: int) -> IntArray:
+    return np.unique(np.linspace(0, vertices - 1, _points(vertices)).round().astype(np.int32))
+
+
+def _over_shapes(space: _Space, targets: Sequence[_Target], counts: IntArray, steps: _Steps) -> FloatArray:
+    out = np.zeros((len(targets), len(counts), 2))
+    for row, target in enumerate(targets):
+        out[row] = _told(space.model, target.cut_to(space.kept), counts)
+        steps.step()
+    return out
+
+
+def _told(model: ShapeModel, target: _Target, counts: IntArray, *, surface: bool = True) -> FloatArray:
+    """Return how far (n, 2), mm, a shape lies from what the first modes tell of it: its vertices, and its surface."""
+    there, out = target.shape.vertices[target.seen], np.zeros((len(counts), 2))
+    T_model_shape = _onto_mean(model, target)
+    for column, k in enumerate(counts):
+        told, T_model_shape = _in_best_pose(model, target, int(k), T_model_shape)
+        fitted = T_model_shape.inverse().apply(told)
+        out[column, 0] = np.linalg.norm(fitted[target.seen] - there, axis=1).mean()
+        if surface:
+            out[column, 1] = _apart(target.shape.with_vertices(fitted), target)
+    return out
+
+
+def _onto_mean(model: ShapeModel, target: _Target) -> Similarity:
+    seen, scaled = target.seen, model.gauge == "shape"
+    return fit_similarity(target.shape.vertices[seen], model.mean_vertices[seen], with_scale=scaled)
+
+
+def _in_best_pose(model: ShapeModel, target: _Target, k: int, T: Similarity) -> tuple[FloatArray, Similarity]:
+    """Return the shape (V, 3) that the first `k` modes tell by what is seen, and T_model_target, from `T` on.
+
+    Where all is seen that is the nearest one; else the likeliest, b = (P^T P + s / variance)^-1 P^T y, with the noise
+    s that the modes leave over, as what they do to unseen vertices alone could be anything.
+    """
+    seen, mean, modes = target.seen, model.mean_vertices, np.ascontiguousarray(model.vertex_basis.T)[:k]
+    there, heard, precision = target.shape.vertices[seen], modes, None
+    if len(seen) < len(mean):
+        heard = modes.reshape(len(modes), -1, 3)[:, seen].reshape(len(modes), -1)
+        variance = model.stddev[:k] ** 2
+        left = max(model.total_variance - float(variance.sum()), _LEAST_NOISE * model.total_variance)
+        precision = heard @ heard.T + np.diag(left / (3 * len(mean)) / variance)
+    told = mean
+    for _ in range(_POSE_ROUNDS):
+        b = heard @ (T.apply(there) - mean[seen]).reshape(-1)
+        if precision is not None:
+            b = np.asarray(np.linalg.solve(precision, b))
+        told = mean + (b @ modes).reshape(-1, 3)
+        T = fit_similarity(there, told[seen], with_scale=model.gauge == "shape")
+    return told, T
+
+
+def _apart(fitted: Mesh, target: _Target) -> float:
+    """Return the mean of both mean distances between two surfaces, mm, each at points spread over what is seen."""
+    seen = target.seen[_spread(len(target.seen))]
+    there = target.engine.query(fitted.vertices[seen]).distance.mean()
+    back = build_engine(fitted).query(target.surface.vertices[_spread(len(target.surface.vertices))])
+    counted: BoolArray = np.ones(len(back.distance), dtype=np.bool_)
+    if target.is_scan:
+        # A scan may show more than the surface covers.
+        counted = ~on_boundary(back, fitted, boundary_vertices(fitted))
+    return float(0.5 * (there + (back.distance[counted].mean() if counted.any() else there)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Nearest:
+    """Training shapes in the pose of the model, to find how far others lie from the nearest one.
+
+    Args:
+        targets: their surfaces.
+        meshes: their vertices.
+        picked: the numbers of vertices by which they are compared.
+        vertices: (N, P, 3) of those.
+    """
+
+    targets: Sequence[_Target]
+    meshes: Sequence[Mesh]
+    picked: IntArray
+    vertices: FloatArray
+
+    @staticmethod
+    def of(posed: Sequence[Mesh], vertices: int) -> _Nearest:
+        picked = _spread(vertices)
+        compared = np.stack([mesh.vertices[picked] for mesh in posed])
+        return _Nearest([_Target.of(mesh, None) for mesh in posed], posed, picked, compared)
+
+    def off(self, shape: FloatArray) -> tuple[float, float]:
+        """Return how far `shape` (V, 3), mm, lies from the nearest one: its vertices, and its surface."""
+        mean_of = np.nanmean if np.isnan(self.vertices).any() else np.mean
+        off = mean_of(np.linalg.norm(self.vertices - shape[self.picked], axis=2), axis=1)
+        drawn, nearest = self.meshes[0].with_vertices(shape), np.argsort(off, kind="stable")[:_NEAREST]
+        return float(off.min()), min(_apart(drawn, self.targets[int(i)]) for i in nearest)
+
+
+def _posed(model: ShapeModel, targets: Sequence[_Target], settings: QualitySettings) -> list[Mesh]:
+    """Return the shapes in the pose and size of the model, by what is seen of them."""
+    out: list[Mesh] = []
+    for target in targets:
+        shape = target.shape
+        if settings.align:
+            shape = shape.with_vertices(_onto_mean(model, target).apply(shape.vertices))
+        out.append(shape)
+    return out
+
+
+def _compactness(model: ShapeModel, targets: Sequence[_Target], counts: IntArray, settings: QualitySettings) -> Curve:
+    """Return the share of the variance that the first modes hold, its interval by jackknife over shapes."""
+    posed = [mesh.vertices for mesh in _posed(model, targets, settings)]
+    for i, target in enumerate(targets):
+        if len(target.seen) < model.n_vertices:
+            told = _in_best_pose(model, target, model.n_modes, _onto_mean(model, target))[0]
+            posed[i] = np.where(np.isnan(posed[i]), told, posed[i])
+    flat = np.stack(posed).reshape(len(targets), -1) - model.mean_vertices.reshape(-1)
+    gram = flat @ flat.T
+    share = model.cumulative_variance[np.minimum(counts, model.n_modes) - 1]
+    n, kept = len(targets), min(model.vertex_basis.shape[1], model.n_modes)
+    rest = [np.flatnonzero(np.arange(n) != i) for i in range(n)]
+    without = np.stack([_shares(gram[np.ix_(some, some)], counts, kept) for some in rest])
+    spread = 1.96 * np.sqrt((n - 1) / n * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
+    return Curve(counts, share, np.maximum(share - spread, 0.0), np.minimum(share + spread, 1.0))
+
+
+def _shares(gram: FloatArray, counts: IntArray, kept: int) -> FloatArray:
+    centred = gram - gram.mean(axis=0) - gram.mean(axis=1)[:, None] + gram.mean()
+    values = np.maximum(np.linalg.eigvalsh(centred)[::-1], 0.0)
+    return np.cumsum(values)[np.minimum(counts, min(kept, len(values))) - 1] / values.sum()
+
+
+def _more_shapes(by_shapes: Curve, seed: int) -> str:
+    """Return in a sentence what more training shapes did to the error, and so would do."""
+    each, at = by_shapes.each, by_shapes.at
+    if each is None:
+        return ""
+    few = int(np.argmin(np.abs(at - at[-1] / 2)))
+    few = min(few, len(at) - 2)
+    draws = np.random.default_rng(seed).integers(len(each), size=(_RESAMPLES, len(each)))
+    fell = 1 - each[draws, -1].mean(axis=1) / each[draws, few].mean(axis=1)
+    now = 100 * float(1 - each[:, -1].mean() / each[:, few].mean())
+    low, high = 100 * np.percentile(fell, [2.5, 97.5])
+    changed = f"fell by {now:.0f} %" if now >= 0 else f"rose by {-now:.0f} %"
+    said = f"From {at[few]} to {at[-1]} training shapes the error on unseen ones {changed} "
+    said += f"(95 %: {low:.0f} to {high:.0f} %), "
+    if low > 0 and now >= 5:
+        return said + "so more shapes would help."
+    return said + (
+        "so more shapes would help little." if high < 10 else "so these shapes do not show whether more would help."
+    )

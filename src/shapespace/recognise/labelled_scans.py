@@ -1,0 +1,221 @@
+"""Coefficients of fitted scans with what is known of them: from records or a coefficients.csv, in the order given."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from shapespace.errors import FileFormatError, InputError
+from shapespace.io.containers.json_files import check_file
+from shapespace.io.files import read_bytes
+from shapespace.io.meshes.mesh_io import stem_of
+from shapespace.io.tables.label_table import Label
+from shapespace.io.tables.table_io import table_rows
+from shapespace.reprs import short_repr
+from shapespace.store.results import Results, modes_of
+from shapespace.types import FloatArray, read_only
+
+NEUTRAL = "neutral"
+"""The label of neutral faces, unless another is given."""
+
+STATUSES = ("converged", "max_iterations", "doubtful", "failed")
+_LARGEST_BYTES = 2**28
+_TABLE_AGAIN = "run shapespace fit to write it again, or take the column checksum out if that was meant"
+
+
+@dataclass(frozen=True, eq=False)
+class ScanCoefficients:
+    """One fitted scan, as far as recognition knows it.
+
+    Args:
+        name: of the fit.
+        status: `converged`, `max_iterations`, `doubtful` or `failed`.
+        reason: why it has that status.
+        z: (K,) coefficients in standard deviations; None where the fit failed.
+        model_hash: content hash of the model.
+        label: its class; empty if not known.
+        subject: whom it shows; empty if not known.
+        file: name of the scan's file, where it is known.
+    """
+
+    name: str
+    status: str
+    reason: str
+    z: FloatArray | None
+    model_hash: str
+    label: str = ""
+    subject: str = ""
+    file: str = ""
+
+    __repr__ = short_repr
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the fit neither failed nor is doubtful."""
+        return self.z is not None and self.status in ("converged", "max_iterations")
+
+
+def from_record(name: str, record: Mapping[str, Any]) -> ScanCoefficients:
+    """Return the scan that a NAME.fit.json tells of.
+
+    Raises:
+        FileFormatError: the record lacks what recognition needs, or it is damaged.
+    """
+    try:
+        status = str(record["status"])
+        z = None if status == "failed" else read_only(np.asarray(record["z"], dtype=np.float64))
+        scan = ScanCoefficients(
+            name, status, str(record["reason"]), z, str(record["model"]["hash"]), file=str(record["scan"]["name"])
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise FileFormatError(f"The record of {name} is damaged or not whole; fit the scan again.") from error
+    return _checked(scan, f"The record of {name}")
+
+
+def from_results(results: Results) -> list[ScanCoefficients]:
+    """Return the fits of a folder with a store, in the order of their names.
+
+    Those in shards that cannot be read are left out, see `Results.problems`.
+
+    Raises:
+        FileFormatError: a fit lacks what recognition needs, or is damaged.
+        InputError: there are none.
+    """
+    texts = ("scan", "status", "reason", "model_hash", "scan_name")
+    columns = [f"z{k}" for k in range(1, modes_of(results) + 1)]
+    found: list[ScanCoefficients] = []
+    for rows in results.iter_rows((*texts, "modes", *columns)):
+        z = np.array([rows[column] for column in columns], dtype=np.float64).reshape(len(columns), -1).T
+        for told, modes, values in zip(
+            zip(*(rows[text] for text in texts), strict=True), rows["modes"], z, strict=True
+        ):
+            name, status, reason, model, file = (text or "" for text in told)
+            own = None if status == "failed" else read_only(values[: modes or 0])
+            found.append(_checked(ScanCoefficients(name, status, reason, own, model, file=file), f"The fit {name}"))
+    if not found:
+        raise InputError(f"{results.folder} holds no results of fits; fit some scans first.")
+    return sorted(found, key=lambda scan: scan.name)
+
+
+def read_coefficients(path: Path) -> list[ScanCoefficients]:
+    """Return the scans in a coefficients.csv.
+
+    Raises:
+        FileError: it cannot be read.
+        FileFormatError: it is not such a table, or it does not say of which model it is.
+    """
+    check_file(path, _LARGEST_BYTES, _TABLE_AGAIN)
+    rows = table_rows(read_bytes(path))
+    try:
+        heads = next(rows)
+        modes = _modes(heads, path)
+        scans = [
+            _from_row(dict(zip(heads, row, strict=True)), modes, f"{path}, row {number}")
+            for number, row in enumerate(rows, 1)
+        ]
+    except FileFormatError:
+        raise
+    except ValueError as error:
+        raise FileFormatError(f"{path} {error}; {_TABLE_AGAIN}.") from error
+    if not scans:
+        raise FileFormatError(f"{path} has no rows; fit some scans first.")
+    return scans
+
+
+def _modes(heads: Sequence[str], path: Path) -> int:
+    known, modes = set(heads), 0
+    while f"z{modes + 1}" in known:
+        modes += 1
+    if not modes or not {"scan", "status", "reason"} <= known:
+        raise FileFormatError(f"{path} is no table of coefficients; give one that shapespace fit wrote.")
+    if "model_hash" not in known:
+        raise FileFormatError(
+            f"{path} does not say of which model its coefficients are; run shapespace fit to write it again, "
+            "or give the folder of the results."
+        )
+    return modes
+
+
+def _from_row(row: Mapping[str, str], modes: int, where: str) -> ScanCoefficients:
+    status = row["status"]
+    z: FloatArray | None = None
+    if status != "failed":
+        try:
+            z = read_only(np.asarray([float(row[f"z{k}"]) for k in range(1, modes + 1)]))
+        except ValueError as error:
+            raise FileFormatError(f"{where}: a coefficient is not a number; fit the scan again.") from error
+    scan = ScanCoefficients(row["scan"], status, row["reason"], z, row["model_hash"])
+    return _checked(scan, where)
+
+
+def _checked(scan: ScanCoefficients, where: str) -> ScanCoefficients:
+    if scan.status not in STATUSES:
+        raise FileFormatError(f"{where} has the status {scan.status[:40]!r}, which no fit has; fit the scan again.")
+    if scan.z is not None and (scan.z.ndim != 1 or not len(scan.z) or not np.isfinite(scan.z).all()):
+        raise FileFormatError(f"{where} has coefficients that are not finite numbers; fit the scan again.")
+    if not scan.model_hash:
+        raise FileFormatError(f"{where} does not say of which model its coefficients are; fit the scan again.")
+    return scan
+
+
+def labelled(scans: Sequence[ScanCoefficients], labels: Mapping[str, Label]) -> list[ScanCoefficients]:
+    """Return `scans` with labels and subjects, found by the name of the scan's file or of the fit."""
+    found: list[ScanCoefficients] = []
+    for scan in scans:
+        label = labels.get(stem_of(scan.file)) if scan.file else None
+        label = label or labels.get(scan.name) or labels.get(stem_of(scan.name))
+        found.append(replace(scan, label=label.text, subject=label.subject) if label else scan)
+    return found
+
+
+def one_model(scans: Sequence[ScanCoefficients]) -> str:
+    """Return the hash of the one model that all `scans` were fitted with.
+
+    Raises:
+        InputError: there are several, or no scans.
+    """
+    hashes = sorted({scan.model_hash for scan in scans})
+    if not hashes:
+        raise InputError("There are no fits to recognise anything in; fit some scans first.")
+    if len(hashes) > 1:
+        raise InputError(
+            f"These fits are of {len(hashes)} different models ({', '.join(h[:12] for h in hashes[:4])}), so their "
+            "coefficients cannot be compared; fit all scans with one model."
+        )
+    return hashes[0]
+
+
+def relative_to_neutral(z: FloatArray, subjects: Sequence[str], is_neutral: Sequence[bool] | Any) -> FloatArray:
+    """Return coefficients (n, K) relative to those of the same person's neutral face.
+
+    Args:
+        z: (n, K) in standard deviations; rows that are not finite stay so, and are no neutral face.
+        subjects: n names of people.
+        is_neutral: (n,) which are neutral; of several neutral faces of a person the mean is taken.
+
+    Raises:
+        InputError: arrays that do not belong together, or people without a neutral face, named.
+    """
+    people, neutral = np.asarray(subjects, dtype=str), np.asarray(is_neutral, dtype=bool)
+    if z.ndim != 2 or people.shape != (len(z),) or neutral.shape != (len(z),):
+        raise InputError(
+            f"Coefficients (n, K) need a subject and a mark each, not {z.shape}, {people.shape} and {neutral.shape}."
+        )
+    neutral = neutral & np.isfinite(z).all(axis=1)
+    lacking = sorted(set(people.tolist()) - set(people[neutral].tolist()))
+    if lacking:
+        more = f" and {len(lacking) - 5} more" if len(lacking) > 5 else ""
+        named = ", ".join(name or "(no name)" for name in lacking[:5])
+        raise InputError(
+            f"There is no usable neutral face of {named}{more}; add it with its label, or recognise without neutral "
+            "faces."
+        )
+    relative = np.empty_like(z)
+    for name in cast(list[str], np.unique(people).tolist()):
+        mine = people == name
+        relative[mine] = z[mine] - z[mine & neutral].mean(axis=0)
+    return relative

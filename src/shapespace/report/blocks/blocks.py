@@ -1,0 +1,302 @@
+"""What every page is made of: text, tables, figures, and sections that hold them; templates turn them to HTML."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+from shapespace.report.blocks.wording import DASH, STATUS_WORDS, isfinite, mm
+
+
+@dataclass(frozen=True)
+class Text:
+    """A paragraph; its kind is a class of report.css."""
+
+    text: str
+    kind: Literal["", "soft", "notice", "broken"] = ""
+
+
+@dataclass(frozen=True)
+class Command:
+    """A line for the terminal."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell of a table, or a few words in a sentence.
+
+    Args:
+        text: what is read.
+        value: the number that a table sorts it by; None sorts by the text, not-a-number comes last.
+        status: which of the statuses it is, for its colour; empty for none.
+        place: where in the page it leads, or None.
+    """
+
+    text: str
+    value: float | None = None
+    status: str = ""
+    place: str | None = None
+
+    @property
+    def sort_key(self) -> float | str:
+        """The value, empty where it is not a number."""
+        return self.value if self.value is not None and isfinite(self.value) else ""
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of a table: its head, and whether it holds numbers or text."""
+
+    head: str
+    kind: Literal["text", "number"] = "text"
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table whose first column names its rows.
+
+    Args:
+        columns: heads and kinds.
+        rows: one cell a column.
+        caption: what the table holds, also the name of its scroll box.
+        sortable: the page's script makes buttons of the heads.
+        stack: on a phone the cells of a row stand under each other, for tables of long text.
+    """
+
+    MOST_OPEN = 14
+    """Rows beyond which a table scrolls within itself."""
+
+    columns: Sequence[Column]
+    rows: Sequence[Sequence[Cell]]
+    caption: str
+    sortable: bool = False
+    stack: bool = False
+
+    @property
+    def long(self) -> bool:
+        """Whether it scrolls within itself, under its heads."""
+        return len(self.rows) > self.MOST_OPEN
+
+
+@dataclass(frozen=True)
+class Facts:
+    """A table of names and values."""
+
+    rows: Sequence[tuple[str, str]]
+    caption: str
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """Figures that are seen at a glance, each (value, small print after it, what it is)."""
+
+    rows: Sequence[tuple[str, str, str]]
+
+
+@dataclass(frozen=True)
+class Item:
+    """A sentence of a list, perhaps after a name that may lead to a place in the page."""
+
+    text: str
+    name: Cell | None = None
+
+
+@dataclass(frozen=True)
+class Notice:
+    """A box with a list of sentences; nothing where there are none."""
+
+    heading: str
+    items: Sequence[str | Item]
+    kind: Literal["notice", "broken"] = "notice"
+
+
+@dataclass(frozen=True)
+class Notes:
+    """A list of remarks."""
+
+    items: Sequence[str]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A status and the reason for it."""
+
+    status: Cell
+    reason: str
+
+
+@dataclass(frozen=True)
+class Image:
+    """WebP `data` of `size` pixels; `alt` says what is seen."""
+
+    data: bytes
+    size: tuple[int, int]
+    alt: str
+
+    @property
+    def source(self) -> str:
+        """The picture as it stands in a page."""
+        return "data:image/webp;base64," + base64.b64encode(self.data).decode("ascii")
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A picture with its caption."""
+
+    image: Image
+    caption: str
+    kind: Literal["chart", "drawing", "plain"] = "plain"
+
+
+@dataclass(frozen=True)
+class Turning:
+    """What turns where the browser can, and is a still on paper and without a script.
+
+    Args:
+        widget: a name of `Shapespace.widgets` in widgets.js.
+        payload: the id of what it shows.
+        poster: the still.
+        caption: of both.
+        label: what it is, for screen readers.
+        still: what the still shows, told with it alone.
+    """
+
+    widget: Literal["modes", "morph", "fit", "scatter"]
+    payload: str
+    poster: Image
+    caption: str
+    label: str
+    still: str
+
+
+@dataclass(frozen=True)
+class Card:
+    """One fit in a gallery.
+
+    Args:
+        place: its name in the page.
+        name: of the fit.
+        status: of the fit.
+        label: beside it; empty for none.
+        told: in a sentence or two.
+        image: its picture, or None.
+        why_none: why there is no picture.
+        detail: the place with all its pictures, or None.
+    """
+
+    place: str
+    name: str
+    status: Cell
+    label: str
+    told: str
+    image: Image | None
+    why_none: str = ""
+    detail: str | None = None
+
+
+@dataclass(frozen=True)
+class Gallery:
+    """Cards beside each other."""
+
+    cards: Sequence[Card]
+
+
+@dataclass(frozen=True)
+class ScaleKey:
+    """The key of the strips in a gallery: what they show, and the scale of their maps, which ends at `limit_mm`."""
+
+    limit_mm: float
+    bar: Image
+
+
+@dataclass(frozen=True)
+class StripKey:
+    """The key of other strips: what their panels show in words, and scales, each (bar, its ends in words)."""
+
+    told: str
+    bars: Sequence[tuple[Image, str, str]]
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Folded:
+    """A part that is folded away until it is asked for."""
+
+    summary: str
+    body: Sequence[Block]
+
+
+@dataclass(frozen=True)
+class Group:
+    """Blocks in two columns, one of the columns, or blocks side by side, where the window has room for them."""
+
+    kind: Literal["columns", "column", "beside"]
+    body: Sequence[Block]
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the page under a heading of `level` 2 to 6, at a place that links lead to; perhaps folded away."""
+
+    heading: str
+    place: str
+    body: Sequence[Block]
+    level: int = 3
+    link: str = ""
+    """What the navigation calls it."""
+    folded: bool = False
+    status: Cell | None = None
+    """Beside the heading."""
+
+
+Block: TypeAlias = (
+    Text
+    | Command
+    | Table
+    | Facts
+    | Tiles
+    | Notice
+    | Notes
+    | Verdict
+    | Figure
+    | Turning
+    | Gallery
+    | ScaleKey
+    | StripKey
+    | Folded
+    | Group
+    | Section
+)
+
+
+def status(value: str) -> Cell:
+    """Return a cell with a status in words and its colour, sorted from bad to good."""
+    known = list(STATUS_WORDS)
+    kind = value if value in STATUS_WORDS else "failed"
+    return Cell(STATUS_WORDS.get(value, value), float(len(known) - known.index(kind)), kind)
+
+
+def number(value: float, digits: int = 2) -> Cell:
+    """Return a cell that shows `value` with `digits` decimals, a dash where there is none."""
+    return Cell(f"{value:.{digits}f}" if isfinite(value) else DASH, value)
+
+
+def length(value: float) -> Cell:
+    """Return a cell with a length in mm, without the unit, which the column's head gives."""
+    return Cell(mm(value).removesuffix(" mm"), value)
+
+
+def text_table(heads: Sequence[str], rows: Sequence[Sequence[str]], caption: str) -> Table:
+    """Return a table of texts that may be long."""
+    return Table([Column(head) for head in heads], [[Cell(text) for text in row] for row in rows], caption, stack=True)
+
+
+def facts_of(values: Mapping[str, object], caption: str) -> Facts:
+    """Return settings or measures by name, those with parts told by the parts that are plain."""
+    from shapespace.report.blocks.wording import setting, words
+
+    return Facts([(words(key), setting(value)) for key, value in values.items()], caption)

@@ -1,0 +1,69 @@
+"""What the verdict on a fit goes by, in words: the keys of `evidence` in a record, each with what it says."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+
+from shapespace.report.blocks.blocks import Facts
+from shapespace.report.blocks.wording import mm, percent, setting, words
+
+_Told = tuple[str, Callable[[float], str]]
+
+
+def _size(log_scale: float) -> str:
+    return f"{math.exp(log_scale):.3f} times" if abs(log_scale) < math.log(1000) else f"log {log_scale:.3g}"
+
+
+def _plain(value: float) -> str:
+    return f"{value:.3g}"
+
+
+EVIDENCE: Mapping[str, _Told] = MappingProxyType(
+    {
+        "expected_error_mm": ("Expected distance of a vertex from its true place", mm),
+        "error_low_mm": ("... 90 % interval from", mm),
+        "error_high_mm": ("... to", mm),
+        "failure_probability": ("Probability that the fit failed", percent),
+        "seen_share": ("Share of the model that the scan shows", percent),
+        "model_matched_share": ("Share of the model's vertices with a match", percent),
+        "model_allowed_share": ("Share of the model's vertices whose matches may count", percent),
+        "scan_allowed_share": ("Share of the scan's points whose matches may count", percent),
+        "model_near_share": ("Share of the model with the scan anywhere near", percent),
+        "scan_near_share": ("Share of the scan with the model anywhere near", percent),
+        "spread_mm": ("Spread of the distances between what matches", mm),
+        "model_spread_mm": ("Usual distance of a vertex from the mean, in the model", mm),
+        "model_lack_mm": ("What new shapes usually have outside the model", mm),
+        "beyond_model_mm": ("What this scan has outside the model", mm),
+        "left_out_mm": ("What the modes left out would move a vertex by", mm),
+        "posterior_error_mm": ("What matches and modes left out leave open at a vertex", mm),
+        "z2": ("Mean squared coefficient, in variances of new shapes (about 1 is usual)", _plain),
+        "z2_leading": ("... of the leading modes", _plain),
+        "log_scale": ("Scale of the fit beside the model's", _size),
+        "size_mm": ("Size of the mean: RMS distance from its middle", mm),
+        "start_score_mm": ("Score of the start that was taken (small is good)", mm),
+        "start_runner_up_score_mm": ("... of the best one elsewhere", mm),
+        "layered_share": ("Share of the scan that lies on another layer of it", percent),
+        "layers_apart_mm": ("... and how far apart these layers are", mm),
+        "displaced_share": ("Share of the scan that runs along the surface at a distance from it", percent),
+        "displaced_inward_share": ("... inside the surface", percent),
+        "displaced_purity": ("... of the unexplained parts of the scan", percent),
+        "scattered_share": ("Share of the scan that scatters widely around the surface", percent),
+        "second_instance_mm": ("Distance of a second instance in the scan", mm),
+        "second_instance_gap_mm": ("... gap between the two (negative: they overlap)", mm),
+        "mirrored_log_odds": ("Log odds that the scan is mirrored (nats; above 5: mirrored, below -5: not)", _plain),
+        "training_shapes": ("Number of training shapes of the model", _plain),
+        "marks_stddev_mm": ("Standard deviation of the landmarks given", mm),
+        "marks_rms_mm": ("RMS distance from the landmarks given", mm),
+    }
+)
+"""Key -> what it is, and how its value is written."""
+
+
+def evidence_facts(values: Mapping[str, object], caption: str) -> Facts:
+    """Return the evidence of a fit in words, in the order of `EVIDENCE`; keys of other versions as they are."""
+    known = {key: value for key, value in values.items() if key in EVIDENCE and isinstance(value, int | float)}
+    rows = [(EVIDENCE[key][0], EVIDENCE[key][1](float(known[key]))) for key in EVIDENCE if key in known]
+    rows += [(words(key), setting(value)) for key, value in values.items() if key not in known]
+    return Facts(rows, caption)

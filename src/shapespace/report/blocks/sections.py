@@ -1,0 +1,467 @@
+"""Parts that the pages share: the model, one fit in detail, a table of fits, fits together, scores."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import product
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+
+from shapespace.errors import ShapespaceError
+from shapespace.report.blocks.blocks import (
+    Block,
+    Facts,
+    Figure,
+    Folded,
+    Group,
+    Notes,
+    Text,
+    Turning,
+    Verdict,
+    status,
+)
+from shapespace.report.blocks.evidence_text import evidence_facts
+from shapespace.report.blocks.wording import counted, isfinite, listed, mm, percent
+from shapespace.report.inputs.saved_fits import SavedFit
+from shapespace.report.inputs.staged_fit import REGIONS, StagedFit, measured_mm, nice_ceiling
+from shapespace.report.pages.page import Page
+from shapespace.types import FloatArray, Mesh
+
+if TYPE_CHECKING:
+    from shapespace.model.shape_model import ShapeModel
+    from shapespace.report.figures import Coefficients
+    from shapespace.schemas import Quality
+
+ORDER_OF_CONCERN = ("failed", "unreadable", "doubtful", "max_iterations", "converged")
+"""Statuses, those first that somebody must look at."""
+
+MODEL_PICTURES, FIT_PICTURES = 4, 9
+"""How many pictures `model_part` and `fit_in_full` make."""
+
+MODES_IN_WIDGET = 8
+SCAN_TRIANGLES = 8_000
+"""How many triangles of a scan turn in the page; the file of the scan has them all."""
+
+_From = TypeVar("_From")
+_To = TypeVar("_To")
+_CAPTION_HEIGHT = 0.14
+"""Of a figure, beside its width."""
+_DETAIL_BYTES = 1_300_000
+_VARIANCE_SHARES = (0.90, 0.95, 0.98, 0.99)
+
+
+def concern(fit: SavedFit) -> tuple[int, float]:
+    """Return a key that sorts fits by how much they need a look: by status, then by the error expected or seen."""
+    error = fit.expected_error_mm
+    if not isfinite(error):
+        error = fit.distance_mm("scan_to_model")
+    return ORDER_OF_CONCERN.index(fit.status), -error if isfinite(error) else 0.0
+
+
+def in_columns(*pictures: Block) -> Block:
+    """Return pictures in two columns of about equal height, each in the order given; a single one as it is."""
+    if len(pictures) < 2:
+        return pictures[0] if pictures else Group("columns", ())
+    tall = np.array([_height(picture) for picture in pictures])
+    right = np.array([(0, *rest) for rest in product((0, 1), repeat=len(pictures) - 1)], dtype=bool)
+    best = right[np.abs(right @ tall - (~right) @ tall).argmin()]
+    sides = [[picture for picture, there in zip(pictures, best, strict=True) if there == side] for side in (0, 1)]
+    return Group("columns", [Group("column", side) for side in sides])
+
+
+def _height(block: Block) -> float:
+    """Return about how high a block is beside its width."""
+    return block.image.size[1] / block.image.size[0] + _CAPTION_HEIGHT if isinstance(block, Figure) else _CAPTION_HEIGHT
+
+
+# The model
+
+
+def model_part(page: Page, model: ShapeModel, *, figure_of: str = "", to_move: int = MODES_IN_WIDGET) -> list[Block]:
+    """Return what the model is and does: facts, modes to move by hand, modes as stills, spectrum.
+
+    Args:
+        page: that it goes to.
+        model: the shape space.
+        figure_of: said before the caption of the modes.
+        to_move: how many modes can be moved by hand.
+    """
+    from shapespace.report import figures
+
+    needed = [
+        f"{100 * share:g} % in {counted(count, 'mode')}"
+        for share in _VARIANCE_SHARES
+        if (count := model.modes_for_variance(share)) is not None
+    ]
+    rows = [
+        ("Made of", counted(model.n_training, "shape")),
+        ("Surface", f"{model.n_vertices:,} vertices, {0 if model.faces is None else len(model.faces):,} triangles"),
+        ("Modes kept", f"{model.n_modes}, with {100 * float(model.cumulative_variance[-1]):.1f} % of the variance"),
+        ("Variance", listed(needed) or "below 90 % in the modes kept"),
+        ("Size", "divided out (gauge shape)" if model.gauge == "shape" else "kept in the modes (gauge form)"),
+        ("Provenance", model.provenance),
+        ("Licence", model.licence or "not stated"),
+    ]
+    shown = min(5, model.n_modes)
+    return [
+        modes_to_move(page, model, to_move),
+        Facts(rows, "The shape model"),
+        Folded(
+            "Its modes as stills, their variance, the mean from three sides",
+            [
+                in_columns(
+                    page.figure(
+                        figures.modes_figure(model, modes=shown),
+                        f"{figure_of}Each row: the mean with one mode at −3, 0 and +3 standard deviations, and how far "
+                        "each point moves at 3. One scale for all rows.",
+                        alt=f"Mean shape and the first {counted(shown, 'mode')} at minus and plus three standard "
+                        "deviations, with maps of the displacement",
+                    ),
+                    page.figure(
+                        figures.spectrum_figure(model),
+                        "Share of the training set's variance that the first modes hold.",
+                        alt=f"Spectrum: {listed(needed) or 'the modes kept hold less than 90 % of the variance'}",
+                        chart=True,
+                    ),
+                    page.figure(
+                        figures.mean_figure(model),
+                        "The mean shape from three sides"
+                        + (", with the model's landmarks." if model.landmarks else "."),
+                        alt="The mean shape from three sides",
+                    ),
+                )
+            ],
+        ),
+    ]
+
+
+def quality_part(page: Page, quality: Quality) -> Figure:
+    """Return how good the shape space is by its number of modes, from the measures of it that are there."""
+    from shapespace.report import figures
+
+    return page.figure(
+        figures.quality_figure(quality),
+        "Compactness: share of the variance. Generalisation: error on shapes left out. Specificity: distance of random "
+        "shapes from the nearest training shape. Bands: 95 % intervals where they were measured. "
+        + " ".join(quality.sentences),
+        alt="Compactness, generalisation and specificity by the number of modes, those of them that were measured",
+        chart=True,
+    )
+
+
+def modes_to_move(page: Page, model: ShapeModel, most: int) -> Turning | Figure:
+    """Return the model's modes with sliders, as stills of the mean where nothing turns."""
+    from shapespace.report.render import thumbnails
+    from shapespace.report.render.scene import pack_model
+
+    count = min(most, model.n_modes)
+    still = thumbnails.mesh_still(model.mesh(), (420, 420))
+    which = f"The first {counted(count, 'mode')} of {model.n_modes}"
+    if count == model.n_modes:
+        which = f"{'Its' if count == 1 else 'All'} {counted(count, 'mode')}"
+    return page.turning(
+        "modes",
+        pack_model(model, count, small=True),
+        page.image(still, "The mean shape"),
+        f"{which}, to be moved by hand.",
+        label="Modes of the model, one slider each",
+        still="The still shows the mean.",
+    )
+
+
+# One fit
+
+
+def fit_in_full(
+    page: Page,
+    fit: StagedFit,
+    population: FloatArray | None = None,
+    *,
+    reserve: int = 0,
+    of_paper: bool = False,
+    folded: bool = False,
+) -> list[Block]:
+    """Return one fit to turn and every picture of it, as far as the file's size allows.
+
+    Args:
+        page: that they go to.
+        fit: with its stages.
+        population: (N, K) coefficients of others in standard deviations, or None.
+        reserve: bytes of the page that are kept free.
+        of_paper: whether captions name the figures of the paper.
+        folded: whether all but what turns is folded away.
+    """
+    if page.left < _DETAIL_BYTES + reserve:
+        return [Text("Its pictures would make this file larger than 8 MB, so they are left out.", "soft")]
+    turning = page.tried(lambda: fit_to_turn(page, fit))
+    pictures = fit_pictures(page, fit, population, of_paper=of_paper)
+    told = "More pictures: stages, both ways of distance, regions, thresholds, iterations, coefficients"
+    if fit.regions is None:
+        told = "More pictures: both ways of distance, thresholds, coefficients"
+    return [*turning, Folded(told, [pictures]) if folded else pictures]
+
+
+def fit_to_turn(page: Page, fit: StagedFit) -> Turning | Figure:
+    """Return scan and model of one fit, as a strip of stills where nothing turns."""
+    from shapespace.report.render import thumbnails
+    from shapespace.report.render.scene import pack_fit
+
+    limit_mm = fit.scale_mm
+    scale = (
+        f"the signed distance to the scan, −{limit_mm:g} (blue) to +{limit_mm:g} mm (red)."
+        if fit.scan.faces is not None
+        else f"the distance to the points of the scan, 0 to {limit_mm:g} mm."
+    )
+    still = thumbnails.fit_strip(fit, limit_mm, (300, 372))
+    return page.turning(
+        "fit",
+        pack_fit(fit, largest_scan=SCAN_TRIANGLES),
+        page.image(still, strip_alt(fit, limit_mm)),
+        f"{fit.label}: the scan, and the {'fitted model' if fit.regions is None else 'model at each stage'}.",
+        label=f"Scan and model of {fit.label}, to be turned",
+        still=f"The still shows the scan, both over each other, and {scale}",
+    )
+
+
+def surface_to_turn(page: Page, fit: SavedFit, surfaces: Mapping[str, Mesh], why: str) -> Turning | Figure:
+    """Return the fitted surface of a fit whose scan cannot be shown, with a still image as the fallback.
+
+    Args:
+        page: that it goes to.
+        fit: of which it is.
+        surfaces: `final`, and `dense` where there is one, in the model's frame.
+        why: the scan is not shown, as the end of a sentence.
+    """
+    from shapespace.report.render import thumbnails
+    from shapespace.report.render.scene import pack_surfaces
+
+    still = thumbnails.mesh_still(surfaces["final"], (420, 420))
+    return page.turning(
+        "fit",
+        pack_surfaces(surfaces, fit.record, name=fit.name, label=fit.label, why=why, largest=SCAN_TRIANGLES),
+        page.image(still, f"The fitted surface of {fit.name}"),
+        f"{fit.label}: the fitted surface; {why.removesuffix('.')}.",
+        label=f"Fitted surface of {fit.label}, to be turned",
+        still="The still shows the fitted surface.",
+    )
+
+
+def strip_alt(fit: StagedFit, limit_mm: float) -> str:
+    """Return what is seen in `stills.fit_strip`, in words."""
+    return (
+        f"{fit.label}: the scan, scan and model over each other, and a map of the distances; "
+        f"{share_within(fit, limit_mm)} of what the scan shows lies within {limit_mm:g} mm"
+    )
+
+
+def share_within(fit: StagedFit, limit_mm: float) -> str:
+    """Return the share of the vertices that the scan shows which lie within `limit_mm` of it."""
+    known = measured_mm(fit.model_to_scan_mm["final"])
+    return percent(float((known <= limit_mm).mean())) if len(known) else "none"
+
+
+def fit_pictures(page: Page, fit: StagedFit, population: FloatArray | None, *, of_paper: bool) -> Block:
+    """Return every picture of one fit, as `fit_in_full` has them."""
+    from shapespace.report import figures
+
+    stages = {"before": "before", "initial": "after phase 1", "final": "after phase 2", "dense": "dense"}
+    largest = "largest distance from model to scan " + listed(
+        [
+            f"{mm(float(measured_mm(far).max(initial=0.0)))} {stages[stage]}"
+            for stage, far in fit.model_to_scan_mm.items()
+        ]
+    )
+    within = listed([f"{share_within(fit, limit)} within {limit} mm" for limit in (2, 4, 6, 8, 10)])
+    rms = [moment.rms_mm for moment in fit.history]
+    fall = f"falls from {mm(rms[0])} to {mm(rms[-1])} in {counted(len(rms), 'step')}" if rms else "was not saved"
+    alts = {
+        "stages_figure": f"Scan and model of {fit.label} by stage; {largest}",
+        "overlay_figure": f"Scan and model of {fit.label} over each other at each stage; {largest}",
+        "signed_maps": f"Signed distance maps of {fit.label}, model to scan and scan to model",
+        "regions_figure": f"Regions of {fit.label}: {region_shares(fit)}",
+        "threshold_figure": f"Maps of {fit.label}: {within}",
+        "distance_histograms": f"Histograms of closest distances of {fit.label}; {largest}",
+        "history_figure": f"RMS of {fit.label} {fall}",
+        "coefficients_figure": f"Coefficients of {fit.label}: " + ", ".join(f"{value:.1f}" for value in fit.z[:10]),
+    }
+
+    if fit.regions is None:
+        alts = {name: alt for name, alt in alts.items() if name not in _OF_STAGES}
+
+    def picture(name: str, alt: str) -> Figure:
+        more = {"population": population} if name == "coefficients_figure" else {}
+        drawing = getattr(figures, name)(fit, **more)
+        caption = (_OF_PAPER.get(name, "") if of_paper else "") + _CAPTIONS[name]
+        return page.figure(drawing, caption, alt=alt, chart=name in ("history_figure", "coefficients_figure"))
+
+    return in_columns(
+        *(block for name, alt in alts.items() for block in page.tried(lambda name=name, alt=alt: picture(name, alt)))
+    )
+
+
+_OF_STAGES = ("stages_figure", "regions_figure", "history_figure")
+"""Figures that need the output of --stages."""
+_CAPTIONS = {
+    "stages_figure": "The scan, and the model at each stage of the fit, in the frame of the final pose.",
+    "overlay_figure": "Scan and model over each other, the nearer one shown: where they alternate finely, they "
+    "coincide.",
+    "signed_maps": "Signed distances both ways, positive where the scan lies outside of the model; those of a scan of "
+    "points only have no sign. Scan points beyond the model's rim are not counted.",
+    "regions_figure": "What the fit made of each part of the model: it followed the scan, rejected what the scan shows "
+    "there, lay at the scan's border, or was not seen.",
+    "threshold_figure": "Where the model lies within 2 to 10 mm of the scan. Above each panel: share of the vertices "
+    "that the scan shows.",
+    "distance_histograms": "Closest distances both ways, by stage. Scan points beyond the model's rim are not counted.",
+    "history_figure": "RMS of the closest distances that the fit itself sees, by phase.",
+    "coefficients_figure": "Coefficients in standard deviations of the training set, with their own uncertainty. "
+    "Beyond about 3 they are rare in it.",
+}
+_OF_PAPER = {
+    "overlay_figure": "Paper, figures 4 to 7. ",
+    "distance_histograms": "Paper, figures 4 to 7. ",
+    "threshold_figure": "Paper, figure 11. ",
+}
+
+
+def region_shares(fit: StagedFit) -> str:
+    """Return the share of each region in words, or that they are unknown if the stages were not saved."""
+    if fit.regions is None:
+        return "not saved"
+    counts = np.bincount(fit.regions, minlength=len(REGIONS)) / max(len(fit.regions), 1)
+    return listed([f"{name} {percent(float(share))}" for name, share in zip(REGIONS, counts, strict=True)])
+
+
+def fit_facts(fit: SavedFit) -> list[Block]:
+    """Return status, reason, distances and notes of one fit, and its evidence folded away."""
+    out: list[Block] = [Verdict(status(fit.status), fit.reason), Text(distances_told(fit))]
+    if fit.record.notes:
+        out.append(Notes(fit.record.notes))
+    if fit.record.evidence:
+        out.append(Folded("Evidence for the verdict", [evidence_facts(fit.record.evidence, f"Evidence of {fit.name}")]))
+    return out
+
+
+def distances_told(fit: SavedFit) -> str:
+    """Return the mean distances of one fit both ways, what they are over, and the shares seen."""
+    to_scan, to_model = mm(fit.distance_mm("model_to_scan")), mm(fit.distance_mm("scan_to_model"))
+    shown = fit.record.shown
+    if shown is None:
+        return f"On average: the whole model to the scan {to_scan}, the scan to the model {to_model}."
+    seen, covered = shown.model_seen_share, shown.scan_covered_share
+    return (
+        f"On average, over what the scan shows: model to scan {to_scan}{_over(seen, 'model')}, scan to model "
+        f"{to_model}{_over(covered, 'scan')}."
+    )
+
+
+def _over(share: float | None, of: str) -> str:
+    return "" if share is None else f" ({percent(share)} of the {of})"
+
+
+# Many fits
+
+
+def common_limit_mm(fits: Sequence[StagedFit]) -> float:
+    """Return the end of the scale that strips of these fits share: that of the usual fit."""
+    return nice_ceiling(float(np.median([fit.scale_mm for fit in fits]))) if fits else 1.0
+
+
+def usable(items: Sequence[_From], load: Callable[[_From], _To]) -> tuple[list[_To], list[str]]:
+    """Return what `load` gives, and one sentence for each of the items that it refuses."""
+    found: list[_To] = []
+    problems: list[str] = []
+    for item in items:
+        try:
+            found.append(load(item))
+        except ShapespaceError as error:
+            problems.append(str(error))
+    return found, problems
+
+
+# Coefficients
+
+
+def coefficients_of(fit: SavedFit) -> Coefficients:
+    """Return the coefficients of one fit with its label."""
+    from shapespace.report.figures import Coefficients
+
+    entry = fit.entry
+    return Coefficients(fit.name, entry.expression, entry.intensity or 0.0, fit.numbers("b"), fit.numbers("z"))
+
+
+def scatter(page: Page, points: Sequence[Coefficients]) -> list[Block]:
+    """Return the first coefficients of many fits against each other, coloured by label."""
+    from shapespace.report import figures
+
+    labels = list(dict.fromkeys(point.expression for point in points if point.expression))
+    coloured = f", coloured by label: {listed(labels)}" if len(labels) > 1 else ""
+    matrix = page.figure(
+        figures.scatter_matrix(points),
+        f"The first coefficients of {counted(len(points), 'fit')} against each other{coloured}.",
+        alt=f"Scatter matrix of the first coefficients of {counted(len(points), 'fit')}{coloured}",
+    )
+    if any(len(point.b) < 3 for point in points):
+        return [matrix]
+    return [matrix, Folded("The same in space, to be turned", page.tried(lambda: scatter_to_turn(page, points)))]
+
+
+def lines_through_neutral(
+    page: Page, points: Sequence[Coefficients], neutral: Coefficients | None, *, figures_of: Sequence[str] = ("", "")
+) -> Block:
+    """Return the line structure of one subject's expressions in two and in three coefficients (figures 9 and 10).
+
+    Args:
+        page: that it goes to.
+        points: the expressive fits, with at least two coefficients.
+        neutral: the fit of the neutral face, through which the lines pass; None draws none.
+        figures_of: said before the two captions.
+    """
+    from shapespace.report import figures
+
+    about = (
+        "Larger marks are stronger expressions. Lines pass through the fitted neutral face and fit best in all "
+        "coefficients, each in its standard deviations."
+        if neutral
+        else "Larger marks are stronger expressions. No neutral face was fitted, so no lines are drawn."
+    )
+    faces = counted(len(points), "face")
+    pictures: list[Block] = [
+        page.figure(
+            figures.b_plane(points, title="Expressions in the first two coefficients", neutral=neutral),
+            f"{figures_of[0]}{about}",
+            alt=f"Scatter plot of b1 and b2 for {faces}: each expression runs along its own line",
+            chart=True,
+        )
+    ]
+    if all(len(point.b) >= 3 for point in points):
+        pictures.append(
+            page.figure(
+                figures.b_space(points, title="The first three coefficients, from two sides", neutral=neutral),
+                f"{figures_of[1]}Grey lines drop to the floor of the box.",
+                alt=f"Two views of b1, b2 and b3 for {faces} with a line for each expression",
+            )
+        )
+    return in_columns(*pictures)
+
+
+def scatter_to_turn(page: Page, points: Sequence[Coefficients]) -> Turning | Figure:
+    """Return b1, b2 and b3 in space, as a still where nothing turns."""
+    from shapespace.report import figures
+    from shapespace.report.render.scene import pack_scatter
+
+    still = figures.encode_webp(figures.b_space(points), lossless=True)
+    first = np.stack([point.b[:MODES_IN_WIDGET] for point in points])
+    return page.turning(
+        "scatter",
+        pack_scatter(
+            first,
+            [point.expression or "no label" for point in points],
+            [point.name for point in points],
+            axes=[f"b{k + 1}" for k in range(first.shape[1])],
+        ),
+        page.image(still, f"b1, b2 and b3 of {counted(len(points), 'fit')} in space"),
+        "Coefficients of all fits in space, in mm.",
+        label="Scatter of three coefficients, to be turned",
+        still="The still shows the first three from two sides.",
+    )

@@ -1,0 +1,223 @@
+"""Figures of analyses of cohorts: numbers on a surface from all sides, two shapes beside each other, histograms."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.figure import Figure
+
+from shapespace.errors import InputError
+from shapespace.geometry.normals import face_vectors, faces_of
+from shapespace.report.figures.draw import (
+    INK,
+    TEXT,
+    WIDTH,
+    Row,
+    Scale,
+    chart,
+    escaped,
+    finish,
+    grid,
+    legend,
+    plain,
+    short,
+    view,
+    wrap,
+)
+from shapespace.report.inputs.correspondence_folder import upright
+from shapespace.report.inputs.staged_fit import nice_ceiling
+from shapespace.report.render.palette import CATEGORIES, DIVERGING, SEQUENTIAL
+from shapespace.report.render.renderer import Camera, Image, Layer, covered, render
+from shapespace.types import BoolArray, FloatArray, Mesh
+
+_CLOSED = (("front", 0.0), ("one side", 90.0), ("back", 180.0), ("other side", 270.0))
+_OPEN = (("one side", -55.0), ("front", 0.0), ("other side", 55.0))
+_OPEN_SHARE, _AS_IT_STANDS = 0.15, 0.7
+_PALE = 0.72
+_FARTHEST_MM = 1e7
+_MOST_SERIES = 12
+_MOST_BINS = 2000
+
+
+def looked_at(mesh: Mesh) -> tuple[FloatArray, Sequence[tuple[str, float]]]:
+    """Return the rotation (3, 3) that brings `mesh` to how it is looked at, and names of views with their yaw, degrees.
+
+    It stays as it stands where that is upright with its front along +z, as faces are; otherwise its principal axes
+    turn it. A surface that is open to one side is seen from the other alone.
+
+    Raises:
+        InputError: it has no extent, or one beyond all measure.
+    """
+    at = mesh.vertices
+    if not np.abs(at).max(initial=0.0) < _FARTHEST_MM or not np.ptp(at, axis=0).max(initial=0.0) > 0:
+        raise InputError("There is no surface to draw in vertices without extent, or beyond 10 km.")
+    if mesh.faces is None:
+        return np.eye(3), _CLOSED
+    vectors = face_vectors(at, faces_of(mesh))
+    facing, area = vectors.sum(axis=0), float(np.linalg.norm(vectors, axis=1).sum())
+    is_open = float(np.linalg.norm(facing)) > _OPEN_SHARE * area
+    longest = np.linalg.eigh(np.cov(at.T))[1][:, 2]
+    stands = facing[2] > _AS_IT_STANDS * np.linalg.norm(facing) if is_open else abs(longest[1]) > _AS_IT_STANDS
+    return np.eye(3) if stands else upright(mesh), _OPEN if is_open else _CLOSED
+
+
+def _views(points: FloatArray, yaws: Sequence[float], columns: int) -> tuple[list[Camera], tuple[int, int]]:
+    """Return cameras of one scale for all of `yaws`, and the size of their pictures."""
+    seen = [view(points, columns, yaw_deg=yaw) for yaw in yaws]
+    width, height = seen[0].size
+    tall = max(one.camera.height_mm for one in seen)
+    across = max(one.camera.height_mm * one.size[0] / one.size[1] for one in seen)
+    height = min(max(round(width * tall / across), round(width / 3)), round(width * 1.5))
+    own = max(tall, across * height / width)
+    cameras = [Camera(one.camera.centre, own, one.camera.yaw_deg, 0.0, one.camera.distance_mm) for one in seen]
+    return cameras, (width, height)
+
+
+def surface_map_figure(
+    mesh: Mesh,
+    values: FloatArray,
+    *,
+    unit: str,
+    signed: bool = True,
+    limit: float | None = None,
+    mask: BoolArray | None = None,
+    title: str | None = "",
+) -> Figure:
+    """Draw a number for each vertex on a surface, seen from several sides.
+
+    Args:
+        mesh: in mm; without faces its vertices are drawn as balls.
+        values: (V,); not-a-number is drawn in grey.
+        unit: of the numbers.
+        signed: whether two colours part at zero.
+        limit: where the colours end; None for what 98 % of the numbers stay below.
+        mask: (V,) outside which the colour is pale; None for none.
+        title: above the figure; None for none, as in a page that has a heading.
+
+    Raises:
+        InputError: another number of values or of the mask's, no finite value, a limit that is none, or no extent.
+    """
+    count = len(mesh.vertices)
+    if values.shape != (count,) or (mask is not None and mask.shape != (count,)):
+        raise InputError(f"A surface of {count} vertices needs one number each, not {values.shape}.")
+    known = np.isfinite(values)
+    shown = np.abs(values[known & mask] if mask is not None and (known & mask).any() else values[known])
+    if not len(shown):
+        raise InputError("There is nothing to draw on a surface without numbers.")
+    if limit is not None and not 0 < limit < np.inf:
+        raise InputError(f"The colours of a map cannot end at {limit}.")
+    end = nice_ceiling(float(np.quantile(shown, 0.98)) or float(shown.max())) if limit is None else limit
+    turn, sides = looked_at(mesh)
+    turned = mesh.with_vertices(mesh.vertices @ turn.T)
+    scalars = np.clip(values, -4 * end, 4 * end)
+    low, colours = (-end, DIVERGING) if signed else (0.0, SEQUENTIAL)
+    full = Layer(turned, scalars=scalars, colormap=colours, vmin=low, vmax=end)
+    faint = Layer(turned, scalars=scalars, colormap=_PALE + (1 - _PALE) * colours, vmin=low, vmax=end)
+    cameras, size = _views(turned.vertices, [yaw for _, yaw in sides], len(sides))
+    panels: list[Image] = []
+    for camera in cameras:
+        drawn = render(full, camera=camera, size=size)
+        if mask is not None and not mask.all():
+            drawn = _mixed(drawn, render(faint, camera=camera, size=size), _inside(turned, mask, camera, size))
+        panels.append(drawn)
+    ends = {(True, True): "both", (True, False): "low", (False, True): "high"}
+    beyond = ends.get((bool(values[known].min() < low), bool(values[known].max() > end)), "neither")
+    notes = ["Grey: no value."] if not known.all() else []
+    notes += ["Pale: outside of what is marked."] if mask is not None and not mask.all() else []
+    return grid(
+        [Row(panels, [name for name, _ in sides])],
+        title=None if title is None else title or f"{plain(unit)} on the surface",
+        scale=Scale(short(unit, 70), colours, low, end, beyond),
+        note=" ".join(notes),
+    )
+
+
+def _inside(mesh: Mesh, mask: BoolArray, camera: Camera, size: tuple[int, int]) -> FloatArray:
+    """Return the share (H, W) of each pixel that shows triangles, or points, whose vertices are mostly in the mask."""
+    width, height = size
+    if mesh.faces is None:
+        lit = Layer(mesh, scalars=mask.astype(float), colormap=np.eye(3)[[0, 1]], categories=True)
+        drawn = render(lit, camera=camera, size=size).astype(float)
+        return drawn[:, :, 1] / np.maximum(drawn[:, :, 0] + drawn[:, :, 1], 1.0)
+    triangle, _ = covered(mesh, camera=camera, size=(2 * width, 2 * height))
+    inside = np.append(mask[mesh.faces].sum(axis=1) >= 2, [True])[triangle]
+    return inside.reshape(height, 2, width, 2).mean(axis=(1, 3))
+
+
+def _mixed(one: Image, other: Image, share: FloatArray) -> Image:
+    return np.rint(other + (one.astype(float) - other) * share[:, :, None]).astype(np.uint8)
+
+
+def morph_figure(low: Mesh, high: Mesh, labels: tuple[str, str], *, title: str | None = "") -> Figure:
+    """Draw two shapes in correspondence beside each other, from one camera.
+
+    Args:
+        low: one shape.
+        high: the other.
+        labels: what they are.
+        title: above the figure; None for none, as in a page that has a heading.
+
+    Raises:
+        InputError: no extent, or one beyond all measure.
+    """
+    turn, sides = looked_at(low)
+    both = [mesh.with_vertices(mesh.vertices @ turn.T) for mesh in (low, high)]
+    # Half from the side, where a change of depth is seen too.
+    yaws = [0.0, 40.0 if sides is _OPEN else 90.0]
+    points = np.concatenate([mesh.vertices for mesh in both])
+    cameras, size = _views(points, yaws, 4)
+    panels = [render(Layer(mesh), camera=camera, size=size) for mesh in both for camera in cameras]
+    names = [short(label, 30) for label in labels for _ in yaws]
+    both_named = f"{plain(labels[0])}, and {plain(labels[1])}"
+    return grid([Row(panels, names)], title=None if title is None else title or both_named)
+
+
+def histogram_figure(
+    edges: npt.ArrayLike,
+    series: Sequence[tuple[str, npt.ArrayLike]],
+    *,
+    x: str,
+    observed: float | None = None,
+    observed_label: str = "",
+    title: str = "",
+) -> Figure:
+    """Draw a histogram, with a line at one value.
+
+    Args:
+        edges: (n + 1,) rising.
+        series: for each its name, empty for none, and its (n,) counts.
+        x: what the values are, with their unit.
+        observed: where a line stands, such as a statistic among its permutations.
+        observed_label: what it is.
+        title: above the figure.
+
+    Raises:
+        InputError: edges that do not rise, counts of another length or below 0, or nothing to draw.
+    """
+    ends = np.asarray(edges, dtype=np.float64)
+    if not 2 <= len(ends) <= _MOST_BINS or not np.isfinite(ends).all() or not (np.diff(ends) > 0).all():
+        raise InputError(f"A histogram needs 2 to {_MOST_BINS} edges that rise.")
+    if not 1 <= len(series) <= _MOST_SERIES:
+        raise InputError(f"A histogram has 1 to {_MOST_SERIES} series, not {len(series)}.")
+    figure, axes = chart(title or f"Distribution of {plain(x)}", height=3.0)
+    for k, (name, counts) in enumerate(series):
+        many = np.asarray(counts, dtype=np.float64)
+        if many.shape != (len(ends) - 1,) or not np.isfinite(many).all() or (many < 0).any():
+            raise InputError(f"The histogram {short(name)!r} needs {len(ends) - 1} counts that are not negative.")
+        colour, filled = CATEGORIES[k % len(CATEGORIES)], 0.55 if len(series) == 1 else 0.3
+        axes.stairs(many, ends, fill=True, color=colour, alpha=filled, label=escaped(short(name, 40)) or None)
+        axes.stairs(many, ends, color=colour, lw=1.6)
+    low, high = float(ends[0]), float(ends[-1])
+    if observed is not None:
+        if not np.isfinite(observed):
+            raise InputError("What was observed among the values of a histogram must be a finite number.")
+        axes.axvline(observed, color=INK, lw=2.0, ls=(0, (4, 2)), label=escaped(short(observed_label, 40)) or None)
+        low, high = min(low, observed), max(high, observed)
+    room = 0.02 * (high - low)
+    axes.set(xlim=(low - room, high + room), xlabel=escaped(wrap(x, 0.8 * WIDTH, TEXT)), ylabel="count")
+    axes.set_ylim(bottom=0)
+    if any(name for name, _ in series) or (observed is not None and observed_label):
+        legend(axes, loc="best")
+    return finish(figure)

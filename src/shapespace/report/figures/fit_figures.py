@@ -1,0 +1,422 @@
+"""Figures of one fit: its stages, its distances both ways, how it went, and what it ended in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from shapespace.errors import InputError
+from shapespace.fit.vertex_regions import REGIONS
+from shapespace.report.figures.draw import (
+    BACKWARD,
+    FORWARD,
+    GREY,
+    INK,
+    NOT_SHOWN,
+    SMALL,
+    STAGE_WORDS,
+    TEXT,
+    Row,
+    chart,
+    charts,
+    distance_scale,
+    finish,
+    grid,
+    legend,
+    mean_mm,
+    mean_words,
+    mm,
+    number_axis,
+    percent,
+    scan_over,
+    short,
+    surroundings,
+    unknown,
+    view,
+)
+from shapespace.report.inputs.staged_fit import StagedFit, measured_mm, scale_end
+from shapespace.report.render.palette import (
+    BEYOND_COLOUR,
+    DENSE_COLOUR,
+    MODEL_COLOUR,
+    REGION_COLOURS,
+    SCAN_COLOUR,
+    UNKNOWN_COLOUR,
+    WITHIN_COLOUR,
+    Colour,
+)
+from shapespace.report.render.renderer import Image, Layer, distance_layer, render, render_series
+from shapespace.types import FloatArray, Mesh
+
+THRESHOLDS_MM = (2.0, 4.0, 6.0, 8.0, 10.0)
+"""The limits of the paper's figure 11."""
+
+_SHORT_STAGES = {"before": "before", "initial": "phase 1", "final": "phase 2", "dense": "dense"}
+_SIDES = (("from the right", -38.0), ("from the front", 0.0), ("from the left", 38.0))
+_FRONT_AND_SIDE = (0.0, 48.0)
+_REGION_WORDS = {
+    "followed": "followed",
+    "rejected": "rejected: the scan shows something else",
+    "border": "at the scan's border",
+    "unseen": NOT_SHOWN,
+}
+_MOST_MODES = 30
+_NEAR_START = 0.35
+_TOWERS = 2.0
+"""Times its neighbour, and percent, beyond which the first bar of a histogram needs a word."""
+_NEAREST_MM, _FARTHEST_MM = 0.01, 300.0
+_TEXT_ROOM = 1.42
+"""How much farther than the tallest bar a half of a histogram reaches, for the line of text above it."""
+
+
+def stages_figure(fit: StagedFit, *, title: str = "") -> Figure:
+    """Draw the scan, then the model before the fit, after phase 1, after phase 2 and, where there is one, dense.
+
+    A notebook makes the fit out of a result:
+
+        result = ss.fit_scan(model, scan)
+        figures.stages_figure(StagedFit.of(model, result))
+    """
+    stages = [Layer(mesh, _colour(stage)) for stage, mesh in fit.surfaces.items()]
+    layers = [[Layer(fit.scan, SCAN_COLOUR)], *([layer] for layer in stages)]
+    captions = ["scan", *(f"{_SHORT_STAGES.get(stage, stage)}\n{mm(mean_mm(fit, stage))}" for stage in fit.surfaces)]
+    dense = ", and taken the rest of the way" if "dense" in fit.surfaces else ""
+    return grid(
+        _from_two_sides(fit, layers, captions),
+        title=title
+        or f"{short(fit.label)}: the scan, and the model before, after finding pose and after finding shape{dense}",
+        note=mean_words([fit]),
+    )
+
+
+def overlay_figure(fit: StagedFit, *, title: str = "") -> Figure:
+    """Draw scan and model over each other at each stage, from two sides (the paper's figures 4 to 7)."""
+    scan = scan_over(fit.scan)
+    layers = [[scan, Layer(mesh, _colour(stage))] for stage, mesh in fit.surfaces.items()]
+    captions = [f"{_SHORT_STAGES.get(stage, stage)}\n{mm(mean_mm(fit, stage))}" for stage in fit.surfaces]
+    keys: list[tuple[str, Colour]] = [("scan", SCAN_COLOUR), ("model", MODEL_COLOUR)]
+    if "dense" in fit.surfaces:
+        keys.append(("dense surface", DENSE_COLOUR))
+    return grid(
+        _from_two_sides(fit, layers, captions),
+        title=title or f"{short(fit.label)}: scan and model over each other, the nearer one is seen",
+        keys=keys,
+        note=f"{mean_words([fit])} Where both mix finely, the fit is close.",
+    )
+
+
+def signed_maps(fit: StagedFit, stage: str = "final", *, limit_mm: float | None = None, title: str = "") -> Figure:
+    """Draw the distances both ways: on the model to the scan, and on the scan to the model; signed but for points.
+
+        result = ss.fit_scan(model, scan)
+        figures.signed_maps(StagedFit.of(model, result))
+
+    Args:
+        fit: with the stage.
+        stage: `before`, `initial`, `final` or `dense`.
+        limit_mm: where the scale ends; None takes one that nearly all distances keep within.
+        title: above the figure.
+
+    Raises:
+        InputError: the fit has no such stage, or the limit is not positive.
+    """
+    surface = _surface(fit, stage)
+    forward, backward = fit.model_to_scan_mm[stage], fit.scan_to_model_mm[stage]
+    if limit_mm is None:
+        limit_mm = fit.scale_mm if stage == "final" else scale_end(np.concatenate([forward, backward]))
+    if not limit_mm > 0:
+        raise InputError(f"The limit of a scale must be positive, not {limit_mm!r} mm.")
+    signed = fit.scan.faces is not None
+    on_model, on_scan = (
+        distance_layer(mesh, values, limit_mm, signed=signed)
+        for mesh, values in ((surface, forward), (fit.scan, backward))
+    )
+    panels: tuple[list[Image], list[Image]] = ([], [])
+    for _, yaw in _SIDES:
+        seen = view(surroundings(fit), len(_SIDES), yaw_deg=yaw)
+        first = view(surroundings(fit), len(_SIDES))
+        for row, layer in zip(panels, (on_model, on_scan), strict=True):
+            row.append(render(layer, camera=seen.camera, size=first.size))
+    unseen, beyond = unknown(forward), unknown(backward)
+    keys: list[tuple[str, Colour]] = []
+    if unseen:
+        keys.append((f"on the model: {NOT_SHOWN} ({percent(unseen)})", UNKNOWN_COLOUR))
+    if beyond:
+        keys.append((f"on the scan: beyond the model's rim, not counted ({percent(beyond)})", UNKNOWN_COLOUR))
+    rows = [
+        Row(panels[0], [side for side, _ in _SIDES], f"From the model to the scan: {_summary(forward)}"),
+        Row(panels[1], [], f"From the scan to the model: {_summary(backward)}"),
+    ]
+    what = "the dense surface" if stage == "dense" else f"the model {STAGE_WORDS.get(stage, stage)}"
+    if stage == "final":
+        what = "the fitted model"
+    return grid(
+        rows,
+        title=title
+        or f"{short(fit.label)}: how far scan and {what.removeprefix('the ')} lie from each other, both ways",
+        scale=distance_scale(limit_mm, signed=signed),
+        keys=keys,
+    )
+
+
+def threshold_figure(fits: StagedFit | Sequence[StagedFit], *, title: str = "") -> Figure:
+    """Draw where the model lies within 2, 4, 6, 8 and 10 mm of the scan (the paper's figure 11), a row a fit.
+
+    Raises:
+        InputError: no fit is given.
+    """
+    several = [fits] if isinstance(fits, StagedFit) else list(fits)
+    table = np.array([WITHIN_COLOUR, BEYOND_COLOUR])
+    rows: list[Row] = []
+    for fit in several:
+        far = np.abs(fit.model_to_scan_mm["final"])
+        seen = view(fit.surfaces["final"].vertices, len(THRESHOLDS_MM))
+        maps = [
+            [Layer(fit.surfaces["final"], scalars=far, colormap=table, vmin=limit - 1e-3, vmax=limit + 1e-3)]
+            for limit in THRESHOLDS_MM
+        ]
+        panels = render_series(maps, camera=seen.camera, size=seen.size)
+        known = measured_mm(far)
+        within = [percent(float((known <= limit).mean())) if len(known) else "–" for limit in THRESHOLDS_MM]
+        captions = [f"{limit:g} mm\n{share}" for limit, share in zip(THRESHOLDS_MM, within, strict=True)]
+        rows.append(Row(panels, captions, short(fit.label, 60) if len(several) > 1 else ""))
+    unseen = [(NOT_SHOWN, UNKNOWN_COLOUR)] if any(unknown(fit.model_to_scan_mm["final"]) for fit in several) else []
+    whose = f"{short(several[0].label)}: where" if len(several) == 1 else "Where"
+    return grid(
+        rows,
+        title=title or f"{whose} the model lies within 2 to 10 mm of the scan",
+        keys=[("within the limit", WITHIN_COLOUR), ("farther away", BEYOND_COLOUR), *unseen],
+        note="In %: share of the vertices that the scan shows that lie within the limit.",
+    )
+
+
+def distance_histograms(fit: StagedFit, *, title: str = "", bins: int = 60) -> Figure:
+    """Draw how the closest distances of both directions are spread, stage by stage on one scale.
+
+    Distances from the model to the scan stand above each line, those from the scan to the model hang below it. Only
+    vertices that the scan shows count, and scan points within the model's rim.
+    """
+    both = {
+        stage: (measured_mm(fit.model_to_scan_mm[stage]), measured_mm(fit.scan_to_model_mm[stage]))
+        for stage in fit.surfaces
+    }
+    every = np.concatenate([values for pair in both.values() for values in pair])
+    low, high = _decades(every)
+    edges = np.geomspace(low, high, bins + 1)
+    heights = {stage: [100 * _histogram(values, edges) for values in pair] for stage, pair in both.items()}
+    tallest = max(float(height.max()) for pair in heights.values() for height in pair) or 1.0
+    most = _TEXT_ROOM * tallest
+    note = "Counted: the vertices that the scan shows, and scan points within the model's rim."
+    if any(height[0] > max(_TOWERS * height[1], _TOWERS) for pair in heights.values() for height in pair):
+        note += f" The first bar holds all distances below {mm(float(edges[1]))}, 0 among them."
+    figure, plots = charts(
+        title or f"{short(fit.label)}: closest distances both ways, stage by stage", [1.6] * len(both), note=note
+    )
+    for k, (axes, (stage, pair)) in enumerate(zip(plots, heights.items(), strict=True)):
+        for height, values, sign, colour, name in zip(
+            pair, both[stage], (1, -1), (FORWARD, BACKWARD), ("model to scan", "scan to model"), strict=True
+        ):
+            axes.stairs(sign * height, edges, fill=True, color=colour, alpha=0.45, lw=0)
+            axes.stairs(sign * height, edges, color=colour, lw=1.2, baseline=None)
+            told = "no point counted"
+            if len(values):
+                mean = float(values.mean())
+                told = f"mean {mm(mean)}, largest {mm(float(values.max()))}"
+                axes.plot([min(max(mean, low), high)] * 2, [0, sign * tallest], color=colour, lw=1.6, ls=(0, (3, 1.5)))
+            axes.text(
+                0.012, 0.5 + 0.47 * sign, f"{name}: {told}", transform=axes.transAxes, color=colour, fontsize=SMALL - 1,
+                va="top" if sign > 0 else "bottom", bbox={"facecolor": "white", "lw": 0, "pad": 1.5},
+            )  # fmt: skip
+        axes.axhline(0, color=GREY, lw=0.8)
+        axes.set_title(STAGE_WORDS.get(stage, stage), fontsize=TEXT, color=INK, loc="left", pad=4)
+        axes.set(xscale="log", xlim=(low, high), ylim=(-most, most))
+        axes.yaxis.set_major_locator(MaxNLocator(3, symmetric=True))
+        axes.yaxis.set_major_formatter(lambda value, _: f"{abs(value):g}")
+        axes.xaxis.set_major_formatter("{x:g}")
+        if k < len(both) - 1:
+            axes.tick_params(labelbottom=False)
+    to_points = " to the points" if fit.scan.faces is None else ""
+    plots[-1].set_xlabel(f"closest distance{to_points} (mm, log scale); dashed: mean")
+    # In the middle of all: of an even number, that is between two.
+    plots[len(plots) // 2].set_ylabel("share of the points (%)", y=0.5 if len(plots) % 2 else 1.1)
+    return finish(figure, h_pad=0.3)
+
+
+def history_figure(fit: StagedFit, *, title: str = "") -> Figure:
+    """Draw the RMS distance by iteration and phase."""
+    figure, axes = chart(title or f"{short(fit.label)}: the RMS distance from iteration to iteration", height=3.0)
+    rms = np.array([moment.rms_mm for moment in fit.history], dtype=np.float64)
+    phase = np.array([moment.phase for moment in fit.history], dtype=np.int64)
+    usable = np.isfinite(rms)
+    if not usable.any():
+        axes.text(0.5, 0.5, "No iteration was saved.", transform=axes.transAxes, ha="center", fontsize=TEXT, color=GREY)
+        axes.set_xticks([])
+        axes.set_yticks([])
+        return finish(figure)
+    for number, colour, name in ((1, BACKWARD, "phase 1: pose"), (2, FORWARD, "phase 2: pose and shape")):
+        at = np.flatnonzero((phase == number) & usable)
+        if len(at):
+            ends = f"{name}, ends at {mm(float(rms[at[-1]]))}"
+            axes.plot(at, rms[at], color=colour, lw=2, marker="o", ms=4 if len(rms) < 80 else 2, label=ends)
+    change = np.flatnonzero(np.diff(phase) > 0)
+    if len(change):
+        axes.axvline(float(change[0]) + 0.5, color="#c4c7cc", lw=1, ls=(0, (4, 3)))
+    log = bool(rms[usable].min() > 0 and rms[usable].max() > 4 * rms[usable].min())
+    if log:
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:.1e}"[0] in "25" else "")
+    else:
+        axes.set_ylim(0, 1.1 * float(rms[usable].max()) or 1.0)
+    axes.set(xlabel="iteration", ylabel=f"RMS distance (mm, {'log' if log else 'linear'} scale)")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    # Above the plot, where it hides nothing.
+    legend(axes, loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2, borderpad=0.2)
+    finish(figure)
+    axes.tick_params(axis="y", which="minor", labelsize=SMALL - 1)
+    return figure
+
+
+def coefficients_figure(fit: StagedFit, population: FloatArray | None = None, *, title: str = "") -> Figure:
+    """Draw the coefficients of a fit in standard deviations, each with its uncertainty, over those of the population.
+
+    Args:
+        fit: gives z, b_stddev and shrinkage.
+        population: (N, K) z of the training set; None draws where 95 % of a normal population lie.
+        title: above the figure.
+
+    Raises:
+        InputError: the population has another number of coefficients.
+    """
+    count = len(fit.z)
+    shown = min(count, _MOST_MODES)
+    at = np.arange(1, shown + 1)
+    z = fit.z[:shown]
+    figure, axes = chart(
+        title
+        or f"{short(fit.label)}: its coefficient{'s, how sure they are' if count > 1 else ', how sure it is'}, "
+        "and what is usual",
+        height=3.2,
+    )
+    if population is None:
+        axes.axhspan(-1.96, 1.96, color="#ebecee", lw=0, label="95 % of a normal population")
+    else:
+        if population.ndim != 2 or population.shape[1] != count:
+            raise InputError(
+                f"The population must hold {count} coefficients a shape, as the fit does, not {population.shape}."
+            )
+        low, high = np.percentile(population[:, :shown], [2.5, 97.5], axis=0)
+        axes.bar(at, high - low, bottom=low, width=0.9, color="#e3e5e8", label="95 % of the training set")
+    deviation = z_stddev(fit)[:shown]
+    told = fit.shrinkage[:shown] >= 0.5
+    for mask, colour, name in ((told, FORWARD, "determined by the scan"), (~told, "#9cc3df", "mostly the prior")):
+        if mask.any():
+            axes.bar(at[mask], z[mask], width=0.55, color=colour, label=name, zorder=2)
+    known = np.isfinite(deviation)
+    if known.any():
+        axes.errorbar(
+            at[known], z[known], yerr=1.96 * deviation[known], fmt="none", ecolor=INK, elinewidth=1.4, capsize=2.5,
+            zorder=3, label="95 % interval",
+        )  # fmt: skip
+    axes.axhline(0, color=INK, lw=0.8)
+    reach = np.abs(z) + np.where(known, 1.96 * np.nan_to_num(deviation), 0)
+    limit = max(3.0, 1.1 * float(reach.max()))
+    axes.set(ylim=(-limit, 1.45 * limit), ylabel="z = b / sd")
+    axes.set_xlabel("mode" if shown == count else f"mode (first {shown} of {count})")
+    number_axis(axes, shown)
+    legend(axes, loc="upper center", ncols=2)
+    return finish(figure)
+
+
+def z_stddev(fit: StagedFit) -> FloatArray:
+    """Return the standard deviation of z, (K,); not-a-number where z is 0 and does not tell that of its mode."""
+    known = (np.abs(fit.z) > 1e-12) & (np.abs(fit.b) > 0)
+    ratio = np.full(len(fit.z), np.nan)
+    ratio[known] = fit.z[known] / fit.b[known]
+    return ratio * fit.b_stddev
+
+
+def regions_figure(fit: StagedFit, *, title: str = "") -> Figure:
+    """Draw the scan next to the model, whose regions are coloured: matched, rejected, at the border, unobserved.
+
+    Raises:
+        InputError: the regions were not saved.
+    """
+    if fit.regions is None:
+        raise InputError(f"{short(fit.label)} has no saved regions; fit the scan again with --stages.")
+    table = np.array([REGION_COLOURS[name] for name in REGIONS])
+    layer = Layer(
+        fit.surfaces["final"], scalars=fit.regions.astype(np.float64), colormap=table, vmin=-0.5,
+        vmax=len(REGIONS) - 0.5, categories=True,
+    )  # fmt: skip
+    scan = Layer(fit.scan, SCAN_COLOUR)
+    panels: list[Image] = []
+    captions: list[str] = []
+    for _, yaw in (_SIDES[0], _SIDES[2]):
+        seen = view(surroundings(fit), 4, yaw_deg=yaw)
+        panels += render_series([[scan], [layer]], camera=seen.camera, size=view(surroundings(fit), 4).size)
+        captions += ["scan", "model"]
+    share = np.bincount(fit.regions, minlength=len(REGIONS)) / max(len(fit.regions), 1)
+    keys = [
+        (f"{_REGION_WORDS[name]} ({percent(float(share[k]))})", REGION_COLOURS[name])
+        for k, name in enumerate(REGIONS)
+        if share[k] > 0
+    ]
+    return grid(
+        [Row(panels, captions)],
+        title=title or f"{short(fit.label)}: which parts of the model the scan decided",
+        keys=keys,
+        note="In %: share of the model's vertices. What is not blue has only the model, and its neighbours, to go by.",
+    )
+
+
+def _from_two_sides(fit: StagedFit, layers: Sequence[Sequence[Layer]], captions: Sequence[str]) -> list[Row]:
+    points = surroundings(fit)
+    final = fit.surfaces["final"].vertices
+    before = fit.surfaces["before"].vertices if "before" in fit.surfaces else final
+    # Of a start that was near, all is shown; one that was far away would make the rest small.
+    if np.abs(before.mean(axis=0) - final.mean(axis=0)).max() < _NEAR_START * np.ptp(final, axis=0).max():
+        points = np.concatenate([points, before])
+    size = view(points, len(layers)).size
+    rows: list[Row] = []
+    for k, yaw in enumerate(_FRONT_AND_SIDE):
+        camera = view(points, len(layers), yaw_deg=yaw).camera
+        rows.append(Row(render_series(layers, camera=camera, size=size), captions if k == 0 else ()))
+    return rows
+
+
+def _colour(stage: str) -> Colour:
+    return DENSE_COLOUR if stage == "dense" else MODEL_COLOUR
+
+
+def _surface(fit: StagedFit, stage: str) -> Mesh:
+    if stage not in fit.surfaces:
+        raise InputError(f"{short(fit.label)} has no stage {stage!r}; choose one of {', '.join(fit.surfaces)}.")
+    return fit.surfaces[stage]
+
+
+def _summary(values: FloatArray) -> str:
+    far = measured_mm(values)
+    if not len(far):
+        return "no point counted"
+    return f"mean {mm(float(far.mean()))}, 95 % within {mm(float(np.percentile(far, 95)))}"
+
+
+def _decades(values: FloatArray) -> tuple[float, float]:
+    """Return the ends of a logarithmic axis for distances in mm."""
+    inner = values[values > 0]
+    if not len(inner):
+        return 0.1, 10.0
+    low, high = np.percentile(inner, 0.5), float(inner.max())
+    low = float(np.clip(low, _NEAREST_MM, 1.0))
+    return low, float(max(1.1 * min(high, 10 * _FARTHEST_MM), 10 * low))
+
+
+def _histogram(values: FloatArray, edges: FloatArray) -> FloatArray:
+    """Return the share of `values` in each bin; those beyond the ends count at the ends."""
+    if not len(values):
+        return np.zeros(len(edges) - 1)
+    return np.histogram(np.clip(values, edges[0], edges[-1]), edges)[0] / len(values)

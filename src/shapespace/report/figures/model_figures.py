@@ -1,0 +1,397 @@
+"""Figures of a shape space: its mean, what its modes do, and how many of them it needs."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TypeAlias
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from PIL import Image as PillowImage
+from PIL import ImageDraw, ImageFont
+
+from shapespace.errors import FileFormatError, InputError
+from shapespace.io.files import write_bytes
+from shapespace.model.shape_model import ShapeModel
+from shapespace.report.figures.draw import (
+    BACKWARD,
+    FORWARD,
+    INK,
+    TEXT,
+    Row,
+    Scale,
+    chart,
+    charts,
+    counted,
+    finish,
+    grid,
+    legend,
+    mm,
+    number_axis,
+    percent,
+    view,
+)
+from shapespace.report.inputs.staged_fit import nice_ceiling
+from shapespace.report.render.palette import SEQUENTIAL
+from shapespace.report.render.renderer import Camera, Image, Layer, render
+from shapespace.schemas import BySize, Measured, Quality, read
+from shapespace.types import FloatArray, Mesh
+
+SHARES = (0.90, 0.95, 0.98, 0.99)
+"""Shares of the variance for which the number of modes is told."""
+
+_LANDMARK = (0.78, 0.20, 0.14)
+_BARS = "#a9c9e2"
+_QUALITY = {
+    "compactness": ("Compactness: share of the variance held", "share of the variance (%)"),
+    "generalisation": ("Generalisation: error on shapes left out", "mean error (mm)"),
+    "specificity": ("Specificity: distance of random shapes from real ones", "mean distance (mm)"),
+    "reconstruction": ("Reconstruction: error on unseen shapes that were given", "mean error (mm)"),
+}
+_LONGEST_NAME = 26
+_BY_SHAPES = "Generalisation with all modes, by the number of training shapes"
+_COLOURS, _BANDS = (FORWARD, BACKWARD), (_BARS, "#f2c6a5")
+
+
+def mean_figure(model: ShapeModel, *, title: str = "") -> Figure:
+    """Draw the mean shape from three sides, with the model's landmarks where it has any.
+
+    Args:
+        model: the shape space.
+        title: above the figure; by default it says how many shapes the mean is of.
+    """
+    mean = model.mesh()
+    layers = [Layer(mean)]
+    if model.landmarks:
+        at = model.landmarks.interpolate(mean.vertices)
+        size = 0.008 * float(np.ptp(mean.vertices, axis=0).max())
+        layers.append(Layer(Mesh(at), _LANDMARK, point_radius_mm=size))
+    panels: list[Image] = []
+    sides = (("front", 0.0), ("three-quarter", 40.0), ("side", 90.0))
+    # One height in mm for all three, so that they can be compared.
+    front = view(mean.vertices, len(sides))
+    for _, yaw in sides:
+        camera = view(mean.vertices, len(sides), yaw_deg=yaw).camera
+        height = max(camera.height_mm, front.camera.height_mm)
+        turned = Camera(camera.centre, height, yaw, 0.0, camera.distance_mm)
+        panels.append(render(*layers, camera=turned, size=front.size))
+    marks = f", with {counted(len(model.landmarks), 'landmark')}" if model.landmarks else ""
+    return grid(
+        [Row(panels, [name for name, _ in sides])],
+        title=title or f"The mean of {counted(model.n_training, 'shape')}{marks}",
+    )
+
+
+def modes_figure(model: ShapeModel, modes: int = 5, deviations: float = 3.0, *, title: str = "") -> Figure:
+    """Draw what each of the first modes does (the paper's figures 2 and 3).
+
+    A row a mode: the mean less and plus `deviations` standard deviations of it, and how far each vertex then moves; one
+    camera and one scale for all rows.
+
+    Args:
+        model: the shape space.
+        modes: how many to draw at most.
+        deviations: how many standard deviations to each side.
+        title: above the figure.
+
+    Raises:
+        InputError: no mode is asked for, or deviations that are not positive.
+    """
+    if modes < 1 or not deviations > 0:
+        raise InputError(f"There is nothing to draw of {modes} modes at {deviations} standard deviations.")
+    shown = min(modes, model.n_modes)
+    moves = [mode_displacement(model, k, deviations) for k in range(shown)]
+    mean = model.mesh()
+    seen = view(np.concatenate([mean.vertices + sign * move for move in moves for sign in (-1, 1)]), 4)
+    lengths = [np.linalg.norm(move, axis=1) for move in moves]
+    top = nice_ceiling(max(float(length.max()) for length in lengths))
+    middle = render(Layer(mean), camera=seen.camera, size=seen.size)
+    rows: list[Row] = []
+    for k, (move, length) in enumerate(zip(moves, lengths, strict=True)):
+        low, high = (
+            render(Layer(mean.with_vertices(mean.vertices + sign * move)), camera=seen.camera, size=seen.size)
+            for sign in (-1, 1)
+        )
+        mapped = Layer(mean, scalars=length, colormap=SEQUENTIAL, vmax=top)
+        far = render(mapped, camera=seen.camera, size=seen.size)
+        share = float(model.stddev[k] ** 2 / model.total_variance)
+        rows.append(
+            Row(
+                [low, middle, high, far],
+                [f"−{deviations:g} sd", "mean", f"+{deviations:g} sd", "movement"] if k == 0 else [],
+                f"Mode {k + 1}: {percent(share)} of the variance, moves up to {mm(float(length.max()))}",
+            )
+        )
+    of_each = f"{deviations:g} standard deviation{'s' * (deviations != 1)}"
+    return grid(
+        rows,
+        title=title or f"What {_which(shown, model.n_modes)} to the mean",
+        scale=Scale(f"how far a point moves at {of_each} (mm)", SEQUENTIAL, 0.0, top),
+    )
+
+
+def _which(shown: int, count: int) -> str:
+    if count == 1:
+        return "the one mode does"
+    if shown == count:
+        return f"each of the {count} modes does"
+    return f"the first of {count} modes does" if shown == 1 else f"the first {shown} of {count} modes do"
+
+
+def mode_displacement(model: ShapeModel, mode: int, deviations: float = 1.0) -> FloatArray:
+    """Return how far each vertex moves, (V, 3) mm, when coefficient `mode` (from 0) rises by `deviations` of its own.
+
+    Raises:
+        InputError: the model has no such mode.
+    """
+    if not 0 <= mode < model.n_modes:
+        raise InputError(f"The model has {counted(model.n_modes, 'mode')}, so there is no mode with index {mode}.")
+    b = np.zeros(model.n_modes)
+    b[mode] = deviations * model.stddev[mode]
+    return model.reconstruct(b) - model.mean_vertices
+
+
+def mode_animation(
+    model: ShapeModel,
+    mode: int = 0,
+    *,
+    deviations: float = 3.0,
+    frames: int = 24,
+    width: int = 320,
+    yaw_deg: float = 25.0,
+    milliseconds: int = 80,
+) -> bytes:
+    """Return an animated WebP in which the mean sways along one mode and back, for ever.
+
+        Path("mode1.webp").write_bytes(mode_animation(model, 0))
+
+    Args:
+        model: the shape space.
+        mode: which, from 0.
+        deviations: how many standard deviations to each side.
+        frames: of one period, at least 4.
+        width: of the picture in pixels.
+        yaw_deg: how far the shape is turned from the front.
+        milliseconds: that a frame stands.
+
+    Raises:
+        InputError: the model has no such mode, or there are too few frames.
+    """
+    if frames < 4 or milliseconds < 1:
+        raise InputError(f"An animation needs 4 frames or more that stand for a while, not {frames}.")
+    move = mode_displacement(model, mode, 1.0)
+    mean = model.mesh()
+    ends = np.concatenate([mean.vertices + sign * deviations * move for sign in (-1, 1)])
+    seen = view(ends, 1, yaw_deg=yaw_deg, width=width)
+    half = frames // 2
+    swings = deviations * np.sin(np.linspace(-np.pi / 2, np.pi / 2, half + 1))
+    forth = [
+        _labelled(
+            render(Layer(mean.with_vertices(mean.vertices + z * move)), camera=seen.camera, size=seen.size),
+            f"mode {mode + 1}",
+            float(z),
+            deviations,
+        )
+        for z in swings
+    ]
+    cycle = forth + forth[-2:0:-1]
+    stream = io.BytesIO()
+    cycle[0].save(
+        stream,
+        format="WEBP",
+        save_all=True,
+        append_images=cycle[1:],
+        duration=milliseconds,
+        loop=0,
+        quality=72,
+        method=2,
+    )
+    return stream.getvalue()
+
+
+def _labelled(image: Image, name: str, z: float, deviations: float) -> PillowImage.Image:
+    """Add below a picture which mode it is, and where on its way from one end to the other."""
+    height, width = image.shape[:2]
+    type_size = max(11, round(width / 19))
+    strip = round(2.1 * type_size)
+    picture = PillowImage.new("RGB", (width, height + strip), "white")
+    picture.paste(PillowImage.fromarray(image), (0, 0))
+    draw = ImageDraw.Draw(picture)
+    font = ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), type_size)
+    middle = height + strip // 2
+    draw.text((4, middle), name, fill=INK, font=font, anchor="lm")
+    draw.text((width - 4, middle), f"{z:+.1f} sd".replace("-", "−"), fill=INK, font=font, anchor="rm")
+    left, right = round(0.34 * width), round(0.66 * width)
+    draw.line([(left, middle), (right, middle)], fill="#b9bcc2", width=2)
+    draw.line([((left + right) // 2, middle - 4), ((left + right) // 2, middle + 4)], fill="#b9bcc2", width=2)
+    at = round(left + (right - left) * (z + deviations) / (2 * deviations))
+    radius = max(4, type_size // 3)
+    draw.ellipse((at - radius, middle - radius, at + radius, middle + radius), fill=FORWARD)
+    return picture
+
+
+def spectrum_figure(model: ShapeModel, *, shares: Sequence[float] = SHARES, title: str = "") -> Figure:
+    """Draw how much variance the first modes hold, and how many it takes for each of `shares`."""
+    cumulative = model.cumulative_variance
+    needed = {share: model.modes_for_variance(share) for share in shares}
+    reached = [count for count in needed.values() if count is not None]
+    shown = min(len(cumulative), max(8, (max(reached) if len(reached) == len(needed) else len(cumulative)) + 3), 120)
+    count = np.arange(1, shown + 1)
+    shapes = counted(model.n_training, "shape")
+    figure, axes = chart(
+        title
+        or (
+            f"How many modes the variance of {shapes} needs"
+            if len(cumulative) > 1
+            else f"How much of the variance of {shapes} the one mode holds"
+        ),
+        height=3.3,
+    )
+    axes.bar(count, 100 * np.diff(cumulative[:shown], prepend=0.0), color=_BARS, label="each mode")
+    axes.plot(
+        count,
+        100 * cumulative[:shown],
+        color=FORWARD,
+        lw=2,
+        marker="o" if shown < 40 else "",
+        ms=4,
+        label="all up to it",
+    )
+    lines: list[str] = []
+    for share, modes in needed.items():
+        if modes is None:
+            lines.append(f"{100 * share:g} %: more than {counted(len(cumulative), 'mode')}")
+            continue
+        lines.append(f"{100 * share:g} %: {counted(modes, 'mode')}")
+        if modes <= shown:
+            axes.plot([modes], [100 * cumulative[modes - 1]], "o", ms=9, mfc="none", mec=INK, mew=1.4, zorder=5)
+    axes.plot([], [], "o", ms=9, mfc="none", mec=INK, mew=1.4, ls="", label="\n".join(lines))
+    axes.set(xlabel="number of modes", ylabel="share of the variance (%)", ylim=(0, 104))
+    number_axis(axes, shown)
+    legend(axes, loc="center right", bbox_to_anchor=(1.0, 0.42), labelspacing=0.6)
+    return finish(figure)
+
+
+def quality_figure(quality: Quality | Mapping[str, object], *, title: str = "") -> Figure:
+    """Draw compactness, generalisation, specificity and more, those that are there, over the number of modes.
+
+    Args:
+        quality: from `compactness` (shares of the variance, 0 to 1), `generalisation`, `specificity` and
+            `reconstruction` (mm) to a list with one number for 1, 2, 3 and so on modes, or to a mapping of `modes`,
+            `mean` and, if known, `stddev` or `low` and `high`; those of `others` are drawn beside it.
+        title: above the figure; by default it says what is drawn.
+
+    Raises:
+        InputError: none of them is there, or one is no such list.
+    """
+    if not isinstance(quality, Quality):
+        try:
+            quality = read(Quality, quality, "What was measured of a model", "give lists of numbers")
+        except FileFormatError as error:
+            raise InputError(str(error)) from error
+    named = [quality, *quality.others]
+    shown = [key for key in _QUALITY if any(getattr(one, key) is not None for one in named)]
+    sizes = [one.generalisation_by_shapes for one in named]
+    if not shown:
+        raise InputError(f"There is nothing to draw: give at least one of {', '.join(_QUALITY)}.")
+    drawn = {key: [_of(key, one) for one in named] for key in shown}
+    most = int(max(modes.max() for curves in drawn.values() for lines in curves for modes, *_ in lines.values()))
+    by_default = f"How good the shape space is, {'by its number of modes' if most > 1 else 'with its one mode'}"
+    more = [2.5] if any(sizes) else []
+    figure, plots = charts(title or by_default, [2.5] * len(shown) + more)
+    names = [_short(one.name) for one in named] if len(named) > 1 else [""]
+    for axes, (key, curves) in zip(plots, drawn.items(), strict=False):
+        for name, lines, colour, band in zip(names, curves, _COLOURS, _BANDS, strict=False):
+            _draw_lines(axes, key, name, lines, colour, band)
+        heading, unit = _QUALITY[key]
+        axes.set_title(heading, fontsize=TEXT, color=INK, loc="left")
+        axes.set_ylabel(unit)
+        axes.set_ylim(0, 104 if key == "compactness" else None)
+        number_axis(axes, most)
+        _legend_above(axes)
+    plots[len(shown) - 1].set_xlabel("number of modes")
+    if more:
+        _draw_sizes(plots[-1], names, sizes)
+    return finish(figure, h_pad=1.2)
+
+
+_Line: TypeAlias = tuple[FloatArray, FloatArray, FloatArray | None, FloatArray | None]
+
+
+def _of(key: str, quality: Quality) -> dict[str, _Line]:
+    """Return the curves of a measure that are there: by surface, or without a word, and by vertices."""
+    by_surface, by_vertices = getattr(quality, key), getattr(quality, f"{key}_vertices", None)
+    out: dict[str, _Line] = {}
+    if by_surface is not None:
+        out["surface" if by_vertices is not None else ""] = _measured(key, by_surface)
+    if by_vertices is not None:
+        out["vertices"] = _measured(key, by_vertices)
+    return out
+
+
+def _draw_lines(axes: Axes, key: str, name: str, lines: Mapping[str, _Line], colour: str, band: str) -> None:
+    scale = 100.0 if key == "compactness" else 1.0
+    for kind, (modes, mean, low, high) in lines.items():
+        label = ", ".join(part for part in (name, kind) if part)
+        style = "--" if kind == "vertices" else "-"
+        dots = "o" if len(modes) < 40 else ""
+        axes.plot(modes, scale * mean, color=colour, lw=2, ls=style, marker=dots, ms=4, label=label or None)
+        if low is not None and high is not None:
+            axes.fill_between(modes, scale * low, scale * high, color=band, alpha=0.5, lw=0)
+
+
+def _draw_sizes(axes: Axes, names: Sequence[str], sizes: Sequence[BySize | None]) -> None:
+    for name, size, colour, band in zip(names, sizes, _COLOURS, _BANDS, strict=False):
+        if size is not None:
+            axes.plot(size.shapes, size.mean, color=colour, lw=2, ls="--", marker="o", ms=4, label=name or None)
+            axes.fill_between(size.shapes, size.low, size.high, color=band, alpha=0.5, lw=0)
+    axes.set_title(_BY_SHAPES, fontsize=TEXT, color=INK, loc="left")
+    axes.set(xlabel="number of training shapes", ylabel="mean error (mm)", ylim=(0, None))
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    _legend_above(axes)
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= _LONGEST_NAME else "…" + name[-_LONGEST_NAME:]
+
+
+def _legend_above(axes: Axes) -> None:
+    """Add the legend, where there is one, above all curves of the plot, with room made for it."""
+    count = len(axes.get_legend_handles_labels()[1])
+    if count:
+        low, high = axes.get_ylim()
+        axes.set_ylim(low, high + (high - low) * (0.2 * -(-count // 2)))
+        legend(axes, loc="upper right", ncols=2)
+
+
+def _measured(key: str, value: Measured | tuple[float, ...]) -> _Line:
+    """Return numbers of modes, the measure for each, and where its band begins and ends if known, (n,) each."""
+    measured = value if isinstance(value, Measured) else Measured(mean=value)
+    mean = np.array(measured.mean)
+    modes = np.arange(1.0, len(mean) + 1) if measured.modes is None else np.array(measured.modes, dtype=np.float64)
+    low, high = (None if band is None else np.array(band) for band in (measured.low, measured.high))
+    if measured.stddev is not None and len(measured.stddev) == len(mean):
+        low, high = mean - np.array(measured.stddev), mean + np.array(measured.stddev)
+    given = (modes, *(band for band in (low, high, measured.stddev) if band is not None))
+    if not len(mean) or any(len(part) != len(mean) for part in given):
+        raise InputError(f"The {key} of a model must be a list of numbers, one a number of modes.")
+    return modes, mean, low, high
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG or SVG, by the ending of `path`, whole or not at all.
+
+    Raises:
+        FileError: the folder cannot be written, or the disk is full.
+    """
+    stream = io.BytesIO()
+    # Neither date nor random names: the same figure is the same file.
+    with matplotlib.rc_context({"svg.hashsalt": "shapespace", "svg.fonttype": "none"}):
+        kind = path.suffix.removeprefix(".")
+        figure.savefig(stream, format=kind, metadata={"Date": None} if kind == "svg" else {})
+    write_bytes(path, stream.getvalue())

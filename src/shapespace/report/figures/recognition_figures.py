@@ -1,0 +1,576 @@
+"""Figures of recognition: what is confused with what, how well probabilities hold, and what carries the decision."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from shapespace.errors import InputError
+from shapespace.report.figures.draw import (
+    DPI,
+    FORWARD,
+    GREY,
+    INK,
+    MOST_PANELS,
+    SMALL,
+    TEXT,
+    WIDTH,
+    Row,
+    Scale,
+    chart,
+    charts,
+    counted,
+    escaped,
+    finish,
+    grid,
+    legend,
+    measured,
+    number_axis,
+    percent,
+    plain,
+    short,
+    view,
+    wrap,
+)
+from shapespace.report.inputs.staged_fit import nice_ceiling
+from shapespace.report.render.palette import CATEGORIES, SEQUENTIAL, oklab
+from shapespace.report.render.renderer import Image, Layer, render
+from shapespace.types import FloatArray, IntArray, Mesh
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
+
+CurveScale: TypeAlias = Literal["linear", "log", "probit"]
+"""How the numbers of a curve stand along an axis."""
+
+_BARS = "#a9c9e2"
+_MOST_CLASSES_IN_FULL, _MOST_CLASSES = 12, 40
+_MOST_BARS, _MOST_NAMED_BARS, _STRONGEST = 40, 24, 3
+_MOST_REGIONS = 9
+_SIDES = (0.0, 40.0)
+_NO_PICTURE = 0.945
+_MOST_SERIES, _MOST_TICKS = 60, 9
+_LEAST_SHARE, _PROBIT_ROOM = 1e-6, 0.12
+_SHARES = (
+    1e-6, 1e-5, 1e-4, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995,
+    0.998, 0.999, 1 - 1e-4,
+)  # fmt: skip
+
+
+def confusion_figure(counts: npt.ArrayLike, classes: Sequence[str], *, title: str = "") -> Figure:
+    """Draw a confusion matrix: a row a true class, in percent of its scans, with their number.
+
+    Right answers lie in the framed cells of the diagonal; a cell without scans stays empty.
+
+    Args:
+        counts: (C, C) how many scans of the row's class were predicted to be of the column's class.
+        classes: C names.
+        title: above the figure; by default it says how many answers are right.
+
+    Raises:
+        InputError: counts of another shape or below 0, no scan at all, or more than 40 classes.
+    """
+    table = _numbers(counts, "the counts of a confusion matrix", ndim=2)
+    n = len(classes)
+    if not 1 <= n <= _MOST_CLASSES:
+        raise InputError(f"A confusion matrix of 1 to {_MOST_CLASSES} classes can be drawn, not of {n}.")
+    if table.shape != (n, n):
+        raise InputError(f"A confusion matrix of {n} classes must have the shape ({n}, {n}), not {table.shape}.")
+    if (table < 0).any() or not table.sum() > 0:
+        raise InputError("A confusion matrix needs counts that are not negative, and at least one scan.")
+    per_class = table.sum(axis=1)
+    shares = np.divide(table, per_class[:, None], out=np.zeros_like(table), where=per_class[:, None] > 0)
+    rows = [f"{short(name, 18)} ({count:g})" for name, count in zip(classes, per_class, strict=True)]
+    columns = [short(name, 14) for name in classes]
+    longest = max(measured(text, SMALL) for text in columns)
+    wide = (WIDTH - max(measured(text, SMALL) for text in rows) - 60) / n
+    high = max(min(wide, 78.0), 280 / n)
+    upright = longest > 0.94 * wide
+    figure, axes = chart(
+        title or _confused(table, shares, classes), height=(n * high + (longest if upright else 20) + 60) / DPI
+    )
+    axes.imshow(shares, cmap=_map(), vmin=0, vmax=1, aspect="auto", interpolation="nearest")
+    for k in range(1, n):
+        axes.axhline(k - 0.5, color="white", lw=1.5)
+        axes.axvline(k - 0.5, color="white", lw=1.5)
+    for r in range(n):
+        across, up = 1 - 5 / wide, 1 - 5 / high
+        axes.add_patch(Rectangle((r - across / 2, r - up / 2), across, up, fill=False, ec=INK, lw=1.8, zorder=4))
+        if per_class[r] == 0:
+            axes.text((n - 1) / 2, r, "no scan", ha="center", va="center", fontsize=SMALL, color=GREY)
+        for c in range(n):
+            if table[r, c] > 0 and n <= 2 * _MOST_CLASSES_IN_FULL:
+                _cell(axes, r, c, shares[r, c], table[r, c], n)
+    axes.set_xticks(range(n), [escaped(text) for text in columns], rotation=90 if upright else 0)
+    axes.set_yticks(range(n), [escaped(text) for text in rows])
+    axes.set(xlabel="predicted class", ylabel="true class (scans)")
+    finish(figure)
+    axes.grid(False)
+    axes.tick_params(length=0)
+    axes.spines[:].set_visible(False)
+    return figure
+
+
+def _confused(table: FloatArray, shares: FloatArray, classes: Sequence[str]) -> str:
+    """Return how many answers are right, and which class is most often taken for which other."""
+    total = float(table.sum())
+    said = f"{percent(float(np.trace(table)) / total)} of {counted(round(total), 'answer')} are right"
+    wrong = shares * (1 - np.eye(len(classes)))
+    true, taken = divmod(int(wrong.argmax()), len(classes))
+    if wrong[true, taken] == 0:
+        return said
+    return f"{said}; most often {short(classes[true], 24)} is taken for {short(classes[taken], 24)}"
+
+
+def _cell(axes: Axes, row: int, column: int, share: float, count: float, n: int) -> None:
+    ink = "white" if oklab(SEQUENTIAL[round(255 * share)])[0] < 0.64 else INK
+    weight = "bold" if row == column else "normal"
+    if n <= _MOST_CLASSES_IN_FULL:
+        axes.text(
+            column, row - 0.14, percent(share), ha="center", va="center", fontsize=SMALL, color=ink, weight=weight
+        )
+        axes.text(column, row + 0.25, f"{count:g}", ha="center", va="center", fontsize=SMALL - 2, color=ink)
+    else:
+        axes.text(column, row, f"{100 * share:.0f}", ha="center", va="center", fontsize=SMALL - 3, color=ink)
+
+
+def _map() -> Any:
+    from matplotlib.colors import ListedColormap
+
+    return ListedColormap(SEQUENTIAL)
+
+
+def calibration_figure(
+    bins: npt.ArrayLike, *, ece: float | None = None, brier: float | None = None, title: str = ""
+) -> Figure:
+    """Draw how often answers are right against the probability that was stated, and how many answers state it.
+
+    Args:
+        bins: (n, 5), of each bin of probabilities: where it begins and ends, cut to 0 to 1; the mean probability stated
+            and the share of right answers, 0 to 1; how many answers. One without answers is left out, whatever its
+            other numbers.
+        ece: expected calibration error, 0 to 1, where it was measured.
+        brier: Brier score, where it was measured.
+        title: above the figure; by default it says what the calibration error is.
+
+    Raises:
+        InputError: bins of another shape, no answer in any bin, or shares that are not within 0 to 1.
+    """
+    table = _numbers(bins, "the bins of a calibration", ndim=2, finite=False)
+    if table.shape[1] != 5:
+        raise InputError(f"Each bin of a calibration is five numbers, not {table.shape[1]}.")
+    table = table[np.nan_to_num(table[:, 4]) > 0]
+    if not len(table):
+        raise InputError("There is nothing to draw of a calibration without answers.")
+    start, end = 100 * np.clip(table[:, :2].T, 0, 1)
+    stated, right, many = *(100 * table[:, 2:4].T), table[:, 4]
+    if not ((table[:, 2:4] >= 0) & (table[:, 2:4] <= 1)).all():
+        raise InputError("What is stated and what is right in a calibration must lie within 0 to 1.")
+    said = "How often answers are right, against the probability stated for them"
+    if ece is not None:
+        said = f"Stated probabilities are off by {100 * ece:.1f} points on average"
+    note = "" if brier is None else f"Brier score {brier:.3f} (0 is best)."
+    figure, (above, below) = charts(title or said, [2.9, 1.25], note=note)
+    floor = min(float(start.min()), 100 - 1e-3)
+    above.plot([0, 100], [0, 100], color=GREY, ls=(0, (4, 3)), lw=1.4, label="right as often as stated")
+    size = 26 + 190 * many / many.max()
+    above.plot(stated, right, color=FORWARD, lw=1.6, zorder=2)
+    above.scatter(
+        stated,
+        right,
+        s=size,
+        color=FORWARD,
+        edgecolors="white",
+        linewidths=0.8,
+        zorder=3,
+        label="answers, more in larger dots",
+    )
+    above.set(xlim=(floor, 101.5), ylim=(min(floor, float(right.min()) - 5, 100.0), 104), ylabel="right answers (%)")
+    legend(above, loc="lower right" if right[-1] > 60 else "upper left")
+    below.bar(start, many, width=end - start, align="edge", color=_BARS, edgecolor="white")
+    below.set(xlim=(floor, 101.5), xlabel="probability stated (%)", ylabel="answers")
+    below.locator_params(axis="y", nbins=3, integer=True)
+    return finish(figure, h_pad=0.8)
+
+
+def learning_curve_figure(
+    subjects: npt.ArrayLike,
+    mean: npt.ArrayLike,
+    *,
+    low: npt.ArrayLike | None = None,
+    high: npt.ArrayLike | None = None,
+    band: str = "interval",
+    ceiling: float | None = None,
+    title: str = "",
+) -> Figure:
+    """Draw the accuracy on unseen people against how many people were learned from.
+
+    Args:
+        subjects: (n,) people learned from, rising.
+        mean: (n,) accuracy, 0 to 1.
+        low: (n,) lower end of its interval, where it is known,
+        high: (n,) and upper end.
+        band: what the interval is.
+        ceiling: accuracy that no such classifier can be expected to pass, where it is known.
+        title: above the figure; by default it says where the curve begins and ends.
+
+    Raises:
+        InputError: lists that are empty or of different lengths.
+    """
+    x = _numbers(subjects, "the numbers of subjects of a learning curve")
+    y = 100 * _numbers(mean, "the accuracies of a learning curve")
+    if not len(x) or x.shape != y.shape:
+        raise InputError(f"A learning curve of {len(x)} numbers of subjects cannot have {len(y)} accuracies.")
+    order = np.argsort(x, kind="stable")
+    x, y = x[order], y[order]
+    said = f"{_share(y[0])} right with {counted(round(x[0]), 'subject')} to learn from"
+    if len(x) > 1:
+        said = (
+            f"Learning from {x[-1]:g} subjects instead of {x[0]:g} takes the share of right answers from "
+            f"{_share(y[0])} "
+            f"to {_share(y[-1])}"
+        )
+    figure, axes = chart(title or said, height=3.3)
+    bottom = float(y.min())
+    if low is not None and high is not None:
+        ends = [100 * _numbers(values, "the interval of a learning curve")[order] for values in _like(x, low, high)]
+        axes.fill_between(x, ends[0], ends[1], color=_BARS, alpha=0.5, lw=0, label=escaped(short(band, 40)))
+        bottom = min(bottom, float(ends[0].min()))
+    axes.plot(x, y, color=FORWARD, lw=2, marker="o", ms=5, label="right answers")
+    if ceiling is not None:
+        axes.axhline(100 * ceiling, color=INK, ls=(0, (4, 3)), lw=1.4, label=f"ceiling: {_share(100 * ceiling)}")
+        bottom = min(bottom, 100 * ceiling)
+    axes.set(xlabel="subjects learned from", ylabel="right answers, unseen subjects (%)", xlim=(0, 1.04 * float(x[-1])))
+    axes.set_ylim(max(0.0, 10 * np.floor((bottom - 4) / 10)), 101)
+    axes.locator_params(axis="x", integer=True)
+    legend(axes, loc="lower right")
+    return finish(figure)
+
+
+def importance_figure(
+    importance: npt.ArrayLike, names: Sequence[str] = (), *, unit: str = "importance", title: str = ""
+) -> Figure:
+    """Draw how much each mode carries of the decision, the strongest three in a strong colour.
+
+    Args:
+        importance: (K,) of each mode; of more than 40 modes the 40 strongest are drawn, in their order.
+        names: K names of them; none are called 1, 2, 3 and so on.
+        unit: what the numbers are.
+        title: above the figure; by default it names the strongest.
+
+    Raises:
+        InputError: no modes, or another number of names.
+    """
+    values = _numbers(importance, "the importance of modes")
+    if not len(values) or (len(names) and len(names) != len(values)):
+        raise InputError(f"The importance of {len(values)} modes cannot be drawn with {len(names)} names.")
+    labels = [short(name, 12) for name in names] or [str(k + 1) for k in range(len(values))]
+    order = np.argsort(-values, kind="stable")
+    kept: list[int] = np.sort(order[:_MOST_BARS]).tolist()
+    strongest = [int(k) for k in order[:_STRONGEST] if values[k] > 0]
+    words = [labels[k] if len(names) else f"mode {labels[k]}" for k in strongest]
+    said = {0: "No mode carries the decision", 1: f"Mode {words[0] if words else ''} carries the decision most"}.get(
+        len(words), f"The decision is carried most by {', '.join(words[:-1])} and {words[-1] if words else ''}"
+    )
+    note = "" if len(kept) == len(values) else f"The {len(kept)} strongest of {len(values)} modes."
+    figure, axes = chart(title or said, height=3.3, note=note)
+    at = np.arange(1, len(kept) + 1)
+    axes.bar(at, values[kept], color=[FORWARD if k in strongest else _BARS for k in kept], width=0.78)
+    axes.axhline(0, color="#9a9da3", lw=1)
+    if len(names) or len(kept) < len(values):
+        axes.set_xlim(0.3 - max(0.0, (5 - len(at)) / 2), len(at) + 0.7 + max(0.0, (5 - len(at)) / 2))
+        turned = sum(measured(labels[k], SMALL) + 8 for k in kept) > 0.84 * WIDTH
+        every = 1 if len(kept) <= _MOST_BARS and (turned or len(kept) <= _MOST_NAMED_BARS) else 2
+        axes.set_xticks(at[::every], [escaped(labels[k]) for k in kept[::every]], rotation=90 if turned else 0)
+    else:
+        number_axis(axes, len(kept))
+    axes.set(xlabel="mode", ylabel=escaped(wrap(unit, 2.4 * DPI, TEXT)))
+    finish(figure)
+    axes.grid(False, axis="x")
+    return figure
+
+
+def face_map_figure(
+    vertices: FloatArray,
+    faces: IntArray,
+    values: npt.ArrayLike,
+    *,
+    unit: str,
+    regions: Mapping[str, float] | None = None,
+    title: str = "",
+) -> Figure:
+    """Draw what carries the decision on the face, from the front and from aside, and the share of each region.
+
+    Args:
+        vertices: (V, 3) mm, a face that looks along +z with +y up.
+        faces: (F, 3) indices into them.
+        values: (V,) one a vertex; not-a-number is drawn in grey.
+        unit: what the values are.
+        regions: share of each region, 0 to 1; the nine largest are drawn, None for none.
+        title: above the figure; by default it names the largest region.
+
+    Raises:
+        InputError: another number of values than vertices, or no value that is finite.
+        MeshError: vertices and faces that make no mesh.
+    """
+    mesh = Mesh(vertices, faces, name="the face")
+    scalars = _numbers(values, "the values on a face", finite=False)
+    known = scalars[np.isfinite(scalars)]
+    if scalars.shape != (len(mesh.vertices),):
+        raise InputError(f"A face of {len(mesh.vertices)} vertices needs one value each, not {scalars.shape}.")
+    if not len(known):
+        raise InputError("There is nothing to draw on a face without values.")
+    shares = {short(name, 22): float(share) for name, share in (regions or {}).items()}
+    if not all(0 <= share <= 1 for share in shares.values()):
+        raise InputError("The share of a region must lie within 0 to 1.")
+    ranked = sorted(shares.items(), key=lambda item: -item[1])
+    # Few vertices must not make the rest of the face look empty.
+    top = float(np.quantile(known, 0.995))
+    high = nice_ceiling(top if top > 0 else float(known.max()))
+    low = -nice_ceiling(-float(known.min())) if known.min() < 0 else 0.0
+    layer = Layer(mesh, scalars=scalars, colormap=SEQUENTIAL, vmin=low, vmax=high)
+    columns = 3 if ranked else 2
+    panels: list[Image] = []
+    size = view(mesh.vertices, columns).size
+    for yaw in _SIDES:
+        camera = view(mesh.vertices, columns, yaw_deg=yaw).camera
+        panels.append(render(layer, camera=camera, size=size))
+    captions = ["front", "three-quarter"]
+    if ranked:
+        panels.append(np.full_like(panels[0], 255))
+        captions.append("share of each region")
+    most = ranked[0] if ranked and ranked[0][1] > 0 else None
+    said = f"The region that carries most of the decision: {most[0]}, {percent(most[1])}" if most else ""
+    figure = grid(
+        [Row(panels, captions)],
+        title=title or said or "Where on the face the decision lies",
+        scale=Scale(unit, SEQUENTIAL, low, high, "high" if known.max() > high else "neither"),
+        note="Grey: no value." if len(known) < len(scalars) else "",
+    )
+    if ranked:
+        _region_bars(figure, ranked)
+    return figure
+
+
+def _region_bars(figure: Figure, ranked: Sequence[tuple[str, float]]) -> None:
+    """Put bars of the shares in place of the third panel."""
+    shown = list(ranked[:_MOST_REGIONS])
+    if len(ranked) > len(shown):
+        rest = ranked[_MOST_REGIONS - 1 :]
+        shown = [*ranked[: _MOST_REGIONS - 1], (f"{len(rest)} others", sum(share for _, share in rest))]
+    place = figure.axes[2].get_position()
+    figure.delaxes(figure.axes[2])
+    axes = figure.add_axes((place.x0 + 0.01, place.y0, place.width - 0.02, place.height))
+    axes.set_axis_off()
+    at = np.arange(len(shown))
+    shares = np.array([share for _, share in shown])
+    axes.barh(at, shares, height=0.3, color=[FORWARD, *[_BARS] * (len(shown) - 1)])
+    for k, (name, share) in enumerate(shown):
+        axes.text(0, k - 0.24, escaped(name), fontsize=SMALL, color=INK, va="bottom")
+        axes.text(
+            max(float(shares.max()), 1e-9), k - 0.24, percent(share), fontsize=SMALL, color=INK, va="bottom", ha="right"
+        )
+    axes.set(xlim=(0, max(float(shares.max()), 1e-9)), ylim=(max(len(shown), 5) - 0.6, -0.9))
+
+
+def curve_figure(
+    series: Sequence[tuple[str, npt.ArrayLike, npt.ArrayLike]],
+    *,
+    x: str,
+    y: str,
+    title: str = "",
+    bands: Sequence[tuple[npt.ArrayLike, npt.ArrayLike] | None] = (),
+    dots: Sequence[bool] = (),
+    scales: tuple[CurveScale, CurveScale] = ("linear", "linear"),
+    diagonal: bool = False,
+) -> Figure:
+    """Draw one measure against another, a line a series.
+
+    Args:
+        series: for each line its name, empty for none, its (n,) places and its (n,) values.
+        x: what the places are, with their unit,
+        y: and the values.
+        title: above the figure; by default it says what is drawn.
+        bands: for each series the lower and the upper ends (n,) of a band around it, not-a-number where there is none;
+            None for none.
+        dots: for each series whether it is dots without a line.
+        scales: of places and values; on `probit` shares stand at their normal deviates, and those of 0 and 1 at the
+            edge. What is not positive has no place on `log`.
+        diagonal: draw where both are the same.
+
+    Raises:
+        InputError: no series or too many, one whose lists are empty or of different lengths, or numbers that have no
+            place on their scale.
+    """
+    if not 1 <= len(series) <= _MOST_SERIES:
+        raise InputError(f"A figure has 1 to {_MOST_SERIES} curves, not {len(series)}.")
+    found: list[_Curve] = []
+    for k, (name, places, values) in enumerate(series):
+        at = _numbers(places, f"the places of the curve {short(name)}")
+        height = _numbers(values, f"the values of the curve {short(name)}")
+        if not len(at) or at.shape != height.shape:
+            raise InputError(f"The curve {short(name)!r} has {len(at)} places but {len(height)} values.")
+        band = bands[k] if k < len(bands) else None
+        ends = [_numbers(end, f"the band of the curve {short(name)}", finite=False) for end in band or ()]
+        if any(end.shape != at.shape for end in ends):
+            raise InputError(f"The band of the curve {short(name)!r} needs {len(at)} lower and {len(at)} upper ends.")
+        found.append(_Curve(name, at, height, ends, k < len(dots) and dots[k]))
+    limits = (
+        _scale_ends(scales[0], [curve.at for curve in found]),
+        _scale_ends(scales[1], [values for curve in found for values in (curve.height, *curve.ends)]),
+    )
+    square = diagonal and scales[0] == scales[1]
+    figure, axes = chart(
+        title or f"{plain(y)[:1].upper()}{plain(y)[1:]} against {plain(x)}", height=4.6 if square else 3.3
+    )
+    for k, curve in enumerate(found):
+        at, height, *ends = (
+            _placed(values, scales[axis], limits[axis])
+            for axis, values in ((0, curve.at), (1, curve.height), *((1, end) for end in curve.ends))
+        )
+        colour, label = CATEGORIES[k % len(CATEGORIES)], escaped(short(curve.name, 34)) or None
+        if ends:
+            axes.fill_between(at, ends[0], ends[1], color=colour, alpha=0.2, lw=0)
+        if curve.dots:
+            axes.scatter(at, height, s=16, color=colour, alpha=0.6, linewidths=0, label=label)
+            continue
+        dashes = "-" if k < len(CATEGORIES) else (0, (4, 2))
+        axes.plot(at, height, color=colour, ls=dashes, lw=2, ms=4, marker="o" if len(at) < 40 else "", label=label)
+    axes.margins(y=0.12)
+    axes.set_xscale("log" if scales[0] == "log" else "linear")
+    axes.set_yscale("log" if scales[1] == "log" else "linear")
+    for axis, kind, ends in zip((axes.xaxis, axes.yaxis), scales, limits, strict=True):
+        _scaled(axis, kind, ends)
+    if diagonal:
+        low = max(axes.get_xlim()[0], axes.get_ylim()[0])
+        high = min(axes.get_xlim()[1], axes.get_ylim()[1])
+        if low < high:
+            axes.plot([low, high], [low, high], color=GREY, ls=(0, (4, 3)), lw=1.3, scalex=False, scaley=False)
+    axes.set(xlabel=escaped(short(x, 70)), ylabel=escaped(wrap(y, 2.4 * DPI, TEXT)))
+    if any(curve.name for curve in found):
+        legend(axes, loc="best")
+    return finish(figure)
+
+
+@dataclass(frozen=True, eq=False)
+class _Curve:
+    name: str
+    at: FloatArray
+    height: FloatArray
+    ends: Sequence[FloatArray]
+    dots: bool
+
+
+def _scale_ends(kind: CurveScale, values: Sequence[FloatArray]) -> tuple[float, float]:
+    """Return the least and the greatest number that has a place on a scale.
+
+    Raises:
+        InputError: there is none, or shares beyond 0 to 1 on `probit`.
+    """
+    known = np.concatenate(values)
+    known = known[np.isfinite(known)]
+    if kind == "probit" and ((known < 0) | (known > 1)).any():
+        raise InputError("On a probit scale stand shares from 0 to 1.")
+    if kind != "linear":
+        known = known[(known > 0) & ((known < 1) | (kind == "log"))]
+    if not len(known):
+        if kind == "log":
+            raise InputError("On a logarithmic scale stand numbers above 0, and there are none.")
+        return 0.01, 0.99
+    low, high = float(known.min()), float(known.max())
+    return (max(low, _LEAST_SHARE), min(max(high, low), 1 - _LEAST_SHARE)) if kind == "probit" else (low, high)
+
+
+def _placed(values: FloatArray, kind: CurveScale, ends: tuple[float, float]) -> FloatArray:
+    """Return numbers as they are drawn: normal deviates on `probit`, nothing for what has no place on `log`."""
+    if kind == "probit":
+        from scipy.special import ndtri
+
+        low, high = ndtri(ends[0]) - _PROBIT_ROOM, ndtri(ends[1]) + _PROBIT_ROOM
+        return np.clip(ndtri(np.clip(values, 0, 1)), low, high)
+    return np.where(values > 0, values, np.nan) if kind == "log" else values
+
+
+def _scaled(axis: Axis, kind: CurveScale, ends: tuple[float, float]) -> None:
+    """Give an axis its scale and ticks that people read."""
+    if kind == "log":
+        axis.set_major_formatter(lambda value, _: f"{value:g}")
+        if ends[1] < 30 * ends[0]:
+            axis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in "25" else "")
+        else:
+            axis.set_minor_formatter(lambda value, _: "")
+    if kind == "probit":
+        from scipy.special import ndtri
+
+        low, high = float(ndtri(ends[0])) - _PROBIT_ROOM, float(ndtri(ends[1])) + _PROBIT_ROOM
+        ticks = [share for share in _SHARES if low <= ndtri(share) <= high]
+        # Their words would touch where the whole range is shown.
+        while len(ticks) > _MOST_TICKS:
+            ticks = ticks[::2]
+        axis.set_ticks(ndtri(ticks).tolist(), [f"{100 * share:.4g} %" for share in ticks])
+        axis.set_view_interval(low - 0.02, high + 0.02, ignore=True)
+
+
+def mesh_rows_figure(
+    rows: Sequence[tuple[str, Sequence[tuple[str, Mesh | None]]]], *, title: str, yaw_deg: float = 15.0
+) -> Figure:
+    """Draw meshes in rows under their labels, with one camera, one light and one scale for all.
+
+    Args:
+        rows: for each row its label, and for each of its pictures a label and a mesh in mm; None leaves a grey field.
+        title: above the figure.
+        yaw_deg: how far the meshes are turned from the front.
+
+    Raises:
+        InputError: no mesh, or more than 48 pictures.
+    """
+    known = [mesh.vertices for _, pictures in rows for _, mesh in pictures if mesh is not None]
+    count = sum(len(pictures) for _, pictures in rows)
+    if not known or count > MOST_PANELS:
+        raise InputError(f"{plain(title)}: 1 to {MOST_PANELS} meshes can be drawn, not {count if known else 0}.")
+    columns = max(3, max(len(pictures) for _, pictures in rows))
+    seen = view(np.concatenate(known), columns, yaw_deg=yaw_deg)
+    drawn = [
+        Row(
+            [
+                render(Layer(mesh), camera=seen.camera, size=seen.size)
+                if mesh is not None
+                else np.full((seen.size[1], seen.size[0], 3), round(255 * _NO_PICTURE), dtype=np.uint8)
+                for _, mesh in pictures
+            ],
+            [short(label, 60) for label, _ in pictures],
+            short(heading, 70),
+        )
+        for heading, pictures in rows
+        if pictures
+    ]
+    return grid(drawn, title=title)
+
+
+def _like(x: FloatArray, *values: npt.ArrayLike) -> list[npt.ArrayLike]:
+    if any(np.shape(one) != x.shape for one in values):
+        raise InputError(f"The interval of a learning curve must have {len(x)} lower and {len(x)} upper ends.")
+    return list(values)
+
+
+def _share(value_percent: float) -> str:
+    return f"{value_percent:.1f} %"
+
+
+def _numbers(values: npt.ArrayLike, what: str, *, ndim: int = 1, finite: bool = True) -> FloatArray:
+    try:
+        array = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{what[:1].upper()}{what[1:]} must be numbers.") from error
+    if array.ndim != ndim or (finite and not np.isfinite(array).all()):
+        raise InputError(
+            f"{what[:1].upper()}{what[1:]} must be {'a list' if ndim == 1 else 'a table'} of finite numbers."
+        )
+    return array

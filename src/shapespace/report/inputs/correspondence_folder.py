@@ -1,0 +1,285 @@
+"""A folder that `shapespace correspond` wrote, read for report, viewer and terminal: surfaces are read one by one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from msgspec import structs
+
+from shapespace.errors import FileFormatError, ShapespaceError
+from shapespace.geometry.normals import (
+    boundary_edges,
+    face_vectors,
+    faces_of,
+    rms_size,
+    without_estimates,
+    without_vertices,
+)
+from shapespace.geometry.similarity import fit_similarity
+from shapespace.io.files import read_error, sha256_of_file
+from shapespace.io.meshes.mesh_io import read_mesh
+from shapespace.report.blocks.wording import printable, without_folders
+from shapespace.report.inputs.saved_fits import Folder
+from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, read
+from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
+
+_FEWEST_VERTICES = 3
+_ONE_UNIT = 5.0
+_POSED_ALIKE = 0.8
+_OPEN_SHARE = 0.15
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """One surface as pictures need it.
+
+    Args:
+        vertices: (V, 3) in the frame of `Corresponded.mean`, size divided out; not-a-number where missing.
+        T_scan_mean: from that frame to the scan's own.
+    """
+
+    vertices: FloatArray
+    T_scan_mean: Similarity
+
+    @property
+    def seen(self) -> BoolArray:
+        """(V,) which vertices the scan shows."""
+        return there_are(self.vertices)
+
+
+@dataclass(frozen=True, eq=False)
+class Population:
+    """What all surfaces tell together; scans whose surface cannot be read are not in it.
+
+    Args:
+        names: of the scans.
+        seen_count: (V,) how many of them show each vertex.
+        sizes: (N,) RMS distance of the surfaces from their middle, in the scans' own units.
+        unread: name to the reason, of those that cannot be read.
+    """
+
+    names: tuple[str, ...]
+    seen_count: npt.NDArray[np.int64]
+    sizes: FloatArray
+    unread: dict[str, str]
+
+
+class Corresponded:
+    """A folder in correspondence.
+
+    Args:
+        folder: that `shapespace correspond` wrote.
+
+    Raises:
+        FileError: correspondence.json or the mean shape cannot be read.
+        FileFormatError: one of them is damaged.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = Folder(folder, CORRESPOND_AGAIN)
+        summary = CorrespondenceRecord.FILE
+        self.run = read(CorrespondenceRecord, self.folder.json(summary), summary, CORRESPOND_AGAIN)
+        self._mean = self.folder.mesh(CorrespondenceRecord.MEAN)
+        if self._mean.faces is None or not np.isfinite(self._mean.vertices).all():
+            raise FileFormatError(f"{CorrespondenceRecord.MEAN} is no whole surface; {CORRESPOND_AGAIN}.")
+        self.unread: dict[str, str] = {}
+        found = [record for file in self._record_files() if (record := self._record(file)) is not None]
+        self.records = {record.name: record for record in found}
+        self.turn = np.eye(3)
+        self._population: Population | None = None
+
+    @property
+    def root(self) -> Path:
+        """The folder."""
+        return self.folder.root
+
+    @property
+    def mean(self) -> Mesh:
+        """The mean shape as pictures show it: upright, about the origin, of the size that it has in its file."""
+        at = self._mean.vertices
+        return self._mean.with_vertices((at - at.mean(axis=0)) @ self.turn.T)
+
+    @property
+    def holes(self) -> int:
+        """How many borders the mean shape has beside one, which an open surface may have."""
+        from shapespace.geometry.topology import join, labels  # compiled
+
+        edges = boundary_edges(faces_of(self._mean))
+        sets = np.arange(len(self._mean.vertices), dtype=np.int32)
+        join(sets, edges)
+        return max(len(np.unique(labels(sets)[1][edges])) - 1, 0)
+
+    @property
+    def corresponding(self) -> list[CorrespondRecord]:
+        """The records of scans in correspondence."""
+        return [record for record in self.records.values() if record.status == "corresponding"]
+
+    @property
+    def set_aside(self) -> list[CorrespondRecord]:
+        """The records of the others."""
+        return [record for record in self.records.values() if record.status != "corresponding"]
+
+    def surface(self, name: str) -> Mesh:
+        """Return the surface of the scan `name` in its own frame and unit, not-a-number where it is not observed.
+
+        Raises:
+            FileError: it cannot be read.
+            FileFormatError: it is damaged, or not on the template of this folder.
+        """
+        mesh = without_estimates(self.folder.mesh(f"{name}{CorrespondRecord.SURFACE}"))
+        if mesh.faces is None or not np.array_equal(mesh.faces, faces_of(self._mean)):
+            raise FileFormatError(
+                f"{name}{CorrespondRecord.SURFACE} is not on the template of this folder; {CORRESPOND_AGAIN}."
+            )
+        if there_are(mesh.vertices).sum() < _FEWEST_VERTICES:
+            raise FileFormatError(
+                f"{name}{CorrespondRecord.SURFACE} has hardly a vertex that is not missing; {CORRESPOND_AGAIN}."
+            )
+        return mesh
+
+    def placed(self, name: str) -> Placed:
+        """Return the surface of the scan `name` moved onto the mean shape.
+
+        Raises:
+            FileError: it cannot be read.
+            FileFormatError: it is damaged, or not on the template of this folder.
+        """
+        own = self.surface(name).vertices
+        seen = there_are(own)
+        try:
+            T = fit_similarity(self.mean.vertices[seen], own[seen])
+        except ShapespaceError as error:
+            raise FileFormatError(
+                f"{name}{CorrespondRecord.SURFACE} cannot be laid onto the mean shape; {CORRESPOND_AGAIN}."
+            ) from error
+        return Placed(np.where(seen[:, None], T.inverse().apply(own), np.nan), T)
+
+    def raw_scan(self, record: CorrespondRecord) -> Mesh:
+        """Return the scan of a record, if it is still where it was, with the content it had.
+
+        Raises:
+            FileFormatError: it is not, or cannot be read.
+        """
+        if not record.path or "\0" in record.path:
+            raise FileFormatError("the record does not say where the scan is.")
+        file = self.root / record.path
+        if not record.hash:
+            raise FileFormatError("the scan cannot be read.")
+        if not file.is_file() or sha256_of_file(file) != record.hash:
+            raise FileFormatError("the scan is no longer where it was, or has changed.")
+        try:
+            return read_mesh(file)
+        except ShapespaceError as error:
+            raise FileFormatError("the scan cannot be read.") from error
+
+    def population(self, on_scan: Callable[[str], None] | None = None) -> Population:
+        """Return what all surfaces tell together, and turn the mean shape upright; they are read once.
+
+        Args:
+            on_scan: told of each scan that was read.
+        """
+        if self._population is None:
+            counts = np.zeros(len(self._mean.vertices), dtype=np.int64)
+            names: list[str] = []
+            sizes: list[float] = []
+            turns: list[FloatArray] = []
+            unread: dict[str, str] = {}
+            size = rms_size(self._mean.vertices)
+            for record in self.corresponding:
+                try:
+                    placed = self.placed(record.name)
+                except ShapespaceError as error:
+                    unread[record.name] = str(error)
+                    continue
+                finally:
+                    if on_scan is not None:
+                        on_scan(record.name)
+                counts += placed.seen
+                names.append(record.name)
+                sizes.append(placed.T_scan_mean.scale * size)
+                turns.append(placed.T_scan_mean.rotation)
+            self.turn = upright(self._mean, turns)
+            self._population = Population(tuple(names), counts, np.array(sizes), unread)
+        return self._population
+
+    @property
+    def settled(self) -> float:
+        """The share of the size by which vertices move at most in a round that is the last one."""
+        value = self.run.settings.get("settled")
+        return float(value) if isinstance(value, int | float) else 0.0
+
+    @property
+    def units_mixed(self) -> bool:
+        """Whether sizes differ so much that the scans cannot be in one unit."""
+        scales = [record.scale for record in self.corresponding if record.scale]
+        return bool(scales) and max(scales) > _ONE_UNIT * min(scales)
+
+    def _record_files(self) -> list[str]:
+        try:
+            return sorted(path.name for path in self.root.iterdir() if path.name.endswith(CorrespondRecord.ENDING))
+        except OSError as error:
+            raise read_error(self.root, error) from error
+
+    def _record(self, file: str) -> CorrespondRecord | None:
+        name = file.removesuffix(CorrespondRecord.ENDING)
+        try:
+            record = read(CorrespondRecord, self.folder.json(file), file, CORRESPOND_AGAIN)
+            if record.name != name:
+                raise FileFormatError(f"{file} is the record of another scan, {record.name}; {CORRESPOND_AGAIN}.")
+            if any(isinstance(value, float) and not 0 <= value < math.inf for value in structs.astuple(record)):
+                raise FileFormatError(f"{file} is damaged: it holds a number that none can be; {CORRESPOND_AGAIN}.")
+        except ShapespaceError as error:
+            self.unread[printable(name)] = str(error)
+            return None
+        # A report is mailed and a viewer has visitors: neither is to tell where the scans lie on this machine.
+        return structs.replace(record, reason=without_folders(record.reason))
+
+
+def there_are(vertices: FloatArray) -> BoolArray:
+    """Return (V,) which of `vertices` (V, 3) are not missing."""
+    return np.isfinite(vertices.sum(axis=1))
+
+
+def drawable(mesh: Mesh, values: FloatArray | None = None) -> tuple[Mesh, FloatArray | None]:
+    """Return `mesh` without its missing vertices, and `values` (V,) of those that are left."""
+    there = there_are(mesh.vertices)
+    if there.all():
+        return mesh, values
+    vertices, faces = without_vertices(mesh.vertices, faces_of(mesh), there)
+    return Mesh(vertices, faces, name=mesh.name), None if values is None else values[there]
+
+
+def upright(mean: Mesh, turns: Sequence[FloatArray] = ()) -> FloatArray:
+    """Return the rotation (3, 3) that brings the mean shape to how it is looked at: +y up, its front along +z.
+
+    Where the scans stand alike, it is how they stand, as everywhere else. Otherwise the longest axis stands upright
+    with the narrower end below, and the front is where an open surface faces, or the shortest axis of a closed one.
+
+    Args:
+        mean: the surface.
+        turns: (3, 3) rotations from its frame to those of the scans.
+    """
+    if turns:
+        u, strength, vt = np.linalg.svd(np.mean(turns, axis=0))
+        if strength.min() > _POSED_ALIKE:
+            return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    centred = mean.vertices - mean.vertices.mean(axis=0)
+    axes = np.linalg.eigh(centred.T @ centred)[1]
+    vectors = face_vectors(mean.vertices, faces_of(mean))
+    facing = vectors.sum(axis=0)
+    front = axes[:, 0]
+    if np.linalg.norm(facing) > _OPEN_SHARE * np.linalg.norm(vectors, axis=1).sum():
+        front = facing / np.linalg.norm(facing)
+    elif facing @ front < 0:
+        front = -front
+    up = axes[:, 2] if abs(axes[:, 2] @ front) < math.sqrt(0.5) else axes[:, 1]
+    up = up - (up @ front) * front
+    up /= np.linalg.norm(up)
+    if ((centred @ up) * (centred @ np.cross(up, front)) ** 2).mean() < 0:
+        up = -up
+    return np.stack([np.cross(up, front), up, front])

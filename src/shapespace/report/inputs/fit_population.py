@@ -1,0 +1,330 @@
+"""Very many fits at once: their numbers by column, what they were listed with, and who stands out; read in one stream.
+
+Of each fit some forty bytes and its coefficients are kept (float32), no record and no surface.
+"""
+
+from __future__ import annotations
+
+import heapq
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.errors import InputError
+from shapespace.report.blocks.sections import ORDER_OF_CONCERN
+from shapespace.store.results import Results, modes_of
+from shapespace.store.rows import META
+from shapespace.types import FloatArray
+
+MEASURES: Mapping[str, str] = {
+    "expected_error_mm": "expected vertex error (mm)",
+    "to_scan_mm": "mean, model to scan (mm)",
+    "to_model_mm": "mean, scan to model (mm)",
+    "seen_percent": "model that the scan shows (%)",
+}
+"""What is told of each fit, in words."""
+
+MOST_LEVELS, MOST_BINS = 24, 40
+FEWEST = 20
+"""Fits of a level or a stretch of time below which nothing is said about it."""
+
+_MOST_VALUES = 500
+_FEWEST_NUMBERS = 12
+_SIGNS, _LEAST_SHARE, _LEAST_SHIFT = 4.0, 0.1, 0.3
+_NUMBERS = re.compile(r"\d+(?:[.,]\d+)*")
+_NAMES = re.compile(r"\S*[\\/.]\S*[^\s.,;:]")
+_MOST_REASONS = 5000
+
+
+@dataclass(frozen=True, eq=False)
+class Listed:
+    """A column of the list that the scans came from.
+
+    Args:
+        name: its head.
+        kind: `time` and `number` have `values`, `level` has `codes`.
+        values: (n,) float64: numbers, or seconds since 1970; not-a-number where there is none.
+        codes: (n,) int32: which of `levels`; -1 where there is none.
+        levels: in order.
+    """
+
+    name: str
+    kind: Literal["time", "number", "level"]
+    values: FloatArray
+    codes: npt.NDArray[np.int32]
+    levels: tuple[str, ...] = ()
+
+    def groups(self) -> list[tuple[str, npt.NDArray[np.bool_], float]]:
+        """Return levels, or stretches of equal length, each with its name, which fits are in it, and its middle.
+
+        Of very many levels, those with the most fits.
+        """
+        if self.kind == "level":
+            counts = np.bincount(self.codes[self.codes >= 0], minlength=len(self.levels))
+            most = sorted(np.argsort(-counts, kind="stable")[:MOST_LEVELS].tolist())
+            return [(self.levels[k], self.codes == k, float(k)) for k in most if counts[k]]
+        edges = self.edges()
+        at = np.clip(np.searchsorted(edges, self.values, side="right") - 1, 0, len(edges) - 2)
+        at[~np.isfinite(self.values)] = -1
+        middles = (edges[1:] + edges[:-1]) / 2
+        return [
+            (f"{self.told(edges[k])} to {self.told(edges[k + 1])}", at == k, float(middles[k]))
+            for k in range(len(middles))
+        ]
+
+    def edges(self) -> FloatArray:
+        """Return where stretches of times or numbers begin, and where the last ends; of whole numbers at such."""
+        known = self.values[np.isfinite(self.values)]
+        low, high = float(known.min()), float(known.max())
+        most = min(MOST_BINS, max(2, len(known) // FEWEST))
+        if self.kind == "number" and bool((known == np.round(known)).all()):
+            step = max(1.0, float(np.ceil((high - low + 1) / most)))
+            return np.asarray(np.arange(low, high + step + 1, step), dtype=np.float64)
+        return np.asarray(np.linspace(low, np.nextafter(high, np.inf), most + 1), dtype=np.float64)
+
+    def told(self, value: float) -> str:
+        """Return a value in words."""
+        if self.kind == "time":
+            return datetime.fromtimestamp(value, UTC).strftime("%Y-%m-%d")
+        return f"{value:.4g}"
+
+
+@dataclass(frozen=True)
+class Group:
+    """How the fits of one level, or one stretch, differ from all.
+
+    Args:
+        name: of it.
+        count: of its fits.
+        untrusted: share of them that failed, are doubtful or stopped at the limit.
+        error_mm: median of the errors that its trusted fits expect of themselves.
+        error_off_mm: by how much that lies above the median of all.
+        mode: number of the coefficient whose mean differs most from that of all, 0 for none,
+        shift: and by how much, in standard deviations of the model.
+        stands_out: sentences on what is more than chance, and large.
+    """
+
+    name: str
+    count: int
+    untrusted: float
+    error_mm: float
+    error_off_mm: float
+    mode: int
+    shift: float
+    stands_out: tuple[str, ...]
+
+
+class Population:
+    """The fits of a folder by column.
+
+    Args:
+        results: of the folder.
+
+    Raises:
+        InputError: none of them can be read.
+    """
+
+    def __init__(self, results: Results) -> None:
+        columns = sorted(results.column_names())
+        metas = [column for column in columns if column.startswith(META)]
+        n_modes = modes_of(results)
+        self.names: list[str] = []
+        self.n_reasons: Counter[tuple[str, str]] = Counter()
+        self.origins: dict[str, Counter[str]] = {key: Counter() for key in ("method", "version", "model_name")}
+        self.models: Counter[str] = Counter()
+        statuses, models = bytearray(), list[npt.NDArray[np.int32]]()
+        codes_of_models: dict[str, int] = {}
+        measures: dict[str, list[FloatArray]] = {key: [] for key in MEASURES}
+        z: list[npt.NDArray[np.float32]] = []
+        kept: dict[str, tuple[dict[str, int], list[npt.NDArray[np.int32]]]] = {column: ({}, []) for column in metas}
+        wanted = ("scan", "status", "reason", "model_hash", *self.origins, *_READ, *metas)
+        for rows in results.iter_rows((*wanted, *(f"z{k}" for k in range(1, n_modes + 1)))):
+            self.names += rows["scan"]
+            statuses += bytes(_code(status) for status in rows["status"])
+            self._count_reasons(rows["status"], rows["reason"])
+            for key, counts in self.origins.items():
+                counts.update(value for value in rows[key] if value)
+            self.models.update(value for value in rows["model_hash"] if value)
+            models.append(_coded(rows["model_hash"], codes_of_models, 2**31))
+            numbers = {key: np.array(rows[key], dtype=np.float64) for key in _READ}
+            measures["expected_error_mm"].append(numbers["expected_error_mm"])
+            for key, direction in (("to_scan_mm", "model_to_scan"), ("to_model_mm", "scan_to_model")):
+                shown = numbers[f"shown_{direction}_mean_mm"]
+                measures[key].append(np.where(np.isfinite(shown), shown, numbers[f"{direction}_mean_mm"]))
+            measures["seen_percent"].append(100 * numbers["model_seen_share"])
+            z.append(np.array([rows[f"z{k}"] for k in range(1, n_modes + 1)], dtype=np.float32).T.reshape(-1, n_modes))
+            for column, (codes, found) in kept.items():
+                found.append(_coded(rows[column], codes, _MOST_VALUES * 400))
+        if not self.names:
+            raise InputError(f"{results.folder}: none of its fits can be read; {'; '.join(results.problems[:1])}")
+        self.status = np.frombuffer(bytes(statuses), dtype=np.uint8)
+        self.measures = {key: np.concatenate(parts) for key, parts in measures.items()}
+        # Coefficients of other models mean something else.
+        most = codes_of_models.get(self.models.most_common(1)[0][0], 0) if self.models else 0
+        self.z = np.concatenate(z)
+        self.z[np.concatenate(models) != most] = np.nan
+        self.left_out: list[str] = []
+        self.listed = [
+            column
+            for name, (codes, parts) in kept.items()
+            if (column := self._column(name.removeprefix(META), list(codes), np.concatenate(parts))) is not None
+        ]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def counts(self) -> Counter[str]:
+        """How many fits have which status."""
+        found = np.bincount(self.status, minlength=len(ORDER_OF_CONCERN))
+        return Counter({status: int(count) for status, count in zip(ORDER_OF_CONCERN, found, strict=True) if count})
+
+    @property
+    def trusted(self) -> npt.NDArray[np.bool_]:
+        """(n,) which fits converged with nothing found against them."""
+        return self.status == _code("converged")
+
+    def median(self, measure: str) -> float:
+        """Return the median of a measure over the trusted fits; not-a-number where none tells it."""
+        values = self.measures[measure][self.trusted]
+        values = values[np.isfinite(values)]
+        return float(np.median(values)) if len(values) else np.nan
+
+    def far(self) -> FloatArray:
+        """Return (n,) the root mean square of each fit's coefficients in standard deviations; not-a-number without."""
+        out = np.full(len(self), np.nan)
+        has = np.isfinite(self.z).any(axis=1) if self.z.shape[1] else np.zeros(len(self), dtype=bool)
+        out[has] = np.sqrt(np.nanmean(np.square(self.z[has], dtype=np.float64), axis=1))
+        return out
+
+    def worst(self, status: str, most: int) -> list[str]:
+        """Return names of fits of a status: those that expect the largest error of themselves first."""
+        at = np.flatnonzero(self.status == _code(status))
+        error = self.measures["expected_error_mm"][at]
+        error = np.where(np.isfinite(error), error, self.measures["to_model_mm"][at])
+        order = np.argsort(np.where(np.isfinite(error), -error, 0.0), kind="stable")
+        return [self.names[k] for k in at[order[:most]]]
+
+    def compared(self, column: Listed) -> list[Group]:
+        """Return how the fits of each level, or stretch, of a column differ from all."""
+        return list(self._compared(column))
+
+    def _compared(self, column: Listed) -> Iterator[Group]:
+        trusted, errors = self.trusted, self.measures["expected_error_mm"]
+        known = errors[trusted & np.isfinite(errors)]
+        middle = float(np.median(known)) if len(known) else np.nan
+        all_mean = _mean(self.z[trusted])
+        all_share = 1 - float(trusted.mean())
+        for name, inside, _ in column.groups():
+            count = int(inside.sum())
+            if not count:
+                continue
+            mine = errors[inside & trusted]
+            mine = mine[np.isfinite(mine)]
+            error = float(np.median(mine)) if len(mine) else np.nan
+            untrusted = 1 - float(trusted[inside].mean())
+            out: list[str] = []
+            if len(mine) >= FEWEST:
+                spread = 1.2533 * float(mine.std()) / np.sqrt(len(mine))
+                if abs(error - middle) > max(_SIGNS * spread, _LEAST_SHARE * middle):
+                    way = "larger" if error > middle else "smaller"
+                    out.append(f"the expected error is {way}: {error:.2f} mm at the median against {middle:.2f} of all")
+            share_spread = np.sqrt(max(all_share * (1 - all_share), 1e-12) / count)
+            if count >= FEWEST and abs(untrusted - all_share) > max(_SIGNS * share_spread, _LEAST_SHARE * all_share):
+                way = "more" if untrusted > all_share else "fewer"
+                out.append(f"{way} fits are not trusted: {100 * untrusted:.1f} % against {100 * all_share:.1f} of all")
+            shifts = _mean(self.z[inside & trusted]) - all_mean if all_mean.size else all_mean
+            mode, shift = 0, 0.0
+            if len(mine) >= FEWEST and np.isfinite(shifts).any():
+                mode = int(np.nanargmax(np.abs(shifts))) + 1
+                shift = float(shifts[mode - 1])
+                if abs(shift) > max(_SIGNS / np.sqrt(len(mine)), _LEAST_SHIFT):
+                    out.append(f"z{mode} is {'higher' if shift > 0 else 'lower'} by {abs(shift):.2f} on average")
+            yield Group(name, count, untrusted, error, error - middle, mode, shift, tuple(out))
+
+    def _count_reasons(self, statuses: Sequence[str], reasons: Sequence[str | None]) -> None:
+        for status, reason in zip(statuses, reasons, strict=True):
+            if status == "converged":
+                continue
+            # Reasons differ by names and numbers, which say nothing about how often they occur.
+            plain = _NUMBERS.sub("…", _NAMES.sub("…", reason or "no reason given"))[:200]
+            if (status, plain) not in self.n_reasons and len(self.n_reasons) >= _MOST_REASONS:
+                plain = "another reason"
+            self.n_reasons[status, plain] += 1
+
+    def _column(self, name: str, texts: Sequence[str], codes: npt.NDArray[np.int32]) -> Listed | None:
+        """Return a column as times, numbers or levels; None of one whose values all differ, such as identifiers."""
+        if not (codes >= 0).any():
+            return None
+        for kind, parse in (("number", _number), ("time", _seconds)):
+            values = np.array([parse(text) for text in texts])
+            if np.isfinite(values).mean() > 0.95 and len(np.unique(values)) > _FEWEST_NUMBERS:
+                own = np.where(codes >= 0, values[codes], np.nan)
+                return Listed(name, "number" if kind == "number" else "time", own, codes)
+        if not 1 < len(texts) <= min(_MOST_VALUES, len(codes) // 2):
+            if len(texts) > 1:
+                self.left_out.append(name)
+            return None
+        order = sorted(range(len(texts)), key=lambda k: texts[k])
+        rank = np.argsort(np.array(order))
+        own_codes = np.where(codes >= 0, rank[codes], -1).astype(np.int32)
+        return Listed(name, "level", np.zeros(0), own_codes, tuple(texts[k] for k in order))
+
+
+def neediest(results: Results, most: int) -> list[str]:
+    """Return the names of the fits that need a look most: by status, then by the error expected or seen."""
+    found: list[tuple[int, float, str]] = []
+    columns = ("scan", "status", "expected_error_mm", "scan_to_model_mean_mm")
+    for rows in results.iter_rows(columns):
+        for name, status, expected, seen in zip(*(rows[column] for column in columns), strict=True):
+            found.append((_code(status), -(seen or 0.0) if expected is None else -expected, name))
+        found = heapq.nsmallest(most, found)
+    return [name for _, _, name in found]
+
+
+_READ = (
+    "expected_error_mm", "model_seen_share", "model_to_scan_mean_mm", "scan_to_model_mean_mm",
+    "shown_model_to_scan_mean_mm", "shown_scan_to_model_mean_mm",
+)  # fmt: skip
+
+
+def _code(status: str) -> int:
+    return ORDER_OF_CONCERN.index(status) if status in ORDER_OF_CONCERN else ORDER_OF_CONCERN.index("unreadable")
+
+
+def _coded(texts: Sequence[str | None], codes: dict[str, int], most: int) -> npt.NDArray[np.int32]:
+    """Return the number of each text in `codes`, which grows; -1 for none, and beyond `most` different ones."""
+    out = np.full(len(texts), -1, dtype=np.int32)
+    for k, text in enumerate(texts):
+        if text and (text in codes or len(codes) < most):
+            out[k] = codes.setdefault(text, len(codes))
+    return out
+
+
+def _mean(z: npt.NDArray[np.float32]) -> FloatArray:
+    """Return (K,) means, not-a-number where there is nothing."""
+    known = np.isfinite(z)
+    count = known.sum(axis=0)
+    total = np.where(known, z, 0).sum(axis=0, dtype=np.float64)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return np.nan
+
+
+def _seconds(text: str) -> float:
+    try:
+        moment = datetime.fromisoformat(text)
+        return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+    except (ValueError, OverflowError):
+        return np.nan

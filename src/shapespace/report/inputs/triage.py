@@ -1,0 +1,161 @@
+"""Which scans in correspondence to look at first, and why: what stands out beside the others, or is bad by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from math import exp, inf, isfinite, log, nan
+
+import numpy as np
+
+from shapespace.report.blocks.wording import DASH, percent, plain
+from shapespace.report.inputs.correspondence_folder import Corresponded
+from shapespace.schemas import CorrespondRecord
+
+_STANDS_OUT = 4.0
+"""How many times the usual spread above the middle makes a scan one to look at."""
+_LEAST_SPREAD = 0.25
+_TO_STDDEV = 1.4826
+
+
+@dataclass(frozen=True)
+class Concern:
+    """Why a scan in correspondence may need a look.
+
+    Args:
+        weight: how much it stands out, 0 for not at all.
+        reasons: in words, the weightiest first.
+    """
+
+    weight: float = 0.0
+    reasons: tuple[str, ...] = ()
+
+    @property
+    def told(self) -> str:
+        """The reasons as a sentence."""
+        return sentence("; ".join(self.reasons)) if self.reasons else "Nothing about it stands out."
+
+
+@dataclass(frozen=True)
+class _Measure:
+    """What may stand out.
+
+    Args:
+        of: the value of each scan, not-a-number where it is not known.
+        told: a value in words.
+        least_spread: the spread of values is at least this.
+        at_least: below this nothing is said.
+        always: above this it is said however many others are alike.
+    """
+
+    of: Sequence[float]
+    told: Callable[[float], str]
+    least_spread: float
+    at_least: float = 0.0
+    always: float = inf
+
+
+def concerns_of(at: Corresponded) -> dict[str, Concern]:
+    """Return for each scan in correspondence, by its name, what stands out about it."""
+    population = at.population()
+    records = [at.records[name] for name in population.names]
+    found: list[list[tuple[float, str]]] = [[] for _ in records]
+    for measure in _measures(records, population.sizes.tolist(), at.settled):
+        centre = median(measure.of)
+        spread = _TO_STDDEV * median([abs(value - centre) for value in measure.of])
+        spread = max(spread, measure.least_spread, 1e-12)
+        for reasons, value in zip(found, measure.of, strict=True):
+            over = (value - centre) / spread
+            if value > measure.always:
+                over = max(over, _STANDS_OUT * value / measure.always)
+            if over > _STANDS_OUT and value > measure.at_least:
+                reasons.append((over, measure.told(value)))
+    ordered = [sorted(reasons, reverse=True) for reasons in found]
+    return {
+        record.name: Concern(reasons[0][0] if reasons else 0.0, tuple(told for _, told in reasons))
+        for record, reasons in zip(records, ordered, strict=True)
+    }
+
+
+def _measures(records: Sequence[CorrespondRecord], sizes: Sequence[float], settled: float) -> list[_Measure]:
+    far = [distance_share(record, "p99", size) for record, size in zip(records, sizes, strict=True)]
+    growth = [log(record.area_factor) if record.area_factor else nan for record in records]
+    moved = [record.moved_share[-1] if record.moved_share else nan for record in records]
+    return [
+        _Measure(
+            far,
+            lambda v: (
+                f"1 % of its points lie farther off than {percent_of(v)} of its size, where "
+                f"{percent_of(median(far))} is usual"
+            ),
+            _LEAST_SPREAD * known(median(far)),
+            always=0.1,
+        ),
+        _Measure(
+            [known(record.folded_share) for record in records],
+            lambda v: f"{percent_of(v)} of its triangles are folded over",
+            0.0005,
+            at_least=0.001,
+            always=0.01,
+        ),
+        _Measure(
+            [1 - known(record.seen_share) for record in records],
+            lambda v: f"it shows only {percent(1 - v)} of the mean shape",
+            0.03,
+            at_least=0.2,
+        ),
+        _Measure(
+            [1 - known(record.covered_share) for record in records],
+            lambda v: f"only {percent(1 - v)} of its points are reached",
+            0.02,
+            at_least=0.1,
+            always=0.25,
+        ),
+        _Measure(
+            growth,
+            lambda v: (
+                f"its triangles grow or shrink up to {exp(v):.1f} times, where {exp(median(growth)):.1f} is usual"
+            ),
+            _LEAST_SPREAD * known(median(growth)),
+        ),
+        _Measure(
+            moved,
+            lambda v: f"its vertices still moved by {percent_of(v)} of its size in the last round",
+            _LEAST_SPREAD * known(median(moved)),
+            at_least=settled,
+        ),
+    ]
+
+
+def distance_share(record: CorrespondRecord, which: str, size: float) -> float:
+    """Return the distance `mean`, `p95`, `p99` or `max` of a record as a share of `size`, which is in its unit."""
+    return known(getattr(record, f"distance_{which}")) / size
+
+
+def known(value: float | None) -> float:
+    """Return a number that may be absent, not-a-number for none."""
+    return nan if value is None else value
+
+
+def median(values: Sequence[float]) -> float:
+    """Return the median of those that are numbers, not-a-number where none is."""
+    numbers = [value for value in values if isfinite(value)]
+    return float(np.median(numbers)) if numbers else nan
+
+
+def percent_of(share: float) -> str:
+    """Return a small share in percent with two digits or so."""
+    return f"{plain(float(f'{100 * share:.2g}'))} %" if isfinite(share) else DASH
+
+
+def sentence(text: str) -> str:
+    """Return `text` from a capital letter to a full stop."""
+    return f"{text[:1].upper()}{text[1:]}" + ("" if text.endswith(".") else ".") if text else ""
+
+
+def scan_status(record: CorrespondRecord, concerns: Mapping[str, Concern]) -> str:
+    """Return `corresponding`, `look` for one that stands out, `set aside`, or `unreadable` where its surface is."""
+    if record.status != "corresponding":
+        return "set aside"
+    concern = concerns.get(record.name)
+    return "unreadable" if concern is None else "look" if concern.reasons else "corresponding"

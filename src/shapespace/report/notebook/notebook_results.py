@@ -1,0 +1,187 @@
+"""Views of results in a notebook: title, sentences, tables, and a picture where there is a surface."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+from shapespace.errors import ShapespaceError
+from shapespace.report.blocks.blocks import Block, Cell, Column, Notes, Table, Text
+from shapespace.report.blocks.wording import counted, listed, mm, percent
+from shapespace.report.inputs.saved_fits import Folder
+from shapespace.report.notebook.notebook_fits import Drawn, notebook_html
+from shapespace.report.pages.page import Page
+from shapespace.report.pages.study_parts import ANALYSIS, TITLES, StudyParts
+from shapespace.schemas import TablePart, read_part, to_json
+from shapespace.types import Mesh
+
+if TYPE_CHECKING:
+    from shapespace.cohort.cohort import Cohort
+    from shapespace.correspondence.groupwise import Correspondence
+    from shapespace.geometry.volume_surface import VolumeSurface
+    from shapespace.model.additive import AdditiveModel
+    from shapespace.statistics.answer import Answer
+    from shapespace.statistics.predictor import Predictions, Predictor
+    from shapespace.store.results import Results
+
+MOST_TABLES, MOST_ROWS = 2, 12
+"""Largest number of tables of an analysis, and of rows of a table, in a notebook; reports have all."""
+
+_MOST_NOTES = 6
+_MOST_COLUMNS = 8
+
+
+class Answered(Protocol):
+    """The result of an analysis."""
+
+    def answer(self) -> Answer:
+        """Return the answer that is saved and reported."""
+        ...
+
+
+def html_of_analysis(result: Answered) -> str:
+    """Return the notebook view of an analysis: its summary and its first tables."""
+    try:
+        answer = result.answer()
+    except ShapespaceError as error:
+        return notebook_html(result, type(result).__name__, [f"Nothing can be reported: {error}"], [])
+    # Tables need neither files nor pictures; the folder is never read.
+    parts = StudyParts(Page(1), Folder(Path()), ANALYSIS)
+    parts_as_kept = [read_part(to_json(part), ANALYSIS.file, ANALYSIS.again) for part in answer.parts]
+    tables = [part for part in parts_as_kept if isinstance(part, TablePart)]
+    blocks: list[Block] = []
+    for part in tables[:MOST_TABLES]:
+        for block in parts.blocks(part, part.title or TITLES["table"]):
+            blocks += _shortened(block) if isinstance(block, Table) else [block]
+    blocks.append(Notes([*answer.notes[:_MOST_NOTES], "result.answer().save(folder) keeps tables, maps and report."]))
+    return notebook_html(result, answer.title, answer.summary, [], blocks=blocks)
+
+
+def html_of_cohort(cohort: Cohort) -> str:
+    """Return the notebook view of a cohort: its size and source, and the first rows of its table."""
+    rows = [
+        ("Shapes", f"{len(cohort):,} {'surfaces' if cohort.fitted is None else 'fits'}"),
+        ("Surface", f"{cohort.n_vertices:,} vertices, {0 if cohort.faces is None else len(cohort.faces):,} triangles"),
+        ("Coefficients", f"{len(cohort.basis)} of each shape"),
+        ("Size", "divided out (gauge shape)" if cohort.gauge == "shape" else "kept (gauge form)"),
+        ("Landmarks", listed(list(cohort.landmarks or ())) or "none"),
+    ]
+    columns = list(cohort.table.columns)[:_MOST_COLUMNS]
+    cells = [
+        [name, *(cohort.table.columns[column][row] for column in columns)]
+        for row, name in enumerate(cohort.names[:MOST_ROWS])
+    ]
+    blocks: list[Block] = _table(["shape", *columns], cells, "The first shapes", len(cohort))
+    if len(cohort.table.columns) > len(columns):
+        blocks.append(Text(f"{len(cohort.table.columns) - len(columns)} more columns are left out."))
+    return notebook_html(cohort, "Cohort", [], rows, blocks=[*blocks, Notes(cohort.notes[:_MOST_NOTES])])
+
+
+def html_of_results(results: Results) -> str:
+    """Return the notebook view of a folder of results: number of fits by status, and the first fits."""
+    rows = [("Folder", str(results.folder)), ("Fits", f"{len(results):,}")]
+    rows += [(status.capitalize(), f"{count:,}") for status, count in results.counts().items()]
+    cells: list[list[str]] = []
+    for name in results.names()[:MOST_ROWS]:
+        try:
+            record = results.record(name)
+            cells.append([name, str(record.get("status", "")), str(record.get("reason", ""))])
+        except ShapespaceError as error:
+            cells.append([name, "unreadable", str(error)])
+    blocks = _table(["fit", "status", "reason"], cells, "The first fits", len(results))
+    return notebook_html(results, "Results", [], rows, blocks=[*blocks, Notes(results.problems[:_MOST_NOTES])])
+
+
+def html_of_correspondence(found: Correspondence) -> str:
+    """Return the notebook view of scans in correspondence: the mean shape, and the coverage of each scan."""
+    kept = [scan for scan in found.scans if not scan.reason]
+    rows = [
+        ("Scans", f"{len(kept)} of {len(found.scans)} in correspondence"),
+        ("Surface", f"{len(found.template.vertices):,} vertices"),
+        ("Rounds", f"{len(found.moved)}; movement in the last {percent(found.moved[-1])} of the size")
+        if found.moved
+        else ("Rounds", "none"),
+    ]
+    cells = [
+        [scan.name, scan.reason or "in correspondence", percent(scan.seen), percent(scan.covered)]
+        for scan in sorted(found.scans, key=lambda scan: not scan.reason)[:MOST_ROWS]
+    ]
+    heads = ["scan", "status", "share of the mean shape seen", "share of the scan covered"]
+    blocks = _table(heads, cells, "The scans, excluded ones first", len(found.scans))
+    draw = _surface(found.template, "The mean shape.")
+    return notebook_html(found, "Correspondence", [found.why], rows, draw, blocks=blocks)
+
+
+def html_of_volume_surface(surface: VolumeSurface) -> str:
+    """Return the notebook view of the surface of a volume: its picture, labels and volume."""
+    mesh = surface.mesh
+    rows = [
+        ("Labels", listed([str(label) for label in surface.labels])),
+        ("Surface", f"{len(mesh.vertices):,} vertices, {0 if mesh.faces is None else len(mesh.faces):,} triangles"),
+        ("Volume", f"{surface.volume_mm3:,.0f} mm³, {surface.voxels:,} voxels"),
+        ("Pieces", str(surface.pieces)),
+    ]
+    rows += [("Note", note) for note in surface.notes]
+    return notebook_html(surface, mesh.name, [], rows, _surface(mesh, "The surface in its own axes."))
+
+
+def html_of_additive_model(model: AdditiveModel) -> str:
+    """Return the notebook view of an additive model."""
+    shape = model.shape
+    rows = [
+        ("Coefficients", f"{model.n_identity} of identity, {shape.n_modes - model.n_identity} of expression"),
+        ("Made of", counted(shape.n_training, "shape")),
+        ("Surface", f"{shape.n_vertices:,} vertices, {0 if shape.faces is None else len(shape.faces):,} triangles"),
+        ("Provenance", shape.provenance or "not stated"),
+        ("Licence", shape.licence or "not stated"),
+    ]
+    return notebook_html(model, "Additive model", [], rows, _surface(shape.mesh(), "The mean shape."))
+
+
+def html_of_predictor(predictor: Predictor) -> str:
+    """Return the notebook view of a predictor: its target, training data and range."""
+    rows = [
+        ("Subjects", str(predictor.subjects)),
+        ("Method", predictor.method),
+        ("Targets", f"{predictor.lowest:.4g} to {predictor.highest:.4g}"),
+        ("Intervals", f"{percent(predictor.level)}"),
+        ("Surface", f"{len(predictor.mean):,} vertices, gauge {predictor.gauge}"),
+        ("Farthest subject", mm(predictor.farthest_mm)),
+    ]
+    return notebook_html(predictor, f"Predictor of {predictor.target}", [], rows)
+
+
+def html_of_predictions(found: Predictions) -> str:
+    """Return the notebook view of predictions: value and interval of the first shapes."""
+    cells = [
+        [name, f"{found.value[k]:.4g}", f"{found.low[k]:.4g} to {found.high[k]:.4g}", found.outside[k]]
+        for k, name in enumerate(found.names[:MOST_ROWS])
+    ]
+    heads = ["shape", "value", "interval", "outside of the training data"]
+    blocks = _table(heads, cells, "The first shapes", len(found.names))
+    return notebook_html(found, "Predictions", [], [("Shapes", str(len(found.names)))], blocks=blocks)
+
+
+def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], caption: str, total: int) -> list[Block]:
+    """Return a table of the first of `total` rows, and how many there are beyond them."""
+    shown: list[Block] = [
+        Table([Column(head) for head in heads], [[Cell(text) for text in row] for row in rows], caption)
+    ]
+    return shown if total <= len(rows) else [*shown, Text(f"{total - len(rows):,} more are left out.")]
+
+
+def _shortened(table: Table) -> list[Block]:
+    """Return a table with at most `MOST_ROWS` rows, and how many there are beyond them."""
+    shown = Table(table.columns, table.rows[:MOST_ROWS], table.caption)
+    left = len(table.rows) - MOST_ROWS
+    return [shown] if left <= 0 else [shown, Text(f"{left:,} more rows are left out.")]
+
+
+def _surface(mesh: Mesh, caption: str) -> Callable[[], Drawn]:
+    def draw() -> Drawn:
+        from shapespace.report.render.thumbnails import mesh_still
+
+        return mesh_still(mesh), caption
+
+    return draw

@@ -1,0 +1,482 @@
+"""The report of a folder that `shapespace correspond` wrote."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from math import isfinite, nan
+from typing import TypeAlias
+
+import numpy as np
+
+from shapespace.errors import FileFormatError, ShapespaceError
+from shapespace.geometry.closest import build_engine
+from shapespace.report.blocks import sections
+from shapespace.report.blocks.blocks import (
+    Block,
+    Card,
+    Cell,
+    Column,
+    Command,
+    Facts,
+    Folded,
+    Gallery,
+    Image,
+    Item,
+    Notice,
+    StripKey,
+    Table,
+    Text,
+    Tiles,
+    number,
+    text_table,
+)
+from shapespace.report.blocks.wording import DASH, counted, listed, percent, plain, setting, words
+from shapespace.report.inputs.correspondence_folder import Corresponded, Placed, drawable, upright
+from shapespace.report.inputs.saved_fits import Folder
+from shapespace.report.inputs.staged_fit import nice_ceiling
+from shapespace.report.inputs.triage import (
+    concerns_of,
+    distance_share,
+    known,
+    median,
+    percent_of,
+    scan_status,
+    sentence,
+)
+from shapespace.report.pages.page import Chapter, Page, Step
+from shapespace.report.render.palette import DIVERGING, SEQUENTIAL
+from shapespace.schemas import CORRESPOND_AGAIN, CorrespondRecord, Quality, read
+from shapespace.types import FloatArray, Mesh
+from shapespace.version import __version__
+
+MOST_CARDS, MOST_EMPTY_CARDS, MOST_BOARDS, MOST_ROWS = 24, 6, 11, 2000
+_MOST_NAMED = 12
+_HARDLY_SEEN, _WHOLE_SHARE = 0.5, 0.9
+_STATUS = {
+    "unreadable": ("unreadable", "failed"),
+    "set aside": ("excluded", "failed"),
+    "look": ("to be looked at", "doubtful"),
+    "corresponding": ("in correspondence", "converged"),
+}
+_TRIANGLES_DRAWN = 400_000
+
+_Make: TypeAlias = Callable[[CorrespondRecord], Cell]
+
+
+class CorrespondencePage:
+    """The report of a correspondence in the making.
+
+    Args:
+        folder: that `shapespace correspond` wrote.
+        on_step: told of each picture, and of each scan that is read.
+
+    Raises:
+        FileError: correspondence.json or the mean shape cannot be read.
+        FileFormatError: one of them is damaged, or no scan's record can be read.
+    """
+
+    def __init__(self, folder: Folder, on_step: Step | None = None) -> None:
+        self.at = Corresponded(folder.root)
+        if not self.at.records:
+            raise FileFormatError(f"{folder.root} holds no record of a scan; {CORRESPOND_AGAIN}.")
+        together = len(self.at.corresponding)
+        self.page = Page(together + min(len(self.at.records), MOST_CARDS) + 5, on_step)
+        self.all = self.at.population(self.page.step)
+        self.mean = self.at.mean
+        self.size = dict(zip(self.all.names, self.all.sizes, strict=True))
+        self.records = [self.at.records[name] for name in self.all.names]
+        self.concerns = concerns_of(self.at)
+        self.ordered = sorted(self.records, key=lambda record: (-self.concerns[record.name].weight, record.name))
+        self.out = [*self.at.set_aside, *(self.at.records[name] for name in self.all.unread)]
+        self._cards = {record.name: self.page.place(f"scan-{record.name}") for record in self._carded()}
+
+    # What is told of each
+
+    def share(self, record: CorrespondRecord, which: str) -> float:
+        """Return a distance of a record as a share of the object's size."""
+        return distance_share(record, which, self.size.get(record.name, nan))
+
+    def status(self, record: CorrespondRecord) -> Cell:
+        """Return what came of a scan, sorted from bad to good."""
+        found = scan_status(record, self.concerns)
+        words, colour = _STATUS[found]
+        return Cell(words, float(list(_STATUS).index(found)), colour)
+
+    @property
+    def looked_at(self) -> list[CorrespondRecord]:
+        """The scans that stand out."""
+        return [record for record in self.ordered if self.concerns[record.name].reasons]
+
+    # The page
+
+    def html(self) -> str:
+        """Return the page."""
+        name = self.at.root.resolve().name
+        chapters = [
+            Chapter("Summary", self.summary),
+            Chapter("The same places on every scan", self.same_places, "Same places"),
+            Chapter("How near, and where nothing is shown", self.nearness, "Nearness"),
+            Chapter("The scans", self.scans, "Scans"),
+            Chapter("The rounds", self.rounds, "Rounds"),
+            Chapter("Settings and hashes", self.settings, "Settings"),
+        ]
+        if (self.at.root / "quality.json").is_file():
+            chapters.insert(4, Chapter("Quality of the shape space", self.quality, "Quality"))
+        lead = (
+            "Raw scans brought to one surface: the same vertex is meant to be the same place on all of them. The size "
+            "of an object is the RMS distance of its surface from its middle."
+        )
+        made = f"Made by shapespace {__version__} from the files in {name}."
+        return self.page.html(
+            f"Correspondence of {counted(self.total, 'scan')} in {name}", [Text(lead)], made, chapters
+        )
+
+    @property
+    def total(self) -> int:
+        """How many scans there are, unreadable ones too."""
+        return len(self.at.records) + len(self.at.unread)
+
+    def summary(self) -> list[Block]:
+        """Return what came of the scans, in a sentence, in figures, and those that need a look."""
+        mean, far = (median([self.share(r, which) for r in self.records]) for which in ("mean", "p99"))
+        seen = median([known(record.seen_share) for record in self.records])
+        tiles = [
+            (str(len(self.records)), f"of {self.total}", "scans in correspondence"),
+            (f"{self.at.run.vertices:,}", "", "vertices, the same on all"),
+            (
+                percent_of(mean).removesuffix(" %"),
+                "%",
+                "of its size: mean distance between scan and surface, median scan",
+            ),
+            (percent_of(far).removesuffix(" %"), "%", "of its size: 99 % of the points lie nearer, median scan"),
+            (percent(seen).removesuffix(" %"), "%", "of the vertices are shown by the median scan"),
+        ]
+        if self.at.run.rounds:
+            last = percent_of(self.at.run.rounds[-1])
+            tiles.append((last.removesuffix(" %"), "%", "of the size: movement of vertices in the last round (RMS)"))
+        return [
+            Text(self.verdict()),
+            Tiles(tiles),
+            self._set_aside(),
+            self._to_look_at(),
+            Notice("Cannot be read", [Item(text, Cell(name)) for name, text in self._damaged().items()], "broken"),
+            Text("To look at single vertices on all scans, and to go on to a shape space:"),
+            Command(f"shapespace view {self.at.root.name}\nshapespace build {self.at.root.name} -o model.h5"),
+        ]
+
+    def verdict(self) -> str:
+        """Return in a few sentences whether to go on, and what to look at first."""
+        n, aside = len(self.records), len(self.out) + len(self.at.unread)
+        told = f"{n} of {counted(self.total, 'scan')} {'is' if n == 1 else 'are'} in correspondence"
+        some = self.looked_at
+        told += f"; {counted(len(some), 'of them stands', 'of them stand')} out and should be looked at" if some else (
+            " and none of them stands out"
+        )  # fmt: skip
+        told += f"; {aside} {'is' if aside == 1 else 'are'} excluded." if aside else "."
+        folded = [record.folded_share for record in self.records if record.folded_share]
+        told += " No triangle is folded over." if not folded else (
+            f" {counted(len(folded), 'scan has', 'scans have')} folded triangles, {percent_of(max(folded))} at most."
+        )  # fmt: skip
+        return f"{told} {self._settling()}"
+
+    def _settling(self) -> str:
+        moved = self.at.run.rounds
+        if not moved:
+            return ""
+        if moved[-1] < self.at.settled:
+            return f"The rounds have settled: in the last one vertices moved by {percent_of(moved[-1])} of the size."
+        return (
+            f"The rounds have not settled: in the last one vertices still moved by {percent_of(moved[-1])} of the "
+            f"size, and {percent_of(self.at.settled)} counts as settled; more --rounds may still better it."
+        )
+
+    def _set_aside(self) -> Notice:
+        items = [Item(sentence(r.reason), Cell(r.name, place=self._cards.get(r.name))) for r in self.at.set_aside]
+        if len(items) > _MOST_NAMED:
+            items = [*items[:_MOST_NAMED], Item(f"{counted(len(items) - _MOST_NAMED, 'other')}, in the table of all.")]
+        return Notice("Excluded scans: they are not in a model built from this folder", items, "broken")
+
+    def _to_look_at(self) -> Notice:
+        some = self.looked_at
+        items = [
+            Item(self.concerns[record.name].told, Cell(record.name, place=self._cards.get(record.name)))
+            for record in some[:_MOST_NAMED]
+        ]
+        if len(some) > _MOST_NAMED:
+            items.append(Item(f"{counted(len(some) - _MOST_NAMED, 'other')}, in the table of all."))
+        return Notice("In correspondence, and to be looked at", items)
+
+    def _damaged(self) -> Mapping[str, str]:
+        return {**self.at.unread, **self.all.unread}
+
+    # The pictures
+
+    def same_places(self) -> list[Block]:
+        """Return a checkerboard on the mean shape, carried to the worst scans and to some of the others."""
+        from shapespace.report import figures
+
+        shown = self._boards()
+        if not shown:
+            return [Text("There is no surface to show.", "broken")]
+        placed = {record.name: self.at.placed(record.name) for record in shown}
+        which = "All scans." if len(shown) == len(self.records) else (
+            f"{len(shown)} of {counted(len(self.records), 'scan')}: those that stand out most, then some of the others."
+        )  # fmt: skip
+        surfaces, labels = [placed[r.name].vertices for r in shown], [record.name for record in shown]
+        pictures: list[Block] = []
+        for yaw, side in ((0.0, "from the front"), (figures.SIDE_DEG, "from one side")):
+            title = f"The same squares on every scan, {side}"
+            drawn = figures.checkerboard_figure(self.mean, surfaces, labels, yaw_deg=yaw, title=title)
+            caption = f"{which} A checkerboard is laid onto the mean shape and carried to each scan by its vertices."
+            alt = f"The same checkerboard {side} on the mean shape and on {listed(labels)}"
+            # As wide as the page: small squares tell nothing.
+            pictures.append(replace(self.page.figure(drawn, caption, alt=alt), kind="plain"))
+        return [
+            Text(
+                "Compare them place by place: an edge or a corner that you know, such as the corner of an eye or a "
+                "knob of a bone, must lie in the same square on every scan, at the same place of the square. "
+                "Where squares have slid along the surface, the correspondence is wrong, however near the surface lies "
+                "to the scan. All are turned and sized as the mean shape; what a scan does not show is left out."
+            ),
+            *pictures,
+        ]
+
+    def _boards(self) -> list[CorrespondRecord]:
+        """Return the scans of the checkerboards: those that stand out, and some evenly from the others."""
+        first = self.looked_at[: MOST_BOARDS // 2 + 1] if len(self.records) > MOST_BOARDS else list(self.ordered)
+        rest = [record for record in self.ordered if record not in first]
+        room = MOST_BOARDS - len(first)
+        picked = [len(rest) * k // room for k in range(min(room, len(rest)))]
+        return [*first, *(rest[k] for k in picked)]
+
+    def nearness(self) -> list[Block]:
+        """Return the distances of all scans, and where vertices are missing."""
+        from shapespace.report import figures
+
+        if not self.records:
+            return [Text("There is no scan in correspondence.", "broken")]
+        shares = np.array([[self.share(r, w) for w in ("mean", "p95", "p99", "max")] for r in self.records])
+        share = 1 - self.all.seen_count / len(self.records)
+        hardly = float((share > 1 - _HARDLY_SEEN).mean())
+        told = "Every scan shows every vertex."
+        if share.any():
+            most = (
+                f"{percent(hardly)} on more than half, which build leaves out" if hardly else "none on more than half"
+            )
+            told = f"{percent(float((share > 0).mean()))} of the vertices are missing on at least one scan, and {most}."
+        there = median([known(record.area_share) for record in self.records])
+        lacking: list[Block] = []
+        if there < _WHOLE_SHARE:
+            what = (
+                f"The mean shape lacks parts that the scans show: its surface is {percent(there)} of the median "
+                "scan's, mostly because the first template lacked them. Give a whole one with --template."
+            )
+            lacking.append(Text(what, "notice"))
+        if self.at.holes:
+            what = (
+                f"The mean shape has {counted(self.at.holes, 'hole')} beside its border. Where the object has no "
+                "opening, the first template had a hole, and no scan can show anything there; give a whole one with "
+                "--template."
+            )
+            lacking.append(Text(what, "notice"))
+        return [
+            Text(
+                "Distances are measured both ways: from the vertices that a scan shows to the scan, and from its "
+                "points to the surface, leaving out what lies beyond the surface's rim."
+            ),
+            *lacking,
+            sections.in_columns(
+                self.page.figure(
+                    figures.nearness_figure(shares),
+                    "How many scans have a mean distance, and 95 %, 99 % and all of their points, within each length.",
+                    alt=f"Cumulative distances of {counted(len(self.records), 'scan')}",
+                    chart=True,
+                ),
+                self.page.figure(
+                    figures.missing_figure(self.mean, share),
+                    f"{told} The mean shape from four sides.",
+                    alt="Share of scans that do not show each vertex, on the mean shape from four sides",
+                ),
+            ),
+        ]
+
+    # The scans
+
+    def scans(self) -> list[Block]:
+        """Return the gallery, the worst first, and the table of all."""
+        all_shown = len(self._cards) == len(self.records) + len(self.out)
+        heading = "All scans, the worst first" if all_shown else f"The {len(self._cards)} scans to look at first"
+        return [
+            self.page.section(heading, self.gallery),
+            self.page.section("Every scan in numbers", self.numbers),
+        ]
+
+    def _carded(self) -> list[CorrespondRecord]:
+        room = max(MOST_EMPTY_CARDS, MOST_CARDS - len(self.records))
+        first = self.out[:room]
+        return [*first, *self.ordered[: MOST_CARDS - len(first)]]
+
+    def gallery(self) -> list[Block]:
+        """Return a card for each of the first scans."""
+        from shapespace.report.render import thumbnails
+
+        limit = 100 * (median([self.share(record, "p99") for record in self.records]) or nan)
+        limit = nice_ceiling(limit)
+        bars = [(SEQUENTIAL, "0", f"{limit:g} % of its size, or more"), (DIVERGING, "half the area", "twice the area")]
+        key = StripKey(
+            "Each strip, from the left: the scan; the checkerboard of the front view; how far each vertex lies from "
+            "the scan (pale to dark); how much each triangle has shrunk (blue) or grown (red) beside the mean shape, "
+            "with the change of size divided out and folded triangles in black.",
+            [(self.page.image(thumbnails.colour_bar(c), f"from {low} to {high}"), low, high) for c, low, high in bars],
+            "Where areas change, shapes may differ; where they change suddenly, squares have slid.",
+        )
+        carded = self._carded()
+        out: list[Block] = [Text("Sorted: excluded scans first, then by how much they stand out.")]
+        if len(carded) < len(self.records) + len(self.out):
+            others = counted(len(self.records) + len(self.out) - len(carded), "other scan")
+            out.append(
+                Text(f"{others} have no picture here, so that this file stays below 8 MB; the table has them all.")
+            )
+        return [*out, key, Gallery([self.card(record, limit) for record in carded])]
+
+    def card(self, record: CorrespondRecord, limit: float) -> Card:
+        """Return one scan of the gallery, its distances on a scale that ends at `limit` percent of its size."""
+        image, note = None, ""
+        try:
+            image, note = self._still(record, limit)
+        except ShapespaceError as error:
+            note = f"No picture: {error}"
+        self.page.step(record.name)
+        status = self.status(record)
+        if record in self.out:
+            return Card(self._cards[record.name], record.name, status, "", self._reason(record), image, note)
+        told = f"Mean distance {percent_of(self.share(record, 'mean'))} of its size. {self.concerns[record.name].told}"
+        told += f" {note}" if note else ""
+        return Card(self._cards[record.name], record.name, status, "", told, image)
+
+    def _still(self, record: CorrespondRecord, limit: float) -> tuple[Image, str]:
+        """Return the picture of a scan, and what it lacks."""
+        from shapespace.report.render import thumbnails
+
+        if record in self.out:
+            scan = drawable(self._bounded(record))[0]
+            if scan.faces is not None:
+                scan = scan.with_vertices(scan.vertices @ upright(scan).T)
+            return self.page.image(thumbnails.mesh_still(scan), f"The scan {record.name}, excluded"), ""
+        placed = self.at.placed(record.name)
+        scan, note = None, ""
+        far = np.full(len(placed.vertices), nan)
+        try:
+            own = drawable(self._bounded(record))[0]
+            scan, far = self._beside(own, placed)
+        except FileFormatError as error:
+            note = f"Without the scan beside it: {error}"
+        still = thumbnails.correspondence_strip(self.mean, placed.vertices, scan, far, limit)
+        seen = "the scan, the checkerboard, distances and areas" if scan else "the checkerboard and areas"
+        return self.page.image(still, f"{record.name}: {seen}"), note
+
+    def _bounded(self, record: CorrespondRecord) -> Mesh:
+        from shapespace.report.render.decimate import thinned
+
+        return thinned(self.at.raw_scan(record), _TRIANGLES_DRAWN)[0]
+
+    def _beside(self, scan: Mesh, placed: Placed) -> tuple[Mesh, FloatArray]:
+        """Return the scan moved onto the mean shape, and how far off each vertex lies, percent of the size."""
+        moved = scan.with_vertices(placed.T_scan_mean.inverse().apply(scan.vertices))
+        far = np.full(len(placed.vertices), nan)
+        far[placed.seen] = build_engine(moved).query(placed.vertices[placed.seen]).distance
+        size = float(np.sqrt((self.mean.vertices**2).sum(axis=1).mean()))
+        return moved, 100 * far / size
+
+    def numbers(self) -> list[Block]:
+        """Return the table of all scans."""
+        out: list[Block] = []
+        if self.at.units_mixed:
+            out.append(Text("The scans are in different units: compare distances in % of the size.", "notice"))
+        columns: list[tuple[Column, _Make]] = [
+            (Column("Scan"), lambda r: Cell(r.name, place=self._cards.get(r.name))),
+            (Column("Status"), lambda r: self.status(r)),
+            (Column("Mean distance", "number"), lambda r: _cell(known(r.distance_mean))),
+            (Column("95 % within", "number"), lambda r: _cell(known(r.distance_p95))),
+            (Column("99 % within", "number"), lambda r: _cell(known(r.distance_p99))),
+            (Column("Farthest", "number"), lambda r: _cell(known(r.distance_max))),
+            (Column("Mean, % of size", "number"), lambda r: _cell(100 * self.share(r, "mean"))),
+            (Column("99 %, % of size", "number"), lambda r: _cell(100 * self.share(r, "p99"))),
+            (Column("Vertices shown, %", "number"), lambda r: number(100 * known(r.seen_share), 1)),
+            (Column("Scan reached, %", "number"), lambda r: number(100 * known(r.covered_share), 1)),
+            (Column("Area covered, %", "number"), lambda r: number(100 * known(r.area_share), 1)),
+            (Column("Folded, %", "number"), lambda r: _cell(100 * known(r.folded_share))),
+            (Column("Area change, times", "number"), lambda r: number(known(r.area_factor), 2)),
+            (Column("Size beside the usual", "number"), lambda r: number(known(r.scale), 3)),
+            (Column("Moved last, % of size", "number"), lambda r: _cell(100 * (r.moved_share or [nan])[-1])),
+            (Column("CPU seconds", "number"), lambda r: number(sum(r.cpu_s) if r.cpu_s else nan, 1)),
+        ]
+        records = [*self.out, *self.ordered]
+        rows = [[make(record) for _, make in columns] for record in records[:MOST_ROWS]]
+        if len(records) > MOST_ROWS:
+            out.append(Text(f"The first {MOST_ROWS:,} of {len(records):,} scans; their records have all."))
+        table = Table([column for column, _ in columns], rows, "All scans", sortable=len(rows) > 1)
+        what = (
+            "Distances are both ways; those without % are in the unit of the scan's file. Area covered: that of the "
+            "surface beside that of the scan. Folded: triangles that turn back over their neighbours. Area change: "
+            "95 % of the triangles grow or shrink by less than so many times beside the mean shape, size divided out."
+        )
+        notes: list[Block] = [Text(what, "soft")]
+        why = [[record.name, self._reason(record)] for record in records if self._reason(record)]
+        if why:
+            heading = f"The reasons of {counted(len(why), 'scan')}"
+            notes = [*notes, Folded(heading, [text_table(("Scan", "Why"), why, "Reasons")])]
+        return [*out, table, *notes]
+
+    def _reason(self, record: CorrespondRecord) -> str:
+        if record in self.out:
+            return sentence(record.reason or self.all.unread.get(record.name, ""))
+        return self.concerns[record.name].told if self.concerns[record.name].reasons else ""
+
+    # The rest
+
+    def rounds(self) -> list[Block]:
+        """Return by how much vertices moved in each round, and what it cost."""
+        from shapespace.report import figures
+
+        run = self.at.run
+        figure = self.page.figure(
+            figures.movement_figure(run.rounds, [record.moved_share for record in self.records], self.at.settled),
+            "Each round begins at what the last one found. The first counts from the first template, so it is the "
+            "largest; when vertices move no more, another round changes nothing.",
+            alt=f"Movement of vertices in {counted(len(run.rounds), 'round')}: "
+            + listed([percent_of(moved) for moved in run.rounds]),
+            chart=True,
+        )
+        rows: list[list[Cell]] = []
+        for k, moved in enumerate(run.rounds):
+            cpu = [record.cpu_s[k] for record in self.records if len(record.cpu_s) > k]
+            row = [Cell(f"Round {k + 1}", float(k + 1)), _cell(100 * moved)]
+            rows.append([*row, number(sum(cpu), 1), number(median(cpu), 1), number(max(cpu, default=nan), 1)])
+        heads = ["Moved (RMS), % of size", "CPU seconds, all scans", "a scan, median", "a scan, most"]
+        table = Table(
+            [Column("Round"), *(Column(head, "number") for head in heads)], rows, "Movement and time by round"
+        )
+        note = "CPU seconds are those of the scans in correspondence; choosing the template is not counted."
+        return [Text(run.template), figure, table, Text(note, "soft")]
+
+    def quality(self) -> list[Block]:
+        """Return what quality.json says."""
+        measured = read(Quality, self.at.folder.json("quality.json"), "quality.json", "measure it again")
+        return [sections.quality_part(self.page, measured)]
+
+    def settings(self) -> list[Block]:
+        """Return settings, versions and hashes."""
+        run = self.at.run
+        rows = [("Report", f"shapespace {__version__}"), ("Correspondence", f"shapespace {run.version}")]
+        rows += [("First template", run.template), ("Vertices made", f"{run.vertices:,}")]
+        rows += [(words(key), setting(value)) for key, value in run.settings.items() if key != "vertices"]
+        files = [[r.name, r.path or DASH, r.hash or DASH] for r in list(self.at.records.values())[:MOST_ROWS]]
+        hashes = text_table(("Scan", "File", "Hash"), files, "Content hashes of the scans")
+        return [Facts(rows, "Settings and versions"), Folded("Content hashes (SHA-256)", [hashes])]
+
+
+def _cell(value: float) -> Cell:
+    """Return a number of any size with three digits or so."""
+    return Cell(plain(value) if isfinite(value) else DASH, value)

@@ -1,0 +1,469 @@
+"""The report of the demo: both experiments of the paper, beside what the paper states."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+
+from shapespace.errors import FileFormatError
+from shapespace.model.shape_model import ShapeModel
+from shapespace.report.blocks import fit_tables as tables
+from shapespace.report.blocks import sections
+from shapespace.report.blocks.blocks import Block, Facts, Figure, Folded, Notice, Table, Text, Tiles, text_table
+from shapespace.report.blocks.wording import DASH, STATUS_WORDS, isfinite, mm, moment, plain, setting, words
+from shapespace.report.inputs.saved_fits import Folder, SavedFit, read_fit, staged_fit
+from shapespace.report.pages.page import Chapter, Make, Page, Step
+from shapespace.schemas import DEMO_AGAIN, Case, Claim, DemoModel, ExpressionsOfOne, FitEntry, ManyPeople, read
+
+if TYPE_CHECKING:
+    from shapespace.report.inputs.staged_fit import StagedFit
+
+_RESERVE_BYTES = 1_200_000
+_PICTURES = 30
+_MODES_OF_A_CASE = 4
+_NOTHING = Text("No fit kept its surfaces.", "broken")
+_T = TypeVar("_T")
+
+
+class DemoPage:
+    """The report of the demo in the making; each part of demo.json is read for itself, so that none costs another.
+
+    Args:
+        folder: of the demo.
+        on_step: told of each picture.
+
+    Raises:
+        FileError: demo.json cannot be read.
+        FileFormatError: it is no JSON object.
+    """
+
+    def __init__(self, folder: Folder, on_step: Step | None = None) -> None:
+        self.page = Page(_PICTURES, on_step)
+        self.folder = folder
+        self.content = folder.json("demo.json")
+        self.problems: list[str] = []
+        self.first = self._part("experiment1", ExpressionsOfOne)
+        self.second = self._part("experiment2", ManyPeople)
+        head = {key: self._part(key, kind) for key, kind in (("version", str), ("created", str), ("machine", str))}
+        self.made = f"shapespace {head['version'] or ''}, {moment(head['created'] or '')}"
+        self.machine = head["machine"] or "not recorded"
+        self.quick = bool(self._part("quick", bool))
+        self.cases = self.second.cases if self.second else ()
+        self.entries = [*(self.first.fits if self.first else ()), *(case.fit for case in self.cases)]
+        self._fits: dict[str, SavedFit] = {}
+        self._staged: dict[str, StagedFit] = {}
+        self._models: dict[str, ShapeModel] = {}
+
+    def _part(self, key: str, kind: type[_T]) -> _T | None:
+        """Return one part of demo.json, or None where it is absent, or damaged, which is kept for the summary."""
+        try:
+            return read(kind, self.content[key], f"{key} in demo.json", DEMO_AGAIN) if key in self.content else None
+        except FileFormatError as error:
+            self.problems.append(str(error))
+            return None
+
+    def html(self) -> str:
+        """Return the page."""
+        lead = [
+            Text(
+                "Raw surfaces are fitted by a statistical shape model with the modified ICP of Quan, Matuszewski, "
+                "Shark and Ait-Boudaoud. All distances are in millimetres."
+            ),
+            Text(
+                f"{self.made}."
+                + (" This was the quick demo: coarser scans and an earlier stop." if self.quick else ""),
+                "soft",
+            ),
+        ]
+        chapters = [
+            Chapter("Summary", self.summary),
+            Chapter("Experiment 1", self.experiment_1),
+            Chapter("Experiment 2", self.experiment_2),
+            Chapter("Settings, versions and hashes", self.settings, "Settings"),
+        ]
+        title = "Low-dimensional surface parameterisation: the paper, run again"
+        return self.page.html(title, lead, f"Made by {self.made} from the files in its own folder.", chapters)
+
+    def parted(self, parts: Mapping[str, Make], level: int = 3) -> list[Block]:
+        """Return parts under their headings."""
+        return [self.page.section(heading, make, level) for heading, make in parts.items()]
+
+    # What is read, once
+
+    def fit(self, entry: FitEntry) -> SavedFit:
+        """Return the fit of an entry of demo.json."""
+        key = str(entry.json)
+        if key not in self._fits:
+            self._fits[key] = read_fit(self.folder, entry)
+        return self._fits[key]
+
+    def staged(self, fit: SavedFit, label: str = "") -> StagedFit:
+        """Return what pictures of `fit` need, called `label`."""
+        key = str(fit.entry.stages)
+        if key not in self._staged:
+            self._staged[key] = staged_fit(self.folder, fit)
+        return replace(self._staged[key], label=label or fit.label)
+
+    def model(self, owner: DemoModel) -> ShapeModel:
+        """Return the model of an experiment or a case."""
+        if owner.model not in self._models:
+            self._models[owner.model] = ShapeModel.load(self.folder.path(owner.model))
+        return self._models[owner.model]
+
+    def readable(self, entries: Sequence[FitEntry]) -> tuple[list[SavedFit], list[str]]:
+        """Return the fits whose records can be read, and one sentence for each that cannot."""
+        return sections.usable(entries, self.fit)
+
+    def pictured(self, fits: Sequence[SavedFit]) -> tuple[list[tuple[SavedFit, StagedFit]], Notice]:
+        """Return the fits whose surfaces can be shown, and the names of the others."""
+
+        def both(fit: SavedFit) -> tuple[SavedFit, StagedFit]:
+            if not fit.pictured:
+                raise FileFormatError(f"{fit.name}: {fit.reason or 'no surface was kept'}")
+            return fit, self.staged(fit)
+
+        shown, absent = sections.usable(fits, both)
+        return shown, Notice("Not in the pictures", absent)
+
+    # Summary
+
+    def summary(self) -> list[Block]:
+        """Return the figures of the whole run, the main picture, and the paper beside it."""
+        parts = {"Main figure": self.main_figure, "The paper beside this run": self.paper_table}
+        return [*self.tiles(), *self.parted(parts)]
+
+    def tiles(self) -> list[Block]:
+        """Return what was fitted and how much of it is to be trusted."""
+        fits, problems = self.readable(self.entries)
+        total, first = len(self.entries), len(self.entries) - len(self.cases)
+        counts = Counter(fit.status for fit in fits)
+        tests = [fit.entry for fit in fits if fit.entry.intensity and fit.status != "failed"]
+        distances = [fit.distance_mm("model_to_scan") for fit in fits if fit.entry in tests]
+        where = ", over what it shows" if fits and all(fit.shown for fit in fits if fit.entry in tests) else ""
+        errors = _mean([entry.vertex_error_mm.mean for entry in tests if entry.vertex_error_mm])
+        floors = _mean([entry.floor_mm.mean for entry in tests if entry.floor_mm])
+        blind = "fits converged with nothing found against them; the plain method is blind to some errors"
+        modes = plain(self.first.modes_for_98_5 if self.first else None)
+        tiles = [
+            (str(counts["converged"]), f"of {total}", blind),
+            (modes, "", "modes hold 98.5 % of the variance of one person's expressions"),
+            (*_parted(_mean(distances)), f"mean closest distance of the test faces, model to scan{where}"),
+            (*_parted(errors), f"their true vertex error; the model's best possible is {mm(floors)}"),
+        ]
+        rest = ", ".join(
+            f"{counts[key]} {word}" for key, word in STATUS_WORDS.items() if counts[key] and key != "converged"
+        )
+        told = (
+            f"{total} fits are reported: {first} to simulated scans of one person's expressions, {total - first} to "
+            f"scans of other people.{f' Besides those that converged: {rest}.' if rest else ''}"
+        )
+        doubts = [f"{fit.name}: {STATUS_WORDS[fit.status]}. {fit.reason}" for fit in fits if fit.status != "converged"]
+        return [
+            Text(told),
+            Tiles(tiles),
+            Notice("Not to be trusted without a look", doubts),
+            Notice("Cannot be read", [*self.problems, *problems]),
+        ]
+
+    def main_figure(self) -> list[Block]:
+        """Return the middle test face and the scans of experiment 2 with their fits."""
+        from shapespace.report import figures
+
+        fits, _ = self.readable(self.first.fits if self.first else ())
+        usable = [fit for fit in _tests(fits) if fit.pictured]
+        usable.sort(key=lambda fit: fit.summary_mm("final", "model_to_scan", "mean"))
+        wanted = [(fit.entry, f"{fit.label} (simulated)") for fit in usable[len(usable) // 2 :][:1]]
+        for case in self.cases:
+            both = ((case.fit, "paper"), (case.robust, "robust"))
+            wanted += [(fit, f"{_short(case)}, {method}") for fit, method in both if fit and fit.stages]
+        shown, unread = sections.usable(wanted, lambda pair: self.staged(self.fit(pair[0]), pair[1]))
+        if not shown:
+            raise FileFormatError("No fit kept a surface to show; run the demo again.")
+        labels = [fit.label for fit in shown]
+        return [
+            self.page.figure(
+                figures.portrait_figure(shown, labels, title="Raw scans and the models fitted to them"),
+                "Rows: the test expression with the median distance, then each scan of experiment 2, fitted by the "
+                "method of the paper and by the robust method. The last column maps the distance of each model vertex "
+                f"to the scan, all rows on one scale.{self.true_errors()}",
+                alt="Scan, fitted model, both overlaid, and a distance map, for " + "; ".join(labels),
+            ),
+            Notice("Not in the picture", unread),
+        ]
+
+    def true_errors(self) -> str:
+        """Return the mean true vertex errors of both methods in experiment 2, where the truth is known."""
+        sentences: list[str] = []
+        for case in self.cases:
+            paper, robust = case.fit.vertex_error_mm, case.robust and case.robust.vertex_error_mm
+            if paper and robust and case.fit.floor_mm:
+                sentences.append(
+                    f" {_short(case).capitalize()}: mean true vertex error {mm(paper.mean)} by the method of the "
+                    f"paper, {mm(robust.mean)} by the robust method; the best possible with this model is "
+                    f"{mm(case.fit.floor_mm.mean)}."
+                )
+        return "".join(sentences)
+
+    def paper_table(self) -> Table:
+        """Return what the paper states beside what this run measured."""
+        claims = read(tuple[Claim, ...], self.content.get("paper_table"), "paper_table in demo.json", DEMO_AGAIN)
+        if not claims:
+            raise FileFormatError("demo.json holds no comparison with the paper; run the demo again.")
+        return text_table(
+            ("Quantity", "Paper", "This run", "True error", "Why it differs"),
+            [[row.quantity, row.paper, row.measured, row.truth or DASH, row.why or "It does not."] for row in claims],
+            "Distances are to the closest point of the scan; the true error is between vertices that correspond, "
+            "beside the floor that a perfect fit of the same model would reach.",
+        )
+
+    # Experiment 1
+
+    def experiment_1(self) -> list[Block]:
+        """Return one person's expressions: model, fits, recognition."""
+        one = self.first
+        if one is None:
+            raise FileFormatError("demo.json holds no experiment 1; run the demo again.")
+        fits, problems = self.readable(one.fits)
+        tests = _tests(fits)
+        farthest = sorted(
+            (fit for fit in tests if fit.pictured),
+            key=lambda fit: -np.nan_to_num(fit.summary_mm("before", "model_to_scan", "max")),
+        )
+        intro = (
+            f"{one.title or 'Expressions of one person'}: {_told(one.n_training)} faces of one simulated person make "
+            f"the model, {_told(one.modes_for_98_5)} modes hold 98.5 % of their variance, and unseen expressions are "
+            "fitted as raw surfaces: triangulated anew, moved, turned, scaled, with 0.2 mm noise."
+        )
+        parts: dict[str, Make] = {
+            "The training faces": lambda: self.training(one),
+            "Mean and first modes": lambda: self.modes(one, "Paper, figures 2 and 3. "),
+            "The test faces": lambda: self.test_faces(tests),
+            "From far away, step by step": lambda: (
+                [
+                    block
+                    for fit in farthest[: 1 if self.quick else 2]
+                    for block in self.one_fit(fit, fit.label, one.population_z)
+                ]
+                or [_NOTHING]
+            ),
+            "Test faces, fitted": lambda: self.all_fitted(tests),
+            "Distance maps": lambda: self.maps(tests),
+            "Every fit in numbers": lambda: self.numbers(fits),
+            "Expressions as directions": lambda: self.directions(one, fits),
+        }
+        return [Text(intro), Notice("Cannot be read", problems), *self.parted(parts)]
+
+    def numbers(self, fits: Sequence[SavedFit]) -> Table:
+        """Return the table of fits."""
+        return tables.fits_table(fits, {}, caption="Distances at the end, in mm. A dash: not known.")
+
+    def training(self, one: ExpressionsOfOne) -> Figure:
+        """Return some of the faces that the model is made of."""
+        from shapespace.report import figures
+
+        examples = one.training_examples[: 8 if self.quick else 12]
+        meshes = [self.folder.mesh(example.file) for example in examples]
+        labels = [example.label for example in examples]
+        return self.page.figure(
+            figures.faces_grid(meshes, labels, title="Training faces: one person, mixed expressions"),
+            f"Paper, figure 1. {len(meshes)} of the {_told(one.n_training)} faces that the model is made of.",
+            alt=f"{len(meshes)} faces of one person with different expressions, in a grid",
+        )
+
+    def modes(self, owner: DemoModel, paper: str, to_move: int = sections.MODES_IN_WIDGET) -> list[Block]:
+        """Return what the model is and does."""
+        return sections.model_part(self.page, self.model(owner), figure_of=paper, to_move=to_move)
+
+    def test_faces(self, tests: Sequence[SavedFit]) -> list[Block]:
+        """Return the scans of the test faces."""
+        from shapespace.report import figures
+
+        shown, absent = self.pictured(tests)
+        if not shown:
+            return [absent if absent.items else Text("No test face was fitted.", "broken")]
+        labels = [staged.label for _, staged in shown]
+        title = "Test faces: raw surfaces, none of them in the training set"
+        return [
+            self.page.figure(
+                figures.faces_grid([staged.scan for _, staged in shown], labels, title=title),
+                "Paper, figure 8. The scans, turned back to the front by the fitted pose; simulated.",
+                alt="Grid of test faces: " + ", ".join(labels),
+            ),
+            absent,
+        ]
+
+    def one_fit(self, fit: SavedFit, label: str, population_z: Sequence[Sequence[float]] = ()) -> list[Block]:
+        """Return one fit to turn, with every picture, its coefficients beside those of the population (N, K)."""
+        if len({len(z) for z in population_z}) > 1:
+            raise FileFormatError("population_z in demo.json has rows of different lengths; run the demo again.")
+        staged = self.staged(fit, label)
+        spread = np.array(population_z, dtype=np.float64) if population_z else None
+        return sections.fit_in_full(self.page, staged, spread, reserve=_RESERVE_BYTES, of_paper=True)
+
+    def all_fitted(self, tests: Sequence[SavedFit]) -> list[Block]:
+        """Return every test face with its fitted model."""
+        from shapespace.report import figures
+
+        shown, absent = self.pictured(tests)
+        if not shown:
+            return [absent]
+        chosen = _strongest(shown) if self.quick else [staged for _, staged in shown]
+        return [
+            self.page.figure(
+                figures.aligned_grid(chosen, title="Scan and fitted model over each other"),
+                "Where the surfaces coincide, noise decides which one is seen: a fine mixture of both colours is a "
+                "close fit, a large patch of one is not. Above each: mean distance, model to scan.",
+                alt="Overlays of scan and fitted model for " + ", ".join(staged.label for staged in chosen),
+            ),
+            absent,
+        ]
+
+    def directions(self, one: ExpressionsOfOne, fits: Sequence[SavedFit]) -> list[Block]:
+        """Return the coefficients of the test faces, and the scores of recognition."""
+        left_out = plain(one.scores.get("left_out")).split(", ")
+        kept = [fit for fit in fits if fit.status != "failed" and fit.name not in left_out]
+        scans = [sections.coefficients_of(fit) for fit in _tests(kept)]
+        neutral = next((sections.coefficients_of(fit) for fit in kept if not fit.entry.intensity), None)
+        out: list[Block] = []
+        if scans and all(len(scan.b) >= 2 for scan in scans):
+            of = ("Paper, figure 9. ", "Paper, figure 10. ")
+            out.append(sections.lines_through_neutral(self.page, scans, neutral, figures_of=of))
+            if all(len(scan.b) >= 3 for scan in scans):
+                out += self.page.tried(lambda: sections.scatter_to_turn(self.page, scans))
+        return out + tables.score_tables(
+            one.scores, many="Is each expression a line through neutral?", single="Are the expressions disjoint?"
+        )
+
+    def maps(self, tests: Sequence[SavedFit]) -> list[Block]:
+        """Return threshold maps and distance maps of the test faces."""
+        from shapespace.report import figures
+
+        shown, absent = self.pictured(tests)
+        if not shown:
+            return [absent]
+        chosen = _strongest(shown)
+        every = chosen if self.quick else [staged for _, staged in shown]
+        return [
+            sections.in_columns(
+                self.page.figure(
+                    figures.threshold_figure(chosen),
+                    "Paper, figure 11, for the strongest level of each expression. Above each panel: share of the "
+                    "vertices within the limit.",
+                    alt="Maps of the face with the part within 2, 4, 6, 8 and 10 mm of the scan for "
+                    + ", ".join(staged.label for staged in chosen),
+                ),
+                self.page.figure(
+                    figures.distance_maps(every, title="The same distances on a finer scale"),
+                    "Distance from each model vertex to the scan, all on one scale.",
+                    alt="Distance maps on one scale for " + ", ".join(staged.label for staged in every),
+                ),
+            ),
+            absent,
+        ]
+
+    # Experiment 2
+
+    def experiment_2(self) -> list[Block]:
+        """Return models of many people, fitted to scans of another person."""
+        if not self.cases:
+            raise FileFormatError("demo.json holds no case of experiment 2; run the demo again.")
+        scans = "a scan" if len(self.cases) == 1 else "scans"
+        models = [case.model for case in self.cases]
+        return [
+            Text(f"Models of many people's neutral faces, fitted to {scans} of another person."),
+            *(
+                self.page.section(
+                    case.title or "Case",
+                    lambda case=case, k=k: self.case(case, with_model=case.model not in models[:k]),
+                )
+                for k, case in enumerate(self.cases)
+            ),
+        ]
+
+    def case(self, case: Case, *, with_model: bool) -> list[Block]:
+        """Return one scan of experiment 2."""
+        fit = self.fit(case.fit)
+        kind = "Simulated scan. " if case.simulated else "Real scan. "
+        if case.note.lower().startswith(("simulated", "real", "a real")):
+            kind = ""
+        told = f"The model is made of {_told(case.n_training)} people"
+        if case.modes_for_98_5:
+            told += f"; {case.modes_for_98_5} modes hold 98.5 % of the variance"
+            told += f", and {case.n_modes} are used." if case.n_modes else "."
+        else:
+            told += f"; its {_told(case.n_modes)} modes hold less than 98.5 % of the variance."
+        out: list[Block] = [Text(kind + case.note, "notice" if case.simulated else ""), Text(told), self.numbers([fit])]
+        if not fit.pictured:
+            return out
+        parts: dict[str, Make] = {"Step by step": lambda: self.one_fit(fit, _short(case))}
+        if with_model and not self.quick:
+            parts["The model"] = lambda: self.modes(case, "", _MODES_OF_A_CASE)
+        return out + self.parted(parts, 4)
+
+    # The rest
+
+    def settings(self) -> list[Block]:
+        """Return settings, times, versions and hashes."""
+        problems: list[str] = []
+
+        def told(key: str, kind: type[_T], otherwise: _T) -> _T:
+            try:
+                return read(kind, self.content.get(key, otherwise), f"{key} in demo.json", DEMO_AGAIN)
+            except FileFormatError as error:
+                problems.append(str(error))
+                return otherwise
+
+        rows = [("Machine", self.machine), ("Seed", plain(self.content.get("seed")))]
+        rows += [
+            (f"Time, {words(key)}", f"{value:.1f} s") for key, value in told("seconds", dict[str, float], {}).items()
+        ]
+        rows += [
+            (f"Setting, {words(key)}", plain(value)) for key, value in told("settings", dict[str, object], {}).items()
+        ]
+        rows += [(f"Version, {key}", value) for key, value in told("versions", dict[str, str], {}).items()]
+        fits, unread = self.readable(self.entries)
+        if fits:
+            rows += [(f"Fit, {words(key)}", setting(value)) for key, value in fits[0].record.config.items()]
+        files = [
+            [fit.name, *(f"{file.name} {file.hash or 'not recorded'}" for file in (fit.record.scan, fit.record.model))]
+            for fit in fits
+        ]
+        hashes = text_table(("Fit", "Scan", "Model"), files, "Content hashes of the files that took part")
+        return [
+            Facts(rows, "Settings and versions"),
+            Folded("Content hashes (SHA-256)", [hashes]),
+            Notice("Cannot be read", [*problems, *unread]),
+        ]
+
+
+def _tests(fits: Sequence[SavedFit]) -> list[SavedFit]:
+    return [fit for fit in fits if fit.entry.intensity]
+
+
+def _strongest(shown: Sequence[tuple[SavedFit, StagedFit]]) -> list[StagedFit]:
+    """Return the fit of the highest intensity of each expression."""
+    ranked = sorted(shown, key=lambda pair: pair[0].entry.intensity or 0)
+    return list({fit.entry.expression: staged for fit, staged in ranked}.values())
+
+
+def _short(case: Case) -> str:
+    """Return the name of a case that fits beside a row of pictures."""
+    return case.short or case.fit.name
+
+
+def _told(count: int | None) -> str:
+    return "?" if count is None else str(count)
+
+
+def _mean(values: Sequence[float]) -> float:
+    known = [value for value in values if isfinite(value)]
+    return sum(known) / len(known) if known else np.nan
+
+
+def _parted(value: float) -> tuple[str, str]:
+    number, _, unit = mm(value).partition(" ")
+    return number, unit

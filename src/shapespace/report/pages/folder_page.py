@@ -1,0 +1,522 @@
+"""The report of a folder that `shapespace fit` wrote."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from shapespace.errors import InputError, ShapespaceError
+from shapespace.io.tables.label_table import Label
+from shapespace.report.blocks import fit_tables as tables
+from shapespace.report.blocks import sections
+from shapespace.report.blocks.blocks import (
+    Block,
+    Card,
+    Cell,
+    Command,
+    Figure,
+    Folded,
+    Gallery,
+    Image,
+    Item,
+    Notice,
+    ScaleKey,
+    Text,
+    Tiles,
+    status,
+    text_table,
+)
+from shapespace.report.blocks.settings_text import settings_told
+from shapespace.report.blocks.wording import DASH, STATUS_WORDS, counted, isfinite, listed, mm, printable
+from shapespace.report.inputs.fit_labels import find_labels, labelled
+from shapespace.report.inputs.saved_fits import (
+    Folder,
+    SavedFit,
+    ScanNotFoundError,
+    model_of,
+    raw_scan,
+    saved_surfaces,
+    staged_fit,
+)
+from shapespace.report.pages import recognition_page as recognition
+from shapespace.report.pages.page import Chapter, Page, Step
+from shapespace.schemas import Quality, read
+from shapespace.types import FloatArray
+from shapespace.version import __version__
+
+if TYPE_CHECKING:
+    from shapespace.model.shape_model import ShapeModel
+    from shapespace.report.inputs.staged_fit import StagedFit
+
+MOST_CARDS = 24
+MOST_EMPTY_CARDS = 6
+MOST_OPEN_CARDS = 6
+MOST_DETAILS = 3
+MOST_ROWS = 2000
+MOST_CURVES = 100
+_MOST_NAMED = 12
+_MOST_WORST = 3
+_VERDICT = "Do not trust this fit: "
+_FEWEST_LEVELS = 2
+_RESERVE_BYTES, _MOST_RESERVED = 400_000, 2
+
+
+class FolderPage:
+    """The report of a folder of fits in the making.
+
+    Args:
+        folder: that the fits lie in.
+        fits: found there, one or more.
+        model: the model's file, or None to go by the records.
+        labels: a table of labels, or None to look for one.
+        on_step: told of each picture.
+    """
+
+    def __init__(
+        self,
+        folder: Folder,
+        fits: Sequence[SavedFit],
+        *,
+        model: Path | None = None,
+        labels: Path | None = None,
+        on_step: Step | None = None,
+    ) -> None:
+        self.folder = folder
+        self.recognised = (folder.root / recognition.STUDY.file).is_file()
+        self.analyses = recognition.find_analyses(folder.root)
+        self.label_note = ""
+        found: Mapping[str, Label] = {}
+        try:
+            found, self.label_note = find_labels(folder, fits, labels)
+        except ShapespaceError as error:
+            if labels is not None:
+                raise
+            self.label_note = f"There are no labels: {error}"
+        self.fits = sorted((labelled(fit, found) for fit in fits), key=sections.concern)
+        self.main = _main_fits(self.fits)
+        planned = sections.MODEL_PICTURES + min(len(fits), MOST_CARDS) + 4 + len(self.main) * sections.FIT_PICTURES
+        self.page = Page(planned, on_step)
+        self.model_path = model
+        self._model: ShapeModel | None = None
+        if model is not None:
+            self.model()
+        self._staged: dict[str, StagedFit] = {}
+        self._details = {fit.name: self.page.place(f"pictures-of-{fit.name}") for fit in self.main}
+        carded = _carded(self.fits) if len(fits) > 1 or not self.main else []
+        self._cards = {fit.name: self.page.place(f"fit-{fit.name}") for fit in carded}
+        self.carded = carded
+
+    # What is read, once
+
+    def model(self) -> ShapeModel:
+        """Return the model of the fits."""
+        if self._model is None:
+            self._model = model_of(self.folder, self.fits, self.model_path)
+        return self._model
+
+    def staged(self, fit: SavedFit) -> StagedFit:
+        """Return what pictures of `fit` need, called by its name."""
+        if fit.name not in self._staged:
+            self._staged[fit.name] = replace(staged_fit(self.folder, fit), label=fit.name)
+        return self._staged[fit.name]
+
+    # The page
+
+    def html(self) -> str:
+        """Return the page."""
+        name = self.folder.root.resolve().name
+        chapters = [
+            Chapter("Summary", self.summary),
+            Chapter("The fits", self.fits_part, "Fits"),
+            Chapter("The fits together", self.together_part, "Together"),
+            Chapter("The model", self.model_part, "Model"),
+            Chapter("Settings, versions and hashes", self.settings, "Settings"),
+        ]
+        if sum(fit.fitted for fit in self.fits) < 2:
+            del chapters[2]
+        if self.recognised:
+            found = Chapter("Recognition", lambda: recognition.study_section(self.page, self.folder))
+            chapters.insert(-2, found)
+        chapters[-2:-2] = recognition.analysis_chapters(self.page, self.folder.root, self.analyses)
+        lead = "What a statistical shape model made of raw surfaces. Distances are in millimetres of the model's frame."
+        made = f"Made by shapespace {__version__} from the files in {name}."
+        return self.page.html(f"{counted(len(self.fits), 'fit')} in {name}", [Text(lead)], made, chapters)
+
+    @property
+    def places(self) -> Mapping[str, str]:
+        """Where in the page a fit is shown, by its name."""
+        return self._cards | self._details
+
+    def place_of(self, name: str) -> str | None:
+        """Return where in the page a fit is shown, or None."""
+        return (self._details | self._cards).get(printable(name))
+
+    def model_part(self) -> list[Block]:
+        """Return the model, with what quality.json says of it where there is such a file."""
+        out = sections.model_part(self.page, self.model())
+        if (self.folder.root / "quality.json").is_file():
+            out += self.page.tried(self.quality)
+        return out
+
+    def quality(self) -> Block:
+        """Return what quality.json says."""
+        measured = read(Quality, self.folder.json("quality.json"), "quality.json", "measure it again")
+        return sections.quality_part(self.page, measured)
+
+    def summary(self) -> list[Block]:
+        """Return what was fitted and how much of it is to be trusted."""
+        counts = Counter(fit.status for fit in self.fits)
+        trusted = [fit for fit in self.fits if fit.status == "converged"]
+        tiles = [
+            (str(len(trusted)), f"of {len(self.fits)}", "with nothing found against them"),
+            (str(counts["doubtful"] + counts["max_iterations"]), "", "to be looked at before use"),
+            (str(counts["failed"] + counts["unreadable"]), "", "without a result"),
+        ]
+        to_scan = "from model to scan, over what the scan shows"
+        if not all(fit.shown for fit in trusted):
+            to_scan = "from the whole model to the scan"
+        for value, what in (
+            (_median([fit.expected_error_mm for fit in trusted]), "vertex error that such a fit expects of itself"),
+            (_median([fit.distance_mm("model_to_scan") for fit in trusted]), f"mean distance {to_scan}"),
+            (_median([fit.distance_mm("scan_to_model") for fit in trusted]), "mean distance from scan to model"),
+        ):
+            if isfinite(value):
+                tiles.append((mm(value).removesuffix(" mm"), "mm", f"{what}, median of those"))
+        return [
+            Text(self.told(counts)),
+            Tiles(tiles),
+            *self.other_models(),
+            self.doubts(),
+            *self.worst(),
+            *self.without_stages(),
+        ]
+
+    def told(self, counts: Mapping[str, int]) -> str:
+        """Return in a sentence or two what was fitted, and how many fits have which status."""
+        models = sorted({fit.record.model.name or "an unknown model" for fit in self.fits})
+        methods = sorted({fit.record.method for fit in self.fits} - {""})
+        told = f"{counted(len(self.fits), 'scan was', 'scans were')} fitted with {listed(models)}"
+        told += f" by the {listed(methods)} method{'s' if len(methods) > 1 else ''}. " if methods else ". "
+        trusted = counts["converged"]
+        told += counted(trusted, "fit") if trusted else "None"
+        told += f" converged with nothing {'found against them' if trusted != 1 else 'against it'}"
+        rest = {
+            "max_iterations": "stopped at the limit of steps",
+            "doubtful": "doubtful",
+            "failed": "could not be fitted",
+            "unreadable": "cannot be read",
+        }
+        others = listed([f"{counts[key]} {word}" for key, word in rest.items() if counts[key]])
+        return f"{told}; {others}." if others else f"{told}."
+
+    def other_models(self) -> list[Block]:
+        """Return which fits are by another model than the one shown, where one was given."""
+        if self.model_path is None:
+            return []
+        shown = self.model_hash()
+        others = [fit.name for fit in self.fits if fit.fitted and fit.record.model.hash != shown]
+        return [Notice(f"Fitted with another model than {self.model_path.name}", others)]
+
+    def doubts(self) -> Notice:
+        """Return the fits that need a look, by name and reason."""
+        bad = [fit for fit in self.fits if fit.status != "converged"]
+        places = self._details | self._cards
+        items: list[str | Item] = [
+            Item(
+                f"{STATUS_WORDS[fit.status]}. {_without_verdict(fit.reason)}",
+                Cell(fit.name, place=places.get(fit.name)),
+            )
+            for fit in bad[:_MOST_NAMED]
+        ]
+        if len(bad) > _MOST_NAMED:
+            items.append(f"{counted(len(bad) - _MOST_NAMED, 'other')}, in the table of all fits.")
+        return Notice("Not to be trusted without a look", items)
+
+    def worst(self) -> list[Block]:
+        """Return in a sentence which fits lie farthest from their scans, of those with nothing else against them."""
+        good = [fit for fit in self.fits if fit.status == "converged" and isfinite(fit.distance_mm("model_to_scan"))]
+        far = sorted(good, key=lambda fit: -fit.distance_mm("model_to_scan"))[:_MOST_WORST]
+        if len(good) < 2:
+            return []
+        told = listed([f"{fit.name} ({mm(fit.distance_mm('model_to_scan'))})" for fit in far])
+        which = "These" if len(good) == len(self.fits) else "Of those with nothing against them, these"
+        return [Text(f"{which} lie farthest from their scans on average: {told}.")]
+
+    def curves(self) -> Figure:
+        """Return which share of the surface lies within each distance."""
+        from shapespace.report import figures
+
+        # Without stages, each curve needs the scan to be read and the distances to be measured.
+        pictured = [fit for fit in self.fits if fit.pictured and (fit.entry.stages or fit.name in self.places)]
+        shown, problems = sections.usable(pictured[:MOST_CURVES], self.staged)
+        if not shown:
+            raise InputError(f"There are no distances to draw: {problems[0]}" if problems else "No surface was saved.")
+        some = f" The first {len(shown)} fits of the table." if sum(f.pictured for f in self.fits) > len(shown) else ""
+        return self.page.figure(
+            figures.error_curves(shown),
+            "Share of the model's vertices that lie within each distance of the scan, one curve a fit. Vertices at "
+            f"which the scan shows nothing are not counted.{some}",
+            alt=f"Cumulative distances of {counted(len(shown), 'fit')}",
+            chart=True,
+        )
+
+    def without_stages(self) -> list[Block]:
+        """Return notices on fits without pictures, and on the command that adds the stages if none were saved."""
+        fitted = [fit for fit in self.fits if fit.fitted]
+        if not fitted:
+            return [Text("There is no fit to show.", "broken")]
+        absent = Notice("Not in the pictures", self.not_drawn())
+        if any(fit.entry.stages for fit in fitted):
+            return [absent]
+        record = fitted[0].record
+        scan = record.scan.path or "SCAN"
+        scans = str(Path(scan).parent) if len(fitted) > 1 else scan
+        return [
+            absent,
+            Text(
+                "These fits were saved without their stages: the pictures show the fitted surfaces and the scans, with "
+                "distances that this report measured. This command, run in the folder of the results, adds the surface "
+                "before the fit and after phase 1, the regions and the iterations:",
+                "soft",
+            ),
+            Command(f"shapespace fit {record.model.path or 'MODEL.h5'} {scans} -o . --stages"),
+        ]
+
+    def not_drawn(self) -> list[str]:
+        """Return one sentence for each of the main fits that cannot be drawn, or not with its scan."""
+        return [
+            f"{fit.name}: {_of_scan(error)}" if isinstance(error, ScanNotFoundError) else str(error)
+            for fit in self.main
+            if (error := self.problem(fit)) is not None
+        ]
+
+    def problem(self, fit: SavedFit) -> ShapespaceError | None:
+        """Return why `fit` cannot be drawn with its scan, or None."""
+        try:
+            self.staged(fit)
+        except ShapespaceError as error:
+            return error
+        return None
+
+    # Fits
+
+    def fits_part(self) -> list[Block]:
+        """Return the gallery, the table, and the main fits in detail, folded away where there are several."""
+        page = self.page
+        parts: list[Block] = []
+        if self._cards:
+            heading = "All fits" if len(self.fits) <= MOST_CARDS else f"The {MOST_CARDS} fits to look at first"
+            parts.append(page.section(heading, self.gallery))
+        parts.append(page.section("Every fit in numbers", self.numbers))
+        several = len(self.fits) > 1
+        for fit in self.main:
+            made = page.section(
+                f"{fit.name} in detail", lambda fit=fit: self.detail(fit), place=self._details[fit.name],
+                folded=several, status=status(fit.status) if several else None,
+            )  # fmt: skip
+            # Of a single fit, its pictures matter more than its numbers.
+            parts.insert(len(parts) if several else 0, made)
+        return parts
+
+    def together_part(self) -> list[Block]:
+        """Return how near all fits come, and their coefficients against each other."""
+        curves: Sequence[Block] = self.page.tried(self.curves) if any(fit.pictured for fit in self.fits) else ()
+        coefficients = self.page.tried(self.together)
+        drawn = [block for block in coefficients if isinstance(block, Figure)]
+        rest = [block for block in coefficients if not isinstance(block, Figure)]
+        return [sections.in_columns(*curves, *drawn), *rest]
+
+    def gallery(self) -> list[Block]:
+        """Return a card for each of the first fits: failed and doubtful first, then by their error."""
+        from shapespace.report.render import thumbnails
+
+        sample, _ = sections.usable([fit for fit in self.carded if fit.pictured], self.staged)
+        good = [fit for fit in sample if fit.status == "converged"]
+        limit = sections.common_limit_mm(good or sample)
+        out: list[Block] = [Text("Sorted by status (failed, doubtful, converged), then by expected error.")]
+        if len(self.fits) > len(self.carded):
+            others = counted(len(self.fits) - len(self.carded), "other fit")
+            more = f"{others} have no picture here, so that this file stays below 8 MB; the table has them all."
+            out.append(Text(more))
+        if sample:
+            out.append(ScaleKey(limit, self.page.image(thumbnails.colour_bar(), "from blue over pale to red")))
+        cards = [self.card(fit, limit) for fit in self.carded]
+        out.append(Gallery(cards[:MOST_OPEN_CARDS]))
+        if len(cards) > MOST_OPEN_CARDS:
+            out.append(Folded(f"{len(cards) - MOST_OPEN_CARDS} more", [Gallery(cards[MOST_OPEN_CARDS:])]))
+        return out
+
+    def card(self, fit: SavedFit, limit_mm: float) -> Card:
+        """Return one fit of the gallery, its map on a scale that ends at `limit_mm`."""
+        image, why = None, ""
+        try:
+            image = self.still(fit, limit_mm)
+        except ShapespaceError as error:
+            why = f"No picture: {error}"
+        self.page.step(fit.name)
+        seen = fit.distance_mm("scan_to_model")
+        told = f"Scan to model {mm(seen)} on average. " if isfinite(seen) else ""
+        # The summary has the whole reason of these.
+        named = [bad.name for bad in self.fits if bad.status != "converged"][:_MOST_NAMED]
+        return Card(
+            self._cards[fit.name],
+            fit.name,
+            status(fit.status),
+            fit.label if fit.label != fit.name else "",
+            told + (_first_reason(fit) if fit.name in named else fit.reason),
+            image,
+            why,
+            self._details.get(fit.name),
+        )
+
+    def still(self, fit: SavedFit, limit_mm: float) -> Image:
+        """Return the best picture of a fit that there is: with its stages, its fitted surface, or its scan."""
+        from shapespace.report.render import thumbnails
+
+        if fit.pictured:
+            try:
+                staged = self.staged(fit)
+            except ScanNotFoundError:
+                surfaces = saved_surfaces(self.folder, fit)
+                still, alt = thumbnails.mesh_still(surfaces["final"]), f"The fitted surface of {fit.name}"
+            else:
+                still, alt = thumbnails.fit_strip(staged, limit_mm), sections.strip_alt(staged, limit_mm)
+        else:
+            still, alt = (
+                thumbnails.mesh_still(raw_scan(self.folder, fit)),
+                f"The raw scan {fit.name}, as its axes stand",
+            )
+        return self.page.image(still, alt)
+
+    def numbers(self) -> list[Block]:
+        """Return the table of all fits."""
+        shown = self.fits[:MOST_ROWS]
+        caption = "Every fit: distances and errors at the end in mm. A dash: not known."
+        out: list[Block] = [tables.fits_table(shown, self.places, caption=caption)]
+        if len(self.fits) > len(shown):
+            left = counted(len(self.fits) - len(shown), "other fit")
+            out.append(Text(f"{left} are left out here; coefficients.csv has all."))
+        return [*out, *([Text(self.label_note, "soft")] if self.label_note else [])]
+
+    def of_one_model(self, model_hash: str) -> list[SavedFit]:
+        """Return the fits by one model that have coefficients: only these can be compared."""
+        return [fit for fit in self.fits if fit.fitted and fit.record.b and fit.record.model.hash == model_hash]
+
+    def model_hash(self) -> str:
+        """Return the content hash of the model whose fits are compared.
+
+        Raises:
+            InputError: there are several, and none was given.
+        """
+        if self.model_path is not None:
+            return self.model().content_hash
+        hashes = {fit.record.model.hash for fit in self.fits if fit.fitted}
+        if len(hashes) > 1:
+            raise InputError(
+                f"The fits are by {len(hashes)} different models, so their coefficients cannot be compared; "
+                "give one of the models with --model."
+            )
+        return hashes.pop() if hashes else ""
+
+    def together(self) -> list[Block]:
+        """Return the coefficients of all fits by one model against each other, and the lines of one subject's."""
+        compared = self.of_one_model(self.model_hash())
+        out = sections.scatter(self.page, [sections.coefficients_of(fit) for fit in compared])
+        expressive = [fit for fit in compared if fit.entry.intensity]
+        subjects = {fit.entry.subject for fit in expressive}
+        levels = Counter(fit.entry.expression for fit in expressive)
+        if len(subjects) != 1 or "" in subjects or max(levels.values(), default=0) < _FEWEST_LEVELS:
+            return out
+        points = [sections.coefficients_of(fit) for fit in expressive]
+        if any(len(point.b) < 2 for point in points):
+            return out
+        own = (fit for fit in compared if fit.entry.intensity == 0 and fit.entry.subject in subjects)
+        neutral = next(map(sections.coefficients_of, own), None)
+        return [*out, *self.page.tried(lambda: sections.lines_through_neutral(self.page, points, neutral))]
+
+    def detail(self, fit: SavedFit) -> list[Block]:
+        """Return one fit with every picture, as far as the file's size allows; without its scan, its surface alone."""
+        try:
+            staged = self.staged(fit)
+        except ScanNotFoundError as error:
+            why, surfaces = str(error), saved_surfaces(self.folder, fit)
+            turning = self.page.tried(lambda: sections.surface_to_turn(self.page, fit, surfaces, why))
+            return [*sections.fit_facts(fit), *turning]
+        population = self.others(fit)
+        reserve = _RESERVE_BYTES + recognition.SECTION_BYTES * min(self.recognised + len(self.analyses), _MOST_RESERVED)
+        alone = len(self.fits) == 1
+        pictures = sections.fit_in_full(self.page, staged, population, reserve=reserve, folded=alone)
+        return [*sections.fit_facts(fit), *pictures]
+
+    def others(self, fit: SavedFit) -> FloatArray | None:
+        """Return coefficients (N, K) of the other fits by the model of `fit`; None where there are too few."""
+        same = self.of_one_model(fit.record.model.hash)
+        others = [other.numbers("z") for other in same if other.name != fit.name]
+        return np.stack(others) if len(others) > 2 and len({len(z) for z in others}) == 1 else None
+
+    # The rest
+
+    def settings(self) -> list[Block]:
+        """Return settings that the fits share, versions and hashes."""
+        known = [fit for fit in self.fits if fit.fitted] or self.fits
+        configs = [fit.record.config for fit in known if fit.record.config]
+        rows = [("Report", f"shapespace {__version__}")]
+        versions = sorted({fit.record.version for fit in self.fits} - {""})
+        if versions:
+            rows.append(("Fits", f"shapespace {listed(versions)}"))
+        files = [
+            [fit.name, *(part or DASH for part in (fit.record.scan.name, fit.record.scan.hash, fit.record.model.hash))]
+            for fit in self.fits[:MOST_ROWS]
+        ]
+        heads = ("Fit", "Scan", "Hash of the scan", "Hash of the model")
+        hashes = text_table(heads, files, "Content hashes of the files that took part")
+        return [*settings_told(configs, rows), Folded("Content hashes (SHA-256)", [hashes])]
+
+
+def _main_fits(fits: Sequence[SavedFit]) -> list[SavedFit]:
+    """Return the fits shown with every picture: the worst doubtful one, the worst and the median of the others."""
+    pictured = [fit for fit in fits if fit.pictured]
+    if len(pictured) <= MOST_DETAILS:
+        return pictured
+    doubtful = [fit for fit in pictured if fit.status == "doubtful"]
+    others = [fit for fit in pictured if fit.status != "doubtful"]
+    if not others:
+        return doubtful[:MOST_DETAILS]
+    return doubtful[:1] + [others[k] for k in sorted({0, len(others) // 2})]
+
+
+def _carded(fits: Sequence[SavedFit]) -> list[SavedFit]:
+    """Return the fits of the gallery; where not all have room, those without a result leave some to the others."""
+    if len(fits) <= MOST_CARDS:
+        return list(fits)
+    empty, rest = [fit for fit in fits if not fit.fitted], [fit for fit in fits if fit.fitted]
+    first = empty[: max(MOST_EMPTY_CARDS, MOST_CARDS - len(rest))]
+    return [*first, *rest[: MOST_CARDS - len(first)]]
+
+
+def _of_scan(error: ScanNotFoundError) -> str:
+    return f"{str(error).removesuffix('.')}; the fitted surface is shown alone."
+
+
+def _without_verdict(reason: str) -> str:
+    """Return a reason without the words that its status says already."""
+    rest = reason.removeprefix(_VERDICT)
+    return rest if rest == reason else rest[:1].upper() + rest[1:]
+
+
+def _first_reason(fit: SavedFit) -> str:
+    """Return the first of the reasons of a fit, and how many there are beside it."""
+    if not fit.reason.startswith(_VERDICT):
+        return fit.reason
+    first, *others = _without_verdict(fit.reason).split("; ")
+    return f"{first.removesuffix('.')}, and {counted(len(others), 'more reason')}." if others else first
+
+
+def _median(values: Sequence[float]) -> float:
+    known = [value for value in values if isfinite(value)]
+    return float(np.median(known)) if known else np.nan

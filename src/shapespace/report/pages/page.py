@@ -1,0 +1,228 @@
+"""A self-contained page: style, scripts, pictures and payloads inside; sections fail by themselves."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+from shapespace.errors import ShapespaceError
+from shapespace.report.blocks.blocks import Block, Cell, Figure, Image, Section, Text, Turning
+from shapespace.report.blocks.wording import anchor
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Drawing
+
+    from shapespace.report.render.thumbnails import Still
+
+LARGEST_REPORT_BYTES = 8_000_000
+"""A report stays below this size, so that it can be mailed."""
+
+_SHELL_BYTES = 250_000
+_RESERVE_BYTES = 700_000
+
+Step = Callable[[str, int], None]
+"""Told what was just made, and about how many such things there will be, for a progress bar."""
+
+Make: TypeAlias = Callable[[], Block | Sequence[Block]]
+"""Makes a part of a page."""
+
+
+@dataclass(frozen=True)
+class Chapter:
+    """A part of the page that its navigation leads to: its heading, what makes it, and its link's text if shorter."""
+
+    heading: str
+    make: Make
+    link: str = ""
+
+
+class Page:
+    """A page in the making: what it embeds, how large it is so far, and where its sections failed.
+
+    Args:
+        planned: about how many pictures there will be.
+        on_step: told of each picture.
+    """
+
+    def __init__(self, planned: int, on_step: Step | None = None) -> None:
+        self._planned = planned
+        self._on_step = on_step
+        self._payloads: list[str] = []
+        self._anchors: set[str] = set()
+        self._spent = _SHELL_BYTES
+
+    @property
+    def left(self) -> int:
+        """How many bytes may still be embedded."""
+        return LARGEST_REPORT_BYTES - self._spent
+
+    def spend(self, n_bytes: int) -> None:
+        """Count bytes that are embedded by other means than this page's."""
+        self._spent += n_bytes
+
+    def step(self, what: str) -> None:
+        """Tell the progress bar what was just made."""
+        if self._on_step is not None:
+            self._on_step(what, self._planned)
+
+    def place(self, text: str) -> str:
+        """Return a name for a place in the page, made of `text` and taken only once."""
+        name = base = anchor(text)
+        count = 1
+        while name in self._anchors:
+            count += 1
+            name = f"{base}-{count}"
+        self._anchors.add(name)
+        return name
+
+    def section(
+        self, heading: str, make: Make, level: int = 3, place: str | None = None, link: str = "", *,
+        folded: bool = False, status: Cell | None = None,
+    ) -> Section:  # fmt: skip
+        """Return a section, or its heading and why it could not be made."""
+        place = place or self.place(heading)
+        return Section(heading, place, self.tried(make), level, link or heading, folded, status)
+
+    def tried(self, make: Make) -> Sequence[Block]:
+        """Return what `make` gives, or why it could not."""
+        try:
+            made = make()
+        except ShapespaceError as error:
+            return [Text(f"This part could not be made. {error}", "broken")]
+        return made if isinstance(made, Sequence) else [made]
+
+    def figure(self, figure: Drawing, caption: str, *, alt: str, chart: bool = False) -> Figure:
+        """Return a drawing with its caption; `alt` says what is seen in it."""
+        from shapespace.report.figures import encode_webp
+
+        still = encode_webp(figure, lossless=chart)
+        self.step(caption)
+        return Figure(self.image(still, alt), caption, "chart" if chart else "drawing")
+
+    def image(self, still: Still, alt: str) -> Image:
+        """Return a picture as an image of this page."""
+        self._spent += 4 * -(-len(still[0]) // 3)
+        return Image(*still, alt)
+
+    def turning(
+        self,
+        widget: Literal["modes", "morph", "fit", "scatter"],
+        payload: bytes,
+        poster: Image,
+        caption: str,
+        *,
+        label: str,
+        still: str,
+    ) -> Turning | Figure:
+        """Return something that turns, or its still alone where the page would grow too large.
+
+        Args:
+            widget: as of `blocks.Turning`, as all the others but
+            payload: what it shows, from `report.scene`.
+            poster: the still.
+            caption: of both.
+            label: what it is.
+            still: what the still shows.
+        """
+        from shapespace.report.render import scene
+
+        name = f"payload-{len(self._payloads) + 1}"
+        if not self._payloads:
+            self._spent += len(scene.scripts()) + len(scene.style())
+        text = scene.payload_html(name, payload)
+        self.step(caption)
+        if len(text) > self.left - _RESERVE_BYTES:
+            why = f"It does not turn, so that this file stays below {LARGEST_REPORT_BYTES // 1_000_000} MB."
+            return Figure(poster, f"{caption} {still} {why}")
+        self._spent += len(text)
+        self._payloads.append(text)
+        return Turning(widget, name, poster, caption, label, still)
+
+    def html(self, title: str, lead: Sequence[Block], made: str, chapters: Sequence[Chapter]) -> str:
+        """Return the whole page.
+
+        Args:
+            title: of the page.
+            lead: below the title.
+            made: by what and when.
+            chapters: its parts in order.
+        """
+        from markupsafe import Markup
+
+        # Their places come first, so that no part inside takes the name of a chapter.
+        places = [self.place(chapter.heading) for chapter in chapters]
+        sections = [
+            self.section(chapter.heading, chapter.make, 2, place, chapter.link)
+            for chapter, place in zip(chapters, places, strict=True)
+        ]
+        style, early, scripts = _asset("report.css"), _script(_asset("theme.js")), [_script(_asset("report.js"))]
+        if self._payloads:
+            from shapespace.report.render import scene
+
+            style += scene.style()
+            scripts.insert(0, _script(scene.scripts()))
+        policy = (
+            "default-src 'none'; img-src data: blob:; "
+            f"style-src {_hash(style)}; script-src {' '.join(_hash(text) for text in (early, *scripts))}; "
+            "base-uri 'none'; form-action 'none'"
+        )
+        template = _environment().get_template("page.html")
+        return template.render(
+            title=title,
+            lead=lead,
+            made=made,
+            sections=sections,
+            # Ours, and hashed by the policy above: these alone are not escaped.
+            policy=Markup(policy),
+            style=Markup(style),
+            early=Markup(early),
+            scripts=[Markup(text) for text in scripts],
+            payloads=[Markup(text) for text in self._payloads],
+        )
+
+
+def rendered(blocks: Sequence[Block]) -> str:
+    """Return blocks as HTML."""
+    from markupsafe import Markup
+
+    macros: Any = template("blocks.html").module
+    return Markup("").join(getattr(macros, type(block).__name__)(block) for block in blocks)
+
+
+def template(name: str) -> Any:
+    """Return a template of ours, which escapes all that it is given."""
+    return _environment().get_template(name)
+
+
+@cache
+def _environment() -> Any:  # what Jinja2 keeps for templates is untyped
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    made: Any = Environment(
+        loader=PackageLoader("shapespace.report"),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=StrictUndefined,
+    )
+    made.globals["blocks"] = rendered
+    return made
+
+
+@cache
+def _asset(name: str) -> str:
+    return files("shapespace.report").joinpath("assets", name).read_text(encoding="utf-8")
+
+
+def _script(text: str) -> str:
+    """Return a script of ours so that it does not end its own element; the two marks occur in its strings only."""
+    return text.replace("</script", "<\\/script").replace("<!--", "<\\!--")
+
+
+def _hash(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"

@@ -1,0 +1,429 @@
+"""Each kind of part of a recognition.json or an analysis.json as blocks of a page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from msgspec import structs
+
+from shapespace.errors import FileFormatError, ShapespaceError
+from shapespace.report.blocks import sections
+from shapespace.report.blocks.blocks import Block, Cell, Column, Figure, Folded, Notice, Table, Text, length
+from shapespace.report.blocks.wording import DASH, counted, listed, percent
+from shapespace.report.inputs.saved_fits import Folder
+from shapespace.report.pages.page import Page
+from shapespace.schemas import (
+    ANALYSIS_AGAIN,
+    PARTS,
+    STUDY_AGAIN,
+    Analysis,
+    CalibrationPart,
+    ConfusionPart,
+    CurvePart,
+    FaceMapPart,
+    HistogramPart,
+    LearningCurvePart,
+    LinesPart,
+    MeshesPart,
+    ModesPart,
+    MorphPart,
+    Part,
+    Point,
+    Recognition,
+    Still,
+    SurfaceMapPart,
+    TableColumn,
+    TablePart,
+    TextPart,
+    read,
+)
+from shapespace.types import Mesh
+
+if TYPE_CHECKING:
+    from shapespace.report.figures import Coefficients
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A kind of file with parts.
+
+    Args:
+        file: its name.
+        struct: what it holds.
+        again: what a reader can do about one that is wrong.
+        word: what it holds, in a word,
+        article: with its article,
+        title: of a page without one,
+        lead: and below it.
+    """
+
+    file: str
+    struct: type[Recognition]
+    again: str
+    word: str
+    article: str
+    title: str
+    lead: str
+
+    def wrong(self, what: str) -> FileFormatError:
+        """Return the error that says `what` is wrong with the file."""
+        return FileFormatError(f"{self.file} is damaged: {what}; {self.again}.")
+
+
+STUDY = Kept(
+    "recognition.json", Recognition, STUDY_AGAIN, "study", "a study", "Recognition study",
+    "What a study of recognition measured",
+)  # fmt: skip
+ANALYSIS = Kept(
+    Analysis.FILE, Analysis, ANALYSIS_AGAIN, "analysis", "an analysis", "Analysis", "What an analysis of shapes found"
+)
+MOST_ROWS, MOST_PARAGRAPH = 500, 2000
+_MOST_COLUMNS = 30
+TITLES = {
+    "table": "Table",
+    "confusion": "Confusion matrix",
+    "calibration": "Calibration",
+    "learning_curve": "Learning curve",
+    "modes": "Modes that carry the decision",
+    "face_map": "Regions of the face that carry the decision",
+    "lines": "Lines through neutral",
+    "meshes": "Meshes",
+    "curve": "Curve",
+    "surface_map": "Map",
+    "morph": "From one shape to the other",
+    "histogram": "Spread",
+    "text": "Notes",
+}
+"""Of parts without one, by kind."""
+Drawn = tuple[Any, str, str]
+"""A drawing, its caption where the part has no note, and what is seen in it."""
+
+
+class StudyParts:
+    """What turns parts into blocks of a page.
+
+    Args:
+        page: that they go to.
+        folder: with the arrays and meshes that they name.
+        kept: the kind of file that they stand in.
+    """
+
+    def __init__(self, page: Page, folder: Folder, kept: Kept) -> None:
+        self.page = page
+        self.folder = folder
+        self.kept = kept
+
+    def blocks(self, part: Part, title: str) -> list[Block]:
+        """Return a part by its kind.
+
+        Raises:
+            ShapespaceError: it cannot be shown.
+        """
+        return _MAKERS[type(part)](self, part, title, part.note or "")
+
+    def drawn(self, drawing: Drawn, note: str, *, chart: bool = True) -> Figure:
+        """Return a drawing with its caption, or the part's note in its place."""
+        figure, about, alt = drawing
+        return self.page.figure(figure, note or about, alt=alt, chart=chart)
+
+    def text(self, part: TextPart, title: str, note: str) -> list[Block]:
+        """Return paragraphs."""
+        return [*paragraphs(part.text), *([Text(note, "soft")] if note else [])]
+
+    def table(self, part: TablePart, title: str, note: str) -> list[Block]:
+        """Return a table that sorts."""
+        if not 1 <= len(part.columns) <= _MOST_COLUMNS:
+            raise self.kept.wrong(f"a table has {len(part.columns)} columns, not 1 to {_MOST_COLUMNS}")
+        if any(len(row) != len(part.columns) for row in part.rows):
+            raise self.kept.wrong(f"a row of a table has another number of cells than its {len(part.columns)} columns")
+        heads = [
+            Column(
+                f"{column.name} (mm)"
+                if column.kind == "mm" and "mm" not in column.name.strip("()").split()
+                else column.name,
+                "text" if column.kind == "text" else "number",
+            )
+            for column in part.columns
+        ]
+        cells = [
+            [_cell(value, column, self.kept) for value, column in zip(row, part.columns, strict=True)]
+            for row in part.rows[:MOST_ROWS]
+        ]
+        out: list[Block] = [Table(heads, cells, note or title, sortable=len(cells) > 1)]
+        if len(part.rows) > MOST_ROWS:
+            out.append(Text(f"{counted(len(part.rows) - MOST_ROWS, 'other row')} are left out."))
+        return out
+
+    def confusion(self, part: ConfusionPart, title: str, note: str) -> list[Block]:
+        """Return a confusion matrix as a picture, and folded away as a table."""
+        from shapespace.report import figures
+
+        classes = part.classes
+        if {len(row) for row in part.counts} - {len(classes)}:
+            raise self.kept.wrong(f"a confusion matrix of {len(classes)} classes has rows of another length")
+        figure = figures.confusion_figure(part.counts, classes)
+        totals = [sum(row) for row in part.counts]
+        right = [f"{name} {percent(part.counts[k][k] / totals[k])}" for k, name in enumerate(classes) if totals[k]]
+        about = (
+            "Rows: the true class. Columns: the predicted class. Percent of the row, and below it how many; an empty "
+            "cell is none. Framed: right answers."
+        )
+        alt = f"Confusion matrix of {counted(len(classes), 'class', 'classes')}; right answers: {listed(right, 40)}"
+        rows = [
+            [name, *(f"{value:g} ({percent(value / total)})" if total else DASH for value in row)]
+            for name, row, total in zip(classes, part.counts, totals, strict=True)
+        ]
+        heads = [Column("True class"), *(Column(f"predicted {name}", "number") for name in classes)]
+        table = Table(heads, [list(map(Cell, row)) for row in rows], f"Confusion matrix: {title}")
+        picture = self.page.figure(figure, f"{note} {about}".strip(), alt=alt, chart=True)
+        return [picture, Folded("The same as a table", [table])]
+
+    def calibration(self, part: CalibrationPart, title: str, note: str) -> list[Block]:
+        """Return how well stated probabilities hold."""
+        from shapespace.report import figures
+
+        bins = np.array([structs.astuple(one) for one in part.bins], dtype=np.float64).reshape(-1, 5)
+        figure = figures.calibration_figure(bins, ece=part.ece, brier=part.brier)
+        told = [f"stated {percent(said)}, right {percent(right)}" for _, _, said, right, count in bins if count > 0]
+        said = "" if part.ece is None else f"; expected calibration error {100 * part.ece:.1f} points"
+        about = (
+            "How often answers are right, against the probability stated for them: under the dashed line they are "
+            "right less often than stated. Larger dots stand for more answers, which the bars count."
+        )
+        alt = f"Calibration: {listed(told, 20)}{said}"
+        return [self.page.figure(figure, f"{note} {about}".strip(), alt=alt, chart=True)]
+
+    def learning_curve(self, part: LearningCurvePart, title: str, note: str) -> list[Block]:
+        """Return the accuracy against how many people were learned from."""
+        from shapespace.report import figures
+
+        low, high = (None if ends is None else np.array(ends, dtype=np.float64) for ends in (part.low, part.high))
+        figure = figures.learning_curve_figure(
+            part.subjects, part.mean, low=low, high=high, band=part.band or "interval", ceiling=part.ceiling
+        )
+        told = [
+            f"{100 * mean:.1f} % from {count:g} subjects" for count, mean in zip(part.subjects, part.mean, strict=True)
+        ]
+        said = "" if part.ceiling is None else f"; ceiling {100 * part.ceiling:.1f} %"
+        about = "Accuracy on subjects who were not in the training set, by the number of training subjects."
+        return [self.drawn((figure, about, f"Learning curve: {listed(told, 20)}{said}"), note)]
+
+    def modes(self, part: ModesPart, title: str, note: str) -> list[Block]:
+        """Return how much each mode carries of the decision."""
+        from shapespace.report import figures
+
+        values, unit = part.importance, part.unit
+        figure = figures.importance_figure(values, part.names, unit=unit)
+        called = part.names or [f"mode {k + 1}" for k in range(len(values))]
+        ranked = sorted(zip(values, called, strict=True), key=lambda pair: -pair[0])
+        told = listed([f"{name} {value:.3g}" for value, name in ranked[:10]])
+        alt = f"Importance of {counted(len(values), 'mode')} in {unit}, the largest: {told}"
+        return [self.drawn((figure, f"How much each mode carries of the decision, in {unit}.", alt), note)]
+
+    def face_map(self, part: FaceMapPart, title: str, note: str) -> list[Block]:
+        """Return where on the face the decision lies, and the share of each region."""
+        from shapespace.report import figures
+
+        vertices, faces, values = self._arrays(part.arrays, (part.vertices, part.faces, part.values))
+        numbers = all(array.dtype.kind in "iuf" for array in (vertices, values))
+        if not numbers or faces.dtype.kind not in "iu" or vertices.ndim != 2 or not np.isfinite(vertices).all():
+            raise self.kept.wrong("the arrays of a map are no places, triangles and numbers")
+        shares = sorted(part.regions.items(), key=lambda item: -item[1])
+        figure = figures.face_map_figure(vertices.astype(float), faces, values, unit=part.unit, regions=dict(shares))
+        told = listed([f"{name} {percent(share)}" for name, share in shares], 30)
+        alt = f"The face from the front and from aside, coloured by {part.unit}{f'; by region: {told}' if told else ''}"
+        out: list[Block] = [
+            self.drawn((figure, f"Where on the face the decision lies: {part.unit}.", alt), note, chart=False)
+        ]
+        if shares:
+            rows = [[Cell(name), Cell(f"{100 * share:.1f} %", share)] for name, share in shares[:MOST_ROWS]]
+            heads = [Column("Region"), Column("Share of the decision", "number")]
+            out.append(Folded("The shares as a table", [Table(heads, rows, title)]))
+        return out
+
+    def lines(self, part: LinesPart, title: str, note: str) -> list[Block]:
+        """Return the lines of the expressions in the first coefficients (figures 9 and 10 of the paper)."""
+        points = [_coefficients(point, self.kept) for point in part.points]
+        neutral = _coefficients(part.neutral, self.kept) if part.neutral else None
+        if not points or len({len(point.b) for point in (*points, *([neutral] if neutral else []))}) != 1:
+            raise self.kept.wrong(
+                "the points of lines must be one or more, all with as many coefficients as the neutral face"
+            )
+        lines = sections.lines_through_neutral(self.page, points, neutral)
+        return [*([Text(note)] if note else []), lines]
+
+    def meshes(self, part: MeshesPart, title: str, note: str) -> list[Block]:
+        """Return stills of meshes in rows; one that cannot be read leaves a grey field and says why."""
+        from shapespace.report import figures
+
+        problems: list[str] = []
+
+        def mesh(entry: Still) -> Mesh | None:
+            try:
+                found = self.folder.mesh(entry.file)
+                if not len(found.vertices) or not np.isfinite(found.vertices).all():
+                    raise self.kept.wrong(f"the mesh {entry.file!r} has no vertices, or some that are not finite")
+                return found
+            except ShapespaceError as error:
+                problems.append(f"{entry.label}: {error}")
+                return None
+
+        rows = [(row.label, [(entry.label, mesh(entry)) for entry in row.meshes]) for row in part.rows]
+        if problems and len(problems) == sum(len(pictures) for _, pictures in rows):
+            return [Notice("None of these meshes can be shown", problems, "broken")]
+        told = [f"{heading}: {listed([label for label, _ in pictures])}" for heading, pictures in rows]
+        drawing = (
+            figures.mesh_rows_figure(rows, title=title),
+            "One camera, one light and one scale for all.",
+            "; ".join(told)[:MOST_PARAGRAPH] or title,
+        )
+        return [self.drawn(drawing, note, chart=False), Notice("Not in the picture", problems, "broken")]
+
+    def curve(self, part: CurvePart, title: str, note: str) -> list[Block]:
+        """Return one measure against another."""
+        from shapespace.report import figures
+
+        x, y = part.x or "x", part.y or "y"
+        ends = [(one.low, one.high) for one in part.series]
+        figure = figures.curve_figure(
+            [(one.label, one.x, one.y) for one in part.series], x=x, y=y,
+            bands=[None if low is None or high is None else (_known(low), _known(high)) for low, high in ends],
+            dots=[one.points for one in part.series], scales=(part.x_scale, part.y_scale), diagonal=part.diagonal,
+        )  # fmt: skip
+        told = [
+            f"{one.label or y} from {one.y[0]:.3g} at {one.x[0]:g} to {one.y[-1]:.3g} at {one.x[-1]:g}"
+            for one in part.series
+            if one.x and one.y
+        ]
+        about = f"{y[:1].upper()}{y[1:]} against {x}."
+        bands = " Bands: its interval." if any(low is not None for low, _ in ends) else ""
+        dashes = " Dashed: where both are the same." if part.diagonal else ""
+        about += bands + dashes
+        return [self.drawn((figure, about, f"{about} {listed(told)}"), note)]
+
+    def surface_map(self, part: SurfaceMapPart, title: str, note: str) -> list[Block]:
+        """Return a number for each vertex on a surface, seen from several sides."""
+        from shapespace.report import figures
+
+        names = (part.vertices, part.faces, part.values, *([part.mask] if part.mask else []))
+        vertices, faces, values, *masks = self._arrays(part.arrays, names)
+        mesh = self._mesh(vertices, faces)
+        mask = masks[0].astype(bool) if masks else None
+        if values.dtype.kind not in "iuf" or (mask is not None and masks[0].dtype.kind not in "biu"):
+            raise self.kept.wrong("the values of a map are no numbers, or its mask is none")
+        values = values.astype(np.float64)
+        figure = figures.surface_map_figure(
+            mesh, values, unit=part.unit, signed=part.signed, limit=part.limit, mask=mask, title=None
+        )
+        known = values[np.isfinite(values)]
+        inside = "" if mask is None else f"; {percent(float(mask.mean()))} of the vertices are marked"
+        alt = (
+            f"{title}: the surface from several sides, coloured by {part.unit}, {known.min():.3g} to {known.max():.3g}"
+            f"{inside}"
+        )
+        return [self.drawn((figure, f"Seen from several sides; {part.unit}.", alt), note, chart=False)]
+
+    def morph(self, part: MorphPart, title: str, note: str) -> list[Block]:
+        """Return two shapes between which a slider moves; beside each other where nothing turns."""
+        from shapespace.report import figures
+        from shapespace.report.render.scene import pack_morph
+
+        low, high, faces = self._arrays(part.arrays, (part.low, part.high, part.faces))
+        if low.shape != high.shape:
+            raise self.kept.wrong("the two shapes of a morph have different numbers of vertices")
+        first, last = self._mesh(low, faces), self._mesh(high, faces)
+        turn, _ = figures.looked_at(first)
+        both = first.with_vertices(first.vertices @ turn.T), last.with_vertices(last.vertices @ turn.T)
+        labels = part.low_label or "low", part.high_label or "high"
+        still = figures.encode_webp(figures.morph_figure(*both, labels, title=None))
+        told = f"{title}: {labels[0]}, and {labels[1]}"
+        times = ""
+        if part.times != 1:
+            times = f" The difference is drawn {part.times:g} times as large as it is."
+        turning = self.page.turning(
+            "morph", pack_morph(*both, labels), self.page.image(still, told),
+            f"{note or f'From {labels[0]} to {labels[1]}.'}{times}",
+            label=told, still="The still shows both, from the front and from the side.",
+        )  # fmt: skip
+        return [turning]
+
+    def histogram(self, part: HistogramPart, title: str, note: str) -> list[Block]:
+        """Return a histogram."""
+        from shapespace.report import figures
+
+        figure = figures.histogram_figure(
+            part.edges, [(one.label, one.counts) for one in part.series], x=part.x, observed=part.observed,
+            observed_label=part.observed_label or "observed",
+        )  # fmt: skip
+        many = [f"{one.label} {sum(one.counts):g}".strip() for one in part.series]
+        about = f"Counts: {listed(many)}."
+        if part.observed is not None:
+            about += f" Dashed line: {part.observed_label or 'observed'}, {part.observed:.3g}."
+        alt = f"Histogram of {part.x} from {part.edges[0]:.3g} to {part.edges[-1]:.3g}. {about}"
+        return [self.drawn((figure, about, alt), note)]
+
+    def _arrays(self, name: str, names: Sequence[str]) -> list[npt.NDArray[Any]]:
+        """Return arrays of a file by their names."""
+        arrays = self.folder.arrays(name)
+        absent = [one for one in names if one not in arrays]
+        if absent:
+            raise FileFormatError(f"{name} holds no array {absent[0]!r}; {self.kept.again}.")
+        return [arrays[one] for one in names]
+
+    def _mesh(self, vertices: npt.NDArray[Any], faces: npt.NDArray[Any]) -> Mesh:
+        """Return a surface of arrays; without triangles, points."""
+        if vertices.dtype.kind not in "iuf" or faces.dtype.kind not in "iu" or vertices.ndim != 2:
+            raise self.kept.wrong("the arrays of a surface are no places and triangles")
+        if not np.isfinite(vertices).all():
+            raise self.kept.wrong("some vertices of a surface are not finite")
+        return Mesh(vertices.astype(np.float64), faces if faces.size else None, name="the surface")
+
+
+_MAKERS: Mapping[type[Part], Callable[[StudyParts, Any, str, str], list[Block]]] = {
+    kind: getattr(StudyParts, name) for name, kind in PARTS.items()
+}
+
+
+def paragraphs(said: str | tuple[str, ...]) -> list[Block]:
+    """Return sentences as paragraphs."""
+    return [Text(text) for text in ((said,) if isinstance(said, str) else said)[:MOST_ROWS]]
+
+
+def _known(values: Sequence[float | None]) -> list[float]:
+    return [float("nan") if value is None else value for value in values]
+
+
+def _coefficients(point: Point, kept: Kept) -> Coefficients:
+    from shapespace.report.figures import Coefficients
+
+    if len(point.b) != len(point.z):
+        raise kept.wrong(
+            f"a point of lines has {len(point.b)} coefficients in mm but {len(point.z)} in standard deviations"
+        )
+    return Coefficients(point.label, point.expression, point.intensity or 0.0, np.array(point.b), np.array(point.z))
+
+
+def _cell(value: object, column: TableColumn, kept: Kept) -> Cell:
+    """Return a cell of a table by the kind of its column."""
+    where = f"{kept.file}: the column {column.name!r}"
+    if column.kind == "text":
+        return Cell(DASH if value in (None, "") else str(value))
+    if value is None:
+        return Cell(DASH, float("nan"))
+    if column.kind == "interval":
+        low, high = read(tuple[float, float], value, where, kept.again)
+        return Cell(f"{100 * low:.1f} to {100 * high:.1f} %", low)
+    found = read(float, value, where, kept.again)
+    if column.kind == "mm":
+        return length(found)
+    told = {
+        "percent": f"{100 * found:.1f} %",
+        "p": "< 0.001" if found < 0.001 else f"{found:.3f}",
+        "count": f"{found:,.0f}",
+        "number": f"{found:,.0f}" if abs(found) >= 1000 else f"{found:.3g}",
+    }
+    return Cell(told[column.kind], found)

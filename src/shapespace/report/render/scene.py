@@ -1,0 +1,506 @@
+"""What turns in the browser: arrays packed for scene.js, and the scripts that draw them.
+
+The bytes of `pack` are a uint32 (little-endian) with the length of a JSON header, the header, zeros up to a multiple of
+8, then the arrays, each at a multiple of 8. `Shapespace.unpack` of scene.js reads them back.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import struct
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.errors import InputError
+from shapespace.report.inputs.staged_fit import StagedFit, measured_mm
+from shapespace.report.render.decimate import thinned
+from shapespace.schemas import FitRecord, to_json
+from shapespace.types import FloatArray, IntArray, Mesh, Similarity
+
+if TYPE_CHECKING:
+    from shapespace.model.shape_model import ShapeModel
+
+SCRIPTS = ("vendor/three.min.js", "scene.js", "widgets.js")
+"""The scripts of `assets` that a page with scenes needs, in this order; the colours come before the last."""
+
+_DTYPES = ("float32", "int32", "uint32", "uint16", "int16", "uint8")
+_UNKNOWN = -32768
+_MOST_STEPS = 32767
+# What a report rounds to: an error of 0.02 mm is a hundredth of what a good fit leaves.
+_PLACE_STEP_MM = 0.04
+_DISTANCE_STEP_MM = 0.05
+_MODE_STEP_MM = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """An array of 16-bit integers, perhaps times a scale, for `pack`.
+
+    Args:
+        values: int16 or uint16, any shape; -32768 stands for NaN where there is a scale.
+        scale: one positive number, one for each leading row, or None for integers that are what they are.
+        coded: store differences from row to row, byte by byte, which deflate makes small where neighbours are alike.
+        follows: name of an array packed before, of the same shape and scale; differences from it are coded.
+    """
+
+    values: npt.NDArray[np.int16] | npt.NDArray[np.uint16]
+    scale: float | list[float] | None = None
+    coded: bool = False
+    follows: str | None = None
+
+
+def quantised(values: npt.ArrayLike, *, step: float = 0.0, by_row: bool = False, coded: bool = False) -> Steps:
+    """Return `values` as int16 steps; the error is at most half a step.
+
+    Args:
+        values: float, any shape; NaN and infinities become NaN.
+        step: the least step; 0 takes the finest, max|values| / 32767.
+        by_row: one step for each leading row instead of one for all.
+        coded: see `Steps`.
+    """
+    array = np.asarray(values, dtype=np.float64)
+    known = np.isfinite(array)
+    size = np.where(known, np.abs(array), 0.0)
+    largest = size.reshape(len(array), -1).max(axis=1, initial=0.0) if by_row else size.max(initial=0.0)
+    scale = np.maximum(np.asarray(largest) / _MOST_STEPS, step)
+    scale = np.where(scale > 0, scale, 1.0)
+    steps = np.rint(np.where(known, array, 0.0) / (scale.reshape(-1, *[1] * (array.ndim - 1)) if by_row else scale))
+    whole = np.where(known, steps, _UNKNOWN).astype(np.int16)
+    return Steps(whole, [float(value) for value in scale] if by_row else float(scale), coded)
+
+
+def pack(arrays: Mapping[str, npt.NDArray[Any] | Steps], facts: Mapping[str, Any]) -> bytes:
+    """Return `arrays` and `facts` as bytes that `Shapespace.unpack` reads in the browser.
+
+    Args:
+        arrays: name -> array; float64 becomes float32, int64 int32 and bool uint8, other types must be float32, int32,
+            uint32, uint16, int16 or uint8, or `Steps`.
+        facts: anything JSON can hold; numbers that are not finite become null.
+
+    Raises:
+        InputError: an array of another type, or facts that JSON cannot hold.
+    """
+    specs: dict[str, Any] = {}
+    buffers: list[bytes] = []
+    offset = 0
+    for name, given in arrays.items():
+        array = given.values if isinstance(given, Steps) else _portable(name, np.asarray(given))
+        spec: dict[str, Any] = {"dtype": array.dtype.name, "shape": list(array.shape), "offset": offset}
+        data = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<")).tobytes()
+        if isinstance(given, Steps):
+            if given.scale is not None:
+                spec["scale"] = given.scale
+            if given.coded:
+                before = arrays[given.follows] if given.follows is not None else None
+                spec["coded"] = given.follows or True
+                data = _coded(array, before.values if isinstance(before, Steps) else None)
+        specs[name] = spec
+        buffers.append(data + bytes(-len(data) % 8))
+        offset += len(buffers[-1])
+    try:
+        header = json.dumps({"facts": to_json(facts), "arrays": specs}, allow_nan=False).encode("ascii")
+    except (TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"The facts of a scene must be plain values that JSON can hold ({error}).") from error
+    return struct.pack("<I", len(header)) + header + bytes(-(4 + len(header)) % 8) + b"".join(buffers)
+
+
+def _coded(array: npt.NDArray[Any], before: npt.NDArray[Any] | None) -> bytes:
+    """Return the differences from row to row modulo 2^16, small ones of both signs as small numbers, by byte planes."""
+    columns = array.shape[-1] if array.ndim > 1 else 1
+    values = array.reshape(-1, columns).view(np.uint16)
+    if before is not None:
+        values = values - before.reshape(-1, columns).view(np.uint16)
+    steps = np.diff(values, axis=0, prepend=np.zeros((1, columns), np.uint16)).view(np.int16).astype(np.int32)
+    zigzag = np.where(steps < 0, -2 * steps - 1, 2 * steps).astype("<u2")
+    return np.ascontiguousarray(zigzag.T).view(np.uint8).reshape(columns, -1, 2).transpose(0, 2, 1).tobytes()
+
+
+def pack_model(model: ShapeModel, modes: int | None = None, *, small: bool = False) -> bytes:
+    """Return what `Shapespace.Model` and the widget of modes need.
+
+    Arrays: `mean` (V, 3) mm; `faces` (F, 3), absent for point models; `modes` (K, V, 3) quantised, the displacement of
+    one standard deviation of each mode, mm; `stddev` (K,) mm; `share` (K,) of the training variance.
+
+    Args:
+        model: any model.
+        modes: how many of its modes; None takes all, and a number above them is cut to them.
+        small: for a report: rounded to 0.02 mm, and vertices and triangles in another order, which deflates well.
+
+    Raises:
+        InputError: fewer than one mode.
+    """
+    if modes is not None and modes < 1:
+        raise InputError(f"At least one mode must be packed, not {modes}.")
+    K = model.n_modes if modes is None else min(modes, model.n_modes)
+    order, faces = np.arange(model.n_vertices), model.faces
+    if small and faces is not None:
+        order, faces = _neighbours_together(faces, model.n_vertices)
+    one = np.zeros(K)
+    moved = np.empty((K, model.n_vertices, 3))
+    for k in range(K):
+        one[k] = model.stddev[k]
+        moved[k] = model.reconstruct(one) - model.mean_vertices
+        one[k] = 0.0
+    arrays: dict[str, npt.NDArray[Any] | Steps] = {
+        "mean": quantised(model.mean_vertices[order], step=_PLACE_STEP_MM, coded=True)
+        if small
+        else model.mean_vertices,
+        "modes": quantised(moved[:, order], step=_MODE_STEP_MM if small else 0.0, by_row=True, coded=small),
+        "stddev": model.stddev[:K],
+        "share": model.stddev[:K] ** 2 / model.total_variance,
+    }
+    if faces is not None:
+        arrays["faces"] = _indices(faces, model.n_vertices, coded=small)
+    place = np.argsort(order)
+    facts = {
+        "kind": "model",
+        "names": [f"mode {k + 1}" for k in range(K)],
+        "n_modes": model.n_modes,
+        "n_training": model.n_training,
+        "gauge": model.gauge,
+        "landmarks": {
+            name: {"vertices": place[corners].tolist(), "weights": weights.tolist()}
+            for name, corners, weights in zip(
+                model.landmarks.names, model.landmarks.corners, model.landmarks.barycentric, strict=True
+            )
+        },
+        "provenance": model.provenance,
+        "licence": model.licence,
+    }
+    return pack(arrays, facts)
+
+
+def pack_morph(low: Mesh, high: Mesh, labels: tuple[str, str], *, largest: int = 20_000) -> bytes:
+    """Return what the widget of a morph needs: two shapes in correspondence as a mean and one mode, from -1 to 1.
+
+    Arrays: `mean` (V, 3) mm; `faces`, absent for points; `modes` (1, V, 3) mm, half of the difference.
+
+    Args:
+        low: where the slider begins.
+        high: in correspondence with it; where the slider ends.
+        labels: what they are.
+        largest: how many triangles (or points) are kept.
+    """
+    middle, half = (low.vertices + high.vertices) / 2, (high.vertices - low.vertices) / 2
+    mesh, kept = _small(low.with_vertices(middle), largest)
+    extent = float(np.ptp(middle, axis=0).max())
+    arrays: dict[str, npt.NDArray[Any] | Steps] = {
+        "mean": quantised(mesh.vertices, step=min(_PLACE_STEP_MM, extent / 4000), coded=True),
+        "modes": quantised(half[None, kept], step=min(_MODE_STEP_MM, extent / 8000), by_row=True, coded=True),
+    }
+    if mesh.faces is not None:
+        arrays["faces"] = _indices(mesh.faces, len(mesh.vertices), coded=True)
+    return pack(arrays, {"kind": "morph", "low": labels[0], "high": labels[1]})
+
+
+def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: int | None = None) -> bytes:
+    """Return what the widget of a fit needs: the scan, the model at each stage, distances, regions, iterations.
+
+    Arrays: `scan` (S, 3) mm and `scan_faces`; `faces` of the model; by stage `surface_STAGE` (V, 3) mm,
+    `model_to_scan_STAGE` (V,) and `scan_to_model_STAGE` (S,) mm, signed where the fact `signed` is true, lengths where
+    the scan is a point cloud, not-a-number where unknown; `beyond_model_STAGE` and
+    `beyond_scan_STAGE` (101,), the shares of all vertices farther than 0, 0.1, ... 10 mm; `regions` (V,) codes, where
+    the stages were saved;
+    of a scan with colours `scan_colours` (S, 3), `colours_final` and `colours_dense` (V, 3) uint8;
+    `b`, `z`, `b_stddev` (K,); `history_b` (n, K) mm, `history_T` (n, 3, 4), `history_phase`, `history_iteration`
+    and `history_rms_mm` (n,). The fact `scale_mm` is the end of the one colour scale of this fit.
+
+    Args:
+        staged: a fit with its stages.
+        largest_scan: for a report: scan and model are thinned to at most this many triangles (or points) each, rounded
+            to 0.02 mm, their vertices put in another order, and the iterations left out. None packs all as it is.
+        most_sent: without `largest_scan`: the scan alone is thinned to at most this many triangles (or points).
+
+    Raises:
+        InputError: `largest_scan` or `most_sent` below 1.
+    """
+    for limit in (largest_scan, most_sent):
+        if limit is not None and limit < 1:
+            raise InputError(f"A scan must keep at least one triangle, not {limit}.")
+    small = largest_scan is not None
+    last = list(staged.surfaces.values())[-1]
+    scan, model = staged.scan, last
+    of_scan, of_model = np.arange(len(scan.vertices)), np.arange(len(model.vertices))
+    if largest_scan is not None:
+        scan, of_scan = _small(scan, largest_scan)
+        model, of_model = _small(last, largest_scan)
+    elif most_sent is not None:
+        scan, of_scan = thinned(scan, most_sent)
+    arrays: dict[str, npt.NDArray[Any] | Steps] = {"scan": _places(scan.vertices, small)}
+    if scan.faces is not None:
+        arrays["scan_faces"] = _indices(scan.faces, len(scan.vertices), coded=small)
+    if model.faces is not None:
+        arrays["faces"] = _indices(model.faces, len(model.vertices), coded=small)
+    arrays |= _stage_arrays(staged, of_model, of_scan, small=small)
+    arrays |= {
+        "b": staged.b,
+        "z": staged.z,
+        "b_stddev": staged.b_stddev,
+    }
+    if staged.regions is not None:
+        arrays["regions"] = staged.regions[of_model].astype(np.uint8)
+    if staged.history and not small:
+        arrays |= _history(staged)
+    arrays |= _colours(staged, of_model, of_scan)
+    facts = {
+        "kind": "fit",
+        "name": staged.name,
+        "label": staged.label,
+        "status": staged.status,
+        "reason": staged.reason,
+        "stages": list(staged.surfaces),
+        "scale_mm": staged.scale_mm,
+        # Points have no inside.
+        "signed": staged.scan.faces is not None,
+        "mean_mm": {
+            stage: {"model": _mean(staged.model_to_scan_mm[stage]), "scan": _mean(staged.scan_to_model_mm[stage])}
+            for stage in staged.surfaces
+        },
+        "region_shares": _region_shares(staged),
+        "scan_vertices": len(staged.scan.vertices),
+        "scan_faces": 0 if staged.scan.faces is None else len(staged.scan.faces),
+        "thinned": len(scan.vertices) < len(staged.scan.vertices) or len(model.vertices) < len(last.vertices),
+    }
+    return pack(arrays, facts)
+
+
+def pack_surfaces(
+    surfaces: Mapping[str, Mesh], record: FitRecord, *, name: str, label: str, why: str, largest: int | None = None
+) -> bytes:
+    """Return the data for the widget of a fit without its scan: as `pack_fit`, without scan and distances.
+
+    Args:
+        surfaces: `final`, and `dense` where there is one, with the same triangles, in the model's frame.
+        record: of the fit.
+        name: of the fit.
+        label: what pictures call it.
+        why: there is no scan to show, as the end of a sentence.
+        largest: for a report: how many triangles (or points) are kept; None packs all as it is.
+    """
+    last = list(surfaces.values())[-1]
+    model, kept = (last, np.arange(len(last.vertices))) if largest is None else _small(last, largest)
+    small = largest is not None
+    places = {f"surface_{stage}": surface.vertices[kept] for stage, surface in surfaces.items()}
+    arrays: dict[str, npt.NDArray[Any] | Steps] = {}
+    if model.faces is not None:
+        arrays["faces"] = _indices(model.faces, len(model.vertices), coded=small)
+    arrays |= _alike(places) if small else {key: _places(points, small) for key, points in places.items()}
+    arrays |= {key: np.array(getattr(record, key), dtype=np.float64) for key in ("b", "z", "b_stddev")}
+    facts = {
+        "kind": "fit",
+        "name": name,
+        "label": label,
+        "status": record.status,
+        "reason": record.reason,
+        "stages": list(surfaces),
+        "without_scan": f"The fitted surface is shown alone, since {why}",
+        "thinned": len(model.vertices) < len(last.vertices),
+    }
+    return pack(arrays, facts)
+
+
+def _stage_arrays(
+    staged: StagedFit, of_model: npt.NDArray[np.intp], of_scan: npt.NDArray[np.intp], *, small: bool
+) -> dict[str, npt.NDArray[Any] | Steps]:
+    """Return surface and distances at each stage, of these vertices and scan points; shares are of all of them."""
+    surfaces = {f"surface_{stage}": surface.vertices[of_model] for stage, surface in staged.surfaces.items()}
+    arrays: dict[str, npt.NDArray[Any] | Steps] = {}
+    arrays |= _alike(surfaces) if small else {name: _places(values, small) for name, values in surfaces.items()}
+    step = _DISTANCE_STEP_MM if small else 0.0
+    signed = staged.scan.faces is not None
+    for stage in staged.surfaces:
+        forward, backward = staged.model_to_scan_mm[stage][of_model], staged.scan_to_model_mm[stage][of_scan]
+        if not signed:
+            forward, backward = np.abs(forward), np.abs(backward)
+        arrays[f"model_to_scan_{stage}"] = quantised(forward, step=step, coded=small)
+        arrays[f"scan_to_model_{stage}"] = quantised(backward, step=step, coded=small)
+        arrays[f"beyond_model_{stage}"] = _shares_beyond(staged.model_to_scan_mm[stage])
+        arrays[f"beyond_scan_{stage}"] = _shares_beyond(staged.scan_to_model_mm[stage])
+    return arrays
+
+
+def _colours(
+    staged: StagedFit, of_model: npt.NDArray[np.intp], of_scan: npt.NDArray[np.intp]
+) -> dict[str, npt.NDArray[Any] | Steps]:
+    """Return the colours of the scan, and those that the surfaces took from it, where there are any."""
+    arrays: dict[str, npt.NDArray[Any] | Steps] = {}
+    if staged.scan.colours is not None:
+        arrays["scan_colours"] = staged.scan.colours[of_scan]
+    for stage, surface in staged.surfaces.items():
+        if surface.colours is not None:
+            arrays[f"colours_{stage}"] = surface.colours[of_model]
+    return arrays
+
+
+def _history(staged: StagedFit) -> dict[str, npt.NDArray[Any]]:
+    """Return the iterations as arrays."""
+    moments, K = staged.history, len(staged.b)
+    return {
+        "history_b": np.array([moment.b for moment in moments]).reshape(-1, K),
+        "history_T": np.array([_matrix(moment.T_final_now) for moment in moments]).reshape(-1, 3, 4),
+        "history_phase": np.array([moment.phase for moment in moments], dtype=np.int32),
+        "history_iteration": np.array([moment.iteration for moment in moments], dtype=np.int32),
+        "history_rms_mm": np.array([moment.rms_mm for moment in moments], dtype=np.float32),
+    }
+
+
+def pack_scatter(
+    points: FloatArray, labels: Sequence[str], names: Sequence[str], *, axes: Sequence[str], unit: str = "mm"
+) -> bytes:
+    """Return what the widget of a scatter needs.
+
+    Arrays: `points` (n, K) float32; `labels` (n,) int32 codes into the fact `labels`, by first appearance.
+
+    Args:
+        points: (n, K) coefficients, K at least 1.
+        labels: n labels, which give the colours.
+        names: n names.
+        axes: K names of the coefficients.
+        unit: of the coefficients, in words.
+
+    Raises:
+        InputError: lengths that do not go together.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    if (
+        points.ndim != 2
+        or not len(points) == len(labels) == len(names)
+        or points.shape[1] != len(axes)
+        or not len(axes)
+    ):
+        raise InputError(
+            f"A scatter of points {points.shape} needs a label and a name for each point and a name for each "
+            f"coefficient, not {len(labels)}, {len(names)} and {len(axes)}."
+        )
+    kinds = list(dict.fromkeys(labels))
+    codes = np.array([kinds.index(label) for label in labels], dtype=np.int32)
+    facts = {"kind": "scatter", "labels": kinds, "names": list(names), "axes": list(axes), "unit": unit}
+    return pack({"points": points, "labels": codes}, facts)
+
+
+def scripts() -> str:
+    """Return the JavaScript of a page with scenes, for one inline `<script>`."""
+    from shapespace.report.render import palette as colours
+
+    folder = files("shapespace.report").joinpath("assets")
+    shared = {
+        "sequential": colours.as_list(colours.SEQUENTIAL),
+        "diverging": colours.as_list(colours.DIVERGING),
+        "regions": {name: list(colour) for name, colour in colours.REGION_COLOURS.items()},
+        "categories": [list(colour) for colour in colours.CATEGORIES],
+        "clay": list(colours.CLAY),
+        "scan": list(colours.SCAN_COLOUR),
+        "model": list(colours.MODEL_COLOUR),
+        "dense": list(colours.DENSE_COLOUR),
+        "unknown": list(colours.UNKNOWN_COLOUR),
+        "signal": list(colours.BEYOND_COLOUR),
+    }
+    texts = [folder.joinpath(name).read_text(encoding="utf-8") for name in SCRIPTS]
+    texts.insert(-1, f"Shapespace.colours = {json.dumps(shared)};\n")
+    return "\n".join(texts)
+
+
+def style() -> str:
+    """Return the CSS of views and widgets, for a page that defines --page, --ink, --soft, --line, --card, --accent."""
+    return files("shapespace.report").joinpath("assets/widgets.css").read_text(encoding="utf-8")
+
+
+def payload_html(identifier: str, payload: bytes) -> str:
+    """Return `payload` as a script element of a type that browsers keep but never run: deflated, in base64.
+
+    Args:
+        identifier: its id, escaped here; widgets are given the element or this id.
+        payload: from `pack`.
+    """
+    text = base64.b64encode(zlib.compress(payload, 9)).decode("ascii")
+    mark = escape(identifier, quote=True)
+    return f'<script type="application/octet-stream" data-coding="deflate" id="{mark}">{text}</script>\n'
+
+
+def _portable(name: str, array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    wanted = {"float64": np.float32, "int64": np.int32, "bool": np.uint8}.get(array.dtype.name)
+    if wanted is not None:
+        if array.dtype == np.int64 and array.size and np.abs(array).max() > np.iinfo(np.int32).max:
+            raise InputError(f"The array {name!r} holds integers beyond 32 bits, which scenes do not have.")
+        array = array.astype(wanted)
+    if array.dtype.name not in _DTYPES:
+        raise InputError(f"The array {name!r} has the type {array.dtype}; scenes have {', '.join(_DTYPES)}.")
+    return array
+
+
+def _indices(faces: IntArray, vertices: int, *, coded: bool) -> npt.NDArray[Any] | Steps:
+    if vertices > 1 << 16:
+        return faces.astype(np.uint32)
+    return Steps(faces.astype(np.uint16), coded=coded)
+
+
+def _places(points: FloatArray, small: bool) -> npt.NDArray[Any] | Steps:
+    return quantised(points, step=_PLACE_STEP_MM, coded=True) if small else points.astype(np.float32)
+
+
+def _alike(surfaces: Mapping[str, FloatArray]) -> dict[str, Steps]:
+    """Return surfaces of the same vertices in one step, each but the first as what differs from the one before."""
+    largest = max(float(np.abs(points).max(initial=0.0)) for points in surfaces.values())
+    step = max(largest / _MOST_STEPS, _PLACE_STEP_MM)
+    out: dict[str, Steps] = {}
+    before: str | None = None
+    for name, points in surfaces.items():
+        out[name] = Steps(np.rint(points / step).astype(np.int16), step, True, before)
+        before = name
+    return out
+
+
+def _small(mesh: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
+    """Return `mesh` thinned, with neighbours near each other in the order, and the indices of its vertices."""
+    few, kept = thinned(mesh, largest)
+    if few.faces is None:
+        return few, kept
+    order, faces = _neighbours_together(few.faces, len(few.vertices))
+    return Mesh(few.vertices[order], faces, name=mesh.name), kept[order]
+
+
+def _neighbours_together(faces: IntArray, vertices: int) -> tuple[npt.NDArray[np.intp], IntArray]:
+    """Return an order of the vertices, (V,), in which neighbours are near, and the sorted triangles in that order."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+    rows, columns = faces[:, [0, 1, 2, 1, 2, 0]].ravel(), faces[:, [1, 2, 0, 0, 1, 2]].ravel()
+    graph = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(vertices, vertices)).tocsr()
+    order = np.asarray(reverse_cuthill_mckee(graph, symmetric_mode=True), dtype=np.intp)
+    place = np.empty(vertices, dtype=np.int32)
+    place[order] = np.arange(vertices, dtype=np.int32)
+    moved = place[faces]
+    first = moved.argmin(axis=1)[:, None]
+    moved = np.take_along_axis(moved, (first + np.arange(3)) % 3, axis=1)
+    return order, moved[np.lexsort((moved[:, 2], moved[:, 1], moved[:, 0]))]
+
+
+def _region_shares(staged: StagedFit) -> list[float]:
+    """Return the share of each region of `fit.regions.REGIONS`; empty where the regions were not saved."""
+    if staged.regions is None:
+        return []
+    return (np.bincount(staged.regions, minlength=4) / max(len(staged.regions), 1)).tolist()
+
+
+def _mean(signed_mm: FloatArray) -> float:
+    known = measured_mm(signed_mm)
+    return float(known.mean()) if len(known) else math.nan
+
+
+def _shares_beyond(signed_mm: FloatArray) -> npt.NDArray[Any]:
+    known = np.sort(measured_mm(signed_mm))
+    within = np.searchsorted(known, np.arange(101) / 10.0 + 1e-9, side="right")
+    return (1.0 - within / max(len(known), 1)).astype(np.float32)
+
+
+def _matrix(T: Similarity) -> FloatArray:
+    return np.column_stack([T.scale * T.rotation, T.translation])

@@ -1,0 +1,122 @@
+"""Small stills for cards: one strip of equal panels for each fit, all on one scale, as WebP."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+from PIL import Image as PillowImage
+
+from shapespace.geometry.distortion import Distortion
+from shapespace.geometry.normals import faces_of
+from shapespace.report.inputs.correspondence_folder import drawable, there_are
+from shapespace.report.render.checkerboard import checker_layer, checker_places
+from shapespace.report.render.palette import DIVERGING, MODEL_COLOUR, SCAN_COLOUR, SEQUENTIAL, Colour
+from shapespace.report.render.renderer import Camera, Image, Layer, distance_layer, render, render_series
+from shapespace.types import FloatArray, IntArray, Mesh
+
+if TYPE_CHECKING:
+    from shapespace.report.inputs.staged_fit import StagedFit
+
+PANEL = (176, 232)
+"""Width and height of a panel in pixels."""
+
+AREA_LIMIT = 2.0
+"""The factor of growth at which the maps of change of area end."""
+FOLD_COLOUR: Colour = (0.05, 0.05, 0.05)
+
+Still: TypeAlias = tuple[bytes, tuple[int, int]]
+"""WebP, and its width and height in pixels."""
+
+
+def fit_strip(fit: StagedFit, limit_mm: float, panel: tuple[int, int] = PANEL) -> Still:
+    """Return three panels: the scan, scan and model over each other, distances from model to scan.
+
+    The distances are signed, on `colours.DIVERGING` from -limit_mm; those to a point cloud, which has no inside, are on
+    `colours.SEQUENTIAL` from 0. Vertices that the scan does not show are grey.
+
+    Args:
+        fit: with its stages.
+        limit_mm: where the scale of the distances ends.
+        panel: width and height of each panel in pixels.
+    """
+    surface = fit.surfaces["final"]
+    camera = Camera.framing(surface.vertices, aspect=panel[0] / panel[1], margin=0.02)
+    scan, model = Layer(fit.scan, SCAN_COLOUR), Layer(surface, MODEL_COLOUR)
+    plain, both = render_series([[scan], [scan, model]], camera=camera, size=panel)
+    distances = distance_layer(surface, fit.model_to_scan_mm["final"], limit_mm, signed=fit.scan.faces is not None)
+    seen = render(distances, camera=camera, size=panel)
+    return encoded(np.concatenate([plain, both, seen], axis=1))
+
+
+def correspondence_strip(
+    mean: Mesh, vertices: FloatArray, scan: Mesh | None, distance: FloatArray, limit: float,
+    panel: tuple[int, int] = PANEL,
+) -> Still:  # fmt: skip
+    """Return panels: the scan, the checkerboard on it, its distance, and the change of area with folded triangles.
+
+    Distances are on `colours.SEQUENTIAL` from 0; areas on `colours.DIVERGING`, from blue for `1 / AREA_LIMIT` to red
+    for `AREA_LIMIT`. Triangles that fold over are black, with those around them, so that they are seen.
+
+    Args:
+        mean: the mean shape, upright.
+        vertices: (V, 3) of the surface, moved onto the mean shape; not-a-number where missing.
+        scan: the raw scan moved likewise; None leaves out its panel and that of the distances.
+        distance: (V,) of the vertices from the scan, not-a-number where unknown; not used without a scan.
+        limit: where the scale of the distances ends.
+        panel: width and height of each panel in pixels.
+    """
+    surface = mean.with_vertices(vertices)
+    there, far = drawable(surface, distance)
+    faces, changed = faces_of(surface), Distortion.of(surface, mean)
+    _, growth = drawable(surface, _at_vertices(changed.growth, faces, len(vertices)))
+    layers = [[checker_layer(surface, checker_places(mean))]]
+    if scan is not None:
+        layers = [
+            [Layer(drawable(scan)[0], SCAN_COLOUR)], *layers,
+            [Layer(there, scalars=far, colormap=SEQUENTIAL, vmax=limit)],
+        ]  # fmt: skip
+    end = float(np.log(AREA_LIMIT))
+    area = [Layer(there, scalars=growth, colormap=DIVERGING, vmin=-end, vmax=end)]
+    if changed.folded.any():
+        around = np.isin(faces, faces[changed.folded]).any(axis=1) & there_are(vertices)[faces].all(axis=1)
+        # Of equally near surfaces the first stays.
+        area.insert(0, Layer(Mesh(np.nan_to_num(vertices), faces[around]), FOLD_COLOUR))
+    framed = np.concatenate([mean.vertices, there.vertices])
+    camera = Camera.framing(framed, aspect=panel[0] / panel[1], margin=0.02)
+    pictures = [render(*one, camera=camera, size=panel) for one in (*layers, area)]
+    return encoded(np.concatenate(pictures, axis=1))
+
+
+def _at_vertices(values: FloatArray, faces: IntArray, vertices: int) -> FloatArray:
+    """Return the mean (V,) of what is known of the triangles around each vertex."""
+    known = np.isfinite(values)
+    flat = faces[known].ravel()
+    count = np.bincount(flat, minlength=vertices)
+    total = np.bincount(flat, np.repeat(values[known], 3), vertices)
+    return np.divide(total, count, out=np.full(vertices, np.nan), where=count > 0)
+
+
+def mesh_still(mesh: Mesh, panel: tuple[int, int] = PANEL) -> Still:
+    """Return one mesh from the front, as its axes stand."""
+    camera = Camera.framing(mesh.vertices, aspect=panel[0] / panel[1], margin=0.06)
+    # Points are drawn as balls, of a size that joins them whatever the unit of the file.
+    radius = 0.004 * float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+    return encoded(render(Layer(mesh, point_radius_mm=max(radius, 1e-9)), camera=camera, size=panel))
+
+
+def colour_bar(colours: Sequence[Sequence[float]] | np.ndarray = DIVERGING) -> Still:
+    """Return a map as a bar of 256 by 10 pixels."""
+    row = np.rint(255 * np.asarray(colours)).astype(np.uint8)
+    return encoded(np.repeat(row[None], 10, axis=0), lossless=True)
+
+
+def encoded(image: Image, *, lossless: bool = False, quality: int = 84, effort: int = 3) -> Still:
+    """Return pixels (H, W, 3) uint8 as WebP."""
+    stream = io.BytesIO()
+    PillowImage.fromarray(np.ascontiguousarray(image)).save(
+        stream, format="WEBP", lossless=lossless, quality=quality, method=effort
+    )
+    return stream.getvalue(), (image.shape[1], image.shape[0])
