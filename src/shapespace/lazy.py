@@ -66,12 +66,12 @@ def lazy_import(name: str) -> Callable[..., Any]:
     return getattr(import_module(f"shapespace.{LAZY_FUNCTIONS[name]}"), name)
 
 
-def other_package(module: str, what: str, install: str = "") -> Any:
+def other_package(module: str, purpose: str, install: str = "") -> Any:
     """Return a module of a package that shapespace does not require.
 
     Args:
         module: its name.
-        what: needs it, at the beginning of a sentence.
+        purpose: needs it, at the beginning of a sentence.
         install: what pip is to install, where that is not called as the module.
 
     Raises:
@@ -82,7 +82,7 @@ def other_package(module: str, what: str, install: str = "") -> Any:
     except ImportError as error:
         package = module.partition(".")[0]
         if isinstance(error, ModuleNotFoundError) and error.name == package:
-            why = f"which is not installed; run pip install {install or package}."
+            cause = f"which is not installed; run pip install {install or package}."
         else:
-            why = f"which is installed and cannot be loaded ({error}); see how it is to be installed."
-        raise ShapespaceError(f"{what} needs {package}, {why}") from error
+            cause = f"which is installed and cannot be loaded ({error}); see how it is to be installed."
+        raise ShapespaceError(f"{purpose} needs {package}, {cause}") from error

@@ -19,14 +19,14 @@ def short_repr(self: Any) -> str:
 
     It stands in a class as `__repr__ = short_repr`.
     """
-    told = (f"{one.name}={told_briefly(getattr(self, one.name))}" for one in fields(self) if one.repr)
-    return f"{type(self).__name__}({', '.join(told)})"
+    shown_fields = (f"{item.name}={told_briefly(getattr(self, item.name))}" for item in fields(self) if item.repr)
+    return f"{type(self).__name__}({', '.join(shown_fields)})"
 
 
 def listed_briefly(parts: Sequence[str]) -> str:
     """Return the first of `parts`, and the number of the others, in one line."""
-    more = f"; and {len(parts) - _MOST_NAMES} more" if len(parts) > _MOST_NAMES else ""
-    return "; ".join(_clipped(part) for part in parts[:_MOST_NAMES]) + more
+    others_note = f"; and {len(parts) - _MOST_NAMES} more" if len(parts) > _MOST_NAMES else ""
+    return "; ".join(_clipped(part) for part in parts[:_MOST_NAMES]) + others_note
 
 
 def told_briefly(value: Any) -> str:
@@ -44,13 +44,13 @@ def told_briefly(value: Any) -> str:
 
 def _of_mapping(value: Mapping[object, object]) -> str:
     names = [str(name) for name in value]
-    more = f", and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
-    return "{" + ", ".join(_clipped(name) for name in names[:_MOST_NAMES]) + more + "}"
+    others_note = f", and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+    return "{" + ", ".join(_clipped(name) for name in names[:_MOST_NAMES]) + others_note + "}"
 
 
 def _of_other(value: object) -> str:
-    told = repr(value)
-    return f"{type(value).__name__}(…)" if is_dataclass(value) and len(told) > _LONGEST else _clipped(told)
+    text = repr(value)
+    return f"{type(value).__name__}(…)" if is_dataclass(value) and len(text) > _LONGEST else _clipped(text)
 
 
 def _of_array(array: npt.NDArray[Any]) -> str:

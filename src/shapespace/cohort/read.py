@@ -123,27 +123,27 @@ def _rows(results: Results) -> list[_Row]:
     texts = ("scan", "status", "scan_name", "scan_hash", "model_hash")
     columns = (*texts, "centroid_size_mm", "mm_per_scan_unit", "beyond_model_mm", "modes", *known)
     numbers = [*(f"b{k}" for k in modes), *(f"b{k}_stddev" for k in modes)]
-    found: list[_Row] = []
+    rows: list[_Row] = []
     for part in results.iter_rows((*columns, *numbers)):
         values = np.array([part[column] for column in numbers], dtype=np.float64).reshape(2, len(modes), -1)
-        for at in range(len(part["scan"])):
-            own = int(part["modes"][at] or 0)
-            found.append(
+        for index in range(len(part["scan"])):
+            n_modes = int(part["modes"][index] or 0)
+            rows.append(
                 _Row(
-                    str(part["scan"][at] or ""),
-                    str(part["status"][at] or ""),
-                    str(part["scan_name"][at] or ""),
-                    str(part["scan_hash"][at] or ""),
-                    str(part["model_hash"][at] or ""),
-                    values[0, :own, at],
-                    values[1, :own, at],
-                    _number(part["centroid_size_mm"][at]),
-                    _number(part["mm_per_scan_unit"][at]),
-                    _number(part["beyond_model_mm"][at]),
-                    {column.removeprefix(META): str(part[column][at] or "").strip() for column in known},
+                    str(part["scan"][index] or ""),
+                    str(part["status"][index] or ""),
+                    str(part["scan_name"][index] or ""),
+                    str(part["scan_hash"][index] or ""),
+                    str(part["model_hash"][index] or ""),
+                    values[0, :n_modes, index],
+                    values[1, :n_modes, index],
+                    _number(part["centroid_size_mm"][index]),
+                    _number(part["mm_per_scan_unit"][index]),
+                    _number(part["beyond_model_mm"][index]),
+                    {column.removeprefix(META): str(part[column][index] or "").strip() for column in known},
                 )
             )
-    return sorted(found, key=lambda row: row.name)
+    return sorted(rows, key=lambda row: row.name)
 
 
 def _of_results(
@@ -161,27 +161,27 @@ def _of_results(
         heads = dict.fromkeys(head for row in rows for head in row.known)
         cells = {head: tuple(row.known.get(head, "") for row in rows) for head in heads}
         table = Table(cells, tuple(row.name for row in rows), str(results.folder))
-        pairs = [(row, at) for at, row in enumerate(rows)]
+        pairs = [(row, index) for index, row in enumerate(rows)]
     else:
         by_key = _by_key(rows)
-        pairs = [(by_key[key], at) for at, key in enumerate(keys) if key in by_key]
+        pairs = [(by_key[key], index) for index, key in enumerate(keys) if key in by_key]
         _tell_unmatched(
             notes, table, keys, by_key, [row.name for row, _ in pairs], [row.name for row in rows], results.folder
         )
-    kept = [(row, at) for row, at in pairs if row.status in used]
+    accepted = [(row, index) for row, index in pairs if row.status in used]
     for status, count in Counter(row.status for row, _ in pairs if row.status not in used).items():
-        who = named([row.name for row, _ in pairs if row.status == status])
-        notes.append(f"{count} of {len(pairs)} fits are left out, which are {status} ({who}).")
+        excluded_names = named([row.name for row, _ in pairs if row.status == status])
+        notes.append(f"{count} of {len(pairs)} fits are left out, which are {status} ({excluded_names}).")
     least = options.least if onto is None else 1
-    if len(kept) < least:
+    if len(accepted) < least:
         raise InputError(
-            f"{results.folder}: {len(kept)} of its fits can be used, and {_count_is(least)} the least; "
+            f"{results.folder}: {len(accepted)} of its fits can be used, and {_count_is(least)} the least; "
             + (notes[-1] if notes else "fit more scans.")
         )
-    fits = [row for row, _ in kept]
+    fits = [row for row, _ in accepted]
     _refuse_mixed(fits, results.folder)
     model, additive = _model_of(results, fits[0], None if options.model is None else Path(options.model))
-    stated = table.take([at for _, at in kept])
+    stated = table.take([index for _, index in accepted])
     names = tuple(row.name for row in fits)
     sizes = read_only([row.size_mm for row in fits])
     width = max(len(row.b) for row in fits)
@@ -198,9 +198,9 @@ def _of_results(
     if kind == "coefficients":
         cohort = Cohort.of_fits(fitted, names, stated, sizes, options.gauge)
     else:
-        lacking = [name for name in names if not results.has(name, kind)]
-        if lacking:
-            raise InputError(f"{results.folder} holds no {kind} surface of {named(lacking)}; fit them again"
+        without_surface = [name for name in names if not results.has(name, kind)]
+        if without_surface:
+            raise InputError(f"{results.folder} holds no {kind} surface of {named(without_surface)}; fit them again"
                              f"{' with --dense' if kind == 'dense' else ''}.")  # fmt: skip
         unknown = [row.name for row in fits if not np.isfinite(row.mm_per_unit)]
         if unknown and options.gauge == "form":
@@ -209,12 +209,12 @@ def _of_results(
                 "or compare shapes with --gauge shape."
             )
         meshes: list[Mesh] = []
-        for at, row in enumerate(fits):
+        for index, row in enumerate(fits):
             mesh = results.surface(row.name, kind)
             ratio = row.mm_per_unit if np.isfinite(row.mm_per_unit) else 1.0
             meshes.append(replace(mesh.with_vertices(mesh.vertices * ratio), name=row.name))
             if on_shape is not None:
-                on_shape(at + 1, len(fits))
+                on_shape(index + 1, len(fits))
         cohort = replace(
             Cohort.of_meshes(meshes, stated, options.gauge, onto, options.least),
             fitted=fitted,
@@ -226,11 +226,11 @@ def _of_results(
 
 
 def _kind(
-    asked: Surfaces, results: Results, names: Sequence[str], gauge: Gauge, fits: Sequence[_Row], onto: Cohort | None
+    surfaces: Surfaces, results: Results, names: Sequence[str], gauge: Gauge, fits: Sequence[_Row], onto: Cohort | None
 ) -> Literal["coefficients", "fitted", "dense"]:
     """Return the kind of shapes of fits to read: the requested one, or for `auto` the most complete one."""
-    if asked != "auto":
-        return asked
+    if surfaces != "auto":
+        return surfaces
     if onto is not None and onto.fitted is not None and onto.source.kind in ("coefficients", "fitted", "dense"):
         return onto.source.kind
     sized = gauge == "shape" or all(np.isfinite(row.mm_per_unit) for row in fits)
@@ -245,25 +245,29 @@ def _of_surfaces(
     onto: Cohort | None,
     on_shape: Callable[[int, int], None] | None,
 ) -> Cohort:
-    found = surface_files([folder])
-    notes = list(found.notes)
+    listing = surface_files([folder])
+    notes = list(listing.notes)
     if options.gauge == "form":
-        found.refuse_mixed_units()
-    files = {surface_stem(file): file for file in found.files if file.suffix.lower() != ".csv"}
-    kept = [(files[key], at) for at, key in enumerate(keys) if key in files]
-    _tell_unmatched(notes, table, keys, files, [surface_stem(file) for file, _ in kept], list(files), folder)
+        listing.refuse_mixed_units()
+    files = {surface_stem(file): file for file in listing.files if file.suffix.lower() != ".csv"}
+    matched = [(files[key], row_index) for row_index, key in enumerate(keys) if key in files]
+    _tell_unmatched(notes, table, keys, files, [surface_stem(file) for file, _ in matched], list(files), folder)
     least = options.least if onto is None else 1
-    if len(kept) < least:
-        raise InputError(f"{folder}: {len(kept)} of its meshes are in {table.where}, and {_count_is(least)} the least.")
+    if len(matched) < least:
+        raise InputError(
+            f"{folder}: {len(matched)} of its meshes are in {table.where}, and {_count_is(least)} the least."
+        )
     meshes: list[Mesh] = []
-    for done, (file, _) in enumerate(kept, 1):
+    for n_read, (file, _) in enumerate(matched, 1):
         mesh = mesh_at(file)
-        ratio = found.unit_ratios.get(file, 1.0)
+        ratio = listing.unit_ratios.get(file, 1.0)
         meshes.append(replace(mesh.with_vertices(mesh.vertices / ratio), name=surface_stem(file)))
         if on_shape is not None:
-            on_shape(done, len(kept))
-    cohort = Cohort.of_meshes(meshes, table.take([at for _, at in kept]), options.gauge, onto, options.least)
-    corresponding = all(file.name.endswith(SURFACE) for file, _ in kept)
+            on_shape(n_read, len(matched))
+    cohort = Cohort.of_meshes(
+        meshes, table.take([row_index for _, row_index in matched]), options.gauge, onto, options.least
+    )
+    corresponding = all(file.name.endswith(SURFACE) for file, _ in matched)
     source = ShapeSource("corresponding" if corresponding else "surfaces")
     return replace(cohort, notes=(*notes, *cohort.notes), source=source)
 
@@ -272,7 +276,7 @@ def _tell_unmatched(
     notes: list[str],
     table: Table,
     keys: Sequence[str],
-    there: Mapping[str, Any],
+    available: Mapping[str, Any],
     used: Sequence[str],
     names: Sequence[str],
     folder: Path,
@@ -282,7 +286,7 @@ def _tell_unmatched(
     Raises:
         InputError: no row has a shape.
     """
-    unknown = [key for key in keys if key not in there]
+    unknown = [key for key in keys if key not in available]
     if len(unknown) == len(keys):
         raise InputError(
             f"{folder} holds no shape of {table.where} (such as {named(unknown)}; there is {named(names)}); give the "
@@ -293,9 +297,11 @@ def _tell_unmatched(
             f"{len(unknown)} of {len(keys)} rows of {table.where} are left out, whose shape is not in "
             f"{folder} ({named(unknown)})."
         )
-    rest = sorted(set(names) - set(used))
-    if rest:
-        notes.append(f"{len(rest)} of {len(names)} shapes in {folder} have no row in {table.where} ({named(rest)}).")
+    unmatched = sorted(set(names) - set(used))
+    if unmatched:
+        notes.append(
+            f"{len(unmatched)} of {len(names)} shapes in {folder} have no row in {table.where} ({named(unmatched)})."
+        )
 
 
 def _by_key(rows: Sequence[_Row]) -> dict[str, _Row]:
@@ -312,20 +318,22 @@ def _refuse_mixed(fits: Sequence[_Row], folder: Path) -> None:
             f"{folder} holds fits of {len(hashes)} different models ({', '.join(h[:12] for h in hashes[:3])}), whose "
             "coefficients cannot be compared; fit all scans with one model."
         )
-    first: dict[str, str] = {}
+    first_names: dict[str, str] = {}
     for row in fits:
-        known = first.setdefault(row.scan_hash or row.name, row.name)
-        if known != row.name:
-            raise InputError(f"{known} and {row.name} are fits of the same scan; leave one of them out of the table.")
+        first_name = first_names.setdefault(row.scan_hash or row.name, row.name)
+        if first_name != row.name:
+            raise InputError(
+                f"{first_name} and {row.name} are fits of the same scan; leave one of them out of the table."
+            )
 
 
-def _model_of(results: Results, fit: _Row, given: Path | None) -> tuple[ShapeModel, AdditiveModel | None]:
+def _model_of(results: Results, fit: _Row, model_path: Path | None) -> tuple[ShapeModel, AdditiveModel | None]:
     source: dict[str, Any] = results.record(fit.name)["model"]
-    path = given or results.folder / str(source.get("path") or source.get("name", ""))
-    if given is None and not path.is_file():
+    path = model_path or results.folder / str(source.get("path") or source.get("name", ""))
+    if model_path is None and not path.is_file():
         raise InputError(f"{results.folder}: the model {path.name} is no longer at {path}; give it with --model.")
-    found = load_model(path)
-    model, additive = (found.shape, found) if isinstance(found, AdditiveModel) else (found, None)
+    read_model = load_model(path)
+    model, additive = (read_model.shape, read_model) if isinstance(read_model, AdditiveModel) else (read_model, None)
     if model.content_hash != fit.model_hash:
         raise InputError(f"{path} is not the model of the fits in {results.folder}; give the right one with --model.")
     return model, additive

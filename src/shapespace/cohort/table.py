@@ -67,8 +67,8 @@ class Table:
             InputError: there is no such column.
         """
         if column not in self.columns:
-            there = ", ".join(self.columns) or "no other columns"
-            raise InputError(f"{self.where} has no column {column!r}; it has {there}.")
+            available = ", ".join(self.columns) or "no other columns"
+            raise InputError(f"{self.where} has no column {column!r}; it has {available}.")
         return self.columns[column]
 
     def kind(self, column: str) -> Literal["number", "text"]:
@@ -78,13 +78,13 @@ class Table:
             InputError: there is no such column, or most of its cells are numbers and some are not.
         """
         cells = {row: cell for row, cell in zip(self.rows, self.texts(column), strict=True) if cell}
-        odd = [row for row, cell in cells.items() if not is_number(cell)]
-        if len(odd) * 2 >= len(cells):
+        not_numeric = [row for row, cell in cells.items() if not is_number(cell)]
+        if len(not_numeric) * 2 >= len(cells):
             return "text"
-        if odd:
+        if not_numeric:
             raise InputError(
-                f"{self.where}: {column!r} holds numbers but {cells[odd[0]][:40]!r} at {odd[0]}"
-                f"{_more(len(odd) - 1)}; write a number there, or leave it empty."
+                f"{self.where}: {column!r} holds numbers but {cells[not_numeric[0]][:40]!r} at {not_numeric[0]}"
+                f"{_more(len(not_numeric) - 1)}; write a number there, or leave it empty."
             )
         return "number"
 
@@ -106,8 +106,8 @@ class Table:
         Raises:
             InputError: there is no such column.
         """
-        found = [self.texts(column) for column in columns]
-        return [row for row in range(len(self)) if not all(cells[row] for cells in found)]
+        texts = [self.texts(column) for column in columns]
+        return [row for row in range(len(self)) if not all(cells[row] for cells in texts)]
 
     def take(self, rows: Sequence[int]) -> Table:
         """Return the table of some rows, in their order."""
@@ -140,22 +140,23 @@ def read_table(path: Path) -> tuple[Table, tuple[str, ...]]:
     names = heads[key]
     places = [PurePath(row[key].replace("\\", "/")) for row in rows]
     # Scans of one name in different folders are called by their folders too, as their fits are.
-    several = {stem for stem, count in Counter(stem_of(place) for place in places).items() if count > 1}
-    keys = tuple(_with_folders(place) if stem_of(place) in several else stem_of(place) for place in places)
+    repeated = {stem for stem, count in Counter(stem_of(place) for place in places).items() if count > 1}
+    keys = tuple(_with_folders(place) if stem_of(place) in repeated else stem_of(place) for place in places)
     if "" in keys:
         raise FileFormatError(
             f"{path} has no {names} in row {keys.index('') + 1}; name the shape, or leave the row out."
         )
-    twice = [key for key, count in Counter(keys).items() if count > 1]
-    if twice:
+    repeated_keys = [key for key, count in Counter(keys).items() if count > 1]
+    if repeated_keys:
         raise FileFormatError(
-            f"{path} has two or more rows of {twice[0][:80]!r}{_more(len(twice) - 1)}; keep one row for each shape."
+            f"{path} has two or more rows of {repeated_keys[0][:80]!r}{_more(len(repeated_keys) - 1)}; "
+            "keep one row for each shape."
         )
     columns: dict[str, tuple[str, ...]] = {}
-    for at, head in enumerate(heads):
+    for index, head in enumerate(heads):
         if head and head not in (CHECKSUM, names):
-            called = head.removeprefix(_META)
-            columns[head if called in heads or not called else called] = tuple(row[at] for row in rows)
+            column = head.removeprefix(_META)
+            columns[head if column in heads or not column else column] = tuple(row[index] for row in rows)
     return Table(columns, keys, str(path)), keys
 
 

@@ -76,8 +76,8 @@ class Bone:
     def draw(rng: np.random.Generator, longer_mm: float = 0.0) -> Bone:
         """Return a random skull, with a snout that is longer than usual by `longer_mm`."""
         half = _HALF_MM * np.exp(0.03 * rng.standard_normal(3)) * np.exp(_SIZE * rng.standard_normal())
-        own = rng.standard_normal(len(_BUMPS))
-        paired = np.where(np.arange(len(_BUMPS)) <= _TWIN, own, own[_TWIN])
+        bump_weights = rng.standard_normal(len(_BUMPS))
+        paired = np.where(np.arange(len(_BUMPS)) <= _TWIN, bump_weights, bump_weights[_TWIN])
         heights = _BUMPS[:, 4] + _BUMPS[:, 5] * paired
         heights[_LEFT:] += _FLUCTUATING * rng.standard_normal(len(_BUMPS) - _LEFT)
         heights[_SNOUT] += np.log1p(longer_mm / (_HALF_MM[2] * np.exp(_BUMPS[_SNOUT, 4])))
@@ -150,6 +150,6 @@ def _with_hole(scan: Mesh, rng: np.random.Generator) -> Mesh:
     centre = scan.vertices[rng.integers(len(scan.vertices))]
     radius = _CUT_MM * rng.uniform(0.7, 1.3)
     assert scan.faces is not None
-    kept = np.linalg.norm(scan.vertices - centre, axis=1) > radius
-    vertices, faces = without_vertices(scan.vertices, scan.faces, kept)
+    is_kept = np.linalg.norm(scan.vertices - centre, axis=1) > radius
+    vertices, faces = without_vertices(scan.vertices, scan.faces, is_kept)
     return replace(scan, vertices=vertices, faces=faces)

@@ -118,8 +118,8 @@ def raw_surface(organ: Star, rng: np.random.Generator, points: int = _POINTS) ->
 def label_volume(organ: Organ, rng: np.random.Generator) -> LabelVolume:
     """Return `organ` as voxels with the label 1, nearly along the axes of the patient, as a scanner gives them."""
     turn = Rotation.from_rotvec(0.15 * rng.standard_normal(3)).as_matrix()
-    there = organ.surface(_spread(400)) @ turn.T
-    low, high = there.min(axis=0) - _MARGIN_MM, there.max(axis=0) + _MARGIN_MM
+    surface_points = organ.surface(_spread(400)) @ turn.T
+    low, high = surface_points.min(axis=0) - _MARGIN_MM, surface_points.max(axis=0) + _MARGIN_MM
     counts = np.ceil((high - low) / _VOXEL_MM).astype(int)
     places = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, 3) * _VOXEL_MM + low
     labels = organ.inside(places @ turn).reshape(counts).astype(np.uint8)

@@ -42,9 +42,9 @@ class Warp:
         stretch = np.exp(self.stretch * rng.standard_normal(3))
         out = x * (stretch / stretch.prod() ** (1 / 3) - 1.0)
         for length_mm, stddev_mm in self.fields:
-            one = _field(x, length_mm, rng)
-            other = one[mirror] * FLIP
-            out += stddev_mm / np.sqrt(2.0) * (one + other + self.lopsided * (one - other))
+            component = _field(x, length_mm, rng)
+            other = component[mirror] * FLIP
+            out += stddev_mm / np.sqrt(2.0) * (component + other + self.lopsided * (component - other))
         return out
 
 

@@ -87,9 +87,16 @@ class Matlab:
         check_file(path, _LARGEST_BYTES, _AGAIN)
         try:
             tree = _tree(path)
-            layout = next((one for one in _LAYOUTS if {one.mean, one.basis, one.spread} <= tree.arrays.keys()), None)
+            layout = next(
+                (
+                    candidate
+                    for candidate in _LAYOUTS
+                    if {candidate.mean, candidate.basis, candidate.spread} <= tree.arrays.keys()
+                ),
+                None,
+            )
             if layout is None:
-                known = ", ".join(one.title for one in _LAYOUTS)
+                known = ", ".join(candidate.title for candidate in _LAYOUTS)
                 raise ModelFileError(f"{path} holds no shape model of a kind that is known ({known}).")
             return _model(tree, layout)
         except ApartError as error:
@@ -117,9 +124,11 @@ def _model(tree: Tree, layout: _Layout) -> LinearModel:
         raise ApartError(f"its mean, basis and spread have the shapes {mean.shape}, {basis.shape} and {spread.shape}")
     n_training = layout.n_training
     if isinstance(n_training, str):
-        told = tree.arrays.get(n_training)
+        training_count = tree.arrays.get(n_training)
         n_training = (
-            int(told.reshape(-1)[0]) if told is not None and told.size == 1 and told.reshape(-1)[0] > 1 else None
+            int(training_count.reshape(-1)[0])
+            if training_count is not None and training_count.size == 1 and training_count.reshape(-1)[0] > 1
+            else None
         )
     return LinearModel(
         mean=mean.reshape(-1, 3),
@@ -137,12 +146,12 @@ def _floats(array: npt.NDArray[Any]) -> FloatArray:
     return np.asarray(array, dtype=np.float64)
 
 
-def _faces(found: npt.NDArray[Any] | None, layout: _Layout, n: int) -> npt.NDArray[np.int32] | None:
-    if found is None or not found.size:
+def _faces(triangles: npt.NDArray[Any] | None, layout: _Layout, n: int) -> npt.NDArray[np.int32] | None:
+    if triangles is None or not triangles.size:
         return None
-    faces = found.T if found.ndim == 2 and found.shape[0] == 3 != found.shape[1] else found
+    faces = triangles.T if triangles.ndim == 2 and triangles.shape[0] == 3 != triangles.shape[1] else triangles
     if faces.ndim != 2 or faces.shape[1] != 3 or not np.isfinite(faces).all() or np.abs(faces).max() > n:
-        raise ApartError(f"its triangles have the shape {found.shape}, or name vertices that it does not have")
+        raise ApartError(f"its triangles have the shape {triangles.shape}, or name vertices that it does not have")
     # Those of menpo count from 0, those of MATLAB's own from 1.
     faces = faces.astype(np.int32) - (layout.first_vertex or int(faces.min() > 0 and faces.max() == n))
     return faces[:, [0, 2, 1]] if layout.is_clockwise else faces

@@ -97,7 +97,7 @@ class LinearModel:
         elif any(block.moved.ndim != 2 or len(block.moved) != 3 * n or not block.moved.shape[1] for block in blocks):
             shapes = " and ".join(str(block.moved.shape) for block in blocks)
             wrong = f"its modes have the shape {shapes}, which {n} vertices do not"
-        elif not all(are_measurable(one) for one in (self.mean, *(block.moved for block in blocks))):
+        elif not all(are_measurable(array) for array in (self.mean, *(block.moved for block in blocks))):
             wrong = "it holds numbers that are not finite, or too large for lengths"
         elif any(block.names and len(block.names) != block.moved.shape[1] for block in blocks):
             wrong = "it has another number of names than of modes"
@@ -124,23 +124,26 @@ def scaled(basis: npt.ArrayLike, stddev: npt.ArrayLike) -> FloatArray:
     return np.asarray(basis, dtype=np.float64) * np.asarray(stddev, dtype=np.float64)
 
 
-def orthonormal(moved: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return U (D, K), s (K,) and W (M, K) with `moved` (D, M) = U s W^T; modes that do not vary are left out."""
-    length = np.linalg.norm(moved, axis=0)
+def orthonormal(displacements: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return U (D, K), s (K,) and W (M, K) with `displacements` (D, M) = U s W^T, without modes that do not vary."""
+    length = np.linalg.norm(displacements, axis=0)
     order = np.argsort(-length, kind="stable")
     keep = order[length[order] > _NO_STDDEV * length.max()] if length.size and length.max() > 0 else order[:0]
-    unit = moved[:, keep] / length[keep]
+    unit = displacements[:, keep] / length[keep]
     # The last bits hang on the number of threads, and workers, which have one, must find the same model.
     with threadpool_limits(1, user_api="blas"):
-        if np.abs(unit.T @ unit - np.eye(len(keep))).max(initial=0.0) <= ORTHOGONAL and len(keep) == moved.shape[1]:
+        if (
+            np.abs(unit.T @ unit - np.eye(len(keep))).max(initial=0.0) <= ORTHOGONAL
+            and len(keep) == displacements.shape[1]
+        ):
             # As it stands but for the rounding of single precision, so that modes stay the file's own.
-            found, upper = qr(unit, mode="economic")
-            exact = np.asarray(found * np.sign(np.diag(upper)), dtype=np.float64)
-            return exact, length[keep], np.eye(moved.shape[1])[:, keep]
-        left, stddev, right = svd(moved, full_matrices=False)
-    kept = stddev > _NO_STDDEV * stddev.max(initial=0.0)
+            directions, upper = qr(unit, mode="economic")
+            exact = np.asarray(directions * np.sign(np.diag(upper)), dtype=np.float64)
+            return exact, length[keep], np.eye(displacements.shape[1])[:, keep]
+        left, stddev, right = svd(displacements, full_matrices=False)
+    is_kept = stddev > _NO_STDDEV * stddev.max(initial=0.0)
     sign = np.sign(left[np.abs(left).argmax(axis=0), np.arange(left.shape[1])])
-    return (left * sign)[:, kept], stddev[kept], (right.T * sign)[:, kept]
+    return (left * sign)[:, is_kept], stddev[is_kept], (right.T * sign)[:, is_kept]
 
 
 class ModelReader(Protocol):

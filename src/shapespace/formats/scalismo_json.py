@@ -58,16 +58,16 @@ class ScalismoJson:
         try:
             tree = _tree(read_bytes(path))
         except (ValueError, OverflowError, RecursionError, MemoryError) as error:
-            told = " ".join(str(error).split())[:120].rstrip(".")
-            raise ModelFileError(f"{path} is damaged, or no HDF5/JSON: {told}; {_AGAIN}.") from error
+            message = " ".join(str(error).split())[:120].rstrip(".")
+            raise ModelFileError(f"{path} is damaged, or no HDF5/JSON: {message}; {_AGAIN}.") from error
         return model_of(tree, path)
 
     def write(self, model: LinearModel, path: Path) -> Sequence[str]:
         """As `ModelFormat.write`."""
-        tree, said = tree_of(model)
+        tree, notes = tree_of(model)
         with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as out:
             out.writelines(_text_of(tree))
-        return said
+        return notes
 
 
 class _Link(msgspec.Struct):
@@ -141,16 +141,16 @@ def _tree(text: bytes) -> Tree:
     return Tree(arrays, texts, attributes, tuple(groups))
 
 
-def _attributes(found: Sequence[_Attribute]) -> dict[str, Any]:
+def _attributes(entries: Sequence[_Attribute]) -> dict[str, Any]:
     """Return numbers and texts by name; converters of HDF5 files write single ones as lists of one."""
-    told: dict[str, Any] = {}
-    for one in found:
-        value = one.value
+    values: dict[str, Any] = {}
+    for entry in entries:
+        value = entry.value
         while isinstance(value, list) and len(cast(list[Any], value)) == 1:
             value = cast(list[Any], value)[0]
         if isinstance(value, str | int | float):
-            told[one.name] = value.rstrip("\0") if isinstance(value, str) else value
-    return told
+            values[entry.name] = value.rstrip("\0") if isinstance(value, str) else value
+    return values
 
 
 def _value(dataset: _Dataset, path: str) -> npt.NDArray[Any] | str | None:
@@ -164,14 +164,14 @@ def _value(dataset: _Dataset, path: str) -> npt.NDArray[Any] | str | None:
         return value.rstrip("\0") if isinstance(value, str) else None
     if kind not in ("H5T_FLOAT", "H5T_INTEGER"):
         return None
-    one: Any = int if kind == "H5T_INTEGER" else float
+    number_type: Any = int if kind == "H5T_INTEGER" else float
     dims = _of(dataset.shape, "dims")
     shape = cast(list[Any], dims) if isinstance(dims, list) else []
     if len(shape) > 2 or not all(isinstance(size, int) and size >= 0 for size in shape):
         return None
     if shape and math.prod(shape) == 0:
         return np.empty(shape)
-    typed = one if not shape else list[one] if len(shape) == 1 else list[list[one]]
+    typed = number_type if not shape else list[number_type] if len(shape) == 1 else list[list[number_type]]
     array = np.array(msgspec.json.decode(dataset.value, type=typed, strict=True))
     if array.shape != tuple(shape) or array.dtype.kind not in "iuf":
         raise ApartError(f"{path} is cut short, or not of the shape {shape} that it says")
@@ -201,11 +201,11 @@ def _text_of(tree: Tree) -> Generator[str]:
             }
             for child in children
         ]
-        told = [
+        entries = [
             {"name": name, "type": _TEXT, "shape": _SCALAR, "value": str(value)}
             for name, value in tree.attributes.get(path, {}).items()
         ]
-        groups[known_as[path]] = {"alias": [path], "attributes": told, "links": links}
+        groups[known_as[path]] = {"alias": [path], "attributes": entries, "links": links}
     yield f'{{"apiVersion":"1.0.0","root":"{known_as["/"]}","groups":{_json(groups)},"datasets":{{'
     comma = ""
     for path, text in tree.texts.items():

@@ -10,8 +10,8 @@ _MEMINFO, _CGROUP = Path("/proc/meminfo"), Path("/sys/fs/cgroup")
 
 def available_bytes() -> int | None:
     """Return the bytes that this process can still take; None where the system does not tell."""
-    found = [size for size in (_of_system(), _of_container()) if size is not None]
-    return min(found) if found else None
+    sizes = [size for size in (_of_system(), _of_container()) if size is not None]
+    return min(sizes) if sizes else None
 
 
 def _of_system() -> int | None:

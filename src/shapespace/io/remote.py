@@ -48,16 +48,16 @@ def addresses(address: str, endings: Sequence[str], *, recursive: bool) -> list[
         head, sep, chain = address.partition("::")
         scheme = head.split("://", 1)[0]
         if _GLOB & set(path):
-            found = files.glob(path)
+            paths = files.glob(path)
         elif head.lower().endswith(tuple(endings)):
             return [address]
         else:
-            found = files.find(path, maxdepth=None if recursive else 1)
-        named = [f"{scheme}://{str(one).removeprefix(f'{scheme}://')}{sep}{chain}" for one in sorted(found)]
-    taken = [one for one in named if name_of(one).lower().endswith(tuple(endings))]
-    if not taken:
+            paths = files.find(path, maxdepth=None if recursive else 1)
+        full_addresses = [f"{scheme}://{str(item).removeprefix(f'{scheme}://')}{sep}{chain}" for item in sorted(paths)]
+    readable = [item for item in full_addresses if name_of(item).lower().endswith(tuple(endings))]
+    if not readable:
         raise InputError(f"{address} holds no meshes; shapespace reads {', '.join(endings)}.")
-    return taken
+    return readable
 
 
 def version_of(address: str) -> str:
@@ -110,8 +110,8 @@ def _files(address: str) -> tuple[Any, str]:
         from fsspec.core import url_to_fs  # pyright: ignore[reportUnknownVariableType]
     except ImportError as error:
         raise _missing("remote") from error
-    found: tuple[Any, str] = url_to_fs(address)  # pyright: ignore[reportUnknownVariableType]
-    return found
+    filesystem: tuple[Any, str] = url_to_fs(address)  # pyright: ignore[reportUnknownVariableType]
+    return filesystem
 
 
 @contextlib.contextmanager
@@ -126,8 +126,8 @@ def _told(address: str) -> Generator[None]:
     except FileNotFoundError as error:
         raise FileError(f"Cannot read {address}: there is no such file; check the address.") from error
     except Exception as error:
-        why = " ".join(str(error).split())[:200] or type(error).__name__
-        raise FileError(f"Cannot read {address}: {why}; check the address and the connection.") from error
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise FileError(f"Cannot read {address}: {reason}; check the address and the connection.") from error
 
 
 def _missing(extra: str) -> ShapespaceError:

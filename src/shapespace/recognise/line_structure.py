@@ -155,17 +155,17 @@ def pooled_line_scores(
     rho = monotonicity_p = None
     if intensity is not None:
         groups = [np.flatnonzero(classes == c) for c in range(len(names))]
-        along = [_position(v[mine]) for mine in groups]
-        rho = float(np.mean([_spearman(a, intensity[mine]) for a, mine in zip(along, groups, strict=True)]))
+        along = [_position(v[rows]) for rows in groups]
+        rho = float(np.mean([_spearman(a, intensity[rows]) for a, rows in zip(along, groups, strict=True)]))
         drawn = [
             float(np.mean([_spearman(a, rng.permutation(intensity[m])) for a, m in zip(along, groups, strict=True)]))
             for _ in range(permutations)
         ]
         monotonicity_p = _permutation_p(rho, drawn)
-    told = [str(name) for name in names]
+    class_names = [str(name) for name in names]
     return PooledLineScores(
-        r2_through_neutral=dict(zip(told, observed.tolist(), strict=True)),
-        r2_p={name: _permutation_p(float(observed[c]), shuffled[:, c].tolist()) for c, name in enumerate(told)},
+        r2_through_neutral=dict(zip(class_names, observed.tolist(), strict=True)),
+        r2_p={name: _permutation_p(float(observed[c]), shuffled[:, c].tolist()) for c, name in enumerate(class_names)},
         mean_r2_p=_permutation_p(float(observed.mean()), shuffled.mean(axis=1).tolist()),
         spearman=rho,
         monotonicity_p=monotonicity_p,
@@ -176,8 +176,8 @@ def _line_r2(gram: FloatArray, classes: np.ndarray) -> FloatArray:
     """Return R2 of the line through neutral of each class, from the products (n, n) of the samples."""
     scores: list[float] = []
     for c in range(int(classes.max()) + 1):
-        mine = np.flatnonzero(classes == c)
-        part = gram[np.ix_(mine, mine)]
+        rows = np.flatnonzero(classes == c)
+        part = gram[np.ix_(rows, rows)]
         energy = float(np.trace(part))
         # The squared singular values of the samples are the eigenvalues of their products.
         scores.append(float(np.linalg.eigvalsh(part)[-1]) / energy if energy > 0 else 0.0)
@@ -241,12 +241,12 @@ def _accuracy(unit: FloatArray, classes: np.ndarray) -> float:
     n_classes = int(classes.max()) + 1
     sums = np.stack([unit[classes == c].sum(axis=0) for c in range(n_classes)])
     hits = 0
-    for i, own in enumerate(classes):
+    for i, class_index in enumerate(classes):
         without = sums.copy()
-        without[own] -= unit[i]
+        without[class_index] -= unit[i]
         norms = np.linalg.norm(without, axis=1)
         cosine = (without @ unit[i]) / np.where(norms > 0, norms, np.inf)
-        hits += int(cosine.argmax() == own)
+        hits += int(cosine.argmax() == class_index)
     return hits / len(unit)
 
 
@@ -289,9 +289,9 @@ def _smallest_margin(v: FloatArray, classes: np.ndarray) -> tuple[float, tuple[i
     for a, b in itertools.combinations(range(n_classes), 2):
         w = np.asarray(np.linalg.solve(shrunk, means[b] - means[a]), dtype=np.float64)
         along = v @ w
-        gap = float(along[classes == b].min() - along[classes == a].max())
+        separation = float(along[classes == b].min() - along[classes == a].max())
         spread = float(np.sqrt(w @ within @ w))
-        scaled = gap / spread if spread > 0 else 0.0
+        scaled = separation / spread if spread > 0 else 0.0
         if scaled < best[0]:
             best = (scaled, (a, b))
     return best

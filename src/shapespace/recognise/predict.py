@@ -124,17 +124,17 @@ def _with_labels(scans: Sequence[ScanCoefficients]) -> tuple[list[ScanCoefficien
     """Return the scans to train on, how many are left out and why, and the same in sentences."""
     labelled = [scan for scan in scans if scan.label]
     used = [scan for scan in labelled if scan.trusted]
-    lost = Counter(scan.status for scan in labelled if not scan.trusted)
+    untrusted = Counter(scan.status for scan in labelled if not scan.trusted)
     without_label = len(scans) - len(labelled)
     if not used:
         raise InputError(
             f"None of the {len(scans)} scans has both a label and a fit to be trusted; check that the table of labels "
             "names the scans."
         )
-    notes = [f"{count} {status} of the fits with a label left out." for status, count in sorted(lost.items())]
+    notes = [f"{count} {status} of the fits with a label left out." for status, count in sorted(untrusted.items())]
     if without_label:
         notes.append(f"{without_label} of {len(scans)} scans have no label and are left out.")
-    return used, {**dict(lost), "without_label": without_label}, notes
+    return used, {**dict(untrusted), "without_label": without_label}, notes
 
 
 def _samples(
@@ -158,15 +158,21 @@ def _samples(
         )
     expressive = labels != neutral
     z = relative_to_neutral(z, subjects, ~expressive)[expressive]
-    return z, labels[expressive], [name for name, mine in zip(subjects, expressive, strict=True) if mine]
+    return (
+        z,
+        labels[expressive],
+        [name for name, is_expressive in zip(subjects, expressive, strict=True) if is_expressive],
+    )
 
 
 def _classes(labels: Any) -> tuple[list[str], list[int]]:
     """Return the classes and how many samples each has, or raise where they cannot be learned."""
     classes, counts = np.unique(labels, return_counts=True)
     if len(classes) < 2 or counts.min() < 2:
-        few = ", ".join(f"{name} ({n})" for name, n in zip(classes, counts, strict=True)) or "none"
-        raise InputError(f"Training needs at least two classes with at least two scans each; these were found: {few}.")
+        counts_text = ", ".join(f"{name} ({n})" for name, n in zip(classes, counts, strict=True)) or "none"
+        raise InputError(
+            f"Training needs at least two classes with at least two scans each; these were found: {counts_text}."
+        )
     if UNSURE in classes:
         raise InputError(f"The label {UNSURE!r} is what shapespace answers below the confidence; give it another name.")
     return classes.tolist(), counts.tolist()
@@ -217,19 +223,19 @@ def predict_scans(saved: SavedClassifier, scans: Sequence[ScanCoefficients]) -> 
         z = scan.z - zero[scan.subject] if saved.relative_to_neutral else scan.z
         p = saved.probabilities(z[None])[0]
         best = int(p.argmax())
-        sure = bool(p[best] >= saved.confidence)
+        is_certain = bool(p[best] >= saved.confidence)
         name = saved.classes[best]
-        why = f"The likeliest class, {name}, has the probability {p[best]:.2f}, below {saved.confidence:g}."
-        answers.append(Answer(scan.name, scan.status, name if sure else UNSURE, p, "" if sure else why))
+        reason = f"The likeliest class, {name}, has the probability {p[best]:.2f}, below {saved.confidence:g}."
+        answers.append(Answer(scan.name, scan.status, name if is_certain else UNSURE, p, "" if is_certain else reason))
     return answers
 
 
 def _neutral_of(saved: SavedClassifier, scans: Sequence[ScanCoefficients]) -> dict[str, FloatArray]:
-    found: dict[str, list[FloatArray]] = {}
+    neutrals: dict[str, list[FloatArray]] = {}
     for scan in scans:
         if scan.label == saved.neutral and scan.subject and scan.trusted and scan.z is not None:
-            found.setdefault(scan.subject, []).append(scan.z)
-    return {name: np.mean(z, axis=0) for name, z in found.items()}
+            neutrals.setdefault(scan.subject, []).append(scan.z)
+    return {name: np.mean(z, axis=0) for name, z in neutrals.items()}
 
 
 def _refusal(
@@ -260,13 +266,17 @@ def write_answers(path: Path, answers: Sequence[Answer], classes: Sequence[str])
     header = ("scan", "status", "prediction", *(f"p_{name}" for name in classes), "reason")
     rows = [
         (
-            answer.scan,
-            answer.status,
-            answer.prediction,
-            *(["" for _ in classes] if answer.probabilities is None else [f"{p:.6f}" for p in answer.probabilities]),
-            answer.reason,
+            prediction.scan,
+            prediction.status,
+            prediction.prediction,
+            *(
+                ["" for _ in classes]
+                if prediction.probabilities is None
+                else [f"{p:.6f}" for p in prediction.probabilities]
+            ),
+            prediction.reason,
         )
-        for answer in answers
+        for prediction in answers
     ]
     write_rows(path, header, rows)
 
@@ -278,9 +288,9 @@ def _stacked(scans: Sequence[ScanCoefficients]) -> FloatArray:
     return np.stack(rows)
 
 
-def _modes(known: int, modes: int | None) -> int:
+def _modes(available: int, modes: int | None) -> int:
     if modes is None:
-        return known
-    if not 1 <= modes <= known:
-        raise InputError(f"There are {known} coefficients, so a classifier cannot see {modes} of them.")
+        return available
+    if not 1 <= modes <= available:
+        raise InputError(f"There are {available} coefficients, so a classifier cannot see {modes} of them.")
     return modes

@@ -66,9 +66,11 @@ class Fold:
                 f"A fold needs (n, K) training and (m, K) test coefficients with a label and a subject each, not "
                 f"{self.train.shape} with {n} labels and {self.test.shape} with {m} labels."
             )
-        both = sorted(set(self.train_subjects) & set(self.test_subjects))
-        if both:
-            raise InputError(f"{', '.join(both[:3])} would be trained on and tested; split the samples by subject.")
+        shared_subjects = sorted(set(self.train_subjects) & set(self.test_subjects))
+        if shared_subjects:
+            raise InputError(
+                f"{', '.join(shared_subjects[:3])} would be trained on and tested; split the samples by subject."
+            )
 
 
 @dataclass(frozen=True)
@@ -126,8 +128,8 @@ def subject_folds(subjects: Sequence[str], n_folds: int, seed: int = 0) -> list[
     if not 2 <= n_folds <= count:
         raise InputError(f"{count} subjects cannot be split into {n_folds} folds; ask for 2 to {count}.")
     # One class for all: then it evens out the number of samples, which GroupKFold does only unshuffled.
-    parted: Any = StratifiedGroupKFold(n_folds, shuffle=True, random_state=seed)
-    return list(parted.split(people, np.zeros(len(people)), people))
+    splitter: Any = StratifiedGroupKFold(n_folds, shuffle=True, random_state=seed)
+    return list(splitter.split(people, np.zeros(len(people)), people))
 
 
 def folds_of(
@@ -181,13 +183,13 @@ def nested_predictions(
     refuse_unknown(classifiers)
     if not classifiers or not modes:
         raise InputError("Nested cross-validation needs at least one classifier and one number of modes.")
-    found: list[tuple[FloatArray, Choice]] = []
+    results: list[tuple[FloatArray, Choice]] = []
     with threadpool_limits(1):  # small matrices: more threads cost more than they give
         for number, fold in enumerate(folds, 1):
-            found.append(_nested(fold, classes, classifiers, inner_folds, seed, modes))
+            results.append(_nested(fold, classes, classifiers, inner_folds, seed, modes))
             if on_fold is not None:
                 on_fold(number, len(folds))
-    return _gather(folds, classes, found)
+    return _gather(folds, classes, results)
 
 
 def _nested(
@@ -203,7 +205,7 @@ def _nested(
     K = X.shape[1]
     counts = sorted({min(K if m is None else m, K) for m in modes})
     by_modes = [left_out(X[:, :m], labels, inner, classes, "lda", {}, seed) for m in counts]
-    tried = [macro_accuracy(labels, answers_of(found, classes), classes) for found in by_modes]
+    tried = [macro_accuracy(labels, answers_of(candidate, classes), classes) for candidate in by_modes]
     m = counts[int(np.argmax(tried))]
     best: tuple[float, str, dict[str, Any], FloatArray] | None = None
     fewest = min(len(train) for train, _ in inner)
@@ -219,8 +221,8 @@ def _nested(
         raise InputError("None of the classifiers can be had with so few training samples; add samples.")
     accuracy, name, parameters, probabilities = best
     temperature = fit_temperature(labels.tolist(), probabilities, classes)
-    answer = predict_probabilities(X[:, :m], labels, fold.test[:, :m], classes, name, parameters, seed)
-    return calibrated(answer, temperature), Choice(name, parameters, m, temperature, accuracy)
+    fold_probabilities = predict_probabilities(X[:, :m], labels, fold.test[:, :m], classes, name, parameters, seed)
+    return calibrated(fold_probabilities, temperature), Choice(name, parameters, m, temperature, accuracy)
 
 
 def fixed_predictions(
@@ -233,14 +235,14 @@ def fixed_predictions(
     """
     classes = classes_of(folds)
     refuse_unknown([classifier])
-    found: list[tuple[FloatArray, Choice]] = []
+    results: list[tuple[FloatArray, Choice]] = []
     with threadpool_limits(1):
         for fold in folds:
             X, labels, _ = usable(fold)
             m = min(modes or X.shape[1], X.shape[1])
-            answer = predict_probabilities(X[:, :m], labels, fold.test[:, :m], classes, classifier, {}, seed)
-            found.append((answer, Choice(classifier, {}, m, 1.0, float("nan"))))
-    return _gather(folds, classes, found)
+            probabilities = predict_probabilities(X[:, :m], labels, fold.test[:, :m], classes, classifier, {}, seed)
+            results.append((probabilities, Choice(classifier, {}, m, 1.0, float("nan"))))
+    return _gather(folds, classes, results)
 
 
 def predict_probabilities(
@@ -261,20 +263,20 @@ def predict_probabilities(
     if neighbours > len(X):
         raise InputError(f"{neighbours} nearest neighbours cannot be had among {len(X)} training samples; add samples.")
     finite = np.isfinite(test).all(axis=1)
-    only = np.unique(np.asarray(labels, dtype=str))
-    if len(only) == 1:  # as happens in inner folds of very few people; several classifiers refuse it
-        answer = np.full((len(test), len(classes)), np.nan)
-        answer[finite] = 0.0
-        answer[finite, list(classes).index(str(only[0]))] = 1.0
-        return answer
+    present = np.unique(np.asarray(labels, dtype=str))
+    if len(present) == 1:  # as happens in inner folds of very few people; several classifiers refuse it
+        probabilities = np.full((len(test), len(classes)), np.nan)
+        probabilities[finite] = 0.0
+        probabilities[finite, list(classes).index(str(present[0]))] = 1.0
+        return probabilities
     pipeline.fit(X, labels)
-    answer = np.full((len(test), len(classes)), np.nan)
+    probabilities = np.full((len(test), len(classes)), np.nan)
     if finite.any():
         columns = [classes.index(name) for name in pipeline.classes_.tolist()]
-        known = np.zeros((int(finite.sum()), len(classes)))
-        known[:, columns] = pipeline.predict_proba(test[finite])
-        answer[finite] = known
-    return answer
+        probabilities_known = np.zeros((int(finite.sum()), len(classes)))
+        probabilities_known[:, columns] = pipeline.predict_proba(test[finite])
+        probabilities[finite] = probabilities_known
+    return probabilities
 
 
 def left_out(
@@ -287,10 +289,12 @@ def left_out(
     seed: int = 0,
 ) -> FloatArray:
     """Return probabilities (n, C) of each sample by the classifier fitted to the folds that do not hold it."""
-    answer = np.full((len(X), len(classes)), np.nan)
+    probabilities = np.full((len(X), len(classes)), np.nan)
     for train, test in folds:
-        answer[test] = predict_probabilities(X[train], labels[train], X[test], classes, classifier, parameters, seed)
-    return answer
+        probabilities[test] = predict_probabilities(
+            X[train], labels[train], X[test], classes, classifier, parameters, seed
+        )
+    return probabilities
 
 
 def classes_of(folds: Sequence[Fold]) -> tuple[str, ...]:
@@ -321,9 +325,9 @@ def usable(fold: Fold) -> tuple[FloatArray, Any, Any]:
 
 def answers_of(probabilities: FloatArray, classes: Sequence[str]) -> Any:
     """Return the likeliest classes (n,); empty where a fit failed."""
-    lost = np.isnan(probabilities).any(axis=1)
+    undefined = np.isnan(probabilities).any(axis=1)
     best = np.where(np.isnan(probabilities), -1.0, probabilities).argmax(axis=1)
-    return np.where(lost, "", np.asarray(classes)[best])
+    return np.where(undefined, "", np.asarray(classes)[best])
 
 
 def _grid(name: str) -> Iterator[dict[str, Any]]:
@@ -332,8 +336,10 @@ def _grid(name: str) -> Iterator[dict[str, Any]]:
         yield dict(zip(grid, values, strict=True))
 
 
-def _gather(folds: Sequence[Fold], classes: tuple[str, ...], found: Sequence[tuple[FloatArray, Choice]]) -> Predictions:
-    probabilities = np.concatenate([answer for answer, _ in found])
+def _gather(
+    folds: Sequence[Fold], classes: tuple[str, ...], results: Sequence[tuple[FloatArray, Choice]]
+) -> Predictions:
+    probabilities = np.concatenate([fold_probabilities for fold_probabilities, _ in results])
     labels = np.concatenate([np.asarray(fold.test_labels, dtype=str) for fold in folds])
     subjects = np.concatenate([np.asarray(fold.test_subjects, dtype=str) for fold in folds])
     index = np.arange(len(labels))
@@ -347,5 +353,5 @@ def _gather(folds: Sequence[Fold], classes: tuple[str, ...], found: Sequence[tup
         probabilities[order],
         tuple(subjects[order].tolist()),
         index[order],
-        tuple(choice for _, choice in found),
+        tuple(choice for _, choice in results),
     )

@@ -137,8 +137,8 @@ def _shuffled(labels: Any, rows: Mapping[str, IndexArray], order: Mapping[str, I
     if not order:
         return labels
     out = labels.copy()
-    for name, mine in rows.items():
-        out[mine] = labels[mine][order[name]]
+    for name, subject_rows in rows.items():
+        out[subject_rows] = labels[subject_rows][order[name]]
     return out
 
 
@@ -149,13 +149,13 @@ def _score_lda(
     unit = np.eye(len(classes))
     for p in folds:
         member = unit[_shuffled(p.train_labels, p.train_rows, order)[p.finite]]
-        there = np.flatnonzero(member.any(axis=0))
-        coef, intercept = linear_rule(p.X, member[:, there], p.gram, LDA_SHRINKAGE)
+        present = np.flatnonzero(member.any(axis=0))
+        coef, intercept = linear_rule(p.X, member[:, present], p.gram, LDA_SHRINKAGE)
         scores = p.test @ coef.T + intercept
-        lost = np.isnan(scores).any(axis=1)
-        answer = np.where(lost, -1, there[np.where(np.isnan(scores), -np.inf, scores).argmax(axis=1)])
+        undefined = np.isnan(scores).any(axis=1)
+        predicted = np.where(undefined, -1, present[np.where(np.isnan(scores), -np.inf, scores).argmax(axis=1)])
         truth = _shuffled(p.test_labels, p.test_rows, order)
-        hits += np.bincount(truth[answer == truth], minlength=len(classes))
+        hits += np.bincount(truth[predicted == truth], minlength=len(classes))
         counts += np.bincount(truth, minlength=len(classes))
     return float((hits[counts > 0] / counts[counts > 0]).mean())
 
@@ -168,9 +168,11 @@ def _score_any(
     answers: list[str] = []
     for p in folds:
         labels = names[_shuffled(p.train_labels, p.train_rows, order)][p.finite]
-        found = predict_probabilities(p.fold.train[p.finite], labels, p.fold.test, classes, classifier, {}, seed)
+        probabilities = predict_probabilities(
+            p.fold.train[p.finite], labels, p.fold.test, classes, classifier, {}, seed
+        )
         truth += names[_shuffled(p.test_labels, p.test_rows, order)].tolist()
-        answers += answers_of(found, classes).tolist()
+        answers += answers_of(probabilities, classes).tolist()
     return macro_accuracy(truth, answers, classes)
 
 
@@ -211,9 +213,11 @@ def learning_curve(
             for fold in folds:
                 X, labels, subjects = usable(fold)
                 people = rng.choice(np.unique(np.asarray(fold.train_subjects, dtype=str)), counts[i], replace=False)
-                mine = np.isin(subjects, people)
-                found = predict_probabilities(X[mine], labels[mine], fold.test, classes, classifier, {}, seed)
-                answers += answers_of(found, classes).tolist()
+                is_train = np.isin(subjects, people)
+                probabilities = predict_probabilities(
+                    X[is_train], labels[is_train], fold.test, classes, classifier, {}, seed
+                )
+                answers += answers_of(probabilities, classes).tolist()
             curve[i, j] = macro_accuracy(truth, answers, classes)
     return LearningCurve(np.asarray(counts, dtype=np.int64), curve)
 
@@ -252,8 +256,8 @@ def mode_importance(
             test, truth = fold.test[finite, :m], np.asarray(fold.test_labels, dtype=str)[finite]
             pipeline: Any = CLASSIFIERS[classifier](seed)
             pipeline.fit(X[:, :m], labels)
-            found = cast(Any, permutation_importance)(
+            importances = cast(Any, permutation_importance)(
                 pipeline, test, truth, scoring=score, n_repeats=repeats, random_state=seed
             )
-            loss[f, :m] = found.importances_mean
+            loss[f, :m] = importances.importances_mean
     return loss

@@ -166,10 +166,10 @@ def read_manifest(folder: Path) -> Manifest | None:
         return None
     if known.get("format_version") != Manifest.VERSION and known.get("format") == Manifest.FORMAT:
         raise FileFormatError(f"{path} is of a version of stores that this shapespace does not know; update it.")
-    found = read(Manifest, cast(object, content), str(path), "copy it again")
-    if any(not 0 < shard.rows <= MOST_ROWS for shard in found.shards):
+    manifest = read(Manifest, cast(object, content), str(path), "copy it again")
+    if any(not 0 < shard.rows <= MOST_ROWS for shard in manifest.shards):
         raise FileFormatError(f"{path} is damaged: a shard has no rows, or too many; copy it again.")
-    return found
+    return manifest
 
 
 def require_store_extra() -> None:

@@ -77,17 +77,17 @@ def coefficient_row(name: str, record: Mapping[str, Any]) -> dict[str, Any]:
 
 def _size_cells(record: Mapping[str, Any]) -> dict[str, Any]:
     extents = record.get("extents_mm") or (None, None, None)
-    told = record.get("centroid_size_mm"), *extents, record.get("area_mm2")
-    return {key: value for key, value in zip(_SIZES, told, strict=True) if value is not None}
+    sizes = record.get("centroid_size_mm"), *extents, record.get("area_mm2")
+    return {key: value for key, value in zip(_SIZES, sizes, strict=True) if value is not None}
 
 
 def _moved_cells(record: Mapping[str, Any]) -> dict[str, float]:
     """Return the RMS by which each mode, and all together, move a vertex from the mean; b is a norm over all."""
     if not record.get("n_vertices"):
         return {}
-    moved = np.abs(np.asarray(record["b"], dtype=np.float64)) / np.sqrt(float(record["n_vertices"]))
-    cells = {f"b{k}_rms_mm": float(value) for k, value in enumerate(moved, 1)}
-    return cells | {"shape_rms_mm": float(np.linalg.norm(moved))}
+    displacement = np.abs(np.asarray(record["b"], dtype=np.float64)) / np.sqrt(float(record["n_vertices"]))
+    cells = {f"b{k}_rms_mm": float(value) for k, value in enumerate(displacement, 1)}
+    return cells | {"shape_rms_mm": float(np.linalg.norm(displacement))}
 
 
 def _distance_column(direction: str, measure: str) -> str:
@@ -97,11 +97,11 @@ def _distance_column(direction: str, measure: str) -> str:
 def _shown_cells(record: Mapping[str, Any]) -> dict[str, Any]:
     if "shown" not in record:  # of a fit by an earlier version
         return {}
-    shown, in_scan = record["shown"], record["shown_scan_mm"]
-    cells = {key: shown[key] for key in _SHARES}
+    overlap, overlap_scan = record["shown"], record["shown_scan_mm"]
+    cells = {key: overlap[key] for key in _SHARES}
     for direction in _DIRECTIONS:
-        cells |= {f"shown_{direction}_{measure}_mm": shown[direction][measure] for measure in ("mean", "median")}
-        cells[f"shown_{direction}_mean_scan_mm"] = in_scan[direction]["mean"]
+        cells |= {f"shown_{direction}_{measure}_mm": overlap[direction][measure] for measure in ("mean", "median")}
+        cells[f"shown_{direction}_mean_scan_mm"] = overlap_scan[direction]["mean"]
     return cells
 
 
@@ -112,17 +112,19 @@ def _pose_cells(pose: Mapping[str, Any]) -> dict[str, float]:
     turn = Rotation.from_matrix(np.asarray(pose["rotation"], dtype=np.float64)).as_rotvec(degrees=True)
     cells = {"scale": float(pose["scale"])}
     cells |= {f"rotation_{axis}_deg": float(angle) for axis, angle in zip(_AXES, turn, strict=True)}
-    return cells | {f"translation_{axis}": at for axis, at in zip(_AXES, pose["translation"], strict=True)}
+    return cells | {f"translation_{axis}": value for axis, value in zip(_AXES, pose["translation"], strict=True)}
 
 
-def coefficient_columns(n_modes: int, known: Sequence[str] = ()) -> list[str]:
-    """Return the columns of coefficients.csv in order, for `n_modes` coefficients; `known` came with the scans."""
+def coefficient_columns(n_modes: int, metadata_columns: Sequence[str] = ()) -> list[str]:
+    """Return the columns of coefficients.csv in order: for `n_modes` coefficients, and for metadata of the scans."""
     modes = range(1, n_modes + 1)
     # The two means come first: older readers look for them there.
     lead = [_distance_column(direction, "mean") for direction in _DIRECTIONS]
-    every = [_distance_column(direction, measure) for direction in _DIRECTIONS for measure in _DISTANCE_COLUMNS]
+    distance_columns = [
+        _distance_column(direction, measure) for direction in _DIRECTIONS for measure in _DISTANCE_COLUMNS
+    ]
     columns = ["scan", "status", "reason", *(f"b{k}" for k in modes), *(f"z{k}" for k in modes), *lead]
-    columns += [column for column in every if column not in lead]
+    columns += [column for column in distance_columns if column not in lead]
     columns += [
         "scale",
         "mm_per_scan_unit",
@@ -130,7 +132,7 @@ def coefficient_columns(n_modes: int, known: Sequence[str] = ()) -> list[str]:
         *(f"b{k}_rms_mm" for k in modes),
         *_TOLD_OF_FITS,
     ]
-    return [*columns, *known, CHECKSUM, "model_hash"]
+    return [*columns, *metadata_columns, CHECKSUM, "model_hash"]
 
 
 def store_row(name: str, record: Mapping[str, Any]) -> dict[str, Any]:

@@ -167,7 +167,7 @@ class Shown:
                 return packed(staged_fit(self.folder, fit))
             except ScanNotFoundError as error:
                 surfaces = saved_surfaces(self.folder, fit)
-                return pack_surfaces(surfaces, fit.record, name=fit.name, label=fit.label, why=self.told(str(error)))
+                return pack_surfaces(surfaces, fit.record, name=fit.name, label=fit.label, reason=self.told(str(error)))
 
     def _ours(self, fit: SavedFit) -> bool:
         return fit.record.model.hash == self.model.content_hash

@@ -50,8 +50,8 @@ def is_asymmetric(model: ShapeModel) -> bool:
         return False
     if model not in _asymmetric:
         spread = math.sqrt(float((model.stddev**2).sum()) / model.n_vertices) / rms_size(model.mean_vertices)
-        off = find_mirror(model.mesh()).off_share
-        _asymmetric[model] = off > max(_LEAST_ASYMMETRY, _LEAST_OF_SPREAD * spread)
+        asymmetric_share = find_mirror(model.mesh()).off_share
+        _asymmetric[model] = asymmetric_share > max(_LEAST_ASYMMETRY, _LEAST_OF_SPREAD * spread)
     return _asymmetric[model]
 
 
@@ -74,24 +74,24 @@ def mirrored_log_odds(
     scan, flip = target.mesh, np.diag([-1.0, 1.0, 1.0])
     reflected = scan.vertices @ flip
     T = fitted.T_scan_fitted
-    own = refine(model, scan.vertices, [T], with_scale=with_scale)[0]
+    scan_pose = refine(model, scan.vertices, [T], with_scale=with_scale)[0]
     starts = [_reflected_pose(T, flip, Q, model.mean_vertices.mean(axis=0)) for Q in _reflections(model)]
     coarse = refine(model, reflected, starts, with_scale=with_scale, step=MIDDLE)
     best = min(coarse, key=lambda pose: pose.score_mm)
-    other = refine(model, reflected, [best.T_scan_model], with_scale=with_scale)[0]
-    if not math.isfinite(own.score_mm):
+    mirrored_pose = refine(model, reflected, [best.T_scan_model], with_scale=with_scale)[0]
+    if not math.isfinite(scan_pose.score_mm):
         return None
-    ratio = other.score_mm / max(own.score_mm, 1e-12)
+    ratio = mirrored_pose.score_mm / max(scan_pose.score_mm, 1e-12)
     if ratio > _CLEARLY_WORSE:
         return -_PATCHES * math.log(min(ratio, 1e6))
     faces = None if scan.faces is None else scan.faces[:, ::-1]
     mirror = ScanTarget(Mesh(reflected, faces, name=scan.name))
-    start = Start(other.T_scan_model, "given", float("nan"), other.b)
+    start = Start(mirrored_pose.T_scan_model, "given", float("nan"), mirrored_pose.b)
     try:
-        found = last_of(robust_icp(model, mirror, start, settings, with_scale=with_scale))
+        fit_result = last_of(robust_icp(model, mirror, start, settings, with_scale=with_scale))
     except (FitError, InputError):
         return -_PATCHES * math.log(_CLEARLY_WORSE)
-    return _cost(model, target, fitted) - _cost(model, mirror, found)
+    return _cost(model, target, fitted) - _cost(model, mirror, fit_result)
 
 
 def _reflections(model: ShapeModel) -> list[FloatArray]:

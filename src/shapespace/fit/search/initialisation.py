@@ -79,14 +79,14 @@ def find_unit(model: ShapeModel, scan: Mesh) -> str:
     if not low < ratio * MM_PER_UNIT[second] < high or penalty[second] > penalty[best] + _LIKELIER_BY_FAR:
         return best
     centred = scan.vertices - np.median(scan.vertices, axis=0)
-    found: dict[str, float] = {}
+    scores: dict[str, float] = {}
     for unit in (best, second):
         start = start_from_any_pose(model, MM_PER_UNIT[unit] * centred, seed=0)
         # In a wrong unit no pose stands out from the others.
         if start.score_mm <= _STANDS_OUT * start.runner_up_score_mm:
             return unit
-        found[unit] = start.score_mm
-    return min(found, key=lambda unit: found[unit])
+        scores[unit] = start.score_mm
+    return min(scores, key=lambda unit: scores[unit])
 
 
 def start_from_landmarks(
@@ -138,14 +138,14 @@ def start_from_any_pose(
 
     scaled = model.gauge == "shape" if with_scale is None else with_scale
     upright, poses = search(model, scan_vertices_mm, with_scale=scaled, seed=seed)
-    turned = [float(np.trace(upright.T_scan_model.rotation @ pose.T_scan_model.rotation.T)) for pose in poses]
+    traces = [float(np.trace(upright.T_scan_model.rotation @ pose.T_scan_model.rotation.T)) for pose in poses]
     starts = [
         Start(pose.T_scan_model, "upright" if trace > _SAME_TURN_TRACE else "rotations", pose.score_mm, pose.b)
-        for pose, trace in zip(poses, turned, strict=True)
+        for pose, trace in zip(poses, traces, strict=True)
     ]
-    best, others = starts[0], tuple(starts[1:])
-    runner_up = min((other.score_mm for other in others), default=float("inf"))
-    return replace(best, runner_up_score_mm=runner_up, alternatives=others)
+    best, alternatives = starts[0], tuple(starts[1:])
+    runner_up = min((other.score_mm for other in alternatives), default=float("inf"))
+    return replace(best, runner_up_score_mm=runner_up, alternatives=alternatives)
 
 
 def _size(points: FloatArray) -> float:

@@ -85,23 +85,25 @@ def find_second_instance(
         return None
     size_mm, scale = rms_size(model.mean_vertices), fitted.T_scan_fitted.scale
     placed = build_engine(Mesh(fitted.vertices_scan_mm, model.faces))
-    far = placed.query(target.mesh.vertices).distance > _NEAR * size_mm * scale
-    if far.sum() < max(_FEWEST, _LEAST_REST * len(far)):
+    is_far = placed.query(target.mesh.vertices).distance > _NEAR * size_mm * scale
+    if is_far.sum() < max(_FEWEST, _LEAST_REST * len(is_far)):
         return None
-    rest = ScanTarget(part_of(target.mesh, far))
-    T = _same_moved(fitted, rest.mesh.vertices, size_mm)
+    remaining_target = ScanTarget(part_of(target.mesh, is_far))
+    T = _same_moved(fitted, remaining_target.mesh.vertices, size_mm)
     if T is None:
         return None
     try:
-        other = last_of(robust_icp(model, rest, Start(T, "given", float("nan")), settings, with_scale=with_scale))
+        second_fit = last_of(
+            robust_icp(model, remaining_target, Start(T, "given", float("nan")), settings, with_scale=with_scale)
+        )
     except (FitError, InputError):
         return None
-    if score(other.evidence) > 0.0 or other.evidence["spread_mm"] > _AS_GOOD * fitted.evidence["spread_mm"]:
+    if score(second_fit.evidence) > 0.0 or second_fit.evidence["spread_mm"] > _AS_GOOD * fitted.evidence["spread_mm"]:
         return None
-    first, second = fitted.vertices_scan_mm, other.vertices_scan_mm
-    apart = second.mean(axis=0) - first.mean(axis=0)
-    away = float(np.linalg.norm(apart))
-    towards = apart / max(away, 1e-12)
+    first, second = fitted.vertices_scan_mm, second_fit.vertices_scan_mm
+    offset = second.mean(axis=0) - first.mean(axis=0)
+    away = float(np.linalg.norm(offset))
+    towards = offset / max(away, 1e-12)
     gap = float((second @ towards).min() - (first @ towards).max())
     return SecondInstance(away / scale, gap / scale)
 
@@ -128,19 +130,21 @@ def displaced(model: ShapeModel, target: ScanTarget, fitted: Fitted) -> dict[str
     size, spread = rms_size(model.mean_vertices) * scale, fitted.evidence["spread_mm"] * scale
     points = target.mesh.vertices[target.draw(_POINTS, np.random.default_rng(0))]
     surface = Mesh(fitted.vertices_scan_mm, model.faces)
-    at = build_engine(surface).query(points)
-    height = np.einsum("ij,ij->i", points - at.points, vertex_normals(surface)[at.vertex])
+    nearest = build_engine(surface).query(points)
+    height = np.einsum("ij,ij->i", points - nearest.points, vertex_normals(surface)[nearest.vertex])
     around = height[np.asarray(cKDTree(points).query(points, _NEIGHBOURS)[1], dtype=np.int32)[:, 1:]]
     alike = np.median(np.abs(around - height[:, None]), axis=1) < _ALIKE * np.abs(height)
-    inside = ~boundary_vertices(surface)[at.vertex]
-    far = max(_DISPLACED[0] * size, _SPREADS * spread)
-    moved = (np.abs(height) > far) & (at.distance < _DISPLACED[1] * size) & alike & inside
-    moved &= np.abs(height) > _ALONG_NORMAL * at.distance
+    inside = ~boundary_vertices(surface)[nearest.vertex]
+    limit = max(_DISPLACED[0] * size, _SPREADS * spread)
+    is_displaced = (np.abs(height) > limit) & (nearest.distance < _DISPLACED[1] * size) & alike & inside
+    is_displaced &= np.abs(height) > _ALONG_NORMAL * nearest.distance
     return {
-        "displaced_share": float(moved.mean()),
-        "displaced_inward_share": float((moved & (height < 0.0)).mean()),
-        "displaced_purity": float(moved.mean() / max(float((at.distance > far).mean()), 1.0 / len(points))),
-        "scattered_share": float(((at.distance > _DISPLACED[0] * size) & inside & ~alike).mean()),
+        "displaced_share": float(is_displaced.mean()),
+        "displaced_inward_share": float((is_displaced & (height < 0.0)).mean()),
+        "displaced_purity": float(
+            is_displaced.mean() / max(float((nearest.distance > limit).mean()), 1.0 / len(points))
+        ),
+        "scattered_share": float(((nearest.distance > _DISPLACED[0] * size) & inside & ~alike).mean()),
     }
 
 
@@ -157,18 +161,18 @@ def layers(model: ShapeModel, target: ScanTarget, fitted: Fitted) -> dict[str, f
         fitted: where the fit to it ended.
     """
     size_mm, scale = rms_size(model.mean_vertices), fitted.T_scan_fitted.scale
-    found = {"layered_share": 0.0, "layers_apart_mm": 0.0}
+    shares = {"layered_share": 0.0, "layers_apart_mm": 0.0}
     if fitted.evidence["spread_mm"] < _APART * size_mm:
-        return found
+        return shares
     points = target.mesh.vertices[target.draw(_POINTS, np.random.default_rng(0))]
     surface = Mesh(fitted.vertices_scan_mm, model.faces)
-    at = build_engine(surface).query(points)
-    near = at.distance < 2 * _NEAR * size_mm * scale
-    if near.sum() < _FEWEST:
-        return found
-    normals = vertex_normals(surface)[at.vertex[near]]
-    height = np.einsum("ij,ij->i", (points - at.points)[near], normals)
-    feet = at.points[near]
+    nearest = build_engine(surface).query(points)
+    is_near = nearest.distance < 2 * _NEAR * size_mm * scale
+    if is_near.sum() < _FEWEST:
+        return shares
+    normals = vertex_normals(surface)[nearest.vertex[is_near]]
+    height = np.einsum("ij,ij->i", (points - nearest.points)[is_near], normals)
+    feet = nearest.points[is_near]
     heights = np.sort(height[cKDTree(feet).query(feet, _NEIGHBOURS)[1]], axis=1)
     gaps = np.diff(heights, axis=1)[:, _LEAST_SIDE - 1 : _NEIGHBOURS - _LEAST_SIDE]
     split = gaps.argmax(axis=1) + _LEAST_SIDE
@@ -177,29 +181,29 @@ def layers(model: ShapeModel, target: ScanTarget, fitted: Fitted) -> dict[str, f
     widest = np.maximum(heights[rows, split - 1] - heights[:, 0], heights[:, -1] - heights[rows, split])
     layered = widest < _TIGHT * gap
     if layered.any():
-        found = {
+        shares = {
             "layered_share": float(layered.mean()),
             "layers_apart_mm": float(np.median(gap[layered])) / scale,
         }
-    return found
+    return shares
 
 
-def _same_moved(fitted: Fitted, rest: FloatArray, size_mm: float) -> Similarity | None:
-    """Return the pose at which the shape that was fitted, turned much as it is, lies on `rest` (R, 3); None for none.
+def _same_moved(fitted: Fitted, remaining_points: FloatArray, size_mm: float) -> Similarity | None:
+    """Return the pose, of similar rotation, at which the fitted shape lies on `remaining_points` (R, 3), or None.
 
     It is far cheaper than a search, which a head or a collar around a face would otherwise cost.
     """
-    T, tree, rng = fitted.T_scan_fitted, cKDTree(rest), np.random.default_rng(0)
+    T, tree, rng = fitted.T_scan_fitted, cKDTree(remaining_points), np.random.default_rng(0)
     x = fitted.vertices_scan_mm[rng.choice(len(fitted.vertices_scan_mm), _GLANCED)]
 
     def score(points: FloatArray, cap: float) -> FloatArray:
         return np.minimum(tree.query(points)[0], cap * size_mm * T.scale).mean(axis=-1)
 
-    places = rest[rng.choice(len(rest), _PLACES)] - x[rng.choice(_GLANCED, _PLACES)]
-    places = np.vstack([np.median(rest, axis=0) - np.median(x, axis=0), places])
+    places = remaining_points[rng.choice(len(remaining_points), _PLACES)] - x[rng.choice(_GLANCED, _PLACES)]
+    places = np.vstack([np.median(remaining_points, axis=0) - np.median(x, axis=0), places])
     move = Similarity(1.0, np.eye(3), places[int(np.argmin(score(x + places[:, None], _FARTHEST)))])
     for _ in range(_ROUNDS):
         distance, nearest = tree.query(move.apply(x))
-        kept = np.asarray(distance <= np.quantile(distance, _TRIMMED), dtype=np.bool_)
-        move = fit_similarity(x[kept], rest[np.asarray(nearest)[kept]], with_scale=False)
+        is_near = np.asarray(distance <= np.quantile(distance, _TRIMMED), dtype=np.bool_)
+        move = fit_similarity(x[is_near], remaining_points[np.asarray(nearest)[is_near]], with_scale=False)
     return move @ T if float(score(move.apply(x), _CAP)) < _SCORED * size_mm * T.scale else None

@@ -15,23 +15,26 @@ GZIP = b"\x1f\x8b"
 _SMALL = 2**20
 
 
-def unpacked(data: bytes, path: Path, most: int) -> bytes:
+def unpacked(data: bytes, path: Path, max_bytes: int) -> bytes:
     """Return what `data`, all of a gzip file, holds.
 
     Args:
         data: the whole file.
         path: its name, for messages.
-        most: bytes that the content may have.
+        max_bytes: largest size of the content.
 
     Raises:
-        FileFormatError: it is cut short or damaged, or unpacks to more than `most`, or `limits.GROWTH` times its bytes.
+        FileFormatError: it is cut short or damaged, or unpacks to more than `max_bytes`, or `limits.GROWTH` times its
+            size.
     """
-    most = min(most, max(GROWTH * len(data), _SMALL))
+    max_bytes = min(max_bytes, max(GROWTH * len(data), _SMALL))
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as stream:
-            content = stream.read(most + 1)
+            content = stream.read(max_bytes + 1)
     except (OSError, EOFError, zlib.error) as error:
         raise damaged(path, f"its compressed data end early or are wrong; {CUT_SHORT}") from error
-    if len(content) > most:
-        raise damaged(path, f"it unpacks to more than {most / 2**20:.0f} MiB, so unpack it with gunzip and look at it")
+    if len(content) > max_bytes:
+        raise damaged(
+            path, f"it unpacks to more than {max_bytes / 2**20:.0f} MiB, so unpack it with gunzip and look at it"
+        )
     return content

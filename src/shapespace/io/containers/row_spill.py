@@ -69,7 +69,9 @@ class Spill:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
         self.close()
 
     def close(self) -> None:
@@ -134,7 +136,7 @@ class Spill:
             raise write_error(self.path, error) from error
 
     def _panels(self) -> list[slice]:
-        return [slice(at, min(at + _PANEL, self.columns)) for at in range(0, self.columns, _PANEL)]
+        return [slice(start, min(start + _PANEL, self.columns)) for start in range(0, self.columns, _PANEL)]
 
     def _seek(self, columns: slice, row: int) -> None:
         width = columns.stop - columns.start

@@ -241,8 +241,10 @@ def _format(path: Path, verb: str) -> LandmarkFormat:
         if path.name.lower().endswith(ending):
             return LANDMARK_FORMATS[ending]
     endings = [*LANDMARK_FORMATS, *(READ_ONLY_LANDMARKS if verb == "read" else ())]
-    what = "can be read, not written" if path.suffix.lower() in READ_ONLY_LANDMARKS else "is not a landmark format"
-    raise FileFormatError(f"Cannot {verb} {path}: the ending '{path.suffix}' {what}; use one of {', '.join(endings)}.")
+    problem = "can be read, not written" if path.suffix.lower() in READ_ONLY_LANDMARKS else "is not a landmark format"
+    raise FileFormatError(
+        f"Cannot {verb} {path}: the ending '{path.suffix}' {problem}; use one of {', '.join(endings)}."
+    )
 
 
 def _content(path: Path) -> bytes:
@@ -252,23 +254,23 @@ def _content(path: Path) -> bytes:
     return data
 
 
-def _point(values: Iterable[Any], what: str, path: Path) -> FloatArray:
+def _point(values: Iterable[Any], landmark_name: str, path: Path) -> FloatArray:
     try:
         numbers = [float(value) for value in values]
     except (TypeError, ValueError, OverflowError) as error:
-        raise damaged(path, f"{what} has a coordinate that is not a number") from error
+        raise damaged(path, f"{landmark_name} has a coordinate that is not a number") from error
     if len(numbers) != 3:
-        raise damaged(path, f"{what} has {len(numbers)} coordinates, not 3")
+        raise damaged(path, f"{landmark_name} has {len(numbers)} coordinates, not 3")
     return np.array(numbers, dtype=np.float64)
 
 
-def _from_json(read: Callable[[Any, Path], Pairs]) -> Callable[[bytes, Path], Pairs]:
+def _from_json(parse: Callable[[Any, Path], Pairs]) -> Callable[[bytes, Path], Pairs]:
     """Wrap a reader of parsed JSON: what is missing or of the wrong type there is one clear error here."""
 
     def wrapped(data: bytes, path: Path) -> Pairs:
         value = json_value(data, path)
         try:
-            return read(value, path)
+            return parse(value, path)
         except FileError:
             raise
         except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError) as error:
@@ -473,15 +475,15 @@ def _read_bnd(data: bytes, path: Path) -> Pairs:
 
 def _read_lm3(data: bytes, path: Path) -> Pairs:
     lines = [line for line in _text_lines(data) if line]
-    counted = (re.fullmatch(r"(\d{1,6})(?:\s+landmarks?\s*:?)?", line, re.IGNORECASE) for line in lines)
-    at, count = next(((i, int(m[1])) for i, m in enumerate(counted) if m), (0, -1))
+    header_matches = (re.fullmatch(r"(\d{1,6})(?:\s+landmarks?\s*:?)?", line, re.IGNORECASE) for line in lines)
+    header_row, count = next(((i, int(m[1])) for i, m in enumerate(header_matches) if m), (0, -1))
     if count < 0:
         raise damaged(path, "it does not say how many landmarks it holds, so it is not an .lm3 file")
-    rest = lines[at + 1 :]
-    if len(rest) != 2 * count:
-        raise damaged(path, f"it says {count} landmarks, but {len(rest)} lines follow; it is damaged or cut short")
+    body = lines[header_row + 1 :]
+    if len(body) != 2 * count:
+        raise damaged(path, f"it says {count} landmarks, but {len(body)} lines follow; it is damaged or cut short")
     return [
-        (n, _point(xyz.split(), f"landmark '{n[:60]}'", path)) for n, xyz in zip(rest[::2], rest[1::2], strict=True)
+        (n, _point(xyz.split(), f"landmark '{n[:60]}'", path)) for n, xyz in zip(body[::2], body[1::2], strict=True)
     ]
 
 
@@ -491,8 +493,8 @@ _FCSV_COLUMNS = "id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID"
 def _read_fcsv(data: bytes, path: Path) -> Pairs:
     columns, system = _FCSV_COLUMNS.split(","), "RAS"
     for line in _text_lines(data):
-        name, found, value = line.lstrip("# ").partition("=")
-        if line.startswith("#") and found:
+        name, separator, value = line.lstrip("# ").partition("=")
+        if line.startswith("#") and separator:
             if name.strip().lower() == "columns":
                 columns = [cell.strip() for cell in value.split(",")]
             elif name.strip().lower() == "coordinatesystem":
@@ -524,15 +526,15 @@ def fcsv_text(landmarks: Mapping[str, FloatArray], descriptions: Mapping[str, st
 def _read_tps(data: bytes, path: Path) -> Pairs:
     lines = [line for line in _text_lines(data) if line]
     heads = [re.fullmatch(r"LM(3?)\s*=\s*(\d{1,6})", line, re.IGNORECASE) for line in lines]
-    starts = [at for at, head in enumerate(heads) if head]
+    starts = [row for row, head in enumerate(heads) if head]
     if len(starts) != 1:
-        what = f"it has {len(starts)} specimens, so save each in a file of its own" if starts else "it has no LM3="
-        raise damaged(path, what)
+        problem = f"it has {len(starts)} specimens, so save each in a file of its own" if starts else "it has no LM3="
+        raise damaged(path, problem)
     head = heads[starts[0]]
     if head is None or not head[1]:
         raise damaged(path, "its landmarks are of two dimensions (LM=), and those of a surface have three (LM3=)")
-    rest = lines[starts[0] + 1 :]
-    points = [line for line in rest if "=" not in line]
+    body = lines[starts[0] + 1 :]
+    points = [line for line in body if "=" not in line]
     if len(points) != int(head[2]):
         raise damaged(path, f"it says {head[2]} landmarks, but {len(points)} rows follow; it is damaged or cut short")
     return [
@@ -560,12 +562,12 @@ _POINTS_HEAD = re.compile(r"version\b.*|n_points\s*:\s*(\d{1,6})|(?:s\s+)?(\d{1,
 def _read_points(data: bytes, path: Path) -> Pairs:
     """Read rows `x y z` or `name x y z`, after a count or a header perhaps, as landmark editors save them."""
     out: Pairs = []
-    said = None
+    declared = None
     for line in _text_lines(data):
         row = line.partition("#")[0].strip()
         head = _POINTS_HEAD.fullmatch(row)
         if not row or head:
-            said = int(next(filter(None, head.groups()), 0)) or said if head else said
+            declared = int(next(filter(None, head.groups()), 0)) or declared if head else declared
             continue
         words = re.split(r"[\s,;]+", row.rstrip(",;"))
         name = words[0] if len(words) == 4 else f"point_{len(out)}"
@@ -574,8 +576,8 @@ def _read_points(data: bytes, path: Path) -> Pairs:
         if len(words) not in (3, 4):
             raise damaged(path, f"{name} is not a row of 'x y z' or 'name x y z' but has {len(words)} columns")
         out.append((name, _point(words[-3:], f"landmark '{name[:60]}'", path)))
-    if said is not None and said != len(out):
-        raise damaged(path, f"it says {said} landmarks, but {len(out)} rows follow; it is damaged or cut short")
+    if declared is not None and declared != len(out):
+        raise damaged(path, f"it says {declared} landmarks, but {len(out)} rows follow; it is damaged or cut short")
     return out
 
 

@@ -40,10 +40,10 @@ def read_mat_mesh(data: bytes, path: Path) -> Mesh:
         tree = read_matlab_apart(path, names[:_MOST_VARIABLES])
     except ApartError as error:
         raise damaged(path, f"{error}; {CUT_SHORT}") from error
-    found = _mesh(tree)
-    if found is None:
+    mesh = _mesh(tree)
+    if mesh is None:
         raise damaged(path, f"it has no structure with Vertices and Faces; {_SAVE}")
-    vertices, faces = (np.asarray(array, dtype=np.float64) for array in found)
+    vertices, faces = (np.asarray(array, dtype=np.float64) for array in mesh)
     points = vertices if vertices.shape[1] == 3 else vertices.T
     corners = faces if faces.shape[1] == 3 else faces.T
     if points.shape[1] != 3 or corners.shape[1] != 3 or not np.isfinite(corners).all():
@@ -60,5 +60,5 @@ def _mesh(tree: Tree) -> tuple[npt.NDArray[Any], npt.NDArray[Any]] | None:
         place, _, last = name.rpartition("/")
         if array.ndim == 2:
             places.setdefault(place, {})[last.lower()] = array
-    whole = (place for place in places.values() if {"vertices", "faces"} <= place.keys())
-    return next(((place["vertices"], place["faces"]) for place in whole), None)
+    complete = (place for place in places.values() if {"vertices", "faces"} <= place.keys())
+    return next(((place["vertices"], place["faces"]) for place in complete), None)

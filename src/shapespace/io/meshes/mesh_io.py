@@ -154,14 +154,14 @@ def _unpacked_name(path: PurePath | str) -> PurePath:
 
 def _format(path: Path, verb: str) -> MeshFormat:
     ending = ending_of(path) if verb == "read" else path.suffix.lower()
-    found = MESH_FORMATS.get(ending)
-    if found is None:
+    mesh_format = MESH_FORMATS.get(ending)
+    if mesh_format is None:
         known = ending in READ_ONLY_FORMATS
-        what = "can be read, not written" if known else "is not a mesh format"
+        problem = "can be read, not written" if known else "is not a mesh format"
         endings = MESH_ENDINGS if verb == "read" else MESH_FORMATS
         advice = _CONVERT.get(ending, f"use one of {', '.join(endings)}")
-        raise FileFormatError(f"Cannot {verb} {path}: the ending '{path.suffix}' {what}; {advice}.")
-    return found
+        raise FileFormatError(f"Cannot {verb} {path}: the ending '{path.suffix}' {problem}; {advice}.")
+    return mesh_format
 
 
 def _read_any_vtk(data: bytes, path: Path) -> Mesh:

@@ -59,17 +59,21 @@ def read_off(data: bytes, path: Path) -> Mesh:
     check_count(m, 2, len(data), "faces", path)
     # Normals stand before colours, whichever the keyword names first.
     kinds = keyword[1] or b""
-    at = 0 if b"C" not in kinds else 6 if b"N" in kinds else 3
+    colour_column = 0 if b"C" not in kinds else 6 if b"N" in kinds else 3
     points: list[FloatArray] = []
     colours: list[FloatArray | None] = []
     for part in _batches(rows, n, "vertices", path):
         points.append(_points(part, path))
-        colours.append(_colours(part, at, path) if at else None)
+        colours.append(_colours(part, colour_column, path) if colour_column else None)
     vertices = joined(points, np.float64, 3)
-    own = [part for part in colours if part is not None]
-    painted = bytes_of_colours(np.concatenate(own)) if own and len(own) == len(colours) else None
+    known_colours = [part for part in colours if part is not None]
+    vertex_colours = (
+        bytes_of_colours(np.concatenate(known_colours))
+        if known_colours and len(known_colours) == len(colours)
+        else None
+    )
     faces = joined([_faces(part, path) for part in _batches(rows, m, "faces", path)], np.int64, 3)
-    return mesh_of(vertices, faces, path, painted)
+    return mesh_of(vertices, faces, path, vertex_colours)
 
 
 def _rows(data: bytes) -> Iterator[list[bytes]]:
@@ -82,13 +86,13 @@ def _rows(data: bytes) -> Iterator[list[bytes]]:
                 yield words
 
 
-def _batches(rows: Iterator[list[bytes]], count: int, what: str, path: Path) -> Iterator[list[list[bytes]]]:
+def _batches(rows: Iterator[list[bytes]], count: int, row_kind: str, path: Path) -> Iterator[list[list[bytes]]]:
     left = count
     while left:
         part = list(islice(rows, min(left, _ROWS)))
         if not part:
             raise damaged(
-                path, f"its header declares {count} {what}, but only {count - left} lines follow; {CUT_SHORT}"
+                path, f"its header declares {count} {row_kind}, but only {count - left} lines follow; {CUT_SHORT}"
             )
         left -= len(part)
         yield part
@@ -100,12 +104,14 @@ def _points(rows: list[list[bytes]], path: Path) -> FloatArray:
     return floats(chain.from_iterable(words[:3] for words in rows), path).reshape(-1, 3)
 
 
-def _colours(rows: list[list[bytes]], at: int, path: Path) -> FloatArray | None:
-    """Return the three numbers from word `at` of each line, (n, 3); None where some line has none."""
-    if min(map(len, rows)) < at + 3:
+def _colours(rows: list[list[bytes]], first_column: int, path: Path) -> FloatArray | None:
+    """Return the three numbers from word `first_column` of each line, (n, 3); None where some line has none."""
+    if min(map(len, rows)) < first_column + 3:
         return None
     try:
-        return floats(chain.from_iterable(words[at : at + 3] for words in rows), path).reshape(-1, 3)
+        return floats(chain.from_iterable(words[first_column : first_column + 3] for words in rows), path).reshape(
+            -1, 3
+        )
     except FileFormatError:
         return None
 

@@ -32,41 +32,41 @@ def read_pcd(data: bytes, path: Path) -> Mesh:
     Raises:
         FileFormatError: it is no PCD, has no x, y and z, or is cut short.
     """
-    head, at = _header(plain_text(data), path)
+    head, data_start = _header(plain_text(data), path)
     data = plain_text(data)
     row, n = _row(head, path)
     kind = head["DATA"][0].lower()
     if kind == "ascii":
-        points = _text(data[at:], head, n, path)
+        points = _text(data[data_start:], head, n, path)
     elif kind == "binary":
-        check_count(n, row.itemsize, len(data) - at, "points", path)
-        table = np.frombuffer(data, row, n, at)
+        check_count(n, row.itemsize, len(data) - data_start, "points", path)
+        table = np.frombuffer(data, row, n, data_start)
         points = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
     elif kind == "binary_compressed":
-        points = _unpacked(data, at, row, n, path)
+        points = _unpacked(data, data_start, row, n, path)
     else:
         raise damaged(path, f"its data are '{kind[:40]}', but only ascii, binary and binary_compressed are read")
-    seen = ~np.isnan(points).any(axis=1)
-    if not seen.any():
+    is_measured = ~np.isnan(points).any(axis=1)
+    if not is_measured.any():
         raise damaged(path, "none of its points is there")
-    return mesh_of(points[seen], None, path)
+    return mesh_of(points[is_measured], None, path)
 
 
 def _header(data: bytes, path: Path) -> tuple[dict[str, list[str]], int]:
     """Return the words of each line of the header by the first, and where the data begin."""
-    found: dict[str, list[str]] = {}
-    at = 0
-    while "DATA" not in found:
-        end = data.find(b"\n", at, _MOST_HEADER)
+    fields: dict[str, list[str]] = {}
+    offset = 0
+    while "DATA" not in fields:
+        end = data.find(b"\n", offset, _MOST_HEADER)
         if end < 0:
             raise damaged(path, "it has no header that ends in DATA, so it is not a PCD file")
-        words = data[at:end].decode("ascii", "replace").split()
-        at = end + 1
+        words = data[offset:end].decode("ascii", "replace").split()
+        offset = end + 1
         if words and not words[0].startswith("#"):
-            found[words[0].upper()] = words[1:]
-    if not found["DATA"]:
+            fields[words[0].upper()] = words[1:]
+    if not fields["DATA"]:
         raise damaged(path, "its header does not say how the data are written")
-    return found, at
+    return fields, offset
 
 
 def _row(head: dict[str, list[str]], path: Path) -> tuple[np.dtype[np.void], int]:
@@ -101,26 +101,26 @@ def _text(text: bytes, head: dict[str, list[str]], n: int, path: Path) -> FloatA
     columns = [int(starts[names.index(axis)]) for axis in "xyz"]
     check_count(n, 6, len(text) + 1, "points", path)
     parts: list[FloatArray] = []
-    found = 0
+    row_count = 0
     for lines in line_blocks(text):
         rows = [words for words in (line.split() for line in lines) if words]
         if rows and min(map(len, rows)) < width:
             raise damaged(path, f"a row has too few numbers; {CUT_SHORT}")
         parts.append(floats(chain.from_iterable([row[c] for c in columns] for row in rows), path).reshape(-1, 3))
-        found += len(rows)
-    if found != n:
-        raise damaged(path, f"its header declares {n} points, but {found} follow; {CUT_SHORT}")
+        row_count += len(rows)
+    if row_count != n:
+        raise damaged(path, f"its header declares {n} points, but {row_count} follow; {CUT_SHORT}")
     return joined(parts, np.float64, 3)
 
 
-def _unpacked(data: bytes, at: int, row: np.dtype[np.void], n: int, path: Path) -> FloatArray:
+def _unpacked(data: bytes, offset: int, row: np.dtype[np.void], n: int, path: Path) -> FloatArray:
     """Return the points of packed data, in which each field stands for all points before the next."""
-    sizes = np.frombuffer(data[at : at + 8].ljust(8, b"\0"), "<u4")
+    sizes = np.frombuffer(data[offset : offset + 8].ljust(8, b"\0"), "<u4")
     packed, size = int(sizes[0]), int(sizes[1])
-    if n < 0 or size != n * row.itemsize or at + 8 + packed > len(data):
+    if n < 0 or size != n * row.itemsize or offset + 8 + packed > len(data):
         raise damaged(path, f"its packed data have another length than its header says; {CUT_SHORT}")
     Allowance(len(data), path).take(size, 1)
-    content = _lzf(data[at + 8 : at + 8 + packed], size, path)
+    content = _lzf(data[offset + 8 : offset + 8 + packed], size, path)
     offsets = {name: n * int(field[1]) for name, field in (row.fields or {}).items()}
     runs = [np.frombuffer(content, row[axis], n, offsets[axis]).astype(np.float64) for axis in "xyz"]
     return np.stack(runs, axis=1)
@@ -129,25 +129,25 @@ def _unpacked(data: bytes, at: int, row: np.dtype[np.void], n: int, path: Path) 
 def _lzf(data: bytes, size: int, path: Path) -> bytes:
     """Return the `size` bytes that LZF made of `data`: runs as they are, and copies of what came before."""
     out = bytearray()
-    at = 0
+    position = 0
     try:
-        while at < len(data) and len(out) <= size:
-            control = data[at]
-            at += 1
+        while position < len(data) and len(out) <= size:
+            control = data[position]
+            position += 1
             if control < _LITERAL:
-                out += data[at : at + control + 1]
-                at += control + 1
+                out += data[position : position + control + 1]
+                position += control + 1
                 continue
             length = control >> 5
             if length == _LONG:
-                length += data[at]
-                at += 1
-            back = len(out) - ((control & 31) << 8) - data[at] - 1
-            at += 1
-            if back < 0:
+                length += data[position]
+                position += 1
+            copy_start = len(out) - ((control & 31) << 8) - data[position] - 1
+            position += 1
+            if copy_start < 0:
                 raise IndexError
             length += 2
-            run = bytes(out[back : back + length])
+            run = bytes(out[copy_start : copy_start + length])
             # What is copied may go on into the copy.
             out += (run * (length // len(run) + 1))[:length]
     except IndexError as error:

@@ -75,9 +75,9 @@ class _Element:
 class _Words:
     """The words of ascii data from byte `at`, one after another; few of them are in memory at a time."""
 
-    def __init__(self, data: bytes, at: int) -> None:
+    def __init__(self, data: bytes, offset: int) -> None:
         self.data = data
-        self.begin = self.end = at
+        self.begin = self.end = offset
         self.block: list[bytes] = []
         self.at = 0
 
@@ -139,27 +139,27 @@ def read_ply(data: bytes, path: Path) -> Mesh:
         MeshError: faces that point past the end of the vertices.
     """
     data = plain_text(data)
-    order, elements, at = _header(data, path)
+    order, elements, offset = _header(data, path)
     vertices: FloatArray | None = None
     colours: ByteArray | None = None
     observed: BoolArray | None = None
     faces: IndexArray | None = None
-    words = _Words(data, at)
+    words = _Words(data, offset)
     for element in elements:
         if element.name == "tristrips":
             raise damaged(path, "it holds triangle strips, so export it again with plain triangles")
-        available = words.left if order == "" else len(data) - at
+        available = words.left if order == "" else len(data) - offset
         check_count(element.count, element.least_bytes(order == ""), available, _plural(element.name), path)
         lists = any(p.count is not None for p in element.properties)
-        wanted = None
+        list_index = None
         if element.name == "face" and element.count:
-            wanted = element.index_list()
-            if wanted is None:
+            list_index = element.index_list()
+            if list_index is None:
                 raise damaged(path, "its faces have no property vertex_indices, so export it again")
         if lists and order == "":
-            counts, corners = _ascii_lists(words, element, wanted, path)
+            counts, corners = _ascii_lists(words, element, list_index, path)
         elif lists:
-            counts, corners, at = _binary_lists(data, at, element, order, wanted, path)
+            counts, corners, offset = _binary_lists(data, offset, element, order, list_index, path)
         else:
             positions = element.name == "vertex"
             if positions:
@@ -171,12 +171,12 @@ def read_ply(data: bytes, path: Path) -> Mesh:
                     words.skip(element.count * len(element.properties))
             else:
                 if positions:
-                    vertices, colours, observed = _binary_vertices(data, at, element, order)
-                at += element.count * element.least_bytes(False)
+                    vertices, colours, observed = _binary_vertices(data, offset, element, order)
+                offset += element.count * element.least_bytes(False)
             continue
         if element.name == "vertex":
             raise damaged(path, "its vertices carry lists, so export it again without them")
-        if wanted is not None:
+        if list_index is not None:
             if len(counts) and counts.min() < 0:
                 raise damaged(path, f"a face has {int(counts.min())} corners; {CUT_SHORT}")
             faces = fan_triangles(counts, corners)
@@ -196,13 +196,15 @@ def probe_ply(head: bytes, size: int, path: Path) -> None:
     Raises:
         FileFormatError: it is not PLY, or cut short.
     """
-    order, elements, at = _header(head, path)
+    order, elements, offset = _header(head, path)
     for element in elements:
-        check_count(element.count, 1, size - at + 1, _plural(element.name), path)
+        check_count(element.count, 1, size - offset + 1, _plural(element.name), path)
         corners = [p for p in element.properties if element.name == "face" and p.count is not None]
-        each = element.least_bytes(order == "") + sum(3 * (np.dtype(p.item).itemsize if order else 2) for p in corners)
-        check_count(element.count, each, size - at + 1, _plural(element.name), path)
-        at += element.count * each
+        element_bytes = element.least_bytes(order == "") + sum(
+            3 * (np.dtype(p.item).itemsize if order else 2) for p in corners
+        )
+        check_count(element.count, element_bytes, size - offset + 1, _plural(element.name), path)
+        offset += element.count * element_bytes
 
 
 def _plural(name: str) -> str:
@@ -276,10 +278,10 @@ def _is_observed(element: _Element, column: npt.NDArray[Any] | None) -> BoolArra
     return None if column is None or "f" in kinds else np.asarray(column != 0)
 
 
-def _binary_vertices(data: bytes, at: int, element: _Element, order: str) -> _Vertices:
+def _binary_vertices(data: bytes, offset: int, element: _Element, order: str) -> _Vertices:
     names = [p.name for p in element.properties]
     row = np.dtype([(f"p{i}", order + p.item) for i, p in enumerate(element.properties)])
-    table = np.frombuffer(data, dtype=row, count=element.count, offset=at)
+    table = np.frombuffer(data, dtype=row, count=element.count, offset=offset)
     out = np.empty((element.count, 3), dtype=np.float64)
     for axis, name in enumerate("xyz"):
         out[:, axis] = table[f"p{names.index(name)}"]
@@ -293,25 +295,25 @@ def _ascii_vertices(words: _Words, element: _Element, path: Path) -> _Vertices:
     width = len(names)
     flags = (_OBSERVED,) if _OBSERVED in names else ()
     columns: dict[str, list[FloatArray]] = {name: [] for name in ("x", "y", "z", *_colour_names(names), *flags)}
-    taken = 0
+    n_read = 0
     for part in words.take(element.count * width):
         for axis, parts in columns.items():
             # A part may begin and end anywhere in a row.
-            parts.append(floats(part[(names.index(axis) - taken) % width :: width], path))
-        taken += len(part)
-    if taken < element.count * width:
+            parts.append(floats(part[(names.index(axis) - n_read) % width :: width], path))
+        n_read += len(part)
+    if n_read < element.count * width:
         raise _ended(element, path)
-    found = {name: joined(parts, np.float64) for name, parts in columns.items()}
-    positions = np.stack([found[axis] for axis in "xyz"], axis=1)
-    return positions, _colours(element, found), _is_observed(element, found.get(_OBSERVED))
+    arrays = {name: joined(parts, np.float64) for name, parts in columns.items()}
+    positions = np.stack([arrays[axis] for axis in "xyz"], axis=1)
+    return positions, _colours(element, arrays), _is_observed(element, arrays.get(_OBSERVED))
 
 
 def _ended(element: _Element, path: Path) -> FileFormatError:
     return damaged(path, f"it ends among its {_plural(element.name)}; {CUT_SHORT}")
 
 
-def _ascii_lists(words: _Words, element: _Element, wanted: int | None, path: Path) -> tuple[IndexArray, IndexArray]:
-    if len(element.properties) == 1 and element.count and wanted == 0:
+def _ascii_lists(words: _Words, element: _Element, list_index: int | None, path: Path) -> tuple[IndexArray, IndexArray]:
+    if len(element.properties) == 1 and element.count and list_index == 0:
         table = _alike(words, element.count, path)
         if table is not None:
             return table[:, 0], table[:, 1:].ravel()
@@ -328,7 +330,7 @@ def _ascii_lists(words: _Words, element: _Element, wanted: int | None, path: Pat
                 part = words.some(size)
                 if len(part) < size:
                     raise StopIteration
-                if i == wanted:
+                if i == list_index:
                     sizes.append(size)
                     corners.extend(map(int, part))
     except (ValueError, OverflowError) as error:
@@ -346,29 +348,29 @@ def _alike(words: _Words, count: int, path: Path) -> IndexArray | None:
     words.back_to(start)
     if size <= 0 or count * (size + 1) * 2 > words.left:
         return None
-    taken = 0
+    n_read = 0
     parts: list[IndexArray] = []
     for part in words.take(count * (size + 1)):
-        lengths = part[-taken % (size + 1) :: size + 1]
+        lengths = part[-n_read % (size + 1) :: size + 1]
         if lengths.count(first) != len(lengths):
             break
         parts.append(ints(part, path))
-        taken += len(part)
-    if taken == count * (size + 1):
+        n_read += len(part)
+    if n_read == count * (size + 1):
         return np.concatenate(parts).reshape(count, size + 1)
     words.back_to(start)
     return None
 
 
 def _binary_lists(
-    data: bytes, at: int, element: _Element, order: str, wanted: int | None, path: Path
+    data: bytes, offset: int, element: _Element, order: str, list_index: int | None, path: Path
 ) -> tuple[IndexArray, IndexArray, int]:
     none = np.zeros(0, dtype=np.int64)
     if element.count == 0:
-        return none, none, at
+        return none, none, offset
     if any(p.count is not None and p.count[0] == "f" for p in element.properties):
         raise damaged(path, "a list has a length that is not a whole number, so export it again")
-    uniform = _uniform_lists(data, at, element, order, wanted)
+    uniform = _uniform_lists(data, offset, element, order, list_index)
     if uniform is not None:
         return uniform
     endian = "little" if order == "<" else "big"
@@ -376,39 +378,39 @@ def _binary_lists(
     for i, p in enumerate(element.properties):
         count_bytes = 0 if p.count is None else np.dtype(p.count).itemsize
         signed = p.count is not None and p.count[0] == "i"
-        plan.append((count_bytes, np.dtype(p.item).itemsize, signed, i == wanted))
+        plan.append((count_bytes, np.dtype(p.item).itemsize, signed, i == list_index))
     starts, sizes = array("q"), array("q")
     for _ in range(element.count):
         for count_bytes, item, signed, keep in plan:
             if count_bytes == 0:
-                at += item
+                offset += item
                 continue
-            size = int.from_bytes(data[at : at + count_bytes], endian, signed=signed)
-            at += count_bytes
+            size = int.from_bytes(data[offset : offset + count_bytes], endian, signed=signed)
+            offset += count_bytes
             if keep:
-                starts.append(at)
+                starts.append(offset)
                 sizes.append(size)
-            at += max(size, 0) * item
-        if at > len(data):
+            offset += max(size, 0) * item
+        if offset > len(data):
             raise damaged(path, f"it ends among its {_plural(element.name)}; {CUT_SHORT}")
-    if wanted is None:
-        return none, none, at
-    kind = np.dtype(order + element.properties[wanted].item)
+    if list_index is None:
+        return none, none, offset
+    kind = np.dtype(order + element.properties[list_index].item)
     counts = np.array(sizes, dtype=np.int64)
-    each = np.maximum(counts, 0)
-    step = np.arange(int(each.sum()), dtype=np.int64) - np.repeat(np.cumsum(each) - each, each)
-    first = np.repeat(np.array(starts, dtype=np.int64), each) + step * kind.itemsize
-    raw = np.frombuffer(data, dtype=np.uint8)[first[:, None] + np.arange(kind.itemsize)]
-    return counts, _indices(np.ascontiguousarray(raw).view(kind).ravel()), at
+    lengths = np.maximum(counts, 0)
+    step = np.arange(int(lengths.sum()), dtype=np.int64) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+    first_byte = np.repeat(np.array(starts, dtype=np.int64), lengths) + step * kind.itemsize
+    raw = np.frombuffer(data, dtype=np.uint8)[first_byte[:, None] + np.arange(kind.itemsize)]
+    return counts, _indices(np.ascontiguousarray(raw).view(kind).ravel()), offset
 
 
 def _uniform_lists(
-    data: bytes, at: int, element: _Element, order: str, wanted: int | None
+    data: bytes, start: int, element: _Element, order: str, list_index: int | None
 ) -> tuple[IndexArray, IndexArray, int] | None:
     """Read the rows at one stroke if all lists have the lengths of the first row's; None if they do not."""
     fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
     expected: list[tuple[str, int]] = []
-    offset = at
+    offset = start
     for i, p in enumerate(element.properties):
         if p.count is None:
             fields.append((f"p{i}", order + p.item))
@@ -425,23 +427,23 @@ def _uniform_lists(
         expected.append((f"c{i}", size))
         offset += size * np.dtype(p.item).itemsize
     row = np.dtype(fields)
-    end = at + element.count * row.itemsize
+    end = start + element.count * row.itemsize
     if end > len(data):
         return None
-    table = np.frombuffer(data, dtype=row, count=element.count, offset=at)
+    table = np.frombuffer(data, dtype=row, count=element.count, offset=start)
     if any((table[name] != size).any() for name, size in expected):
         return None
-    if wanted is None:
+    if list_index is None:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), end
-    return table[f"c{wanted}"].astype(np.int64), _indices(table[f"p{wanted}"].ravel()), end
+    return table[f"c{list_index}"].astype(np.int64), _indices(table[f"p{list_index}"].ravel()), end
 
 
 def _indices(values: npt.NDArray[Any]) -> IndexArray:
     """Return whole numbers of any scalar type as int64; what is not whole becomes -1, which no mesh accepts."""
     if values.dtype.kind == "f":
         numbers = values.astype(np.float64)
-        whole = np.isfinite(numbers) & (numbers == np.floor(numbers)) & (np.abs(numbers) < 2**53)
-        return np.where(whole, numbers, -1.0).astype(np.int64)
+        is_whole = np.isfinite(numbers) & (numbers == np.floor(numbers)) & (np.abs(numbers) < 2**53)
+        return np.where(is_whole, numbers, -1.0).astype(np.int64)
     return values.astype(np.int64)
 
 
@@ -484,5 +486,5 @@ def ply_comment(path: Path) -> str:
             lines = stream.read(_FIRST_LINES).split(b"\n")
     except OSError:
         return ""
-    found = next((line for line in lines if line.startswith(b"comment ")), b"")
-    return found.removeprefix(b"comment ").decode("ascii", "replace").strip()
+    comment_line = next((line for line in lines if line.startswith(b"comment ")), b"")
+    return comment_line.removeprefix(b"comment ").decode("ascii", "replace").strip()

@@ -119,11 +119,11 @@ def write_stl(mesh: Mesh) -> bytes:
     if (np.abs(corners) > np.finfo(np.float32).max).any():
         raise InputError(f"{mesh.name} has coordinates too large for STL; write it as PLY instead.")
     used = np.unique(mesh.faces)
-    apart = len(merge_equal(mesh.vertices[used])[0])
+    n_distinct = len(merge_equal(mesh.vertices[used])[0])
     left = len(merge_equal(mesh.vertices[used].astype(np.float32).astype(np.float64))[0])
-    if apart - left > _MOST_MERGED * apart:
+    if n_distinct - left > _MOST_MERGED * n_distinct:
         raise InputError(
-            f"{mesh.name} lies so far from the origin, for its size, that STL's float32 would merge its {apart} "
+            f"{mesh.name} lies so far from the origin, for its size, that STL's float32 would merge its {n_distinct} "
             f"vertices into {left}; move it to the origin, or write it as PLY."
         )
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

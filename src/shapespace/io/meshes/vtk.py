@@ -108,9 +108,9 @@ class _Cursor(ABC):
     def skip_if_offsets(self) -> bool:
         """Move past the word OFFSETS if it comes next, and return whether it did."""
         # As a number, 'OFFS' would be a polygon of a thousand million corners.
-        found = _OFFSETS.match(self.data, self.at)
-        self.at = found.end() if found else self.at
-        return found is not None
+        match = _OFFSETS.match(self.data, self.at)
+        self.at = match.end() if match else self.at
+        return match is not None
 
 
 class _TextCursor(_Cursor):
@@ -123,8 +123,8 @@ class _TextCursor(_Cursor):
                 raise damaged(self.path, f"it ends among its numbers; {CUT_SHORT}")
             if len(words) > count:
                 # Cut again, to see where the last of them ends.
-                rest = self.data[self.at : stop].split(None, count)[count]
-                words, stop = words[:count], stop - len(rest)
+                remainder = self.data[self.at : stop].split(None, count)[count]
+                words, stop = words[:count], stop - len(remainder)
             parts.append(floats(words, self.path) if kind[0] == "f" else ints(words, self.path))
             self.at = stop
             count -= len(words)
@@ -317,11 +317,11 @@ def _legacy_cells(cursor: _Cursor, path: Path) -> tuple[IndexArray, IndexArray]:
         if (table[:, 0] == table.shape[1] - 1).all():
             return table[:, 0], table[:, 1:].ravel()
     sizes: list[int] = []
-    at, values = 0, packed.tolist()
-    while at < second and len(sizes) < first and values[at] >= 0:
-        sizes.append(values[at])
-        at += values[at] + 1
-    if at != second or len(sizes) != first:
+    position, values = 0, packed.tolist()
+    while position < second and len(sizes) < first and values[position] >= 0:
+        sizes.append(values[position])
+        position += values[position] + 1
+    if position != second or len(sizes) != first:
         raise damaged(path, f"its cells do not add up to the size that they declare; {CUT_SHORT}")
     counts = np.array(sizes, dtype=np.int64)
     keep = np.ones(second, dtype=np.bool_)
@@ -351,8 +351,8 @@ def write_vtk(mesh: Mesh) -> bytes:
     surface = head.encode("ascii") + points + section.encode("ascii") + packed.tobytes() + b"\n"
     if mesh.colours is None:
         return surface
-    told = f"POINT_DATA {n}\nSCALARS RGB unsigned_char 3\nLOOKUP_TABLE default\n"
-    return surface + told.encode("ascii") + mesh.colours.tobytes() + b"\n"
+    colour_header = f"POINT_DATA {n}\nSCALARS RGB unsigned_char 3\nLOOKUP_TABLE default\n"
+    return surface + colour_header.encode("ascii") + mesh.colours.tobytes() + b"\n"
 
 
 @dataclass(frozen=True)
@@ -383,9 +383,9 @@ def read_vtp(data: bytes, path: Path) -> Mesh:
     appended = b""
     if mark:
         # Raw data are not XML, so the XML parser sees only what comes before them.
-        tag, _, rest = tail.partition(b">")
+        tag, _, body = tail.partition(b">")
         head += mark + tag + b"/></VTKFile>"
-        appended = rest.partition(b"_")[2]
+        appended = body.partition(b"_")[2]
     root = xml_root(head, path)
     if root.tag != "VTKFile" or root.get("type") != "PolyData":
         raise damaged(path, "it is not a VTK file of type PolyData; extract its surface first")
@@ -400,7 +400,7 @@ def read_vtp(data: bytes, path: Path) -> Mesh:
     points: list[FloatArray] = []
     colours: list[ByteArray | None] = []
     faces: list[IndexArray] = []
-    before = 0
+    n_vertices = 0
     for piece in root.iterfind("PolyData/Piece"):
         xml.allowance.part()
         vertices = _piece_points(piece, xml)
@@ -408,22 +408,22 @@ def read_vtp(data: bytes, path: Path) -> Mesh:
             arrays = {a.get("Name"): a for a in piece.iterfind(f"{section}/DataArray")}
             if not {"connectivity", "offsets"} <= arrays.keys():
                 continue
-            ends = _data_array(arrays["offsets"], xml).astype(np.int64)
+            face_ends = _data_array(arrays["offsets"], xml).astype(np.int64)
             corners = _data_array(arrays["connectivity"], xml).astype(np.int64)
-            if not len(ends):
+            if not len(face_ends):
                 continue
             xml.allowance.take(3 * len(corners), 8)
-            triangles = cut(*_from_offsets(np.concatenate([[0], ends]), corners, path))
+            triangles = cut(*_from_offsets(np.concatenate([[0], face_ends]), corners, path))
             # Checked piece by piece: joined, an index past one piece would point into the next.
-            faces.append(_faces_of(mesh_of(vertices, triangles, path)) + before)
+            faces.append(_faces_of(mesh_of(vertices, triangles, path)) + n_vertices)
         points.append(vertices)
         colours.append(_piece_colours(piece, len(vertices), xml))
-        before += len(vertices)
+        n_vertices += len(vertices)
     if not points:
         raise damaged(path, f"it holds no points; {CUT_SHORT}")
-    own = [part for part in colours if part is not None]
-    painted = np.concatenate(own) if len(own) == len(colours) else None
-    return mesh_of(np.concatenate(points), joined(faces, np.int64, 3), path, painted)
+    known_colours = [part for part in colours if part is not None]
+    vertex_colours = np.concatenate(known_colours) if len(known_colours) == len(colours) else None
+    return mesh_of(np.concatenate(points), joined(faces, np.int64, 3), path, vertex_colours)
 
 
 def _faces_of(mesh: Mesh) -> IndexArray:
@@ -483,22 +483,22 @@ def _data_array(array: ET.Element, xml: _Xml) -> Values:
     return np.frombuffer(raw, dtype=kind)
 
 
-def _decoded(data: bytes, at: int, is_base64: bool, xml: _Xml) -> bytes:
-    """Return the bytes of one array that starts at byte `at` of `data`."""
+def _decoded(data: bytes, offset: int, is_base64: bool, xml: _Xml) -> bytes:
+    """Return the bytes of one array that starts at byte `offset` of `data`."""
     width = np.dtype(xml.header).itemsize
     if not xml.compressed:
-        (length,) = _words(data, at, 1, is_base64, xml)
+        (length,) = _words(data, offset, 1, is_base64, xml)
         chars = 4 * -(-width // 3)
         # Some writers encode the length by itself, which leaves padding, and others together with the data.
-        if is_base64 and data[at : at + chars].endswith(b"="):
-            return _stream(data, at + chars, 0, length, True, xml)
-        return _stream(data, at, width, length, is_base64, xml)
-    (blocks,) = _words(data, at, 1, is_base64, xml)
-    check_count(blocks, width, len(data) - at, "compressed blocks", xml.path)
+        if is_base64 and data[offset : offset + chars].endswith(b"="):
+            return _stream(data, offset + chars, 0, length, True, xml)
+        return _stream(data, offset, width, length, is_base64, xml)
+    (blocks,) = _words(data, offset, 1, is_base64, xml)
+    check_count(blocks, width, len(data) - offset, "compressed blocks", xml.path)
     xml.allowance.part(blocks)
-    _, size, last, *packed = _words(data, at, 3 + blocks, is_base64, xml)
+    _, size, last, *packed = _words(data, offset, 3 + blocks, is_base64, xml)
     header = (3 + blocks) * width
-    stream = _stream(data, at + (4 * -(-header // 3) if is_base64 else header), 0, sum(packed), is_base64, xml)
+    stream = _stream(data, offset + (4 * -(-header // 3) if is_base64 else header), 0, sum(packed), is_base64, xml)
     out: list[bytes] = []
     begin = 0
     for i, length in enumerate(packed):
@@ -517,22 +517,22 @@ def _decoded(data: bytes, at: int, is_base64: bool, xml: _Xml) -> bytes:
     return b"".join(out)
 
 
-def _words(data: bytes, at: int, count: int, is_base64: bool, xml: _Xml) -> list[int]:
+def _words(data: bytes, offset: int, count: int, is_base64: bool, xml: _Xml) -> list[int]:
     """Return the `count` whole numbers at the start of an array."""
     kind = np.dtype(xml.header)
-    return np.frombuffer(_stream(data, at, 0, count * kind.itemsize, is_base64, xml), dtype=kind).tolist()
+    return np.frombuffer(_stream(data, offset, 0, count * kind.itemsize, is_base64, xml), dtype=kind).tolist()
 
 
-def _stream(data: bytes, at: int, start: int, length: int, is_base64: bool, xml: _Xml) -> bytes:
-    """Return `length` bytes from byte `start` of what `data` encodes from byte `at` on."""
+def _stream(data: bytes, offset: int, start: int, length: int, is_base64: bool, xml: _Xml) -> bytes:
+    """Return `length` bytes from byte `start` of what `data` encodes from byte `offset` on."""
     end = start + length
-    check_count(end, 1, len(data) - at, "bytes of data", xml.path)
+    check_count(end, 1, len(data) - offset, "bytes of data", xml.path)
     if not is_base64:
-        return data[at + start : at + end]
+        return data[offset + start : offset + end]
     # Arrays may lie on the same bytes, so that each counts by itself.
     xml.allowance.take(end, 1)
     try:
-        raw = base64.b64decode(data[at : at + 4 * -(-end // 3)], validate=True)
+        raw = base64.b64decode(data[offset : offset + 4 * -(-end // 3)], validate=True)
     except ValueError as error:
         raise damaged(xml.path, f"it has data that are not base64; {CUT_SHORT}") from error
     if len(raw) < end:
@@ -544,7 +544,7 @@ def write_vtp(mesh: Mesh) -> bytes:
     """Return `mesh` as XML VTK poly data with inline base64, Float64 points, uncompressed."""
     n = len(mesh.vertices)
     cells = np.arange(n, dtype=np.int32).reshape(-1, 1) if mesh.faces is None else mesh.faces
-    ends = np.arange(1, len(cells) + 1, dtype="<i8") * cells.shape[1]
+    face_ends = np.arange(1, len(cells) + 1, dtype="<i8") * cells.shape[1]
     section, verts, polys = ("Verts", n, 0) if mesh.faces is None else ("Polys", 0, len(cells))
 
     def array(name: str, kind: str, values: Values, components: str = "") -> str:
@@ -554,8 +554,8 @@ def write_vtp(mesh: Mesh) -> bytes:
 
     colours: list[str] = []
     if mesh.colours is not None:
-        told = array("RGB", "UInt8", mesh.colours, ' NumberOfComponents="3"')
-        colours = ['<PointData Scalars="RGB">', told, "</PointData>"]
+        colour_array = array("RGB", "UInt8", mesh.colours, ' NumberOfComponents="3"')
+        colours = ['<PointData Scalars="RGB">', colour_array, "</PointData>"]
     lines = [
         '<?xml version="1.0"?>',
         '<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt64">',
@@ -568,7 +568,7 @@ def write_vtp(mesh: Mesh) -> bytes:
         *colours,
         f"<{section}>",
         array("connectivity", "Int64", cells.astype("<i8").ravel()),
-        array("offsets", "Int64", ends),
+        array("offsets", "Int64", face_ends),
         f"</{section}>",
         "</Piece>",
         "</PolyData>",

@@ -30,11 +30,11 @@ def read_xyz(data: bytes, path: Path) -> Mesh:
     if b"\0" in data[:65536]:
         raise damaged(path, "it is binary; of this ending only text with rows of x y z is read")
     parts: list[FloatArray] = []
-    width = before = declared = 0
+    width = lines_before = declared = 0
     for lines in line_blocks(plain_text(data)):
         rows = [line.translate(_SEPARATORS).split() for line in lines if not line.lstrip().startswith(_COMMENTS)]
         rows = [row for row in rows if row]
-        if rows and not before and not width and not _is_number(rows[0][0]) and len(rows[0]) >= 3:
+        if rows and not lines_before and not width and not _is_number(rows[0][0]) and len(rows[0]) >= 3:
             rows = rows[1:]
         counts = [row[0] for row in rows if len(row) == 1]
         points = [row for row in rows if len(row) > 1]
@@ -42,16 +42,16 @@ def read_xyz(data: bytes, path: Path) -> Mesh:
             width = width or len(points[0])
             if any(len(row) != width for row in points) or width < 3:
                 raise damaged(path, f"it is no table of points with three or more columns, {width} in each row")
-            if not all(map(_is_number, points[0])) and not before:
+            if not all(map(_is_number, points[0])) and not lines_before:
                 raise damaged(path, "it has words beside its points (a molecule perhaps), so it is no scan")
-            taken = chain.from_iterable(row[:3] for row in points)
-            parts.append(floats(taken, path).reshape(-1, 3))
-            before += len(points)
+            coordinates = chain.from_iterable(row[:3] for row in points)
+            parts.append(floats(coordinates, path).reshape(-1, 3))
+            lines_before += len(points)
         declared += sum(ints(counts, path).tolist())
-    if not before:
+    if not lines_before:
         raise damaged(path, "it has no rows of x y z")
-    if declared and declared != before:
-        raise damaged(path, f"it declares {declared} points, but {before} follow; {CUT_SHORT}")
+    if declared and declared != lines_before:
+        raise damaged(path, f"it declares {declared} points, but {lines_before} follow; {CUT_SHORT}")
     return mesh_of(joined(parts, np.float64, 3), None, path)
 
 

@@ -71,13 +71,13 @@ def checked_table_text(header: Sequence[str], rows: Iterable[Sequence[object]]) 
 
 def write_checked(stream: TextIO, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Write the same to `stream`, a row at a time."""
-    at = header.index(CHECKSUM)
+    checksum_column = header.index(CHECKSUM)
     header = [str(_written(name)) for name in header]
     write_row = _row_writer(stream)
     write_row(header)
     for row in rows:
         cells = ["" if cell is None else str(_written(cell)) for cell in row]
-        write_row([*cells[:at], row_checksum(header, cells), *cells[at + 1 :]])
+        write_row([*cells[:checksum_column], row_checksum(header, cells), *cells[checksum_column + 1 :]])
 
 
 def _row_writer(stream: TextIO) -> Callable[[Sequence[object]], object]:
@@ -109,8 +109,8 @@ def as_written(cell: str) -> str:
 def row_checksum(header: Sequence[str], cells: Sequence[str]) -> str:
     """Return what stands in the column `CHECKSUM` of a row; no number is written so, which a program might round."""
     pairs = sorted((name, cell) for name, cell in zip(header, cells, strict=True) if name != CHECKSUM)
-    said = "\0".join(f"{name}\1{cell}" for name, cell in pairs)
-    return f"sha256:{hashlib.sha256(said.encode('utf-8', 'surrogatepass')).hexdigest()[:16]}"
+    row_text = "\0".join(f"{name}\1{cell}" for name, cell in pairs)
+    return f"sha256:{hashlib.sha256(row_text.encode('utf-8', 'surrogatepass')).hexdigest()[:16]}"
 
 
 def key_column(header: Sequence[str], names: Sequence[str] = KEYS) -> int | None:
@@ -141,19 +141,19 @@ def table_rows(content: bytes) -> Iterator[list[str]]:
         header = [as_written(name).strip() for name in raw]
         known = [name for name in header if name]
         if len(set(known)) != len(known):
-            twice = next(name for name in known if known.count(name) > 1)
-            raise ValueError(f"has two columns of one name ({twice[:40]!r})")
+            repeated = next(name for name in known if known.count(name) > 1)
+            raise ValueError(f"has two columns of one name ({repeated[:40]!r})")
         yield header
-        at, lacking = header.index(CHECKSUM) if CHECKSUM in header else None, 0
+        checksum_column, n_unchecked = header.index(CHECKSUM) if CHECKSUM in header else None, 0
         for number, row in enumerate(lines, 1):
             if len(row) > len(raw) and not any(cell.strip() for cell in row[len(raw) :]):
                 del row[len(raw) :]
-            if len(row) > len(raw) or (at is not None and len(row) != len(raw)):
+            if len(row) > len(raw) or (checksum_column is not None and len(row) != len(raw)):
                 raise ValueError(f"has {len(row)} cells in row {number}, and {len(raw)} columns")
-            if at is not None and row_checksum(raw, row) != row[at]:
+            if checksum_column is not None and row_checksum(raw, row) != row[checksum_column]:
                 raise ValueError(f"was changed in row {number} since it was written, as its column {CHECKSUM} tells")
-            lacking += len(raw) - len(row)
-            if lacking > _MOST_LACKING:
+            n_unchecked += len(raw) - len(row)
+            if n_unchecked > _MOST_LACKING:
                 raise ValueError(f"has rows with far fewer cells than its {len(raw)} columns, such as row {number}")
             yield [*map(as_written, row), *[""] * (len(raw) - len(row))]
     except csv.Error as error:
@@ -172,8 +172,8 @@ def decoded_text(content: bytes) -> str:
         if content.startswith(_UTF_16):
             raise ValueError("is not text, or UTF-16 that is cut short") from error
         # Five bytes have no character in the code page of Windows; Latin-1 has one for each.
-        odd = any(byte in content for byte in (b"\x81", b"\x8d", b"\x8f", b"\x90", b"\x9d"))
-        return content.decode("latin-1" if odd else "cp1252")
+        is_undefined = any(byte in content for byte in (b"\x81", b"\x8d", b"\x8f", b"\x90", b"\x9d"))
+        return content.decode("latin-1" if is_undefined else "cp1252")
 
 
 def _csv_lines(text: str) -> Iterator[list[str]]:
@@ -202,17 +202,17 @@ def _with_decimal_points(lines: list[list[str]]) -> list[list[str]]:
     Raises:
         ValueError: a column has both, or points for thousands.
     """
-    for at, name in enumerate(lines[0] if lines else []):
-        cells = {number: line[at].strip() for number, line in enumerate(lines) if number and at < len(line)}
+    for column, name in enumerate(lines[0] if lines else []):
+        cells = {number: line[column].strip() for number, line in enumerate(lines) if number and column < len(line)}
         cells = {number: cell for number, cell in cells.items() if cell.lower() not in MISSING}
         with_comma = [n for n, cell in cells.items() if _DECIMAL_COMMA.fullmatch(cell) or _THOUSANDS.fullmatch(cell)]
-        rest = [cell for number, cell in cells.items() if number not in set(with_comma)]
-        if not with_comma or not all(_NUMBER.fullmatch(cell) for cell in rest):
+        other_cells = [cell for number, cell in cells.items() if number not in set(with_comma)]
+        if not with_comma or not all(_NUMBER.fullmatch(cell) for cell in other_cells):
             continue
-        if any(_THOUSANDS.fullmatch(cells[n]) for n in with_comma) or not all(map(_INTEGER.fullmatch, rest)):
+        if any(_THOUSANDS.fullmatch(cells[n]) for n in with_comma) or not all(map(_INTEGER.fullmatch, other_cells)):
             raise ValueError(f"writes numbers with commas and with points in the column {name[:40]!r}; use one of them")
         for number in with_comma:
-            lines[number][at] = cells[number].replace(",", ".")
+            lines[number][column] = cells[number].replace(",", ".")
     return lines
 
 
@@ -227,6 +227,6 @@ def _sheet(content: bytes) -> Iterator[list[str]]:
                 f"has a cell outside its table ({row[last - 1][:40]!r}); give that column a name, and leave no title"
                 " above the names of columns"
             )
-        line = [row.get(at, "") for at in range(width)]
+        line = [row.get(column, "") for column in range(width)]
         if any(cell.strip() for cell in line):
             yield line

@@ -56,13 +56,13 @@ def sheet_rows(content: bytes, sheet: str | None = None) -> list[Row]:
     book = _Elements(("sheet", "workbookPr"))
     _parse(members, "xl/workbook.xml", book)
     sheets = [attributes for tag, attributes in book.found if tag == "sheet"]
-    chosen = next((one for one in sheets if sheet is None or one.get("name") == sheet), None)
+    chosen = next((entry for entry in sheets if sheet is None or entry.get("name") == sheet), None)
     if chosen is None:
         raise ValueError(f"has no sheet called {sheet}" if sheet else "has no sheet, so it is no workbook")
     key = next((value for name, value in chosen.items() if name.endswith("}id")), "")
     relations = _Elements(("Relationship",))
     _parse(members, _RELATIONS, relations)
-    targets = {one.get("Id"): one.get("Target", "") for _, one in relations.found}
+    targets = {entry.get("Id"): entry.get("Target", "") for _, entry in relations.found}
     target = targets.get(key, "").removeprefix("/xl/").removeprefix("xl/")
     shared = _Strings()
     if "xl/sharedStrings.xml" in members:
@@ -70,7 +70,7 @@ def sheet_rows(content: bytes, sheet: str | None = None) -> list[Row]:
     styles = _Elements(("numFmt", "xf", "cellXfs", "cellStyleXfs"))
     if "xl/styles.xml" in members:
         _parse(members, "xl/styles.xml", styles)
-    since_1904 = any(tag == "workbookPr" and one.get("date1904") in ("1", "true") for tag, one in book.found)
+    since_1904 = any(tag == "workbookPr" and entry.get("date1904") in ("1", "true") for tag, entry in book.found)
     cells = _Cells(shared.strings, _date_styles(styles), since_1904=since_1904)
     _parse(members, f"xl/{target}", cells)
     return cells.rows
@@ -160,9 +160,9 @@ class _Cells(_Handler):
         if name == "row":
             self._row, self._column = {}, -1
         elif name == "c":
-            at = _CELL.fullmatch(attrs.get("r", ""))
+            reference = _CELL.fullmatch(attrs.get("r", ""))
             # A cell without a place follows the one before it.
-            self._column = _column(at[1]) if at else self._column + 1
+            self._column = _column(reference[1]) if reference else self._column + 1
             if self._column >= _MOST_COLUMNS:
                 raise ValueError("has more columns than a sheet can have")
             self._kind, self._style, self._parts = attrs.get("t", "n"), attrs.get("s", "0"), []
@@ -231,20 +231,24 @@ def _parse(members: Mapping[str, bytes], name: str, target: _Target) -> None:
 
 def _date_styles(styles: _Elements) -> frozenset[str]:
     """Return the numbers, as text, of the styles of cells that show dates or times."""
-    codes = {one.get("numFmtId", ""): one.get("formatCode", "") for tag, one in styles.found if tag == "numFmt"}
-    found: set[str] = set()
+    codes = {
+        attributes.get("numFmtId", ""): attributes.get("formatCode", "")
+        for tag, attributes in styles.found
+        if tag == "numFmt"
+    }
+    date_styles: set[str] = set()
     of_cells, number = False, 0
-    for tag, one in styles.found:
+    for tag, attributes in styles.found:
         if tag in ("cellXfs", "cellStyleXfs"):
             of_cells, number = tag == "cellXfs", 0
         elif tag == "xf" and of_cells:
-            key = one.get("numFmtId", "0")
-            own = _NO_CODE.sub("", codes.get(key, "")).lower()
+            key = attributes.get("numFmtId", "0")
+            code = _NO_CODE.sub("", codes.get(key, "")).lower()
             built_in = key not in codes and key.isascii() and key.isdecimal() and len(key) < _DIGITS
-            if (built_in and int(key) in _DATES) or (own != "general" and re.search(r"[ymdhs]", own)):
-                found.add(str(number))
+            if (built_in and int(key) in _DATES) or (code != "general" and re.search(r"[ymdhs]", code)):
+                date_styles.add(str(number))
             number += 1
-    return frozenset(found)
+    return frozenset(date_styles)
 
 
 def _column(letters: str) -> int:

@@ -193,31 +193,36 @@ def _unpacking(path: Path) -> Generator[None]:
 
 def _labels(stream: IO[bytes], head: _Head, max_memory_bytes: int, path: Path) -> npt.NDArray[np.integer[Any]]:
     """Return the labels as a flat array, decoded in pieces so that no more than the array is in memory at a time."""
-    whole = head.kind.kind in "iu" and (head.slope, head.shift) == (1.0, 0.0)
-    kind: np.dtype[Any] = head.kind.newbyteorder("=") if whole else np.dtype(np.int32)
+    is_integral = head.kind.kind in "iu" and (head.slope, head.shift) == (1.0, 0.0)
+    kind: np.dtype[Any] = head.kind.newbyteorder("=") if is_integral else np.dtype(np.int32)
     count = math.prod(head.shape)
-    needed = count * kind.itemsize + _WORK_BYTES
-    if needed > max_memory_bytes:
+    needed_bytes = count * kind.itemsize + _WORK_BYTES
+    if needed_bytes > max_memory_bytes:
         raise InputError(
-            f"{path} has {' x '.join(map(str, head.shape))} voxels, which take {needed / 2**30:.2g} GiB of memory, "
-            f"over the limit of {max_memory_bytes / 2**30:.2g} GiB; crop or resample it, or allow more (--max-memory)."
+            f"{path} has {' x '.join(map(str, head.shape))} voxels, which take {needed_bytes / 2**30:.2g} GiB of "
+            f"memory, over the limit of {max_memory_bytes / 2**30:.2g} GiB; crop or resample it, or allow "
+            "more (--max-memory)."
         )
     # Pages that stay zero, as most of a mask is, take no memory.
     labels = np.zeros(count, dtype=kind)
     values = _Values()
     buffer = memoryview(bytearray(min(_PIECE, head.bytes)))
-    at = 0
+    offset = 0
     with _unpacking(path):
-        while at < count:
-            wanted = min(len(buffer), (count - at) * head.kind.itemsize)
-            read = _filled(stream, buffer[:wanted])
-            if read < wanted:
-                there = at * head.kind.itemsize + read
-                raise damaged(path, f"it ends after {there:,} of {head.bytes:,} bytes of voxels; {CUT_SHORT}")
-            piece: npt.NDArray[Any] = np.frombuffer(buffer[:wanted], dtype=head.kind)
-            if piece.any() or not whole:
-                labels[at : at + len(piece)] = piece if whole else values.rounded(piece * head.slope + head.shift, path)
-            at += len(piece)
+        while offset < count:
+            request_bytes = min(len(buffer), (count - offset) * head.kind.itemsize)
+            read = _filled(stream, buffer[:request_bytes])
+            if read < request_bytes:
+                available_values = offset * head.kind.itemsize + read
+                raise damaged(
+                    path, f"it ends after {available_values:,} of {head.bytes:,} bytes of voxels; {CUT_SHORT}"
+                )
+            piece: npt.NDArray[Any] = np.frombuffer(buffer[:request_bytes], dtype=head.kind)
+            if piece.any() or not is_integral:
+                labels[offset : offset + len(piece)] = (
+                    piece if is_integral else values.rounded(piece * head.slope + head.shift, path)
+                )
+            offset += len(piece)
         # The checksum of a stream is only looked at where it ends.
         stream.read(1)
     values.check(path)
@@ -226,10 +231,10 @@ def _labels(stream: IO[bytes], head: _Head, max_memory_bytes: int, path: Path) -
 
 def _filled(stream: IO[bytes], view: memoryview) -> int:
     """Read into `view` until it is full or the stream ends, and return how many bytes were read."""
-    at = 0
-    while at < len(view) and (count := cast(Any, stream).readinto(view[at:])):
-        at += count
-    return at
+    filled = 0
+    while filled < len(view) and (count := cast(Any, stream).readinto(view[filled:])):
+        filled += count
+    return filled
 
 
 @dataclass
@@ -246,9 +251,9 @@ class _Values:
         if not math.isfinite(low) or not math.isfinite(high):
             raise InputError(f"{path} has voxels that are not finite, so it holds no labels; give the label map.")
         self.low, self.high = min(self.low, low), max(self.high, high)
-        found = np.rint(values)
-        self.off = max(self.off, float(np.abs(values - found).max()))
-        return found if self._are_labels() else np.zeros(len(values))
+        whole_values = np.rint(values)
+        self.off = max(self.off, float(np.abs(values - whole_values).max()))
+        return whole_values if self._are_labels() else np.zeros(len(values))
 
     def _are_labels(self) -> bool:
         return max(-self.low, self.high) < 2**31 and self.off <= _ROUNDING
@@ -303,10 +308,12 @@ def _nifti_affine(header: Any) -> tuple[FloatArray, tuple[str, ...]]:
     affine = np.array(form, dtype=np.float64)
     notes: tuple[str, ...] = ()
     if other_code and other is not None:
-        ends = np.array([[0, 0, 0, 1], [*np.array(header.get_data_shape())[:3], 1]], dtype=np.float64)
-        apart = float(np.abs(ends @ (affine - np.asarray(other)).T).max())
-        if apart > _APART_MM:
-            notes = (f"Its header says in two ways where it lies, up to {apart:.3g} mm apart; the sform is taken.",)
+        corners = np.array([[0, 0, 0, 1], [*np.array(header.get_data_shape())[:3], 1]], dtype=np.float64)
+        distance_mm = float(np.abs(corners @ (affine - np.asarray(other)).T).max())
+        if distance_mm > _APART_MM:
+            notes = (
+                f"Its header says in two ways where it lies, up to {distance_mm:.3g} mm apart; the sform is taken.",
+            )
     return affine, notes
 
 
@@ -324,10 +331,10 @@ def _open_nrrd(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tuple
     data = file.read(_MOST_HEADER)
     if data[:4] != b"NRRD":
         raise damaged(path, "its header is not that of a NRRD volume; export it again as .nrrd")
-    ends = [(at, len(blank)) for blank in (b"\n\n", b"\r\n\r\n") if (at := data.find(blank)) >= 0]
-    if not ends:
+    header_ends = [(position, len(blank)) for blank in (b"\n\n", b"\r\n\r\n") if (position := data.find(blank)) >= 0]
+    if not header_ends:
         raise damaged(path, f"its header has no end; {CUT_SHORT}")
-    start = sum(min(ends))
+    start = sum(min(header_ends))
     try:
         fields: dict[str, Any] = dict(nrrd.read_header(io.BytesIO(data[:start])))
     except Exception as error:
@@ -384,8 +391,8 @@ def _nrrd_affine(fields: dict[str, Any], path: Path) -> tuple[FloatArray, tuple[
         spacings = np.asarray(fields["spacings"], dtype=np.float64)
         axes = tuple(map(int, np.flatnonzero(~np.isnan(spacings))))
         return _affine(np.diag(spacings[list(axes[:3])]), np.zeros(3)), (_UNORIENTED,), axes
-    given = [None if row is None else np.asarray(row, dtype=np.float64) for row in directions]
-    rows = {axis: row for axis, row in enumerate(given) if row is not None and not np.isnan(row).all()}
+    axis_vectors = [None if row is None else np.asarray(row, dtype=np.float64) for row in directions]
+    rows = {axis: row for axis, row in enumerate(axis_vectors) if row is not None and not np.isnan(row).all()}
     if len(rows) != 3 or any(row.shape != (3,) for row in rows.values()):
         raise InputError(f"{path}: it does not lie in a space of three dimensions; save one volume of labels as LPS.")
     signs = _NRRD_SPACES.get(space)
@@ -444,11 +451,11 @@ def _sound(affine: FloatArray, path: Path) -> FloatArray:
         wrong = "has numbers that are not finite"
     else:
         lengths = np.linalg.norm(steps, axis=0)
-        told = " x ".join(f"{length:.3g}" for length in lengths)
+        lengths_text = " x ".join(f"{length:.3g}" for length in lengths)
         if not lengths.all() or abs(np.linalg.det(steps / lengths)) < _FLAT:
             wrong = "is singular, so that voxels have no volume"
         elif lengths.min() < _LEAST_MM or lengths.max() > _MOST_MM:
-            wrong = f"gives voxels of {told} mm"
+            wrong = f"gives voxels of {lengths_text} mm"
     if wrong:
         raise InputError(f"{path}: its affine {wrong}; export it again with voxel sizes and directions.")
     return affine

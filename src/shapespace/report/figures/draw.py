@@ -131,13 +131,13 @@ def surroundings(fit: StagedFit) -> FloatArray:
     low, high = surface.min(axis=0), surface.max(axis=0)
     room = 0.16 * float((high - low).max())
     scan = fit.scan.vertices
-    near = ((scan > low - room) & (scan < high + room)).all(axis=1)
+    is_near = ((scan > low - room) & (scan < high + room)).all(axis=1)
     # Shreds that float near a scan are seen where they are, but do not make the rest small.
-    kept = scan[near]
-    if len(kept) > 100:
-        inner, outer = np.percentile(kept, [0.3, 99.7], axis=0)
-        kept = kept[((kept >= inner) & (kept <= outer)).all(axis=1)]
-    return np.concatenate([surface, kept])
+    cropped = scan[is_near]
+    if len(cropped) > 100:
+        inner, outer = np.percentile(cropped, [0.3, 99.7], axis=0)
+        cropped = cropped[((cropped >= inner) & (cropped <= outer)).all(axis=1)]
+    return np.concatenate([surface, cropped])
 
 
 def grid(
@@ -269,10 +269,10 @@ def without_empty_rows(panels: Sequence[Image]) -> list[Image]:
     used = np.zeros(panels[0].shape[0], dtype=bool)
     for panel in panels:
         used |= (panel < 255).any(axis=(1, 2))
-    at = np.flatnonzero(used)
-    if not len(at):
+    used_rows = np.flatnonzero(used)
+    if not len(used_rows):
         return list(panels)
-    return [panel[max(at[0] - _EDGE, 0) : at[-1] + 1 + _EDGE] for panel in panels]
+    return [panel[max(used_rows[0] - _EDGE, 0) : used_rows[-1] + 1 + _EDGE] for panel in panels]
 
 
 def chart(title: str, *, height: float, note: str = "") -> tuple[Figure, Axes]:
@@ -284,21 +284,21 @@ def chart(title: str, *, height: float, note: str = "") -> tuple[Figure, Axes]:
 def charts(title: str, heights: Sequence[float], *, note: str = "", columns: int = 1) -> tuple[Figure, list[Axes]]:
     """Return a figure with rows of plots of `heights` in inches, and the plots row by row."""
     wrapped = wrap(title, WIDTH - 2 * _EDGE, TITLE, bold=True)
-    below = wrap(note, WIDTH - 2 * _EDGE, SMALL) if note else ""
+    note_lines = wrap(note, WIDTH - 2 * _EDGE, SMALL) if note else ""
     top = (height_of(wrapped, TITLE) + 14) / DPI
-    bottom = (height_of(below, SMALL) + 12) / DPI if below else 0.03
+    bottom = (height_of(note_lines, SMALL) + 12) / DPI if note_lines else 0.03
     total = sum(heights) + top + bottom
     figure = ShownFigure(figsize=(WIDTH / DPI, total), dpi=DPI, facecolor="white")
     places = figure.add_gridspec(len(heights), columns, height_ratios=list(heights))
     axes = [figure.add_subplot(places[r, c]) for r in range(len(heights)) for c in range(columns)]
-    start = total * DPI - height_of(below, SMALL) - 2
-    for text, first, size, look in (
+    start = total * DPI - height_of(note_lines, SMALL) - 2
+    for text, first, size, text_style in (
         (wrapped, 6.0, TITLE, {"color": INK, "fontweight": "bold"}),
-        (below, start, SMALL, {"color": GREY}),
+        (note_lines, start, SMALL, {"color": GREY}),
     ):
         for k, line in enumerate(text.split("\n")):
             up = 1 - (first + baseline(k, size)) / DPI / total
-            figure.text(_EDGE / WIDTH, up, escaped(line), in_layout=False, fontsize=size, **cast(Any, look))
+            figure.text(_EDGE / WIDTH, up, escaped(line), in_layout=False, fontsize=size, **cast(Any, text_style))
     # Where the plots may stand, for `finish`.
     cast(Any, figure).plots_within = (0.0, bottom / total, 1.0, 1 - top / total)
     return figure, axes
@@ -327,8 +327,8 @@ def style(axes: Axes) -> None:
 
 def legend(axes: Axes, **options: Any) -> None:
     """Add the legend of a plot."""
-    made = cast(Any, axes).legend(fontsize=SMALL, labelcolor=INK, framealpha=0.9, **{"handlelength": 1.5, **options})
-    made.get_frame().set_linewidth(0.0)
+    box = cast(Any, axes).legend(fontsize=SMALL, labelcolor=INK, framealpha=0.9, **{"handlelength": 1.5, **options})
+    box.get_frame().set_linewidth(0.0)
 
 
 @contextmanager
@@ -378,8 +378,8 @@ def height_of(text: str, size: float) -> float:
     return line_height(size) * (1 + text.count("\n")) if text else 0.0
 
 
-def wrap(text: str, width: float, size: float, *, bold: bool = False, most: int = _MOST_LINES) -> str:
-    """Return `text` in at most `most` lines, none wider than `width` pixels, all of like length.
+def wrap(text: str, width: float, size: float, *, bold: bool = False, max_lines: int = _MOST_LINES) -> str:
+    """Return `text` in at most `max_lines` lines, none wider than `width` pixels, all of like length.
 
     What is left out ends in `…`.
     """
@@ -395,14 +395,14 @@ def wrap(text: str, width: float, size: float, *, bold: bool = False, most: int 
     longest = range(1, max(map(len, parts)) + 1)
     letters = max(bisect_left(longest, True, key=lambda n: any(map(wide, in_lines(n)))), 1)
     lines = in_lines(letters)
-    if len(lines) <= most:
+    if len(lines) <= max_lines:
         return "\n".join(
             in_lines(1 + bisect_left(longest[:letters], True, key=lambda n: len(in_lines(n)) <= len(lines)))
         )
-    last = lines[most - 1]
+    last = lines[max_lines - 1]
     while last and wide(last + "…"):
         last = last[:-1].rstrip()
-    return "\n".join([*lines[: most - 1], last + "…"])
+    return "\n".join([*lines[: max_lines - 1], last + "…"])
 
 
 _LONGEST = 400
@@ -410,8 +410,8 @@ _LONGEST = 400
 
 def plain(text: str) -> str:
     """Return `text` of a user without what cannot be printed, and no longer than a caption could be."""
-    kept = re.sub(r"[^\S\n]", " ", printable(str(text)[: _LONGEST + 1]))
-    return kept if len(kept) <= _LONGEST else kept[: _LONGEST - 1] + "…"
+    printable_text = re.sub(r"[^\S\n]", " ", printable(str(text)[: _LONGEST + 1]))
+    return printable_text if len(printable_text) <= _LONGEST else printable_text[: _LONGEST - 1] + "…"
 
 
 def escaped(text: str) -> str:
@@ -419,10 +419,10 @@ def escaped(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-def short(text: str, most: int = 28) -> str:
-    """Return one line of at most `most` characters."""
+def short(text: str, max_length: int = 28) -> str:
+    """Return one line of at most `max_length` characters."""
     line = " ".join(plain(text).split())
-    return line if len(line) <= most else line[: most - 1] + "…"
+    return line if len(line) <= max_length else line[: max_length - 1] + "…"
 
 
 def in_rows(items: Sequence[_Item], columns: int) -> list[list[_Item]]:

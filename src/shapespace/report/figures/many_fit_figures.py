@@ -65,31 +65,31 @@ def error_curves(fits: Sequence[StagedFit], *, stage: str = "final", title: str 
         raise InputError("There is nothing to draw of cumulative errors without fits.")
     if any(stage not in fit.surfaces for fit in fits):
         raise InputError(f"Not every fit has the stage {stage!r}, so their errors cannot be compared there.")
-    far = [np.sort(measured_mm(fit.model_to_scan_mm[stage])) for fit in fits]
-    fits = [fit for fit, values in zip(fits, far, strict=True) if len(values)]
-    far = [values for values in far if len(values)]
-    if not far:
+    sorted_distances = [np.sort(measured_mm(fit.model_to_scan_mm[stage])) for fit in fits]
+    fits = [fit for fit, values in zip(fits, sorted_distances, strict=True) if len(values)]
+    sorted_distances = [values for values in sorted_distances if len(values)]
+    if not sorted_distances:
         return _nothing_shown(title)
-    pooled = np.sort(np.concatenate(far))
+    pooled = np.sort(np.concatenate(sorted_distances))
     figure, axes = chart(
         title or f"How close the model comes to the scan, over {counted(len(fits), 'fit')}", height=3.5
     )
     thin = {"lw": 1.1, "alpha": float(np.clip(12 / len(fits), 0.12, 0.8))}
-    seen: set[str] = set()
-    for fit, values in sorted(zip(fits, far, strict=True), key=lambda pair: pair[0].status != "converged"):
+    labelled_stages: set[str] = set()
+    for fit, values in sorted(zip(fits, sorted_distances, strict=True), key=lambda pair: pair[0].status != "converged"):
         doubtful = fit.status in ("doubtful", "failed")
         name = "a doubtful fit" if doubtful else "a fit"
         colour = _DOUBTFUL if doubtful else "#7fa8c9"
-        _curve(axes, values, color=colour, label=None if name in seen else name, **thin)
-        seen.add(name)
+        _curve(axes, values, color=colour, label=None if name in labelled_stages else name, **thin)
+        labelled_stages.add(name)
     if len(fits) > 1:
         _curve(axes, pooled, color=INK, lw=2.6, label="all together")
     for share in (0.5, 0.95):
-        at = float(np.quantile(pooled, share))
-        axes.plot([at], [100 * share], "o", color=INK, ms=6, zorder=5)
+        distance = float(np.quantile(pooled, share))
+        axes.plot([distance], [100 * share], "o", color=INK, ms=6, zorder=5)
         axes.annotate(
-            f"{100 * share:.0f} % within {mm(at)}", (at, 100 * share), xytext=(10, -5), textcoords="offset points",
-            fontsize=SMALL, color=INK, va="top",
+            f"{100 * share:.0f} % within {mm(distance)}", (distance, 100 * share), xytext=(10, -5),
+            textcoords="offset points", fontsize=SMALL, color=INK, va="top",
         )  # fmt: skip
     axes.set(xlabel="distance from the model to the scan (mm)", ylabel="vertices that the scan shows (%)")
     axes.set(xlim=(0, nice_ceiling(1.15 * float(np.quantile(pooled, 0.985)))), ylim=(0, 102))
@@ -110,9 +110,9 @@ def _nothing_shown(title: str) -> Figure:
 def _curve(axes: Any, values: FloatArray, **style: Any) -> None:
     """Draw the share of sorted `values` up to each of them, in at most 400 steps."""
     share = np.linspace(0, 1, min(len(values), 400) + 1)
-    at = np.quantile(values, share, method="inverted_cdf") if len(values) > 400 else np.concatenate([[0.0], values])
+    sample = np.quantile(values, share, method="inverted_cdf") if len(values) > 400 else np.concatenate([[0.0], values])
     axes.plot(
-        np.concatenate([at, [10 * values[-1] + 1]]),
+        np.concatenate([sample, [10 * values[-1] + 1]]),
         100 * np.concatenate([share, [1.0]]),
         drawstyle="steps-post",
         **style,
@@ -130,8 +130,8 @@ def faces_grid(
     if not meshes or len(meshes) != len(labels):
         raise InputError(f"{title}: {len(meshes)} meshes do not go with {len(labels)} labels.")
     columns = min(columns, max(len(meshes), 3))
-    seen = view(np.concatenate([m.vertices for m in meshes]), columns)
-    images = [render(Layer(mesh, colour), camera=seen.camera, size=seen.size) for mesh in meshes]
+    camera_view = view(np.concatenate([m.vertices for m in meshes]), columns)
+    images = [render(Layer(mesh, colour), camera=camera_view.camera, size=camera_view.size) for mesh in meshes]
     return grid(
         [Row(i, t) for i, t in zip(in_rows(images, columns), in_rows(list(labels), columns), strict=True)], title=title
     )
@@ -153,11 +153,13 @@ def portrait_figure(
     signed = all(fit.scan.faces is not None for fit in fits)
     rows: list[Row] = []
     for k, fit in enumerate(fits):
-        seen = view(surroundings(fit), 4, yaw_deg=yaw_deg)
-        final, far = fit.surfaces["final"], fit.model_to_scan_mm["final"]
+        camera_view = view(surroundings(fit), 4, yaw_deg=yaw_deg)
+        final, distances = fit.surfaces["final"], fit.model_to_scan_mm["final"]
         scan, over, model = Layer(fit.scan, SCAN_COLOUR), scan_over(fit.scan), Layer(final, MODEL_COLOUR)
-        mapped = distance_layer(final, far, top, signed=signed)
-        panels = render_series([[scan], [model], [over, model], [mapped]], camera=seen.camera, size=seen.size)
+        mapped = distance_layer(final, distances, top, signed=signed)
+        panels = render_series(
+            [[scan], [model], [over, model], [mapped]], camera=camera_view.camera, size=camera_view.size
+        )
         captions = ["scan", "model, fitted", "both", "distance"] if k == 0 else []
         name = short(labels[k] if labels else fit.label, 60)
         rows.append(Row(panels, captions, f"{name}: mean {mm(mean_mm(fit))}"))
@@ -224,7 +226,7 @@ def _equal_views(fits: Sequence[StagedFit], columns: int, layers: Callable[[Stag
         raise InputError("There is nothing to draw without fits.")
     columns = min(columns, max(len(fits), 3))
     views = [view(fit.surfaces["final"].vertices, columns, margin=0.07) for fit in fits]
-    size = (views[0].size[0], int(np.median([seen.size[1] for seen in views])))
+    size = (views[0].size[0], int(np.median([item.size[1] for item in views])))
     return [
         render(
             *layers(fit),

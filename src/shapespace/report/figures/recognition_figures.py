@@ -121,12 +121,12 @@ def confusion_figure(counts: npt.ArrayLike, classes: Sequence[str], *, title: st
 def _confused(table: FloatArray, shares: FloatArray, classes: Sequence[str]) -> str:
     """Return how many answers are right, and which class is most often taken for which other."""
     total = float(table.sum())
-    said = f"{percent(float(np.trace(table)) / total)} of {counted(round(total), 'answer')} are right"
-    wrong = shares * (1 - np.eye(len(classes)))
-    true, taken = divmod(int(wrong.argmax()), len(classes))
-    if wrong[true, taken] == 0:
-        return said
-    return f"{said}; most often {short(classes[true], 24)} is taken for {short(classes[taken], 24)}"
+    headline = f"{percent(float(np.trace(table)) / total)} of {counted(round(total), 'answer')} are right"
+    error_shares = shares * (1 - np.eye(len(classes)))
+    true, predicted_class = divmod(int(error_shares.argmax()), len(classes))
+    if error_shares[true, predicted_class] == 0:
+        return headline
+    return f"{headline}; most often {short(classes[true], 24)} is taken for {short(classes[predicted_class], 24)}"
 
 
 def _cell(axes: Axes, row: int, column: int, share: float, count: float, n: int) -> None:
@@ -170,19 +170,19 @@ def calibration_figure(
     if not len(table):
         raise InputError("There is nothing to draw of a calibration without answers.")
     start, end = 100 * np.clip(table[:, :2].T, 0, 1)
-    stated, right, many = *(100 * table[:, 2:4].T), table[:, 4]
+    stated, right, counts = *(100 * table[:, 2:4].T), table[:, 4]
     if not ((table[:, 2:4] >= 0) & (table[:, 2:4] <= 1)).all():
         raise InputError("What is stated and what is right in a calibration must lie within 0 to 1.")
-    said = "How often answers are right, against the probability stated for them"
+    headline = "How often answers are right, against the probability stated for them"
     if ece is not None:
-        said = f"Stated probabilities are off by {100 * ece:.1f} points on average"
+        headline = f"Stated probabilities are off by {100 * ece:.1f} points on average"
     note = "" if brier is None else f"Brier score {brier:.3f} (0 is best)."
-    figure, (above, below) = charts(title or said, [2.9, 1.25], note=note)
+    figure, (curve_axes, count_axes) = charts(title or headline, [2.9, 1.25], note=note)
     floor = min(float(start.min()), 100 - 1e-3)
-    above.plot([0, 100], [0, 100], color=GREY, ls=(0, (4, 3)), lw=1.4, label="right as often as stated")
-    size = 26 + 190 * many / many.max()
-    above.plot(stated, right, color=FORWARD, lw=1.6, zorder=2)
-    above.scatter(
+    curve_axes.plot([0, 100], [0, 100], color=GREY, ls=(0, (4, 3)), lw=1.4, label="right as often as stated")
+    size = 26 + 190 * counts / counts.max()
+    curve_axes.plot(stated, right, color=FORWARD, lw=1.6, zorder=2)
+    curve_axes.scatter(
         stated,
         right,
         s=size,
@@ -192,11 +192,13 @@ def calibration_figure(
         zorder=3,
         label="answers, more in larger dots",
     )
-    above.set(xlim=(floor, 101.5), ylim=(min(floor, float(right.min()) - 5, 100.0), 104), ylabel="right answers (%)")
-    legend(above, loc="lower right" if right[-1] > 60 else "upper left")
-    below.bar(start, many, width=end - start, align="edge", color=_BARS, edgecolor="white")
-    below.set(xlim=(floor, 101.5), xlabel="probability stated (%)", ylabel="answers")
-    below.locator_params(axis="y", nbins=3, integer=True)
+    curve_axes.set(
+        xlim=(floor, 101.5), ylim=(min(floor, float(right.min()) - 5, 100.0), 104), ylabel="right answers (%)"
+    )
+    legend(curve_axes, loc="lower right" if right[-1] > 60 else "upper left")
+    count_axes.bar(start, counts, width=end - start, align="edge", color=_BARS, edgecolor="white")
+    count_axes.set(xlim=(floor, 101.5), xlabel="probability stated (%)", ylabel="answers")
+    count_axes.locator_params(axis="y", nbins=3, integer=True)
     return finish(figure, h_pad=0.8)
 
 
@@ -230,19 +232,19 @@ def learning_curve_figure(
         raise InputError(f"A learning curve of {len(x)} numbers of subjects cannot have {len(y)} accuracies.")
     order = np.argsort(x, kind="stable")
     x, y = x[order], y[order]
-    said = f"{_share(y[0])} right with {counted(round(x[0]), 'subject')} to learn from"
+    headline = f"{_share(y[0])} right with {counted(round(x[0]), 'subject')} to learn from"
     if len(x) > 1:
-        said = (
+        headline = (
             f"Learning from {x[-1]:g} subjects instead of {x[0]:g} takes the share of right answers from "
             f"{_share(y[0])} "
             f"to {_share(y[-1])}"
         )
-    figure, axes = chart(title or said, height=3.3)
+    figure, axes = chart(title or headline, height=3.3)
     bottom = float(y.min())
     if low is not None and high is not None:
-        ends = [100 * _numbers(values, "the interval of a learning curve")[order] for values in _like(x, low, high)]
-        axes.fill_between(x, ends[0], ends[1], color=_BARS, alpha=0.5, lw=0, label=escaped(short(band, 40)))
-        bottom = min(bottom, float(ends[0].min()))
+        interval = [100 * _numbers(values, "the interval of a learning curve")[order] for values in _like(x, low, high)]
+        axes.fill_between(x, interval[0], interval[1], color=_BARS, alpha=0.5, lw=0, label=escaped(short(band, 40)))
+        bottom = min(bottom, float(interval[0].min()))
     axes.plot(x, y, color=FORWARD, lw=2, marker="o", ms=5, label="right answers")
     if ceiling is not None:
         axes.axhline(100 * ceiling, color=INK, ls=(0, (4, 3)), lw=1.4, label=f"ceiling: {_share(100 * ceiling)}")
@@ -273,24 +275,35 @@ def importance_figure(
         raise InputError(f"The importance of {len(values)} modes cannot be drawn with {len(names)} names.")
     labels = [short(name, 12) for name in names] or [str(k + 1) for k in range(len(values))]
     order = np.argsort(-values, kind="stable")
-    kept: list[int] = np.sort(order[:_MOST_BARS]).tolist()
+    kept_modes: list[int] = np.sort(order[:_MOST_BARS]).tolist()
     strongest = [int(k) for k in order[:_STRONGEST] if values[k] > 0]
     words = [labels[k] if len(names) else f"mode {labels[k]}" for k in strongest]
-    said = {0: "No mode carries the decision", 1: f"Mode {words[0] if words else ''} carries the decision most"}.get(
-        len(words), f"The decision is carried most by {', '.join(words[:-1])} and {words[-1] if words else ''}"
+    headline = {
+        0: "No mode carries the decision",
+        1: f"Mode {words[0] if words else ''} carries the decision most",
+    }.get(len(words), f"The decision is carried most by {', '.join(words[:-1])} and {words[-1] if words else ''}")
+    note = "" if len(kept_modes) == len(values) else f"The {len(kept_modes)} strongest of {len(values)} modes."
+    figure, axes = chart(title or headline, height=3.3, note=note)
+    positions = np.arange(1, len(kept_modes) + 1)
+    axes.bar(
+        positions, values[kept_modes], color=[FORWARD if k in strongest else _BARS for k in kept_modes], width=0.78
     )
-    note = "" if len(kept) == len(values) else f"The {len(kept)} strongest of {len(values)} modes."
-    figure, axes = chart(title or said, height=3.3, note=note)
-    at = np.arange(1, len(kept) + 1)
-    axes.bar(at, values[kept], color=[FORWARD if k in strongest else _BARS for k in kept], width=0.78)
     axes.axhline(0, color="#9a9da3", lw=1)
-    if len(names) or len(kept) < len(values):
-        axes.set_xlim(0.3 - max(0.0, (5 - len(at)) / 2), len(at) + 0.7 + max(0.0, (5 - len(at)) / 2))
-        turned = sum(measured(labels[k], SMALL) + 8 for k in kept) > 0.84 * WIDTH
-        every = 1 if len(kept) <= _MOST_BARS and (turned or len(kept) <= _MOST_NAMED_BARS) else 2
-        axes.set_xticks(at[::every], [escaped(labels[k]) for k in kept[::every]], rotation=90 if turned else 0)
+    if len(names) or len(kept_modes) < len(values):
+        axes.set_xlim(
+            0.3 - max(0.0, (5 - len(positions)) / 2), len(positions) + 0.7 + max(0.0, (5 - len(positions)) / 2)
+        )
+        is_horizontal = sum(measured(labels[k], SMALL) + 8 for k in kept_modes) > 0.84 * WIDTH
+        label_step = (
+            1 if len(kept_modes) <= _MOST_BARS and (is_horizontal or len(kept_modes) <= _MOST_NAMED_BARS) else 2
+        )
+        axes.set_xticks(
+            positions[::label_step],
+            [escaped(labels[k]) for k in kept_modes[::label_step]],
+            rotation=90 if is_horizontal else 0,
+        )
     else:
-        number_axis(axes, len(kept))
+        number_axis(axes, len(kept_modes))
     axes.set(xlabel="mode", ylabel=escaped(wrap(unit, 2.4 * DPI, TEXT)))
     finish(figure)
     axes.grid(False, axis="x")
@@ -346,11 +359,13 @@ def face_map_figure(
     if ranked:
         panels.append(np.full_like(panels[0], 255))
         captions.append("share of each region")
-    most = ranked[0] if ranked and ranked[0][1] > 0 else None
-    said = f"The region that carries most of the decision: {most[0]}, {percent(most[1])}" if most else ""
+    top_region = ranked[0] if ranked and ranked[0][1] > 0 else None
+    headline = (
+        f"The region that carries most of the decision: {top_region[0]}, {percent(top_region[1])}" if top_region else ""
+    )
     figure = grid(
         [Row(panels, captions)],
-        title=title or said or "Where on the face the decision lies",
+        title=title or headline or "Where on the face the decision lies",
         scale=Scale(unit, SEQUENTIAL, low, high, "high" if known.max() > high else "neither"),
         note="Grey: no value." if len(known) < len(scalars) else "",
     )
@@ -361,23 +376,26 @@ def face_map_figure(
 
 def _region_bars(figure: Figure, ranked: Sequence[tuple[str, float]]) -> None:
     """Put bars of the shares in place of the third panel."""
-    shown = list(ranked[:_MOST_REGIONS])
-    if len(ranked) > len(shown):
-        rest = ranked[_MOST_REGIONS - 1 :]
-        shown = [*ranked[: _MOST_REGIONS - 1], (f"{len(rest)} others", sum(share for _, share in rest))]
+    top_regions = list(ranked[:_MOST_REGIONS])
+    if len(ranked) > len(top_regions):
+        other_regions = ranked[_MOST_REGIONS - 1 :]
+        top_regions = [
+            *ranked[: _MOST_REGIONS - 1],
+            (f"{len(other_regions)} others", sum(share for _, share in other_regions)),
+        ]
     place = figure.axes[2].get_position()
     figure.delaxes(figure.axes[2])
     axes = figure.add_axes((place.x0 + 0.01, place.y0, place.width - 0.02, place.height))
     axes.set_axis_off()
-    at = np.arange(len(shown))
-    shares = np.array([share for _, share in shown])
-    axes.barh(at, shares, height=0.3, color=[FORWARD, *[_BARS] * (len(shown) - 1)])
-    for k, (name, share) in enumerate(shown):
+    positions = np.arange(len(top_regions))
+    shares = np.array([share for _, share in top_regions])
+    axes.barh(positions, shares, height=0.3, color=[FORWARD, *[_BARS] * (len(top_regions) - 1)])
+    for k, (name, share) in enumerate(top_regions):
         axes.text(0, k - 0.24, escaped(name), fontsize=SMALL, color=INK, va="bottom")
         axes.text(
             max(float(shares.max()), 1e-9), k - 0.24, percent(share), fontsize=SMALL, color=INK, va="bottom", ha="right"
         )
-    axes.set(xlim=(0, max(float(shares.max()), 1e-9)), ylim=(max(len(shown), 5) - 0.6, -0.9))
+    axes.set(xlim=(0, max(float(shares.max()), 1e-9)), ylim=(max(len(top_regions), 5) - 0.6, -0.9))
 
 
 def curve_figure(
@@ -411,50 +429,54 @@ def curve_figure(
     """
     if not 1 <= len(series) <= _MOST_SERIES:
         raise InputError(f"A figure has 1 to {_MOST_SERIES} curves, not {len(series)}.")
-    found: list[_Curve] = []
+    parsed: list[_Curve] = []
     for k, (name, places, values) in enumerate(series):
-        at = _numbers(places, f"the places of the curve {short(name)}")
+        x_values = _numbers(places, f"the places of the curve {short(name)}")
         height = _numbers(values, f"the values of the curve {short(name)}")
-        if not len(at) or at.shape != height.shape:
-            raise InputError(f"The curve {short(name)!r} has {len(at)} places but {len(height)} values.")
+        if not len(x_values) or x_values.shape != height.shape:
+            raise InputError(f"The curve {short(name)!r} has {len(x_values)} places but {len(height)} values.")
         band = bands[k] if k < len(bands) else None
-        ends = [_numbers(end, f"the band of the curve {short(name)}", finite=False) for end in band or ()]
-        if any(end.shape != at.shape for end in ends):
-            raise InputError(f"The band of the curve {short(name)!r} needs {len(at)} lower and {len(at)} upper ends.")
-        found.append(_Curve(name, at, height, ends, k < len(dots) and dots[k]))
+        band_limits = [_numbers(end, f"the band of the curve {short(name)}", finite=False) for end in band or ()]
+        if any(end.shape != x_values.shape for end in band_limits):
+            raise InputError(
+                f"The band of the curve {short(name)!r} needs {len(x_values)} lower and {len(x_values)} upper ends."
+            )
+        parsed.append(_Curve(name, x_values, height, band_limits, k < len(dots) and dots[k]))
     limits = (
-        _scale_ends(scales[0], [curve.at for curve in found]),
-        _scale_ends(scales[1], [values for curve in found for values in (curve.height, *curve.ends)]),
+        _scale_ends(scales[0], [curve.at for curve in parsed]),
+        _scale_ends(scales[1], [values for curve in parsed for values in (curve.height, *curve.ends)]),
     )
     square = diagonal and scales[0] == scales[1]
     figure, axes = chart(
         title or f"{plain(y)[:1].upper()}{plain(y)[1:]} against {plain(x)}", height=4.6 if square else 3.3
     )
-    for k, curve in enumerate(found):
-        at, height, *ends = (
+    for k, curve in enumerate(parsed):
+        x_values, height, *band_limits = (
             _placed(values, scales[axis], limits[axis])
             for axis, values in ((0, curve.at), (1, curve.height), *((1, end) for end in curve.ends))
         )
         colour, label = CATEGORIES[k % len(CATEGORIES)], escaped(short(curve.name, 34)) or None
-        if ends:
-            axes.fill_between(at, ends[0], ends[1], color=colour, alpha=0.2, lw=0)
+        if band_limits:
+            axes.fill_between(x_values, band_limits[0], band_limits[1], color=colour, alpha=0.2, lw=0)
         if curve.dots:
-            axes.scatter(at, height, s=16, color=colour, alpha=0.6, linewidths=0, label=label)
+            axes.scatter(x_values, height, s=16, color=colour, alpha=0.6, linewidths=0, label=label)
             continue
         dashes = "-" if k < len(CATEGORIES) else (0, (4, 2))
-        axes.plot(at, height, color=colour, ls=dashes, lw=2, ms=4, marker="o" if len(at) < 40 else "", label=label)
+        axes.plot(
+            x_values, height, color=colour, ls=dashes, lw=2, ms=4, marker="o" if len(x_values) < 40 else "", label=label
+        )
     axes.margins(y=0.12)
     axes.set_xscale("log" if scales[0] == "log" else "linear")
     axes.set_yscale("log" if scales[1] == "log" else "linear")
-    for axis, kind, ends in zip((axes.xaxis, axes.yaxis), scales, limits, strict=True):
-        _scaled(axis, kind, ends)
+    for axis, kind, band_limits in zip((axes.xaxis, axes.yaxis), scales, limits, strict=True):
+        _scaled(axis, kind, band_limits)
     if diagonal:
         low = max(axes.get_xlim()[0], axes.get_ylim()[0])
         high = min(axes.get_xlim()[1], axes.get_ylim()[1])
         if low < high:
             axes.plot([low, high], [low, high], color=GREY, ls=(0, (4, 3)), lw=1.3, scalex=False, scaley=False)
     axes.set(xlabel=escaped(short(x, 70)), ylabel=escaped(wrap(y, 2.4 * DPI, TEXT)))
-    if any(curve.name for curve in found):
+    if any(curve.name for curve in parsed):
         legend(axes, loc="best")
     return finish(figure)
 
@@ -488,28 +510,28 @@ def _scale_ends(kind: CurveScale, values: Sequence[FloatArray]) -> tuple[float, 
     return (max(low, _LEAST_SHARE), min(max(high, low), 1 - _LEAST_SHARE)) if kind == "probit" else (low, high)
 
 
-def _placed(values: FloatArray, kind: CurveScale, ends: tuple[float, float]) -> FloatArray:
+def _placed(values: FloatArray, kind: CurveScale, limits: tuple[float, float]) -> FloatArray:
     """Return numbers as they are drawn: normal deviates on `probit`, nothing for what has no place on `log`."""
     if kind == "probit":
         from scipy.special import ndtri
 
-        low, high = ndtri(ends[0]) - _PROBIT_ROOM, ndtri(ends[1]) + _PROBIT_ROOM
+        low, high = ndtri(limits[0]) - _PROBIT_ROOM, ndtri(limits[1]) + _PROBIT_ROOM
         return np.clip(ndtri(np.clip(values, 0, 1)), low, high)
     return np.where(values > 0, values, np.nan) if kind == "log" else values
 
 
-def _scaled(axis: Axis, kind: CurveScale, ends: tuple[float, float]) -> None:
+def _scaled(axis: Axis, kind: CurveScale, limits: tuple[float, float]) -> None:
     """Give an axis its scale and ticks that people read."""
     if kind == "log":
         axis.set_major_formatter(lambda value, _: f"{value:g}")
-        if ends[1] < 30 * ends[0]:
+        if limits[1] < 30 * limits[0]:
             axis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in "25" else "")
         else:
             axis.set_minor_formatter(lambda value, _: "")
     if kind == "probit":
         from scipy.special import ndtri
 
-        low, high = float(ndtri(ends[0])) - _PROBIT_ROOM, float(ndtri(ends[1])) + _PROBIT_ROOM
+        low, high = float(ndtri(limits[0])) - _PROBIT_ROOM, float(ndtri(limits[1])) + _PROBIT_ROOM
         ticks = [share for share in _SHARES if low <= ndtri(share) <= high]
         # Their words would touch where the whole range is shown.
         while len(ticks) > _MOST_TICKS:
@@ -536,13 +558,13 @@ def mesh_rows_figure(
     if not known or count > MOST_PANELS:
         raise InputError(f"{plain(title)}: 1 to {MOST_PANELS} meshes can be drawn, not {count if known else 0}.")
     columns = max(3, max(len(pictures) for _, pictures in rows))
-    seen = view(np.concatenate(known), columns, yaw_deg=yaw_deg)
-    drawn = [
+    camera_view = view(np.concatenate(known), columns, yaw_deg=yaw_deg)
+    images = [
         Row(
             [
-                render(Layer(mesh), camera=seen.camera, size=seen.size)
+                render(Layer(mesh), camera=camera_view.camera, size=camera_view.size)
                 if mesh is not None
-                else np.full((seen.size[1], seen.size[0], 3), round(255 * _NO_PICTURE), dtype=np.uint8)
+                else np.full((camera_view.size[1], camera_view.size[0], 3), round(255 * _NO_PICTURE), dtype=np.uint8)
                 for _, mesh in pictures
             ],
             [short(label, 60) for label, _ in pictures],
@@ -551,11 +573,11 @@ def mesh_rows_figure(
         for heading, pictures in rows
         if pictures
     ]
-    return grid(drawn, title=title)
+    return grid(images, title=title)
 
 
 def _like(x: FloatArray, *values: npt.ArrayLike) -> list[npt.ArrayLike]:
-    if any(np.shape(one) != x.shape for one in values):
+    if any(np.shape(item) != x.shape for item in values):
         raise InputError(f"The interval of a learning curve must have {len(x)} lower and {len(x)} upper ends.")
     return list(values)
 
@@ -564,13 +586,13 @@ def _share(value_percent: float) -> str:
     return f"{value_percent:.1f} %"
 
 
-def _numbers(values: npt.ArrayLike, what: str, *, ndim: int = 1, finite: bool = True) -> FloatArray:
+def _numbers(values: npt.ArrayLike, name: str, *, ndim: int = 1, finite: bool = True) -> FloatArray:
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{what[:1].upper()}{what[1:]} must be numbers.") from error
+        raise InputError(f"{name[:1].upper()}{name[1:]} must be numbers.") from error
     if array.ndim != ndim or (finite and not np.isfinite(array).all()):
         raise InputError(
-            f"{what[:1].upper()}{what[1:]} must be {'a list' if ndim == 1 else 'a table'} of finite numbers."
+            f"{name[:1].upper()}{name[1:]} must be {'a list' if ndim == 1 else 'a table'} of finite numbers."
         )
     return array

@@ -88,8 +88,8 @@ class Corresponded:
         if self._mean.faces is None or not np.isfinite(self._mean.vertices).all():
             raise FileFormatError(f"{CorrespondenceRecord.MEAN} is no whole surface; {CORRESPOND_AGAIN}.")
         self.unread: dict[str, str] = {}
-        found = [record for file in self._record_files() if (record := self._record(file)) is not None]
-        self.records = {record.name: record for record in found}
+        records = [record for file in self._record_files() if (record := self._record(file)) is not None]
+        self.records = {record.name: record for record in records}
         self.turn = np.eye(3)
         self._population: Population | None = None
 
@@ -101,8 +101,8 @@ class Corresponded:
     @property
     def mean(self) -> Mesh:
         """The mean shape as pictures show it: upright, about the origin, of the size that it has in its file."""
-        at = self._mean.vertices
-        return self._mean.with_vertices((at - at.mean(axis=0)) @ self.turn.T)
+        vertices = self._mean.vertices
+        return self._mean.with_vertices((vertices - vertices.mean(axis=0)) @ self.turn.T)
 
     @property
     def holes(self) -> int:
@@ -149,15 +149,15 @@ class Corresponded:
             FileError: it cannot be read.
             FileFormatError: it is damaged, or not on the template of this folder.
         """
-        own = self.surface(name).vertices
-        seen = there_are(own)
+        vertices = self.surface(name).vertices
+        is_observed = there_are(vertices)
         try:
-            T = fit_similarity(self.mean.vertices[seen], own[seen])
+            T = fit_similarity(self.mean.vertices[is_observed], vertices[is_observed])
         except ShapespaceError as error:
             raise FileFormatError(
                 f"{name}{CorrespondRecord.SURFACE} cannot be laid onto the mean shape; {CORRESPOND_AGAIN}."
             ) from error
-        return Placed(np.where(seen[:, None], T.inverse().apply(own), np.nan), T)
+        return Placed(np.where(is_observed[:, None], T.inverse().apply(vertices), np.nan), T)
 
     def raw_scan(self, record: CorrespondRecord) -> Mesh:
         """Return the scan of a record, if it is still where it was, with the content it had.
@@ -247,11 +247,11 @@ def there_are(vertices: FloatArray) -> BoolArray:
 
 def drawable(mesh: Mesh, values: FloatArray | None = None) -> tuple[Mesh, FloatArray | None]:
     """Return `mesh` without its missing vertices, and `values` (V,) of those that are left."""
-    there = there_are(mesh.vertices)
-    if there.all():
+    is_observed = there_are(mesh.vertices)
+    if is_observed.all():
         return mesh, values
-    vertices, faces = without_vertices(mesh.vertices, faces_of(mesh), there)
-    return Mesh(vertices, faces, name=mesh.name), None if values is None else values[there]
+    vertices, faces = without_vertices(mesh.vertices, faces_of(mesh), is_observed)
+    return Mesh(vertices, faces, name=mesh.name), None if values is None else values[is_observed]
 
 
 def upright(mean: Mesh, turns: Sequence[FloatArray] = ()) -> FloatArray:

@@ -107,10 +107,10 @@ class Folder:
         try:
             yield
         except ShapespaceError as error:
-            told = str(error)
+            message = str(error)
             for root in dict.fromkeys((str(self.root.resolve()), str(self.root))):
-                told = told.replace(f"{root}{os.sep}", "")
-            raise type(error)(told) from error
+                message = message.replace(f"{root}{os.sep}", "")
+            raise type(error)(message) from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,18 +153,18 @@ class SavedFit:
 
     def summary_mm(self, stage: str, direction: Direction, measure: Measure) -> float:
         """Return a distance over the whole model, or all of the scan, in mm; not-a-number where there is none."""
-        found = self.record.distances_mm.get(stage)
-        return _known(getattr(getattr(found, direction), measure)) if found else math.nan
+        summary = self.record.distances_mm.get(stage)
+        return _known(getattr(getattr(summary, direction), measure)) if summary else math.nan
 
     def distance_mm(self, direction: Direction, measure: Measure = "mean") -> float:
         """Return a distance of the final stage over what the scan shows, in mm; not-a-number where there is none.
 
         Records of earlier versions do not have it, see `shown`; of them it is that of `summary_mm`.
         """
-        found = self.record.shown
+        overlap = self.record.shown
         return (
-            _known(getattr(getattr(found, direction), measure))
-            if found
+            _known(getattr(getattr(overlap, direction), measure))
+            if overlap
             else self.summary_mm("final", direction, measure)
         )
 
@@ -179,9 +179,9 @@ class SavedFit:
         value = self.record.evidence.get("expected_error_mm")
         return float(value) if isinstance(value, int | float) else math.nan
 
-    def with_entry(self, **known: Any) -> SavedFit:
+    def with_entry(self, **values: Any) -> SavedFit:
         """Return the fit with more known beside its record, by the names of `FitEntry`."""
-        return SavedFit(structs.replace(self.entry, **known), self.record)
+        return SavedFit(structs.replace(self.entry, **values), self.record)
 
     def numbers(self, key: Literal["b", "z"]) -> FloatArray:
         """Return coefficients of the record, (K,).
@@ -272,10 +272,10 @@ def saved_surfaces(folder: Folder, fit: SavedFit) -> dict[str, Mesh]:
         FileFormatError: one is damaged, or the record has no pose.
     """
     files = {"final": fit.entry.fitted, "dense": fit.entry.dense}
-    found = {stage: folder.mesh(file) for stage, file in files.items() if file or stage == "final"}
-    if len({len(mesh.vertices) for mesh in found.values()}) > 1:
+    surfaces = {stage: folder.mesh(file) for stage, file in files.items() if file or stage == "final"}
+    if len({len(mesh.vertices) for mesh in surfaces.values()}) > 1:
         raise FileFormatError(f"{fit.name}: its fitted and its dense surface differ in their vertices; {_AGAIN}.")
-    return {stage: _in_model_frame(mesh, fit) for stage, mesh in found.items()}
+    return {stage: _in_model_frame(mesh, fit) for stage, mesh in surfaces.items()}
 
 
 def _in_model_frame(mesh: Mesh, fit: SavedFit) -> Mesh:
@@ -312,13 +312,13 @@ def raw_scan(folder: Folder, fit: SavedFit) -> Mesh:
     return mesh
 
 
-def model_of(folder: Folder, fits: Sequence[SavedFit], given: Path | None = None) -> ShapeModel:
+def model_of(folder: Folder, fits: Sequence[SavedFit], model_path: Path | None = None) -> ShapeModel:
     """Return the model by which `fits` were made.
 
     Args:
         folder: where the fits lie.
         fits: one or more; those without a readable record do not count.
-        given: the model's file; None goes by the path in the records.
+        model_path: the model's file; None goes by the path in the records.
 
     Raises:
         FileError: it cannot be read.
@@ -329,10 +329,10 @@ def model_of(folder: Folder, fits: Sequence[SavedFit], given: Path | None = None
     hashes = {source.hash for source in sources}
     if not sources:
         raise InputError(f"{folder.root}: no record names a model; give it with --model.")
-    if len(hashes) > 1 and given is None:
+    if len(hashes) > 1 and model_path is None:
         raise InputError(f"{folder.root}: its fits are by {len(hashes)} different models; give one with --model.")
-    path = given or folder.root / (sources[0].path or sources[0].name)
-    if given is None and not path.exists():
+    path = model_path or folder.root / (sources[0].path or sources[0].name)
+    if model_path is None and not path.exists():
         raise InputError(f"{folder.root}: the model {path.name} is no longer at {path}; give it with --model.")
     model = ShapeModel.load(path)
     if model.content_hash not in hashes:

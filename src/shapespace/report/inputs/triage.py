@@ -55,40 +55,40 @@ class _Measure:
     always: float = inf
 
 
-def concerns_of(at: Corresponded) -> dict[str, Concern]:
+def concerns_of(folder: Corresponded) -> dict[str, Concern]:
     """Return for each scan in correspondence, by its name, what stands out about it."""
-    population = at.population()
-    records = [at.records[name] for name in population.names]
-    found: list[list[tuple[float, str]]] = [[] for _ in records]
-    for measure in _measures(records, population.sizes.tolist(), at.settled):
+    population = folder.population()
+    records = [folder.records[name] for name in population.names]
+    reasons_by_record: list[list[tuple[float, str]]] = [[] for _ in records]
+    for measure in _measures(records, population.sizes.tolist(), folder.settled):
         centre = median(measure.of)
         spread = _TO_STDDEV * median([abs(value - centre) for value in measure.of])
         spread = max(spread, measure.least_spread, 1e-12)
-        for reasons, value in zip(found, measure.of, strict=True):
+        for reasons, value in zip(reasons_by_record, measure.of, strict=True):
             over = (value - centre) / spread
             if value > measure.always:
                 over = max(over, _STANDS_OUT * value / measure.always)
             if over > _STANDS_OUT and value > measure.at_least:
                 reasons.append((over, measure.told(value)))
-    ordered = [sorted(reasons, reverse=True) for reasons in found]
+    ordered = [sorted(reasons, reverse=True) for reasons in reasons_by_record]
     return {
-        record.name: Concern(reasons[0][0] if reasons else 0.0, tuple(told for _, told in reasons))
+        record.name: Concern(reasons[0][0] if reasons else 0.0, tuple(reason for _, reason in reasons))
         for record, reasons in zip(records, ordered, strict=True)
     }
 
 
-def _measures(records: Sequence[CorrespondRecord], sizes: Sequence[float], settled: float) -> list[_Measure]:
-    far = [distance_share(record, "p99", size) for record, size in zip(records, sizes, strict=True)]
+def _measures(records: Sequence[CorrespondRecord], sizes: Sequence[float], settled_mm: float) -> list[_Measure]:
+    tail_shares = [distance_share(record, "p99", size) for record, size in zip(records, sizes, strict=True)]
     growth = [log(record.area_factor) if record.area_factor else nan for record in records]
-    moved = [record.moved_share[-1] if record.moved_share else nan for record in records]
+    last_movements = [record.moved_share[-1] if record.moved_share else nan for record in records]
     return [
         _Measure(
-            far,
+            tail_shares,
             lambda v: (
                 f"1 % of its points lie farther off than {percent_of(v)} of its size, where "
-                f"{percent_of(median(far))} is usual"
+                f"{percent_of(median(tail_shares))} is usual"
             ),
-            _LEAST_SPREAD * known(median(far)),
+            _LEAST_SPREAD * known(median(tail_shares)),
             always=0.1,
         ),
         _Measure(
@@ -119,17 +119,17 @@ def _measures(records: Sequence[CorrespondRecord], sizes: Sequence[float], settl
             _LEAST_SPREAD * known(median(growth)),
         ),
         _Measure(
-            moved,
+            last_movements,
             lambda v: f"its vertices still moved by {percent_of(v)} of its size in the last round",
-            _LEAST_SPREAD * known(median(moved)),
-            at_least=settled,
+            _LEAST_SPREAD * known(median(last_movements)),
+            at_least=settled_mm,
         ),
     ]
 
 
-def distance_share(record: CorrespondRecord, which: str, size: float) -> float:
+def distance_share(record: CorrespondRecord, statistic: str, size: float) -> float:
     """Return the distance `mean`, `p95`, `p99` or `max` of a record as a share of `size`, which is in its unit."""
-    return known(getattr(record, f"distance_{which}")) / size
+    return known(getattr(record, f"distance_{statistic}")) / size
 
 
 def known(value: float | None) -> float:

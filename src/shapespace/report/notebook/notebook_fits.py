@@ -38,16 +38,16 @@ _CURVES = (
 )
 
 
-def plot_model(model: ShapeModel, what: str, **options: Any) -> Figure:
+def plot_model(model: ShapeModel, kind: str, **options: Any) -> Figure:
     """Do what `ShapeModel.plot` says."""
     require_report_extra()
     from shapespace.report import figures
 
     draw = {"modes": figures.modes_figure, "mean": figures.mean_figure, "spectrum": figures.spectrum_figure}
-    return _choose(draw, what)(model, **options)
+    return _choose(draw, kind)(model, **options)
 
 
-def plot_fit(result: FitResult, what: str, **options: Any) -> Figure:
+def plot_fit(result: FitResult, kind: str, **options: Any) -> Figure:
     """Do what `FitResult.plot` says."""
     require_report_extra()
     from shapespace.report import figures
@@ -61,7 +61,7 @@ def plot_fit(result: FitResult, what: str, **options: Any) -> Figure:
         "history": figures.history_figure,
         "regions": figures.regions_figure,
     }
-    return _choose(draw, what)(StagedFit.of(result.model, result), **options)
+    return _choose(draw, kind)(StagedFit.of(result.model, result), **options)
 
 
 def plot_quality(quality: ModelQuality, **options: Any) -> Figure:
@@ -69,11 +69,11 @@ def plot_quality(quality: ModelQuality, **options: Any) -> Figure:
     require_report_extra()
     from shapespace.report import figures
 
-    told = {name: _numbers(curve) for name in _CURVES if (curve := getattr(quality, name)) is not None}
+    curves = {name: _numbers(curve) for name in _CURVES if (curve := getattr(quality, name)) is not None}
     if quality.by_shapes is not None:
         sizes = _numbers(quality.by_shapes)
-        told["generalisation_by_shapes"] = {"shapes": sizes.pop("modes"), **sizes}
-    return figures.quality_figure(told, **options)
+        curves["generalisation_by_shapes"] = {"shapes": sizes.pop("modes"), **sizes}
+    return figures.quality_figure(curves, **options)
 
 
 def _numbers(curve: Curve) -> dict[str, list[float]]:
@@ -81,20 +81,22 @@ def _numbers(curve: Curve) -> dict[str, list[float]]:
     return {name: values.tolist() for name, values in of.items()}
 
 
-def _choose(draw: Mapping[str, Callable[..., Figure]], what: str) -> Callable[..., Figure]:
-    if what not in draw:
-        raise InputError(f"There is no plot {what!r}; choose one of {', '.join(draw)}.")
-    return draw[what]
+def _choose(draw: Mapping[str, Callable[..., Figure]], kind: str) -> Callable[..., Figure]:
+    if kind not in draw:
+        raise InputError(f"There is no plot {kind!r}; choose one of {', '.join(draw)}.")
+    return draw[kind]
 
 
 def html_of_model(model: ShapeModel) -> str:
     """Return a model for a notebook: its first modes, what it was made of, and what it may be used for."""
-    needed = [f"{percent(share)} in {n}" for share in _SHARES if (n := model.modes_for_variance(share)) is not None]
+    modes_needed = [
+        f"{percent(share)} in {n}" for share in _SHARES if (n := model.modes_for_variance(share)) is not None
+    ]
     rows = [
         ("Made of", counted(model.n_training, "shape")),
         ("Surface", f"{model.n_vertices:,} vertices, {0 if model.faces is None else len(model.faces):,} triangles"),
         ("Modes", f"{model.n_modes}, with {100 * float(model.cumulative_variance[-1]):.1f} % of the variance"),
-        ("Variance", listed(needed) or "below 90 % in the modes kept"),
+        ("Variance", listed(modes_needed) or "below 90 % in the modes kept"),
         ("Size", "divided out (gauge shape)" if model.gauge == "shape" else "kept in the modes (gauge form)"),
         ("Landmarks", listed(list(model.landmarks)) or "none"),
         ("Provenance", model.provenance or "not stated"),
@@ -109,12 +111,12 @@ def html_of_model(model: ShapeModel) -> str:
 
 def html_of_fit(result: FitResult) -> str:
     """Return a fit for a notebook: where it is how far from the scan, the verdict, and the largest coefficients."""
-    shown = result.shown
+    overlap = result.shown
     largest = sorted(range(len(result.z)), key=lambda k: -abs(result.z[k]))[:_MOST_COEFFICIENTS]
-    seen, covered = percent(shown.model_seen_share), percent(shown.scan_covered_share)
+    seen_share, covered_share = percent(overlap.model_seen_share), percent(overlap.scan_covered_share)
     rows = [
-        ("Model to scan", f"{mm(shown.model_to_scan.mean)} mean, over the {seen} that the scan shows"),
-        ("Scan to model", f"{mm(shown.scan_to_model.mean)} mean, over the {covered} that the model covers"),
+        ("Model to scan", f"{mm(overlap.model_to_scan.mean)} mean, over the {seen_share} that the scan shows"),
+        ("Scan to model", f"{mm(overlap.scan_to_model.mean)} mean, over the {covered_share} that the model covers"),
         ("Coefficients", f"{len(result.z)}; " + ", ".join(f"z{k + 1} {result.z[k]:+.1f}" for k in largest)),
         ("Scale", f"{result.T_scan_model.scale:.4g} ({result.mm_per_scan_unit:g} mm in the scan's unit)"),
         ("Method", f"{result.method}, started from {result.start}, {sum(result.seconds.values()):.2f} s"),
@@ -141,8 +143,10 @@ def html_of_quality(quality: ModelQuality) -> str:
         curve = getattr(quality, name)
         if curve is not None:
             value, low, high = curve.mean[-1], curve.low[-1], curve.high[-1]
-            told = percent(value) if name == "compactness" else f"{mm(value)} ({low:.3g} to {high:.3g})"
-            rows.append((name.replace("_vertices", " (vertices)").capitalize(), f"{told} with {curve.at[-1]} modes"))
+            value_text = percent(value) if name == "compactness" else f"{mm(value)} ({low:.3g} to {high:.3g})"
+            rows.append(
+                (name.replace("_vertices", " (vertices)").capitalize(), f"{value_text} with {curve.at[-1]} modes")
+            )
 
     def draw() -> Drawn:
         return _still(plot_quality(quality)), "Bands are 95 % intervals."

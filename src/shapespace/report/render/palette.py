@@ -86,19 +86,19 @@ def _even(anchors: npt.ArrayLike, count: int) -> FloatArray:
     anchors = np.asarray(anchors, dtype=np.float64)
     curve = _between(np.linspace(0, len(anchors) - 1, 2001), np.arange(len(anchors)), anchors)
     # Corners in a map are seen as edges that the data do not have.
-    reach = 150
-    padded = np.concatenate([2 * curve[0] - curve[reach:0:-1], curve, 2 * curve[-1] - curve[-2 : -reach - 2 : -1]])
-    window = np.hanning(2 * reach + 1) / np.hanning(2 * reach + 1).sum()
+    n_steps = 150
+    padded = np.concatenate([2 * curve[0] - curve[n_steps:0:-1], curve, 2 * curve[-1] - curve[-2 : -n_steps - 2 : -1]])
+    window = np.hanning(2 * n_steps + 1) / np.hanning(2 * n_steps + 1).sum()
     for k in range(3):
         curve[:, k] = np.convolve(padded[:, k], window, mode="valid")
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
     return _srgb(_between(np.linspace(0, float(along[-1]), count), along, curve))
 
 
-def _between(at: npt.NDArray[Any], known: npt.NDArray[Any], colours: FloatArray) -> FloatArray:
-    out = np.empty((len(at), 3))
+def _between(positions: npt.NDArray[Any], known: npt.NDArray[Any], colours: FloatArray) -> FloatArray:
+    out = np.empty((len(positions), 3))
     for k in range(3):
-        out[:, k] = np.interp(at, known, colours[:, k])
+        out[:, k] = np.interp(positions, known, colours[:, k])
     return out
 
 
@@ -109,8 +109,8 @@ def _frozen(colours: FloatArray) -> FloatArray:
 
 
 def _sequential() -> FloatArray:
-    named = ("f6f1e4", "f3cf8e", "e98f53", "c24a5c", "7a2669", "2b1250")
-    return _frozen(_even(oklab([_hex(name) for name in named]), 256))
+    anchors = ("f6f1e4", "f3cf8e", "e98f53", "c24a5c", "7a2669", "2b1250")
+    return _frozen(_even(oklab([_hex(name) for name in anchors]), 256))
 
 
 def _diverging() -> FloatArray:

@@ -86,8 +86,8 @@ class Camera:
         if not len(points) or not np.isfinite(points).all():
             raise InputError("A camera needs at least one point to look at, and all of them finite.")
         axes = _view_axes(yaw_deg, pitch_deg)
-        seen = points @ axes.T
-        low, high = seen.min(axis=0), seen.max(axis=0)
+        projected = points @ axes.T
+        low, high = projected.min(axis=0), projected.max(axis=0)
         extent = high - low
         height = float(max(extent[1], extent[0] / aspect, 1e-6)) * (1 + 2 * margin)
         centre = ((low + high) / 2) @ axes
@@ -95,9 +95,11 @@ class Camera:
             return Camera(centre, height, yaw_deg, pitch_deg)
         distance = 5.0 * height + float(extent[2])
         # Nearer parts grow in perspective, so the height is that of the point which reaches farthest out.
-        offset = np.abs(seen - (low + high) / 2) * (distance / (distance - (seen[:, 2:] - (low + high)[2] / 2)))
-        reach = max(float(offset[:, 1].max()), float(offset[:, 0].max()) / aspect, 1e-6)
-        grown = 2 * reach * (1 + 2 * margin)
+        offset = np.abs(projected - (low + high) / 2) * (
+            distance / (distance - (projected[:, 2:] - (low + high)[2] / 2))
+        )
+        half_height = max(float(offset[:, 1].max()), float(offset[:, 0].max()) / aspect, 1e-6)
+        grown = 2 * half_height * (1 + 2 * margin)
         return Camera(centre, grown, yaw_deg, pitch_deg, distance)
 
 
@@ -136,11 +138,11 @@ class Layer:
         if self.scalars is None:
             return
         name = self.mesh.name
-        for which, given in (("scalars", self.scalars), ("across", self.across)):
-            if given is None:
+        for field_name, field_values in (("scalars", self.scalars), ("across", self.across)):
+            if field_values is None:
                 continue
-            values = read_only(given)
-            object.__setattr__(self, which, values)
+            values = read_only(field_values)
+            object.__setattr__(self, field_name, values)
             if values.shape != (len(self.mesh.vertices),):
                 raise InputError(
                     f"{name} has {len(self.mesh.vertices)} vertices but the scalars have the shape {values.shape}."
@@ -214,16 +216,16 @@ def render_series(
             f"each side times the samples must be 1 to {_LARGEST_SIDE}."
         )
     fine = (size[0] * supersample, size[1] * supersample)
-    found: dict[tuple[object, ...], _Surfels] = {}
+    surfels_by_key: dict[tuple[object, ...], _Surfels] = {}
     pieces: dict[int, tuple[_Single, _Surfels]] = {}
     for layer in {id(layer): layer for layers in pictures for layer in layers}.values():
         # Layers hold views of their scalars: those of one array begin at one place.
         scalars = None if layer.scalars is None else layer.scalars.ctypes.data
         across = None if layer.across is None else layer.across.ctypes.data
-        seen = (id(layer.mesh), scalars, across, layer.point_radius_mm, layer.categories)
-        if seen not in found:
-            found[seen] = _surfels(layer, camera, fine, supersample)
-        pieces[id(layer)] = (_shaded(layer, found[seen]), found[seen])
+        cache_key = (id(layer.mesh), scalars, across, layer.point_radius_mm, layer.categories)
+        if cache_key not in surfels_by_key:
+            surfels_by_key[cache_key] = _surfels(layer, camera, fine, supersample)
+        pieces[id(layer)] = (_shaded(layer, surfels_by_key[cache_key]), surfels_by_key[cache_key])
     return [_composed([pieces[id(layer)] for layer in layers], size, supersample) for layers in pictures]
 
 
@@ -270,16 +272,16 @@ def _view_axes(yaw_deg: float, pitch_deg: float) -> FloatArray:
 def _project(points: FloatArray, camera: Camera, size: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
     """Return pixel positions (N, 2), y down, and depths (N,) that are linear across a triangle on the screen."""
     width, height = size
-    seen = (points - camera.centre) @ _view_axes(camera.yaw_deg, camera.pitch_deg).T
+    camera_points = (points - camera.centre) @ _view_axes(camera.yaw_deg, camera.pitch_deg).T
     pixels_per_mm = height / camera.height_mm
     if camera.distance_mm is None:
-        scale, depth = np.full(len(seen), pixels_per_mm), -seen[:, 2]
+        scale, depth = np.full(len(camera_points), pixels_per_mm), -camera_points[:, 2]
     else:
-        away = camera.distance_mm - seen[:, 2]
+        away = camera.distance_mm - camera_points[:, 2]
         # Behind the eye there is no picture: NaN drops the triangle.
         away = np.where(away > 0.05 * camera.distance_mm, away, np.nan)
         scale, depth = pixels_per_mm * camera.distance_mm / away, -1.0 / away
-    screen = np.stack([width / 2 + seen[:, 0] * scale, height / 2 - seen[:, 1] * scale], axis=1)
+    screen = np.stack([width / 2 + camera_points[:, 0] * scale, height / 2 - camera_points[:, 1] * scale], axis=1)
     return screen, depth
 
 
@@ -306,24 +308,35 @@ def _surfels(layer: Layer, camera: Camera, size: tuple[int, int], supersample: i
     triangle, nearest = _rasterise(screen, depth, faces, size)
     pixel = np.flatnonzero(triangle >= 0)
     # Colours bear single precision.
-    normal, back = np.empty((3, len(pixel)), dtype=np.float32), np.empty(len(pixel), dtype=np.bool_)
+    normal, is_back = np.empty((3, len(pixel)), dtype=np.float32), np.empty(len(pixel), dtype=np.bool_)
     scalars = read_only(np.zeros(0)) if layer.scalars is None else layer.scalars
     scalar = np.empty(len(pixel) if len(scalars) else 0, dtype=np.float32)
     nearness = np.ones(len(vertices)) if camera.distance_mm is None else -depth
     normals = vertex_normals(layer.mesh) @ _view_axes(camera.yaw_deg, camera.pitch_deg).T
     interpolated(
         pixel, triangle[pixel], screen, nearness, faces, normals, scalars, layer.categories, size[0],
-        normal, scalar, back,
+        normal, scalar, is_back,
     )  # fmt: skip
     if layer.across is not None:
-        other = np.empty_like(scalar)
+        scratch = np.empty_like(scalar)
         interpolated(
-            pixel, triangle[pixel], screen, nearness, faces, normals, layer.across, False, size[0], normal, other, back
+            pixel,
+            triangle[pixel],
+            screen,
+            nearness,
+            faces,
+            normals,
+            layer.across,
+            False,
+            size[0],
+            normal,
+            scratch,
+            is_back,
         )
-        scalar = squares(scalar, other)
+        scalar = squares(scalar, scratch)
     depth_mm = _depth_mm(nearest[pixel], camera).astype(np.float32)
     occlusion = _occlusion(pixel, depth_mm, size, supersample, camera)
-    return _Surfels(pixel, depth_mm, normal, scalar, back, occlusion)
+    return _Surfels(pixel, depth_mm, normal, scalar, is_back, occlusion)
 
 
 def squares(along: npt.NDArray[np.floating[Any]], across: npt.NDArray[np.floating[Any]]) -> _Single:
@@ -361,19 +374,19 @@ def _balls(layer: Layer, camera: Camera, size: tuple[int, int], supersample: int
     nearest_balls(screen, behind, radius, rise_mm, width, height, winner, nearest)
     pixel = np.flatnonzero(winner >= 0)
     owner = winner[pixel]
-    at = np.stack([pixel % width + 0.5, pixel // width + 0.5], axis=1)
-    flat = (at - screen[owner]) / radius * [1.0, -1.0]
+    pixel_centres = np.stack([pixel % width + 0.5, pixel // width + 0.5], axis=1)
+    flat = (pixel_centres - screen[owner]) / radius * [1.0, -1.0]
     up = np.sqrt(np.clip(1 - (flat**2).sum(axis=1), 0, 1))
     normal = np.concatenate([flat.T, up[None]]).astype(np.float32)
     if surface is not None:
-        seen = (surface @ _view_axes(camera.yaw_deg, camera.pitch_deg).T).astype(np.float32)
-        seen *= np.where(seen[:, 2:] < 0, np.float32(-1), np.float32(1))
+        view_directions = (surface @ _view_axes(camera.yaw_deg, camera.pitch_deg).T).astype(np.float32)
+        view_directions *= np.where(view_directions[:, 2:] < 0, np.float32(-1), np.float32(1))
         # A little of the ball is kept, by which a cloud is told from a closed surface.
-        normal = np.ascontiguousarray(_unit((seen[owner].T + 0.35 * normal).astype(np.float32)))
+        normal = np.ascontiguousarray(_unit((view_directions[owner].T + 0.35 * normal).astype(np.float32)))
     scalar = (np.zeros(0) if layer.scalars is None else layer.scalars[owner]).astype(np.float32)
     depth_mm = nearest[pixel].astype(np.float32)
-    back = np.zeros(len(pixel), dtype=np.bool_)
-    return _Surfels(pixel, depth_mm, normal, scalar, back, _occlusion(pixel, depth_mm, size, supersample, camera))
+    is_back = np.zeros(len(pixel), dtype=np.bool_)
+    return _Surfels(pixel, depth_mm, normal, scalar, is_back, _occlusion(pixel, depth_mm, size, supersample, camera))
 
 
 _CLOSING = 0.8
@@ -388,8 +401,10 @@ def _cloud_surface(mesh: Mesh) -> tuple[float, FloatArray | None]:
         if len(points) <= _NEIGHBOURS:
             _clouds[mesh] = (1.0, None)
         else:
-            away, near = cast(tuple[FloatArray, npt.NDArray[np.int64]], cKDTree(points).query(points, k=_NEIGHBOURS))
-            offset = points[near] - points[near].mean(axis=1, keepdims=True)
+            away, neighbours = cast(
+                tuple[FloatArray, npt.NDArray[np.int64]], cKDTree(points).query(points, k=_NEIGHBOURS)
+            )
+            offset = points[neighbours] - points[neighbours].mean(axis=1, keepdims=True)
             normals = np.linalg.eigh(np.einsum("nki,nkj->nij", offset, offset))[1][:, :, 0]
             _clouds[mesh] = (float(np.median(away[:, 4])), np.asarray(normals))
     return _clouds[mesh]
@@ -435,18 +450,18 @@ def _occlusion(
 ) -> _Single:
     """Return (n,) in (0, 1]: darker where a point lies behind its neighbours' mean depth (Luft et al. 2006)."""
     width, height = size
-    there = np.zeros((height, width), dtype=np.float32)
-    there.ravel()[pixel] = 1
+    is_surface = np.zeros((height, width), dtype=np.float32)
+    is_surface.ravel()[pixel] = 1
     depth = np.zeros((height, width), dtype=np.float32)
     depth.ravel()[pixel] = depth_mm
     coarse = (slice(None, None, supersample), slice(None, None, supersample))
     out = np.ones(len(pixel), dtype=np.float32)
     row, column = pixel // width // supersample, pixel % width // supersample
     # The wide one shades the eye sockets and below the chin, the narrow one draws lips, lids and folds.
-    for reach, most, strength in ((0.026, 0.035, 26.0), (0.007, 0.010, 42.0)):
-        sigma = reach * height / supersample
-        total = gaussian_filter(there[coarse], sigma, truncate=2.5)
+    for radius_share, max_depth, strength in ((0.026, 0.035, 26.0), (0.007, 0.010, 42.0)):
+        sigma = radius_share * height / supersample
+        total = gaussian_filter(is_surface[coarse], sigma, truncate=2.5)
         mean = gaussian_filter(depth[coarse], sigma, truncate=2.5) / np.maximum(total, 1e-6)
-        behind = np.clip(depth_mm - mean[row, column], 0, most * camera.height_mm)
-        out *= np.exp(np.float32(-strength / camera.height_mm) * behind)
+        depth_behind = np.clip(depth_mm - mean[row, column], 0, max_depth * camera.height_mm)
+        out *= np.exp(np.float32(-strength / camera.height_mm) * depth_behind)
     return out

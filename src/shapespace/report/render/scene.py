@@ -74,8 +74,8 @@ def quantised(values: npt.ArrayLike, *, step: float = 0.0, by_row: bool = False,
     scale = np.maximum(np.asarray(largest) / _MOST_STEPS, step)
     scale = np.where(scale > 0, scale, 1.0)
     steps = np.rint(np.where(known, array, 0.0) / (scale.reshape(-1, *[1] * (array.ndim - 1)) if by_row else scale))
-    whole = np.where(known, steps, _UNKNOWN).astype(np.int16)
-    return Steps(whole, [float(value) for value in scale] if by_row else float(scale), coded)
+    whole_steps = np.where(known, steps, _UNKNOWN).astype(np.int16)
+    return Steps(whole_steps, [float(value) for value in scale] if by_row else float(scale), coded)
 
 
 def pack(arrays: Mapping[str, npt.NDArray[Any] | Steps], facts: Mapping[str, Any]) -> bytes:
@@ -92,17 +92,17 @@ def pack(arrays: Mapping[str, npt.NDArray[Any] | Steps], facts: Mapping[str, Any
     specs: dict[str, Any] = {}
     buffers: list[bytes] = []
     offset = 0
-    for name, given in arrays.items():
-        array = given.values if isinstance(given, Steps) else _portable(name, np.asarray(given))
+    for name, values in arrays.items():
+        array = values.values if isinstance(values, Steps) else _portable(name, np.asarray(values))
         spec: dict[str, Any] = {"dtype": array.dtype.name, "shape": list(array.shape), "offset": offset}
         data = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<")).tobytes()
-        if isinstance(given, Steps):
-            if given.scale is not None:
-                spec["scale"] = given.scale
-            if given.coded:
-                before = arrays[given.follows] if given.follows is not None else None
-                spec["coded"] = given.follows or True
-                data = _coded(array, before.values if isinstance(before, Steps) else None)
+        if isinstance(values, Steps):
+            if values.scale is not None:
+                spec["scale"] = values.scale
+            if values.coded:
+                reference = arrays[values.follows] if values.follows is not None else None
+                spec["coded"] = values.follows or True
+                data = _coded(array, reference.values if isinstance(reference, Steps) else None)
         specs[name] = spec
         buffers.append(data + bytes(-len(data) % 8))
         offset += len(buffers[-1])
@@ -113,12 +113,12 @@ def pack(arrays: Mapping[str, npt.NDArray[Any] | Steps], facts: Mapping[str, Any
     return struct.pack("<I", len(header)) + header + bytes(-(4 + len(header)) % 8) + b"".join(buffers)
 
 
-def _coded(array: npt.NDArray[Any], before: npt.NDArray[Any] | None) -> bytes:
+def _coded(array: npt.NDArray[Any], reference: npt.NDArray[Any] | None) -> bytes:
     """Return the differences from row to row modulo 2^16, small ones of both signs as small numbers, by byte planes."""
     columns = array.shape[-1] if array.ndim > 1 else 1
     values = array.reshape(-1, columns).view(np.uint16)
-    if before is not None:
-        values = values - before.reshape(-1, columns).view(np.uint16)
+    if reference is not None:
+        values = values - reference.reshape(-1, columns).view(np.uint16)
     steps = np.diff(values, axis=0, prepend=np.zeros((1, columns), np.uint16)).view(np.int16).astype(np.int32)
     zigzag = np.where(steps < 0, -2 * steps - 1, 2 * steps).astype("<u2")
     return np.ascontiguousarray(zigzag.T).view(np.uint8).reshape(columns, -1, 2).transpose(0, 2, 1).tobytes()
@@ -144,17 +144,17 @@ def pack_model(model: ShapeModel, modes: int | None = None, *, small: bool = Fal
     order, faces = np.arange(model.n_vertices), model.faces
     if small and faces is not None:
         order, faces = _neighbours_together(faces, model.n_vertices)
-    one = np.zeros(K)
-    moved = np.empty((K, model.n_vertices, 3))
+    unit = np.zeros(K)
+    mode_shapes = np.empty((K, model.n_vertices, 3))
     for k in range(K):
-        one[k] = model.stddev[k]
-        moved[k] = model.reconstruct(one) - model.mean_vertices
-        one[k] = 0.0
+        unit[k] = model.stddev[k]
+        mode_shapes[k] = model.reconstruct(unit) - model.mean_vertices
+        unit[k] = 0.0
     arrays: dict[str, npt.NDArray[Any] | Steps] = {
         "mean": quantised(model.mean_vertices[order], step=_PLACE_STEP_MM, coded=True)
         if small
         else model.mean_vertices,
-        "modes": quantised(moved[:, order], step=_MODE_STEP_MM if small else 0.0, by_row=True, coded=small),
+        "modes": quantised(mode_shapes[:, order], step=_MODE_STEP_MM if small else 0.0, by_row=True, coded=small),
         "stddev": model.stddev[:K],
         "share": model.stddev[:K] ** 2 / model.total_variance,
     }
@@ -191,11 +191,11 @@ def pack_morph(low: Mesh, high: Mesh, labels: tuple[str, str], *, largest: int =
         largest: how many triangles (or points) are kept.
     """
     middle, half = (low.vertices + high.vertices) / 2, (high.vertices - low.vertices) / 2
-    mesh, kept = _small(low.with_vertices(middle), largest)
+    mesh, source_rows = _small(low.with_vertices(middle), largest)
     extent = float(np.ptp(middle, axis=0).max())
     arrays: dict[str, npt.NDArray[Any] | Steps] = {
         "mean": quantised(mesh.vertices, step=min(_PLACE_STEP_MM, extent / 4000), coded=True),
-        "modes": quantised(half[None, kept], step=min(_MODE_STEP_MM, extent / 8000), by_row=True, coded=True),
+        "modes": quantised(half[None, source_rows], step=min(_MODE_STEP_MM, extent / 8000), by_row=True, coded=True),
     }
     if mesh.faces is not None:
         arrays["faces"] = _indices(mesh.faces, len(mesh.vertices), coded=True)
@@ -274,7 +274,7 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: i
 
 
 def pack_surfaces(
-    surfaces: Mapping[str, Mesh], record: FitRecord, *, name: str, label: str, why: str, largest: int | None = None
+    surfaces: Mapping[str, Mesh], record: FitRecord, *, name: str, label: str, reason: str, largest: int | None = None
 ) -> bytes:
     """Return the data for the widget of a fit without its scan: as `pack_fit`, without scan and distances.
 
@@ -283,13 +283,13 @@ def pack_surfaces(
         record: of the fit.
         name: of the fit.
         label: what pictures call it.
-        why: there is no scan to show, as the end of a sentence.
+        reason: there is no scan to show, as the end of a sentence.
         largest: for a report: how many triangles (or points) are kept; None packs all as it is.
     """
     last = list(surfaces.values())[-1]
-    model, kept = (last, np.arange(len(last.vertices))) if largest is None else _small(last, largest)
+    model, source_rows = (last, np.arange(len(last.vertices))) if largest is None else _small(last, largest)
     small = largest is not None
-    places = {f"surface_{stage}": surface.vertices[kept] for stage, surface in surfaces.items()}
+    places = {f"surface_{stage}": surface.vertices[source_rows] for stage, surface in surfaces.items()}
     arrays: dict[str, npt.NDArray[Any] | Steps] = {}
     if model.faces is not None:
         arrays["faces"] = _indices(model.faces, len(model.vertices), coded=small)
@@ -302,7 +302,7 @@ def pack_surfaces(
         "status": record.status,
         "reason": record.reason,
         "stages": list(surfaces),
-        "without_scan": f"The fitted surface is shown alone, since {why}",
+        "without_scan": f"The fitted surface is shown alone, since {reason}",
         "thinned": len(model.vertices) < len(last.vertices),
     }
     return pack(arrays, facts)
@@ -427,11 +427,11 @@ def payload_html(identifier: str, payload: bytes) -> str:
 
 
 def _portable(name: str, array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    wanted = {"float64": np.float32, "int64": np.int32, "bool": np.uint8}.get(array.dtype.name)
-    if wanted is not None:
+    target_dtype = {"float64": np.float32, "int64": np.int32, "bool": np.uint8}.get(array.dtype.name)
+    if target_dtype is not None:
         if array.dtype == np.int64 and array.size and np.abs(array).max() > np.iinfo(np.int32).max:
             raise InputError(f"The array {name!r} holds integers beyond 32 bits, which scenes do not have.")
-        array = array.astype(wanted)
+        array = array.astype(target_dtype)
     if array.dtype.name not in _DTYPES:
         raise InputError(f"The array {name!r} has the type {array.dtype}; scenes have {', '.join(_DTYPES)}.")
     return array
@@ -452,20 +452,20 @@ def _alike(surfaces: Mapping[str, FloatArray]) -> dict[str, Steps]:
     largest = max(float(np.abs(points).max(initial=0.0)) for points in surfaces.values())
     step = max(largest / _MOST_STEPS, _PLACE_STEP_MM)
     out: dict[str, Steps] = {}
-    before: str | None = None
+    previous: str | None = None
     for name, points in surfaces.items():
-        out[name] = Steps(np.rint(points / step).astype(np.int16), step, True, before)
-        before = name
+        out[name] = Steps(np.rint(points / step).astype(np.int16), step, True, previous)
+        previous = name
     return out
 
 
 def _small(mesh: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
     """Return `mesh` thinned, with neighbours near each other in the order, and the indices of its vertices."""
-    few, kept = thinned(mesh, largest)
-    if few.faces is None:
-        return few, kept
-    order, faces = _neighbours_together(few.faces, len(few.vertices))
-    return Mesh(few.vertices[order], faces, name=mesh.name), kept[order]
+    small_mesh, source_rows = thinned(mesh, largest)
+    if small_mesh.faces is None:
+        return small_mesh, source_rows
+    order, faces = _neighbours_together(small_mesh.faces, len(small_mesh.vertices))
+    return Mesh(small_mesh.vertices[order], faces, name=mesh.name), source_rows[order]
 
 
 def _neighbours_together(faces: IntArray, vertices: int) -> tuple[npt.NDArray[np.intp], IntArray]:
@@ -478,10 +478,10 @@ def _neighbours_together(faces: IntArray, vertices: int) -> tuple[npt.NDArray[np
     order = np.asarray(reverse_cuthill_mckee(graph, symmetric_mode=True), dtype=np.intp)
     place = np.empty(vertices, dtype=np.int32)
     place[order] = np.arange(vertices, dtype=np.int32)
-    moved = place[faces]
-    first = moved.argmin(axis=1)[:, None]
-    moved = np.take_along_axis(moved, (first + np.arange(3)) % 3, axis=1)
-    return order, moved[np.lexsort((moved[:, 2], moved[:, 1], moved[:, 0]))]
+    new_faces = place[faces]
+    rotation = new_faces.argmin(axis=1)[:, None]
+    new_faces = np.take_along_axis(new_faces, (rotation + np.arange(3)) % 3, axis=1)
+    return order, new_faces[np.lexsort((new_faces[:, 2], new_faces[:, 1], new_faces[:, 0]))]
 
 
 def _region_shares(staged: StagedFit) -> list[float]:
@@ -492,14 +492,14 @@ def _region_shares(staged: StagedFit) -> list[float]:
 
 
 def _mean(signed_mm: FloatArray) -> float:
-    known = measured_mm(signed_mm)
-    return float(known.mean()) if len(known) else math.nan
+    known_mm = measured_mm(signed_mm)
+    return float(known_mm.mean()) if len(known_mm) else math.nan
 
 
 def _shares_beyond(signed_mm: FloatArray) -> npt.NDArray[Any]:
-    known = np.sort(measured_mm(signed_mm))
-    within = np.searchsorted(known, np.arange(101) / 10.0 + 1e-9, side="right")
-    return (1.0 - within / max(len(known), 1)).astype(np.float32)
+    sorted_mm = np.sort(measured_mm(signed_mm))
+    counts = np.searchsorted(sorted_mm, np.arange(101) / 10.0 + 1e-9, side="right")
+    return (1.0 - counts / max(len(sorted_mm), 1)).astype(np.float32)
 
 
 def _matrix(T: Similarity) -> FloatArray:

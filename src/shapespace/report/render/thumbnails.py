@@ -45,10 +45,10 @@ def fit_strip(fit: StagedFit, limit_mm: float, panel: tuple[int, int] = PANEL) -
     surface = fit.surfaces["final"]
     camera = Camera.framing(surface.vertices, aspect=panel[0] / panel[1], margin=0.02)
     scan, model = Layer(fit.scan, SCAN_COLOUR), Layer(surface, MODEL_COLOUR)
-    plain, both = render_series([[scan], [scan, model]], camera=camera, size=panel)
+    plain, overlay = render_series([[scan], [scan, model]], camera=camera, size=panel)
     distances = distance_layer(surface, fit.model_to_scan_mm["final"], limit_mm, signed=fit.scan.faces is not None)
-    seen = render(distances, camera=camera, size=panel)
-    return encoded(np.concatenate([plain, both, seen], axis=1))
+    distance_image = render(distances, camera=camera, size=panel)
+    return encoded(np.concatenate([plain, overlay, distance_image], axis=1))
 
 
 def correspondence_strip(
@@ -69,24 +69,24 @@ def correspondence_strip(
         panel: width and height of each panel in pixels.
     """
     surface = mean.with_vertices(vertices)
-    there, far = drawable(surface, distance)
-    faces, changed = faces_of(surface), Distortion.of(surface, mean)
-    _, growth = drawable(surface, _at_vertices(changed.growth, faces, len(vertices)))
+    drawn_surface, drawn_distance = drawable(surface, distance)
+    faces, distortion = faces_of(surface), Distortion.of(surface, mean)
+    _, growth = drawable(surface, _at_vertices(distortion.growth, faces, len(vertices)))
     layers = [[checker_layer(surface, checker_places(mean))]]
     if scan is not None:
         layers = [
             [Layer(drawable(scan)[0], SCAN_COLOUR)], *layers,
-            [Layer(there, scalars=far, colormap=SEQUENTIAL, vmax=limit)],
+            [Layer(drawn_surface, scalars=drawn_distance, colormap=SEQUENTIAL, vmax=limit)],
         ]  # fmt: skip
     end = float(np.log(AREA_LIMIT))
-    area = [Layer(there, scalars=growth, colormap=DIVERGING, vmin=-end, vmax=end)]
-    if changed.folded.any():
-        around = np.isin(faces, faces[changed.folded]).any(axis=1) & there_are(vertices)[faces].all(axis=1)
+    area = [Layer(drawn_surface, scalars=growth, colormap=DIVERGING, vmin=-end, vmax=end)]
+    if distortion.folded.any():
+        around = np.isin(faces, faces[distortion.folded]).any(axis=1) & there_are(vertices)[faces].all(axis=1)
         # Of equally near surfaces the first stays.
         area.insert(0, Layer(Mesh(np.nan_to_num(vertices), faces[around]), FOLD_COLOUR))
-    framed = np.concatenate([mean.vertices, there.vertices])
+    framed = np.concatenate([mean.vertices, drawn_surface.vertices])
     camera = Camera.framing(framed, aspect=panel[0] / panel[1], margin=0.02)
-    pictures = [render(*one, camera=camera, size=panel) for one in (*layers, area)]
+    pictures = [render(*layer_group, camera=camera, size=panel) for layer_group in (*layers, area)]
     return encoded(np.concatenate(pictures, axis=1))
 
 
