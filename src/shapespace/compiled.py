@@ -30,7 +30,7 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
 
 
 @contextmanager
-def on_compiling(tell: Callable[[], None]) -> Generator[None]:
+def notify_compilation(tell: Callable[[], None]) -> Generator[None]:
     """Call `tell` once if any code is compiled in this block, before it is; code read from disk does not count."""
 
     class First(cast(Any, event).Listener):

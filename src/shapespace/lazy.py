@@ -66,7 +66,7 @@ def lazy_import(name: str) -> Callable[..., Any]:
     return getattr(import_module(f"shapespace.{LAZY_FUNCTIONS[name]}"), name)
 
 
-def other_package(module: str, purpose: str, install: str = "") -> Any:
+def require_package(module: str, purpose: str, install: str = "") -> Any:
     """Return a module of a package that shapespace does not require.
 
     Args:

@@ -19,17 +19,17 @@ def short_repr(self: Any) -> str:
 
     It stands in a class as `__repr__ = short_repr`.
     """
-    shown_fields = (f"{item.name}={told_briefly(getattr(self, item.name))}" for item in fields(self) if item.repr)
+    shown_fields = (f"{item.name}={describe_briefly(getattr(self, item.name))}" for item in fields(self) if item.repr)
     return f"{type(self).__name__}({', '.join(shown_fields)})"
 
 
-def listed_briefly(parts: Sequence[str]) -> str:
+def list_briefly(parts: Sequence[str]) -> str:
     """Return the first of `parts`, and the number of the others, in one line."""
     others_note = f"; and {len(parts) - _MOST_NAMES} more" if len(parts) > _MOST_NAMES else ""
-    return "; ".join(_clipped(part) for part in parts[:_MOST_NAMES]) + others_note
+    return "; ".join(_clip(part) for part in parts[:_MOST_NAMES]) + others_note
 
 
-def told_briefly(value: Any) -> str:
+def describe_briefly(value: Any) -> str:
     """Return a few words on `value`, of which nothing is measured or read for that."""
     if isinstance(value, np.ndarray):
         return _of_array(cast(npt.NDArray[Any], value))
@@ -45,12 +45,12 @@ def told_briefly(value: Any) -> str:
 def _of_mapping(value: Mapping[object, object]) -> str:
     names = [str(name) for name in value]
     others_note = f", and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
-    return "{" + ", ".join(_clipped(name) for name in names[:_MOST_NAMES]) + others_note + "}"
+    return "{" + ", ".join(_clip(name) for name in names[:_MOST_NAMES]) + others_note + "}"
 
 
 def _of_other(value: object) -> str:
     text = repr(value)
-    return f"{type(value).__name__}(…)" if is_dataclass(value) and len(text) > _LONGEST else _clipped(text)
+    return f"{type(value).__name__}(…)" if is_dataclass(value) and len(text) > _LONGEST else _clip(text)
 
 
 def _of_array(array: npt.NDArray[Any]) -> str:
@@ -59,5 +59,5 @@ def _of_array(array: npt.NDArray[Any]) -> str:
     return f"<{' x '.join(map(str, array.shape))} {array.dtype}>"
 
 
-def _clipped(text: str) -> str:
+def _clip(text: str) -> str:
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 2]} …"

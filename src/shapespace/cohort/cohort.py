@@ -15,15 +15,15 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.cohort.classes import class_notes
-from shapespace.cohort.incomplete import completed_by, completed_shapes
-from shapespace.cohort.table import Table, named, numbers_as_text
+from shapespace.cohort.incomplete import complete_by_population, completed_shapes
+from shapespace.cohort.table import Table, list_names, numbers_as_text
 from shapespace.errors import CorrespondenceError, InputError
 from shapespace.geometry.procrustes import Gauge, align_in_place, centroid_size, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.lazy import lazy_import
 from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
-from shapespace.reprs import listed_briefly, short_repr
+from shapespace.reprs import list_briefly, short_repr
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, SurfaceLandmarks, read_only
 
 SUBJECT = "subject"
@@ -179,7 +179,7 @@ class Cohort:
 
     def __repr__(self) -> str:
         noun = "surfaces" if self.fitted is None else "fits"
-        columns = listed_briefly(list(self.table.columns)) or "no columns"
+        columns = list_briefly(list(self.table.columns)) or "no columns"
         return (
             f"<Cohort of {len(self)} {noun} with {self.n_vertices:,} vertices, gauge {self.gauge}; "
             f"{len(self.basis)} coefficients each; columns: {columns}>"
@@ -261,7 +261,7 @@ class Cohort:
         if not missing:
             new = [note for note in class_notes(self.table, columns) if note not in self.notes]
             return replace(self, notes=(*self.notes, *new)) if new else self
-        excluded_names = named([self.names[row] for row in missing])
+        excluded_names = list_names([self.names[row] for row in missing])
         if not drop_missing:
             raise InputError(
                 f"{self.table.where}: {' or '.join(columns)} of {len(missing)} of {len(self)} shapes is missing "
@@ -332,11 +332,11 @@ class Cohort:
             if analysed is not None:
                 mask = None if is_observed[:, analysed].all() else np.logical_and(is_observed, analysed)
             if mask is not None:
-                shapes = _completed_by(onto, shapes, is_observed, shape_names)
+                shapes = _complete_by(onto, shapes, is_observed, shape_names)
             if mask is not None or analysed is not None:
                 part = slice(None) if analysed is None else analysed
                 sizes = read_only([centroid_size(shape[part]) for shape in shapes])
-            _bring_onto(shapes, onto)
+            _align_to(shapes, onto)
         elif mask is not None:
             completed = completed_shapes(shapes, is_observed, shape_names, gauge, faces, align=align)
             shapes, mask, sizes = completed.shapes, completed.observed, read_only(completed.sizes_mm)
@@ -412,8 +412,8 @@ class Cohort:
         if gauge == "form" and not np.isfinite(sizes_mm).all():
             without_size = [name for name, size in zip(names, sizes_mm, strict=True) if not np.isfinite(size)]
             raise InputError(
-                f"The size of {named(without_size)} is not known in mm, so forms cannot be compared; fit with --unit, "
-                "or compare shapes with --gauge shape."
+                f"The size of {list_names(without_size)} is not known in mm, so forms cannot be compared; fit with "
+                "--unit, or compare shapes with --gauge shape."
             )
         if gauge == "form" or model.gauge == "form":
             centre = reference.mean(axis=0)
@@ -436,7 +436,7 @@ class Cohort:
         return cohort
 
 
-def _bring_onto(shapes: FloatArray, onto: Cohort) -> None:
+def _align_to(shapes: FloatArray, onto: Cohort) -> None:
     """Move each of `shapes` (N, V, 3) in place to the mean of a cohort; in the `shape` gauge to its tangent plane."""
     mean_shape = onto.vertices(onto.coefficients.mean(axis=0))
     part = slice(None) if onto.analysed is None else onto.analysed
@@ -458,12 +458,12 @@ def _refuse_other_vertices(shapes: FloatArray, onto: Cohort) -> None:
         raise InputError(f"Shapes of {shapes.shape[1]} vertices cannot be compared with those of {onto.n_vertices}.")
 
 
-def _completed_by(onto: Cohort, shapes: FloatArray, observed: BoolArray, names: Sequence[str]) -> FloatArray:
+def _complete_by(onto: Cohort, shapes: FloatArray, observed: BoolArray, names: Sequence[str]) -> FloatArray:
     """Return shapes (M, V, 3) in which analysed vertices that are not `observed` (M, V) are estimated by a cohort."""
     part = np.ones(onto.n_vertices, dtype=np.bool_) if onto.analysed is None else onto.analysed
     population = np.stack([onto.vertices(k) for k in range(len(onto))])[:, part]
     out = shapes.copy()
-    out[:, part] = completed_by(
+    out[:, part] = complete_by_population(
         population, population.mean(axis=0), shapes[:, part], observed[:, part], names, onto.gauge
     )
     return out

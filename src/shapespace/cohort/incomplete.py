@@ -12,7 +12,7 @@ import numpy as np
 from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import spsolve
 
-from shapespace.cohort.table import named
+from shapespace.cohort.table import list_names
 from shapespace.errors import InputError
 from shapespace.geometry.procrustes import Gauge, centroid_size
 from shapespace.geometry.similarity import fit_similarity
@@ -104,7 +104,7 @@ def _refuse_unobserved(known: BoolArray, names: Sequence[str]) -> None:
         )
     too_sparse = [name for name, row in zip(names, known, strict=True) if row.sum() < _FEWEST_VERTICES]
     if too_sparse:
-        raise InputError(f"{named(too_sparse)}: too few vertices are observed; leave it out.")
+        raise InputError(f"{list_names(too_sparse)}: too few vertices are observed; leave it out.")
 
 
 def _one_position(shapes: FloatArray, mean: FloatArray, analysed: BoolArray, faces: IntArray | None) -> FloatArray:
@@ -140,7 +140,7 @@ def _harmonic(position: FloatArray, empty: BoolArray, faces: IntArray | None, ce
     return np.asarray(spsolve(laplacian[empty][:, empty].tocsc(), right), dtype=np.float64).reshape(-1, 3)
 
 
-def completed_by(
+def complete_by_population(
     population: FloatArray,
     mean: FloatArray,
     shapes: FloatArray,

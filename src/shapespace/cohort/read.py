@@ -12,7 +12,7 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 
 from shapespace.cohort.cohort import Cohort, Fitted, ShapeSource
-from shapespace.cohort.table import Table, named, read_table
+from shapespace.cohort.table import Table, list_names, read_table
 from shapespace.errors import InputError
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.meshes.mesh_io import stem_of
@@ -165,17 +165,17 @@ def _of_results(
     else:
         by_key = _by_key(rows)
         pairs = [(by_key[key], index) for index, key in enumerate(keys) if key in by_key]
-        _tell_unmatched(
+        _note_unmatched(
             notes, table, keys, by_key, [row.name for row, _ in pairs], [row.name for row in rows], results.folder
         )
     accepted = [(row, index) for row, index in pairs if row.status in used]
     for status, count in Counter(row.status for row, _ in pairs if row.status not in used).items():
-        excluded_names = named([row.name for row, _ in pairs if row.status == status])
+        excluded_names = list_names([row.name for row, _ in pairs if row.status == status])
         notes.append(f"{count} of {len(pairs)} fits are left out, which are {status} ({excluded_names}).")
     least = options.least if onto is None else 1
     if len(accepted) < least:
         raise InputError(
-            f"{results.folder}: {len(accepted)} of its fits can be used, and {_count_is(least)} the least; "
+            f"{results.folder}: {len(accepted)} of its fits can be used, and {_count_words(least)} the least; "
             + (notes[-1] if notes else "fit more scans.")
         )
     fits = [row for row, _ in accepted]
@@ -200,12 +200,14 @@ def _of_results(
     else:
         without_surface = [name for name in names if not results.has(name, kind)]
         if without_surface:
-            raise InputError(f"{results.folder} holds no {kind} surface of {named(without_surface)}; fit them again"
-                             f"{' with --dense' if kind == 'dense' else ''}.")  # fmt: skip
+            dense = " with --dense" if kind == "dense" else ""
+            raise InputError(
+                f"{results.folder} holds no {kind} surface of {list_names(without_surface)}; fit them again{dense}."
+            )
         unknown = [row.name for row in fits if not np.isfinite(row.mm_per_unit)]
         if unknown and options.gauge == "form":
             raise InputError(
-                f"The size of {named(unknown)} is not known in mm, so forms cannot be compared; fit with --unit, "
+                f"The size of {list_names(unknown)} is not known in mm, so forms cannot be compared; fit with --unit, "
                 "or compare shapes with --gauge shape."
             )
         meshes: list[Mesh] = []
@@ -251,11 +253,11 @@ def _of_surfaces(
         listing.refuse_mixed_units()
     files = {surface_stem(file): file for file in listing.files if file.suffix.lower() != ".csv"}
     matched = [(files[key], row_index) for row_index, key in enumerate(keys) if key in files]
-    _tell_unmatched(notes, table, keys, files, [surface_stem(file) for file, _ in matched], list(files), folder)
+    _note_unmatched(notes, table, keys, files, [surface_stem(file) for file, _ in matched], list(files), folder)
     least = options.least if onto is None else 1
     if len(matched) < least:
         raise InputError(
-            f"{folder}: {len(matched)} of its meshes are in {table.where}, and {_count_is(least)} the least."
+            f"{folder}: {len(matched)} of its meshes are in {table.where}, and {_count_words(least)} the least."
         )
     meshes: list[Mesh] = []
     for n_read, (file, _) in enumerate(matched, 1):
@@ -272,7 +274,7 @@ def _of_surfaces(
     return replace(cohort, notes=(*notes, *cohort.notes), source=source)
 
 
-def _tell_unmatched(
+def _note_unmatched(
     notes: list[str],
     table: Table,
     keys: Sequence[str],
@@ -289,18 +291,19 @@ def _tell_unmatched(
     unknown = [key for key in keys if key not in available]
     if len(unknown) == len(keys):
         raise InputError(
-            f"{folder} holds no shape of {table.where} (such as {named(unknown)}; there is {named(names)}); give the "
-            "folder of its shapes with --shapes."
+            f"{folder} holds no shape of {table.where} (such as {list_names(unknown)}; there is {list_names(names)}); "
+            "give the folder of its shapes with --shapes."
         )
     if unknown:
         notes.append(
             f"{len(unknown)} of {len(keys)} rows of {table.where} are left out, whose shape is not in "
-            f"{folder} ({named(unknown)})."
+            f"{folder} ({list_names(unknown)})."
         )
     unmatched = sorted(set(names) - set(used))
     if unmatched:
         notes.append(
-            f"{len(unmatched)} of {len(names)} shapes in {folder} have no row in {table.where} ({named(unmatched)})."
+            f"{len(unmatched)} of {len(names)} shapes in {folder} have no row in {table.where} "
+            f"({list_names(unmatched)})."
         )
 
 
@@ -339,7 +342,7 @@ def _model_of(results: Results, fit: _Row, model_path: Path | None) -> tuple[Sha
     return model, additive
 
 
-def _count_is(count: int) -> str:
+def _count_words(count: int) -> str:
     return {1: "one is", 2: "two are"}.get(count, f"{count} are")
 
 

@@ -84,7 +84,7 @@ class Table:
         if not_numeric:
             raise InputError(
                 f"{self.where}: {column!r} holds numbers but {cells[not_numeric[0]][:40]!r} at {not_numeric[0]}"
-                f"{_more(len(not_numeric) - 1)}; write a number there, or leave it empty."
+                f"{_others_note(len(not_numeric) - 1)}; write a number there, or leave it empty."
             )
         return "number"
 
@@ -149,7 +149,7 @@ def read_table(path: Path) -> tuple[Table, tuple[str, ...]]:
     repeated_keys = [key for key, count in Counter(keys).items() if count > 1]
     if repeated_keys:
         raise FileFormatError(
-            f"{path} has two or more rows of {repeated_keys[0][:80]!r}{_more(len(repeated_keys) - 1)}; "
+            f"{path} has two or more rows of {repeated_keys[0][:80]!r}{_others_note(len(repeated_keys) - 1)}; "
             "keep one row for each shape."
         )
     columns: dict[str, tuple[str, ...]] = {}
@@ -182,13 +182,13 @@ def is_number(cell: str) -> bool:
         return False
 
 
-def _more(count: int) -> str:
+def _others_note(count: int) -> str:
     return f" and {count} more" if count > 0 else ""
 
 
-def named(names: Sequence[str]) -> str:
+def list_names(names: Sequence[str]) -> str:
     """Return the first of `names` in words, and how many more there are."""
-    return ", ".join(names[:_NAMED]) + _more(len(names) - _NAMED)
+    return ", ".join(names[:_NAMED]) + _others_note(len(names) - _NAMED)
 
 
 def numbers_as_text(values: FloatArray) -> tuple[str, ...]:

@@ -171,7 +171,7 @@ def _quiet_pooch() -> Generator[None]:
 
 
 @contextlib.contextmanager
-def locked(path: Path) -> Generator[None]:
+def hold_lock(path: Path) -> Generator[None]:
     """Hold a lock on the file `path`; the system lets go of it even if the process is killed."""
     try:
         stream = path.open("a+b")

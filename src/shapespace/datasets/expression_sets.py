@@ -132,16 +132,18 @@ class ScanSet:
         words = Counter(scan.expression for scan in self.scans)
         people = len({scan.subject for scan in self.scans})
         counts = ", ".join(f"{word} {words[word]}" for word in sorted(words, key=_order))
-        lines = [f"{self.layout}: {_many(len(self.scans), 'scan')} of {_many(people, 'subject')} ({counts})."]
+        lines = [
+            f"{self.layout}: {_count_words(len(self.scans), 'scan')} of {_count_words(people, 'subject')} ({counts})."
+        ]
         reasons: dict[str, list[str]] = {}
         for left in self.left_out:
             reasons.setdefault(left.why, []).append(left.name)
-        lines += [f"Left out, {reason}: {_some(names)}." for reason, names in reasons.items()]
+        lines += [f"Left out, {reason}: {_list_names(names)}." for reason, names in reasons.items()]
         if alone := self.subjects_without_neutral():
-            lines.append(f"No neutral scan: {_some(alone)}.")
+            lines.append(f"No neutral scan: {_list_names(alone)}.")
         unlisted_names = {scan.expression for scan in self.scans if scan.kind == "expression"} - set(EXPRESSIONS)
         if unlisted_names:
-            lines.append(f"Expressions of other names: {_some(sorted(unlisted_names))}.")
+            lines.append(f"Expressions of other names: {_list_names(sorted(unlisted_names))}.")
         return "\n".join(lines)
 
 
@@ -193,7 +195,7 @@ def scan_set(folder: Path | str, kinds: Collection[str] = ("neutral", "expressio
         if scan.kind in kinds:
             scans.append(scan)
         else:
-            left_out.append(LeftOut(_inside(scan.path, folder), f"not asked for ({scan.kind})"))
+            left_out.append(LeftOut(_relative_name(scan.path, folder), f"not asked for ({scan.kind})"))
     if not scans:
         raise InputError(f"{folder} holds no scans of kind {' or '.join(kinds)}; choose other kinds or folders.")
     return ScanSet(folder, layout, tuple(scans), tuple(left_out))
@@ -227,7 +229,7 @@ def _from_names(folder: Path, files: Iterable[Path]) -> tuple[str, list[ScanEntr
     for path in files:
         recognised = next(((layout, read) for layout, reader in readers.items() if (read := reader(path))), None)
         if recognised is None:
-            left_out.append(LeftOut(_inside(path, folder), "the name says nothing known"))
+            left_out.append(LeftOut(_relative_name(path, folder), "the name says nothing known"))
             continue
         layout, (entry, key, rank) = recognised
         layouts.setdefault(layout, path)
@@ -239,9 +241,9 @@ def _from_names(folder: Path, files: Iterable[Path]) -> tuple[str, list[ScanEntr
         if rank < best[key][0]:
             loser = best[key][1]
             best[key] = (rank, entry)
-        left_out.append(LeftOut(_inside(loser.path, folder), reason))
+        left_out.append(LeftOut(_relative_name(loser.path, folder), reason))
     if len(layouts) > 1:
-        first, second = (_inside(path, folder) for path in layouts.values())
+        first, second = (_relative_name(path, folder) for path in layouts.values())
         raise InputError(
             f"{folder} holds scans of {' and '.join(layouts)} ({first}, {second}); give the folder of one of them."
         )
@@ -308,7 +310,7 @@ def _from_labels(folder: Path, files: Iterable[Path]) -> tuple[list[ScanEntry], 
     left_out: list[LeftOut] = []
     for line, row in numbered[1:]:
         cells = dict(zip(header, row, strict=False))
-        entry = _labelled(cells, f"{path}, line {line}", folder)
+        entry = _entry_of_row(cells, f"{path}, line {line}", folder)
         row_name = f"{cells['file']} (line {line})"
         target = _existing(entry.path)
         if target is None:
@@ -320,7 +322,7 @@ def _from_labels(folder: Path, files: Iterable[Path]) -> tuple[list[ScanEntry], 
         else:
             entries[target] = entry
     unlisted = sorted(known - set(entries))
-    left_out += [LeftOut(_inside(file, folder.resolve()), f"not in {LABELS}") for file in unlisted]
+    left_out += [LeftOut(_relative_name(file, folder.resolve()), f"not in {LABELS}") for file in unlisted]
     if not entries:
         raise InputError(f"{path} names no scan that is there; its column 'file' is relative to its own folder.")
     return list(entries.values()), left_out
@@ -334,7 +336,7 @@ def _existing(path: Path) -> Path | None:
         return None
 
 
-def _labelled(cells: Mapping[str, str], row_name: str, folder: Path) -> ScanEntry:
+def _entry_of_row(cells: Mapping[str, str], row_name: str, folder: Path) -> ScanEntry:
     empty = [name for name in ("file", "subject", "expression") if not cells.get(name)]
     if empty:
         raise InputError(f"{row_name} has no {' and no '.join(empty)}; fill it in.")
@@ -357,14 +359,14 @@ def _order(expression: str) -> tuple[int, str]:
     return (EXPRESSIONS.index(expression) if expression in EXPRESSIONS else len(EXPRESSIONS), expression)
 
 
-def _inside(path: Path, folder: Path) -> str:
+def _relative_name(path: Path, folder: Path) -> str:
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else str(path)
 
 
-def _many(count: int, noun: str) -> str:
+def _count_words(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
-def _some(names: Collection[str]) -> str:
+def _list_names(names: Collection[str]) -> str:
     first_names = ", ".join(list(names)[:_SHOWN])
     return first_names if len(names) <= _SHOWN else f"{first_names} and {len(names) - _SHOWN} more"

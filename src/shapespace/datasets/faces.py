@@ -175,14 +175,14 @@ class FaceGenerator:
                         weights[key] = float(w_build * w_gender * w_age)
         for decrease, increase in self._pairs():
             spread = _SPREAD[decrease.removeprefix("left_").split("_")[0]]
-            shared = _bounded(rng, spread)
+            shared = _draw_bounded_factor(rng, spread)
             sides = ("left_", "right_") if decrease.startswith("left_") else ("",)
             lopsided = decrease.startswith("left_asym")
             for side in sides:
                 # An asymmetry target is drawn for each side by itself; every other pair of sides shares its weight.
-                x = _bounded(rng, spread) if lopsided else shared
+                x = _draw_bounded_factor(rng, spread) if lopsided else shared
                 if side and not lopsided:
-                    x = float(np.clip(x + _bounded(rng, _SIDE_SPREAD), -2.5 * spread, 2.5 * spread))
+                    x = float(np.clip(x + _draw_bounded_factor(rng, _SIDE_SPREAD), -2.5 * spread, 2.5 * spread))
                 down, up = (side + n.removeprefix("left_") for n in (decrease, increase))
                 if x < 0 and down != up:
                     weights[down] = -x
@@ -249,9 +249,9 @@ class FaceGenerator:
             raise InputError(f"Unknown expression {name!r}; choose one of {', '.join(EXPRESSIONS)}.")
         out = np.zeros(len(self.unit_names))
         for unit, weight in EXPRESSIONS[name].items():
-            pair_weight = weight * (1 + _bounded(rng, variation))
+            pair_weight = weight * (1 + _draw_bounded_factor(rng, variation))
             for side in ("Left", "Right") if unit not in self.unit_names else ("",):
-                lean = 1 + (_bounded(rng, 0.3 * variation) if side else 0.0)
+                lean = 1 + (_draw_bounded_factor(rng, 0.3 * variation) if side else 0.0)
                 out[self.unit_names.index(unit + side)] = min(1.0, pair_weight * lean)
         return out
 
@@ -274,8 +274,8 @@ class FaceGenerator:
         ):
             if len(weights) != len(shapes):
                 raise InputError(
-                    f"This {weight_kind} has {len(weights)} weights, but the generator has {len(shapes)} shapes; draw it "
-                    "from the same generator."
+                    f"This {weight_kind} has {len(weights)} weights, but the generator has {len(shapes)} shapes; draw "
+                    "it from the same generator."
                 )
         change = self._identity_change(person.weights)
         if person.warp_mm is not None:
@@ -319,7 +319,7 @@ def _combine(weights: FloatArray, shapes: npt.NDArray[np.float32]) -> FloatArray
     return np.tensordot(weights[used].astype(np.float32), shapes[used], axes=1).astype(np.float64)
 
 
-def _bounded(rng: np.random.Generator, spread: float) -> float:
+def _draw_bounded_factor(rng: np.random.Generator, spread: float) -> float:
     """Draw from a normal distribution cut off at 2.5 standard deviations."""
     while True:
         x = float(rng.normal())

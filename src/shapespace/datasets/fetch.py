@@ -27,7 +27,7 @@ from typing import Any, cast
 from tqdm import tqdm
 
 from shapespace.datasets import ict_files
-from shapespace.datasets.download import NotThereError, download, locked
+from shapespace.datasets.download import NotThereError, download, hold_lock
 from shapespace.errors import DataError
 from shapespace.io.disk_cache import cache_folder
 from shapespace.io.files import atomic_path, make_folder, sha256_of_file, write_text
@@ -232,14 +232,14 @@ def data_get(
     root = cache or cache_folder()
     folder = data_folder(data_set, cache=root)
     if folder is not None:
-        folder = _verified(data_set, folder, root)
+        folder = _verify(data_set, folder, root)
     else:
         make_folder(root / data_set.name)
-        with locked(root / f".{data_set.name}.lock"):
+        with hold_lock(root / f".{data_set.name}.lock"):
             # Another process may have finished it while this one waited.
             if data_folder(data_set, cache=root) is None:
                 _download_all(data_set, root / data_set.name, base_url, progress)
-            folder = _verified(data_set, root / data_set.name, root)
+            folder = _verify(data_set, root / data_set.name, root)
     return folder if to is None else _copy(data_set, folder, Path(to))
 
 
@@ -263,7 +263,7 @@ def _missing(data_set: Dataset, folder: Path) -> list[str]:
     return [path for path in required if not (folder / path).is_file()]
 
 
-def _verified(data_set: Dataset, folder: Path, root: Path) -> Path:
+def _verify(data_set: Dataset, folder: Path, root: Path) -> Path:
     if data_set.packed is None:
         for file in data_set.files:
             path = folder / file.path

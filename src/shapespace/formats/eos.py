@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import ModelFileError
-from shapespace.formats.model_parts import LinearModel, Modes, orthonormal, scaled
+from shapespace.formats.model_parts import LinearModel, Modes, orthonormal, scale_columns
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import read_bytes, write_bytes
 from shapespace.types import FloatArray, SurfaceLandmarks
@@ -218,7 +218,7 @@ def _pca(archive: _Archive) -> tuple[FloatArray, FloatArray, npt.NDArray[Any]]:
     faces = archive.vector("<i4", 3)
     if mean.shape[1] > 1 or basis.shape != (mean.size, variance.size) or (variance < 0).any() or mean.size % 3:
         raise _DamagedError(f"its parts have the shapes {mean.shape}, {basis.shape} and {variance.shape}")
-    return mean.ravel(), scaled(basis, np.sqrt(variance.ravel())), faces
+    return mean.ravel(), scale_columns(basis, np.sqrt(variance.ravel())), faces
 
 
 def _expression(archive: _Archive, size: int) -> tuple[Modes, FloatArray]:

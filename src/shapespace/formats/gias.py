@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from shapespace.errors import ModelFileError
-from shapespace.formats.model_parts import LinearModel, Modes, scaled
+from shapespace.formats.model_parts import LinearModel, Modes, scale_columns
 from shapespace.io.containers.archives import LARGEST_BYTES, npy_array, zip_members
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import open_file
@@ -54,7 +54,7 @@ class Gias:
                 f"{variance.shape}; {_AGAIN}."
             )
         variance = variance[: modes.shape[1]]
-        displacements = scaled(modes, np.sqrt(np.maximum(variance, 0.0)))
+        displacements = scale_columns(modes, np.sqrt(np.maximum(variance, 0.0)))
         notes: list[str] = []
         spread = _optional(members, "SD")
         if spread is not None and spread.size == mean.size:

@@ -69,7 +69,7 @@ class Gltf:
             notes.append("Its weights are not zero; the mean is the shape without them.")
         if not facts:
             notes.append("A weight of one is taken as one standard deviation.")
-        shape, expression = _parted(displacements, morphs, facts.get("n_identity"))
+        shape, expression = _split_identity(displacements, morphs, facts.get("n_identity"))
         return with_facts(
             LinearModel(
                 mean=mean,
@@ -122,7 +122,7 @@ def _without_seams(
     return mean[kept_rows], columns, joined_faces[~flat], n - len(kept_rows)
 
 
-def _parted(displacements: FloatArray, morphs: Morphs, n_identity: object) -> tuple[Modes, Modes | None]:
+def _split_identity(displacements: FloatArray, morphs: Morphs, n_identity: object) -> tuple[Modes, Modes | None]:
     """Return the modes of identity and of expression, or all of them and None."""
     k = displacements.shape[1]
     identity = [bool(_IDENTITY.fullmatch(name)) for name in morphs.names]

@@ -11,10 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import ModelFileError
-from shapespace.formats.model_parts import LinearModel, Modes, are_measurable, scaled
+from shapespace.formats.model_parts import LinearModel, Modes, are_measurable, scale_columns
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import open_file
-from shapespace.io.sandbox import HDF5_SIGNATURE, ApartError, Tree, read_hdf5_apart, read_matlab_apart
+from shapespace.io.sandbox import HDF5_SIGNATURE, SandboxError, Tree, read_hdf5_sandboxed, read_matlab_sandboxed
 from shapespace.types import FloatArray
 
 _AGAIN = "give the file as it was downloaded"
@@ -99,7 +99,7 @@ class Matlab:
                 known = ", ".join(candidate.title for candidate in _LAYOUTS)
                 raise ModelFileError(f"{path} holds no shape model of a kind that is known ({known}).")
             return _model(tree, layout)
-        except ApartError as error:
+        except SandboxError as error:
             raise ModelFileError(f"{path} is damaged or cut short: {error}; {_AGAIN}.") from error
 
 
@@ -107,8 +107,10 @@ def _tree(path: Path) -> Tree:
     with open_file(path) as stream:
         head = stream.read(_HDF5_AT + len(HDF5_SIGNATURE))
     if not (head.startswith(HDF5_SIGNATURE) or head[_HDF5_AT:] == HDF5_SIGNATURE):
-        return read_matlab_apart(path, _WANTED)
-    tree = read_hdf5_apart(path, leave=("/texMU", "/texPC", "/tex", "/segbin", "/segbb", "/segMM", "/segMB", "/#refs#"))
+        return read_matlab_sandboxed(path, _WANTED)
+    tree = read_hdf5_sandboxed(
+        path, leave=("/texMU", "/texPC", "/tex", "/segbin", "/segbb", "/segMM", "/segMB", "/#refs#")
+    )
     # MATLAB has the last axis first.
     return Tree({name: array.T for name, array in tree.arrays.items()}, groups=tree.groups)
 
@@ -119,9 +121,9 @@ def _model(tree: Tree, layout: _Layout) -> LinearModel:
     if basis.shape == (len(spread), len(mean)) != (len(mean), len(spread)):
         basis = basis.T
     if not all(map(are_measurable, (mean, basis, spread))) or not (spread >= 0).all():
-        raise ApartError("its numbers are not finite, too large, or spread below 0")
+        raise SandboxError("its numbers are not finite, too large, or spread below 0")
     if len(mean) % 3 or basis.shape != (len(mean), len(spread)):
-        raise ApartError(f"its mean, basis and spread have the shapes {mean.shape}, {basis.shape} and {spread.shape}")
+        raise SandboxError(f"its mean, basis and spread have the shapes {mean.shape}, {basis.shape} and {spread.shape}")
     n_training = layout.n_training
     if isinstance(n_training, str):
         training_count = tree.arrays.get(n_training)
@@ -132,7 +134,7 @@ def _model(tree: Tree, layout: _Layout) -> LinearModel:
         )
     return LinearModel(
         mean=mean.reshape(-1, 3),
-        shape=Modes(scaled(basis, spread if layout.is_stddev else np.sqrt(spread))),
+        shape=Modes(scale_columns(basis, spread if layout.is_stddev else np.sqrt(spread))),
         faces=_faces(tree.arrays.get(layout.faces), layout, len(mean) // 3),
         mm=layout.mm,
         n_training=n_training,
@@ -151,7 +153,7 @@ def _faces(triangles: npt.NDArray[Any] | None, layout: _Layout, n: int) -> npt.N
         return None
     faces = triangles.T if triangles.ndim == 2 and triangles.shape[0] == 3 != triangles.shape[1] else triangles
     if faces.ndim != 2 or faces.shape[1] != 3 or not np.isfinite(faces).all() or np.abs(faces).max() > n:
-        raise ApartError(f"its triangles have the shape {triangles.shape}, or name vertices that it does not have")
+        raise SandboxError(f"its triangles have the shape {triangles.shape}, or name vertices that it does not have")
     # Those of menpo count from 0, those of MATLAB's own from 1.
     faces = faces.astype(np.int32) - (layout.first_vertex or int(faces.min() > 0 and faces.max() == n))
     return faces[:, [0, 2, 1]] if layout.is_clockwise else faces

@@ -119,7 +119,7 @@ def are_measurable(array: FloatArray) -> bool:
     return bool((np.abs(array) <= _LARGEST).all())
 
 
-def scaled(basis: npt.ArrayLike, stddev: npt.ArrayLike) -> FloatArray:
+def scale_columns(basis: npt.ArrayLike, stddev: npt.ArrayLike) -> FloatArray:
     """Return U sqrt(lambda), float64, of `basis` (D, K) and `stddev` (K,)."""
     return np.asarray(basis, dtype=np.float64) * np.asarray(stddev, dtype=np.float64)
 

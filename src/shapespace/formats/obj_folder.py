@@ -62,7 +62,9 @@ class ObjFolder:
         steps: list[FloatArray] = []
         for file in mode_files:
             shape = read_mesh(file)
-            same = len(shape.vertices) == len(neutral_mesh.vertices) and _same(shape.faces, neutral_mesh.faces)
+            same = len(shape.vertices) == len(neutral_mesh.vertices) and _have_same_faces(
+                shape.faces, neutral_mesh.faces
+            )
             if not same:
                 raise ModelFileError(
                     f"{file} has other vertices or triangles than {neutral.name}, so that they are no blendshapes; "
@@ -70,7 +72,7 @@ class ObjFolder:
                 )
             steps.append((shape.vertices - neutral_mesh.vertices).ravel())
         names = [file.stem for file in mode_files]
-        shape, expression = _parted(np.stack(steps), names)
+        shape, expression = _split_modes(np.stack(steps), names)
         facts = json_object(read_json(path / _FACTS, "remove it") if (path / _FACTS).is_file() else None)
         notes: list[str] = []
         if not facts:
@@ -125,11 +127,11 @@ def _counts(path: Path) -> tuple[int, int]:
     return content.count(b"\nv "), content.count(b"\nf ")
 
 
-def _same(first: IntArray | None, second: IntArray | None) -> bool:
+def _have_same_faces(first: IntArray | None, second: IntArray | None) -> bool:
     return first is second if first is None or second is None else np.array_equal(first, second)
 
 
-def _parted(steps: FloatArray, names: list[str]) -> tuple[Modes, Modes | None]:
+def _split_modes(steps: FloatArray, names: list[str]) -> tuple[Modes, Modes | None]:
     identity = np.array([bool(_IDENTITY.fullmatch(name)) for name in names])
     if not 0 < identity.sum() < len(names):
         return Modes(steps.T, tuple(names)), None

@@ -19,7 +19,7 @@ from shapespace.formats.statismo import model_of
 from shapespace.formats.statismo_tree import tree_of
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import atomic_path, read_bytes
-from shapespace.io.sandbox import ApartError, Tree
+from shapespace.io.sandbox import SandboxError, Tree
 
 _AGAIN = "export it again from where it was made"
 _LARGEST_BYTES = 2**31
@@ -115,23 +115,23 @@ def _tree(text: bytes) -> Tree:
     while waiting:
         path, known_as = waiting.pop()
         if known_as not in file.groups:
-            raise ApartError(f"there is no group {path or '/'} in it")
+            raise SandboxError(f"there is no group {path or '/'} in it")
         if len(groups) + len(arrays) + len(waiting) > _MOST_NODES or path.count("/") > _DEEPEST:
-            raise ApartError("it has more groups than a model")
+            raise SandboxError("it has more groups than a model")
         group = file.groups[known_as]
         groups.append(path or "/")
         attributes[path or "/"] = _attributes(group.attributes)
         for link in group.links:
             inner = f"{path}/{link.title}"
             if link.kind != "H5L_TYPE_HARD" or len(link.title) > _LONGEST_NAME:
-                raise ApartError(f"{inner[:_LONGEST_NAME]} is a link to elsewhere")
+                raise SandboxError(f"{inner[:_LONGEST_NAME]} is a link to elsewhere")
             if link.collection == "groups":
                 waiting.append((inner, link.id))
             elif link.id in file.datasets:
                 dataset = file.datasets[link.id]
                 left -= len(bytes(dataset.value))
                 if left < 0:
-                    raise ApartError("it links to the same values again and again")
+                    raise SandboxError("it links to the same values again and again")
                 attributes[inner] = _attributes(dataset.attributes)
                 value = _value(dataset, inner)
                 if isinstance(value, str):
@@ -174,7 +174,7 @@ def _value(dataset: _Dataset, path: str) -> npt.NDArray[Any] | str | None:
     typed = number_type if not shape else list[number_type] if len(shape) == 1 else list[list[number_type]]
     array = np.array(msgspec.json.decode(dataset.value, type=typed, strict=True))
     if array.shape != tuple(shape) or array.dtype.kind not in "iuf":
-        raise ApartError(f"{path} is cut short, or not of the shape {shape} that it says")
+        raise SandboxError(f"{path} is cut short, or not of the shape {shape} that it says")
     # Characters of legacy VTK files are such numbers.
     return array.astype(np.uint8) if base.endswith(("I8LE", "U8LE", "I8BE", "U8BE")) else array
 

@@ -25,7 +25,7 @@ from shapespace.formats.model_folder import write_folder
 from shapespace.formats.model_parts import LinearModel, Modes
 from shapespace.geometry.procrustes import align_in_place
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.io.containers.json_files import check_file, json_of
+from shapespace.io.containers.json_files import check_file, parse_json
 from shapespace.io.files import read_bytes, write_text
 from shapespace.io.meshes.mesh_io import MESH_ENDINGS, read_mesh
 from shapespace.io.meshes.vtk import write_vtk
@@ -74,7 +74,7 @@ class ShapeWorks:
         if path.suffix.lower() == ".xlsx":
             rows = _sheet(content, path)
         else:
-            tree = json_object(json_of(content, path, _AGAIN))
+            tree = json_object(parse_json(content, path, _AGAIN))
             rows = _rows(tree.get("data"))
             facts = json_object(tree.get(KEY))
         return with_facts(_model(_Project(path, rows, Allowance(len(content), path))), facts)

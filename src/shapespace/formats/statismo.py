@@ -16,14 +16,14 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import ModelFileError, ShapespaceError
-from shapespace.formats.model_parts import ORTHOGONAL, LinearModel, Modes, are_measurable, are_triangles, scaled
+from shapespace.formats.model_parts import ORTHOGONAL, LinearModel, Modes, are_measurable, are_triangles, scale_columns
 from shapespace.formats.statismo_tree import PARAMETERS, hdf5_of, tree_of
 from shapespace.geometry.landmark_placement import place_landmarks
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import write_bytes
 from shapespace.io.landmarks.landmark_io import LANDMARK_FORMATS
 from shapespace.io.meshes.vtk import read_vtk
-from shapespace.io.sandbox import HDF5_SIGNATURE, ApartError, Tree, read_hdf5_apart
+from shapespace.io.sandbox import HDF5_SIGNATURE, SandboxError, Tree, read_hdf5_sandboxed
 from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks
 
 _AGAIN = "export it again from where it was made"
@@ -56,8 +56,8 @@ class Statismo:
         """As `ModelReader.read`."""
         check_file(path, _LARGEST_BYTES, _AGAIN)
         try:
-            return model_of(read_hdf5_apart(path, leave=("/color",)), path)
-        except ApartError as error:
+            return model_of(read_hdf5_sandboxed(path, leave=("/color",)), path)
+        except SandboxError as error:
             raise ModelFileError(f"{path} is damaged or cut short: {error}; {_AGAIN}.") from error
 
     def write(self, model: LinearModel, path: Path) -> Sequence[str]:
@@ -86,7 +86,7 @@ def model_of(tree: Tree, path: Path) -> LinearModel:
 
 
 @dataclass(frozen=True, eq=False)
-class _Part:
+class _ModelBlock:
     """One model of a tree: mean (D,), moved (D, K), and variance that no mode holds."""
 
     mean: FloatArray
@@ -157,7 +157,7 @@ def _version(tree: Tree, root: str) -> tuple[int, int] | None:
     return None
 
 
-def _part(tree: Tree, root: str) -> _Part:
+def _part(tree: Tree, root: str) -> _ModelBlock:
     mean, variance = _array(tree, f"{root}/model/mean").ravel(), _array(tree, f"{root}/model/pcaVariance").ravel()
     basis = _array(tree, f"{root}/model/pcaBasis")
     if basis.shape == (len(variance), len(mean)) != (len(mean), len(variance)):
@@ -186,8 +186,8 @@ def _part(tree: Tree, root: str) -> _Part:
     skew = np.abs(unit[:, is_used].T @ unit[:, is_used] - np.eye(int(is_used.sum()))).max(initial=0.0)
     # The file has variances less the noise, which every direction has.
     n_orthogonal = len(variance) if skew <= ORTHOGONAL else 0
-    displacements = scaled(unit, np.sqrt(variance + (noise if n_orthogonal else 0.0)))
-    return _Part(mean, displacements, noise * (len(mean) - n_orthogonal))
+    displacements = scale_columns(unit, np.sqrt(variance + (noise if n_orthogonal else 0.0)))
+    return _ModelBlock(mean, displacements, noise * (len(mean) - n_orthogonal))
 
 
 def _array(tree: Tree, path: str) -> FloatArray:
@@ -221,7 +221,7 @@ def _surface(
     if cells.min() < 0 or cells.max() >= n:
         raise ValueError("its cells name points that it does not have")
     if cells.shape[1] == 4:
-        faces = _outside(cells.astype(np.int64), mean)
+        faces = _outer_triangles(cells.astype(np.int64), mean)
         used = np.unique(faces)
         notes.append(f"Of its tetrahedra the surface is read, {len(faces)} triangles; {n - len(used)} points within "
                      "are left out.")  # fmt: skip
@@ -247,7 +247,7 @@ def _points(tree: Tree, root: str, mean: FloatArray) -> tuple[FloatArray, bool]:
     return points.astype(np.float64), False
 
 
-def _outside(cells: npt.NDArray[np.int64], mean: FloatArray) -> npt.NDArray[np.int64]:
+def _outer_triangles(cells: npt.NDArray[np.int64], mean: FloatArray) -> npt.NDArray[np.int64]:
     """Return the triangles (M, 3) of tetrahedra (C, 4) that belong to one of them alone, turned outward."""
     a, b, c, d = (mean[cells[:, corner]] for corner in range(4))
     volume = np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a)
@@ -270,7 +270,7 @@ def _parameters(tree: Tree, root: str) -> dict[str, str]:
     return {path.removeprefix(start): text for path, text in tree.texts.items() if path.startswith(start)}
 
 
-def _n_training(tree: Tree, root: str, part: _Part, parameters: Mapping[str, str]) -> int | None:
+def _n_training(tree: Tree, root: str, part: _ModelBlock, parameters: Mapping[str, str]) -> int | None:
     if parameters.get("n_training", "").isdecimal():
         return int(parameters["n_training"][:9])
     scores = tree.arrays.get(f"{root}/modelinfo/scores")

@@ -23,7 +23,7 @@ _LEFT_OUT = 1e-6
 
 
 @dataclass
-class _Growing:
+class _TreeBuilder:
     """A tree that is being made, of `model`."""
 
     model: LinearModel
@@ -90,7 +90,7 @@ def tree_of(model: LinearModel) -> tuple[Tree, list[str]]:
     provenance |= {"unit": "mm"} if model.mm == 1.0 else {}
     provenance |= {"n_training": str(model.n_training)} if model.n_training else {}
     provenance = {name: text.replace("\0", " ") for name, text in provenance.items() if text}
-    growing = _Growing(model, provenance, datetime.now(UTC).strftime("%a %b %d %H:%M:%S UTC %Y"))
+    growing = _TreeBuilder(model, provenance, datetime.now(UTC).strftime("%a %b %d %H:%M:%S UTC %Y"))
     notes = ["Numbers are in single precision."]
     mean = model.mean.ravel()
     if model.expression is None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from shapespace.errors import InputError, MeshError
 from shapespace.io.meshes.mesh_io import read_mesh
-from shapespace.lazy import other_package
+from shapespace.lazy import require_package
 from shapespace.types import ByteArray, IntArray, Mesh
 
 MeshLike: TypeAlias = Mesh | str | os.PathLike[str] | Any
@@ -39,8 +39,8 @@ def as_mesh(x: MeshLike, name: str = "") -> Mesh:
     if isinstance(x, str | os.PathLike):
         return read_mesh(Path(cast("str | os.PathLike[str]", x)))
     mesh_name = name or _name_of(x)
-    mesh_parts = _held(x)
-    vertices, faces = _parts(mesh_parts, mesh_name)
+    mesh_parts = _as_simple_mesh(x)
+    vertices, faces = _mesh_arrays(mesh_parts, mesh_name)
     try:
         return Mesh(
             np.array(vertices, dtype=np.float64), faces, name=mesh_name, colours=_colours_of(mesh_parts, len(vertices))
@@ -51,7 +51,7 @@ def as_mesh(x: MeshLike, name: str = "") -> Mesh:
         raise InputError(f"{mesh_name}: its vertices are no numbers of the shape (V, 3).") from error
 
 
-class _AsMeshes(Sequence[Mesh]):
+class _MeshSequence(Sequence[Mesh]):
     """A sequence of meshes that are converted when they are accessed."""
 
     def __init__(self, items: Any) -> None:
@@ -66,7 +66,7 @@ class _AsMeshes(Sequence[Mesh]):
     def __getitem__(self, index: slice) -> Sequence[Mesh]: ...
     def __getitem__(self, index: int | slice) -> Mesh | Sequence[Mesh]:
         if isinstance(index, slice):
-            return _AsMeshes(self._items[index])
+            return _MeshSequence(self._items[index])
         return as_mesh(self._items[index], name=f"mesh {index + 1}")
 
 
@@ -85,38 +85,38 @@ def as_meshes(items: Any, function: str) -> Sequence[Mesh]:
             f"{function} takes a list of meshes, not {type(cast(object, items)).__name__}; give meshes, their paths, "
             "or arrays (V, 3)."
         )
-    return _AsMeshes(items)
+    return _MeshSequence(items)
 
 
-def _held(x: Any) -> Any:
+def _as_simple_mesh(x: Any) -> Any:
     """Return the mesh that an object of another tool stands for."""
     if hasattr(x, "to_legacy"):  # Open3D's tensors
         return x.to_legacy()
     return x.to_mesh() if hasattr(x, "geometry") and hasattr(x, "to_mesh") else x  # a scene of trimesh
 
 
-def _parts(x: Any, mesh_name: str) -> tuple[Any, Any]:
+def _mesh_arrays(x: Any, mesh_name: str) -> tuple[Any, Any]:
     """Return vertices, and triangles or None."""
     if isinstance(x, np.ndarray):
         return cast(Any, x), None
     if isinstance(x, list | tuple):
-        return _pair(cast(Sequence[Any], x), mesh_name)
-    return _parts_of_object(x, mesh_name)
+        return _check_pair(cast(Sequence[Any], x), mesh_name)
+    return _object_arrays(x, mesh_name)
 
 
-def _pair(x: Sequence[Any], mesh_name: str) -> tuple[Any, Any]:
+def _check_pair(x: Sequence[Any], mesh_name: str) -> tuple[Any, Any]:
     if len(x) != 2:
         raise InputError(f"{mesh_name}: give vertices and triangles as a pair of arrays, not {len(x)} things.")
     return x[0], x[1]
 
 
-def _parts_of_object(x: Any, mesh_name: str) -> tuple[Any, Any]:
+def _object_arrays(x: Any, mesh_name: str) -> tuple[Any, Any]:
     if hasattr(x, "points") and hasattr(x, "cells") and hasattr(x, "cells_dict"):  # meshio
-        return x.points, _of_cells(x.cells_dict, mesh_name)
+        return x.points, _triangles_of_cells(x.cells_dict, mesh_name)
     if hasattr(x, "points") and hasattr(x, "trilist"):  # menpo
         return x.points, x.trilist
     if hasattr(x, "points") and hasattr(x, "n_points"):  # PyVista, and menpo's clouds
-        return _of_pyvista(x, mesh_name)
+        return _pyvista_arrays(x, mesh_name)
     if hasattr(x, "vertices"):  # trimesh and Open3D
         faces = getattr(x, "faces", getattr(x, "triangles", None))
         return x.vertices, None if faces is None or not len(faces) else np.asarray(faces)
@@ -128,7 +128,7 @@ def _parts_of_object(x: Any, mesh_name: str) -> tuple[Any, Any]:
     )
 
 
-def _of_cells(cells: Mapping[str, Any], mesh_name: str) -> IntArray | None:
+def _triangles_of_cells(cells: Mapping[str, Any], mesh_name: str) -> IntArray | None:
     blocks = [np.asarray(cells["triangle"])] if "triangle" in cells else []
     if "quad" in cells:
         quads = np.asarray(cells["quad"])
@@ -141,7 +141,7 @@ def _of_cells(cells: Mapping[str, Any], mesh_name: str) -> IntArray | None:
     return np.concatenate(blocks).astype(np.int32) if blocks else None
 
 
-def _of_pyvista(x: Any, mesh_name: str) -> tuple[Any, Any]:
+def _pyvista_arrays(x: Any, mesh_name: str) -> tuple[Any, Any]:
     if not hasattr(x, "faces"):
         if hasattr(x, "extract_surface"):
             raise InputError(f"{mesh_name}: a grid is no surface; give what its extract_surface() returns.")
@@ -202,7 +202,7 @@ def _name_of(x: Any) -> str:
 
 def to_trimesh(mesh: Mesh) -> Any:
     """Return a `trimesh.Trimesh`, or a `trimesh.PointCloud` without triangles; vertices keep their order."""
-    trimesh = other_package("trimesh", "Mesh.to_trimesh")
+    trimesh = require_package("trimesh", "Mesh.to_trimesh")
     metadata = {"name": mesh.name}
     colours = None if mesh.colours is None else mesh.colours.copy()
     if mesh.faces is None:
@@ -214,7 +214,7 @@ def to_trimesh(mesh: Mesh) -> Any:
 
 def to_pyvista(mesh: Mesh) -> Any:
     """Return a `pyvista.PolyData`."""
-    pyvista = other_package("pyvista", "Mesh.to_pyvista")
+    pyvista = require_package("pyvista", "Mesh.to_pyvista")
     if mesh.faces is None:
         out = pyvista.PolyData(mesh.vertices.copy())
     else:
@@ -227,7 +227,7 @@ def to_pyvista(mesh: Mesh) -> Any:
 
 def to_open3d(mesh: Mesh) -> Any:
     """Return an `open3d.geometry.TriangleMesh`, or a `PointCloud` without triangles."""
-    open3d = other_package("open3d", "Mesh.to_open3d")
+    open3d = require_package("open3d", "Mesh.to_open3d")
     points = open3d.utility.Vector3dVector(mesh.vertices.copy())
     colours = None if mesh.colours is None else open3d.utility.Vector3dVector(mesh.colours / 255.0)
     if mesh.faces is None:
@@ -243,7 +243,7 @@ def to_open3d(mesh: Mesh) -> Any:
 
 def to_meshio(mesh: Mesh) -> Any:
     """Return a `meshio.Mesh`."""
-    meshio = other_package("meshio", "Mesh.to_meshio")
+    meshio = require_package("meshio", "Mesh.to_meshio")
     cells = np.arange(len(mesh.vertices))[:, None] if mesh.faces is None else mesh.faces.copy()
     point_data = {}
     if mesh.colours is not None:
@@ -255,7 +255,7 @@ def to_meshio(mesh: Mesh) -> Any:
 
 def to_menpo(mesh: Mesh) -> Any:
     """Return a `menpo.shape.TriMesh`, or a `PointCloud` without triangles."""
-    shape = other_package("menpo.shape", "Mesh.to_menpo")
+    shape = require_package("menpo.shape", "Mesh.to_menpo")
     if mesh.faces is None:
         return shape.PointCloud(mesh.vertices.copy())
     return shape.TriMesh(mesh.vertices.copy(), trilist=mesh.faces.copy())

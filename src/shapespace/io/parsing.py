@@ -27,7 +27,7 @@ _SPACE = re.compile(rb"\s")
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 
 
-def damaged(path: Path, problem: str) -> FileFormatError:
+def damage_error(path: Path, problem: str) -> FileFormatError:
     """Return the one-sentence error that `path` cannot be read because of `problem`."""
     return FileFormatError(f"Cannot read {path}: {problem}.")
 
@@ -79,7 +79,7 @@ def floats_of(text: bytes, path: Path) -> FloatArray:
     Raises:
         FileFormatError: one of them is not a number.
     """
-    return joined([floats(words, path) for words in _word_blocks(text)], np.float64)
+    return join_parts([floats(words, path) for words in _word_blocks(text)], np.float64)
 
 
 def ints_of(text: bytes, path: Path) -> IndexArray:
@@ -88,10 +88,10 @@ def ints_of(text: bytes, path: Path) -> IndexArray:
     Raises:
         FileFormatError: one of them is not a whole number, or is too large for 64 bits.
     """
-    return joined([ints(words, path) for words in _word_blocks(text)], np.int64)
+    return join_parts([ints(words, path) for words in _word_blocks(text)], np.int64)
 
 
-def joined(parts: Sequence[npt.NDArray[Any]], kind: npt.DTypeLike, *row: int) -> npt.NDArray[Any]:
+def join_parts(parts: Sequence[npt.NDArray[Any]], kind: npt.DTypeLike, *row: int) -> npt.NDArray[Any]:
     """Return `parts` one after another, or an empty array with rows of shape `row`."""
     return np.concatenate(parts) if parts else np.zeros((0, *row), dtype=kind)
 
@@ -105,7 +105,7 @@ def floats(tokens: Iterable[bytes], path: Path) -> FloatArray:
     try:
         return np.fromiter(map(float, tokens), dtype=np.float64)
     except ValueError as error:
-        raise damaged(path, f"it has text where a number should be ({_short(error)})") from error
+        raise damage_error(path, f"it has text where a number should be ({_short(error)})") from error
 
 
 def ints(tokens: Iterable[bytes], path: Path) -> IndexArray:
@@ -117,7 +117,7 @@ def ints(tokens: Iterable[bytes], path: Path) -> IndexArray:
     try:
         return np.fromiter(map(int, tokens), dtype=np.int64)
     except (ValueError, OverflowError) as error:
-        raise damaged(path, f"it has no whole number where one should be ({_short(error)})") from error
+        raise damage_error(path, f"it has no whole number where one should be ({_short(error)})") from error
 
 
 def _short(error: Exception) -> str:
@@ -245,9 +245,9 @@ def xml_root(data: bytes, path: Path) -> ET.Element:
         parser.feed(data)
         return parser.close()
     except ET.ParseError as error:
-        raise damaged(path, f"it is not well-formed XML ({_short(error)})") from error
+        raise damage_error(path, f"it is not well-formed XML ({_short(error)})") from error
     except (ValueError, LookupError) as error:
-        raise damaged(path, _short(error)) from error
+        raise damage_error(path, _short(error)) from error
 
 
 def json_value(data: bytes, path: Path) -> Any:
@@ -259,7 +259,7 @@ def json_value(data: bytes, path: Path) -> Any:
     try:
         return json.loads(data.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:
-        raise damaged(path, f"it is not valid JSON ({_short(error)})") from error
+        raise damage_error(path, f"it is not valid JSON ({_short(error)})") from error
 
 
 def check_count(declared: int, bytes_each: int, available: int, item_name: str, path: Path) -> None:
@@ -276,9 +276,9 @@ def check_count(declared: int, bytes_each: int, available: int, item_name: str, 
         FileFormatError: there are too many of them, or fewer than none.
     """
     if declared < 0:
-        raise damaged(path, f"its header declares {declared} {item_name}")
+        raise damage_error(path, f"its header declares {declared} {item_name}")
     if declared * bytes_each > available:
-        raise damaged(
+        raise damage_error(
             path,
             f"its header declares {declared} {item_name}, but only {max(available, 0)} bytes follow; {CUT_SHORT}",
         )

@@ -43,7 +43,7 @@ def addresses(address: str, endings: Sequence[str], *, recursive: bool) -> list[
         FileError: the place cannot be reached.
         ShapespaceError: what reads such addresses is not installed.
     """
-    with _told(address):
+    with _translate_errors(address):
         files, path = _files(address)
         head, sep, chain = address.partition("::")
         scheme = head.split("://", 1)[0]
@@ -67,13 +67,13 @@ def version_of(address: str) -> str:
         FileError: it cannot be reached.
         ShapespaceError: what reads such addresses is not installed.
     """
-    with _told(address):
+    with _translate_errors(address):
         files, path = _files(address)
         return hashlib.sha256(str(files.ukey(path)).encode()).hexdigest()
 
 
 @contextlib.contextmanager
-def fetched(address: str, most_bytes: int) -> Generator[Path]:
+def fetch_copy(address: str, most_bytes: int) -> Generator[Path]:
     """Yield a copy of the file at an address, of the same name, which is there during the block.
 
     Raises:
@@ -94,7 +94,7 @@ def fetched(address: str, most_bytes: int) -> Generator[Path]:
 
 
 def _copy(address: str, file: Path, most_bytes: int) -> None:
-    with _told(address):
+    with _translate_errors(address):
         files, path = _files(address)
         with files.open(path, "rb") as source, file.open("wb") as copy:
             count = 0
@@ -109,20 +109,20 @@ def _files(address: str) -> tuple[Any, str]:
     try:
         from fsspec.core import url_to_fs  # pyright: ignore[reportUnknownVariableType]
     except ImportError as error:
-        raise _missing("remote") from error
+        raise _missing_extra_error("remote") from error
     filesystem: tuple[Any, str] = url_to_fs(address)  # pyright: ignore[reportUnknownVariableType]
     return filesystem
 
 
 @contextlib.contextmanager
-def _told(address: str) -> Generator[None]:
+def _translate_errors(address: str) -> Generator[None]:
     """Turn what the many libraries below fsspec raise into one sentence."""
     try:
         yield
     except ShapespaceError:
         raise
     except ImportError as error:
-        raise _missing("remote") from error
+        raise _missing_extra_error("remote") from error
     except FileNotFoundError as error:
         raise FileError(f"Cannot read {address}: there is no such file; check the address.") from error
     except Exception as error:
@@ -130,7 +130,7 @@ def _told(address: str) -> Generator[None]:
         raise FileError(f"Cannot read {address}: {reason}; check the address and the connection.") from error
 
 
-def _missing(extra: str) -> ShapespaceError:
+def _missing_extra_error(extra: str) -> ShapespaceError:
     return ShapespaceError(
         f"Addresses need the extra '{extra}', and s3:// and gs:// need s3fs and gcsfs too; run "
         f"pip install 'shapespace[{extra}]' s3fs gcsfs, or give files."

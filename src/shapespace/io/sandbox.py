@@ -37,7 +37,7 @@ BYTES_A_SECOND: Final = 2**22
 HDF5_SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
 
 
-class ApartError(ValueError):
+class SandboxError(ValueError):
     """The file is damaged, or made to harm; the text says how, as a clause."""
 
 
@@ -58,7 +58,7 @@ class Tree:
     groups: Sequence[str] = ("/",)
 
 
-def read_hdf5_apart(path: Path, leave: Sequence[str] = ()) -> Tree:
+def read_hdf5_sandboxed(path: Path, leave: Sequence[str] = ()) -> Tree:
     """Return what is in an HDF5 file, but for what stands at the paths `leave`, and objects of other kinds.
 
     Raises:
@@ -68,12 +68,12 @@ def read_hdf5_apart(path: Path, leave: Sequence[str] = ()) -> Tree:
     return _read(path, {"kind": "hdf5", "leave": list(leave)})
 
 
-def read_matlab_apart(path: Path, variables: Sequence[str]) -> Tree:
+def read_matlab_sandboxed(path: Path, variables: Sequence[str]) -> Tree:
     """Return the variables `variables` of a MATLAB file of version 4 to 7, structures as groups, those that are there.
 
     Raises:
         FileError: it cannot be read.
-        ApartError: as of `read_hdf5_apart`.
+        ApartError: as of `read_hdf5_sandboxed`.
     """
     return _read(path, {"kind": "matlab", "wanted": list(variables)})
 
@@ -102,26 +102,26 @@ def _read(path: Path, request: dict[str, Any]) -> Tree:
                 timeout=seconds, check=False,
             )  # fmt: skip
         except subprocess.TimeoutExpired as error:
-            raise ApartError(f"reading it takes longer than {seconds} s") from error
+            raise SandboxError(f"reading it takes longer than {seconds} s") from error
         except OSError as error:
-            raise ApartError(f"the system does not let a process start that reads it ({error.strerror})") from error
+            raise SandboxError(f"the system does not let a process start that reads it ({error.strerror})") from error
     return _tree(completed.stdout)
 
 
 def _tree(output: bytes) -> Tree:
     head, newline, _ = output.partition(b"\n") if len(output) < 2**16 else (output[: output.find(b"\n")], b"\n", b"")
     if not newline or not head:
-        raise ApartError("the library that reads it does not survive it")
+        raise SandboxError("the library that reads it does not survive it")
     header = json.loads(head)
     if "wrong" in header:
-        raise ApartError(header["wrong"])
+        raise SandboxError(header["wrong"])
     arrays: dict[str, npt.NDArray[Any]] = {}
     offset = len(head) + 1
     for path, kind, shape in header["arrays"]:
         dtype = np.dtype(kind)
         count = int(np.prod(shape, dtype=np.int64))
         if offset + count * dtype.itemsize > len(output):
-            raise ApartError("the library that reads it does not survive it")
+            raise SandboxError("the library that reads it does not survive it")
         arrays[path] = np.frombuffer(output, dtype, count, offset).reshape(shape)
         offset += count * dtype.itemsize
     return Tree(arrays, header["texts"], header["attributes"], tuple(header["groups"]))

@@ -29,7 +29,7 @@ class _RefusedError(ValueError):
     """The file asks for what no model needs; the text says what, as a clause."""
 
 
-class _Found:
+class _FileContent:
     """What has been read, and how many bytes more may be."""
 
     def __init__(self, most_bytes: int) -> None:
@@ -56,15 +56,15 @@ class _Found:
             out.write(array.tobytes())
 
 
-def _hdf5(stream: BinaryIO, request: dict[str, Any], content: _Found) -> None:
+def _hdf5(stream: BinaryIO, request: dict[str, Any], content: _FileContent) -> None:
     import h5py
 
     with h5py.File(stream, "r") as file:
-        _close_the_door()
+        _forbid_opening_files()
         _walk(file, "", content, tuple(request["leave"]))
 
 
-def _walk(group: Any, path: str, content: _Found, leave: tuple[str, ...]) -> None:
+def _walk(group: Any, path: str, content: _FileContent, leave: tuple[str, ...]) -> None:
     import h5py
 
     content.groups.append(path or "/")
@@ -87,7 +87,7 @@ def _walk(group: Any, path: str, content: _Found, leave: tuple[str, ...]) -> Non
             _dataset(item, inner, content)
 
 
-def _attributes(item: Any, path: str, content: _Found) -> None:
+def _attributes(item: Any, path: str, content: _FileContent) -> None:
     import h5py
 
     values: dict[str, Any] = {}
@@ -106,7 +106,7 @@ def _attributes(item: Any, path: str, content: _Found) -> None:
         content.attributes[path] = values
 
 
-def _dataset(dataset: Any, path: str, content: _Found) -> None:
+def _dataset(dataset: Any, path: str, content: _FileContent) -> None:
     import h5py as library
 
     h5py: Any = library
@@ -140,11 +140,11 @@ def _text(value: Any) -> str:
     return data.partition(b"\0")[0].decode("utf-8", "replace")[:_LONGEST_TEXT]
 
 
-def _matlab(stream: BinaryIO, request: dict[str, Any], content: _Found) -> None:
+def _matlab(stream: BinaryIO, request: dict[str, Any], content: _FileContent) -> None:
     from scipy import io as scipy_io
 
     library: Any = scipy_io
-    _close_the_door()
+    _forbid_opening_files()
     variables = [(name, shape) for name, shape, _ in library.whosmat(stream)]
     requested = [(name, shape) for name, shape in variables if name in request["wanted"]]
     content.groups.extend(f"/{name}" for name, _ in variables if name not in request["wanted"])
@@ -154,10 +154,10 @@ def _matlab(stream: BinaryIO, request: dict[str, Any], content: _Found) -> None:
     loaded = library.loadmat(stream, variable_names=[name for name, _ in requested])
     for name, _ in requested:
         if name in loaded:
-            _unfold(loaded[name], f"/{name}", content)
+            _add_variable(loaded[name], f"/{name}", content)
 
 
-def _unfold(value: Any, path: str, content: _Found) -> None:
+def _add_variable(value: Any, path: str, content: _FileContent) -> None:
     """Add a variable, or the fields of a structure, as groups of HDF5 would hold them."""
     if path.count("/") > _DEEPEST or type(value) is not np.ndarray:
         return
@@ -166,10 +166,10 @@ def _unfold(value: Any, path: str, content: _Found) -> None:
     elif value.dtype.names and value.size == 1:
         content.groups.append(path)
         for name in value.dtype.names:
-            _unfold(value.reshape(-1)[0][name], f"{path}/{name}", content)
+            _add_variable(value.reshape(-1)[0][name], f"{path}/{name}", content)
 
 
-def _close_the_door() -> None:
+def _forbid_opening_files() -> None:
     """Open no more files, where the system can hold a process to that."""
     if sys.platform != "win32":
         import resource
@@ -179,7 +179,7 @@ def _close_the_door() -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (3, 3))
 
 
-def _hold(most_memory: int, most_seconds: int) -> None:
+def _limit_resources(most_memory: int, most_seconds: int) -> None:
     """Hold this process to so much memory and work, where the system can."""
     if sys.platform != "win32":
         import resource
@@ -192,8 +192,8 @@ def _hold(most_memory: int, most_seconds: int) -> None:
 
 def _main() -> None:
     request = json.loads(sys.argv[1])
-    _hold(request["most_memory"], request["most_seconds"])
-    content, out = _Found(request["most_bytes"]), sys.stdout.buffer
+    _limit_resources(request["most_memory"], request["most_seconds"])
+    content, out = _FileContent(request["most_bytes"]), sys.stdout.buffer
     try:
         {"hdf5": _hdf5, "matlab": _matlab}[request["kind"]](sys.stdin.buffer, request, content)
     except _RefusedError as error:

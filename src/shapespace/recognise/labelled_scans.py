@@ -73,7 +73,7 @@ def from_record(name: str, record: Mapping[str, Any]) -> ScanCoefficients:
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise FileFormatError(f"The record of {name} is damaged or not whole; fit the scan again.") from error
-    return _checked(scan, f"The record of {name}")
+    return _check(scan, f"The record of {name}")
 
 
 def from_results(results: Results) -> list[ScanCoefficients]:
@@ -96,7 +96,7 @@ def from_results(results: Results) -> list[ScanCoefficients]:
             name, status, reason, model, file = (text or "" for text in labels)
             coefficients = None if status == "failed" else read_only(values[: modes or 0])
             scans.append(
-                _checked(ScanCoefficients(name, status, reason, coefficients, model, file=file), f"The fit {name}")
+                _check(ScanCoefficients(name, status, reason, coefficients, model, file=file), f"The fit {name}")
             )
     if not scans:
         raise InputError(f"{results.folder} holds no results of fits; fit some scans first.")
@@ -151,10 +151,10 @@ def _from_row(row: Mapping[str, str], modes: int, row_name: str) -> ScanCoeffici
         except ValueError as error:
             raise FileFormatError(f"{row_name}: a coefficient is not a number; fit the scan again.") from error
     scan = ScanCoefficients(row["scan"], status, row["reason"], z, row["model_hash"])
-    return _checked(scan, row_name)
+    return _check(scan, row_name)
 
 
-def _checked(scan: ScanCoefficients, row_name: str) -> ScanCoefficients:
+def _check(scan: ScanCoefficients, row_name: str) -> ScanCoefficients:
     if scan.status not in STATUSES:
         raise FileFormatError(f"{row_name} has the status {scan.status[:40]!r}, which no fit has; fit the scan again.")
     if scan.z is not None and (scan.z.ndim != 1 or not len(scan.z) or not np.isfinite(scan.z).all()):
@@ -164,7 +164,7 @@ def _checked(scan: ScanCoefficients, row_name: str) -> ScanCoefficients:
     return scan
 
 
-def labelled(scans: Sequence[ScanCoefficients], labels: Mapping[str, Label]) -> list[ScanCoefficients]:
+def with_labels(scans: Sequence[ScanCoefficients], labels: Mapping[str, Label]) -> list[ScanCoefficients]:
     """Return `scans` with labels and subjects, found by the name of the scan's file or of the fit."""
     matched: list[ScanCoefficients] = []
     for scan in scans:

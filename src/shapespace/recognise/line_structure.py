@@ -214,10 +214,10 @@ def disjointness(v: FloatArray, labels: Sequence[str], *, permutations: int = 99
         chance=float(counts.max() / counts.sum()),
         cosine_silhouette=silhouette,
         separability=separability,
-        accuracy_p=_permutation_p(accuracy, _each(_accuracy, unit, shuffles)),
-        silhouette_p=_permutation_p(silhouette, _each(_silhouette, unit, shuffles)),
-        separability_p=_permutation_p(separability, _each(_separability, inside, shuffles)),
-        margin_p=_permutation_p(margin, _each(lambda x, c: _smallest_margin(x, c)[0], inside, shuffles)),
+        accuracy_p=_permutation_p(accuracy, _permuted_scores(_accuracy, unit, shuffles)),
+        silhouette_p=_permutation_p(silhouette, _permuted_scores(_silhouette, unit, shuffles)),
+        separability_p=_permutation_p(separability, _permuted_scores(_separability, inside, shuffles)),
+        margin_p=_permutation_p(margin, _permuted_scores(lambda x, c: _smallest_margin(x, c)[0], inside, shuffles)),
         smallest_margin=margin,
         smallest_margin_pair=(str(names[pair[0]]), str(names[pair[1]])),
     )
@@ -297,7 +297,7 @@ def _smallest_margin(v: FloatArray, classes: np.ndarray) -> tuple[float, tuple[i
     return best
 
 
-def _each(
+def _permuted_scores(
     score: Callable[[FloatArray, np.ndarray], float], unit: FloatArray, shuffles: Sequence[np.ndarray]
 ) -> list[float]:
     return [score(unit, shuffled) for shuffled in shuffles]

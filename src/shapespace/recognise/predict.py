@@ -17,7 +17,7 @@ from shapespace.recognise.classification_scores import fit_temperature, macro_ac
 from shapespace.recognise.classifier_file import SavedClassifier, software_versions
 from shapespace.recognise.classifiers import CLASSIFIERS
 from shapespace.recognise.labelled_scans import NEUTRAL, ScanCoefficients, one_model, relative_to_neutral
-from shapespace.recognise.predictions import left_out, subject_folds
+from shapespace.recognise.predictions import cross_validated_probabilities, subject_folds
 from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, require
 
@@ -31,7 +31,7 @@ _FOLDS = 5
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class ScanPrediction:
     """What recognition says of one scan.
 
     Args:
@@ -141,7 +141,7 @@ def _samples(
     scans: Sequence[ScanCoefficients], neutral: str | None, projection: FloatArray | None
 ) -> tuple[FloatArray, Any, list[str]]:
     """Return features (n, k), labels (n,) and subjects; with `neutral`, relative to the faces that it labels."""
-    z = _stacked(scans)
+    z = _stack_coefficients(scans)
     if projection is not None:
         if projection.shape[1:] != z.shape[1:]:
             raise InputError(
@@ -190,7 +190,7 @@ def _calibrate(
     if not splits or any(len(np.unique(labels[train])) < 2 for train, _ in splits):
         note = "There are too few subjects for cross-validation: accuracy is unknown, probabilities are not calibrated."
         return 1.0, {"macro_accuracy": None, "by": None, "folds": 0}, note
-    probabilities = left_out(z, labels, splits, classes, classifier, {}, seed)
+    probabilities = cross_validated_probabilities(z, labels, splits, classes, classifier, {}, seed)
     temperature = fit_temperature(labels.tolist(), probabilities, classes)
     answers = np.asarray(classes)[probabilities.argmax(axis=1)]
     accuracy = macro_accuracy(labels, answers, classes)
@@ -200,7 +200,7 @@ def _calibrate(
     return temperature, {"macro_accuracy": accuracy, "by": "subject" if by_subject else "scan", "folds": folds}, note
 
 
-def predict_scans(saved: SavedClassifier, scans: Sequence[ScanCoefficients]) -> list[Answer]:
+def predict_scans(saved: SavedClassifier, scans: Sequence[ScanCoefficients]) -> list[ScanPrediction]:
     """Return one answer for each of `scans`, in their order.
 
     A failed fit gets no answer; a doubtful one, or one below the confidence, gets `UNSURE`; each with its reason.
@@ -210,14 +210,16 @@ def predict_scans(saved: SavedClassifier, scans: Sequence[ScanCoefficients]) -> 
     """
     saved.refuse_other_model(one_model(scans))
     zero = _neutral_of(saved, scans) if saved.relative_to_neutral else {}
-    answers: list[Answer] = []
+    answers: list[ScanPrediction] = []
     for scan in scans:
         is_reference = saved.relative_to_neutral and scan.label == saved.neutral
         refusal = _refusal(saved, scan, zero, is_reference)
         if refusal is not None or scan.z is None:
             doubtful = scan.status == "doubtful" and not is_reference
             answers.append(
-                Answer(scan.name, scan.status, UNSURE if doubtful else "", None, refusal or scan.reason, is_reference)
+                ScanPrediction(
+                    scan.name, scan.status, UNSURE if doubtful else "", None, refusal or scan.reason, is_reference
+                )
             )
             continue
         z = scan.z - zero[scan.subject] if saved.relative_to_neutral else scan.z
@@ -226,7 +228,9 @@ def predict_scans(saved: SavedClassifier, scans: Sequence[ScanCoefficients]) -> 
         is_certain = bool(p[best] >= saved.confidence)
         name = saved.classes[best]
         reason = f"The likeliest class, {name}, has the probability {p[best]:.2f}, below {saved.confidence:g}."
-        answers.append(Answer(scan.name, scan.status, name if is_certain else UNSURE, p, "" if is_certain else reason))
+        answers.append(
+            ScanPrediction(scan.name, scan.status, name if is_certain else UNSURE, p, "" if is_certain else reason)
+        )
     return answers
 
 
@@ -257,7 +261,7 @@ def _refusal(
     return None
 
 
-def write_answers(path: Path, answers: Sequence[Answer], classes: Sequence[str]) -> None:
+def write_answers(path: Path, answers: Sequence[ScanPrediction], classes: Sequence[str]) -> None:
     """Write a CSV table: scan, status, prediction, p_CLASS for each class, reason.
 
     Raises:
@@ -281,7 +285,7 @@ def write_answers(path: Path, answers: Sequence[Answer], classes: Sequence[str])
     write_rows(path, header, rows)
 
 
-def _stacked(scans: Sequence[ScanCoefficients]) -> FloatArray:
+def _stack_coefficients(scans: Sequence[ScanCoefficients]) -> FloatArray:
     rows = [scan.z for scan in scans if scan.z is not None]
     if len({len(z) for z in rows}) != 1:
         raise InputError("The fits have different numbers of coefficients; fit all scans with one model.")

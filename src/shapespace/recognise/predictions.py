@@ -200,12 +200,12 @@ def _nested(
     seed: int,
     modes: Sequence[int | None],
 ) -> tuple[FloatArray, Choice]:
-    X, labels, subjects = usable(fold)
+    X, labels, subjects = usable_training_rows(fold)
     inner = subject_folds(subjects.tolist(), inner_folds, seed)
     K = X.shape[1]
     counts = sorted({min(K if m is None else m, K) for m in modes})
-    by_modes = [left_out(X[:, :m], labels, inner, classes, "lda", {}, seed) for m in counts]
-    tried = [macro_accuracy(labels, answers_of(candidate, classes), classes) for candidate in by_modes]
+    by_modes = [cross_validated_probabilities(X[:, :m], labels, inner, classes, "lda", {}, seed) for m in counts]
+    tried = [macro_accuracy(labels, likeliest_classes(candidate, classes), classes) for candidate in by_modes]
     m = counts[int(np.argmax(tried))]
     best: tuple[float, str, dict[str, Any], FloatArray] | None = None
     fewest = min(len(train) for train, _ in inner)
@@ -213,8 +213,8 @@ def _nested(
         for parameters in _grid(name):
             if int(parameters.get("classify__n_neighbors", 1)) > fewest:
                 continue  # so many neighbours there are not
-            probabilities = left_out(X[:, :m], labels, inner, classes, name, parameters, seed)
-            accuracy = macro_accuracy(labels, answers_of(probabilities, classes), classes)
+            probabilities = cross_validated_probabilities(X[:, :m], labels, inner, classes, name, parameters, seed)
+            accuracy = macro_accuracy(labels, likeliest_classes(probabilities, classes), classes)
             if best is None or accuracy > best[0] + 1e-12:
                 best = accuracy, name, parameters, probabilities
     if best is None:
@@ -238,7 +238,7 @@ def fixed_predictions(
     results: list[tuple[FloatArray, Choice]] = []
     with threadpool_limits(1):
         for fold in folds:
-            X, labels, _ = usable(fold)
+            X, labels, _ = usable_training_rows(fold)
             m = min(modes or X.shape[1], X.shape[1])
             probabilities = predict_probabilities(X[:, :m], labels, fold.test[:, :m], classes, classifier, {}, seed)
             results.append((probabilities, Choice(classifier, {}, m, 1.0, float("nan"))))
@@ -279,7 +279,7 @@ def predict_probabilities(
     return probabilities
 
 
-def left_out(
+def cross_validated_probabilities(
     X: FloatArray,
     labels: Any,
     folds: Sequence[tuple[IndexArray, IndexArray]],
@@ -314,7 +314,7 @@ def refuse_unknown(names: Sequence[str]) -> None:
             raise InputError(f"There is no classifier {name!r}; choose among {', '.join(CLASSIFIERS)}.")
 
 
-def usable(fold: Fold) -> tuple[FloatArray, Any, Any]:
+def usable_training_rows(fold: Fold) -> tuple[FloatArray, Any, Any]:
     """Return the finite training rows with labels and subjects as arrays."""
     finite = np.isfinite(fold.train).all(axis=1)
     labels = np.asarray(fold.train_labels, dtype=str)[finite]
@@ -323,7 +323,7 @@ def usable(fold: Fold) -> tuple[FloatArray, Any, Any]:
     return fold.train[finite], labels, np.asarray(fold.train_subjects, dtype=str)[finite]
 
 
-def answers_of(probabilities: FloatArray, classes: Sequence[str]) -> Any:
+def likeliest_classes(probabilities: FloatArray, classes: Sequence[str]) -> Any:
     """Return the likeliest classes (n,); empty where a fit failed."""
     undefined = np.isnan(probabilities).any(axis=1)
     best = np.where(np.isnan(probabilities), -1.0, probabilities).argmax(axis=1)
@@ -349,7 +349,7 @@ def _gather(
     return Predictions(
         classes,
         tuple(labels[order].tolist()),
-        tuple(answers_of(probabilities, classes)[order].tolist()),
+        tuple(likeliest_classes(probabilities, classes)[order].tolist()),
         probabilities[order],
         tuple(subjects[order].tolist()),
         index[order],

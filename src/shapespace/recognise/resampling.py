@@ -13,7 +13,14 @@ from threadpoolctl import threadpool_limits
 from shapespace.errors import InputError
 from shapespace.recognise.classification_scores import IndexArray, macro_accuracy
 from shapespace.recognise.classifiers import CLASSIFIERS, LDA_SHRINKAGE, linear_rule
-from shapespace.recognise.predictions import Fold, answers_of, classes_of, predict_probabilities, refuse_unknown, usable
+from shapespace.recognise.predictions import (
+    Fold,
+    classes_of,
+    likeliest_classes,
+    predict_probabilities,
+    refuse_unknown,
+    usable_training_rows,
+)
 from shapespace.types import FloatArray
 
 
@@ -172,7 +179,7 @@ def _score_any(
             p.fold.train[p.finite], labels, p.fold.test, classes, classifier, {}, seed
         )
         truth += names[_shuffled(p.test_labels, p.test_rows, order)].tolist()
-        answers += answers_of(probabilities, classes).tolist()
+        answers += likeliest_classes(probabilities, classes).tolist()
     return macro_accuracy(truth, answers, classes)
 
 
@@ -211,13 +218,13 @@ def learning_curve(
         for i, j in itertools.product(range(len(counts)), range(repeats)):
             answers: list[str] = []
             for fold in folds:
-                X, labels, subjects = usable(fold)
+                X, labels, subjects = usable_training_rows(fold)
                 people = rng.choice(np.unique(np.asarray(fold.train_subjects, dtype=str)), counts[i], replace=False)
                 is_train = np.isin(subjects, people)
                 probabilities = predict_probabilities(
                     X[is_train], labels[is_train], fold.test, classes, classifier, {}, seed
                 )
-                answers += answers_of(probabilities, classes).tolist()
+                answers += likeliest_classes(probabilities, classes).tolist()
             curve[i, j] = macro_accuracy(truth, answers, classes)
     return LearningCurve(np.asarray(counts, dtype=np.int64), curve)
 
@@ -250,7 +257,7 @@ def mode_importance(
     loss = np.zeros((len(folds), folds[0].train.shape[1]))
     with threadpool_limits(1):
         for f, fold in enumerate(folds):
-            X, labels, _ = usable(fold)
+            X, labels, _ = usable_training_rows(fold)
             m = min(modes or X.shape[1], X.shape[1])
             finite = np.isfinite(fold.test).all(axis=1)
             test, truth = fold.test[finite, :m], np.asarray(fold.test_labels, dtype=str)[finite]

@@ -24,7 +24,7 @@ from shapespace.geometry.normals import vertex_normals
 from shapespace.geometry.procrustes import align_in_place, centroid_size, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.lazy import lazy_import
-from shapespace.reprs import listed_briefly, short_repr
+from shapespace.reprs import list_briefly, short_repr
 from shapespace.schemas import Methods, SampleSize, TestScheme
 from shapespace.statistics.answer import Answer
 from shapespace.statistics.methods import methods_of
@@ -195,7 +195,7 @@ class Asymmetry:
         return lazy_import("answer_of_asymmetry")(self)
 
     def __repr__(self) -> str:
-        rows = listed_briefly([f"{row.source}: p {row.p:.3g}" for row in self.anova if row.p is not None])
+        rows = list_briefly([f"{row.source}: p {row.p:.3g}" for row in self.anova if row.p is not None])
         return f"<Asymmetry of {len(self.subjects)} subjects, {len(self.cohort)} shapes; {rows or 'no test'}>"
 
     def _repr_html_(self) -> str:

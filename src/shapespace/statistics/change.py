@@ -11,7 +11,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from shapespace.cohort.cohort import Cohort
-from shapespace.cohort.table import named
+from shapespace.cohort.table import list_names
 from shapespace.errors import InputError
 from shapespace.geometry.normals import boundary_edges, vertex_areas
 from shapespace.geometry.similarity import fit_similarity
@@ -94,8 +94,8 @@ def change(
     single = tuple(name for name, own in visits.of.items() if len(own) < 2)
     if len(single) == len(visits.of):
         raise InputError(
-            f"{cohort.table.where}: none of its {len(single)} subjects has two visits ({named(single)}); give the same "
-            f"subject in {settings.subject} and another time in {visits.column}."
+            f"{cohort.table.where}: none of its {len(single)} subjects has two visits ({list_names(single)}); give the "
+            f"same subject in {settings.subject} and another time in {visits.column}."
         )
     groups = _groups(cohort, settings, visits, single)
     stable = stable_vertices(cohort, settings.stable)

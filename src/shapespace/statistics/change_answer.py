@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.cohort.table import named
+from shapespace.cohort.table import list_names
 from shapespace.geometry.distortion import factor_to_draw, flip_factor
 from shapespace.schemas import (
     CurvePart,
@@ -549,10 +549,10 @@ def _notes(change: Found) -> list[str]:
     notes: list[str] = []
     if change.single:
         alone, every = len(change.single), len(change.subjects) + len(change.single)
-        notes.append(f"{alone} of {every} subjects are left out, who have one visit ({named(change.single)}).")
+        notes.append(f"{alone} of {every} subjects are left out, who have one visit ({list_names(change.single)}).")
     ends = {(one.visits[0].label, one.visits[-1].label) for one in change.subjects}
     if not change.unit and len(ends) > 1:
-        told = named([f"{first} to {last}" for first, last in sorted(ends)])
+        told = list_names([f"{first} to {last}" for first, last in sorted(ends)])
         notes.append(f"Not all subjects have the same first and last visit ({told}).")
     if change.model_only:
         notes.append(

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from shapespace.cohort.cohort import Cohort
-from shapespace.reprs import listed_briefly, short_repr
+from shapespace.reprs import list_briefly, short_repr
 from shapespace.schemas import Methods, TestScheme
 from shapespace.statistics.change_align import stable_vertices
 from shapespace.statistics.change_group import LEVEL, MapTest
@@ -247,9 +247,7 @@ class Found:
 
     def __repr__(self) -> str:
         tests = {"mean change": self.group, " and ".join(self.groups) + " differ": self.between}
-        p_values = listed_briefly(
-            [f"{name}: p {test.omnibus_p:.3g}" for name, test in tests.items() if test is not None]
-        )
+        p_values = list_briefly([f"{name}: p {test.omnibus_p:.3g}" for name, test in tests.items() if test is not None])
         return (
             f"<{type(self).__name__} of {len(self.subjects)} subjects, {len(self.cohort)} scans; uncertainty from "
             f"{self.uncertainty}{f'; {p_values}' if p_values else ''}>"

@@ -19,7 +19,7 @@ import numpy as np
 from shapespace.cohort.cohort import Cohort, with_columns
 from shapespace.errors import InputError
 from shapespace.lazy import lazy_import
-from shapespace.reprs import listed_briefly, short_repr
+from shapespace.reprs import list_briefly, short_repr
 from shapespace.schemas import Methods, TestScheme
 from shapespace.statistics.answer import Answer
 from shapespace.statistics.compare_formula import (
@@ -249,7 +249,7 @@ class Comparison:
         return lazy_import("answer_of_comparison")(self)
 
     def __repr__(self) -> str:
-        terms = listed_briefly([f"{test.term}: R² {100 * test.r2:.1f} %, p {test.p:.3g}" for test in self.tests])
+        terms = list_briefly([f"{test.term}: R² {100 * test.r2:.1f} %, p {test.p:.3g}" for test in self.tests])
         return f"<Comparison of {len(self.cohort)} shapes of {self.subjects} subjects; {terms}>"
 
     def _repr_html_(self) -> str:

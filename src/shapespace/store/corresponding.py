@@ -74,7 +74,7 @@ def surface_files(paths: Sequence[Path], *, recursive: bool = False) -> SurfaceF
     notes: list[str] = []
     for path in paths:
         summary = _summary_of(path)
-        if summary is None and (summary_files := _kept_surfaces(path, notes)):
+        if summary is None and (summary_files := _stored_surfaces(path, notes)):
             files += summary_files
         elif summary is None:
             listing = mesh_files([path], recursive=recursive)
@@ -122,7 +122,7 @@ def _surfaces(folder: Path, summary: CorrespondenceRecord) -> list[Path]:
     return files
 
 
-def _kept_surfaces(path: Path, notes: list[str]) -> list[Path]:
+def _stored_surfaces(path: Path, notes: list[str]) -> list[Path]:
     """Return the surfaces of the fits in a folder with a store, as files for `mesh_at`; none of other folders."""
     results = results_at(path) if path.is_dir() else None
     if results is None:

@@ -17,12 +17,12 @@ import numpy.typing as npt
 
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.io.containers.archives import arrays_in, read_arrays
-from shapespace.io.containers.json_files import LARGEST_BYTES, json_of, read_json
+from shapespace.io.containers.json_files import LARGEST_BYTES, parse_json, read_json
 from shapespace.io.files import read_bytes, read_error
 from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.io.tables.table_io import CHECKSUM
-from shapespace.lazy import lazy_import, other_package
-from shapespace.reprs import told_briefly
+from shapespace.lazy import lazy_import, require_package
+from shapespace.reprs import describe_briefly
 from shapespace.schemas import FIT_AGAIN, FitRecord
 from shapespace.store.manifest import Manifest, read_manifest
 from shapespace.store.rows import FLAGS, META, coefficient_columns, kind_of, store_row
@@ -40,7 +40,7 @@ _NEAR = 3
 _OPEN = 4
 
 
-class Stored(NamedTuple):
+class StoredFit(NamedTuple):
     """Where a store keeps a fit, and what it has of it.
 
     Args:
@@ -68,7 +68,7 @@ class _Identity(msgspec.Struct, frozen=True):
     id: str = ""
 
 
-class Store:
+class ResultStore:
     """The shards of a folder.
 
     Args:
@@ -80,16 +80,16 @@ class Store:
         self.folder, self.manifest = folder, manifest
         self.shards = [Shard(folder, entry) for entry in manifest.shards]
         self.problems: list[str] = []
-        self._index: dict[str, Stored] | None = None
+        self._index: dict[str, StoredFit] | None = None
 
     @property
-    def index(self) -> Mapping[str, Stored]:
+    def index(self) -> Mapping[str, StoredFit]:
         """Name -> where it is kept, in the order of the shards; those of damaged shards are missing.
 
         One sentence for each damaged shard goes to `problems`. A name that is in two shards is that of the later one.
         """
         if self._index is None:
-            index: dict[str, Stored] = {}
+            index: dict[str, StoredFit] = {}
             for number, shard in enumerate(self.shards):
                 try:
                     columns = shard.columns(("scan", "id", "status", ROW, *FLAGS))
@@ -101,7 +101,7 @@ class Store:
                     zip(*columns.values(), strict=True)
                 ):
                     index.pop(name, None)
-                    index[name] = Stored(
+                    index[name] = StoredFit(
                         number, row, content_hash, identity or "", status, *(flag is True for flag in flags)
                     )
             self._index = index
@@ -162,11 +162,11 @@ class Results:
         ShapespaceError: there is a store, and the extra `store` is not installed.
     """
 
-    def __init__(self, folder: Path | str, store: Store | None = None) -> None:
+    def __init__(self, folder: Path | str, store: ResultStore | None = None) -> None:
         require_path(folder, "Results")
         self.folder = Path(folder)
         manifest = None if store is not None else read_manifest(self.folder)
-        self.store = store if manifest is None else Store(self.folder, manifest)
+        self.store = store if manifest is None else ResultStore(self.folder, manifest)
         try:
             file_names = {entry.name for entry in os.scandir(self.folder)}
         except OSError as error:
@@ -201,7 +201,7 @@ class Results:
         return list(dict.fromkeys([*(self.store.problems if self.store else ()), *self._problems]))
 
     @property
-    def _stored(self) -> Mapping[str, Stored]:
+    def _stored(self) -> Mapping[str, StoredFit]:
         return self.store.index if self.store else {}
 
     def names(self) -> list[str]:
@@ -209,7 +209,7 @@ class Results:
         return sorted({*self.singles, *self._stored})
 
     def __repr__(self) -> str:
-        return f"<Results in {told_briefly(str(self.folder))}: {len(self):,} fits>"
+        return f"<Results in {describe_briefly(str(self.folder))}: {len(self):,} fits>"
 
     def _repr_html_(self) -> str:
         return lazy_import("html_of_results")(self)
@@ -247,7 +247,7 @@ class Results:
             InputError: there is no such fit.
         """
         path = self.folder / f"{name}{ENDING}"
-        record: object = json_of(self.record_bytes(name), path, FIT_AGAIN)
+        record: object = parse_json(self.record_bytes(name), path, FIT_AGAIN)
         FitRecord.from_json(record, str(path))
         return cast(dict[str, Any], record)
 
@@ -281,7 +281,7 @@ class Results:
             raise FileFormatError(f"{self.folder}: the stages of {name} were not kept; fit it again with --stages.")
         return store.stages(name)
 
-    def _store_of(self, name: str) -> Store:
+    def _store_of(self, name: str) -> ResultStore:
         """Return the store that holds a fit which is no single file, as `known` checks."""
         self.known(name)
         assert self.store is not None
@@ -340,7 +340,7 @@ class Results:
             InputError: no fit has such a column.
             ShapespaceError: pandas is not installed.
         """
-        pandas = other_package("pandas", "Results.to_dataframe")
+        pandas = require_package("pandas", "Results.to_dataframe")
         available = self.column_names()
         if columns is None:
             known = sorted(column for column in available if column.startswith(META))
@@ -366,7 +366,7 @@ class Results:
         Raises:
             ShapespaceError: xarray or pandas is not installed.
         """
-        xarray = other_package("xarray", "Results.to_xarray")
+        xarray = require_package("xarray", "Results.to_xarray")
         frame, modes = self.to_dataframe(), range(1, modes_of(self) + 1)
         of_modes = {
             "b": [f"b{k}" for k in modes], "z": [f"z{k}" for k in modes], "b_stddev": [f"b{k}_stddev" for k in modes]
@@ -407,7 +407,7 @@ class Results:
 # Files of a store, by the names that they would have as single ones
 
 
-def named(file: str) -> tuple[str, str]:
+def split_file_name(file: str) -> tuple[str, str]:
     """Return NAME and what it is of the name of a result file: `record`, one of `ENDINGS`, or nothing."""
     for kind, ending in {"record": ENDING, **ENDINGS}.items():
         if file.endswith(ending) and file != ending:
@@ -437,20 +437,20 @@ def _results_at(resolved: Path, folder: Path, modified_ns: int, _files_changed: 
 
 
 @lru_cache(maxsize=_OPEN)
-def _store_at(_resolved: Path, folder: Path, _changed: int) -> Store | None:
+def _store_at(_resolved: Path, folder: Path, _changed: int) -> ResultStore | None:
     manifest = read_manifest(folder)
-    return None if manifest is None else Store(folder, manifest)
+    return None if manifest is None else ResultStore(folder, manifest)
 
 
-def kept_at(path: Path) -> bool:
+def is_stored_at(path: Path) -> bool:
     """Return whether a store in the folder of `path` keeps what a single file of that name would hold."""
-    name, kind = named(path.name)
+    name, kind = split_file_name(path.name)
     if not kind or path.is_file() or (results := results_at(path.parent)) is None:
         return False
     return name in results and (kind == "record" or results.has(name, kind))
 
 
-def wrote_landmarks(record: Path) -> bool:
+def has_written_landmarks(record: Path) -> bool:
     """Return whether the fit that `record` is of wrote landmarks beside it; files of that name may be a user's own."""
     try:
         return b'"found_landmarks"' in read_bytes(record)
@@ -460,7 +460,7 @@ def wrote_landmarks(record: Path) -> bool:
 
 def is_result(path: Path) -> bool:
     """Return whether `path` is a file, or a store in its folder keeps what such a file would hold."""
-    return path.is_file() or kept_at(path)
+    return path.is_file() or is_stored_at(path)
 
 
 def mesh_at(path: Path) -> Mesh:
@@ -469,8 +469,8 @@ def mesh_at(path: Path) -> Mesh:
     Raises:
         As `read_mesh`, and FileFormatError: the store is damaged.
     """
-    if kept_at(path):
-        name, kind = named(path.name)
+    if is_stored_at(path):
+        name, kind = split_file_name(path.name)
         results = results_at(path.parent)
         assert results is not None
         return results.surface(name, kind)
@@ -484,8 +484,8 @@ def bytes_at(path: Path) -> bytes:
         FileError: it cannot be read.
         FileFormatError: the store is damaged.
     """
-    if kept_at(path):
-        name, kind = named(path.name)
+    if is_stored_at(path):
+        name, kind = split_file_name(path.name)
         results = results_at(path.parent)
         assert results is not None
         return results.stages(name) if kind == "stages" else results.record_bytes(name)
@@ -504,12 +504,12 @@ def json_at(path: Path, remedy: str, most_bytes: int = LARGEST_BYTES) -> Any:
         FileError: it cannot be read.
         FileFormatError: it is too large, or not plain JSON.
     """
-    if not kept_at(path):
+    if not is_stored_at(path):
         return read_json(path, remedy, most_bytes)
     content = bytes_at(path)
     if len(content) > most_bytes:
         raise FileFormatError(f"{path} is larger ({len(content) / 2**20:.0f} MiB) than such a file can be; {remedy}.")
-    return json_of(content, path, remedy)
+    return parse_json(content, path, remedy)
 
 
 def arrays_at(path: Path, remedy: str) -> dict[str, npt.NDArray[Any]]:
@@ -519,7 +519,7 @@ def arrays_at(path: Path, remedy: str) -> dict[str, npt.NDArray[Any]]:
         FileError: it cannot be read.
         FileFormatError: it is damaged, or holds other things than arrays.
     """
-    if not kept_at(path):
+    if not is_stored_at(path):
         return read_arrays(path, remedy)
     content = bytes_at(path)
     try:

@@ -103,7 +103,7 @@ def dense_surface(
             noise_mm = min(noise_mm, matches.noise_mm)
 
     fine = _field(model, settings.fine_range_share * size_mm, settings.fine_amplitude_mm)
-    base, is_folded = unfolded(start, start, start + displacement, topology, settings.turn_cosine)
+    base, is_folded = revert_folds(start, start, start + displacement, topology, settings.turn_cosine)
     out, along, normals = np.zeros((len(start), 1)), np.ones((len(start), 1)), surface.normals
     seen_at = np.zeros(len(start))
     for round_ in range(settings.fine_rounds):
@@ -112,7 +112,7 @@ def dense_surface(
             matches = _match(matcher, surface, T, matches.matches.hint, settings)
         seen_at, pull_at = matches.gathered(noise_mm)
         fine.solve(seen_at, seen_at * out[:, 0] - pull_at, along, out, settings)
-    is_unfolded, held_back = unfolded(start, base, base + out * normals, topology, settings.turn_cosine)
+    is_unfolded, held_back = revert_folds(start, base, base + out * normals, topology, settings.turn_cosine)
     is_determined, damped = seen_at * noise_mm**2 > _SEEN, int((is_folded | held_back).sum())
     along_mm = np.einsum("vd,vd->v", up[is_determined], (is_unfolded - start)[is_determined])
     moved_mm = float(np.sqrt((along_mm**2).sum() / max(len(along_mm), 1)))
@@ -261,7 +261,7 @@ def _laplacian(x: FloatArray, topology: Topology) -> _Laplacian:
     return _Laplacian(off_diagonal, diagonal, owned_areas(Mesh(x, topology.faces)))
 
 
-def unfolded(
+def revert_folds(
     start: FloatArray, base: FloatArray, displaced: FloatArray, topology: Topology, turn_cosine: float
 ) -> tuple[FloatArray, BoolArray]:
     """Return `displaced` (V, 3) held back towards `base` where triangles would fold, and (V,) where that is.

@@ -41,7 +41,11 @@ class Robust(RobustSettings):
         """Yield the states of phase 1 with the pose alone, then of phase 2 with pose and shape together."""
         from shapespace.fit.robust.robust_icp import robust_icp
         from shapespace.fit.search.chirality import mirrored_log_odds
-        from shapespace.fit.search.second_instance import displaced, find_second_instance, layers  # compiled
+        from shapespace.fit.search.second_instance import (  # compiled
+            displaced_shares,
+            find_second_instance,
+            layer_evidence,
+        )
 
         fitted = yield from robust_icp(
             model,
@@ -56,8 +60,8 @@ class Robust(RobustSettings):
             **fitted.evidence,
             "training_shapes": float(model.n_training),
             **start_evidence(start),
-            **layers(model, scan, fitted),
-            **displaced(model, scan, fitted),
+            **layer_evidence(model, scan, fitted),
+            **displaced_shares(model, scan, fitted),
         }
         evidence |= reliability(evidence).as_evidence()
         if not limits.part:

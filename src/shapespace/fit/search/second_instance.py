@@ -89,7 +89,7 @@ def find_second_instance(
     if is_far.sum() < max(_FEWEST, _LEAST_REST * len(is_far)):
         return None
     remaining_target = ScanTarget(part_of(target.mesh, is_far))
-    T = _same_moved(fitted, remaining_target.mesh.vertices, size_mm)
+    T = _fit_pose_again(fitted, remaining_target.mesh.vertices, size_mm)
     if T is None:
         return None
     try:
@@ -108,7 +108,7 @@ def find_second_instance(
     return SecondInstance(away / scale, gap / scale)
 
 
-def displaced(model: ShapeModel, target: ScanTarget, fitted: Fitted) -> dict[str, float]:
+def displaced_shares(model: ShapeModel, target: ScanTarget, fitted: Fitted) -> dict[str, float]:
     """Return the shares of the scan that run along the fitted surface at a distance, and that scatter, by name.
 
     Where the parts of a scan differ in scale or pose, the fit follows one part, and the others run along the surface at
@@ -148,7 +148,7 @@ def displaced(model: ShapeModel, target: ScanTarget, fitted: Fitted) -> dict[str
     }
 
 
-def layers(model: ShapeModel, target: ScanTarget, fitted: Fitted) -> dict[str, float]:
+def layer_evidence(model: ShapeModel, target: ScanTarget, fitted: Fitted) -> dict[str, float]:
     """Return over which share of the scan there are two surfaces on top of each other, and how far apart, by name.
 
     Around a point of such a scan the heights over the fitted surface fall into two tight groups with a gap between.
@@ -188,7 +188,7 @@ def layers(model: ShapeModel, target: ScanTarget, fitted: Fitted) -> dict[str, f
     return shares
 
 
-def _same_moved(fitted: Fitted, remaining_points: FloatArray, size_mm: float) -> Similarity | None:
+def _fit_pose_again(fitted: Fitted, remaining_points: FloatArray, size_mm: float) -> Similarity | None:
     """Return the pose, of similar rotation, at which the fitted shape lies on `remaining_points` (R, 3), or None.
 
     It is far cheaper than a search, which a head or a collar around a face would otherwise cost.

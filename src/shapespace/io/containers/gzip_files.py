@@ -7,7 +7,7 @@ import io
 import zlib
 from pathlib import Path
 
-from shapespace.io.parsing import CUT_SHORT, damaged
+from shapespace.io.parsing import CUT_SHORT, damage_error
 from shapespace.io.read_limits import GROWTH
 
 GZIP = b"\x1f\x8b"
@@ -15,7 +15,7 @@ GZIP = b"\x1f\x8b"
 _SMALL = 2**20
 
 
-def unpacked(data: bytes, path: Path, max_bytes: int) -> bytes:
+def unpack_gzip(data: bytes, path: Path, max_bytes: int) -> bytes:
     """Return what `data`, all of a gzip file, holds.
 
     Args:
@@ -32,9 +32,9 @@ def unpacked(data: bytes, path: Path, max_bytes: int) -> bytes:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as stream:
             content = stream.read(max_bytes + 1)
     except (OSError, EOFError, zlib.error) as error:
-        raise damaged(path, f"its compressed data end early or are wrong; {CUT_SHORT}") from error
+        raise damage_error(path, f"its compressed data end early or are wrong; {CUT_SHORT}") from error
     if len(content) > max_bytes:
-        raise damaged(
+        raise damage_error(
             path, f"it unpacks to more than {max_bytes / 2**20:.0f} MiB, so unpack it with gunzip and look at it"
         )
     return content

@@ -63,7 +63,7 @@ class _Parts:
         root = self._messages(self._fields("Q", 64)[0], _IN_ROOT, "the file")
         attributes = dict(self._attribute(body) for kind, body in root if kind == _ATTRIBUTE)
         arrays: Arrays = {}
-        for tree, heap in (_unpacked("QQ", body) for kind, body in root if kind == _GROUP):
+        for tree, heap in (_unpack("QQ", body) for kind, body in root if kind == _GROUP):
             for name, header in self._names(tree, heap):
                 if name in arrays:
                     raise OtherHdf5Error(f"it names {name!r} twice")
@@ -76,7 +76,7 @@ class _Parts:
         return self._data[offset : offset + count]
 
     def _fields(self, layout: str, offset: int) -> tuple[Any, ...]:
-        return _unpacked(layout, self._bytes(offset, struct.calcsize(f"<{layout}")))
+        return _unpack(layout, self._bytes(offset, struct.calcsize(f"<{layout}")))
 
     def _charge(self, count: int, part_name: str) -> None:
         """Take `count` bytes from what the file may fill in memory, before they are taken there."""
@@ -94,13 +94,13 @@ class _Parts:
         for block in blocks:  # grows while it is walked, by what is continued elsewhere
             place = 0
             while place + 8 <= len(block):
-                kind, size, flags = _unpacked("HHB", block[place : place + 5])
+                kind, size, flags = _unpack("HHB", block[place : place + 5])
                 body = block[place + 8 : place + 8 + size]
                 place += 8 + size
                 if place > len(block) or flags & _SHARED or len(messages) + len(blocks) > _MOST:
                     raise OtherHdf5Error(f"{part_name} has a header that is damaged")
                 if kind == _CONTINUED:
-                    blocks.append(self._bytes(*_unpacked("QQ", body)))
+                    blocks.append(self._bytes(*_unpack("QQ", body)))
                 elif kind in allowed:
                     messages.append((kind, body))
                 else:
@@ -141,13 +141,13 @@ class _Parts:
         self._charge(size, repr(name))
         if tuple(messages[_LAYOUT][:2]) != _ONE_PIECE:
             raise OtherHdf5Error(f"{name!r} is not stored in one piece")
-        address, stored = _unpacked("QQ", messages[_LAYOUT][2:18])
+        address, stored = _unpack("QQ", messages[_LAYOUT][2:18])
         if stored != size or not size:
             raise OtherHdf5Error(f"{name!r} is empty or cut short")
         return np.frombuffer(self._bytes(address, size), dtype).reshape(shape)
 
     def _attribute(self, body: memoryview) -> tuple[str, Attribute]:
-        version, *sizes = _unpacked("BxHHH", body[:8])
+        version, *sizes = _unpack("BxHHH", body[:8])
         bounds = np.cumsum([8, *(-(-size // 8) * 8 for size in sizes)]).tolist()
         name, kind, space, value = (bytes(body[a:b]) for a, b in zip(bounds, [*bounds[1:], None], strict=True))
         attribute = _text(name.partition(b"\0")[0])
@@ -155,7 +155,7 @@ class _Parts:
         if version != 1 or _shape(memoryview(space)) or not (kind == _TEXT or kind in _NUMBERS):
             raise OtherHdf5Error(f"its attribute {attribute!r} is neither a number nor a text")
         if kind == _TEXT:
-            length, heap, index = _unpacked("IQI", value[:16])
+            length, heap, index = _unpack("IQI", value[:16])
             return attribute, self._text_in_heap(length, heap, index, attribute)
         number = np.frombuffer(value[: _NUMBERS[kind].itemsize], _NUMBERS[kind])
         if not len(number):
@@ -167,7 +167,7 @@ class _Parts:
         objects = self._bytes(heap, size)
         place = 16
         for _ in range(_MOST if mark == b"GCOL" else 0):
-            index, stored_length = _unpacked("H6xQ", objects[place : place + 16])
+            index, stored_length = _unpack("H6xQ", objects[place : place + 16])
             if index == text_index:
                 if stored_length < length or place + 16 + stored_length > size:
                     break
@@ -177,7 +177,7 @@ class _Parts:
         raise OtherHdf5Error(f"its attribute {attribute!r} is damaged")
 
 
-def _unpacked(layout: str, data: memoryview | bytes) -> tuple[Any, ...]:
+def _unpack(layout: str, data: memoryview | bytes) -> tuple[Any, ...]:
     try:
         return struct.unpack(f"<{layout}", data)
     except struct.error as error:
@@ -185,10 +185,10 @@ def _unpacked(layout: str, data: memoryview | bytes) -> tuple[Any, ...]:
 
 
 def _shape(space: memoryview) -> tuple[int, ...]:
-    version, rank = _unpacked("BB", space[:2])
+    version, rank = _unpack("BB", space[:2])
     if version != 1 or rank > _MOST_AXES:
         raise OtherHdf5Error("it holds an array of a strange shape")
-    return _unpacked(f"{rank}Q", space[8 : 8 + 8 * rank])
+    return _unpack(f"{rank}Q", space[8 : 8 + 8 * rank])
 
 
 def _text(data: bytes) -> str:

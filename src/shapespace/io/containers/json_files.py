@@ -32,10 +32,10 @@ def read_json(path: Path, remedy: str, most_bytes: int = LARGEST_BYTES) -> Any:
         FileFormatError: it is no file of so few bytes, or not plain JSON.
     """
     check_file(path, most_bytes, remedy)
-    return json_of(read_bytes(path), path, remedy)
+    return parse_json(read_bytes(path), path, remedy)
 
 
-def json_of(content: bytes, path: Path, remedy: str) -> Any:
+def parse_json(content: bytes, path: Path, remedy: str) -> Any:
     """Return what `plain_json` makes of the content of the file `path`, wherever that was read.
 
     Raises:
@@ -71,7 +71,7 @@ def plain_json(text: bytes | str) -> Any:
         ValueError: it is not JSON, is nested too deep, or holds a whole number of more than 64 bits.
     """
     try:
-        value: object = _decoded(text)
+        value: object = _decode(text)
     except RecursionError as error:
         raise ValueError("it is nested too deep") from error
     holder = [value]
@@ -96,7 +96,7 @@ def _make_plain(container: dict[Any, object] | list[object], depth: int) -> None
             raise ValueError("it holds a number that is too large")
 
 
-def _decoded(text: bytes | str) -> object:
+def _decode(text: bytes | str) -> object:
     """Return the value in `text`; what is not strict JSON, such as NaN, is left to the slower reader that takes it."""
     try:
         return msgspec.json.decode(text)

@@ -56,7 +56,7 @@ class PickleRefusedError(ValueError):
 
 
 @dataclass
-class _Made:
+class _PickledObject:
     """What the pickle would have made: a word of `_KNOWN`, of what, and what it was then given as its state."""
 
     what: str
@@ -93,7 +93,7 @@ def pickled_dict(data: bytes) -> dict[str, Any]:
         for step, (opcode, argument, _) in enumerate(pickletools.genops(data)):
             if step > _MOST_STEPS:
                 raise PickleRefusedError(f"it has more than {_MOST_STEPS} steps")
-            _take(machine, opcode.name, argument)
+            _run_step(machine, opcode.name, argument)
         content = machine.pop()
     except PickleRefusedError:
         raise
@@ -115,7 +115,7 @@ def pickled_array(value: object, depth: int = 0) -> npt.NDArray[Any]:
             return np.array(value, dtype=np.float64)
         except OverflowError as error:
             raise PickleRefusedError("a list in it is no array") from error
-    if not isinstance(value, _Made) or depth > _DEEPEST:
+    if not isinstance(value, _PickledObject) or depth > _DEEPEST:
         raise PickleRefusedError("what should be an array is none")
     state_items, state_fields = _tuple(value.state), _dict(value.state)
     if value.what == "array" and len(state_items) == 5:
@@ -129,11 +129,11 @@ def pickled_array(value: object, depth: int = 0) -> npt.NDArray[Any]:
     if value.what == "chumpy" and "x" in state_fields:
         return pickled_array(state_fields["x"], depth + 1)
     if value.what == "chumpy" and {"a", "idxs"} <= state_fields.keys():
-        return _selected(state_fields, depth)
+        return _select_rows(state_fields, depth)
     raise PickleRefusedError("what should be an array is none")
 
 
-def _selected(state: dict[str, Any], depth: int) -> npt.NDArray[Any]:
+def _select_rows(state: dict[str, Any], depth: int) -> npt.NDArray[Any]:
     """Return what chumpy's Select takes from an array."""
     flat = pickled_array(state["a"], depth + 1).ravel()
     indices = pickled_array(state["idxs"], depth + 1).astype(np.int64).ravel()
@@ -144,11 +144,11 @@ def _selected(state: dict[str, Any], depth: int) -> npt.NDArray[Any]:
 
 
 def _dtype(value: object) -> np.dtype[Any]:
-    kind = value.parts[0] if isinstance(value, _Made) and value.what == "dtype" and value.parts else None
+    kind = value.parts[0] if isinstance(value, _PickledObject) and value.what == "dtype" and value.parts else None
     match = _DTYPE.fullmatch(kind) if isinstance(kind, str) else None
     if match is None:
         raise PickleRefusedError("an array in it is not of numbers")
-    state = _tuple(cast(_Made, value).state)
+    state = _tuple(cast(_PickledObject, value).state)
     is_big = len(state) > 1 and state[1] == ">"
     try:
         return np.dtype(match[1]).newbyteorder(">" if is_big or cast(str, kind)[0] == ">" else "<")
@@ -189,7 +189,7 @@ def _as_bytes(data: Any) -> bytes:
     raise PickleRefusedError("an array in it holds objects")
 
 
-def _take(machine: _Machine, name: str, argument: Any) -> None:
+def _run_step(machine: _Machine, name: str, argument: Any) -> None:
     """Take one step of a pickle."""
     stack = machine.stack
     if name in _PLAIN:
@@ -204,20 +204,20 @@ def _take(machine: _Machine, name: str, argument: Any) -> None:
         stack.append(machine.memo[argument])
     elif name in ("GLOBAL", "STACK_GLOBAL"):
         module, name_in_module = argument.split(" ", 1) if name == "GLOBAL" else (machine.pop(), machine.pop())[::-1]
-        stack.append(_named(str(module), str(name_in_module)))
+        stack.append(_resolve_name(str(module), str(name_in_module)))
     elif name in ("REDUCE", "NEWOBJ"):
         arguments, function = machine.pop(), machine.pop()
-        stack.append(_called(function, arguments))
+        stack.append(_call(function, arguments))
     elif name == "BUILD":
         state = machine.pop()
-        if not isinstance(stack[-1], _Made):
+        if not isinstance(stack[-1], _PickledObject):
             raise PickleRefusedError("it changes what is no array")
         stack[-1].state = state
     else:
-        _take_container(machine, name)
+        _run_container_step(machine, name)
 
 
-def _take_container(machine: _Machine, name: str) -> None:
+def _run_container_step(machine: _Machine, name: str) -> None:
     stack = machine.stack
     match name:
         case "PROTO" | "FRAME" | "STOP":
@@ -262,24 +262,24 @@ def _items(pairs: list[Any]) -> dict[Any, Any]:
     return dict(zip(pairs[::2], pairs[1::2], strict=True))
 
 
-def _named(module: str, name: str) -> _Made:
+def _resolve_name(module: str, name: str) -> _PickledObject:
     if _CHUMPY.fullmatch(module) and name.isidentifier():
-        return _Made("name", ("chumpy",))
+        return _PickledObject("name", ("chumpy",))
     if (module, name) not in _KNOWN:
         raise PickleRefusedError(f"it asks for {module[:40]}.{name[:40]}, which no array needs")
-    return _Made("name", (_KNOWN[module, name],))
+    return _PickledObject("name", (_KNOWN[module, name],))
 
 
-def _called(function: Any, arguments: Any) -> Any:
+def _call(function: Any, arguments: Any) -> Any:
     """Return what a call of `function` stands for."""
-    if not isinstance(function, _Made) or function.what != "name" or not isinstance(arguments, tuple):
+    if not isinstance(function, _PickledObject) or function.what != "name" or not isinstance(arguments, tuple):
         raise PickleRefusedError("it calls what is no name")
     values = cast(tuple[Any, ...], arguments)
     kind = function.parts[0]
-    if kind == "object" and values and isinstance(values[0], _Made) and values[0].what == "name":
-        return _Made(values[0].parts[0])
+    if kind == "object" and values and isinstance(values[0], _PickledObject) and values[0].what == "name":
+        return _PickledObject(values[0].parts[0])
     if kind == "bytes":
         if len(values) != 2 or not isinstance(values[0], str) or values[1] not in ("latin1", "latin-1"):
             raise PickleRefusedError("it asks for a strange text")
         return values[0].encode("latin-1", "replace")
-    return _Made(kind, values)
+    return _PickledObject(kind, values)

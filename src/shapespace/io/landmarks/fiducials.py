@@ -27,7 +27,7 @@ def fiducial_texts(fiducials: Found) -> dict[str, str]:
     Slicer takes the coordinates of a mesh as they are, for LPS and mm, so it shows the points on the scan.
     """
     points = {name: np.array(fiducial["at"], dtype=np.float64) for name, fiducial in fiducials.items()}
-    descriptions = {name: _described(fiducial["stddev_mm"]) for name, fiducial in fiducials.items()}
+    descriptions = {name: _describe(fiducial["stddev_mm"]) for name, fiducial in fiducials.items()}
     texts = _table(fiducials), _markups(points, descriptions), fcsv_text(points, descriptions)
     return dict(zip(FIDUCIAL_ENDINGS, texts, strict=True))
 
@@ -37,7 +37,10 @@ def _table(fiducials: Found) -> str:
     return rows_text(
         [
             header,
-            *([name, *_told(fiducial["at"]), *_told(fiducial["stddev_mm"])] for name, fiducial in fiducials.items()),
+            *(
+                [name, *_format_numbers(fiducial["at"]), *_format_numbers(fiducial["stddev_mm"])]
+                for name, fiducial in fiducials.items()
+            ),
         ]
     )
 
@@ -49,9 +52,9 @@ def _markups(points: Mapping[str, FloatArray], descriptions: Mapping[str, str]) 
     return json.dumps(content, indent=1) + "\n"
 
 
-def _told(numbers: Sequence[float] | None) -> list[str]:
+def _format_numbers(numbers: Sequence[float] | None) -> list[str]:
     return [""] * len(_AXES) if numbers is None else [repr(float(number)) for number in numbers]
 
 
-def _described(stddev_mm: Sequence[float] | None) -> str:
+def _describe(stddev_mm: Sequence[float] | None) -> str:
     return "" if stddev_mm is None else f"standard deviation {' '.join(f'{mm:.2f}' for mm in stddev_mm)} mm"

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shapespace.io.parsing import CUT_SHORT, IndexArray, check_count, damaged, mesh_of
+from shapespace.io.parsing import CUT_SHORT, IndexArray, check_count, damage_error, mesh_of
 from shapespace.types import FloatArray, Mesh
 
 _HEADER = struct.Struct("<HHdH")
@@ -39,28 +39,28 @@ def read_bnt(data: bytes, path: Path) -> Mesh:
         FileFormatError: the header contradicts itself or the length of the file, or no point is there.
     """
     if len(data) < _HEADER.size:
-        raise damaged(path, f"it is too short to be a Bosphorus file; {CUT_SHORT}")
+        raise damage_error(path, f"it is too short to be a Bosphorus file; {CUT_SHORT}")
     rows, columns, zmin, name_length = _HEADER.unpack_from(data)
     data_start = _HEADER.size + name_length
     if len(data) < data_start + _COUNT.size:
-        raise damaged(path, f"its header is cut off; {CUT_SHORT}")
+        raise damage_error(path, f"its header is cut off; {CUT_SHORT}")
     (count,) = _COUNT.unpack_from(data, data_start)
     data_start += _COUNT.size
     points = rows * columns
     if not points or count != _COLUMNS * points:
-        raise damaged(
+        raise damage_error(
             path,
             f"its header declares {rows} rows, {columns} columns and {count} numbers, which is no Bosphorus file "
             "(5 numbers a point)",
         )
     check_count(count, 8, len(data) - data_start, "numbers", path)
     if not math.isfinite(zmin):
-        raise damaged(path, "its depth of missing points is not finite, so it is damaged")
+        raise damage_error(path, "its depth of missing points is not finite, so it is damaged")
     grid = np.frombuffer(data, dtype="<f8", count=3 * points, offset=data_start).reshape(3, points).T.astype(np.float64)
     # zmin is the least depth there is.
     is_measured = ~(grid[:, 2] <= zmin)
     if not is_measured.any():
-        raise damaged(path, "all its points are missing")
+        raise damage_error(path, "all its points are missing")
     number = np.full(points, -1, dtype=np.int64)
     number[is_measured] = np.arange(int(is_measured.sum()))
     vertices = grid[is_measured]

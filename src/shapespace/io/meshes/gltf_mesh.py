@@ -20,12 +20,12 @@ import numpy.typing as npt
 
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.files import read_bytes
-from shapespace.io.meshes.textures import FilesBeside, Pictures, TextureError
+from shapespace.io.meshes.textures import CompanionFiles, Pictures, TextureError
 from shapespace.io.parsing import (
     CUT_SHORT,
     IndexArray,
     check_count,
-    damaged,
+    damage_error,
     fan_triangles,
     json_value,
     mesh_of,
@@ -83,10 +83,10 @@ class _Gltf:
     allowance: Allowance
     buffers: dict[str | None, bytes] = field(default_factory=lambda: dict[str | None, bytes]())
     pictures: Pictures = field(default_factory=Pictures)
-    files: FilesBeside = field(init=False)
+    files: CompanionFiles = field(init=False)
 
     def __post_init__(self) -> None:
-        self.files = FilesBeside(self.path)
+        self.files = CompanionFiles(self.path)
 
     def buffer(self, index: int) -> bytes:
         entry = self.tree["buffers"][index]
@@ -99,7 +99,7 @@ class _Gltf:
             self.buffers[uri] = b"" if data is None else data
         data = self.buffers[uri]
         if len(data) < entry["byteLength"]:
-            raise damaged(self.path, f"its buffer {index} is shorter than declared; {CUT_SHORT}")
+            raise damage_error(self.path, f"its buffer {index} is shorter than declared; {CUT_SHORT}")
         return data
 
     def fetch(self, uri: str) -> bytes:
@@ -107,22 +107,22 @@ class _Gltf:
         if uri.startswith("data:"):
             head, _, body = uri.partition(",")
             if not head.endswith(";base64"):
-                raise damaged(self.path, "it has a buffer that is not base64; export it again")
+                raise damage_error(self.path, "it has a buffer that is not base64; export it again")
             return base64.b64decode(body, validate=True)
         folder = self.path.parent.resolve()
         try:
             target = (folder / unquote(uri)).resolve()
             is_there = target.exists()
         except OSError as error:  # a name too long for the system
-            raise damaged(self.path, f"it names a buffer '{uri[:80]}' that is no file; {CUT_SHORT}") from error
+            raise damage_error(self.path, f"it names a buffer '{uri[:80]}' that is no file; {CUT_SHORT}") from error
         if "://" in uri or not target.is_relative_to(folder):
-            raise damaged(self.path, f"it names a buffer outside its own folder ('{uri[:80]}'), which is not read")
+            raise damage_error(self.path, f"it names a buffer outside its own folder ('{uri[:80]}'), which is not read")
         if not is_there:
-            raise damaged(self.path, f"its buffer '{uri[:80]}' is missing beside it; copy that file there too")
+            raise damage_error(self.path, f"its buffer '{uri[:80]}' is missing beside it; copy that file there too")
         try:
             data = read_bytes(target, max(LARGEST_MESH_FILE_BYTES - self.allowance.file_bytes, 0))
         except FileError as error:
-            raise damaged(
+            raise damage_error(
                 self.path, f"its buffer '{uri[:80]}' is no file that can be read or it is too long"
             ) from error
         self.allowance.more_file(len(data))
@@ -133,8 +133,8 @@ class _Gltf:
         used = self.tree.get("extensionsUsed", [])
         extension = next((name for name in _COMPRESSIONS if name in used), None)
         if extension is None:
-            return damaged(self.path, f"{otherwise}; {CUT_SHORT}")
-        return damaged(self.path, f"it is compressed ({extension}), so export it again without compression")
+            return damage_error(self.path, f"{otherwise}; {CUT_SHORT}")
+        return damage_error(self.path, f"it is compressed ({extension}), so export it again without compression")
 
     def view(self, index: int, offset: int, kind: np.dtype[Any], count: int, width: int) -> Values:
         """Return (count, width) numbers from a buffer view."""
@@ -198,7 +198,7 @@ def read_gltf(data: bytes, path: Path) -> Mesh:
             holds no points, or makes more of its bytes than `io.limits` allows.
         MeshError: faces that point past the end of the vertices.
     """
-    return _parsed(data, path, _scene)
+    return _parse(data, path, _scene)
 
 
 def read_morphs(data: bytes, path: Path) -> Morphs:
@@ -211,10 +211,10 @@ def read_morphs(data: bytes, path: Path) -> Morphs:
     Raises:
         FileFormatError: as `read_gltf`, or no mesh has morph targets.
     """
-    return _parsed(data, path, _morphs)
+    return _parse(data, path, _morphs)
 
 
-def _parsed(data: bytes, path: Path, build: Callable[[_Gltf], Found]) -> Found:
+def _parse(data: bytes, path: Path, build: Callable[[_Gltf], Found]) -> Found:
     binary: bytes | None = None
     if data[:4] == b"glTF":
         text, binary = _chunks(data, path)
@@ -224,23 +224,23 @@ def _parsed(data: bytes, path: Path, build: Callable[[_Gltf], Found]) -> Found:
     # Any part of the JSON may be missing or of the wrong type, so that is met in this one place.
     try:
         if not str(tree["asset"]["version"]).startswith("2"):
-            raise damaged(path, "it is not glTF of version 2")
+            raise damage_error(path, "it is not glTF of version 2")
         _refuse_unknown(tree.get("extensionsRequired", []), path)
         return build(_Gltf(path, tree, binary, Allowance(len(data), path)))
     except (KeyError, IndexError, TypeError, AttributeError, OverflowError, binascii.Error) as error:
-        raise damaged(path, f"it is not valid glTF; {CUT_SHORT}") from error
+        raise damage_error(path, f"it is not valid glTF; {CUT_SHORT}") from error
     except ValueError as error:
         if isinstance(error, (FileError, InputError)):
             raise
-        raise damaged(path, f"it is not valid glTF; {CUT_SHORT}") from error
+        raise damage_error(path, f"it is not valid glTF; {CUT_SHORT}") from error
 
 
 def _refuse_unknown(required: list[Any], path: Path) -> None:
     for name in map(str, required):
         if name in _COMPRESSIONS:
-            raise damaged(path, f"it is compressed ({name}), so export it again without compression")
+            raise damage_error(path, f"it is compressed ({name}), so export it again without compression")
         if name not in _HARMLESS_TOO and not name.startswith(_HARMLESS):
-            raise damaged(
+            raise damage_error(
                 path, f"it requires the extension '{name[:60]}', which is not known here, so export it again without it"
             )
 
@@ -248,19 +248,19 @@ def _refuse_unknown(required: list[Any], path: Path) -> None:
 def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes | None]:
     version, length = int.from_bytes(data[4:8], "little"), int.from_bytes(data[8:12], "little")
     if version != 2:
-        raise damaged(path, f"it is GLB of version {version}, not 2")
+        raise damage_error(path, f"it is GLB of version {version}, not 2")
     if length > len(data):
-        raise damaged(path, f"it declares {length} bytes, but has {len(data)}; {CUT_SHORT}")
+        raise damage_error(path, f"it declares {length} bytes, but has {len(data)}; {CUT_SHORT}")
     offset = 12
     chunks: dict[bytes, bytes] = {}
     while offset + 8 <= length:
         size, kind = int.from_bytes(data[offset : offset + 4], "little"), data[offset + 4 : offset + 8]
         if offset + 8 + size > length:
-            raise damaged(path, f"it ends inside a chunk; {CUT_SHORT}")
+            raise damage_error(path, f"it ends inside a chunk; {CUT_SHORT}")
         chunks.setdefault(kind, data[offset + 8 : offset + 8 + size])
         offset += 8 + size
     if b"JSON" not in chunks:
-        raise damaged(path, f"it has no JSON chunk; {CUT_SHORT}")
+        raise damage_error(path, f"it has no JSON chunk; {CUT_SHORT}")
     return chunks[b"JSON"], chunks.get(b"BIN\0")
 
 
@@ -282,7 +282,7 @@ def _nodes_with_meshes(gltf: _Gltf) -> Iterator[tuple[dict[str, Any], FloatArray
     while stack:
         index, parent = stack.pop()
         if index in visited or index < 0:
-            raise damaged(gltf.path, "its nodes do not form a tree; export it again")
+            raise damage_error(gltf.path, "its nodes do not form a tree; export it again")
         visited.add(index)
         gltf.allowance.part()
         node = nodes[index]
@@ -309,7 +309,7 @@ def _scene(gltf: _Gltf) -> Mesh:
             colours.append(vertex_colours)
             n_vertices += len(vertices)
     if not points:
-        raise damaged(gltf.path, "its scene holds no points and no triangles")
+        raise damage_error(gltf.path, "its scene holds no points and no triangles")
     joined = np.concatenate(faces) if faces else None
     return mesh_of(
         np.concatenate(points), joined, gltf.path, _joined_colours(points, colours), tuple(dict.fromkeys(notes))
@@ -331,7 +331,7 @@ def _morphs(gltf: _Gltf) -> Morphs:
     mesh_nodes = list(_nodes_with_meshes(gltf))
     sizes = [_morphed_vertices(gltf, node) for node, _ in mesh_nodes]
     if not any(sizes):
-        raise damaged(gltf.path, "it has no mesh with morph targets")
+        raise damage_error(gltf.path, "it has no mesh with morph targets")
     node, matrix = mesh_nodes[int(np.argmax(sizes))]
     mesh = gltf.tree["meshes"][node["mesh"]]
     count = len(mesh["primitives"][0]["targets"])
@@ -436,7 +436,7 @@ def _primitives(
         gltf.allowance.take(len(corners) if mode == _TRIANGLES else 3 * len(corners), 8)
         if mode == _TRIANGLES:
             if len(corners) % 3:
-                raise damaged(gltf.path, f"its triangles have {len(corners)} corners; {CUT_SHORT}")
+                raise damage_error(gltf.path, f"its triangles have {len(corners)} corners; {CUT_SHORT}")
             corner_triples = corners.reshape(-1, 3)
         else:
             corner_triples = (strip_triangles if mode == _STRIP else fan_triangles)([len(corners)], corners)

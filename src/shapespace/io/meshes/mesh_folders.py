@@ -27,7 +27,7 @@ class MeshFiles:
 
 
 @dataclass
-class _Found:
+class _FolderListing:
     endings: tuple[str, ...]
     files: list[Path] = field(default_factory=list[Path])
     folders: list[str] = field(default_factory=list[str])
@@ -63,15 +63,15 @@ def mesh_files(
         if not _is_folder(path):
             files.append(path)
             continue
-        listing = _Found(tuple(endings))
-        _look_into(path, path, listing, recursive, None if apart_from is None else apart_from.resolve())
+        listing = _FolderListing(tuple(endings))
+        _list_folder(path, path, listing, recursive, None if apart_from is None else apart_from.resolve())
         if not listing.files:
             advice = "; give --recursive for what lies in the folders below it" if listing.folders else ""
             advice += "; unpack those that are compressed with gunzip" if listing.packed else ""
             known = MESH_ENDINGS if endings is MESH_FILE_ENDINGS else endings
             raise InputError(f"{path} holds no {kind_name}{advice}; shapespace reads {', '.join(known)}.")
         files += listing.files
-        left_out += _sentences(path, listing, kind_name)
+        left_out += _omission_notes(path, listing, kind_name)
     return MeshFiles(tuple(files), tuple(left_out))
 
 
@@ -82,7 +82,7 @@ def _is_folder(path: Path) -> bool:
         raise read_error(path, error) from error
 
 
-def _look_into(folder: Path, top: Path, listing: _Found, recursive: bool, apart_from: Path | None) -> None:
+def _list_folder(folder: Path, top: Path, listing: _FolderListing, recursive: bool, apart_from: Path | None) -> None:
     try:
         inside = sorted(p for p in folder.iterdir() if not p.name.startswith("."))
         for path in inside:
@@ -96,7 +96,7 @@ def _look_into(folder: Path, top: Path, listing: _Found, recursive: bool, apart_
                 elif path.is_symlink():
                     listing.linked.append(name)
                 else:
-                    _look_into(path, top, listing, recursive, apart_from)
+                    _list_folder(path, top, listing, recursive, apart_from)
             elif of_kind and path.is_file():
                 listing.files.append(path)
             elif path.name.lower().endswith(tuple(f"{ending}.gz" for ending in listing.endings)):
@@ -107,7 +107,7 @@ def _look_into(folder: Path, top: Path, listing: _Found, recursive: bool, apart_
         raise read_error(folder, error) from error
 
 
-def _sentences(folder: Path, listing: _Found, kind_name: str) -> Iterator[str]:
+def _omission_notes(folder: Path, listing: _FolderListing, kind_name: str) -> Iterator[str]:
     for names, singular, plural, verb, advice in (
         (listing.folders, "folder", "folders", "looked into", f"--recursive takes the {kind_name} there"),
         (listing.linked, "link to a folder", "links to folders", "followed", "give that folder too"),

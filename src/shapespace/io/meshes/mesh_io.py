@@ -12,7 +12,7 @@ from typing import TypeAlias
 import numpy as np
 
 from shapespace.errors import FileFormatError
-from shapespace.io.containers.gzip_files import GZIP, unpacked
+from shapespace.io.containers.gzip_files import GZIP, unpack_gzip
 from shapespace.io.files import open_file, read_bytes, read_error, write_bytes
 from shapespace.io.meshes.bnt import read_bnt
 from shapespace.io.meshes.gltf_mesh import read_gltf, write_glb, write_gltf
@@ -86,7 +86,7 @@ def read_mesh(path: Path | str) -> Mesh:
     read = READ_ONLY_FORMATS.get(ending) or NAMED_FORMATS.get(ending) or _format(path, "read").read
     data = read_bytes(path, LARGEST_MESH_FILE_BYTES)
     if data.startswith(GZIP):
-        data = unpacked(data, path, LARGEST_MESH_FILE_BYTES)
+        data = unpack_gzip(data, path, LARGEST_MESH_FILE_BYTES)
     if not data.strip():
         raise FileFormatError(f"Cannot read {path}: it is empty; export or copy it again.")
     # A NaN or infinity is for the mesh doctor to judge, not for numpy to warn about.

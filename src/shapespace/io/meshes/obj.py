@@ -13,11 +13,11 @@ from shapespace.io.parsing import (
     CUT_SHORT,
     IndexArray,
     bytes_of_colours,
-    damaged,
+    damage_error,
     fan_triangles,
     floats,
     ints,
-    joined,
+    join_parts,
     line_blocks,
     mesh_of,
     number_lines,
@@ -71,20 +71,20 @@ def read_obj(data: bytes, path: Path) -> Mesh:
             faces.append(_faces(polygons, vertices_above, polygon_count, path))
             polygon_count += len(polygons)
     if not count:
-        raise damaged(path, "it has no 'v' lines, so it is not an OBJ file or holds no points")
+        raise damage_error(path, "it has no 'v' lines, so it is not an OBJ file or holds no points")
     known_colours = [part for part in colours if part is not None]
     vertex_colours = bytes_of_colours(np.concatenate(known_colours)) if len(known_colours) == len(colours) else None
     notes: tuple[str, ...] = ()
     if vertex_colours is None:
         vertex_colours, notes = texture_colours(data, count, path)
-    return mesh_of(np.concatenate(vertices), joined(faces, np.int64, 3), path, vertex_colours, notes)
+    return mesh_of(np.concatenate(vertices), join_parts(faces, np.int64, 3), path, vertex_colours, notes)
 
 
 def _points(points: list[list[bytes]], lines_before: int, path: Path) -> FloatArray:
     widths = set(map(len, points))
     if min(widths) < 4:
         line_number = lines_before + next(i for i, words in enumerate(points) if len(words) < 4)
-        raise damaged(path, f"vertex {line_number + 1} has fewer than three numbers; {CUT_SHORT}")
+        raise damage_error(path, f"vertex {line_number + 1} has fewer than three numbers; {CUT_SHORT}")
     if len(widths) == 1:
         flat = list(chain.from_iterable(points))
         return np.stack([floats(flat[axis :: len(points[0])], path) for axis in (1, 2, 3)], axis=1)
@@ -108,15 +108,15 @@ def _faces(polygons: list[list[bytes]], vertices_above: list[int], lines_before:
     counts = np.fromiter(map(len, polygons), dtype=np.int64, count=len(polygons)) - 1
     if counts.min() < 3:
         line_number = lines_before + int(np.argmin(counts))
-        raise damaged(path, f"face {line_number + 1} has fewer than three corners; {CUT_SHORT}")
+        raise damage_error(path, f"face {line_number + 1} has fewer than three corners; {CUT_SHORT}")
     tokens = chain.from_iterable(words[1:] for words in polygons)
     corners = ints((token.partition(b"/")[0] for token in tokens), path)
     if (corners == 0).any():
-        raise damaged(path, "a face points at vertex 0, but OBJ counts from 1; export it again")
+        raise damage_error(path, "a face points at vertex 0, but OBJ counts from 1; export it again")
     declared = np.repeat(np.array(vertices_above, dtype=np.int64), counts)
     absolute = np.where(corners > 0, corners - 1, corners + declared)
     if absolute.min() < 0:
-        raise damaged(path, f"a face points back past the first vertex; {CUT_SHORT}")
+        raise damage_error(path, f"a face points back past the first vertex; {CUT_SHORT}")
     return fan_triangles(counts, absolute)
 
 

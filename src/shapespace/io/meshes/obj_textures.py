@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shapespace.io.meshes.textures import FilesBeside, Pictures, TextureError
+from shapespace.io.meshes.textures import CompanionFiles, Pictures, TextureError
 from shapespace.io.parsing import line_blocks, plain_text
 from shapespace.types import GREY, ByteArray
 
@@ -35,7 +35,7 @@ def texture_colours(data: bytes, vertices: int, path: Path) -> tuple[ByteArray |
     if not libraries or b"vt" not in data:
         return None, ()
     try:
-        files = FilesBeside(path)
+        files = CompanionFiles(path)
         pictures = _libraries(files, dict.fromkeys(libraries))
         if not pictures:
             return None, ()
@@ -44,7 +44,7 @@ def texture_colours(data: bytes, vertices: int, path: Path) -> tuple[ByteArray |
         return None, (f"It is read without its colours: {reason}.",)
 
 
-def _libraries(files: FilesBeside, names: Iterable[bytes]) -> dict[bytes, str]:
+def _libraries(files: CompanionFiles, names: Iterable[bytes]) -> dict[bytes, str]:
     """Return material -> name of its picture, of all materials files; each is read once, however it is spelled."""
     paths = dict.fromkeys(files.find(name.strip().decode("utf-8", "replace"), _LIBRARY) for name in names)
     pictures: dict[bytes, str] = {}
@@ -71,7 +71,7 @@ def _pictures(library: bytes) -> dict[bytes, str]:
     return pictures
 
 
-def _colours(data: bytes, vertices: int, pictures: dict[bytes, str], files: FilesBeside) -> ByteArray | None:
+def _colours(data: bytes, vertices: int, pictures: dict[bytes, str], files: CompanionFiles) -> ByteArray | None:
     uv, corners, materials = _corners(data)
     if not len(corners):
         return None

@@ -15,11 +15,11 @@ from shapespace.io.parsing import (
     IndexArray,
     bytes_of_colours,
     check_count,
-    damaged,
+    damage_error,
     fan_triangles,
     floats,
     ints,
-    joined,
+    join_parts,
     line_blocks,
     mesh_of,
     number_lines,
@@ -47,13 +47,13 @@ def read_off(data: bytes, path: Path) -> Mesh:
     first = next(rows, [b""])
     keyword = _KEYWORD.match(first[0])
     if keyword is None:
-        raise damaged(path, "it does not start with 'OFF', so it is not an OFF file")
+        raise damage_error(path, "it does not start with 'OFF', so it is not an OFF file")
     if keyword[2] or first[-1].upper() == b"BINARY":
-        raise damaged(path, "it is a binary or four-dimensional OFF file, so save it as plain text OFF")
+        raise damage_error(path, "it is a binary or four-dimensional OFF file, so save it as plain text OFF")
     head = [first[0][keyword.end() :], *first[1:]] if len(first[0]) > keyword.end() else first[1:]
     counts = ints((head or next(rows, first[:0]))[:2], path).tolist()
     if len(counts) < 2:
-        raise damaged(path, f"it does not say how many vertices and faces it has; {CUT_SHORT}")
+        raise damage_error(path, f"it does not say how many vertices and faces it has; {CUT_SHORT}")
     n, m = counts
     check_count(n, 6, len(data), "vertices", path)
     check_count(m, 2, len(data), "faces", path)
@@ -65,14 +65,14 @@ def read_off(data: bytes, path: Path) -> Mesh:
     for part in _batches(rows, n, "vertices", path):
         points.append(_points(part, path))
         colours.append(_colours(part, colour_column, path) if colour_column else None)
-    vertices = joined(points, np.float64, 3)
+    vertices = join_parts(points, np.float64, 3)
     known_colours = [part for part in colours if part is not None]
     vertex_colours = (
         bytes_of_colours(np.concatenate(known_colours))
         if known_colours and len(known_colours) == len(colours)
         else None
     )
-    faces = joined([_faces(part, path) for part in _batches(rows, m, "faces", path)], np.int64, 3)
+    faces = join_parts([_faces(part, path) for part in _batches(rows, m, "faces", path)], np.int64, 3)
     return mesh_of(vertices, faces, path, vertex_colours)
 
 
@@ -91,7 +91,7 @@ def _batches(rows: Iterator[list[bytes]], count: int, row_kind: str, path: Path)
     while left:
         part = list(islice(rows, min(left, _ROWS)))
         if not part:
-            raise damaged(
+            raise damage_error(
                 path, f"its header declares {count} {row_kind}, but only {count - left} lines follow; {CUT_SHORT}"
             )
         left -= len(part)
@@ -100,7 +100,7 @@ def _batches(rows: Iterator[list[bytes]], count: int, row_kind: str, path: Path)
 
 def _points(rows: list[list[bytes]], path: Path) -> FloatArray:
     if min(map(len, rows)) < 3:
-        raise damaged(path, f"a vertex has fewer than three numbers; {CUT_SHORT}")
+        raise damage_error(path, f"a vertex has fewer than three numbers; {CUT_SHORT}")
     return floats(chain.from_iterable(words[:3] for words in rows), path).reshape(-1, 3)
 
 
@@ -120,7 +120,7 @@ def _faces(rows: list[list[bytes]], path: Path) -> IndexArray:
     sizes = ints((words[0] for words in rows), path)
     lengths = np.fromiter(map(len, rows), dtype=np.int64, count=len(rows))
     if (sizes < 1).any() or (lengths <= sizes).any():
-        raise damaged(path, f"a face has fewer corners than it says; {CUT_SHORT}")
+        raise damage_error(path, f"a face has fewer corners than it says; {CUT_SHORT}")
     corners = ints(chain.from_iterable(w[1 : 1 + k] for w, k in zip(rows, sizes.tolist(), strict=True)), path)
     return fan_triangles(sizes, corners)
 

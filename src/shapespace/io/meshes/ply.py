@@ -18,11 +18,11 @@ from shapespace.io.parsing import (
     IndexArray,
     bytes_of_colours,
     check_count,
-    damaged,
+    damage_error,
     fan_triangles,
     floats,
     ints,
-    joined,
+    join_parts,
     mesh_of,
     plain_text,
     word_block,
@@ -147,7 +147,7 @@ def read_ply(data: bytes, path: Path) -> Mesh:
     words = _Words(data, offset)
     for element in elements:
         if element.name == "tristrips":
-            raise damaged(path, "it holds triangle strips, so export it again with plain triangles")
+            raise damage_error(path, "it holds triangle strips, so export it again with plain triangles")
         available = words.left if order == "" else len(data) - offset
         check_count(element.count, element.least_bytes(order == ""), available, _plural(element.name), path)
         lists = any(p.count is not None for p in element.properties)
@@ -155,7 +155,7 @@ def read_ply(data: bytes, path: Path) -> Mesh:
         if element.name == "face" and element.count:
             list_index = element.index_list()
             if list_index is None:
-                raise damaged(path, "its faces have no property vertex_indices, so export it again")
+                raise damage_error(path, "its faces have no property vertex_indices, so export it again")
         if lists and order == "":
             counts, corners = _ascii_lists(words, element, list_index, path)
         elif lists:
@@ -175,13 +175,13 @@ def read_ply(data: bytes, path: Path) -> Mesh:
                 offset += element.count * element.least_bytes(False)
             continue
         if element.name == "vertex":
-            raise damaged(path, "its vertices carry lists, so export it again without them")
+            raise damage_error(path, "its vertices carry lists, so export it again without them")
         if list_index is not None:
             if len(counts) and counts.min() < 0:
-                raise damaged(path, f"a face has {int(counts.min())} corners; {CUT_SHORT}")
+                raise damage_error(path, f"a face has {int(counts.min())} corners; {CUT_SHORT}")
             faces = fan_triangles(counts, corners)
     if vertices is None:
-        raise damaged(path, "its header declares no vertices")
+        raise damage_error(path, "its header declares no vertices")
     return mesh_of(vertices, faces, path, colours, observed=observed)
 
 
@@ -213,10 +213,10 @@ def _plural(name: str) -> str:
 
 def _header(data: bytes, path: Path) -> tuple[str, list[_Element], int]:
     if data[:3] != b"ply" or data[3:4] not in (b"\n", b"\r", b" "):
-        raise damaged(path, "it does not start with 'ply', so it is not a PLY file")
+        raise damage_error(path, "it does not start with 'ply', so it is not a PLY file")
     end = data.find(b"end_header", 0, _MAX_HEADER)
     if end < 0:
-        raise damaged(path, f"its header has no end; {CUT_SHORT}")
+        raise damage_error(path, f"its header has no end; {CUT_SHORT}")
     head = data[:end]
     after = end + len(b"end_header")
     newline = b"\r\n" if b"\r\n" in head else (b"\n" if b"\n" in head else b"\r")
@@ -240,15 +240,15 @@ def _header(data: bytes, path: Path) -> tuple[str, list[_Element], int]:
             else:
                 raise ValueError(words[0])
         except (ValueError, KeyError, IndexError) as error:
-            raise damaged(path, f"its header has a line that is not PLY ('{line.strip()[:60]}')") from error
+            raise damage_error(path, f"its header has a line that is not PLY ('{line.strip()[:60]}')") from error
     if order is None:
-        raise damaged(path, "its header does not say whether it is ascii or binary")
+        raise damage_error(path, "its header does not say whether it is ascii or binary")
     return order, elements, start
 
 
 def _refuse_without_xyz(element: _Element, path: Path) -> None:
     if not set("xyz") <= {p.name for p in element.properties}:
-        raise damaged(path, "its vertices have no x, y and z")
+        raise damage_error(path, "its vertices have no x, y and z")
 
 
 def _colour_names(names: list[str]) -> tuple[str, ...]:
@@ -302,19 +302,19 @@ def _ascii_vertices(words: _Words, element: _Element, path: Path) -> _Vertices:
             parts.append(floats(part[(names.index(axis) - n_read) % width :: width], path))
         n_read += len(part)
     if n_read < element.count * width:
-        raise _ended(element, path)
-    arrays = {name: joined(parts, np.float64) for name, parts in columns.items()}
+        raise _truncation_error(element, path)
+    arrays = {name: join_parts(parts, np.float64) for name, parts in columns.items()}
     positions = np.stack([arrays[axis] for axis in "xyz"], axis=1)
     return positions, _colours(element, arrays), _is_observed(element, arrays.get(_OBSERVED))
 
 
-def _ended(element: _Element, path: Path) -> FileFormatError:
-    return damaged(path, f"it ends among its {_plural(element.name)}; {CUT_SHORT}")
+def _truncation_error(element: _Element, path: Path) -> FileFormatError:
+    return damage_error(path, f"it ends among its {_plural(element.name)}; {CUT_SHORT}")
 
 
 def _ascii_lists(words: _Words, element: _Element, list_index: int | None, path: Path) -> tuple[IndexArray, IndexArray]:
     if len(element.properties) == 1 and element.count and list_index == 0:
-        table = _alike(words, element.count, path)
+        table = _read_equal_lists(words, element.count, path)
         if table is not None:
             return table[:, 0], table[:, 1:].ravel()
     sizes, corners = array("q"), array("q")
@@ -334,13 +334,13 @@ def _ascii_lists(words: _Words, element: _Element, list_index: int | None, path:
                     sizes.append(size)
                     corners.extend(map(int, part))
     except (ValueError, OverflowError) as error:
-        raise damaged(path, f"a list has no whole number where one should be; {CUT_SHORT}") from error
+        raise damage_error(path, f"a list has no whole number where one should be; {CUT_SHORT}") from error
     except StopIteration as error:
-        raise _ended(element, path) from error
+        raise _truncation_error(element, path) from error
     return np.array(sizes, dtype=np.int64), np.array(corners, dtype=np.int64)
 
 
-def _alike(words: _Words, count: int, path: Path) -> IndexArray | None:
+def _read_equal_lists(words: _Words, count: int, path: Path) -> IndexArray | None:
     """Return (count, n + 1) the sizes and corners of lists that are all as long as the first; None if they are not."""
     start = words.mark()
     first = next(words, b"")
@@ -369,7 +369,7 @@ def _binary_lists(
     if element.count == 0:
         return none, none, offset
     if any(p.count is not None and p.count[0] == "f" for p in element.properties):
-        raise damaged(path, "a list has a length that is not a whole number, so export it again")
+        raise damage_error(path, "a list has a length that is not a whole number, so export it again")
     uniform = _uniform_lists(data, offset, element, order, list_index)
     if uniform is not None:
         return uniform
@@ -392,7 +392,7 @@ def _binary_lists(
                 sizes.append(size)
             offset += max(size, 0) * item
         if offset > len(data):
-            raise damaged(path, f"it ends among its {_plural(element.name)}; {CUT_SHORT}")
+            raise damage_error(path, f"it ends among its {_plural(element.name)}; {CUT_SHORT}")
     if list_index is None:
         return none, none, offset
     kind = np.dtype(order + element.properties[list_index].item)

@@ -39,7 +39,7 @@ class TextureError(Exception):
     """Why a picture gives no colours, as a clause."""
 
 
-class FilesBeside:
+class CompanionFiles:
     """Materials and pictures that a surface names: in its folder or below it, at most `MOST_BYTES_IN_ALL` together.
 
     Args:
@@ -124,7 +124,7 @@ class Pictures:
         picture = self._unpacked[known]
         if isinstance(picture, TextureError):
             raise picture
-        return _between(picture, uv)
+        return _interpolate(picture, uv)
 
     def _unpack(self, picture: bytes, name: str) -> ByteArray:
         try:
@@ -156,7 +156,7 @@ def _short(name: str) -> str:
     return "".join(letter if letter.isprintable() else "?" for letter in name[:80])
 
 
-def _between(pixels: ByteArray, uv: FloatArray) -> ByteArray:
+def _interpolate(pixels: ByteArray, uv: FloatArray) -> ByteArray:
     height, width = pixels.shape[:2]
     known = np.where(np.isfinite(uv), uv, 0.0)
     # 1 is the last pixel and not the first one again.

@@ -16,7 +16,7 @@ from shapespace.errors import MeshError
 from shapespace.io.parsing import (
     CUT_SHORT,
     IndexArray,
-    damaged,
+    damage_error,
     fan_triangles,
     floats,
     floats_of,
@@ -78,7 +78,7 @@ class _Scene:
 
     def open(self, kind: bytes, name: bytes = b"") -> None:
         if len(self.stack) >= _DEEPEST:
-            raise damaged(self.path, f"its nodes are nested more than {_DEEPEST} deep")
+            raise damage_error(self.path, f"its nodes are nested more than {_DEEPEST} deep")
         self.allowance.part()
         frame = self.frame
         if kind == b"Transform":
@@ -107,7 +107,7 @@ class _Scene:
             elif node.kind == b"Transform" and word in _FIELDS:
                 numbers = floats(words[index + 1 : index + 1 + _FIELDS[word]], self.path)
                 if len(numbers) < _FIELDS[word]:
-                    raise damaged(self.path, f"a Transform has a {word.decode()} of too few numbers; {CUT_SHORT}")
+                    raise damage_error(self.path, f"a Transform has a {word.decode()} of too few numbers; {CUT_SHORT}")
                 node.numbers[b"scale" if word == b"scaleFactor" else word] = numbers
 
     def use(self, name: bytes, node: _Node) -> None:
@@ -119,7 +119,7 @@ class _Scene:
                 self.last_points = self.named_points[name]
         elif name in self.named_shapes:
             printable_name = name[:60].decode("ascii", "replace")
-            raise damaged(
+            raise damage_error(
                 self.path, f"it shows the shape '{printable_name}' twice (USE), so export it again as plain triangles"
             )
 
@@ -129,7 +129,7 @@ class _Scene:
         if name == b"point" and node.kind in _POINTS:
             points = floats_of(text.replace(b",", b" "), self.path)
             if len(points) % 3:
-                raise damaged(self.path, f"its points have {len(points)} numbers, not three each; {CUT_SHORT}")
+                raise damage_error(self.path, f"its points have {len(points)} numbers, not three each; {CUT_SHORT}")
             self.blocks.append((points.reshape(-1, 3), node.frame))
             block = len(self.blocks) - 1
             if node.name:
@@ -151,7 +151,9 @@ class _Scene:
             self.move(node)
         elif node.kind in _MOVES_OF_VRML_1:
             kind = node.kind.decode()
-            raise damaged(self.path, f"it moves its shapes by '{kind}' of VRML 1, so export it again as VRML 2 or PLY")
+            raise damage_error(
+                self.path, f"it moves its shapes by '{kind}' of VRML 1, so export it again as VRML 2 or PLY"
+            )
         elif node.kind in (b"Separator", b"TransformSeparator"):
             self.last_points = node.outer_points
         holds_shapes = len(self.sets) > node.first_set or len(self.blocks) > node.first_block
@@ -161,12 +163,12 @@ class _Scene:
     def add_faces(self, node: _Node) -> None:
         block = self.last_points if node.points is None else node.points
         if block is None or node.index is None:
-            raise damaged(self.path, f"an IndexedFaceSet has no points; {CUT_SHORT}")
+            raise damage_error(self.path, f"an IndexedFaceSet has no points; {CUT_SHORT}")
         face_ends = np.flatnonzero(node.index == -1)
         counts = np.diff(face_ends, prepend=-1) - 1
         counts = counts[counts > 0]
         if len(counts) and counts.min() < 3:
-            raise damaged(self.path, f"a face has only {int(counts.min())} corners; {CUT_SHORT}")
+            raise damage_error(self.path, f"a face has only {int(counts.min())} corners; {CUT_SHORT}")
         corners = node.index[node.index >= 0]
         points = len(self.blocks[block][0])
         if len(corners) and corners.max() >= points:
@@ -187,7 +189,7 @@ class _Scene:
         if (linear == np.eye(3)).all() and not values.get(b"translation", zero).any():
             return
         if self.version_1:
-            raise damaged(
+            raise damage_error(
                 self.path, "it moves its shapes by 'Transform' of VRML 1, so export it again as VRML 2 or PLY"
             )
         self.moved = True
@@ -228,7 +230,7 @@ def _corners(text: bytes, path: Path) -> IndexArray:
         text = _HEXADECIMAL.sub(lambda match: b"%d" % int(match[0], 16), text)
     index = ints_of(text, path)
     if len(index) and index.min() < -1:
-        raise damaged(path, f"a face points at vertex {int(index.min())}; {CUT_SHORT}")
+        raise damage_error(path, f"a face points at vertex {int(index.min())}; {CUT_SHORT}")
     # The last face may do without its end.
     return np.append(index, -1) if len(index) and index[-1] != -1 else index
 
@@ -270,23 +272,25 @@ def read_vrml(data: bytes, path: Path) -> Mesh:
                 scene.numbers(kind, text[offset:close])
                 offset = close + 1
             elif close == len(text):
-                raise damaged(path, f"a list has no end; {CUT_SHORT}")
+                raise damage_error(path, f"a list has no end; {CUT_SHORT}")
             elif text[close : close + 1] == b"[" or kind in (b"point", b"coordIndex"):
-                raise damaged(path, f"a list of numbers has brackets in it; {CUT_SHORT}")
+                raise damage_error(path, f"a list of numbers has brackets in it; {CUT_SHORT}")
             else:
                 scene.open(b"[")
         else:
             scene.words(words)
             if bracket:
                 if not scene.stack or (scene.stack[-1].kind == b"[") != (bracket == b"]"):
-                    raise damaged(path, f"its brackets do not match; {CUT_SHORT}")
+                    raise damage_error(path, f"its brackets do not match; {CUT_SHORT}")
                 scene.close()
     if scene.stack:
-        raise damaged(path, f"{len(scene.stack)} of its nodes have no end; {CUT_SHORT}")
+        raise damage_error(path, f"{len(scene.stack)} of its nodes have no end; {CUT_SHORT}")
     if not sum(len(points) for points, _ in scene.blocks):
-        raise damaged(path, "it holds no points of an IndexedFaceSet, so it is not VRML or holds other shapes")
+        raise damage_error(path, "it holds no points of an IndexedFaceSet, so it is not VRML or holds other shapes")
     if scene.shared and scene.moved:
-        raise damaged(path, "shapes that are moved share their points (USE), so export it again as plain triangles")
+        raise damage_error(
+            path, "shapes that are moved share their points (USE), so export it again as plain triangles"
+        )
     return mesh_of(*scene.placed(), path)
 
 

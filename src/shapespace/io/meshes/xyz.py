@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shapespace.io.parsing import CUT_SHORT, damaged, floats, ints, joined, line_blocks, mesh_of, plain_text
+from shapespace.io.parsing import CUT_SHORT, damage_error, floats, ints, join_parts, line_blocks, mesh_of, plain_text
 from shapespace.types import FloatArray, Mesh
 
 _COMMENTS = (b"#", b"//", b"%")
@@ -28,7 +28,7 @@ def read_xyz(data: bytes, path: Path) -> Mesh:
         FileFormatError: it is binary or no table of numbers, rows differ in their columns, or points are missing.
     """
     if b"\0" in data[:65536]:
-        raise damaged(path, "it is binary; of this ending only text with rows of x y z is read")
+        raise damage_error(path, "it is binary; of this ending only text with rows of x y z is read")
     parts: list[FloatArray] = []
     width = lines_before = declared = 0
     for lines in line_blocks(plain_text(data)):
@@ -41,18 +41,18 @@ def read_xyz(data: bytes, path: Path) -> Mesh:
         if points:
             width = width or len(points[0])
             if any(len(row) != width for row in points) or width < 3:
-                raise damaged(path, f"it is no table of points with three or more columns, {width} in each row")
+                raise damage_error(path, f"it is no table of points with three or more columns, {width} in each row")
             if not all(map(_is_number, points[0])) and not lines_before:
-                raise damaged(path, "it has words beside its points (a molecule perhaps), so it is no scan")
+                raise damage_error(path, "it has words beside its points (a molecule perhaps), so it is no scan")
             coordinates = chain.from_iterable(row[:3] for row in points)
             parts.append(floats(coordinates, path).reshape(-1, 3))
             lines_before += len(points)
         declared += sum(ints(counts, path).tolist())
     if not lines_before:
-        raise damaged(path, "it has no rows of x y z")
+        raise damage_error(path, "it has no rows of x y z")
     if declared and declared != lines_before:
-        raise damaged(path, f"it declares {declared} points, but {lines_before} follow; {CUT_SHORT}")
-    return mesh_of(joined(parts, np.float64, 3), None, path)
+        raise damage_error(path, f"it declares {declared} points, but {lines_before} follow; {CUT_SHORT}")
+    return mesh_of(join_parts(parts, np.float64, 3), None, path)
 
 
 def _is_number(word: bytes) -> bool:

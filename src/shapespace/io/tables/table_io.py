@@ -58,7 +58,7 @@ def rows_text(rows: Iterable[Sequence[object]]) -> str:
     text = io.StringIO()
     write_row = _row_writer(text)
     for row in rows:
-        write_row([_written(cell) for cell in row])
+        write_row([_escape_formula(cell) for cell in row])
     return text.getvalue()
 
 
@@ -72,11 +72,11 @@ def checked_table_text(header: Sequence[str], rows: Iterable[Sequence[object]]) 
 def write_checked(stream: TextIO, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Write the same to `stream`, a row at a time."""
     checksum_column = header.index(CHECKSUM)
-    header = [str(_written(name)) for name in header]
+    header = [str(_escape_formula(name)) for name in header]
     write_row = _row_writer(stream)
     write_row(header)
     for row in rows:
-        cells = ["" if cell is None else str(_written(cell)) for cell in row]
+        cells = ["" if cell is None else str(_escape_formula(cell)) for cell in row]
         write_row([*cells[:checksum_column], row_checksum(header, cells), *cells[checksum_column + 1 :]])
 
 
@@ -93,7 +93,7 @@ def _row_writer(stream: TextIO) -> Callable[[Sequence[object]], object]:
     return write_row
 
 
-def _written(cell: object) -> object:
+def _escape_formula(cell: object) -> object:
     """Return a cell as it is written: text with an apostrophe where a spreadsheet would run it, others as they are."""
     if not isinstance(cell, str):
         return cell
@@ -101,7 +101,7 @@ def _written(cell: object) -> object:
     return f"'{text}" if _FORMULA.match(text) and not _NUMBER.fullmatch(text) else text
 
 
-def as_written(cell: str) -> str:
+def unescape_formula(cell: str) -> str:
     """Return the text of a cell without the apostrophe that the writer puts before what a spreadsheet would run."""
     return cell[1:] if cell[:1] == "'" and _FORMULA.match(cell) else cell
 
@@ -138,7 +138,7 @@ def table_rows(content: bytes) -> Iterator[list[str]]:
             raw.pop()
         if any("\0" in name for name in raw):
             raise ValueError("is not a table but binary, or UTF-16 without a byte order mark")
-        header = [as_written(name).strip() for name in raw]
+        header = [unescape_formula(name).strip() for name in raw]
         known = [name for name in header if name]
         if len(set(known)) != len(known):
             repeated = next(name for name in known if known.count(name) > 1)
@@ -155,7 +155,7 @@ def table_rows(content: bytes) -> Iterator[list[str]]:
             n_unchecked += len(raw) - len(row)
             if n_unchecked > _MOST_LACKING:
                 raise ValueError(f"has rows with far fewer cells than its {len(raw)} columns, such as row {number}")
-            yield [*map(as_written, row), *[""] * (len(raw) - len(row))]
+            yield [*map(unescape_formula, row), *[""] * (len(raw) - len(row))]
     except csv.Error as error:
         raise ValueError(f"is not a CSV table ({error})") from error
 

@@ -26,7 +26,7 @@ import numpy.typing as npt
 
 from shapespace.errors import FileError, InputError, ShapespaceError
 from shapespace.io.files import open_file, read_error
-from shapespace.io.parsing import CUT_SHORT, damaged
+from shapespace.io.parsing import CUT_SHORT, damage_error
 from shapespace.types import MAX_MEMORY_BYTES, FloatArray, LabelVolume
 
 VOLUME_ENDINGS = (".nii", ".nii.gz", ".nrrd")
@@ -74,7 +74,7 @@ _ROUNDING = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
-class _Head:
+class _VolumeHeader:
     """What a header declares.
 
     Args:
@@ -145,9 +145,9 @@ def read_volume(path: Path | str, *, max_memory_bytes: int = MAX_MEMORY_BYTES) -
     require_volumes_extra()
     name = path.name.lower()
     if name.endswith((".nhdr", ".hdr", ".img")):
-        raise damaged(path, "its header and its data are two files; save it as one, .nii.gz or .nrrd")
+        raise damage_error(path, "its header and its data are two files; save it as one, .nii.gz or .nrrd")
     if not name.endswith(VOLUME_ENDINGS):
-        raise damaged(path, f"it is not a volume by its ending; use one of {', '.join(VOLUME_ENDINGS)}")
+        raise damage_error(path, f"it is not a volume by its ending; use one of {', '.join(VOLUME_ENDINGS)}")
     with open_file(path) as file, ExitStack() as stack:
         try:
             size = os.fstat(file.fileno()).st_size
@@ -156,8 +156,8 @@ def read_volume(path: Path | str, *, max_memory_bytes: int = MAX_MEMORY_BYTES) -
             head, stream = (_open_nrrd if is_nrrd else _open_nifti)(file, size, stack, path)
         except OSError as error:
             raise read_error(path, error) from error
-        shape = _three(head, path)
-        affine = _sound(head.affine, path)
+        shape = _spatial_shape(head, path)
+        affine = _check_affine(head.affine, path)
         labels = _labels(stream, head, max_memory_bytes, path)
     return LabelVolume(labels.reshape(shape, order="F"), affine, path.name, head.notes)
 
@@ -168,10 +168,10 @@ def _check_size(size: int, path: Path) -> None:
             f"Cannot read {path}: it has {size:,} bytes, over the bound of {_MOST_BYTES:,}; crop it, as by 3D Slicer."
         )
     if not size:
-        raise damaged(path, "it is empty; export or copy it again")
+        raise damage_error(path, "it is empty; export or copy it again")
 
 
-def _open_nifti(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tuple[_Head, IO[bytes]]:
+def _open_nifti(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tuple[_VolumeHeader, IO[bytes]]:
     """Return the header of a NIfTI file, and a stream at its first voxel."""
     zipped = file.read(2) == b"\x1f\x8b"
     file.seek(0)
@@ -188,10 +188,10 @@ def _unpacking(path: Path) -> Generator[None]:
     try:
         yield
     except (OSError, EOFError, zlib.error) as error:
-        raise damaged(path, f"its compressed data end early or are wrong; {CUT_SHORT}") from error
+        raise damage_error(path, f"its compressed data end early or are wrong; {CUT_SHORT}") from error
 
 
-def _labels(stream: IO[bytes], head: _Head, max_memory_bytes: int, path: Path) -> npt.NDArray[np.integer[Any]]:
+def _labels(stream: IO[bytes], head: _VolumeHeader, max_memory_bytes: int, path: Path) -> npt.NDArray[np.integer[Any]]:
     """Return the labels as a flat array, decoded in pieces so that no more than the array is in memory at a time."""
     is_integral = head.kind.kind in "iu" and (head.slope, head.shift) == (1.0, 0.0)
     kind: np.dtype[Any] = head.kind.newbyteorder("=") if is_integral else np.dtype(np.int32)
@@ -211,10 +211,10 @@ def _labels(stream: IO[bytes], head: _Head, max_memory_bytes: int, path: Path) -
     with _unpacking(path):
         while offset < count:
             request_bytes = min(len(buffer), (count - offset) * head.kind.itemsize)
-            read = _filled(stream, buffer[:request_bytes])
+            read = _fill_buffer(stream, buffer[:request_bytes])
             if read < request_bytes:
                 available_values = offset * head.kind.itemsize + read
-                raise damaged(
+                raise damage_error(
                     path, f"it ends after {available_values:,} of {head.bytes:,} bytes of voxels; {CUT_SHORT}"
                 )
             piece: npt.NDArray[Any] = np.frombuffer(buffer[:request_bytes], dtype=head.kind)
@@ -229,7 +229,7 @@ def _labels(stream: IO[bytes], head: _Head, max_memory_bytes: int, path: Path) -
     return labels
 
 
-def _filled(stream: IO[bytes], view: memoryview) -> int:
+def _fill_buffer(stream: IO[bytes], view: memoryview) -> int:
     """Read into `view` until it is full or the stream ends, and return how many bytes were read."""
     filled = 0
     while filled < len(view) and (count := cast(Any, stream).readinto(view[filled:])):
@@ -271,15 +271,15 @@ class _Values:
             )
 
 
-def _nifti_head(start: bytes, path: Path) -> _Head:
+def _nifti_head(start: bytes, path: Path) -> _VolumeHeader:
     import nibabel
 
     size = next((n for n in _HEADS for order in ("<", ">") if start[:4] == np.array(n, order + "i4").tobytes()), 0)
     magic = start[_MAGIC_AT[size] :][:3] if size else b""
     if magic in _PAIR:
-        raise damaged(path, "its header and its data are two files; save it as one, .nii.gz")
+        raise damage_error(path, "its header and its data are two files; save it as one, .nii.gz")
     if magic not in _SINGLE or len(start) < size:
-        raise damaged(path, "its header is not that of a NIfTI volume; export it again as .nii.gz")
+        raise damage_error(path, "its header is not that of a NIfTI volume; export it again as .nii.gz")
     try:
         header: Any = getattr(nibabel, _HEADS[size]).from_fileobj(io.BytesIO(start[:size]), check=False)
         slope, shift = header.get_slope_inter()
@@ -289,13 +289,13 @@ def _nifti_head(start: bytes, path: Path) -> _Head:
         unit = str(header.get_xyzt_units()[0])
     except Exception as error:
         # What nibabel raises of a header that was tampered with is of any kind.
-        raise damaged(path, f"its header is damaged ({_brief(error)}), so export it again") from error
+        raise damage_error(path, f"its header is damaged ({_first_words(error)}), so export it again") from error
     if unit not in _NIFTI_MM:
-        raise damaged(path, f"its header gives lengths in '{unit}', so export it again in mm")
+        raise damage_error(path, f"its header gives lengths in '{unit}', so export it again in mm")
     if offset < size:
-        raise damaged(path, f"its header says that the voxels begin within the header; {CUT_SHORT}")
+        raise damage_error(path, f"its header says that the voxels begin within the header; {CUT_SHORT}")
     slope, shift = (1.0, 0.0) if slope is None else (float(slope), float(shift or 0.0))
-    return _Head(shape, kind, offset, _in_mm(affine, _NIFTI_MM[unit]), slope, shift, notes)
+    return _VolumeHeader(shape, kind, offset, _in_mm(affine, _NIFTI_MM[unit]), slope, shift, notes)
 
 
 def _nifti_affine(header: Any) -> tuple[FloatArray, tuple[str, ...]]:
@@ -324,26 +324,26 @@ def _quiet_qform(header: Any) -> tuple[Any, int]:
         return None, 0
 
 
-def _open_nrrd(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tuple[_Head, IO[bytes]]:
+def _open_nrrd(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tuple[_VolumeHeader, IO[bytes]]:
     """Return the header of a NRRD file, and a stream at its first voxel."""
     import nrrd
 
     data = file.read(_MOST_HEADER)
     if data[:4] != b"NRRD":
-        raise damaged(path, "its header is not that of a NRRD volume; export it again as .nrrd")
+        raise damage_error(path, "its header is not that of a NRRD volume; export it again as .nrrd")
     header_ends = [(position, len(blank)) for blank in (b"\n\n", b"\r\n\r\n") if (position := data.find(blank)) >= 0]
     if not header_ends:
-        raise damaged(path, f"its header has no end; {CUT_SHORT}")
+        raise damage_error(path, f"its header has no end; {CUT_SHORT}")
     start = sum(min(header_ends))
     try:
         fields: dict[str, Any] = dict(nrrd.read_header(io.BytesIO(data[:start])))
     except Exception as error:
         # What pynrrd raises of a header that was tampered with is of any kind.
-        raise damaged(path, f"its header is damaged ({_brief(error)}), so export it again") from error
+        raise damage_error(path, f"its header is damaged ({_first_words(error)}), so export it again") from error
     if "data file" in fields or "datafile" in fields:
-        raise damaged(path, "its data are in another file; save it with header and data in one")
+        raise damage_error(path, "its data are in another file; save it with header and data in one")
     if any(fields.get(key) for key in ("line skip", "lineskip", "byte skip", "byteskip")):
-        raise damaged(path, "its header skips a part of the data, which is not read; save it again")
+        raise damage_error(path, "its header skips a part of the data, which is not read; save it again")
     head = _nrrd_head(fields, path)
     encoding = str(fields.get("encoding", "")).lower()
     file.seek(start)
@@ -356,19 +356,19 @@ def _open_nrrd(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tuple
     if encoding in ("bzip2", "bz2"):
         _check_declared(head, _BZIP2_SPARE + _BZIP2_GROWTH * (size - start), path)
         return head, stack.enter_context(bz2.BZ2File(file))
-    raise damaged(path, f"its encoding is '{encoding}', but only raw, gzip and bzip2 are read; save it again")
+    raise damage_error(path, f"its encoding is '{encoding}', but only raw, gzip and bzip2 are read; save it again")
 
 
-def _nrrd_head(fields: dict[str, Any], path: Path) -> _Head:
+def _nrrd_head(fields: dict[str, Any], path: Path) -> _VolumeHeader:
     kinds = {name: code for code, names in _NRRD_TYPES.items() for name in names}
     code = kinds.get(str(fields.get("type", "")).lower())
     if code is None:
-        raise damaged(
+        raise damage_error(
             path, f"its voxels are of the type '{fields.get('type')}', which holds no labels; export it again"
         )
     order = str(fields.get("endian", "little")).lower()
     if order not in ("little", "big"):
-        raise damaged(path, f"its header says endian '{order[:40]}', so export it again")
+        raise damage_error(path, f"its header says endian '{order[:40]}', so export it again")
     try:
         shape = tuple(int(n) for n in fields["sizes"])
         if len(shape) != int(fields["dimension"]):
@@ -377,9 +377,9 @@ def _nrrd_head(fields: dict[str, Any], path: Path) -> _Head:
     except InputError:
         raise
     except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
-        raise damaged(path, f"its header is damaged ({_brief(error)}), so export it again") from error
+        raise damage_error(path, f"its header is damaged ({_first_words(error)}), so export it again") from error
     kind = np.dtype(code).newbyteorder("<" if order == "little" else ">")
-    return _Head(shape, kind, 0, affine, notes=notes, axes=axes)
+    return _VolumeHeader(shape, kind, 0, affine, notes=notes, axes=axes)
 
 
 def _nrrd_affine(fields: dict[str, Any], path: Path) -> tuple[FloatArray, tuple[str, ...], tuple[int, ...]]:
@@ -417,24 +417,24 @@ def _in_mm(affine: FloatArray, mm: float) -> FloatArray:
     return _affine(affine[:3, :3] * mm, affine[:3, 3] * mm)
 
 
-def _check_declared(head: _Head, most_bytes: int, path: Path) -> None:
+def _check_declared(head: _VolumeHeader, most_bytes: int, path: Path) -> None:
     """Refuse a header that declares no voxels of labels, or more than `most_bytes`, to which its file can unpack."""
     size = " x ".join(map(str, head.shape)) or "no"
     if head.kind.kind not in "iuf":
         raise InputError(f"{path} has voxels of colours or complex numbers, not of labels; save the label map alone.")
     if not head.shape or min(head.shape) < 1:
-        raise damaged(path, f"its header declares {size} voxels, so that there are none; export it again")
+        raise damage_error(path, f"its header declares {size} voxels, so that there are none; export it again")
     if head.bytes > _MOST_BYTES:
-        raise damaged(
+        raise damage_error(
             path,
             f"its header declares {size} voxels, {head.bytes:,} bytes, over the bound of {_MOST_BYTES:,}; crop it, as "
             "by 3D Slicer",
         )
     if head.start + head.bytes > _MOST_BYTES + _MOST_HEADER or head.start + head.bytes > most_bytes:
-        raise damaged(path, f"its header declares {size} voxels, more than the file can hold; {CUT_SHORT}")
+        raise damage_error(path, f"its header declares {size} voxels, more than the file can hold; {CUT_SHORT}")
 
 
-def _three(head: _Head, path: Path) -> tuple[int, ...]:
+def _spatial_shape(head: _VolumeHeader, path: Path) -> tuple[int, ...]:
     """Return the lengths of the three axes of space; all others must have the length 1."""
     size = " x ".join(map(str, head.shape))
     if len(head.shape) < 3 or len(head.axes) != 3:
@@ -444,7 +444,7 @@ def _three(head: _Head, path: Path) -> tuple[int, ...]:
     return tuple(head.shape[axis] for axis in head.axes)
 
 
-def _sound(affine: FloatArray, path: Path) -> FloatArray:
+def _check_affine(affine: FloatArray, path: Path) -> FloatArray:
     steps = affine[:3, :3]
     wrong = ""
     if not np.isfinite(affine).all():
@@ -461,5 +461,5 @@ def _sound(affine: FloatArray, path: Path) -> FloatArray:
     return affine
 
 
-def _brief(error: Exception) -> str:
+def _first_words(error: Exception) -> str:
     return " ".join(str(error).rstrip(".").split())[:80] or type(error).__name__

@@ -29,7 +29,7 @@ from shapespace.report.figures.draw import (
 from shapespace.report.inputs.correspondence_folder import upright
 from shapespace.report.inputs.staged_fit import nice_ceiling
 from shapespace.report.render.palette import CATEGORIES, DIVERGING, SEQUENTIAL
-from shapespace.report.render.renderer import Camera, Image, Layer, covered, render
+from shapespace.report.render.renderer import Camera, Image, Layer, render, visible_triangles
 from shapespace.types import BoolArray, FloatArray, Mesh
 
 _CLOSED = (("front", 0.0), ("one side", 90.0), ("back", 180.0), ("other side", 270.0))
@@ -41,7 +41,7 @@ _MOST_SERIES = 12
 _MOST_BINS = 2000
 
 
-def looked_at(mesh: Mesh) -> tuple[FloatArray, Sequence[tuple[str, float]]]:
+def upright_views(mesh: Mesh) -> tuple[FloatArray, Sequence[tuple[str, float]]]:
     """Return the rotation (3, 3) that brings `mesh` to how it is looked at, and names of views with their yaw, degrees.
 
     It stays as it stands where that is upright with its front along +z, as faces are; otherwise its principal axes
@@ -111,7 +111,7 @@ def surface_map_figure(
     if limit is not None and not 0 < limit < np.inf:
         raise InputError(f"The colours of a map cannot end at {limit}.")
     end = nice_ceiling(float(np.quantile(magnitudes, 0.98)) or float(magnitudes.max())) if limit is None else limit
-    turn, sides = looked_at(mesh)
+    turn, sides = upright_views(mesh)
     turned_mesh = mesh.with_vertices(mesh.vertices @ turn.T)
     scalars = np.clip(values, -4 * end, 4 * end)
     low, colours = (-end, DIVERGING) if signed else (0.0, SEQUENTIAL)
@@ -122,7 +122,7 @@ def surface_map_figure(
     for camera in cameras:
         image = render(full, camera=camera, size=size)
         if mask is not None and not mask.all():
-            image = _mixed(image, render(faint, camera=camera, size=size), _inside(turned_mesh, mask, camera, size))
+            image = _blend(image, render(faint, camera=camera, size=size), _inside(turned_mesh, mask, camera, size))
         panels.append(image)
     extend_words = {(True, True): "both", (True, False): "low", (False, True): "high"}
     extend = extend_words.get((bool(values[known].min() < low), bool(values[known].max() > end)), "neither")
@@ -143,12 +143,12 @@ def _inside(mesh: Mesh, mask: BoolArray, camera: Camera, size: tuple[int, int]) 
         lit = Layer(mesh, scalars=mask.astype(float), colormap=np.eye(3)[[0, 1]], categories=True)
         image = render(lit, camera=camera, size=size).astype(float)
         return image[:, :, 1] / np.maximum(image[:, :, 0] + image[:, :, 1], 1.0)
-    triangle, _ = covered(mesh, camera=camera, size=(2 * width, 2 * height))
+    triangle, _ = visible_triangles(mesh, camera=camera, size=(2 * width, 2 * height))
     inside = np.append(mask[mesh.faces].sum(axis=1) >= 2, [True])[triangle]
     return inside.reshape(height, 2, width, 2).mean(axis=(1, 3))
 
 
-def _mixed(first: Image, second: Image, share: FloatArray) -> Image:
+def _blend(first: Image, second: Image, share: FloatArray) -> Image:
     return np.rint(second + (first.astype(float) - second) * share[:, :, None]).astype(np.uint8)
 
 
@@ -164,7 +164,7 @@ def morph_figure(low: Mesh, high: Mesh, labels: tuple[str, str], *, title: str |
     Raises:
         InputError: no extent, or one beyond all measure.
     """
-    turn, sides = looked_at(low)
+    turn, sides = upright_views(low)
     end_meshes = [mesh.with_vertices(mesh.vertices @ turn.T) for mesh in (low, high)]
     # Half from the side, where a change of depth is seen too.
     yaws = [0.0, 40.0 if sides is _OPEN else 90.0]

@@ -71,7 +71,7 @@ def scatter_matrix(points: Sequence[Coefficients], modes: int = 4, *, title: str
     Raises:
         InputError: no scans, or scans with different numbers of coefficients.
     """
-    b = _stacked(points)
+    b = _stack_coefficients(points)
     n_shown = min(modes, b.shape[1])
     heading = title or f"The first {counted(n_shown, 'coefficient')} of {counted(len(points), 'scan')}, in mm"
     if n_shown == 1:
@@ -136,7 +136,7 @@ def b_plane(
     Raises:
         InputError: no scans, or fewer than two coefficients.
     """
-    b = _stacked(scans)
+    b = _stack_coefficients(scans)
     if b.shape[1] < 2:
         raise InputError("b1 against b2 needs two coefficients a scan, but there is only one.")
     figure, axes = chart(title or "Each expression runs along its own line: b1 and b2", height=4.4)
@@ -176,7 +176,7 @@ def b_space(
     Raises:
         InputError: no scans, or fewer than three coefficients.
     """
-    b = _stacked(scans)
+    b = _stack_coefficients(scans)
     if b.shape[1] < 3:
         raise InputError(f"b1, b2 and b3 need three coefficients a scan, but there are only {b.shape[1]}.")
     coefficients = np.stack([scan.b[:3] for scan in (*scans, *([neutral] if neutral else []))])
@@ -263,7 +263,7 @@ def _legend_columns(names: Sequence[str]) -> int:
     return 1
 
 
-def _stacked(scans: Sequence[Coefficients]) -> FloatArray:
+def _stack_coefficients(scans: Sequence[Coefficients]) -> FloatArray:
     """Return the coefficients of all scans, (n, K) mm."""
     if not scans:
         raise InputError("There is nothing to draw of coefficients without scans.")

@@ -57,12 +57,12 @@ def checkerboard_figure(
         render(checker_layer(mean.with_vertices(vertices), places), camera=mean_view.camera, size=mean_view.size)
         for vertices in (mean.vertices, *surfaces)
     ]
-    names = ["mean shape", *_told_apart(labels)]
+    names = ["mean shape", *_distinct_labels(labels)]
     rows = [Row(i, t) for i, t in zip(in_rows(images, columns), in_rows(names, columns), strict=True)]
     return grid(rows, title=title or "The same squares on every scan")
 
 
-def _told_apart(labels: Sequence[str]) -> list[str]:
+def _distinct_labels(labels: Sequence[str]) -> list[str]:
     """Return labels that fit above a panel; where cutting makes two of them equal, what they begin with alike goes."""
     cut = [short(label, _LONGEST) for label in labels]
     if len(set(cut)) == len(cut):

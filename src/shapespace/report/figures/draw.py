@@ -63,7 +63,7 @@ _STEPS, _MOST_NUMBERS = (1, 5, 10, 20, 50, 100, 200, 500), 22
 _Item = TypeVar("_Item")
 
 
-class ShownFigure(Figure):
+class DisplayedFigure(Figure):
     """A figure that is displayed once as the value of a notebook's cell, also without pyplot."""
 
     def _repr_png_(self) -> bytes:
@@ -202,20 +202,20 @@ def grid(
     if note:
         y += 4 + write(_EDGE, note, total_w - 2 * _EDGE, SMALL, color=GREY)
     total_h = int(np.ceil(y + 6))
-    figure = _drawn(pictures, texts, total_w, total_h)
+    figure = _compose(pictures, texts, total_w, total_h)
     if scale is not None:
         _colour_bar(figure, scale, bar_at, total_w, total_h)
     return figure
 
 
-def _drawn(
+def _compose(
     pictures: Sequence[tuple[int, float, Image]],
     texts: Sequence[tuple[float, float, str, dict[str, Any]]],
     total_w: int,
     total_h: int,
 ) -> Figure:
     """Return a figure of this size in pixels with pictures and lines of text at their places, from the upper left."""
-    figure = ShownFigure(figsize=(total_w / DPI, total_h / DPI), dpi=DPI, facecolor="white")
+    figure = DisplayedFigure(figsize=(total_w / DPI, total_h / DPI), dpi=DPI, facecolor="white")
     for x, top, image in pictures:
         high, wide = image.shape[:2]
         axes = figure.add_axes((x / total_w, 1 - (round(top) + high) / total_h, wide / total_w, high / total_h))
@@ -288,7 +288,7 @@ def charts(title: str, heights: Sequence[float], *, note: str = "", columns: int
     top = (height_of(wrapped, TITLE) + 14) / DPI
     bottom = (height_of(note_lines, SMALL) + 12) / DPI if note_lines else 0.03
     total = sum(heights) + top + bottom
-    figure = ShownFigure(figsize=(WIDTH / DPI, total), dpi=DPI, facecolor="white")
+    figure = DisplayedFigure(figsize=(WIDTH / DPI, total), dpi=DPI, facecolor="white")
     places = figure.add_gridspec(len(heights), columns, height_ratios=list(heights))
     axes = [figure.add_subplot(places[r, c]) for r in range(len(heights)) for c in range(columns)]
     start = total * DPI - height_of(note_lines, SMALL) - 2

@@ -69,7 +69,7 @@ def error_curves(fits: Sequence[StagedFit], *, stage: str = "final", title: str 
     fits = [fit for fit, values in zip(fits, sorted_distances, strict=True) if len(values)]
     sorted_distances = [values for values in sorted_distances if len(values)]
     if not sorted_distances:
-        return _nothing_shown(title)
+        return _empty_figure(title)
     pooled = np.sort(np.concatenate(sorted_distances))
     figure, axes = chart(
         title or f"How close the model comes to the scan, over {counted(len(fits), 'fit')}", height=3.5
@@ -97,7 +97,7 @@ def error_curves(fits: Sequence[StagedFit], *, stage: str = "final", title: str 
     return finish(figure)
 
 
-def _nothing_shown(title: str) -> Figure:
+def _empty_figure(title: str) -> Figure:
     figure, axes = chart(title or "How close the model comes to the scan", height=1.2)
     axes.text(
         0.5, 0.5, "No vertex of a model is shown by its scan.", transform=axes.transAxes, ha="center", va="center",
@@ -178,7 +178,7 @@ def aligned_grid(
     """Draw scan and fitted model over each other for many fits, in the order given."""
     images = _equal_views(fits, columns, lambda fit: [scan_over(fit.scan), Layer(fit.surfaces["final"], MODEL_COLOUR)])
     return grid(
-        _captioned(images, fits, columns),
+        _caption_rows(images, fits, columns),
         title=title,
         keys=[("scan", SCAN_COLOUR), ("model", MODEL_COLOUR)],
         note=mean_words(fits),
@@ -201,7 +201,7 @@ def distance_maps(
         ],
     )
     return grid(
-        _captioned(images, fits, columns),
+        _caption_rows(images, fits, columns),
         title=title,
         scale=_unsigned(fits, top),
         keys=_grey(fits),
@@ -237,7 +237,7 @@ def _equal_views(fits: Sequence[StagedFit], columns: int, layers: Callable[[Stag
     ]
 
 
-def _captioned(images: Sequence[Image], fits: Sequence[StagedFit], columns: int) -> list[Row]:
+def _caption_rows(images: Sequence[Image], fits: Sequence[StagedFit], columns: int) -> list[Row]:
     columns = min(columns, max(len(fits), 3))
     names = [f"{short(f.label, 30)}\n{mm(mean_mm(f))}" for f in fits]
     return [Row(i, t) for i, t in zip(in_rows(images, columns), in_rows(names, columns), strict=True)]

@@ -132,12 +132,12 @@ def modes_figure(model: ShapeModel, modes: int = 5, deviations: float = 3.0, *, 
     of_each = f"{deviations:g} standard deviation{'s' * (deviations != 1)}"
     return grid(
         rows,
-        title=title or f"What {_which(n_shown, model.n_modes)} to the mean",
+        title=title or f"What {_name_modes(n_shown, model.n_modes)} to the mean",
         scale=Scale(f"how far a point moves at {of_each} (mm)", SEQUENTIAL, 0.0, top),
     )
 
 
-def _which(n_shown: int, count: int) -> str:
+def _name_modes(n_shown: int, count: int) -> str:
     if count == 1:
         return "the one mode does"
     if n_shown == count:

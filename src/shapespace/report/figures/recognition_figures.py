@@ -452,7 +452,7 @@ def curve_figure(
     )
     for k, curve in enumerate(parsed):
         x_values, height, *band_limits = (
-            _placed(values, scales[axis], limits[axis])
+            _to_scale(values, scales[axis], limits[axis])
             for axis, values in ((0, curve.at), (1, curve.height), *((1, end) for end in curve.ends))
         )
         colour, label = CATEGORIES[k % len(CATEGORIES)], escaped(short(curve.name, 34)) or None
@@ -510,7 +510,7 @@ def _scale_ends(kind: CurveScale, values: Sequence[FloatArray]) -> tuple[float, 
     return (max(low, _LEAST_SHARE), min(max(high, low), 1 - _LEAST_SHARE)) if kind == "probit" else (low, high)
 
 
-def _placed(values: FloatArray, kind: CurveScale, limits: tuple[float, float]) -> FloatArray:
+def _to_scale(values: FloatArray, kind: CurveScale, limits: tuple[float, float]) -> FloatArray:
     """Return numbers as they are drawn: normal deviates on `probit`, nothing for what has no place on `log`."""
     if kind == "probit":
         from scipy.special import ndtri

@@ -35,7 +35,7 @@ _OPEN_SHARE = 0.15
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class PlacedSurface:
     """One surface as pictures need it.
 
     Args:
@@ -49,7 +49,7 @@ class Placed:
     @property
     def seen(self) -> BoolArray:
         """(V,) which vertices the scan shows."""
-        return there_are(self.vertices)
+        return observed_mask(self.vertices)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,13 +136,13 @@ class Corresponded:
             raise FileFormatError(
                 f"{name}{CorrespondRecord.SURFACE} is not on the template of this folder; {CORRESPOND_AGAIN}."
             )
-        if there_are(mesh.vertices).sum() < _FEWEST_VERTICES:
+        if observed_mask(mesh.vertices).sum() < _FEWEST_VERTICES:
             raise FileFormatError(
                 f"{name}{CorrespondRecord.SURFACE} has hardly a vertex that is not missing; {CORRESPOND_AGAIN}."
             )
         return mesh
 
-    def placed(self, name: str) -> Placed:
+    def placed(self, name: str) -> PlacedSurface:
         """Return the surface of the scan `name` moved onto the mean shape.
 
         Raises:
@@ -150,14 +150,14 @@ class Corresponded:
             FileFormatError: it is damaged, or not on the template of this folder.
         """
         vertices = self.surface(name).vertices
-        is_observed = there_are(vertices)
+        is_observed = observed_mask(vertices)
         try:
             T = fit_similarity(self.mean.vertices[is_observed], vertices[is_observed])
         except ShapespaceError as error:
             raise FileFormatError(
                 f"{name}{CorrespondRecord.SURFACE} cannot be laid onto the mean shape; {CORRESPOND_AGAIN}."
             ) from error
-        return Placed(np.where(is_observed[:, None], T.inverse().apply(vertices), np.nan), T)
+        return PlacedSurface(np.where(is_observed[:, None], T.inverse().apply(vertices), np.nan), T)
 
     def raw_scan(self, record: CorrespondRecord) -> Mesh:
         """Return the scan of a record, if it is still where it was, with the content it had.
@@ -240,14 +240,14 @@ class Corresponded:
         return structs.replace(record, reason=without_folders(record.reason))
 
 
-def there_are(vertices: FloatArray) -> BoolArray:
+def observed_mask(vertices: FloatArray) -> BoolArray:
     """Return (V,) which of `vertices` (V, 3) are not missing."""
     return np.isfinite(vertices.sum(axis=1))
 
 
 def drawable(mesh: Mesh, values: FloatArray | None = None) -> tuple[Mesh, FloatArray | None]:
     """Return `mesh` without its missing vertices, and `values` (V,) of those that are left."""
-    is_observed = there_are(mesh.vertices)
+    is_observed = observed_mask(mesh.vertices)
     if is_observed.all():
         return mesh, values
     vertices, faces = without_vertices(mesh.vertices, faces_of(mesh), is_observed)

@@ -39,7 +39,7 @@ def find_labels(folder: Folder, fits: Sequence[SavedFit], labels_path: Path | No
     return labels, f"Labels are from {listed(used_names)}, beside the scans." if used_names else ""
 
 
-def labelled(fit: SavedFit, labels: Mapping[str, Label]) -> SavedFit:
+def with_label(fit: SavedFit, labels: Mapping[str, Label]) -> SavedFit:
     """Return `fit` with its label, found by the scan's file name or the name of the fit; as it is without one."""
     scan = fit.record.scan.name
     label = labels.get(stem_of(scan) if scan else fit.name) or labels.get(fit.name)

@@ -43,7 +43,7 @@ _MOST_REASONS = 5000
 
 
 @dataclass(frozen=True, eq=False)
-class Listed:
+class ListedColumn:
     """A column of the list that the scans came from.
 
     Args:
@@ -215,11 +215,11 @@ class Population:
         order = np.argsort(np.where(np.isfinite(error), -error, 0.0), kind="stable")
         return [self.names[k] for k in rows[order[:max_count]]]
 
-    def compared(self, column: Listed) -> list[Group]:
+    def compared(self, column: ListedColumn) -> list[Group]:
         """Return how the fits of each level, or stretch, of a column differ from all."""
         return list(self._compared(column))
 
-    def _compared(self, column: Listed) -> Iterator[Group]:
+    def _compared(self, column: ListedColumn) -> Iterator[Group]:
         trusted, errors = self.trusted, self.measures["expected_error_mm"]
         known = errors[trusted & np.isfinite(errors)]
         middle = float(np.median(known)) if len(known) else np.nan
@@ -262,7 +262,7 @@ class Population:
                 plain = "another reason"
             self.n_reasons[status, plain] += 1
 
-    def _column(self, name: str, texts: Sequence[str], codes: npt.NDArray[np.int32]) -> Listed | None:
+    def _column(self, name: str, texts: Sequence[str], codes: npt.NDArray[np.int32]) -> ListedColumn | None:
         """Return a column as times, numbers or levels; None of one whose values all differ, such as identifiers."""
         if not (codes >= 0).any():
             return None
@@ -270,7 +270,7 @@ class Population:
             values = np.array([parse(text) for text in texts])
             if np.isfinite(values).mean() > 0.95 and len(np.unique(values)) > _FEWEST_NUMBERS:
                 values_by_row = np.where(codes >= 0, values[codes], np.nan)
-                return Listed(name, "number" if kind == "number" else "time", values_by_row, codes)
+                return ListedColumn(name, "number" if kind == "number" else "time", values_by_row, codes)
         if not 1 < len(texts) <= min(_MOST_VALUES, len(codes) // 2):
             if len(texts) > 1:
                 self.left_out.append(name)
@@ -278,10 +278,10 @@ class Population:
         order = sorted(range(len(texts)), key=lambda k: texts[k])
         rank = np.argsort(np.array(order))
         own_codes = np.where(codes >= 0, rank[codes], -1).astype(np.int32)
-        return Listed(name, "level", np.zeros(0), own_codes, tuple(texts[k] for k in order))
+        return ListedColumn(name, "level", np.zeros(0), own_codes, tuple(texts[k] for k in order))
 
 
-def neediest(results: Results, max_count: int) -> list[str]:
+def most_concerning(results: Results, max_count: int) -> list[str]:
     """Return the names of the fits that need a look most: by status, then by the error expected or seen."""
     ranked: list[tuple[int, float, str]] = []
     columns = ("scan", "status", "expected_error_mm", "scan_to_model_mean_mm")

@@ -32,7 +32,7 @@ _MOST_NOTES = 6
 _MOST_COLUMNS = 8
 
 
-class Answered(Protocol):
+class AnsweredResult(Protocol):
     """The result of an analysis."""
 
     def answer(self) -> Answer:
@@ -40,7 +40,7 @@ class Answered(Protocol):
         ...
 
 
-def html_of_analysis(result: Answered) -> str:
+def html_of_analysis(result: AnsweredResult) -> str:
     """Return the notebook view of an analysis: its summary and its first tables."""
     try:
         analysis_answer = result.answer()
@@ -53,7 +53,7 @@ def html_of_analysis(result: Answered) -> str:
     blocks: list[Block] = []
     for part in tables[:MOST_TABLES]:
         for block in parts.blocks(part, part.title or TITLES["table"]):
-            blocks += _shortened(block) if isinstance(block, Table) else [block]
+            blocks += _shorten(block) if isinstance(block, Table) else [block]
     blocks.append(
         Notes([*analysis_answer.notes[:_MOST_NOTES], "result.answer().save(folder) keeps tables, maps and report."])
     )
@@ -178,7 +178,7 @@ def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], caption: str, to
     return blocks if total <= len(rows) else [*blocks, Text(f"{total - len(rows):,} more are left out.")]
 
 
-def _shortened(table: Table) -> list[Block]:
+def _shorten(table: Table) -> list[Block]:
     """Return a table with at most `MOST_ROWS` rows, and how many there are beyond them."""
     short_table = Table(table.columns, table.rows[:MOST_ROWS], table.caption)
     left = len(table.rows) - MOST_ROWS

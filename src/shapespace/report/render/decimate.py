@@ -14,7 +14,7 @@ from shapespace.types import IntArray, Mesh
 _MOST_COLLAPSED = 150_000
 
 
-def thinned(scan: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
+def decimate(scan: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
     """Return `scan` with at most `largest` triangles (points, where it has none), and which vertices are left.
 
     No new point is made, so what was measured at a vertex stays true of it. Of surfaces, the shortest edges are

@@ -90,7 +90,7 @@ def nearest_triangles(
 
 
 @compiled
-def interpolated(
+def interpolate(
     pixel: npt.NDArray[np.int64],
     triangle_index: npt.NDArray[np.int32],
     screen: FloatArray,
@@ -199,7 +199,7 @@ def nearest_balls(
 
 
 @compiled
-def lit(
+def shade_pixels(
     normal: npt.NDArray[np.float32],
     scalar: npt.NDArray[np.float32],
     table: npt.NDArray[np.float32],
@@ -257,7 +257,7 @@ def lit(
 
 
 @compiled
-def put_nearer(
+def merge_nearer(
     pixel: npt.NDArray[np.int64],
     colours: npt.NDArray[np.float32],
     depth: npt.NDArray[np.float32],
@@ -274,7 +274,7 @@ def put_nearer(
 
 
 @compiled
-def averaged(
+def average_pixels(
     samples: npt.NDArray[np.float32], supersample: int, srgb: npt.NDArray[np.uint8], out: npt.NDArray[np.uint8]
 ) -> None:
     """Fill in the mean of the samples of each pixel, as sRGB.

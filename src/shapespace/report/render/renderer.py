@@ -18,7 +18,14 @@ from scipy.spatial import cKDTree
 from shapespace.errors import InputError
 from shapespace.geometry.normals import vertex_normals
 from shapespace.report.render.palette import CLAY, DIVERGING, SEQUENTIAL, UNKNOWN_COLOUR, Colour
-from shapespace.report.render.raster import averaged, interpolated, lit, nearest_balls, nearest_triangles, put_nearer
+from shapespace.report.render.raster import (
+    average_pixels,
+    interpolate,
+    merge_nearer,
+    nearest_balls,
+    nearest_triangles,
+    shade_pixels,
+)
 from shapespace.types import FloatArray, IntArray, Mesh, read_only
 
 Image: TypeAlias = npt.NDArray[np.uint8]
@@ -235,13 +242,13 @@ def _composed(pieces: Sequence[tuple[_Single, _Surfels]], size: tuple[int, int],
     count = width * height * supersample**2
     out, nearest = np.ones((count, 3), dtype=np.float32), np.full(count, np.inf, dtype=np.float32)
     for colours, surfels in pieces:
-        put_nearer(surfels.pixel, colours, surfels.depth_mm, out, nearest)
+        merge_nearer(surfels.pixel, colours, surfels.depth_mm, out, nearest)
     image = np.empty((height, width, 3), dtype=np.uint8)
-    averaged(out.reshape(height * supersample, width * supersample, 3), supersample, _SRGB, image)
+    average_pixels(out.reshape(height * supersample, width * supersample, 3), supersample, _SRGB, image)
     return image
 
 
-def covered(mesh: Mesh, *, camera: Camera, size: tuple[int, int]) -> tuple[IntArray, FloatArray]:
+def visible_triangles(mesh: Mesh, *, camera: Camera, size: tuple[int, int]) -> tuple[IntArray, FloatArray]:
     """Return which triangle each pixel shows, and how deep.
 
     Args:
@@ -313,13 +320,13 @@ def _surfels(layer: Layer, camera: Camera, size: tuple[int, int], supersample: i
     scalar = np.empty(len(pixel) if len(scalars) else 0, dtype=np.float32)
     nearness = np.ones(len(vertices)) if camera.distance_mm is None else -depth
     normals = vertex_normals(layer.mesh) @ _view_axes(camera.yaw_deg, camera.pitch_deg).T
-    interpolated(
+    interpolate(
         pixel, triangle[pixel], screen, nearness, faces, normals, scalars, layer.categories, size[0],
         normal, scalar, is_back,
     )  # fmt: skip
     if layer.across is not None:
         scratch = np.empty_like(scalar)
-        interpolated(
+        interpolate(
             pixel,
             triangle[pixel],
             screen,
@@ -438,7 +445,7 @@ def _shaded(layer: Layer, surfels: _Surfels) -> _Single:
     """Return linear colours (n, 3)."""
     out = np.empty((len(surfels.pixel), 3), dtype=np.float32)
     table = _linear(layer.colour if layer.scalars is None or layer.colormap is None else layer.colormap)
-    lit(
+    shade_pixels(
         surfels.normal, surfels.scalar, table, _linear(UNKNOWN_COLOUR)[0], float(layer.vmin), float(layer.vmax),
         layer.scalars is not None and layer.across is None, _LIGHTS, surfels.occlusion, surfels.back, out,
     )  # fmt: skip

@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from shapespace.errors import InputError
 from shapespace.report.inputs.staged_fit import StagedFit, measured_mm
-from shapespace.report.render.decimate import thinned
+from shapespace.report.render.decimate import decimate
 from shapespace.schemas import FitRecord, to_json
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 
@@ -58,7 +58,7 @@ class Steps:
     follows: str | None = None
 
 
-def quantised(values: npt.ArrayLike, *, step: float = 0.0, by_row: bool = False, coded: bool = False) -> Steps:
+def quantise(values: npt.ArrayLike, *, step: float = 0.0, by_row: bool = False, coded: bool = False) -> Steps:
     """Return `values` as int16 steps; the error is at most half a step.
 
     Args:
@@ -151,10 +151,8 @@ def pack_model(model: ShapeModel, modes: int | None = None, *, small: bool = Fal
         mode_shapes[k] = model.reconstruct(unit) - model.mean_vertices
         unit[k] = 0.0
     arrays: dict[str, npt.NDArray[Any] | Steps] = {
-        "mean": quantised(model.mean_vertices[order], step=_PLACE_STEP_MM, coded=True)
-        if small
-        else model.mean_vertices,
-        "modes": quantised(mode_shapes[:, order], step=_MODE_STEP_MM if small else 0.0, by_row=True, coded=small),
+        "mean": quantise(model.mean_vertices[order], step=_PLACE_STEP_MM, coded=True) if small else model.mean_vertices,
+        "modes": quantise(mode_shapes[:, order], step=_MODE_STEP_MM if small else 0.0, by_row=True, coded=small),
         "stddev": model.stddev[:K],
         "share": model.stddev[:K] ** 2 / model.total_variance,
     }
@@ -191,11 +189,11 @@ def pack_morph(low: Mesh, high: Mesh, labels: tuple[str, str], *, largest: int =
         largest: how many triangles (or points) are kept.
     """
     middle, half = (low.vertices + high.vertices) / 2, (high.vertices - low.vertices) / 2
-    mesh, source_rows = _small(low.with_vertices(middle), largest)
+    mesh, source_rows = _decimate(low.with_vertices(middle), largest)
     extent = float(np.ptp(middle, axis=0).max())
     arrays: dict[str, npt.NDArray[Any] | Steps] = {
-        "mean": quantised(mesh.vertices, step=min(_PLACE_STEP_MM, extent / 4000), coded=True),
-        "modes": quantised(half[None, source_rows], step=min(_MODE_STEP_MM, extent / 8000), by_row=True, coded=True),
+        "mean": quantise(mesh.vertices, step=min(_PLACE_STEP_MM, extent / 4000), coded=True),
+        "modes": quantise(half[None, source_rows], step=min(_MODE_STEP_MM, extent / 8000), by_row=True, coded=True),
     }
     if mesh.faces is not None:
         arrays["faces"] = _indices(mesh.faces, len(mesh.vertices), coded=True)
@@ -231,10 +229,10 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: i
     scan, model = staged.scan, last
     of_scan, of_model = np.arange(len(scan.vertices)), np.arange(len(model.vertices))
     if largest_scan is not None:
-        scan, of_scan = _small(scan, largest_scan)
-        model, of_model = _small(last, largest_scan)
+        scan, of_scan = _decimate(scan, largest_scan)
+        model, of_model = _decimate(last, largest_scan)
     elif most_sent is not None:
-        scan, of_scan = thinned(scan, most_sent)
+        scan, of_scan = decimate(scan, most_sent)
     arrays: dict[str, npt.NDArray[Any] | Steps] = {"scan": _places(scan.vertices, small)}
     if scan.faces is not None:
         arrays["scan_faces"] = _indices(scan.faces, len(scan.vertices), coded=small)
@@ -287,13 +285,13 @@ def pack_surfaces(
         largest: for a report: how many triangles (or points) are kept; None packs all as it is.
     """
     last = list(surfaces.values())[-1]
-    model, source_rows = (last, np.arange(len(last.vertices))) if largest is None else _small(last, largest)
+    model, source_rows = (last, np.arange(len(last.vertices))) if largest is None else _decimate(last, largest)
     small = largest is not None
     places = {f"surface_{stage}": surface.vertices[source_rows] for stage, surface in surfaces.items()}
     arrays: dict[str, npt.NDArray[Any] | Steps] = {}
     if model.faces is not None:
         arrays["faces"] = _indices(model.faces, len(model.vertices), coded=small)
-    arrays |= _alike(places) if small else {key: _places(points, small) for key, points in places.items()}
+    arrays |= _shared_steps(places) if small else {key: _places(points, small) for key, points in places.items()}
     arrays |= {key: np.array(getattr(record, key), dtype=np.float64) for key in ("b", "z", "b_stddev")}
     facts = {
         "kind": "fit",
@@ -314,15 +312,15 @@ def _stage_arrays(
     """Return surface and distances at each stage, of these vertices and scan points; shares are of all of them."""
     surfaces = {f"surface_{stage}": surface.vertices[of_model] for stage, surface in staged.surfaces.items()}
     arrays: dict[str, npt.NDArray[Any] | Steps] = {}
-    arrays |= _alike(surfaces) if small else {name: _places(values, small) for name, values in surfaces.items()}
+    arrays |= _shared_steps(surfaces) if small else {name: _places(values, small) for name, values in surfaces.items()}
     step = _DISTANCE_STEP_MM if small else 0.0
     signed = staged.scan.faces is not None
     for stage in staged.surfaces:
         forward, backward = staged.model_to_scan_mm[stage][of_model], staged.scan_to_model_mm[stage][of_scan]
         if not signed:
             forward, backward = np.abs(forward), np.abs(backward)
-        arrays[f"model_to_scan_{stage}"] = quantised(forward, step=step, coded=small)
-        arrays[f"scan_to_model_{stage}"] = quantised(backward, step=step, coded=small)
+        arrays[f"model_to_scan_{stage}"] = quantise(forward, step=step, coded=small)
+        arrays[f"scan_to_model_{stage}"] = quantise(backward, step=step, coded=small)
         arrays[f"beyond_model_{stage}"] = _shares_beyond(staged.model_to_scan_mm[stage])
         arrays[f"beyond_scan_{stage}"] = _shares_beyond(staged.scan_to_model_mm[stage])
     return arrays
@@ -444,10 +442,10 @@ def _indices(faces: IntArray, vertices: int, *, coded: bool) -> npt.NDArray[Any]
 
 
 def _places(points: FloatArray, small: bool) -> npt.NDArray[Any] | Steps:
-    return quantised(points, step=_PLACE_STEP_MM, coded=True) if small else points.astype(np.float32)
+    return quantise(points, step=_PLACE_STEP_MM, coded=True) if small else points.astype(np.float32)
 
 
-def _alike(surfaces: Mapping[str, FloatArray]) -> dict[str, Steps]:
+def _shared_steps(surfaces: Mapping[str, FloatArray]) -> dict[str, Steps]:
     """Return surfaces of the same vertices in one step, each but the first as what differs from the one before."""
     largest = max(float(np.abs(points).max(initial=0.0)) for points in surfaces.values())
     step = max(largest / _MOST_STEPS, _PLACE_STEP_MM)
@@ -459,9 +457,9 @@ def _alike(surfaces: Mapping[str, FloatArray]) -> dict[str, Steps]:
     return out
 
 
-def _small(mesh: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
+def _decimate(mesh: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
     """Return `mesh` thinned, with neighbours near each other in the order, and the indices of its vertices."""
-    small_mesh, source_rows = thinned(mesh, largest)
+    small_mesh, source_rows = decimate(mesh, largest)
     if small_mesh.faces is None:
         return small_mesh, source_rows
     order, faces = _neighbours_together(small_mesh.faces, len(small_mesh.vertices))

@@ -11,7 +11,7 @@ from PIL import Image as PillowImage
 
 from shapespace.geometry.distortion import Distortion
 from shapespace.geometry.normals import faces_of
-from shapespace.report.inputs.correspondence_folder import drawable, there_are
+from shapespace.report.inputs.correspondence_folder import drawable, observed_mask
 from shapespace.report.render.checkerboard import checker_layer, checker_places
 from shapespace.report.render.palette import DIVERGING, MODEL_COLOUR, SCAN_COLOUR, SEQUENTIAL, Colour
 from shapespace.report.render.renderer import Camera, Image, Layer, distance_layer, render, render_series
@@ -81,7 +81,7 @@ def correspondence_strip(
     end = float(np.log(AREA_LIMIT))
     area = [Layer(drawn_surface, scalars=growth, colormap=DIVERGING, vmin=-end, vmax=end)]
     if distortion.folded.any():
-        around = np.isin(faces, faces[distortion.folded]).any(axis=1) & there_are(vertices)[faces].all(axis=1)
+        around = np.isin(faces, faces[distortion.folded]).any(axis=1) & observed_mask(vertices)[faces].all(axis=1)
         # Of equally near surfaces the first stays.
         area.insert(0, Layer(Mesh(np.nan_to_num(vertices), faces[around]), FOLD_COLOUR))
     framed = np.concatenate([mean.vertices, drawn_surface.vertices])

@@ -11,7 +11,7 @@ from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.proportions import widen_share
 from shapespace.errors import InputError
 from shapespace.lazy import lazy_import
-from shapespace.reprs import listed_briefly, short_repr
+from shapespace.reprs import list_briefly, short_repr
 from shapespace.statistics.answer import Answer
 from shapespace.statistics.identity.rates import Figure, figure, people_drawn
 from shapespace.statistics.identity.rounds import IdentityOptions, Trial, scores_of, trial_of
@@ -130,7 +130,7 @@ class Identification:
         return lazy_import("answer_of_identification")(self)
 
     def __repr__(self) -> str:
-        ranks = listed_briefly([f"{one.name}: rank 1 {one.rank_1.briefly()}" for one in self.scores])
+        ranks = list_briefly([f"{one.name}: rank 1 {one.rank_1.briefly()}" for one in self.scores])
         return f"<Identification of {self.probes} probes among {self.enrolled} subjects; {ranks}>"
 
     def _repr_html_(self) -> str:

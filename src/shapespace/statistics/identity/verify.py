@@ -11,7 +11,7 @@ import numpy as np
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.proportions import widen_share
 from shapespace.lazy import lazy_import
-from shapespace.reprs import listed_briefly, short_repr
+from shapespace.reprs import list_briefly, short_repr
 from shapespace.statistics.answer import Answer
 from shapespace.statistics.identity.calibration import calibrated, cllr, cllr_min
 from shapespace.statistics.identity.rates import Figure, Pairs, Roc, Sweep, figure, people_drawn, resampled
@@ -108,7 +108,7 @@ class Verification:
         return lazy_import("answer_of_verification")(self)
 
     def __repr__(self) -> str:
-        rates = listed_briefly([f"{one.name}: EER {one.eer.briefly()}" for one in self.scores])
+        rates = list_briefly([f"{one.name}: EER {one.eer.briefly()}" for one in self.scores])
         return f"<Verification of {len(self.people)} subjects; {rates}>"
 
     def _repr_html_(self) -> str:
