@@ -9,9 +9,9 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-_SMALL = 9
-_MOST_NAMES = 4
-_LONGEST = 80
+_SMALL = 9  # elements; a rotation matrix is printed in full
+_MOST_NAMES = 4  # entries in one line
+_LONGEST = 80  # characters; a terminal's line
 
 
 def short_repr(self: Any) -> str:

@@ -37,7 +37,7 @@ ShapeKind: TypeAlias = Literal["coefficients", "fitted", "dense", "corresponding
 _TRUNCATED: tuple[ShapeKind, ...] = ("coefficients", "fitted")
 _UNIT_SIZE = 1e-2
 """Tolerance of unit centroid sizes, which identify aligned coordinates; tangent projection changes sizes by less."""
-_ORTHONORMAL = 1e-9
+_ORTHONORMAL = 1e-9  # largest deviation of U U^T from the identity (rounding)
 # Of the size; single precision keeps a copy nearer than this.
 _SAME = 1e-6
 

@@ -26,6 +26,7 @@ _FEWEST_VERTICES = 3
 """Fewest observed vertices of a shape, which determine its pose."""
 _MODES_A_SHAPE, _MOST_MODES = 0.7, 60
 """As in `complete`: the prior removes modes without evidence."""
+# iterations of pose and completion, and the movement that ends them, as a share of the centroid size
 _POSES, _SETTLED = 50, 1e-9
 _ANCHOR = 1e-9
 """Weight of the centroid where vertices without any position are filled: it makes isolated parts determinate."""

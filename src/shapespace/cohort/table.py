@@ -20,8 +20,8 @@ from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, read_only
 
 _META = "meta_"
-_LARGEST_BYTES = 2**28
-_NAMED = 3
+_LARGEST_BYTES = 2**28  # 256 MiB, so that a wrong file cannot fill the memory
+_NAMED = 3  # names in a message before the rest is only counted
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,13 +25,13 @@ from shapespace.types import FloatArray, Mesh
 TABLE = "bones.csv"
 GROUPS = ("coast", "island")
 """The second group has the longer snout."""
-EFFECT_MM = 4.0
+EFFECT_MM = 4.0  # mm, by which the snout of one group is longer
 LEFT_ARCH_MM = 1.5
 """Mean difference of the protrusion of the left and the right arch."""
 
 _HALF_MM = np.array([17.0, 15.0, 26.0])
 """Half axes of the ellipsoid: to the left (x), up (y) and to the snout (z)."""
-_SNOUT, _LEFT, _RIGHT = 0, 2, 3
+_SNOUT, _LEFT, _RIGHT = 0, 2, 3  # rows of `_BUMPS`
 _BUMPS = np.array(
     [
         # x, y, z of the direction; width; mean height and its standard deviation, as logarithms of the radius.
@@ -48,12 +48,13 @@ _BUMPS = np.array(
 _TWIN = np.array([0, 1, 3, 2, 5, 4, 7, 6])
 _FLUCTUATING = 0.015
 """Standard deviation of the height of a bump on one side alone."""
+# random bumps: their number, width (radians), and standard deviation of log radius, paired and on one side
 _WAVES, _WAVE_WIDTH, _WAVE, _WAVE_ONE_SIDE = 24, 0.3, 0.02, 0.004
-_SIZE = 0.08
-_POINTS = 2500
+_SIZE = 0.08  # standard deviation of log size
+_POINTS = 2500  # vertices of a raw surface
 _CUT_EVERY, _CUT_MM = 3, 9.0
 """Every n-th bone has a hole; n, and the mean radius of the hole."""
-_MOST = 10_000
+_MOST = 10_000  # limit on files written to the folder of a demonstration
 
 
 @dataclass(frozen=True, eq=False)

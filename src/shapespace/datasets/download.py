@@ -20,10 +20,10 @@ from tqdm import tqdm
 from shapespace.errors import DataError
 from shapespace.io.files import read_error, write_error
 
-_ATTEMPTS = 3
-_TIMEOUT_S = 30.0
-_BLOCK = 1 << 16
-_MAX_FILE_BYTES = 32 << 20
+_ATTEMPTS = 3  # tries of one file; each resumes the one before
+_TIMEOUT_S = 30.0  # seconds without a byte
+_BLOCK = 1 << 16  # bytes (64 KiB), between updates of the progress bar
+_MAX_FILE_BYTES = 32 << 20  # 32 MiB, for files without a published size
 
 
 def download(url: str, path: Path, bar: tqdm[Any], *, sha256: str | None = None, size: int | None = None) -> None:

@@ -75,7 +75,7 @@ _BU3DFE = re.compile(r"([FM]\d{4})_([A-Z]{2})(\d{2})([A-Z]{2})(?:_(F3D|RAW))?", 
 _BOSPHORUS = re.compile(r"(bs\d{3})_([A-Z]+)_([A-Z0-9]+)_(\d+)", re.IGNORECASE)
 # The face cut out by the database's authors before the whole scan, with ears, hair and collar.
 _PARTS = ("F3D", "", "RAW")
-_SHOWN = 3
+_SHOWN = 3  # names in a message before the rest is only counted
 
 
 @dataclass(frozen=True)

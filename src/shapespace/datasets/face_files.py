@@ -17,8 +17,8 @@ from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.io.tables.table_io import write_rows
 from shapespace.types import FloatArray, Mesh
 
-_LARGEST_EFFECT_MM = 20.0
-_CHIN_WIDTH_MM = 12.0
+_LARGEST_EFFECT_MM = 20.0  # mm; limit for a plausible chin
+_CHIN_WIDTH_MM = 12.0  # mm, standard deviation of the Gaussian around the pogonion
 
 
 def chin_of(faces: FaceGenerator) -> FloatArray:

@@ -65,7 +65,7 @@ _SPREAD = {
     "asym": 0.05, "cheek": 0.22, "chin": 0.18, "ear": 0.20, "eyebrows": 0.18, "eye": 0.22, "forehead": 0.06,
     "head": 0.10, "mouth": 0.20, "neck": 0.08, "nose": 0.19,
 }  # fmt: skip
-_SIDE_SPREAD = 0.03
+_SIDE_SPREAD = 0.03  # standard deviation of the difference between left and right
 _FACE_MM = 110.0
 """A face alone reaches as far from the tip of the nose."""
 _OPPOSITES = {

@@ -32,7 +32,7 @@ from shapespace.errors import DataError
 from shapespace.io.disk_cache import cache_folder
 from shapespace.io.files import atomic_path, make_folder, sha256_of_file, write_text
 
-_TYPICAL_OBJ_BYTES = 2_558_000
+_TYPICAL_OBJ_BYTES = 2_558_000  # bytes; an estimate for the progress bar where the registry has no size
 _LICENCE_NAME = "LICENSE.txt"
 # A mesh is of no use without these; its material and picture are taken along where they are.
 _OPTIONAL_SUFFIXES = (".mtl", ".jpg")

@@ -31,13 +31,14 @@ from shapespace.types import FloatArray, IntArray
 
 Float32Array: TypeAlias = npt.NDArray[np.float32]
 
+# ICT-FaceKit: vertices 0 to 9408 are the face, 9409 to 11247 the rest of the head and neck
 FACE_VERTICES, HEAD_VERTICES = 9409, 11248
-FACE_POLYGONS, HEAD_POLYGONS = 9230, 11144
+FACE_POLYGONS, HEAD_POLYGONS = 9230, 11144  # ICT-FaceKit: quads of the same two parts, in the order of its OBJ files
 PACKED_NAME = "ict_face_and_head.npz"
 NEUTRAL_NAME = "generic_neutral_mesh"
 
-_MAX_OBJ_BYTES = 32 << 20
-_MAX_MODES = 1000
+_MAX_OBJ_BYTES = 32 << 20  # 32 MiB, above ten times a published file
+_MAX_MODES = 1000  # above the modes of ICT-FaceKit, as a limit on damaged files
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ import numpy as np
 from shapespace.geometry.mirror_plane import FLIP
 from shapespace.types import FloatArray, IntArray
 
-_WAVES = 96
+_WAVES = 96  # random Fourier features of the field
 
 
 @dataclass(frozen=True)

@@ -18,12 +18,12 @@ from shapespace.types import FloatArray, SurfaceLandmarks
 
 _AGAIN = "give a model that eos has saved"
 _BLENDSHAPES_AGAIN = "give the blendshapes that eos has saved"
-_LARGEST_BYTES = 2**32
-_NEWEST = 4
-_MOST_NAME_BYTES = 4096
-_PCA, _BLENDSHAPES = 0, 1
+_LARGEST_BYTES = 2**32  # 4 GiB
+_NEWEST = 4  # newest version of eos::morphablemodel::MorphableModel; it is the one written
+_MOST_NAME_BYTES = 4096  # limit on damaged files; names of blendshapes are words
+_PCA, _BLENDSHAPES = 0, 1  # index of the std::variant of expression models in eos::morphablemodel::MorphableModel
 _NOTHING: Final = np.zeros((0, 0))
-_SFM = (3448, 63, 6736)
+_SFM = (3448, 63, 6736)  # vertices, modes and triangles of the Surrey Face Model
 _SFM_LICENCE = "Surrey Face Model (3448): non-commercial use only, see its README"
 Item = TypeVar("Item")
 

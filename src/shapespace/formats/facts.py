@@ -16,8 +16,8 @@ KEY: Final = "shapespace"
 """Under which the facts stand."""
 _PLACES: Final = "landmark_triangles"
 """Landmarks between vertices: name -> vertices, barycentric coordinates, and distance of the given point in mm."""
-_LONGEST_WORDS = 20_000
-_MOST_LANDMARKS = 10_000
+_LONGEST_WORDS = 20_000  # characters; longer than any licence text
+_MOST_LANDMARKS = 10_000  # limit on damaged files, far above published markups
 
 
 def facts_of(model: LinearModel) -> dict[str, Any]:

@@ -18,8 +18,8 @@ from shapespace.io.containers.pickled_arrays import PickleRefusedError, pickled_
 from shapespace.io.files import read_bytes
 
 _AGAIN = "give the file as it was downloaded"
-_LARGEST_BYTES = 2**30
-_MM = 1000.0
+_LARGEST_BYTES = 2**30  # 1 GiB
+_MM = 1000.0  # FLAME is in metres
 _KEYS: Final = {"template": ("v_template", "default_v"), "modes": ("shapedirs",), "faces": ("f", "faces")}
 _JOINTS = ("weights", "J", "joints")
 _FAMILY: Final = {5: "FLAME", 16: "MANO", 24: "SMPL", 52: "SMPL+H", 55: "SMPL-X"}
@@ -28,7 +28,7 @@ _BY_VERTICES: Final = {5023: "FLAME", 778: "MANO", 6890: "SMPL", 10475: "SMPL-X"
 _WITH_EXPRESSION = ("FLAME", "SMPL-X")
 _IDENTITY: Final = {150: 100, 20: 10}
 """Modes of identity among so many, the others being of expression; of more than `_MOST_IDENTITY` the first."""
-_MOST_IDENTITY = 300
+_MOST_IDENTITY = 300  # FLAME: shapedirs has 300 identity modes before the expression modes
 
 
 class Flame:

@@ -20,7 +20,7 @@ from shapespace.types import FloatArray, IntArray
 _AGAIN = "save the principal components again"
 _NEEDED = ("mean", "weights", "modes")
 _FIRST_MEMBERS = (b"mean.npy", b"weights.npy", b"modes.npy")
-_SAME = 1e-4
+_SAME = 1e-4  # share of the extent: single precision and rounding in text
 
 
 class Gias:

@@ -24,9 +24,9 @@ _MM: Final = 1000.0
 """In one unit of glTF, which is a metre."""
 _AGAIN = "export it again"
 _TARGETS = b'"targets"'
-_FLOAT, _INDEX = 5126, 5125
-_VERTICES, _TRIANGLES = 34962, 34963
-_POINT_CLOUD, _SURFACE = 0, 4
+_FLOAT, _INDEX = 5126, 5125  # glTF 2.0 accessor.componentType: FLOAT, UNSIGNED_INT
+_VERTICES, _TRIANGLES = 34962, 34963  # glTF 2.0 bufferView.target: ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER
+_POINT_CLOUD, _SURFACE = 0, 4  # glTF 2.0 primitive.mode: POINTS, TRIANGLES
 _IDENTITY = re.compile(r"identity[ _.-]?\d+", re.IGNORECASE)
 _FAR = 16.0
 """Times its own size; from there on single precision is too coarse, so that the centre goes into the node."""

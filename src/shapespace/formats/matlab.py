@@ -18,8 +18,8 @@ from shapespace.io.sandbox import HDF5_SIGNATURE, SandboxError, Tree, read_hdf5_
 from shapespace.types import FloatArray
 
 _AGAIN = "give the file as it was downloaded"
-_LARGEST_BYTES = 2**31
-_HDF5_AT = 512
+_LARGEST_BYTES = 2**31  # 2 GiB
+_HDF5_AT = 512  # MAT-file 7.3: HDF5 begins after a user block of 512 bytes
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ from threadpoolctl import threadpool_limits
 from shapespace.errors import ModelFileError
 from shapespace.types import FloatArray, IntArray, SurfaceLandmarks, read_only
 
-ORTHOGONAL: Final = 1e-3
-_LARGEST = 1e30
+ORTHOGONAL: Final = 1e-3  # largest |U^T U - I|; single precision stays below
+_LARGEST = 1e30  # coordinates whose squares stay finite in float64
 _NO_STDDEV = 1e-6
 """Of the largest one; what single precision makes of a mode that is not there."""
 

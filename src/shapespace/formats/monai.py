@@ -18,7 +18,7 @@ from shapespace.io.parsing import json_value
 from shapespace.types import FloatArray
 
 _MODEL, _SURFACE = "pca_model.json", "pca_mean_surface.vtp"
-_LARGEST_BYTES = 2**29
+_LARGEST_BYTES = 2**29  # 512 MiB
 _AGAIN = "export the model again"
 _KEYS = (b'"eigenvalues"', b'"explained_variance_ratio"')
 

@@ -27,9 +27,9 @@ _NEUTRALS: Final = (_ICT, "neutral", "neutral_mesh")
 _IDENTITY = re.compile(r"identity[ _.-]?\d+", re.IGNORECASE)
 _FACTS = f"{KEY}.json"
 _LICENCES = ("LICENSE", "LICENSE.txt", "LICENSE.md", "LICENCE", "LICENCE.txt")
-_MOST_LICENCE_BYTES = 2**16
-_LOOKED_AT_BYTES = 2**26
-_MOST_SHAPES = 4096
+_MOST_LICENCE_BYTES = 2**16  # 64 KiB
+_LOOKED_AT_BYTES = 2**26  # 64 MiB
+_MOST_SHAPES = 4096  # limit on files that are opened
 _AGAIN = "export all of them again with the same vertices and triangles"
 
 

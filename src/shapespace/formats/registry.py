@@ -29,8 +29,8 @@ MODEL_FORMATS: Mapping[str, ModelFormat] = {
 """Formats that are read and written, by their names, in the order in which they are asked whether a file is theirs."""
 READ_ONLY_MODELS: Mapping[str, ModelReader] = {one.name: one for one in (Gias(), Flame(), Matlab(), Monai())}
 """Those that are only read, which are asked next."""
-LARGEST_BYTES = 2**34
-_HEAD_BYTES = 4096
+LARGEST_BYTES = 2**34  # 16 GiB
+_HEAD_BYTES = 4096  # signatures and first fields of every format lie within it
 
 
 def read_linear(path: Path) -> tuple[ModelReader, LinearModel]:

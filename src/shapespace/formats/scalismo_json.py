@@ -22,10 +22,10 @@ from shapespace.io.files import atomic_path, read_bytes
 from shapespace.io.sandbox import SandboxError, Tree
 
 _AGAIN = "export it again from where it was made"
-_LARGEST_BYTES = 2**31
-_MOST_NODES = 4096
-_DEEPEST = 16
-_LONGEST_NAME = 1024
+_LARGEST_BYTES = 2**31  # 2 GiB
+_MOST_NODES = 4096  # limit on damaged files; models have tens
+_DEEPEST = 16  # limit on damaged files; models have three levels
+_LONGEST_NAME = 1024  # characters; limit on damaged files
 _MARKS = (b'"apiVersion"', b"H5T_", b"H5S_", b"H5L_")
 _FLOAT: Final = {"class": "H5T_FLOAT", "base": "H5T_IEEE_F32LE"}
 _INTEGER: Final = {"class": "H5T_INTEGER", "base": "H5T_STD_I32LE"}

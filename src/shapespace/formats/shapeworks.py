@@ -35,10 +35,10 @@ from shapespace.io.tables.workbook import sheet_rows
 from shapespace.types import FloatArray, IntArray, Mesh
 
 _AGAIN = "run optimize in ShapeWorks again, or copy its folder of particles beside the project"
-_LARGEST_PROJECT_BYTES = 2**26
+_LARGEST_PROJECT_BYTES = 2**26  # 64 MiB
 _PARTICLES = re.compile(r"(world|local)_particles_(.+)")
 _SURFACES = ("groomed", "shape", "mesh")
-_ON_PARTICLES = 1e-6
+_ON_PARTICLES = 1e-6  # share of the extent: rounding of particles in text
 MOST_DENSE = 2_000
 """Largest number of particles for one spline; it takes 1.0 s for 2,000 and would take 45 s for 12,000."""
 NEIGHBOURS = 32

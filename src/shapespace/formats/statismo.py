@@ -27,13 +27,13 @@ from shapespace.io.sandbox import HDF5_SIGNATURE, SandboxError, Tree, read_hdf5_
 from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks
 
 _AGAIN = "export it again from where it was made"
-_LARGEST_BYTES = 2**31
+_LARGEST_BYTES = 2**31  # 2 GiB
 _POINTS_AT = 1e-3
 """Share of the extent of the model; landmarks farther from its surface are left out."""
 _SINGLE = 2e-6
 """Share of the size of the model by which single precision may move a point."""
-_UNIT_LENGTH = 1e-2
-_BFM_MODES = 199
+_UNIT_LENGTH = 1e-2  # deviation of a column's norm from 1 from which the basis counts as scaled
+_BFM_MODES = 199  # Basel Face Model 2017 and 2019: shape modes
 _BFM_LICENCE = "Basel Face Model: non-commercial research only, see its licence"
 _LEGACY_POINTS = "representer/reference-mesh/vertex-coordinates"
 _LEGACY_CELLS = "representer/reference-mesh/triangle-list"

@@ -18,8 +18,8 @@ from shapespace.types import FloatArray
 
 PARAMETERS: Final = "modelinfo/modelBuilder-0/parameters"
 """Texts by name in each model, where we leave what statismo has no place for."""
-_GREY = 0.5
-_LEFT_OUT = 1e-6
+_GREY = 0.5  # mean colour of a model without colours, of 0 to 1
+_LEFT_OUT = 1e-6  # relative; rounding in single precision
 
 
 @dataclass

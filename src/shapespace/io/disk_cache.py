@@ -24,7 +24,7 @@ from shapespace.io.files import atomic_path
 MOST_BYTES = 500_000_000
 """The files used last stay below this together."""
 _FOLDER = "kept"
-_DIGEST_BYTES = 64
+_DIGEST_BYTES = 64  # hexadecimal digits of SHA-256
 _OFF = ("no", "off", "0")
 
 

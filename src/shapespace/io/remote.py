@@ -14,8 +14,8 @@ from shapespace.errors import FileError, InputError, ShapespaceError
 
 TRIES = 3
 """Times that a download is tried."""
-_WAIT_S = 0.5
-_PIECE = 1 << 20
+_WAIT_S = 0.5  # seconds; doubled at each try
+_PIECE = 1 << 20  # bytes (1 MiB)
 _GLOB = frozenset("*?[")
 
 

@@ -14,12 +14,12 @@ from typing import Any, BinaryIO, Final
 import numpy as np
 import numpy.typing as npt
 
-_MOST_NODES = 4096
-_MOST_ATTRIBUTES = 64
-_DEEPEST = 16
-_MOST_AXES = 8
-_LONGEST_TEXT = 2**20
-_LONGEST_NAME = 1024
+_MOST_NODES = 4096  # limits on damaged files from here on; models have tens of nodes
+_MOST_ATTRIBUTES = 64  # of one group or array
+_DEEPEST = 16  # levels of groups
+_MOST_AXES = 8  # of one array
+_LONGEST_TEXT = 2**20  # bytes (1 MiB)
+_LONGEST_NAME = 1024  # characters
 _FILTERS = {1, 2, 3}
 """Deflate, shuffle and checksums: those that HDF5 itself brings, and that models use."""
 _NUMBERS: Final = "biuf"

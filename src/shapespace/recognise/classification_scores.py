@@ -18,7 +18,7 @@ from shapespace.types import FloatArray
 
 IndexArray: TypeAlias = npt.NDArray[np.integer[Any]]
 
-_LEAST_PROBABILITY = 1e-6
+_LEAST_PROBABILITY = 1e-6  # keeps the logarithm finite
 
 
 @dataclass(frozen=True, eq=False)

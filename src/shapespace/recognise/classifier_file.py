@@ -31,7 +31,7 @@ from shapespace.types import FloatArray
 from shapespace.version import __version__
 
 FORMAT = "shapespace classifier"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 1  # increase when files of an older version cannot be read any more
 FACTS = "shapespace.json"
 _SCHEMA = "schema.json"
 _PROJECTION = "projection.npy"
@@ -80,10 +80,10 @@ _SETTINGS: Mapping[str, Mapping[str, Any]] = {
 }  # fmt: skip
 """Where scikit-learn's compiled code would trust what stands in the file."""
 _OURS = sorted(name for name in TRUSTED if name.startswith("shapespace."))
-_LARGEST_BYTES = 2**28
-_LARGEST_JSON = 2**24
+_LARGEST_BYTES = 2**28  # 256 MiB
+_LARGEST_JSON = 2**24  # 16 MiB
 _AGAIN = "train it again with shapespace recognise train"
-_PROBE_TOLERANCE = 1e-6
+_PROBE_TOLERANCE = 1e-6  # probabilities recomputed by another version of the libraries
 
 
 @dataclass(frozen=True, eq=False)

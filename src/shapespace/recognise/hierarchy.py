@@ -17,8 +17,8 @@ from shapespace.errors import InputError
 from shapespace.recognise.classifiers import ShrinkageLDA
 from shapespace.types import FloatArray
 
-_LEAST_VARIANCE = 1e-3
-_KEPT = 0.995
+_LEAST_VARIANCE = 1e-3  # added to each variance, of coefficients in sd; keeps components from collapsing
+_KEPT = 0.995  # share of the variance
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,7 @@ NEUTRAL = "neutral"
 """The label of neutral faces, unless another is given."""
 
 STATUSES = ("converged", "max_iterations", "doubtful", "failed")
-_LARGEST_BYTES = 2**28
+_LARGEST_BYTES = 2**28  # 256 MiB
 _TABLE_AGAIN = "run shapespace fit to write it again, or take the column checksum out if that was meant"
 
 

@@ -16,7 +16,7 @@ from scipy.stats import rankdata
 from shapespace.errors import InputError
 from shapespace.types import FloatArray
 
-_SHRINKAGE = 0.1
+_SHRINKAGE = 0.1  # towards a multiple of the identity, so that the covariance of few scans is invertible
 
 
 @dataclass(frozen=True)

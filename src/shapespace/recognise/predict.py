@@ -27,7 +27,7 @@ UNSURE = "unsure"
 CONFIDENCE = 0.5
 """The confidence unless another is given: below it the likeliest class is more likely wrong than right."""
 
-_FOLDS = 5
+_FOLDS = 5  # folds by subject of the calibration
 
 
 @dataclass(frozen=True, eq=False)

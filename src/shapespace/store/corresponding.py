@@ -17,7 +17,7 @@ SURFACE, RECORD = CorrespondRecord.SURFACE, CorrespondRecord.ENDING
 SUMMARY, MEAN = CorrespondenceRecord.FILE, CorrespondenceRecord.MEAN
 LANDMARKS = "landmarks.csv"
 _ENDINGS = (*ENDINGS.values(), SURFACE)
-_NAMED = 3
+_NAMED = 3  # names in a message before the rest is only counted
 
 
 @dataclass(frozen=True)

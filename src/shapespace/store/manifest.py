@@ -25,7 +25,7 @@ TABLE, SURFACES, STAGES = "table", "surfaces", "stages"
 PARTS: Mapping[str, str] = {TABLE: ".parquet", SURFACES: ".zarr.zip", STAGES: ".zip"}
 """Folder -> ending of the files in it."""
 
-LARGEST_MANIFEST = 64 * 2**20
+LARGEST_MANIFEST = 64 * 2**20  # 64 MiB
 MOST_ROWS = 100_000
 """Rows that one shard may have."""
 

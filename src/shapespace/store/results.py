@@ -35,9 +35,9 @@ ENDING = ".fit.json"
 ENDINGS: Mapping[str, str] = {"fitted": ".fitted.ply", "dense": ".dense.ply", "stages": ".stages.npz"}
 """What may lie beside it, by what it is."""
 
-BATCH = 1000
-_NEAR = 3
-_OPEN = 4
+BATCH = 1000  # rows; a few MB with all columns
+_NEAR = 3  # similar names in a message
+_OPEN = 4  # folders
 
 
 class StoredFit(NamedTuple):

@@ -30,8 +30,8 @@ ROW = "row"
 MOST_EXPANSION, LEAST_BYTES = 200, 16 * 2**20
 """A table may hold this many times its bytes on disk, and this many bytes in any case."""
 
-_OPEN = 16
-_RECORDS_KEPT = 2
+_OPEN = 16  # files
+_RECORDS_KEPT = 2  # row groups; records are read one after the other
 
 
 class Shard:

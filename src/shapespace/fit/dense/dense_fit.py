@@ -32,9 +32,9 @@ from shapespace.geometry.normals import face_vectors, rms_size
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
 
-_FEWEST_MATCHES = 30
-_FEWEST_PAIRS = 100
-_HALVINGS = 8
+_FEWEST_MATCHES = 30  # below it no robust standard deviation is estimated
+_FEWEST_PAIRS = 100  # below it the noise is not separated from the residual
+_HALVINGS = 8  # halvings of a step before a folded vertex goes back: 1/256 of it
 _SEEN = 0.1
 """Matches that together weigh as much show a vertex; a good one weighs 1."""
 

@@ -56,19 +56,22 @@ RIGID = Step(points=500, widest=0.2, narrowest=0.06, iterations=14, modes=0, kep
 MIDDLE = Step(points=200, widest=0.3, narrowest=0.06, iterations=12, modes=3, kept=5)
 FINE = Step(points=400, widest=0.1, narrowest=0.03, iterations=10, modes=10, kept=2)
 LONG = Step(points=400, widest=0.15, narrowest=0.03, iterations=30, modes=10, kept=4)
-ROTATIONS = 96
+ROTATIONS = 96  # spread evenly over SO(3), about 55 degrees apart
 
-_MODEL_CELL, _SCAN_CELL = 0.07, 0.04
-_MAX_THINNING_CELLS = 4_000_000
+_MODEL_CELL, _SCAN_CELL = 0.07, 0.04  # grid cells for thinning, as shares of the model's size
+_MAX_THINNING_CELLS = 4_000_000  # memory limit
+# largest distance that counts in the score, as shares of the model's size: rigid, and with shape
 _RIGID_CAP, _CAP = 0.1, 0.06
-_PRIOR = 10.0
-_SCALE_STDDEV = 0.15
+_PRIOR = 10.0  # weight of the prior on the coefficients
+_SCALE_STDDEV = 0.15  # of the prior on the relative scale
+# poses within 20 degrees and this share of the model's size are the same one
 _SAME_TURN, _SAME_PLACE = math.cos(math.radians(20.0)), 0.3
-_OTHER_TURN = math.cos(math.radians(40.0))
+_OTHER_TURN = math.cos(math.radians(40.0))  # alternatives to report differ by 40 degrees
+# scores that end the search early: as a share of the cap, and of the best flipped pose
 _CLEARLY_CLOSE, _CLEARLY_BETTER = 0.45, 0.75
-_SURE = 0.85
-_CLEARLY_WORSE, _WORTH = 0.93, 0.05
-_MORE_ROUNDS = 3
+_SURE = 0.85  # score relative to the runner-up below which no more iterations are run
+_CLEARLY_WORSE, _WORTH = 0.93, 0.05  # how much worse an upright pose may score: ratio to the best, or share of the cap
+_MORE_ROUNDS = 3  # repetitions of the last step for ambiguous poses
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ from scipy.ndimage import distance_transform_edt
 
 from shapespace.types import FloatArray, IntArray
 
+# grid of near points: margin and cell as shares of the size, and memory limit (cells)
 _MARGIN, _CELL, _MAX_CELLS = 0.5, 0.08, 400_000
 
 

@@ -26,18 +26,21 @@ from shapespace.types import FloatArray, Mesh, Similarity
 
 # Chosen on fits of `benchmarks/reliability.py`, heads, hair and collars, and a real scan with hair and neck.
 _NEAR = 0.05
-_EXPLAINED = 0.75
-_LEAST_REST = 0.25
-_SCORED = 0.075
-_AS_GOOD = 2.0
-_APART = 0.011
+_EXPLAINED = 0.75  # share of the scan near the fit above which no second instance is sought
+_LEAST_REST = 0.25  # smallest share of the scan that a second instance may have
+_SCORED = 0.075  # largest mean capped distance of a second instance, as a share of its size
+_AS_GOOD = 2.0  # ratio of residual standard deviations up to which the second fit counts as an equal
+_APART = 0.011  # residual standard deviation, share of the size, below which one surface explains the scan
+# trimmed ICP: model points, start positions, iterations, inlier share, distance caps (share of the size)
 _GLANCED, _PLACES, _ROUNDS, _TRIMMED, _FARTHEST, _CAP = 150, 40, 25, 0.7, 0.5, 0.1
+# sampled scan points, nearest points of each (with itself), fewest points to judge by
 _POINTS, _NEIGHBOURS, _FEWEST = 2_000, 7, 100
-_TIGHT, _LEAST_SIDE = 0.5, 2
+_TIGHT, _LEAST_SIDE = 0.5, 2  # two layers: largest width of one relative to the gap, and fewest points on each side
 
 # Chosen on the development seeds of `benchmarks/odd_cases.py`, and on 42 heads with hair.
 _ALL_EXPLAINED = 0.97
-_DISPLACED = (0.04, 0.45)
+_DISPLACED = (0.04, 0.45)  # range of the distance to the fit, as shares of the model's size
+# distance in residual sd, relative variation among neighbours, cosine to the normal
 _SPREADS, _ALIKE, _ALONG_NORMAL = 3.0, 0.35, 0.8
 
 

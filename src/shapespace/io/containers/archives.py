@@ -17,15 +17,15 @@ from shapespace.errors import FileFormatError
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import read_error
 
-LARGEST_BYTES: Final = 2**30
-_MOST_MEMBERS = 4096
+LARGEST_BYTES: Final = 2**30  # 1 GiB, packed
+_MOST_MEMBERS = 4096  # limit on damaged files; results have tens
 _MOST_PACKED = 100
 """Times its own size that an archive may unpack to; what we write unpacks to a few times."""
-_SMALL = 2**20
+_SMALL = 2**20  # 1 MiB that any file may unpack to, and elements that an array without data may declare
 _PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-_TOLD = 80
+_TOLD = 80  # characters of a library's message
 _PLAIN_KINDS = "biufU"
-_LONGEST_AXIS = 2**31 - 1
+_LONGEST_AXIS = 2**31 - 1  # indices are int32
 _HEADER_READERS: Final[Mapping[tuple[int, int], Callable[[IO[bytes]], tuple[Any, Any, Any]]]] = {
     (1, 0): npy.read_array_header_1_0,
     (2, 0): npy.read_array_header_2_0,

@@ -12,7 +12,7 @@ from shapespace.io.read_limits import GROWTH
 
 GZIP = b"\x1f\x8b"
 """With which such a file begins."""
-_SMALL = 2**20
+_SMALL = 2**20  # 1 MiB that any file may unpack to
 
 
 def unpack_gzip(data: bytes, path: Path, max_bytes: int) -> bytes:

@@ -22,10 +22,10 @@ from shapespace.io.containers.hdf5_subset import SIGNATURE, Attribute, OtherHdf5
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import open_file, read_bytes, write_bytes
 
-_USER_BLOCK = 512
+_USER_BLOCK = 512  # bytes; smallest user block that HDF5 allows
 _MAGIC = b"shapespace sha256 "
 _HASH_NAME = "content_hash"
-_LARGEST_BYTES = 2**33
+_LARGEST_BYTES = 2**33  # 8 GiB
 
 
 def content_hash(arrays: Mapping[str, npt.NDArray[Any]], attributes: Mapping[str, Attribute]) -> str:

@@ -21,14 +21,16 @@ Attribute: TypeAlias = str | int | float
 Arrays: TypeAlias = dict[str, npt.NDArray[Any]]
 
 SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
-_MOST = 256
-_MOST_AXES = 8
+_MOST = 256  # limit on names, messages and objects; a model has tens
+_MOST_AXES = 8  # limit on damaged files; arrays of a model have three
+# header message types of the HDF5 file format specification, section IV.A.2
 _SPACE, _TYPE, _LAYOUT, _ATTRIBUTE, _CONTINUED, _GROUP = 0x01, 0x03, 0x08, 0x0C, 0x10, 0x11
+# same section: NIL, old fill value, fill value, modification time
 _NOTHING, _OLD_FILL, _FILL, _CHANGED = 0x00, 0x04, 0x05, 0x12
 _IN_DATASET = {_NOTHING, _SPACE, _TYPE, _OLD_FILL, _FILL, _LAYOUT, _CHANGED}
 _IN_ROOT = {_NOTHING, _ATTRIBUTE, _GROUP, _CHANGED}
-_SHARED = 2
-_ONE_PIECE = (3, 1)
+_SHARED = 2  # header message flag, bit 1
+_ONE_PIECE = (3, 1)  # data layout message: version 3, contiguous storage
 # Each type as its message has it, zero bytes at the end left out: float64, then signed integers, little-endian.
 _NUMBERS = {
     bytes.fromhex("11203f000800000000004000340b0034ff03"): np.dtype("<f8"),

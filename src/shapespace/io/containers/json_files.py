@@ -14,9 +14,9 @@ import msgspec
 from shapespace.errors import FileFormatError
 from shapespace.io.files import read_bytes, read_error
 
-LARGEST_BYTES: Final = 64 * 2**20
-_DEEPEST = 64
-_LARGEST_INT = 2**63
+LARGEST_BYTES: Final = 64 * 2**20  # 64 MiB
+_DEEPEST = 64  # levels; limit on damaged files
+_LARGEST_INT = 2**63  # int64
 
 
 def read_json(path: Path, remedy: str, most_bytes: int = LARGEST_BYTES) -> Any:

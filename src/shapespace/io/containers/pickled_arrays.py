@@ -16,9 +16,9 @@ from typing import Any, Final, cast
 import numpy as np
 import numpy.typing as npt
 
-_MOST_STEPS = 400_000
-_MOST_AXES = 8
-_DEEPEST = 8
+_MOST_STEPS = 400_000  # opcodes; limit on time in damaged files
+_MOST_AXES = 8  # limit on damaged files
+_DEEPEST = 8  # nested chumpy objects
 _MULTIARRAY, _NUMERIC = (
     ("numpy.core.multiarray", "numpy._core.multiarray"),
     ("numpy.core.numeric", "numpy._core.numeric"),

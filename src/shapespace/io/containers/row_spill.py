@@ -20,8 +20,8 @@ from shapespace.errors import FileFormatError
 from shapespace.io.files import read_error, write_error
 from shapespace.types import FloatArray
 
-_PANEL = 1024
-_BLOCK_BYTES = 64 << 20
+_PANEL = 1024  # columns; 8 KiB of each row are read in one piece
+_BLOCK_BYTES = 64 << 20  # 64 MiB of memory for a block
 _FLOAT32 = np.dtype("<f4")
 
 

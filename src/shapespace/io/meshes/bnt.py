@@ -19,7 +19,7 @@ from shapespace.types import FloatArray, Mesh
 
 _HEADER = struct.Struct("<HHdH")
 _COUNT = struct.Struct("<I")
-_COLUMNS = 5
+_COLUMNS = 5  # x, y, z and two image coordinates
 # Of a surface seen at an angle the steps grow by 1 / cos: 8 keeps what is turned up to 82 degrees from the camera.
 _LONGEST_STEPS = 8.0
 

@@ -36,6 +36,7 @@ from shapespace.types import GREY, ByteArray, FloatArray, Mesh
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+# glTF 2.0 primitive.mode: POINTS, TRIANGLES, TRIANGLE_STRIP, TRIANGLE_FAN
 _POINTS, _TRIANGLES, _STRIP, _FAN = 0, 4, 5, 6
 _COMPRESSIONS = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 # What a file may require without its points and triangles becoming others.

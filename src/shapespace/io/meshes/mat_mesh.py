@@ -13,8 +13,8 @@ from shapespace.io.parsing import CUT_SHORT, damage_error, mesh_of
 from shapespace.io.sandbox import HDF5_SIGNATURE, SandboxError, Tree, read_matlab_sandboxed
 from shapespace.types import Mesh
 
-_HDF5_AT = 512
-_MOST_VARIABLES = 64
+_HDF5_AT = 512  # MAT-file 7.3: HDF5 begins after a user block of 512 bytes
+_MOST_VARIABLES = 64  # limit on what one file may ask to be read
 _SAVE = (
     "save it in MATLAB by s = struct('Vertices', T.Vertices, 'Faces', T.Faces); save('t.mat', '-struct', 's', '-v7')"
 )

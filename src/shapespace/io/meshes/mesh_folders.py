@@ -10,7 +10,7 @@ from shapespace.errors import InputError
 from shapespace.io.files import read_error
 from shapespace.io.meshes.mesh_io import MESH_ENDINGS, MESH_FILE_ENDINGS
 
-_NAMED = 3
+_NAMED = 3  # names in a message before the rest is only counted
 
 
 @dataclass(frozen=True)

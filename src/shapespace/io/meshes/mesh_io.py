@@ -30,7 +30,7 @@ from shapespace.io.read_limits import LARGEST_MESH_FILE_BYTES
 from shapespace.types import Mesh, require
 
 _PACKED = ".gz"
-_PROBED_BYTES = 2**16
+_PROBED_BYTES = 2**16  # 64 KiB hold any usual header
 _Probe: TypeAlias = Callable[[bytes, int, Path], None]
 _PROBES: Mapping[str, _Probe] = {".ply": probe_ply, ".stl": probe_stl}
 _CONVERT: Mapping[str, str] = {

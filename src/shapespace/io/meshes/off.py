@@ -29,7 +29,7 @@ from shapespace.types import FloatArray, Mesh
 
 # Geomview writes CN, MeshLab NC.
 _KEYWORD = re.compile(rb"(?:ST)?(CN?|NC?)?(4?n?)OFF")
-_ROWS = 1 << 13
+_ROWS = 1 << 13  # rows parsed at once; a few MB as words
 
 
 def read_off(data: bytes, path: Path) -> Mesh:

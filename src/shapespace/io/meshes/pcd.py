@@ -23,12 +23,12 @@ from shapespace.io.parsing import (
 from shapespace.io.read_limits import Allowance
 from shapespace.types import FloatArray, Mesh
 
-_MOST_HEADER = 1 << 16
-_MOST_COUNT = 1 << 14
+_MOST_HEADER = 1 << 16  # bytes (64 KiB)
+_MOST_COUNT = 1 << 14  # values of one field in a point; limit on damaged files
 _KINDS = {"I": "i", "U": "u", "F": "f"}
 _SIZES = ("1", "2", "4", "8")
-_LITERAL = 32
-_LONG = 7
+_LITERAL = 32  # LZF: control bytes below it are followed by literals
+_LONG = 7  # LZF: this length is continued in the next byte
 
 
 def read_pcd(data: bytes, path: Path) -> Mesh:

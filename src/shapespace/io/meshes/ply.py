@@ -37,8 +37,8 @@ _SCALARS = {
     "int64": "i8", "uint64": "u8",
 }  # fmt: skip
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-_MAX_HEADER = 1 << 20
-_FIRST_LINES = 512
+_MAX_HEADER = 1 << 20  # bytes (1 MiB)
+_FIRST_LINES = 512  # bytes that hold the comment
 _COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 _OBSERVED = "observed"
 """Vertex property of surfaces in correspondence: 0 where the position is an estimate."""

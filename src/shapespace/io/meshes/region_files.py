@@ -10,7 +10,7 @@ from shapespace.io.landmarks.landmark_io import csv_rows
 from shapespace.io.read_limits import LARGEST_LANDMARK_FILE_BYTES
 
 _COLUMN = "vertex"
-_LONGEST = 10
+_LONGEST = 10  # digits that fit into int32
 
 
 def read_region(path: Path | str) -> tuple[int, ...]:

@@ -31,7 +31,7 @@ MOST_BYTES_IN_ALL = 2**29
 MOST_NAMES = 2**14
 """Limit of the files of materials and pictures that a surface names; finding one takes some 40 microseconds."""
 
-_SIDE = 2048
+_SIDE = 2048  # pixels; a texture is sampled at vertices, so finer ones cost memory only
 _KINDS = ("JPEG", "PNG", "BMP", "TIFF")
 
 

@@ -31,7 +31,7 @@ from shapespace.types import FloatArray, Mesh
 _SKIPPED = re.compile(rb'(?:(?:"(?:[^"\\]|\\.)*+(?:"|\\?\Z)|#[^\r\n]*)[\s,]*+)++', re.DOTALL)
 _TO_BRACKET = re.compile(rb"[^{}\[\]]*+")
 _HEXADECIMAL = re.compile(rb"(?<!\S)0[xX][0-9a-fA-F]{1,16}(?!\S)")
-_DEEPEST = 500
+_DEEPEST = 500  # nodes; limit on damaged files
 _POINTS = (b"Coordinate", b"Coordinate3", b"CoordinateDouble")
 _MOVES_OF_VRML_1 = (b"MatrixTransform", b"Translation", b"Rotation", b"Scale")
 _FIELDS = {b"translation": 3, b"rotation": 4, b"scale": 3, b"scaleFactor": 3, b"scaleOrientation": 4, b"center": 3}

@@ -57,8 +57,8 @@ _OFFSETS = re.compile(rb"\s*OFFSETS\s")
 _BLANK_LINE = re.compile(rb"\n[ \t\r]*\n")
 # zlib cannot shrink by more than this (1032 : 1), so a header that promises more lies.
 _MAX_INFLATION = 1040
-_COLOUR_WIDTHS = (3, 4)
-_MOST_ATTRIBUTES = 100
+_COLOUR_WIDTHS = (3, 4)  # RGB and RGBA
+_MOST_ATTRIBUTES = 100  # arrays searched for colours; limit on damaged files
 
 Values = npt.NDArray[Any]
 

@@ -15,7 +15,7 @@ from shapespace.io.tables.table_io import KEYS, key_column, table_rows
 
 LABELS_FILE = "labels.csv"
 _LABELS = ("label", "expression", "class", "group", "subject")
-_LARGEST_BYTES = 16 * 2**20
+_LARGEST_BYTES = 16 * 2**20  # 16 MiB
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,12 @@ WORKBOOK_START: Final = b"PK\x03\x04"
 
 _MOST_UNPACKED = 2**26
 """Bytes that a workbook may unpack to (64 MiB), a million cells or more."""
-_MOST_CELLS = 2_000_000
+_MOST_CELLS = 2_000_000  # limit on memory
 _MOST_TEXT = 2**26
 """Characters in all cells together; one shared string may stand in many of them."""
 _MOST_COLUMNS = 16_384
 """Columns of a sheet in Excel (XFD)."""
-_DIGITS = 7
+_DIGITS = 7  # of the index of a text or a style; a damaged file may have any number
 _CELL = re.compile(r"([A-Z]{1,3})[0-9]{1,7}")
 _RELATIONS = "xl/_rels/workbook.xml.rels"
 _LAST_DAY = 2_958_466

@@ -32,9 +32,9 @@ from shapespace.types import MAX_MEMORY_BYTES, FloatArray, LabelVolume
 VOLUME_ENDINGS = (".nii", ".nii.gz", ".nrrd")
 """The endings that `read_volume` takes."""
 
-_MOST_BYTES = 1 << 31
-_MOST_HEADER = 1 << 20
-_PIECE = 1 << 20
+_MOST_BYTES = 1 << 31  # 2 GiB
+_MOST_HEADER = 1 << 20  # 1 MiB
+_PIECE = 1 << 20  # bytes (1 MiB)
 _WORK_BYTES = 1 << 26
 """Memory of reading besides the labels: libraries, and pieces of 1 MiB as float64 (64 MiB, measured 40)."""
 # No deflate stream grows by more than 1032 to 1.
@@ -66,9 +66,9 @@ _NRRD_SPACES = {
     "left-posterior-superior": (-1, -1, 1), "lps": (-1, -1, 1),
 }  # fmt: skip
 _UNORIENTED = "Its header does not say how it lies in the patient, so that left and right may be swapped."
-_LEAST_MM, _MOST_MM = 1e-4, 1e3
-_FLAT = 1e-4
-_APART_MM = 0.1
+_LEAST_MM, _MOST_MM = 1e-4, 1e3  # mm, voxel sizes from microscopy to thick slices; beyond them the unit is wrong
+_FLAT = 1e-4  # volume of unit axes below which they are coplanar
+_APART_MM = 0.1  # mm by which sform and qform may differ at the corners: rounding, below a voxel
 _ROUNDING = 1e-4
 """Labels that were stored with a slope, or as float32, come back whole but for rounding."""
 

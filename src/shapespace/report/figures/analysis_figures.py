@@ -34,11 +34,12 @@ from shapespace.types import BoolArray, FloatArray, Mesh
 
 _CLOSED = (("front", 0.0), ("one side", 90.0), ("back", 180.0), ("other side", 270.0))
 _OPEN = (("one side", -55.0), ("front", 0.0), ("other side", 55.0))
+# share of the area that faces one way in an open surface, and cosine to the viewer that needs no rotation
 _OPEN_SHARE, _AS_IT_STANDS = 0.15, 0.7
-_PALE = 0.72
-_FARTHEST_MM = 1e7
-_MOST_SERIES = 12
-_MOST_BINS = 2000
+_PALE = 0.72  # share of white outside the mask
+_FARTHEST_MM = 1e7  # mm (10 km); single precision cannot draw beyond it
+_MOST_SERIES = 12  # colours that can be distinguished
+_MOST_BINS = 2000  # above the pixels of a figure nothing is gained
 
 
 def upright_views(mesh: Mesh) -> tuple[FloatArray, Sequence[tuple[str, float]]]:

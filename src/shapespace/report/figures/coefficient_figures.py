@@ -35,10 +35,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
-_MOST_IN_LEGEND = 16
-_MOST_DOTS_BIG = 60
+_MOST_IN_LEGEND = 16  # layout: entries
+_MOST_DOTS_BIG = 60  # layout: dots drawn at full size
 _LEGEND_MARK, _LEGEND_LINE = 3.6 * SMALL * DPI / 72, 1.1
-_SPACE_INCHES = 2.5
+_SPACE_INCHES = 2.5  # layout: inches per panel
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,8 +28,8 @@ from shapespace.report.render.palette import SEQUENTIAL
 from shapespace.report.render.renderer import Camera, Image, Layer, render
 from shapespace.types import FloatArray, Mesh
 
-SIDE_DEG = 65.0
-_LONGEST = 16
+SIDE_DEG = 65.0  # degrees, between three quarters and profile
+_LONGEST = 16  # layout: characters above a panel
 _LINES = ("#9cc3e0", "#0072B2", "#D55E00", "#6b140f")
 
 

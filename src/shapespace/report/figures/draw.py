@@ -52,13 +52,13 @@ NOT_SHOWN = "not shown by the scan"
 
 INK, GREY, RULE = "#1d1f22", "#5c6068", "#e4e5e8"
 FORWARD, BACKWARD = "#0072B2", "#D55E00"
-WIDTH, DPI = 960, 160
-TITLE, TEXT, SMALL = 12.0, 11.0, 9.5
-MOST_PANELS = 48
+WIDTH, DPI = 960, 160  # layout: pixels of the column, dots per inch
+TITLE, TEXT, SMALL = 12.0, 11.0, 9.5  # layout: type sizes, points
+MOST_PANELS = 48  # limit on the size of a figure
 FEWEST_BINNED = 10
 """Values of which a histogram tells something; fewer are drawn one by one."""
-_GAP, _EDGE = 8, 4
-_MOST_LINES = 4
+_GAP, _EDGE = 8, 4  # layout: pixels
+_MOST_LINES = 4  # layout: lines of a caption
 _STEPS, _MOST_NUMBERS = (1, 5, 10, 20, 50, 100, 200, 500), 22
 _Item = TypeVar("_Item")
 
@@ -405,7 +405,7 @@ def wrap(text: str, width: float, size: float, *, bold: bool = False, max_lines:
     return "\n".join([*lines[: max_lines - 1], last + "…"])
 
 
-_LONGEST = 400
+_LONGEST = 400  # characters of a name from a file
 
 
 def plain(text: str) -> str:

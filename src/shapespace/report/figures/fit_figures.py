@@ -56,18 +56,18 @@ THRESHOLDS_MM = (2.0, 4.0, 6.0, 8.0, 10.0)
 
 _SHORT_STAGES = {"before": "before", "initial": "phase 1", "final": "phase 2", "dense": "dense"}
 _SIDES = (("from the right", -38.0), ("from the front", 0.0), ("from the left", 38.0))
-_FRONT_AND_SIDE = (0.0, 48.0)
+_FRONT_AND_SIDE = (0.0, 48.0)  # degrees of yaw
 _REGION_WORDS = {
     "followed": "followed",
     "rejected": "rejected: the scan shows something else",
     "border": "at the scan's border",
     "unseen": NOT_SHOWN,
 }
-_MOST_MODES = 30
-_NEAR_START = 0.35
+_MOST_MODES = 30  # layout: bars
+_NEAR_START = 0.35  # share of the extent within which the start fits into the picture of the result
 _TOWERS = 2.0
 """Times its neighbour, and percent, beyond which the first bar of a histogram needs a word."""
-_NEAREST_MM, _FARTHEST_MM = 0.01, 300.0
+_NEAREST_MM, _FARTHEST_MM = 0.01, 300.0  # mm, limits of a logarithmic axis
 _TEXT_ROOM = 1.42
 """How much farther than the tallest bar a half of a histogram reaches, for the line of text above it."""
 

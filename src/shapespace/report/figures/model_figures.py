@@ -45,7 +45,7 @@ from shapespace.types import FloatArray, Mesh
 SHARES = (0.90, 0.95, 0.98, 0.99)
 """Shares of the variance for which the number of modes is told."""
 
-_LANDMARK = (0.78, 0.20, 0.14)
+_LANDMARK = (0.78, 0.20, 0.14)  # red, sRGB from 0 to 1
 _BARS = "#a9c9e2"
 _QUALITY = {
     "compactness": ("Compactness: share of the variance held", "share of the variance (%)"),
@@ -53,7 +53,7 @@ _QUALITY = {
     "specificity": ("Specificity: distance of random shapes from real ones", "mean distance (mm)"),
     "reconstruction": ("Reconstruction: error on unseen shapes that were given", "mean error (mm)"),
 }
-_LONGEST_NAME = 26
+_LONGEST_NAME = 26  # layout: characters
 _BY_SHAPES = "Generalisation with all modes, by the number of training shapes"
 _COLOURS, _BANDS = (FORWARD, BACKWARD), (_BARS, "#f2c6a5")
 

@@ -33,8 +33,8 @@ from shapespace.types import FloatArray
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_BINS, _TIMES = 60, 5
-_FEWEST = 20
+_BINS, _TIMES = 60, 5  # layout: bins of a histogram, ticks of a time axis
+_FEWEST = 20  # fits below which no quantiles are drawn
 _BANDS = ((1, 99, 0.16), (5, 95, 0.3), (25, 75, 0.5))
 
 

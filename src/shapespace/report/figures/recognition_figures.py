@@ -51,13 +51,14 @@ CurveScale: TypeAlias = Literal["linear", "log", "probit"]
 """How the numbers of a curve stand along an axis."""
 
 _BARS = "#a9c9e2"
-_MOST_CLASSES_IN_FULL, _MOST_CLASSES = 12, 40
-_MOST_BARS, _MOST_NAMED_BARS, _STRONGEST = 40, 24, 3
-_MOST_REGIONS = 9
-_SIDES = (0.0, 40.0)
-_NO_PICTURE = 0.945
-_MOST_SERIES, _MOST_TICKS = 60, 9
-_LEAST_SHARE, _PROBIT_ROOM = 1e-6, 0.12
+_MOST_CLASSES_IN_FULL, _MOST_CLASSES = 12, 40  # layout: classes with full labels, and classes at all
+_MOST_BARS, _MOST_NAMED_BARS, _STRONGEST = 40, 24, 3  # layout: bars, bars with every label, modes named in the title
+_MOST_REGIONS = 9  # layout: bars
+_SIDES = (0.0, 40.0)  # degrees of yaw
+_NO_PICTURE = 0.945  # light grey of an empty panel, from 0 to 1
+_MOST_SERIES, _MOST_TICKS = 60, 9  # layout: curves and ticks
+_LEAST_SHARE, _PROBIT_ROOM = 1e-6, 0.12  # keeps normal deviates finite; margin of the axis in standard deviations
+# ticks of a probit axis
 _SHARES = (
     1e-6, 1e-5, 1e-4, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995,
     0.998, 0.999, 1 - 1e-4,

@@ -28,10 +28,10 @@ from shapespace.report.inputs.saved_fits import Folder
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, read
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
 
-_FEWEST_VERTICES = 3
-_ONE_UNIT = 5.0
-_POSED_ALIKE = 0.8
-_OPEN_SHARE = 0.15
+_FEWEST_VERTICES = 3  # a triangle
+_ONE_UNIT = 5.0  # ratio of scales; mm, cm and m differ by 10 or more
+_POSED_ALIKE = 0.8  # strength of the mean rotation above which the scans share a pose
+_OPEN_SHARE = 0.15  # share of the area that faces one way in an open surface
 
 
 @dataclass(frozen=True, eq=False)

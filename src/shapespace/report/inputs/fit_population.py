@@ -30,16 +30,17 @@ MEASURES: Mapping[str, str] = {
 }
 """What is told of each fit, in words."""
 
-MOST_LEVELS, MOST_BINS = 24, 40
+MOST_LEVELS, MOST_BINS = 24, 40  # layout: rows of a table and bins of a figure
 FEWEST = 20
 """Fits of a level or a stretch of time below which nothing is said about it."""
 
-_MOST_VALUES = 500
-_FEWEST_NUMBERS = 12
+_MOST_VALUES = 500  # distinct texts of a column that counts as a category
+_FEWEST_NUMBERS = 12  # distinct values of a column that counts as numeric
+# a group stands out: standard errors, share of the typical value, and shift in sd of the coefficients
 _SIGNS, _LEAST_SHARE, _LEAST_SHIFT = 4.0, 0.1, 0.3
 _NUMBERS = re.compile(r"\d+(?:[.,]\d+)*")
 _NAMES = re.compile(r"\S*[\\/.]\S*[^\s.,;:]")
-_MOST_REASONS = 5000
+_MOST_REASONS = 5000  # limit on memory
 
 
 @dataclass(frozen=True, eq=False)

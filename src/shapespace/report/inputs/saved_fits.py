@@ -26,7 +26,7 @@ from shapespace.store.results import ENDING, ENDINGS, Results, arrays_at, json_a
 from shapespace.types import FloatArray, Mesh
 
 _AGAIN = "make it again with shapespace fit --stages"
-_FEWEST_POINTS = 20
+_FEWEST_POINTS = 20  # fewer are not a scan
 
 Direction: TypeAlias = Literal["model_to_scan", "scan_to_model"]
 Measure: TypeAlias = Literal["mean", "median", "rms", "p95", "max", "fraction"]

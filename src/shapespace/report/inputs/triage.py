@@ -14,8 +14,8 @@ from shapespace.schemas import CorrespondRecord
 
 _STANDS_OUT = 4.0
 """How many times the usual spread above the middle makes a scan one to look at."""
-_LEAST_SPREAD = 0.25
-_TO_STDDEV = 1.4826
+_LEAST_SPREAD = 0.25  # share of the median that counts as usual variation, where all scans are alike
+_TO_STDDEV = 1.4826  # MAD to standard deviation of a normal distribution: 1 / 0.6745
 
 
 @dataclass(frozen=True)

@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
 Drawn: TypeAlias = "tuple[Still, str]"
 """A picture, and what stands below it."""
-_SHARES = (0.9, 0.95, 0.98)
-_MODES_SHOWN = 2
-_PANEL = (220, 290)
-_MOST_COEFFICIENTS = 5
+_SHARES = (0.9, 0.95, 0.98)  # of the variance; usual choices for the number of modes
+_MODES_SHOWN = 2  # layout: rows
+_PANEL = (220, 290)  # layout: pixels
+_MOST_COEFFICIENTS = 5  # layout: entries
 _CURVES = (
     "compactness",
     "generalisation",

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 MOST_TABLES, MOST_ROWS = 2, 12
 """Largest number of tables of an analysis, and of rows of a table, in a notebook; reports have all."""
 
-_MOST_NOTES = 6
-_MOST_COLUMNS = 8
+_MOST_NOTES = 6  # layout: lines
+_MOST_COLUMNS = 8  # layout: columns
 
 
 class AnsweredResult(Protocol):

@@ -12,7 +12,7 @@ from shapespace.report.render.palette import CATEGORIES
 from shapespace.report.render.renderer import SQUARE_COLOURS, Layer
 from shapespace.types import FloatArray, Mesh
 
-_SQUARES, _MOST_SQUARES = 10, 40
+_SQUARES, _MOST_SQUARES = 10, 40  # squares across the mean side, and at most along the longer one
 _PAPER = np.array([0.93, 0.90, 0.86])
 # Pale enough that eyes and edges are seen through the squares.
 SQUARES = np.stack([_PAPER, *(0.62 * np.array(colour) + 0.38 * _PAPER for colour in CATEGORIES[:SQUARE_COLOURS])])

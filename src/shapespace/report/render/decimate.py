@@ -11,7 +11,7 @@ from shapespace.errors import MeshError
 from shapespace.geometry.remesh import collapse
 from shapespace.types import IntArray, Mesh
 
-_MOST_COLLAPSED = 150_000
+_MOST_COLLAPSED = 150_000  # triangles; larger scans are clustered on a grid first, which is faster
 
 
 def decimate(scan: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:

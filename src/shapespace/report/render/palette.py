@@ -22,12 +22,13 @@ Colour: TypeAlias = tuple[float, float, float]
 
 CLAY: Colour = (0.80, 0.755, 0.715)
 """A surface of which only the form is to be seen."""
+# orange; colours of this group are sRGB from 0 to 1, and differ in lightness too
 SCAN_COLOUR: Colour = (0.93, 0.66, 0.36)
-MODEL_COLOUR: Colour = (0.36, 0.58, 0.80)
-DENSE_COLOUR: Colour = (0.33, 0.66, 0.56)
+MODEL_COLOUR: Colour = (0.36, 0.58, 0.80)  # blue
+DENSE_COLOUR: Colour = (0.33, 0.66, 0.56)  # green
 UNKNOWN_COLOUR: Colour = (0.66, 0.66, 0.66)
 """Where a map has no value."""
-WITHIN_COLOUR: Colour = (0.22, 0.53, 0.74)
+WITHIN_COLOUR: Colour = (0.22, 0.53, 0.74)  # blue
 BEYOND_COLOUR: Colour = (0.95, 0.58, 0.20)
 """The two sides of a threshold."""
 

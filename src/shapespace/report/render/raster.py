@@ -10,7 +10,7 @@ import numpy.typing as npt
 from shapespace.compiled import compiled
 from shapespace.types import FloatArray, IntArray
 
-_TINY = 1e-9
+_TINY = 1e-9  # pixels; keeps triangles that share an edge without gaps
 
 
 @compiled

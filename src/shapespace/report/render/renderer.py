@@ -35,9 +35,9 @@ _Single: TypeAlias = npt.NDArray[np.float32]
 SQUARE_COLOURS = 5
 """How many colours the squares of a checkerboard take in turn."""
 
-_LARGEST_SIDE = 8192
-_SUPERSAMPLE = 2
-_GAMMA = 2.2
+_LARGEST_SIDE = 8192  # pixels; limit on memory
+_SUPERSAMPLE = 2  # samples per pixel and axis
+_GAMMA = 2.2  # approximation of the sRGB transfer function
 # Powers of every pixel would take as long as finding what it shows.
 _SRGB = np.round(255.0 * ((np.arange(65536) + 0.5) / 65536) ** (1 / _GAMMA)).astype(np.uint8)
 
@@ -396,8 +396,8 @@ def _balls(layer: Layer, camera: Camera, size: tuple[int, int], supersample: int
     return _Surfels(pixel, depth_mm, normal, scalar, is_back, _occlusion(pixel, depth_mm, size, supersample, camera))
 
 
-_CLOSING = 0.8
-_NEIGHBOURS = 10
+_CLOSING = 0.8  # radius of a ball in spacings of the points, so that neighbours overlap
+_NEIGHBOURS = 10  # nearest points for normals and spacing, with the point itself
 _clouds: WeakKeyDictionary[Mesh, tuple[float, FloatArray | None]] = WeakKeyDictionary()
 
 

@@ -33,12 +33,12 @@ SCRIPTS = ("vendor/three.min.js", "scene.js", "widgets.js")
 """The scripts of `assets` that a page with scenes needs, in this order; the colours come before the last."""
 
 _DTYPES = ("float32", "int32", "uint32", "uint16", "int16", "uint8")
-_UNKNOWN = -32768
-_MOST_STEPS = 32767
+_UNKNOWN = -32768  # smallest int16
+_MOST_STEPS = 32767  # largest int16
 # What a report rounds to: an error of 0.02 mm is a hundredth of what a good fit leaves.
 _PLACE_STEP_MM = 0.04
-_DISTANCE_STEP_MM = 0.05
-_MODE_STEP_MM = 0.02
+_DISTANCE_STEP_MM = 0.05  # mm
+_MODE_STEP_MM = 0.02  # mm
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,7 +25,7 @@ PANEL = (176, 232)
 
 AREA_LIMIT = 2.0
 """The factor of growth at which the maps of change of area end."""
-FOLD_COLOUR: Colour = (0.05, 0.05, 0.05)
+FOLD_COLOUR: Colour = (0.05, 0.05, 0.05)  # near black, sRGB from 0 to 1
 
 Still: TypeAlias = tuple[bytes, tuple[int, int]]
 """WebP, and its width and height in pixels."""
