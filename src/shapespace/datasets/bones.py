@@ -1,4 +1,4 @@
-"""Simulated bones of two groups: raw scans of small skulls, with a known difference and a known asymmetry.
+"""Simulated bones: raw scans of small skulls in two groups, with a known group difference and asymmetry.
 
 A skull is a star-shaped surface about its centre: an ellipsoid with bumps for snout, crest, cheek arches and condyles,
 and pits for the orbits. The second group has a longer snout; in all skulls the left arch protrudes further than the

@@ -1,4 +1,4 @@
-"""Downloads that go on where a broken run stopped, and locks between processes."""
+"""Downloads that resume after an interruption, and file locks between processes."""
 
 from __future__ import annotations
 
@@ -60,11 +60,11 @@ def download(url: str, path: Path, bar: tqdm[Any], *, sha256: str | None = None,
 
 
 class NotThereError(DataError):
-    """The server says that it has no such file."""
+    """The server has no file at the address."""
 
 
 class _CutError(Exception):
-    """The connection ended before the file did."""
+    """The connection closed before the end of the file."""
 
 
 @dataclass(frozen=True)
@@ -172,7 +172,7 @@ def _quiet_pooch() -> Generator[None]:
 
 @contextlib.contextmanager
 def hold_lock(path: Path) -> Generator[None]:
-    """Hold a lock on the file `path`; the system lets go of it even if the process is killed."""
+    """Hold a lock on the file `path`; the system releases it even if the process is killed."""
     try:
         stream = path.open("a+b")
     except OSError as error:

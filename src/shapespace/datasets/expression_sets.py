@@ -80,7 +80,7 @@ _SHOWN = 3  # names in a message before the rest is only counted
 
 @dataclass(frozen=True)
 class ScanEntry:
-    """A scan and what it shows.
+    """A scan with its subject and expression.
 
     Args:
         path: the file.
@@ -100,7 +100,7 @@ class ScanEntry:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """A file, or a line of `labels.csv`, that is not among the scans, and why."""
+    """A file, or a line of `labels.csv`, that is excluded, with the reason."""
 
     name: str
     why: str
@@ -108,7 +108,7 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class ScanSet:
-    """What a folder of labelled scans holds.
+    """Labelled scans of a folder.
 
     Args:
         folder: the folder.

@@ -29,7 +29,7 @@ def chin_of(faces: FaceGenerator) -> FloatArray:
 
 
 def with_chin(faces: FaceGenerator, face: Mesh, mm: float) -> Mesh:
-    """Return a face of the generator whose chin stands out by `mm` more."""
+    """Return a face of the generator with a chin that protrudes by `mm` more."""
     return face.with_vertices(face.vertices + mm * chin_of(faces)[:, None] * vertex_normals(face))
 
 

@@ -76,7 +76,7 @@ _ETHNICITIES, _GENDERS = ("african", "asian", "caucasian"), ("female", "male")
 
 @dataclass(frozen=True, eq=False)
 class Person:
-    """Who a face is.
+    """Identity weights of a simulated person.
 
     Args:
         weights: (I,) float64 in [0, 1], one for each of the generator's `identity_names`.
@@ -98,7 +98,7 @@ class Person:
 
 @dataclass(frozen=True, eq=False)
 class Expression:
-    """What a face does.
+    """Expression weights of a simulated face.
 
     Args:
         weights: (U,) float64 in [0, 1], one for each of the generator's `unit_names`.
@@ -125,7 +125,7 @@ def _checked_weights(weights: npt.ArrayLike, weight_kind: str) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class FaceGenerator:
-    """Draws simulated people and expressions, all in one topology; see `load_faces`.
+    """Generator of people and expressions in one topology; see `load_faces`.
 
     Args:
         template: the average young adult, V vertices in mm, with all landmarks.
@@ -320,7 +320,7 @@ def _combine(weights: FloatArray, shapes: npt.NDArray[np.float32]) -> FloatArray
 
 
 def _draw_bounded_factor(rng: np.random.Generator, spread: float) -> float:
-    """Draw from a normal distribution cut off at 2.5 standard deviations."""
+    """Draw from a normal distribution truncated at 2.5 standard deviations."""
     while True:
         x = float(rng.normal())
         if abs(x) <= 2.5:

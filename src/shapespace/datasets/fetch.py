@@ -1,4 +1,4 @@
-"""Open data sets: where they are, what they must hash to, and how to get them.
+"""Open data sets: location, published hashes, and download.
 
 A data set is looked for in this order: the local mirror that `SHAPESPACE_DATA` names (a folder holding `<name>/`),
 the cache folder of the platform (or `SHAPESPACE_CACHE`), and then the network: the published
@@ -59,7 +59,7 @@ class DataFile:
 
 @dataclass(frozen=True)
 class Dataset:
-    """An open data set as it was published.
+    """An open data set as published.
 
     Args:
         name: as in `shapespace data get NAME`.

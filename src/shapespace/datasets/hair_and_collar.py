@@ -1,4 +1,4 @@
-"""Hair and collar as a scanner sees them, put onto a simulated scan: surfaces that no model of faces has."""
+"""Simulated hair and collars on a scan, which no face model represents."""
 
 from __future__ import annotations
 

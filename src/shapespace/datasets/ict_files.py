@@ -43,7 +43,7 @@ _MAX_MODES = 1000  # above the modes of ICT-FaceKit, as a limit on damaged files
 
 @dataclass(frozen=True, eq=False)
 class PackedIct:
-    """What is kept of ICT-FaceKit, in centimetres as published.
+    """Arrays of ICT-FaceKit, in centimetres as published.
 
     Args:
         mean: (11248, 3) float64, the neutral mesh.

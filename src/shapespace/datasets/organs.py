@@ -1,4 +1,4 @@
-"""Simulated organs: smooth, closed, without a corner to hold on to, like spleens; as raw surfaces or as label volumes.
+"""Simulated organs without landmarks, such as spleens: smooth, closed, as raw surfaces or as label volumes.
 
 An organ is a star about the middle of a straight body, which is then tapered and bent: a point of the body is inside
 where it is nearer to the middle than the radius in its direction. So both surfaces and voxels follow from one formula.
@@ -35,7 +35,7 @@ _MOST = 10_000  # limit on files written to the folder of a demonstration
 
 @dataclass(frozen=True, eq=False)
 class Organ:
-    """One organ in a frame of its own, mm.
+    """One organ in its own frame, mm.
 
     Args:
         half_mm: (3,) of its axes.

@@ -1,4 +1,4 @@
-"""Smooth random changes of a shape at several scales: what people vary by beyond any list of shapes.
+"""Smooth random deformations at several scales, for variation beyond a fixed set of shapes.
 
 The shape is stretched along its axes, and displaced by Gaussian processes with squared-exponential covariance. Each is
 a sum of many cosine waves in space (random Fourier features: Rahimi and Recht, NIPS 2007), so what lies close together
@@ -19,7 +19,7 @@ _WAVES = 96  # random Fourier features of the field
 
 @dataclass(frozen=True)
 class Warp:
-    """How far shapes vary; lengths in mm of a head.
+    """Amplitude and length scales of a random deformation, mm for a head.
 
     Args:
         stretch: standard deviation of the logarithm of the stretch along each axis; the volume stays.

@@ -127,7 +127,7 @@ def _are_blendshapes(head: bytes) -> bool:
 
 
 class _DamagedError(ValueError):
-    """The bytes are not such an archive."""
+    """The bytes are not an eos archive."""
 
 
 class _Archive:

@@ -1,4 +1,4 @@
-"""What a model says beside its numbers, as JSON for formats that leave room for what others bring along."""
+"""Metadata of a model (landmarks, provenance, licence) as JSON, for formats with a free text field."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def facts_of(model: LinearModel) -> dict[str, Any]:
 
 
 def with_facts(model: LinearModel, facts: object) -> LinearModel:
-    """Return `model` with what `facts` of `facts_of` tells; what is not as that writes it is passed over.
+    """Return `model` with the metadata in `facts`.
 
     Landmarks are in triangles of vertices, so they are read only where the number of vertices is still the same.
     """

@@ -1,4 +1,4 @@
-"""FLAME and the SMPL family: a template and what each coefficient does to it, in metres, as `.npz` or as a pickle."""
+"""FLAME and the SMPL family: a template and blend shapes in metres, as `.npz` or as a pickle."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""glTF 2.0 morph targets: a mesh and what each mode adds to it, which Blender, three.js and game engines move."""
+"""glTF 2.0 morph targets: a mesh with the displacement of each mode, for Blender, three.js and game engines."""
 
 from __future__ import annotations
 
@@ -193,7 +193,7 @@ def _normals(vertices: FloatArray, faces: IntArray, *, upright: bool = False) ->
 
 
 class _Buffer:
-    """The numbers of a file, and where each array lies."""
+    """Binary data of a file, with the offset of each array."""
 
     def __init__(self) -> None:
         self.parts: list[bytes] = []

@@ -1,4 +1,4 @@
-"""Face models in MATLAB files: the Basel Face Model of 2009, LSFM, LYHM; of version 7.3 too, which is HDF5."""
+"""Face models in MATLAB files: the Basel Face Model of 2009, LSFM and LYHM, also in version 7.3 (HDF5)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _HDF5_AT = 512  # MAT-file 7.3: HDF5 begins after a user block of 512 bytes
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where a kind of file has its parts, and what they mean.
+    """Variable names of one kind of file, and their meaning.
 
     Args:
         title: of the model, for provenance.

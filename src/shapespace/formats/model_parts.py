@@ -1,4 +1,4 @@
-"""What the model files of others say, before it becomes a model of ours, and what they are to be told of one.
+"""Linear models as files of other tools store them, and the protocols of readers and writers.
 
 Modes are held as what one standard deviation of each does, U sqrt(lambda), in the unit of the file: every convention of
 basis and spread is that product, and a basis that is not orthonormal loses nothing by it.
@@ -46,7 +46,7 @@ class Modes:
 
 @dataclass(frozen=True, eq=False)
 class LinearModel:
-    """One linear shape model as its file has it.
+    """One linear shape model as stored in a file.
 
     Args:
         mean: (V, 3) vertices where all coefficients are zero, with the mean of the expressions.
@@ -80,7 +80,7 @@ class LinearModel:
         object.__setattr__(self, "landmarks", SurfaceLandmarks.of(self.landmarks))
 
     def noting(self, *notes: str) -> LinearModel:
-        """Return it with more `notes`."""
+        """Return the model with more `notes`."""
         return replace(self, notes=(*self.notes, *notes))
 
     def check(self, path: Path) -> None:
@@ -147,7 +147,7 @@ def orthonormal(displacements: FloatArray) -> tuple[FloatArray, FloatArray, Floa
 
 
 class ModelReader(Protocol):
-    """A format of model files: one module, one class, one place in `MODEL_FORMATS` or `READ_ONLY_MODELS`."""
+    """A reader of one model format: one module, one class, one entry in `MODEL_FORMATS` or `READ_ONLY_MODELS`."""
 
     name: str
     """By which `shapespace convert --to` asks for it."""
@@ -171,7 +171,7 @@ class ModelReader(Protocol):
 
 
 class ModelFormat(ModelReader, Protocol):
-    """A format that is written too."""
+    """A model format with a writer."""
 
     def write(self, model: LinearModel, path: Path) -> Sequence[str]:
         """Write `model` to `path`, whole or not at all, and return sentences on what was changed or left out.

@@ -1,4 +1,4 @@
-"""Folders of OBJ files, one for each shape, as ICT-FaceKit is published: a neutral mesh, identities and expressions."""
+"""Folders of OBJ files, one per shape, in the layout of ICT-FaceKit: a neutral mesh, identities and expressions."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def _files(folder: Path) -> tuple[Path | None, list[Path]]:
 
 
 def _counts(path: Path) -> tuple[int, int]:
-    """Return about how many vertices and faces an OBJ file has, without reading its numbers."""
+    """Return approximate numbers of vertices and faces of an OBJ file, without parsing it."""
     content = b"\n" + read_bytes(path, _LOOKED_AT_BYTES)
     return content.count(b"\nv "), content.count(b"\nf ")
 

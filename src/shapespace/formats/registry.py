@@ -1,4 +1,4 @@
-"""The one list of formats, and which of them a file is."""
+"""Registry of model formats, and detection of the format of a file."""
 
 from __future__ import annotations
 

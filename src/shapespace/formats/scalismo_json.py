@@ -101,7 +101,7 @@ class _File(msgspec.Struct):
 
 
 def _tree(text: bytes) -> Tree:
-    """Return the tree by the links from its root; what nothing links to is not looked at.
+    """Return the tree of linked objects from the root; objects without a link are ignored.
 
     Raises:
         ValueError: it is no such file, as a clause.

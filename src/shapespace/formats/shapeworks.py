@@ -225,7 +225,7 @@ def _domains(project: _Project) -> tuple[str, list[str]]:
 
 @dataclass(frozen=True, eq=False)
 class _Surface:
-    """The mesh of a subject.
+    """Mesh of a subject.
 
     Args:
         subject: its name.

@@ -1,4 +1,4 @@
-"""statismo and scalismo models: HDF5 files, and one tree of groups that their other container shares.
+"""statismo and scalismo models in HDF5, and the tree of groups that both of their containers share.
 
 Dialects differ in how texts, attributes and sizes are stored, in whether a column of the basis is of length 1, and in
 where the points are; all are told apart by what the tree holds. A Morphable Model (Basel Face Model, scalismo-faces) is
@@ -87,7 +87,7 @@ def model_of(tree: Tree, path: Path) -> LinearModel:
 
 @dataclass(frozen=True, eq=False)
 class _ModelBlock:
-    """One model of a tree: mean (D,), moved (D, K), and variance that no mode holds."""
+    """One model of a tree: mean (D,), displacements (D, K), and the variance of the noise."""
 
     mean: FloatArray
     moved: FloatArray
@@ -233,7 +233,7 @@ def _surface(
 
 
 def _points(tree: Tree, root: str, mean: FloatArray) -> tuple[FloatArray, bool]:
-    """Return the points of the reference (V, 3), the mean where there are none, and whether they stand in columns."""
+    """Return the points of the reference (V, 3), or the mean without one, and whether they are stored in columns."""
     points = tree.arrays.get(f"{root}/{_LEGACY_POINTS}")
     if points is not None and points.shape == mean.shape:
         return points.astype(np.float64), False
@@ -248,7 +248,7 @@ def _points(tree: Tree, root: str, mean: FloatArray) -> tuple[FloatArray, bool]:
 
 
 def _outer_triangles(cells: npt.NDArray[np.int64], mean: FloatArray) -> npt.NDArray[np.int64]:
-    """Return the triangles (M, 3) of tetrahedra (C, 4) that belong to one of them alone, turned outward."""
+    """Return the boundary triangles (M, 3) of tetrahedra (C, 4), oriented outward."""
     a, b, c, d = (mean[cells[:, corner]] for corner in range(4))
     volume = np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a)
     cells = np.where((volume < 0)[:, None], cells[:, [0, 2, 1, 3]], cells)

@@ -1,4 +1,4 @@
-"""A model as the tree of groups that statismo 0.9 has, and that as HDF5."""
+"""Conversion of a model to the tree of groups of statismo 0.9, and to HDF5."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _LEFT_OUT = 1e-6  # relative; rounding in single precision
 
 @dataclass
 class _TreeBuilder:
-    """A tree that is being made, of `model`."""
+    """Builder of the tree of `model`."""
 
     model: LinearModel
     told: Mapping[str, str]

@@ -1,4 +1,4 @@
-"""Arrays that a later run would otherwise make again, kept in the user's cache folder up to a bound.
+"""Disk cache of arrays in the user's cache folder, with a size limit.
 
 Each file is written whole under a name that says what it was made of: a SHA-256 in hexadecimal, and after it the `.npz`
 that it is of. What is damaged, or cannot be read or written, counts as not there: whoever asks makes it again.

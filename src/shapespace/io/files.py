@@ -1,4 +1,4 @@
-"""Files that are either whole or not there: atomic writing, hashes, and errors that name the file."""
+"""Atomic writing of files, hashes, and errors that name the file."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def atomic_path(path: Path) -> Generator[Path]:
 
 
 def write_together(files: Mapping[Path, Callable[[Path], object]], remove: Iterable[Path] = ()) -> None:
-    """Write files of which the last vouches for the others: stopped at any moment, it is whole and theirs, or absent.
+    """Write several files so that the last is complete and matches the others, or is absent, after any interruption.
 
     Args:
         files: what writes each, given a temporary path.

@@ -1,4 +1,4 @@
-"""Meshes of other tools, to and from: by what their objects have, so that none of these tools is required."""
+"""Conversion of meshes from and to other tools by the attributes of their objects; none of these tools is required."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def as_meshes(items: Any, function: str) -> Sequence[Mesh]:
 
 
 def _as_simple_mesh(x: Any) -> Any:
-    """Return the mesh that an object of another tool stands for."""
+    """Convert tensors of Open3D and scenes of trimesh to a simple mesh of the same tool."""
     if hasattr(x, "to_legacy"):  # Open3D's tensors
         return x.to_legacy()
     return x.to_mesh() if hasattr(x, "geometry") and hasattr(x, "to_mesh") else x  # a scene of trimesh

@@ -1,4 +1,4 @@
-"""How much memory there is for arrays: what the system can give, or less where a container is held to a limit."""
+"""Memory available for arrays, from the system and the limits of a container."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the readers share: numbers from text, polygons to triangles, and XML and JSON from strangers."""
+"""Parsing functions of all readers: numbers from text, polygons to triangles, untrusted XML and JSON."""
 
 from __future__ import annotations
 

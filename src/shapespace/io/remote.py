@@ -1,4 +1,4 @@
-"""Scans that lie elsewhere, at any address that fsspec knows, such as s3://bucket/scan.ply: fetched for a fit."""
+"""Scans at remote addresses that fsspec supports, such as s3://bucket/scan.ply, copied for a fit."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def name_of(address: str) -> str:
 
 
 def addresses(address: str, endings: Sequence[str], *, recursive: bool) -> list[str]:
-    """Return the files that an address stands for: itself, those of a pattern, or those of a folder.
+    """Return the files at an address: itself, the matches of a pattern, or the files in a folder.
 
     Args:
         address: a file, a folder, or a pattern with * or ?.
@@ -61,7 +61,7 @@ def addresses(address: str, endings: Sequence[str], *, recursive: bool) -> list[
 
 
 def version_of(address: str) -> str:
-    """Return a word that changes with the file at an address, without reading it.
+    """Return a hash that changes with the file at an address, without reading it.
 
     Raises:
         FileError: it cannot be reached.
@@ -116,7 +116,7 @@ def _files(address: str) -> tuple[Any, str]:
 
 @contextlib.contextmanager
 def _translate_errors(address: str) -> Generator[None]:
-    """Turn what the many libraries below fsspec raise into one sentence."""
+    """Convert exceptions of fsspec and the libraries below it to one error message."""
     try:
         yield
     except ShapespaceError:

@@ -1,4 +1,4 @@
-"""HDF5 and MATLAB files of others, which a library reads in a process of its own that may be ended.
+"""HDF5 and MATLAB files from other tools, read by a library in a sandboxed process.
 
 Those libraries take what memory a file asks for, follow links to other files, and hang or crash in damaged structures.
 In that process they see one open file and can open no other, are held to a share of memory and time, and only numbers
@@ -38,12 +38,12 @@ HDF5_SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
 
 
 class SandboxError(ValueError):
-    """The file is damaged, or made to harm; the text says how, as a clause."""
+    """The file is damaged or malicious; the text gives the reason, as a clause."""
 
 
 @dataclass(frozen=True)
 class Tree:
-    """What is in a file of HDF5, or in one of the same shape, by path: "/model/mean".
+    """Content of an HDF5 file, or of a file with the same structure, by path: "/model/mean".
 
     Args:
         arrays: of numbers.
@@ -59,7 +59,7 @@ class Tree:
 
 
 def read_hdf5_sandboxed(path: Path, leave: Sequence[str] = ()) -> Tree:
-    """Return what is in an HDF5 file, but for what stands at the paths `leave`, and objects of other kinds.
+    """Return the content of an HDF5 file, without the paths in `leave` and objects of other kinds.
 
     Raises:
         FileError: it cannot be read.

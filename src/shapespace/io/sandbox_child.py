@@ -1,4 +1,4 @@
-"""Program of the sandbox process: a program of its own, which imports nothing of shapespace.
+"""Program of the sandbox process, which imports nothing of shapespace.
 
 Its standard input is the file. It writes one line of JSON on what it found and, after it, the bytes of the arrays.
 """
@@ -26,11 +26,11 @@ _NUMBERS: Final = "biuf"
 
 
 class _RefusedError(ValueError):
-    """The file asks for what no model needs; the text says what, as a clause."""
+    """The file uses a feature that no model needs; the text names it, as a clause."""
 
 
 class _FileContent:
-    """What has been read, and how many bytes more may be."""
+    """Content read so far, and the number of bytes that remain allowed."""
 
     def __init__(self, most_bytes: int) -> None:
         self.arrays: dict[str, npt.NDArray[Any]] = {}
@@ -40,7 +40,7 @@ class _FileContent:
         self._left, self._most = most_bytes, most_bytes
 
     def charge(self, count: int, path: str) -> None:
-        """Take `count` bytes from what the file may fill in memory, before they are taken there."""
+        """Subtract `count` bytes from the memory allowed, before they are allocated."""
         self._left -= count
         if self._left < 0:
             raise _RefusedError(f"{path} unfolds to more than {self._most >> 20} MiB, out of proportion to the file")
@@ -158,7 +158,7 @@ def _matlab(stream: BinaryIO, request: dict[str, Any], content: _FileContent) ->
 
 
 def _add_variable(value: Any, path: str, content: _FileContent) -> None:
-    """Add a variable, or the fields of a structure, as groups of HDF5 would hold them."""
+    """Add a variable, or the fields of a structure, as HDF5 groups."""
     if path.count("/") > _DEEPEST or type(value) is not np.ndarray:
         return
     if value.dtype.kind in _NUMBERS:
@@ -170,7 +170,7 @@ def _add_variable(value: Any, path: str, content: _FileContent) -> None:
 
 
 def _forbid_opening_files() -> None:
-    """Open no more files, where the system can hold a process to that."""
+    """Limit this process to the files that are open, where the system supports it."""
     if sys.platform != "win32":
         import resource
 
@@ -180,7 +180,7 @@ def _forbid_opening_files() -> None:
 
 
 def _limit_resources(most_memory: int, most_seconds: int) -> None:
-    """Hold this process to so much memory and work, where the system can."""
+    """Limit memory and processor time of this process, where the system supports it."""
     if sys.platform != "win32":
         import resource
 

@@ -1,4 +1,4 @@
-"""Folders that `correspond` wrote: which surfaces are in them, and in which unit."""
+"""Output folders of `correspond`: their surfaces and their unit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The manifest of a store: which shards are in it, with the size and hash of each of their files."""
+"""The manifest of a store: its shards, with the size and hash of each file."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ class StoredFile(Struct, frozen=True, kw_only=True):
 
 
 class ShardEntry(Struct, frozen=True, kw_only=True):
-    """One shard: a table with a row for each fit, and the surfaces of those that have one.
+    """One shard: a table with a row for each fit, and surfaces of some of them.
 
     Args:
         table: its Parquet file.

@@ -1,4 +1,4 @@
-"""The results of fits in a folder, be they single files, shards of a store, or both: read one at a time, or as rows."""
+"""Results of fits in a folder, from single files or shards of a store, read one at a time or as rows."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _OPEN = 4  # folders
 
 
 class StoredFit(NamedTuple):
-    """Where a store keeps a fit, and what it has of it.
+    """Location of a fit in a store, and its files.
 
     Args:
         shard: which one, in the order of the manifest.
@@ -69,7 +69,7 @@ class _Identity(msgspec.Struct, frozen=True):
 
 
 class ResultStore:
-    """The shards of a folder.
+    """Shards of a folder.
 
     Args:
         folder: of the store.
@@ -147,7 +147,7 @@ class ResultStore:
 
 
 class Results:
-    """The results of fits in a folder, single files and those of a store alike.
+    """Results of fits in a folder, from single files and from a store.
 
     A fit that is in both is that of the single files, which are newer. Names and flags are those of the moment when
     this was made.
@@ -188,7 +188,7 @@ class Results:
         }
 
     def is_moved(self, name: str) -> bool:
-        """Return whether the record of a single file stands in a shard, to the byte."""
+        """Return whether a shard contains the record of a single file, byte for byte."""
         try:
             stored = self.store.record_text(name) if self.store and name in self._stored else None
             return stored is not None and stored.encode() == read_bytes(self.folder / f"{name}{ENDING}")
@@ -408,7 +408,7 @@ class Results:
 
 
 def split_file_name(file: str) -> tuple[str, str]:
-    """Return NAME and what it is of the name of a result file: `record`, one of `ENDINGS`, or nothing."""
+    """Return the scan name and the kind of a result file: `record`, one of `ENDINGS`, or nothing."""
     for kind, ending in {"record": ENDING, **ENDINGS}.items():
         if file.endswith(ending) and file != ending:
             return file.removesuffix(ending), kind
@@ -443,7 +443,7 @@ def _store_at(_resolved: Path, folder: Path, _changed: int) -> ResultStore | Non
 
 
 def is_stored_at(path: Path) -> bool:
-    """Return whether a store in the folder of `path` keeps what a single file of that name would hold."""
+    """Return whether a store in the folder of `path` contains the content of a single file of that name."""
     name, kind = split_file_name(path.name)
     if not kind or path.is_file() or (results := results_at(path.parent)) is None:
         return False
@@ -451,7 +451,7 @@ def is_stored_at(path: Path) -> bool:
 
 
 def has_written_landmarks(record: Path) -> bool:
-    """Return whether the fit that `record` is of wrote landmarks beside it; files of that name may be a user's own."""
+    """Return whether the fit of `record` wrote landmark files; files of that name may be a user's own."""
     try:
         return b'"found_landmarks"' in read_bytes(record)
     except ShapespaceError:

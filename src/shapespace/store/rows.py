@@ -1,4 +1,4 @@
-"""Fits as rows: what coefficients.csv holds of each, and what the tables of a store hold beside it."""
+"""Fits as rows of coefficients.csv and of the tables of a store."""
 
 from __future__ import annotations
 

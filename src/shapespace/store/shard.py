@@ -1,4 +1,4 @@
-"""One shard of a store, read with care: nothing is taken that its manifest and the bytes of its files do not cover."""
+"""Reader of one shard of a store, checked against the manifest."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _RECORDS_KEPT = 2  # row groups; records are read one after the other
 
 
 class Shard:
-    """One shard; its files are opened when they are first needed.
+    """One shard; its files are opened on first use.
 
     Args:
         root: folder of the store.
@@ -240,7 +240,7 @@ def _surfaces(path: Path, _changed: int) -> _Surfaces:
 
 
 class _Surfaces:
-    """The Zarr file of a shard, kept open; arrays are checked before the library sees them."""
+    """The open Zarr file of a shard; arrays are checked before the library reads them."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

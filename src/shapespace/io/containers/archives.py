@@ -1,4 +1,4 @@
-"""Zip archives of arrays, .npz among them, from whoever sent them: no pickles, and memory in proportion to the file."""
+"""Readers of untrusted zip archives of arrays, such as .npz files: no pickles, memory proportional to the file size."""
 
 from __future__ import annotations
 

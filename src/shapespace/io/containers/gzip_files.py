@@ -1,4 +1,4 @@
-"""Files packed by gzip, unpacked in proportion to their bytes."""
+"""Reader of gzip files with a limit on the unpacked size."""
 
 from __future__ import annotations
 

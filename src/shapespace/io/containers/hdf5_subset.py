@@ -1,4 +1,4 @@
-"""The part of HDF5 that our own writer uses, read without the HDF5 library.
+"""Reader of the subset of HDF5 that the shapespace writer uses, without the HDF5 library.
 
 That library follows links to other files and devices, takes what memory a header asks for, and hangs or crashes in
 damaged structures; a checksum does not help against who recomputes it. So only this is read, and all else refused:
@@ -41,7 +41,7 @@ _TEXT = bytes.fromhex("19010100100000001000000001000000000008")
 
 
 class OtherHdf5Error(ValueError):
-    """It is HDF5, or claims to be, but not as our writer writes it; the text says why, as a clause."""
+    """An HDF5 file that does not use the layout of the shapespace writer; the text gives the reason, as a clause."""
 
 
 def hdf5_parts(data: memoryview) -> tuple[Arrays, dict[str, Attribute]]:
@@ -110,7 +110,7 @@ class _Parts:
         return messages
 
     def _names(self, tree: int, heap: int) -> list[tuple[str, int]]:
-        """Return each name in the group with the address of its header; all stand at one level of the tree."""
+        """Return each name in the group with the address of its header; all names are at one level of the tree."""
         mark, kind, level, count = self._fields("4sBBH", tree)
         heap_mark, texts = self._fields("4s20xQ", heap)
         if (mark, kind, level, heap_mark) != (b"TREE", 0, 0, b"HEAP") or count > _MOST:

@@ -1,4 +1,4 @@
-"""JSON of our own files, from whoever sent them: bounded in bytes, depth and the size of its numbers."""
+"""Reader and writer of untrusted JSON files, with limits on size, depth and numbers."""
 
 from __future__ import annotations
 

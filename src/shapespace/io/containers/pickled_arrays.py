@@ -1,4 +1,4 @@
-"""Arrays in a Python pickle, which is a program, without running it.
+"""Reader of arrays in Python pickles that does not execute them.
 
 Its steps are taken here, one by one, over numbers, texts, lists and dictionaries. What it would have Python call is
 looked up in a short list of what arrays are made of (numpy, sparse matrices, chumpy) and noted, never called; whatever
@@ -52,12 +52,12 @@ _TUPLES = {"EMPTY_TUPLE": 0, "TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 
 
 class PickleRefusedError(ValueError):
-    """It is no pickle, is damaged, or asks for more than arrays; the text says what, as a clause."""
+    """A pickle that is damaged or contains more than arrays; the text gives the reason, as a clause."""
 
 
 @dataclass
 class _PickledObject:
-    """What the pickle would have made: a word of `_KNOWN`, of what, and what it was then given as its state."""
+    """An object that the pickle would create: its kind from `_KNOWN`, its arguments, and its state."""
 
     what: str
     parts: tuple[Any, ...] = ()
@@ -83,7 +83,7 @@ class _Machine:
 
 
 def pickled_dict(data: bytes) -> dict[str, Any]:
-    """Return the dictionary that a pickle is of; give its values to `pickled_array`.
+    """Return the dictionary in a pickle; pass its values to `pickled_array`.
 
     Raises:
         PickleRefusedError: it is none, is damaged, or names what no array needs.
@@ -105,7 +105,7 @@ def pickled_dict(data: bytes) -> dict[str, Any]:
 
 
 def pickled_array(value: object, depth: int = 0) -> npt.NDArray[Any]:
-    """Return the array that `value` of a pickle is, one inside chumpy too.
+    """Return the array that `value` of a pickle describes, also inside chumpy.
 
     Raises:
         PickleRefusedError: it is none of numbers, or is not as long as it says.
@@ -134,7 +134,7 @@ def pickled_array(value: object, depth: int = 0) -> npt.NDArray[Any]:
 
 
 def _select_rows(state: dict[str, Any], depth: int) -> npt.NDArray[Any]:
-    """Return what chumpy's Select takes from an array."""
+    """Return the elements that chumpy's Select takes from an array."""
     flat = pickled_array(state["a"], depth + 1).ravel()
     indices = pickled_array(state["idxs"], depth + 1).astype(np.int64).ravel()
     shape = state.get("preferred_shape") or (len(indices),)
@@ -190,7 +190,7 @@ def _as_bytes(data: Any) -> bytes:
 
 
 def _run_step(machine: _Machine, name: str, argument: Any) -> None:
-    """Take one step of a pickle."""
+    """Execute one step of a pickle."""
     stack = machine.stack
     if name in _PLAIN:
         stack.append(argument)
@@ -271,7 +271,7 @@ def _resolve_name(module: str, name: str) -> _PickledObject:
 
 
 def _call(function: Any, arguments: Any) -> Any:
-    """Return what a call of `function` stands for."""
+    """Return the object that a call of `function` creates."""
     if not isinstance(function, _PickledObject) or function.what != "name" or not isinstance(arguments, tuple):
         raise PickleRefusedError("it calls what is no name")
     values = cast(tuple[Any, ...], arguments)

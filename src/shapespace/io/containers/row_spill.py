@@ -1,4 +1,4 @@
-"""Rows of single precision in one file, for tables that do not fit into memory.
+"""Rows of single precision in a temporary file, for tables that do not fit into memory.
 
 The file holds panels of columns one after the other, each a C-ordered (rows, width) block of little-endian float32, so
 that both a block of rows and a block of columns are read in long runs. There is no header.
@@ -26,7 +26,7 @@ _FLOAT32 = np.dtype("<f4")
 
 
 class Spill:
-    """A table (rows, columns) of float32 on the disk; what is read of it is float64.
+    """A table (rows, columns) of float32 on disk, read as float64.
 
     Args:
         path: its file.

@@ -1,4 +1,4 @@
-"""Landmarks that a fit found, with their standard deviations, as the files that it writes beside its surface."""
+"""Landmarks predicted by a fit, with their standard deviations, as files of other programs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Landmarks in and out: named points from the programs that people pick them with."""
+"""Readers and writers of landmark files."""
 
 from __future__ import annotations
 
@@ -265,7 +265,7 @@ def _point(values: Iterable[Any], landmark_name: str, path: Path) -> FloatArray:
 
 
 def _from_json(parse: Callable[[Any, Path], Pairs]) -> Callable[[bytes, Path], Pairs]:
-    """Wrap a reader of parsed JSON: what is missing or of the wrong type there is one clear error here."""
+    """Wrap a reader of parsed JSON so that missing or wrong values raise one clear error."""
 
     def wrapped(data: bytes, path: Path) -> Pairs:
         value = json_value(data, path)
@@ -334,7 +334,7 @@ def _label(value: Any, path: Path) -> str:
 
 
 def _is_missing(point: Any) -> bool:
-    """Whether LJSON has no point here: null, or null coordinates."""
+    """Return whether LJSON has no point here: null, or null coordinates."""
     return point is None or all(value is None for value in point)
 
 

@@ -1,4 +1,4 @@
-"""glTF 2.0, as `.gltf` with its buffers and as one `.glb` file; after the Khronos specification.
+"""glTF 2.0 reader and writer, as `.gltf` with its buffers and as one `.glb` file; see the Khronos specification.
 
 trimesh reads glTF too, but it decodes textures, merges by material and reports damage by internal errors.
 """

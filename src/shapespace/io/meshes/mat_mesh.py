@@ -1,4 +1,4 @@
-"""A mesh in a MATLAB file, as MeshMonk and others keep templates: a structure with `Vertices` and `Faces`."""
+"""Meshes in MATLAB files: a structure with `Vertices` and `Faces`, as in MeshMonk."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def read_mat_mesh(data: bytes, path: Path) -> Mesh:
 
 
 def _mesh(tree: Tree) -> tuple[npt.NDArray[Any], npt.NDArray[Any]] | None:
-    """Return the vertices and faces that stand in one place, if there are such."""
+    """Return the vertices and faces of one structure, if there is one."""
     places: dict[str, dict[str, npt.NDArray[Any]]] = {}
     arrays: Mapping[str, npt.NDArray[Any]] = tree.arrays
     for name, array in arrays.items():

@@ -1,4 +1,4 @@
-"""Meshes and other files in folders: which are taken, and what is left out, in words."""
+"""Lists of meshes and other files in folders, with notes on the files that are skipped."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _NAMED = 3  # names in a message before the rest is only counted
 
 @dataclass(frozen=True)
 class MeshFiles:
-    """What `mesh_files` found.
+    """Result of `mesh_files`.
 
     Args:
         files: in the order given, those of a folder in the order of their names.

@@ -1,4 +1,4 @@
-"""Meshes and point clouds in and out: one plain dict says which file name ending means which format."""
+"""Readers and writers of meshes and point clouds, selected by file name ending from one dict."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Wavefront OBJ: its `v` and `f` lines and its colours; texture seams, normals and groups change nothing."""
+"""Wavefront OBJ: `v` and `f` lines and vertex colours; texture seams, normals and groups are ignored."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def _points(points: list[list[bytes]], lines_before: int, path: Path) -> FloatAr
 
 
 def _colours(points: list[list[bytes]], path: Path) -> FloatArray | None:
-    """Return what stands after the coordinates, (n, 3), where that is three numbers of each vertex."""
+    """Return the numbers after the coordinates, (n, 3), if every vertex has three."""
     if set(map(len, points)) != {_COLOURED_WORDS}:
         return None
     try:

@@ -1,4 +1,4 @@
-"""Colours of OBJ surfaces from the pictures that their materials name (`mtllib`, `map_Kd`), one a vertex."""
+"""Vertex colours of OBJ surfaces from the textures of their materials (`mtllib`, `map_Kd`)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""OFF, the text format of Geomview, with its normals, texture coordinates and the colours of faces ignored."""
+"""OFF, the text format of Geomview; normals, texture coordinates and face colours are ignored."""
 
 from __future__ import annotations
 

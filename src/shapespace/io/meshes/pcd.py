@@ -1,4 +1,4 @@
-"""PCD of the Point Cloud Library: text, binary, and binary packed by LZF.
+"""PCD of the Point Cloud Library: text, binary, and binary compressed by LZF.
 
 After "The PCD (Point Cloud Data) file format", https://pointclouds.org/documentation/tutorials/pcd_file_format.html.
 """
@@ -123,7 +123,7 @@ def _text(text: bytes, head: dict[str, list[str]], n: int, path: Path) -> FloatA
 
 
 def _unpack_columns(data: bytes, offset: int, row: np.dtype[np.void], n: int, path: Path) -> FloatArray:
-    """Return the points of packed data, in which each field stands for all points before the next."""
+    """Return the points of compressed data, which stores field after field for all points."""
     sizes = np.frombuffer(data[offset : offset + 8].ljust(8, b"\0"), "<u4")
     packed, size = int(sizes[0]), int(sizes[1])
     if n < 0 or size != n * row.itemsize or offset + 8 + packed > len(data):

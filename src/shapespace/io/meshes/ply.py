@@ -73,7 +73,7 @@ class _Element:
 
 
 class _Words:
-    """The words of ascii data from byte `at`, one after another; few of them are in memory at a time."""
+    """Iterator over the words of ascii data from an offset; few words are in memory at a time."""
 
     def __init__(self, data: bytes, offset: int) -> None:
         self.data = data
@@ -341,7 +341,7 @@ def _ascii_lists(words: _Words, element: _Element, list_index: int | None, path:
 
 
 def _read_equal_lists(words: _Words, count: int, path: Path) -> IndexArray | None:
-    """Return (count, n + 1) the sizes and corners of lists that are all as long as the first; None if they are not."""
+    """Return (count, n + 1) the sizes and corners of lists of equal length; None if their lengths differ."""
     start = words.mark()
     first = next(words, b"")
     size = int(ints([first], path)[0])
@@ -407,7 +407,7 @@ def _binary_lists(
 def _uniform_lists(
     data: bytes, start: int, element: _Element, order: str, list_index: int | None
 ) -> tuple[IndexArray, IndexArray, int] | None:
-    """Read the rows at one stroke if all lists have the lengths of the first row's; None if they do not."""
+    """Read all rows at once if all lists have the lengths of the first row; None otherwise."""
     fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
     expected: list[tuple[str, int]] = []
     offset = start
@@ -439,7 +439,7 @@ def _uniform_lists(
 
 
 def _indices(values: npt.NDArray[Any]) -> IndexArray:
-    """Return whole numbers of any scalar type as int64; what is not whole becomes -1, which no mesh accepts."""
+    """Return whole numbers of any scalar type as int64; other numbers become -1, which no mesh accepts."""
     if values.dtype.kind == "f":
         numbers = values.astype(np.float64)
         is_whole = np.isfinite(numbers) & (numbers == np.floor(numbers)) & (np.abs(numbers) < 2**53)

@@ -1,4 +1,4 @@
-"""STL, ascii and binary: a soup of triangles whose equal corners become one vertex."""
+"""STL, ascii and binary: triangles whose equal corners become one vertex."""
 
 from __future__ import annotations
 

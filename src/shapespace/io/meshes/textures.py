@@ -1,4 +1,4 @@
-"""Pictures that textured surfaces come with, sampled to colours of vertices; read by Pillow, of the extra `report`.
+"""Textures of surfaces, sampled to vertex colours; read by Pillow, of the extra `report`.
 
 What cannot be read leaves a surface without colours and says so in a note: a fit needs the shape alone.
 """
@@ -36,11 +36,11 @@ _KINDS = ("JPEG", "PNG", "BMP", "TIFF")
 
 
 class TextureError(Exception):
-    """Why a picture gives no colours, as a clause."""
+    """The reason why a texture cannot be used, as a clause."""
 
 
 class CompanionFiles:
-    """Materials and pictures that a surface names: in its folder or below it, at most `MOST_BYTES_IN_ALL` together.
+    """Materials and textures in the folder of a surface or below it, at most `MOST_BYTES_IN_ALL` together.
 
     Args:
         path: of the surface.
@@ -97,7 +97,7 @@ class CompanionFiles:
 
 
 class Pictures:
-    """The pictures of one surface, each unpacked once, and in all no more than `MOST_PIXELS_IN_ALL`."""
+    """Textures of one surface, each unpacked once, with at most `MOST_PIXELS_IN_ALL` pixels together."""
 
     def __init__(self) -> None:
         self._unpacked: dict[str, ByteArray | TextureError] = {}

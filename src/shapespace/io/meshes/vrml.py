@@ -1,4 +1,4 @@
-"""VRML 1 and 2 (`.wrl`): the points and faces of its IndexedFaceSets; textures, normals and colours change nothing.
+"""VRML 1 and 2 (`.wrl`): points and faces of IndexedFaceSets; textures, normals and colours are ignored.
 
 Written from ISO/IEC 14772-1:1997 (VRML 2) and "VRML 1.0 Specification" (1995). BU-3DFE stores its scans as VRML 2: one
 Shape with `coord Coordinate { point [ ... ] }`, `coordIndex [ a, b, c, -1, ... ]`, and texture parts that are skipped.
@@ -40,7 +40,7 @@ _KNOWN = {b"USE", b"ccw", b"vertexOrdering", *_FIELDS}
 
 @dataclass
 class _Node:
-    """A node, or a list of nodes, whose closing bracket has not come yet."""
+    """A node, or a list of nodes, whose closing bracket has not been read yet."""
 
     kind: bytes
     name: bytes = b""
@@ -56,7 +56,7 @@ class _Node:
 
 @dataclass
 class _Scene:
-    """What has been read so far: blocks of points, triangles with the block that each set points into, and frames.
+    """State of the parser: blocks of points, triangles with the block of their points, and frames.
 
     A frame is what a Transform moves: the frame outside of it, and its (3, 4) matrix, which is only known where the
     Transform ends. Frame 0 is the file's own.
@@ -93,7 +93,7 @@ class _Scene:
         return self.stack[-1].frame if self.stack else 0
 
     def words(self, words: list[bytes]) -> None:
-        """Take the plain fields that stand in the innermost node."""
+        """Read the plain fields of the innermost node."""
         node = self.stack[-1] if self.stack else _Node(b"")
         for index in [index for index, word in enumerate(words) if word in _KNOWN]:
             word = words[index]
@@ -180,7 +180,7 @@ class _Scene:
         self.sets.append((block, faces[:, ::-1] if node.clockwise else faces, node.frame))
 
     def move(self, node: _Node) -> None:
-        """Apply a Transform to what stands in it: T C R SR S -SR -C, section 6.52 of the standard."""
+        """Apply a Transform to its children: T C R SR S -SR -C, section 6.52 of the standard."""
         values = node.numbers
         zero, none = np.zeros(3), np.array([0.0, 0.0, 1.0, 0.0])
         orientation = _turn(values.get(b"scaleOrientation", none))

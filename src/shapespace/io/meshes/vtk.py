@@ -64,7 +64,7 @@ Values = npt.NDArray[Any]
 
 
 class _Cursor(ABC):
-    """Where a legacy file is being read: words here, and numbers as ascii or binary makes them."""
+    """Read position in a legacy file, with words read here and numbers by the ascii or binary subclass."""
 
     def __init__(self, data: bytes, path: Path) -> None:
         self.data, self.at, self.path = data, 0, path
@@ -357,7 +357,7 @@ def write_vtk(mesh: Mesh) -> bytes:
 
 @dataclass(frozen=True)
 class _Xml:
-    """What the arrays of one XML file have in common."""
+    """Common properties of the arrays of one XML file."""
 
     path: Path
     order: str

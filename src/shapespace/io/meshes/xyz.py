@@ -1,4 +1,4 @@
-"""Rows of points in text: `.xyz` of scanners and CloudCompare, and `.pts` of Leica, which begins with their number."""
+"""Rows of points in text: `.xyz` of scanners and CloudCompare, and `.pts` of Leica, with the number of points first."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _SEPARATORS = bytes.maketrans(b",;\t", b"   ")
 
 
 def read_xyz(data: bytes, path: Path) -> Mesh:
-    """Read rows of three or more numbers, the first three of which are a point; intensity, colour and normals are not.
+    """Read rows whose first three numbers are a point; intensity, colour and normals are ignored.
 
     A row of one number says how many points follow it. A first line of words is the names of columns, and `#`, `//` and
     `%` begin comments; commas and semicolons are spaces.

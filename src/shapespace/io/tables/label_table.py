@@ -1,4 +1,4 @@
-"""Labels of scans from a table such as `shapespace data faces` writes, matched by the names of the scans."""
+"""Labels of scans from a table such as `shapespace data faces` writes, matched by scan name."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _LARGEST_BYTES = 16 * 2**20  # 16 MiB
 
 @dataclass(frozen=True)
 class Label:
-    """What is known of one scan.
+    """Class, subject and intensity of one scan.
 
     Args:
         text: its class, such as an expression; empty where the table has only its subject.

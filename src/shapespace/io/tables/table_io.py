@@ -94,7 +94,7 @@ def _row_writer(stream: TextIO) -> Callable[[Sequence[object]], object]:
 
 
 def _escape_formula(cell: object) -> object:
-    """Return a cell as it is written: text with an apostrophe where a spreadsheet would run it, others as they are."""
+    """Return a cell for writing, with an apostrophe before text that a spreadsheet would execute."""
     if not isinstance(cell, str):
         return cell
     text = cell.encode("utf-8", "backslashreplace").decode("utf-8")
@@ -102,12 +102,12 @@ def _escape_formula(cell: object) -> object:
 
 
 def unescape_formula(cell: str) -> str:
-    """Return the text of a cell without the apostrophe that the writer puts before what a spreadsheet would run."""
+    """Return the text of a cell without the apostrophe that `_escape_formula` adds."""
     return cell[1:] if cell[:1] == "'" and _FORMULA.match(cell) else cell
 
 
 def row_checksum(header: Sequence[str], cells: Sequence[str]) -> str:
-    """Return what stands in the column `CHECKSUM` of a row; no number is written so, which a program might round."""
+    """Return the value of the column `CHECKSUM` for a row."""
     pairs = sorted((name, cell) for name, cell in zip(header, cells, strict=True) if name != CHECKSUM)
     row_text = "\0".join(f"{name}\1{cell}" for name, cell in pairs)
     return f"sha256:{hashlib.sha256(row_text.encode('utf-8', 'surrogatepass')).hexdigest()[:16]}"

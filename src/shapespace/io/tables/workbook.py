@@ -1,4 +1,4 @@
-"""Sheets of Excel workbooks (.xlsx, Office Open XML, ECMA-376 part 1) as rows of text, read as a stream and bounded.
+"""Sheets of Excel workbooks (.xlsx, Office Open XML, ECMA-376 part 1) as rows of text, read as a stream with limits.
 
 Numbers are the text that the file stores, dates are ISO 8601, cells with the error #N/A are empty. Formulas have the
 value that was computed last; nothing is computed.
@@ -85,7 +85,7 @@ class _Target(Protocol):
 
 
 class _Handler:
-    """A target of the XML parser that keeps no tree; document types, and with them entities, are refused."""
+    """A target of the XML parser that builds no tree, and refuses document types and entities."""
 
     def start(self, tag: str, attrs: dict[str, str], /) -> None: ...
 
@@ -100,7 +100,7 @@ class _Handler:
 
 
 class _Elements(_Handler):
-    """The attributes of all elements of some names, in their order."""
+    """Attributes of all elements with given names, in order."""
 
     def __init__(self, names: tuple[str, ...]) -> None:
         self.names = names

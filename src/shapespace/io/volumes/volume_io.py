@@ -1,4 +1,5 @@
-"""Label volumes in: NIfTI (`.nii`, `.nii.gz`) and NRRD (`.nrrd`, header and data in one file), as RAS millimetres.
+"""Readers of label volumes: NIfTI (`.nii`, `.nii.gz`) and NRRD (`.nrrd`, header and data in one file), as RAS
+millimetres.
 
 nibabel and pynrrd read the headers; the voxels are decoded here, so that a header that declares more than its file
 holds, a volume that takes more memory than allowed, and a compressed stream that grows without end are refused before
@@ -75,7 +76,7 @@ _ROUNDING = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class _VolumeHeader:
-    """What a header declares.
+    """Shape, type and orientation that a header declares.
 
     Args:
         shape: of the voxels, in the order of the file, which runs along the first axis first.
@@ -117,7 +118,7 @@ def require_volumes_extra() -> None:
 
 
 def volume_name(path: Path) -> str:
-    """Return the name of the file without its ending, of which `.nii.gz` and `.seg.nrrd` have two parts."""
+    """Return the name of the file without its ending; `.nii.gz` and `.seg.nrrd` are endings of two parts."""
     for ending in (*sorted(VOLUME_ENDINGS, key=len, reverse=True), ".seg"):
         if path.name.lower().endswith(ending) and len(path.name) > len(ending):
             path = path.with_name(path.name[: -len(ending)])
@@ -418,7 +419,7 @@ def _in_mm(affine: FloatArray, mm: float) -> FloatArray:
 
 
 def _check_declared(head: _VolumeHeader, most_bytes: int, path: Path) -> None:
-    """Refuse a header that declares no voxels of labels, or more than `most_bytes`, to which its file can unpack."""
+    """Refuse a header that declares no label voxels, or more bytes than its file can unpack to."""
     size = " x ".join(map(str, head.shape)) or "no"
     if head.kind.kind not in "iuf":
         raise InputError(f"{path} has voxels of colours or complex numbers, not of labels; save the label map alone.")
@@ -435,7 +436,7 @@ def _check_declared(head: _VolumeHeader, most_bytes: int, path: Path) -> None:
 
 
 def _spatial_shape(head: _VolumeHeader, path: Path) -> tuple[int, ...]:
-    """Return the lengths of the three axes of space; all others must have the length 1."""
+    """Return the lengths of the three spatial axes; all other axes must have length 1."""
     size = " x ".join(map(str, head.shape))
     if len(head.shape) < 3 or len(head.axes) != 3:
         raise InputError(f"{path} has {len(head.shape)} dimensions ({size}), which is no volume; give one of labels.")
