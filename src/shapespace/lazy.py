@@ -1,4 +1,4 @@
-"""What lower layers hand on to higher ones, and to packages that are not required, when somebody asks for it.
+"""Lazy imports of functions in higher layers, and of packages that are not required.
 
 Imports point down only. A model can be plotted and a result saved all the same, since their methods look up here who
 does it: this list is all there is of that.

@@ -1,4 +1,4 @@
-"""What a prompt shows of an object that holds arrays: one short line, whatever their size."""
+"""One-line representations of objects that contain arrays."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _LONGEST = 80  # characters; a terminal's line
 
 
 def short_repr(self: Any) -> str:
-    """Return the fields of a dataclass in one line: arrays by their shape and type, long things by how many they hold.
+    """Return the fields of a dataclass in one line: arrays by shape and type, long sequences by length.
 
     It stands in a class as `__repr__ = short_repr`.
     """
@@ -24,13 +24,13 @@ def short_repr(self: Any) -> str:
 
 
 def list_briefly(parts: Sequence[str]) -> str:
-    """Return the first of `parts`, and the number of the others, in one line."""
+    """Return the first of `parts`, and the number of further ones, in one line."""
     others_note = f"; and {len(parts) - _MOST_NAMES} more" if len(parts) > _MOST_NAMES else ""
     return "; ".join(_clip(part) for part in parts[:_MOST_NAMES]) + others_note
 
 
 def describe_briefly(value: Any) -> str:
-    """Return a few words on `value`, of which nothing is measured or read for that."""
+    """Return a short text for `value`, without computing or reading anything."""
     if isinstance(value, np.ndarray):
         return _of_array(cast(npt.NDArray[Any], value))
     if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""The plain data that travels between the parts: meshes, similarities and label volumes.
+"""Data types that all parts share: meshes, landmarks, similarities and label volumes.
 
 Arrays are float64 and read-only. Lengths are millimetres, except the vertices of a scan as read from its file,
 which are in the file's own unit until the fit has found that unit.
@@ -40,7 +40,7 @@ _FEW_DIGITS, _ROUNDING = 1e-4, 1e-12
 
 
 def require(value: object, expected: type, function: str, remedy: str) -> None:
-    """Raise an error in one sentence if an argument has the wrong type.
+    """Raise an InputError if an argument has the wrong type.
 
     Args:
         value: the argument.
@@ -304,7 +304,7 @@ class SurfaceLandmarks(Mapping[str, int]):
 
     @staticmethod
     def of(landmarks: Mapping[str, int]) -> SurfaceLandmarks:
-        """Return `landmarks` themselves, or those at vertices where they are a mapping of name to vertex."""
+        """Return `landmarks`, or landmarks at vertices from a mapping of name to vertex."""
         if isinstance(landmarks, SurfaceLandmarks):
             return landmarks
         vertex = np.array([int(vertex) for vertex in landmarks.values()], dtype=object).reshape(-1, 1)
@@ -317,7 +317,7 @@ class SurfaceLandmarks(Mapping[str, int]):
 
     @property
     def are_vertices(self) -> bool:
-        """Whether each landmark was given as a vertex: it is exactly at one, at no distance from the surface."""
+        """Whether each landmark was given as a vertex: exactly at a vertex, at no distance from the surface."""
         return bool((self.barycentric[:, 0] == 1.0).all()) and not self.distance_mm.any()
 
     def interpolate(self, values: npt.ArrayLike) -> FloatArray:
@@ -342,7 +342,7 @@ class SurfaceLandmarks(Mapping[str, int]):
         return SurfaceLandmarks(tuple(names), self.corners[rows], self.barycentric[rows], self.distance_mm[rows])
 
     def joined(self, *others: SurfaceLandmarks) -> SurfaceLandmarks:
-        """Return these landmarks followed by `others`, of other names.
+        """Return these landmarks followed by `others`, which have different names.
 
         Raises:
             InputError: a name is in two of them.
@@ -356,13 +356,13 @@ class SurfaceLandmarks(Mapping[str, int]):
         )
 
     def within(self, vertices: npt.ArrayLike) -> SurfaceLandmarks:
-        """Return the landmarks that depend on no other vertices than those marked in `vertices` (V,) bool."""
+        """Return the landmarks whose vertices are all marked in `vertices` (V,) bool."""
         marked: BoolArray = np.asarray(vertices, dtype=np.bool_)[self.corners]
         rows = np.asarray(marked.all(axis=1))
         return self.select([name for name, is_inside in zip(self.names, rows, strict=True) if is_inside])
 
     def renumbered(self, vertices: npt.ArrayLike) -> SurfaceLandmarks:
-        """Return the same in the numbers that vertices have when only those marked in `vertices` (V,) bool remain."""
+        """Return the landmarks after removal of the vertices that are not marked in `vertices` (V,) bool."""
         remaining = self.within(vertices)
         number = np.cumsum(np.asarray(vertices, dtype=np.bool_)) - 1
         return dataclasses.replace(remaining, corners=number[remaining.corners].astype(np.int32))
@@ -445,7 +445,7 @@ MAX_MEMORY_BYTES = 2**32
 
 @dataclass(frozen=True, eq=False)
 class LabelVolume:
-    """Labels in voxels, and where these lie in the patient.
+    """Labels in voxels, with the position of the voxels in the patient.
 
     Args:
         labels: (X, Y, Z) whole numbers of any type, read-only; 0 is what has no label.
@@ -483,7 +483,7 @@ class LabelVolume:
 
 
 def common_faces(meshes: Iterable[Mesh]) -> IntArray | None:
-    """Return the triangles that all `meshes` share, or None if they are point clouds.
+    """Return the triangles that all `meshes` share, or None for point clouds.
 
     Raises:
         CorrespondenceError: two of them differ; the message names the second.

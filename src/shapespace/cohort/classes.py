@@ -78,7 +78,7 @@ def _similar(names: Sequence[str], *, letters: bool) -> list[tuple[str, str, str
 
 
 def _one_edit(first: str, second: str) -> bool:
-    """Return whether words differ by one inserted, removed or replaced letter, or by two exchanged neighbours."""
+    """Return whether words differ by one inserted, removed or replaced letter, or by two adjacent letters swapped."""
     start = next(
         (k for k, (a, b) in enumerate(zip(first, second, strict=False)) if a != b), min(len(first), len(second))
     )

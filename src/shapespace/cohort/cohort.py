@@ -1,4 +1,4 @@
-"""A cohort: N shapes in correspondence, as coefficients in an orthonormal basis, with a table of what is known of them.
+"""A cohort: N shapes in correspondence, as coefficients in an orthonormal basis, with a table of covariates.
 
 Squared distances of coefficients are those of the shapes, so what sums over vertices (Procrustes distance, sums of
 squares) needs the coefficients alone, whatever the number of vertices.
@@ -64,7 +64,7 @@ class ShapeSource:
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """What the fits of a cohort tell beside its shapes.
+    """Fit diagnostics of a cohort, one row per shape.
 
     Args:
         model: they are by.
@@ -208,7 +208,7 @@ class Cohort:
         return 1.0 - mask.mean(axis=1)
 
     def observed_in(self, rows: Sequence[int]) -> BoolArray | None:
-        """Return (V,) bool, whether all of these shapes observe an analysed vertex; None if they observe all."""
+        """Return the mask (V,) of vertices that every shape observes; None if all shapes observe all vertices."""
         if self.observed is None and self.analysed is None:
             return None
         observed: BoolArray = np.ones(self.n_vertices, np.bool_)
@@ -248,7 +248,8 @@ class Cohort:
         )
 
     def complete(self, columns: Sequence[str], *, drop_missing: bool = False) -> Cohort:
-        """Return the cohort of the shapes of which all `columns` are known, with notes on the classes of these.
+        """Return the cohort of the shapes with values in all `columns`, with notes on the excluded shapes and the
+        classes.
 
         Args:
             columns: of the table.
@@ -459,7 +460,7 @@ def _refuse_other_vertices(shapes: FloatArray, onto: Cohort) -> None:
 
 
 def _complete_by(onto: Cohort, shapes: FloatArray, observed: BoolArray, names: Sequence[str]) -> FloatArray:
-    """Return shapes (M, V, 3) in which analysed vertices that are not `observed` (M, V) are estimated by a cohort."""
+    """Estimate the unobserved analysed vertices of shapes (M, V, 3) from a cohort; `observed` is (M, V)."""
     part = np.ones(onto.n_vertices, dtype=np.bool_) if onto.analysed is None else onto.analysed
     population = np.stack([onto.vertices(k) for k in range(len(onto))])[:, part]
     out = shapes.copy()
@@ -470,7 +471,8 @@ def _complete_by(onto: Cohort, shapes: FloatArray, observed: BoolArray, names: S
 
 
 def subjects_of(cohort: Cohort, column: str | None) -> tuple[str, ...]:
-    """Return whose each of the N shapes is: by `column`, or by `SUBJECT` where there is one; else each its own.
+    """Return the subject of each of the N shapes: from `column`, or from `SUBJECT`; without either, one subject per
+    shape.
 
     Raises:
         InputError: there is no such column, or a cell of it says nothing.
@@ -516,7 +518,7 @@ def _orthonormal(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _in_basis(rows: FloatArray, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the same for combinations `coefficients` (N, K) of `rows` (K, D), which stay as they are if they can."""
+    """Return an orthonormal basis and coefficients equivalent to `coefficients` (N, K) of `rows` (K, D)."""
     if np.abs(rows @ rows.T - np.eye(len(rows))).max() <= _ORTHONORMAL:
         return read_only(rows), read_only(coefficients)
     q, r = np.linalg.qr(rows.T)

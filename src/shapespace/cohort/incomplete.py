@@ -34,7 +34,7 @@ _ANCHOR = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class CompletedShapes:
-    """Aligned shapes in which missing vertices are estimates.
+    """Aligned shapes with estimates at missing vertices.
 
     Args:
         shapes: (N, V, 3) mm; vertices that are not analysed have one position in all shapes.
@@ -109,7 +109,7 @@ def _refuse_unobserved(known: BoolArray, names: Sequence[str]) -> None:
 
 
 def _one_position(shapes: FloatArray, mean: FloatArray, analysed: BoolArray, faces: IntArray | None) -> FloatArray:
-    """Return one position (M, 3) for each vertex that is not analysed: the mean of those known, or a smooth filling.
+    """Return one position (M, 3) per excluded vertex: the mean of the observed positions, or a harmonic interpolation.
 
     Args:
         shapes: (N, V, 3) shapes as given, aligned; NaN where not observed.

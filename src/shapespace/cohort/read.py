@@ -1,4 +1,4 @@
-"""Cohorts from files: results of fits, or surfaces in correspondence, with a table of what is known of them."""
+"""Cohorts from files: fit results, or surfaces in correspondence, with a table of covariates."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _USED = ("converged", "max_iterations")
 
 @dataclass(frozen=True)
 class CohortOptions:
-    """Which shapes, and how they are made comparable.
+    """Options for the selection and comparison of shapes.
 
     Args:
         shapes: folder of the results of fits, or of meshes in correspondence; None for that of the table.
@@ -67,7 +67,7 @@ def read_cohort(
     onto: Cohort | None = None,
     on_shape: Callable[[int, int], None] | None = None,
 ) -> Cohort:
-    """Return the shapes of the rows of a table, or of all fits in a folder with what their records know.
+    """Return the shapes of the rows of a table, or of all fits in a folder with the metadata of their records.
 
     Doubtful and failed fits are left out, counted and said in the notes, as are rows without a shape and shapes
     without a row.
@@ -308,7 +308,7 @@ def _note_unmatched(
 
 
 def _by_key(rows: Sequence[_Row]) -> dict[str, _Row]:
-    """Return fits by the names of their scans, and by their own, which count for more."""
+    """Return fits by scan name and by fit name; the fit name takes precedence."""
     scans = Counter(stem_of(row.scan_name) for row in rows)
     by_scan = {stem_of(row.scan_name): row for row in rows if scans[stem_of(row.scan_name)] == 1}
     return by_scan | {row.name: row for row in rows}

@@ -61,7 +61,7 @@ class Table:
         return len(self.rows)
 
     def texts(self, column: str) -> tuple[str, ...]:
-        """Return the N cells of a column; one that says nothing is empty.
+        """Return the N cells of a column; missing cells are empty.
 
         Raises:
             InputError: there is no such column.
@@ -72,7 +72,7 @@ class Table:
         return self.columns[column]
 
     def kind(self, column: str) -> Literal["number", "text"]:
-        """Return whether a column holds numbers or classes; one of nothing but missing cells holds classes.
+        """Return whether a column contains numbers or classes; a column without values counts as classes.
 
         Raises:
             InputError: there is no such column, or most of its cells are numbers and some are not.
@@ -89,7 +89,7 @@ class Table:
         return "number"
 
     def numbers(self, column: str) -> FloatArray:
-        """Return the (N,) numbers of a column; NaN where a cell says nothing.
+        """Return the (N,) numbers of a column; NaN for missing cells.
 
         Raises:
             InputError: there is no such column, or a cell is no finite number.
@@ -101,7 +101,7 @@ class Table:
         return read_only([float(cell) if cell else math.nan for cell in cells])
 
     def missing(self, columns: Sequence[str]) -> list[int]:
-        """Return the rows in which one of `columns` says nothing.
+        """Return the rows with a missing cell in one of `columns`.
 
         Raises:
             InputError: there is no such column.
@@ -192,5 +192,5 @@ def list_names(names: Sequence[str]) -> str:
 
 
 def numbers_as_text(values: FloatArray) -> tuple[str, ...]:
-    """Return cells that read back as the same numbers; NaN is an empty one."""
+    """Return text cells that parse to the same numbers; NaN becomes an empty cell."""
     return tuple("" if np.isnan(value) else repr(float(value)) for value in values)

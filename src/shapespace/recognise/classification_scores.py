@@ -1,4 +1,4 @@
-"""How right answers are, and how much their probabilities can be trusted: scores of arrays of labels."""
+"""Scores of predicted classes and their probabilities."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _LEAST_PROBABILITY = 1e-6  # keeps the logarithm finite
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Whether probabilities are what they say.
+    """Calibration of predicted probabilities.
 
     Args:
         confidence: (B,) mean highest probability in each bin that is not empty.
@@ -44,7 +44,7 @@ class Calibration:
 
 @dataclass(frozen=True)
 class ClassScores:
-    """One class.
+    """Precision, recall and F1 score of one class.
 
     Args:
         precision: share of right ones among those called so; NaN where none was.
@@ -78,7 +78,9 @@ def macro_accuracy(labels: Sequence[str] | Any, predicted: Sequence[str] | Any, 
 
 
 def confusion(labels: Sequence[str], predicted: Sequence[str], classes: Sequence[str]) -> IndexArray:
-    """Return counts (C, C + 1): rows are the true classes, columns the answers; the last holds all other answers."""
+    """Return counts (C, C + 1): rows are true classes, columns predicted classes; the last column has all other
+    answers.
+    """
     answers = [prediction if prediction in classes else "" for prediction in predicted]
     return confusion_matrix(list(labels), answers, labels=[*classes, ""])[:-1]
 
@@ -125,7 +127,7 @@ def subject_bootstrap(
 def calibration(
     labels: Sequence[str], probabilities: FloatArray, classes: Sequence[str], *, bins: int = 10
 ) -> Calibration:
-    """Compare probabilities (n, C) with how often they come true; rows that are not finite are left out.
+    """Compare probabilities (n, C) with observed frequencies; rows that are not finite are excluded.
 
     Raises:
         InputError: arrays that do not belong together, or no row with probabilities.
@@ -149,7 +151,7 @@ def calibration(
 
 
 def fit_temperature(labels: Sequence[str], probabilities: FloatArray, classes: Sequence[str]) -> float:
-    """Return the temperature at which probabilities (n, C) of samples left out are most likely (Guo et al., ICML 2017).
+    """Return the temperature that maximises the likelihood of held-out probabilities (n, C) (Guo et al., ICML 2017).
 
     The true class counts for 1 - 1 / (n + 2), as in Platt's calibration (1999): few samples that all are right do not
     show that the next is.
@@ -163,7 +165,7 @@ def fit_temperature(labels: Sequence[str], probabilities: FloatArray, classes: S
 
 
 def calibrated(probabilities: FloatArray, temperature: float) -> FloatArray:
-    """Return probabilities (n, C) at another temperature; which class is likeliest stays."""
+    """Return probabilities (n, C) at another temperature; the likeliest class is unchanged."""
     logits = np.log(np.maximum(probabilities, _LEAST_PROBABILITY))
     return np.asarray(softmax(logits / temperature, axis=1), dtype=np.float64)
 

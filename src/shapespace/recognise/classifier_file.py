@@ -1,4 +1,4 @@
-"""A trained classifier and its file: one .skops archive that holds data alone, and is checked before it is read.
+"""Trained classifiers and their file: one .skops archive without executable content, checked before it is loaded.
 
 skops writes the pipeline as a schema in JSON and arrays in .npy. Beside them stands `shapespace.json`: the format, the
 model's hash, the classes, how it was trained. Nothing in the file is run: types that are not in `TRUSTED` are refused.
@@ -88,7 +88,7 @@ _PROBE_TOLERANCE = 1e-6  # probabilities recomputed by another version of the li
 
 @dataclass(frozen=True, eq=False)
 class SavedClassifier:
-    """A trained classifier with all that its use needs.
+    """A trained classifier with its class names, calibration, model hash and training summary.
 
     Args:
         pipeline: of scikit-learn, fitted.
@@ -162,7 +162,7 @@ class SavedClassifier:
             )
 
     def facts(self) -> dict[str, Any]:
-        """Return what the JSON part of the file says."""
+        """Return the JSON part of the file."""
         return {
             "format": FORMAT,
             "format_version": FORMAT_VERSION,
@@ -181,7 +181,7 @@ class SavedClassifier:
         }
 
     def save(self, path: Path | str) -> None:
-        """Write it to one file, whole or not at all.
+        """Write the classifier to one file, atomically.
 
         Raises:
             InputError: the name does not end in .skops.
@@ -203,7 +203,7 @@ class SavedClassifier:
 
 
 def software_versions() -> dict[str, str]:
-    """Return the versions of what trains a classifier."""
+    """Return the versions of the packages that train a classifier."""
     return {"shapespace": __version__, **{name: version(name) for name in ("scikit-learn", "skops", "numpy")}}
 
 
@@ -252,7 +252,7 @@ def load_classifier(path: Path | str) -> SavedClassifier:
 
 
 def _probe(modes: int) -> FloatArray:
-    """Return fixed coefficients (4, modes) on which a classifier is tried."""
+    """Return fixed coefficients (4, modes) for a test of a loaded classifier."""
     return 2.0 * np.sin(np.arange(1.0, 4 * modes + 1).reshape(4, modes) ** 2)
 
 

@@ -1,4 +1,4 @@
-"""Classifiers of whitened coefficients z: scikit-learn pipelines by name, and our own nearest mean direction."""
+"""Classifiers of whitened coefficients z: scikit-learn pipelines by name, and nearest mean direction."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class NearestMeanDirection(ClassifierMixin, BaseEstimator):
 
 
 class _Discriminants(ClassifierMixin, BaseEstimator):
-    """What linear and quadratic discriminants share: a `shrinkage` from 0 to 1, and `_scores`, log probabilities."""
+    """Base of linear and quadratic discriminants, with `shrinkage` from 0 to 1 and log probabilities `_scores`."""
 
     shrinkage: float
     classes_: Any
@@ -99,7 +99,7 @@ class _Discriminants(ClassifierMixin, BaseEstimator):
         return self.classes_[best]
 
     def _begin(self, X: Any, y: Any) -> tuple[FloatArray, Any]:
-        """Return the samples (n, K) and the index of each one's class, after the checks that `fit` names."""
+        """Validate the samples and return them (n, K) with the class index of each."""
         X, y = validate_data(self, X, y, dtype=np.float64)
         check_classification_targets(y)
         if not 0 <= self.shrinkage <= 1:
@@ -278,7 +278,7 @@ class CalibratedSVC(ClassifierMixin, BaseEstimator):
 
 
 def _margins(decision: Any) -> FloatArray:
-    """Return decision values (n, C); of two classes scikit-learn gives one column."""
+    """Return decision values (n, C), also for two classes, where scikit-learn returns one column."""
     values = np.asarray(decision, dtype=np.float64)
     return values if values.ndim == 2 else np.stack([-values, values], axis=1)
 
@@ -292,7 +292,7 @@ def _directions(X: FloatArray) -> FloatArray:
 
 
 def _left_out_cosines(unit: FloatArray, sums: FloatArray, class_index: Any) -> FloatArray:
-    """Return cosines (n, C) of each sample with the mean directions of the others."""
+    """Return leave-one-out cosines (n, C) of each sample with the mean directions of the classes."""
     cosines = unit @ _directions(sums).T
     rows = np.arange(len(unit))
     cosines[rows, class_index] = (_directions(sums[class_index] - unit) * unit).sum(axis=1)
@@ -302,7 +302,7 @@ def _left_out_cosines(unit: FloatArray, sums: FloatArray, class_index: Any) -> F
 def likeliest_temperature(
     scores: FloatArray, class_index: Any, *, doubt: float = 0.0, bounds: tuple[float, float] = (0.02, 10.0)
 ) -> float:
-    """Return the temperature at which a softmax of `scores` (n, C) makes the true classes likeliest.
+    """Return the temperature that maximises the likelihood of the true classes under a softmax of `scores` (n, C).
 
     Args:
         scores: of samples left out, logits up to the temperature.

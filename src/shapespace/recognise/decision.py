@@ -1,4 +1,4 @@
-"""Where on the face classes differ."""
+"""Maps of the vertices and regions at which classes differ."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from shapespace.types import FloatArray
 def decision_map(
     vertex_basis: FloatArray, stddev: FloatArray, v: FloatArray, labels: Sequence[str], *, noise_mm: float = 0.1
 ) -> FloatArray:
-    """Return how far each vertex tells the classes apart, (V,): its Fisher ratio, to be drawn on the face.
+    """Return the Fisher ratio of the classes at each vertex, (V,), as a map on the face.
 
     The ratio is the variance of the class means of a vertex's displacement over its variance within classes, both
     summed over the three coordinates. `noise_mm` stands below, so that vertices which hardly move do not stand out.

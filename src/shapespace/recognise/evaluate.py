@@ -1,4 +1,4 @@
-"""How well classes are recognised in people who were not trained on: all of it, by the names that one asks for.
+"""Evaluation of classifiers in subjects who were not trained on.
 
 `predictions` has folds by subject and the choice nested inside them, `scores` what answers are worth, `resampling`
 tests against shuffled labels and curves, `decision` where on the face classes differ.

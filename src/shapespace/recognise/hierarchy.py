@@ -1,4 +1,4 @@
-"""The paper's next step: first the type of face, then an expression model for that type (section 5).
+"""Hierarchical classification: first the type of face, then an expression model for that type (the paper, section 5).
 
 Types are the components of a Gaussian mixture of identity coefficients, as many as the Bayesian information criterion
 asks for. The hard form takes the likeliest type; the soft one weighs the answers of all by how likely each type is.

@@ -1,4 +1,4 @@
-"""Coefficients of fitted scans with what is known of them: from records or a coefficients.csv, in the order given."""
+"""Coefficients of fitted scans with labels, from records or a coefficients.csv, in the order given."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _TABLE_AGAIN = "run shapespace fit to write it again, or take the column checksu
 
 @dataclass(frozen=True, eq=False)
 class ScanCoefficients:
-    """One fitted scan, as far as recognition knows it.
+    """Coefficients, labels and status of one fitted scan.
 
     Args:
         name: of the fit.
@@ -60,7 +60,7 @@ class ScanCoefficients:
 
 
 def from_record(name: str, record: Mapping[str, Any]) -> ScanCoefficients:
-    """Return the scan that a NAME.fit.json tells of.
+    """Return the scan of a NAME.fit.json.
 
     Raises:
         FileFormatError: the record lacks what recognition needs, or it is damaged.
@@ -175,7 +175,7 @@ def with_labels(scans: Sequence[ScanCoefficients], labels: Mapping[str, Label]) 
 
 
 def one_model(scans: Sequence[ScanCoefficients]) -> str:
-    """Return the hash of the one model that all `scans` were fitted with.
+    """Return the hash of the model that all `scans` were fitted with.
 
     Raises:
         InputError: there are several, or no scans.

@@ -1,4 +1,4 @@
-"""How an expression shows in coefficients: the lines of figures 9 and 10, and how far apart they lie.
+"""Expressions as lines in coefficient space (figures 9 and 10), and scores of their separation.
 
 With v_i = (b_i - b_neutral) / stddev, samples of one expression at rising
 intensity are expected on a line through neutral, and different expressions on different lines.
@@ -21,7 +21,7 @@ _SHRINKAGE = 0.1  # towards a multiple of the identity, so that the covariance o
 
 @dataclass(frozen=True)
 class LineScores:
-    """One expression's line.
+    """Scores of the line of one expression.
 
     Args:
         r2_through_neutral: share of the summed squares that the best line through neutral explains.
@@ -41,7 +41,7 @@ class LineScores:
 
 @dataclass(frozen=True)
 class PooledLineScores:
-    """All expressions together.
+    """Scores of the lines of all expressions together.
 
     Args:
         r2_through_neutral: by expression, as in `LineScores`.
@@ -62,7 +62,7 @@ class PooledLineScores:
 
 @dataclass(frozen=True)
 class DisjointnessScores:
-    """How far apart the expressions lie.
+    """Scores of the separation of the expressions.
 
     Args:
         leave_one_out_accuracy: of the nearest mean direction by cosine.

@@ -1,4 +1,4 @@
-"""Train a classifier on fitted scans with labels, and answer for others: each scan gets a row, none is guessed."""
+"""Training of a classifier on labelled fits, and prediction for other fits, one row per scan."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _FOLDS = 5  # folds by subject of the calibration
 
 @dataclass(frozen=True, eq=False)
 class ScanPrediction:
-    """What recognition says of one scan.
+    """Predicted class of one scan, with probabilities and status.
 
     Args:
         scan: name of the fit.
@@ -64,7 +64,7 @@ def train_classifier(
     projection: FloatArray | None = None,
     seed: int = 0,
 ) -> tuple[SavedClassifier, list[str]]:
-    """Train a classifier on fitted scans with labels; return it and what the user should know.
+    """Train a classifier on fitted scans with labels; return it with notes for the user.
 
     Failed and doubtful fits and scans without a label are left out and counted. Probabilities are calibrated on people
     left out in turn (on scans left out where no people are named), which also gives the accuracy that is told.
@@ -166,7 +166,7 @@ def _samples(
 
 
 def _classes(labels: Any) -> tuple[list[str], list[int]]:
-    """Return the classes and how many samples each has, or raise where they cannot be learned."""
+    """Return the classes and their sample counts; raise if they cannot be learned."""
     classes, counts = np.unique(labels, return_counts=True)
     if len(classes) < 2 or counts.min() < 2:
         counts_text = ", ".join(f"{name} ({n})" for name, n in zip(classes, counts, strict=True)) or "none"
@@ -181,7 +181,7 @@ def _classes(labels: Any) -> tuple[list[str], list[int]]:
 def _calibrate(
     z: FloatArray, labels: Any, subjects: Sequence[str], classes: Sequence[str], classifier: str, seed: int
 ) -> tuple[float, dict[str, Any], str]:
-    """Return the temperature, what cross-validation found, and what the user should know about it."""
+    """Return the temperature, the cross-validation result, and notes for the user."""
     by_subject = all(subjects)
     groups = list(subjects) if by_subject else [str(i) for i in range(len(z))]
     folds = min(_FOLDS, len(set(groups)))
@@ -201,7 +201,7 @@ def _calibrate(
 
 
 def predict_scans(saved: SavedClassifier, scans: Sequence[ScanCoefficients]) -> list[ScanPrediction]:
-    """Return one answer for each of `scans`, in their order.
+    """Return one prediction per scan, in the order of `scans`.
 
     A failed fit gets no answer; a doubtful one, or one below the confidence, gets `UNSURE`; each with its reason.
 

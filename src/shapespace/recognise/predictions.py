@@ -1,4 +1,4 @@
-"""Classes predicted in people who were not trained on: folds by subject, and a choice nested inside them.
+"""Cross-validated predictions: folds by subject, and nested selection of hyperparameters.
 
 Everything here works on arrays of whitened coefficients, (n, K). A `Fold` carries its own training and test arrays, so
 that the shape model behind them may be another one in each fold, made without the people tested. A test row that is not
@@ -75,7 +75,7 @@ class Fold:
 
 @dataclass(frozen=True)
 class Choice:
-    """What nested cross-validation chose within the training people of one fold.
+    """Hyperparameters that nested cross-validation selected within the training subjects of one fold.
 
     Args:
         classifier: a name of `CLASSIFIERS`.
@@ -94,7 +94,7 @@ class Choice:
 
 @dataclass(frozen=True, eq=False)
 class Predictions:
-    """Answers for the test samples of all folds.
+    """Predicted classes and probabilities of the test samples of all folds.
 
     Args:
         classes: C names, sorted.
@@ -162,7 +162,7 @@ def nested_predictions(
     modes: Sequence[int | None] = MODES,
     on_fold: Callable[[int, int], None] | None = None,
 ) -> Predictions:
-    """Predict the test samples of each fold by what was chosen among its training people alone.
+    """Predict the test samples of each fold with hyperparameters selected in its training subjects alone.
 
     Inside the training people, again split by person: first the number of leading modes is chosen by LDA, then the
     classifier and its parameters with that many, each by macro accuracy of the samples left out. The probabilities of
@@ -228,7 +228,7 @@ def _nested(
 def fixed_predictions(
     folds: Sequence[Fold], classifier: str, *, modes: int | None = None, seed: int = 0
 ) -> Predictions:
-    """Predict the test samples of each fold by one classifier with its own settings, with nothing to choose.
+    """Predict the test samples of each fold by one classifier with fixed hyperparameters.
 
     Raises:
         InputError: no folds, or an unknown classifier.
@@ -308,7 +308,7 @@ def classes_of(folds: Sequence[Fold]) -> tuple[str, ...]:
 
 
 def refuse_unknown(names: Sequence[str]) -> None:
-    """Raise InputError where a name is none of `CLASSIFIERS`."""
+    """Raise InputError for names that are not in `CLASSIFIERS`."""
     for name in names:
         if name not in CLASSIFIERS:
             raise InputError(f"There is no classifier {name!r}; choose among {', '.join(CLASSIFIERS)}.")

@@ -1,4 +1,4 @@
-"""What accuracy is worth: against shuffled labels, fewer people to learn from, and modes taken away."""
+"""Permutation tests, learning curves and mode importance of classifiers."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from shapespace.types import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class PermutationTest:
-    """Macro accuracy, and what it is where labels mean nothing.
+    """Macro accuracy, and its null distribution under permuted labels.
 
     Args:
         observed: with the labels as they are.
@@ -41,7 +41,7 @@ class PermutationTest:
 
 @dataclass(frozen=True, eq=False)
 class LearningCurve:
-    """Macro accuracy against the number of people trained on.
+    """Macro accuracy against the number of training subjects.
 
     Args:
         subjects: (S,) people in each training set.
@@ -102,7 +102,9 @@ def permutation_test(
 
 @dataclass(frozen=True, eq=False)
 class _Prepared:
-    """A fold made ready for many labellings: rows of each person, finite training rows, scaled arrays, their Gram."""
+    """A fold with data that does not depend on the labels: rows of each subject, scaled training rows, their Gram
+    matrix.
+    """
 
     fold: Fold
     train_labels: Any
@@ -232,7 +234,7 @@ def learning_curve(
 def mode_importance(
     folds: Sequence[Fold], classifier: str = "lda", *, modes: int | None = None, repeats: int = 5, seed: int = 0
 ) -> FloatArray:
-    """Return how much macro accuracy a fold loses when one mode's values are shuffled among its test samples, (F, K).
+    """Return the loss of macro accuracy, (F, K), when one mode is permuted among the test samples of a fold.
 
     Modes of folds with shape models of their own agree only about; read the mean over the folds with that in mind.
 

@@ -1,4 +1,4 @@
-"""From the fitted surface the rest of the way to the scan, by smooth fields on the model's own triangles.
+"""Dense stage of a fit: smooth displacement fields from the fitted surface to the scan, on the model's triangles.
 
 The field d is a Gaussian process of the Matern kind, written as a stochastic differential equation on the surface
 (Lindgren, Rue and Lindstrom, J. R. Stat. Soc. B 73, 2011), so that its precision is sparse. Its posterior mean given
@@ -41,7 +41,7 @@ _SEEN = 0.1
 
 @dataclass(frozen=True, eq=False)
 class DenseSurface:
-    """The model's surface on the scan.
+    """The fitted surface displaced onto the scan.
 
     Args:
         vertices_scan_mm: (V, 3) in the scan's mm frame.
@@ -67,7 +67,7 @@ def dense_surface(
     T_scan_model: Similarity,
     settings: DenseSettings,
 ) -> DenseSurface:
-    """Return the surface `vertices_scan_mm` moved onto the scan where the scan shows it.
+    """Displace the surface `vertices_scan_mm` onto the scan where the scan observes it.
 
     No triangle folds: none turns over, or against its neighbours, that does not in `vertices_scan_mm`.
 
@@ -152,7 +152,7 @@ class WeightedMatches:
         return float(np.sqrt(max(left, 0.0)))
 
     def gathered(self, spread_mm: float) -> tuple[FloatArray, FloatArray]:
-        """Return the precision (V,), mm^-2, of what the scan says of each vertex, and the same times the residual."""
+        """Return the precision (V,), mm^-2, of the matches at each vertex, and the precision times the residual."""
         gathered = self.matches.gathered(self._weights(spread_mm), self.faces, self.vertices)
         return gathered.weight / spread_mm**2, gathered.pull / spread_mm**2
 
@@ -193,7 +193,7 @@ def _match(
 
 @dataclass(frozen=True, eq=False)
 class Field:
-    """A Matern field on a surface: its precision is A M^-1 A.
+    """A Matern field on a surface, with precision A M^-1 A.
 
     Args:
         topology: whose rings the off-diagonal entries follow.

@@ -1,4 +1,4 @@
-"""The loops of the dense stage, compiled: a smooth field on a surface, solved for by conjugate gradients."""
+"""Compiled loops of the dense stage: a smooth field on a surface by conjugate gradients."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def compare_triangles(
     cosine: FloatArray,
     even: BoolArray,
 ) -> None:
-    """Say how far triangles have turned, and which agree with the surface around them.
+    """Compute the rotation of each triangle, and whether it agrees with its neighbours.
 
     Args:
         vertices: (V, 3),

@@ -1,4 +1,4 @@
-"""Back to the span of the model: the pose and the coefficients that a fitted surface has there.
+"""Projection of a fitted surface onto the span of the model.
 
 A surface that was met beside the model is told by the model's own coefficients, so it is projected. Plain least squares
 send faint modes, and modes that lie nearly inside the motions of the pose, anywhere to win a hair; weighed by the prior

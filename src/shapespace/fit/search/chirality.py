@@ -42,7 +42,7 @@ _asymmetric: WeakKeyDictionary[ShapeModel, bool] = WeakKeyDictionary()
 
 
 def is_asymmetric(model: ShapeModel) -> bool:
-    """Return whether the mean is so far from its own mirror image that the modes do not absorb a reflection.
+    """Return whether the mean differs from its mirror image by more than the modes can represent.
 
     It is computed once for each model. A model without triangles counts as symmetric.
     """

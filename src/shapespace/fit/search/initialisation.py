@@ -1,4 +1,4 @@
-"""Where to begin: the scan's unit, and a pose of the model from landmarks or from anywhere.
+"""Initialisation of a fit: the unit of the scan, and a pose from landmarks or by global search.
 
 A start with centroids together holds to about 45 degrees. Beyond that, and where it does not fit clearly, many
 rotations are tried (`any_pose`), and what they reach with the leading modes free is compared both ways.
@@ -27,7 +27,7 @@ _STANDS_OUT = 0.8  # score relative to that of the runner-up below which a start
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """A pose to begin from.
+    """A pose that initialises a fit.
 
     Args:
         T_scan_model: from the model's frame to the scan's frame in mm.
@@ -50,12 +50,12 @@ class Start:
 
 
 def start_evidence(start: Start) -> dict[str, float]:
-    """Return what the search for a start says, by name; not a number, or infinite, where nothing was searched."""
+    """Return diagnostics of the initialisation by name; NaN or infinite without a search."""
     return {"start_score_mm": start.score_mm, "start_runner_up_score_mm": start.runner_up_score_mm}
 
 
 def find_unit(model: ShapeModel, scan: Mesh) -> str:
-    """Return the unit, a name of `MM_PER_UNIT`, that makes the scan's size most like the model's.
+    """Return the unit, a name of `MM_PER_UNIT`, for which the sizes of scan and model agree best.
 
     Where two units are about as likely by size, as centimetres and inches are for a part of a face, the likelier one in
     which a pose of the model stands out wins, else the one in which the model fits better.
@@ -92,7 +92,7 @@ def find_unit(model: ShapeModel, scan: Mesh) -> str:
 def start_from_landmarks(
     model: ShapeModel, scan_landmarks_mm: Mapping[str, FloatArray], scan_name: str, *, with_scale: bool
 ) -> Start:
-    """Return the least-squares pose of the model's landmarks on those of the scan that share their names.
+    """Return the least-squares pose from the landmarks that model and scan share by name.
 
     Raises:
         FitError: the model has no landmarks, or fewer than three names are shared.
@@ -123,7 +123,7 @@ def start_from_landmarks(
 def start_from_any_pose(
     model: ShapeModel, scan_vertices_mm: FloatArray, *, seed: int, with_scale: bool | None = None
 ) -> Start:
-    """Return the best pose over all rotations, with the leading modes adapted, and the best of the others.
+    """Return the best pose of a search over all rotations, with the leading modes adapted, and the alternatives.
 
     A scan that clearly fits without a rotation is not searched further. Another rotation wins only when it is clearly
     better, since scans mostly come upright and some objects look the same from several sides.

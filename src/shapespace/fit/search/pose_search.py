@@ -1,4 +1,4 @@
-"""The search for a pose from nowhere: many rotations coarsely, the best of them with scale and leading modes.
+"""Global pose search: many rotations on a coarse level, the best of them with scale and leading modes.
 
 The mean shape alone cannot tell a face from the back of a bald head: what tells them apart is how close, both ways, the
 model comes once its leading modes have adapted. So poses are narrowed down in four steps, each dearer and sharper than
@@ -25,7 +25,7 @@ from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 
 
 class Step(NamedTuple):
-    """One step of the search.
+    """Settings of one step of the search.
 
     Args:
         points: how many points of each side look for the other.
@@ -76,7 +76,7 @@ _MORE_ROUNDS = 3  # repetitions of the last step for ambiguous poses
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """A pose of the adapted model, and how well it fits there.
+    """A pose with adapted coefficients, and its score.
 
     Args:
         T_scan_model: from the model's frame to the scan's, mm.
@@ -141,7 +141,7 @@ def _score(pose: Pose) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _ModelSide:
-    """What the search needs of a model; kept while the model lives."""
+    """Precomputed data of a model for the search; cached while the model exists."""
 
     size: float
     spacing: float
@@ -190,7 +190,7 @@ _MODEL_SIDES: WeakKeyDictionary[ShapeModel, _ModelSide] = WeakKeyDictionary()
 
 @dataclass(frozen=True, eq=False)
 class _Sides:
-    """A model and a scan to be brought together."""
+    """A model and a scan with the data of their registration."""
 
     model: _ModelSide
     scan: FloatArray
@@ -218,11 +218,11 @@ class _Sides:
         return pose if self.is_close(pose) else min(pose, self.refined(GLANCE, R[1], t[1]), key=_score)
 
     def is_close(self, pose: Pose) -> bool:
-        """Return whether the model fits so well there that it is worth asking whether anything else fits better."""
+        """Return whether the score is so good that only flipped poses remain to be tested."""
         return pose.score_mm <= _CLEARLY_CLOSE * _CAP * self.model.size
 
     def flips(self, pose: Pose) -> list[Pose]:
-        """Return the poses turned by half a turn about each axis of the model: what it is likeliest mistaken for."""
+        """Return the poses rotated by 180 degrees about each axis of the model, its likeliest confusions."""
         out: list[Pose] = []
         T, centre = pose.T_scan_model, self.model.points.mean(axis=0)
         for axis in self.model.axes:
@@ -315,7 +315,7 @@ def _is_sure(poses: Sequence[Pose]) -> bool:
 
 
 def _distinct(poses: Sequence[Pose], limit: int, same_turn: float) -> list[Pose]:
-    """Return up to `limit` of `poses`, without those that turn as an earlier one does."""
+    """Return up to `limit` of `poses`, without rotations close to an earlier one."""
     R = np.stack([pose.T_scan_model.rotation for pose in poses])
     return [poses[i] for i in _distinct_rows(R, np.zeros((len(R), 3)), limit, same_turn, math.inf)]
 
@@ -333,7 +333,7 @@ def _distinct_rows(R: FloatArray, t: FloatArray, limit: int, same_turn: float, s
 
 
 def _evenly(points: FloatArray, cell: float, size: float) -> IntArray:
-    """Return the indices of one point for each cell of edge `cell`; lone points far outside are left out."""
+    """Return the indices of one point for each cell of edge `cell`; isolated points far outside are excluded."""
     columns = np.ascontiguousarray(points.T)
     low, high = np.quantile(columns[:, :: max(1, len(points) // 4000)], [0.005, 0.995], axis=1)
     low, high = np.maximum(columns.min(axis=1), low - size), np.minimum(columns.max(axis=1), high + size)
@@ -348,7 +348,7 @@ def _evenly(points: FloatArray, cell: float, size: float) -> IntArray:
 
 
 def _normals(points: FloatArray) -> FloatArray:
-    """Return the directions (N, 3) in which the neighbourhoods of `points` are thinnest."""
+    """Return the normals (N, 3) of `points`: the direction of least variance in each neighbourhood."""
     _, neighbours = cKDTree(points).query(points, k=min(9, len(points)))
     around = points[np.asarray(neighbours).reshape(len(points), -1)]
     around = around - around.mean(axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""The first steps of the search for a start: two-way rigid ICP from many poses at once, on grids of near points.
+"""Rigid steps of the pose search: symmetric ICP from many poses at once, on grids of near points.
 
 A grid holds a near point for each cell, so that a match is one look-up. Weights are Geman and McClure's, with a reach
 that falls from step to step (graduated, as in Zhang, Yao and Deng, PAMI 44(7), 2022).
@@ -18,7 +18,7 @@ _MARGIN, _CELL, _MAX_CELLS = 0.5, 0.08, 400_000
 
 
 class NearGrid(NamedTuple):
-    """A near point for each cell of a box.
+    """Grid with a near point for each cell.
 
     Args:
         near: (X, Y, Z) int32, for each cell, of the points that stand for a cell, that of the nearest such cell.
@@ -56,7 +56,7 @@ class NearGrid(NamedTuple):
 
 
 def edge_of(sides: FloatArray, cells: int) -> float:
-    """Return the edge of the cubes of which a box of `sides` (3,) holds `cells`."""
+    """Return the edge of `cells` cubes that fill a box of `sides` (3,)."""
     return float(sides.prod() / cells) ** (1 / 3)
 
 

@@ -73,7 +73,7 @@ class SecondInstance:
 def find_second_instance(
     model: ShapeModel, target: ScanTarget, fitted: Fitted, settings: RobustSettings, *, with_scale: bool
 ) -> SecondInstance | None:
-    """Return the second instance that the model fits about as well as the first; None where there is none.
+    """Return a second instance that the model fits about as well as the first, or None.
 
     The model is fitted to the unexplained part of the scan, and the status of that fit is estimated as usual.
 
@@ -112,7 +112,7 @@ def find_second_instance(
 
 
 def displaced_shares(model: ShapeModel, target: ScanTarget, fitted: Fitted) -> dict[str, float]:
-    """Return the shares of the scan that run along the fitted surface at a distance, and that scatter, by name.
+    """Return the shares of the scan that are displaced from the fitted surface, and that scatter, by name.
 
     Where the parts of a scan differ in scale or pose, the fit follows one part, and the others run along the surface at
     a distance. Around a point of them the heights over the fitted surface are alike, and little else of the scan is
@@ -152,7 +152,7 @@ def displaced_shares(model: ShapeModel, target: ScanTarget, fitted: Fitted) -> d
 
 
 def layer_evidence(model: ShapeModel, target: ScanTarget, fitted: Fitted) -> dict[str, float]:
-    """Return over which share of the scan there are two surfaces on top of each other, and how far apart, by name.
+    """Return the share of the scan with two overlapping surfaces, and their distance, by name.
 
     Around a point of such a scan the heights over the fitted surface fall into two tight groups with a gap between.
     Noise leaves no gap, and what is thrown off the surface forms no tight group. Both are zero where matched points lie

@@ -1,4 +1,4 @@
-"""The last steps of the search for a start: two-way Gauss-Newton over pose and leading modes, from one pose.
+"""Last steps of the pose search: symmetric Gauss-Newton over pose and leading modes, from one pose.
 
 Matches are exact. Residuals have no side, so the winding of triangles does not matter. Weights are those of
 `rigid_search`. The normal equations are its own: those of `robust` find the same poses, at 1.6 times the CPU time of a
@@ -17,7 +17,7 @@ from shapespace.types import FloatArray, IntArray
 
 
 class ShapePoints(NamedTuple):
-    """What the shape ICP knows of the model, in the model's frame.
+    """Points, normals and modes of the model for the shape search, in the model's frame.
 
     Args:
         points: (M, 3) of the mean, mm.
@@ -59,7 +59,7 @@ def shape_search(
     cap: float,
     out: FloatArray,
 ) -> float:
-    """Run two-way Gauss-Newton over pose and leading modes from one pose, in place, and return the scale it ends at.
+    """Run symmetric Gauss-Newton over pose and leading modes from one pose, in place, and return the final scale.
 
     All is solved in the model's frame, where the modes need no turning; a mean point x and a scan point q brought
     there differ by e = x - q, and the cost is sum w e^T (n n^T + eta I) e + prior reach^2 (sum b_k^2 / lam_k + c

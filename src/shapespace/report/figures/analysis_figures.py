@@ -1,4 +1,4 @@
-"""Figures of analyses of cohorts: numbers on a surface from all sides, two shapes beside each other, histograms."""
+"""Figures of cohort analyses: maps on a surface, pairs of shapes, histograms."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _MOST_BINS = 2000  # above the pixels of a figure nothing is gained
 
 
 def upright_views(mesh: Mesh) -> tuple[FloatArray, Sequence[tuple[str, float]]]:
-    """Return the rotation (3, 3) that brings `mesh` to how it is looked at, and names of views with their yaw, degrees.
+    """Return the rotation (3, 3) that brings `mesh` upright, and names of views with their yaw, degrees.
 
     It stays as it stands where that is upright with its front along +z, as faces are; otherwise its principal axes
     turn it. A surface that is open to one side is seen from the other alone.
@@ -65,7 +65,7 @@ def upright_views(mesh: Mesh) -> tuple[FloatArray, Sequence[tuple[str, float]]]:
 
 
 def _views(points: FloatArray, yaws: Sequence[float], columns: int) -> tuple[list[Camera], tuple[int, int]]:
-    """Return cameras of one scale for all of `yaws`, and the size of their pictures."""
+    """Return cameras with one scale for all of `yaws`, and the size of their images."""
     views = [view(points, columns, yaw_deg=yaw) for yaw in yaws]
     width, height = views[0].size
     tall = max(item.camera.height_mm for item in views)
@@ -154,7 +154,7 @@ def _blend(first: Image, second: Image, share: FloatArray) -> Image:
 
 
 def morph_figure(low: Mesh, high: Mesh, labels: tuple[str, str], *, title: str | None = "") -> Figure:
-    """Draw two shapes in correspondence beside each other, from one camera.
+    """Draw two shapes in correspondence side by side, from one camera.
 
     Args:
         low: one shape.

@@ -1,4 +1,4 @@
-"""Figures of coefficients: against each other, and as lines of expressions through the neutral face."""
+"""Figures of coefficients: scatter plots, and lines of expressions through the neutral face."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Coefficients:
 
 
 def scatter_matrix(points: Sequence[Coefficients], modes: int = 4, *, title: str = "") -> Figure:
-    """Draw the first coefficients against each other, one colour a label, with their spread on the diagonal.
+    """Draw the first coefficients against each other, one colour per label, with distributions on the diagonal.
 
     Args:
         points: the scans.
@@ -126,7 +126,7 @@ def b_plane(
     title: str = "",
     neutral: Coefficients | None = None,
 ) -> Figure:
-    """Draw b1 against b2 (figure 9), one colour an expression, larger for stronger.
+    """Draw b1 against b2 (figure 9), one colour per expression, with larger markers for stronger expressions.
 
     Args:
         scans: expressive ones.
@@ -229,7 +229,7 @@ def b_space(
 
 
 def _style_space(axes: Any, low: FloatArray, high: FloatArray) -> float:
-    """Give a plot in space its names, its ends (3,), and quiet panes; return the points by which it is wider."""
+    """Set names, end points (3,) and pale panes of a 3-D plot; return the extra width in points."""
     for axis, dimension in zip("xyz", range(3), strict=True):
         getattr(axes, f"set_{axis}label")(f"b{dimension + 1} (mm)", fontsize=SMALL, color=INK, labelpad=2)
         getattr(axes, f"set_{axis}lim")(low[dimension], high[dimension])
@@ -255,7 +255,7 @@ def _wider_than_three(axis: Any) -> float:
 
 
 def _legend_columns(names: Sequence[str]) -> int:
-    """Return into how many columns the entries of a legend below a figure go, so that none is cut."""
+    """Return the number of columns that a legend below a figure needs so that no entry is cut."""
     for columns in range(min(len(names), 5), 1, -1):
         parts = np.array_split(np.array([measured(name, SMALL) for name in names]), columns)
         if sum(float(part.max()) + _LEGEND_MARK for part in parts) < WIDTH:
@@ -307,7 +307,7 @@ def _handles(
 
 
 def _spread(axes: Axes, values: FloatArray, groups: Sequence[tuple[str, dict[str, Any], list[int]]]) -> None:
-    """Draw how `values` (n,) are spread, the labels on top of each other; a few of them as dots."""
+    """Draw the distribution of `values` (n,) per label; as dots if there are few."""
     if len(values) < FEWEST_BINNED:
         for _, marker_style, scores in groups:
             axes.plot(values[scores], np.full(len(scores), 0.5), ls="", ms=8, alpha=0.8, clip_on=False, **marker_style)

@@ -1,4 +1,4 @@
-"""Figures of a correspondence: the same places on every scan, where vertices are missing, how near, how settled."""
+"""Figures of a correspondence: checkerboards, missing vertices, distances, and convergence."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _LINES = ("#9cc3e0", "#0072B2", "#D55E00", "#6b140f")
 def checkerboard_figure(
     mean: Mesh, surfaces: Sequence[FloatArray], labels: Sequence[str], *, yaw_deg: float = 0.0, title: str = ""
 ) -> Figure:
-    """Draw one checkerboard on the mean shape and carried to each scan: the same square is the same vertices.
+    """Draw one checkerboard on the mean shape and on each scan: the same square has the same vertices.
 
     Args:
         mean: the mean shape, upright.
@@ -63,7 +63,7 @@ def checkerboard_figure(
 
 
 def _distinct_labels(labels: Sequence[str]) -> list[str]:
-    """Return labels that fit above a panel; where cutting makes two of them equal, what they begin with alike goes."""
+    """Return labels that fit above a panel; if two become equal when cut, their common beginning is removed."""
     cut = [short(label, _LONGEST) for label in labels]
     if len(set(cut)) == len(cut):
         return cut
@@ -72,7 +72,7 @@ def _distinct_labels(labels: Sequence[str]) -> list[str]:
 
 
 def missing_figure(mean: Mesh, missing_share: FloatArray, *, title: str = "") -> Figure:
-    """Draw on the mean shape, from four sides, which share of the scans does not show each vertex.
+    """Draw the share of scans with each vertex missing, on the mean shape from four sides.
 
     Args:
         mean: the mean shape, upright.
@@ -160,6 +160,6 @@ def movement_figure(
 
 
 def _plain_decades(axis: Axis) -> None:
-    """Write 1, 2 and 5 of each decade of a logarithmic axis as people do, and nothing at its other ticks."""
+    """Label 1, 2 and 5 of each decade of a logarithmic axis in plain notation."""
     axis.set_major_formatter(lambda value, _: f"{value:g}")
     axis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in "25" else "")

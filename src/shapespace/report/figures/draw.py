@@ -1,4 +1,4 @@
-"""What all figures share: one width, one type, panels in rows pixel for pixel, charts, scales and keys, WebP.
+"""Common parts of all figures: width, type sizes, rows of panels, charts, scales, legends, WebP.
 
 A figure is 960 pixels wide, and its smallest type stays legible when a phone shows it 340 wide.
 """
@@ -64,7 +64,7 @@ _Item = TypeVar("_Item")
 
 
 class DisplayedFigure(Figure):
-    """A figure that is displayed once as the value of a notebook's cell, also without pyplot."""
+    """A figure that a notebook displays once as the value of a cell, also without pyplot."""
 
     def _repr_png_(self) -> bytes:
         stream = io.BytesIO()
@@ -75,7 +75,7 @@ class DisplayedFigure(Figure):
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A camera, and the size in pixels of the panels that it fills."""
+    """A camera, and the size of its panels in pixels."""
 
     camera: Camera
     size: tuple[int, int]
@@ -116,7 +116,7 @@ class Scale:
 
 
 def view(points: FloatArray, columns: int, *, yaw_deg: float = 0.0, width: int = WIDTH, margin: float = 0.04) -> View:
-    """Return a camera that sees all `points` (N, 3) in panels of which `columns` fill the figure."""
+    """Return a camera that contains all `points` (N, 3), in panels of which `columns` fill the figure."""
     across = (width - (columns - 1) * _GAP) // columns
     flat = Camera.framing(points, yaw_deg=yaw_deg, aspect=1e-3, margin=0.0, perspective=False)
     tall = Camera.framing(points, yaw_deg=yaw_deg, aspect=1e3, margin=0.0, perspective=False)
@@ -229,7 +229,7 @@ def _compose(
 def _place_keys(
     texts: list[tuple[float, float, str, dict[str, Any]]], keys: Sequence[tuple[str, Colour]], y: float, total_w: int
 ) -> float:
-    """Put coloured squares and their names in centred lines, and return the height that they take."""
+    """Draw legend entries in centred lines, and return their height."""
     square, between = measured("■ ", TEXT + 2), 28.0
     lines: list[list[tuple[str, Colour, float]]] = [[]]
     for name, colour in keys:
@@ -265,7 +265,7 @@ def _colour_bar(figure: Figure, scale: Scale, top: float, total_w: int, total_h:
 
 
 def without_empty_rows(panels: Sequence[Image]) -> list[Image]:
-    """Return pictures of one row without the white rows of pixels that all of them have above and below."""
+    """Return images of one row without the white rows of pixels at the top and bottom of all of them."""
     used = np.zeros(panels[0].shape[0], dtype=bool)
     for panel in panels:
         used |= (panel < 255).any(axis=(1, 2))
@@ -333,7 +333,7 @@ def legend(axes: Axes, **options: Any) -> None:
 
 @contextmanager
 def without_glyph_warnings() -> Generator[None]:
-    """Return a block in which a script that the font lacks is drawn as boxes without a warning."""
+    """Return a context that suppresses warnings about glyphs that the font lacks."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
         yield
@@ -369,7 +369,7 @@ def line_height(size: float) -> float:
 
 
 def baseline(line: int, size: float) -> float:
-    """Return how far below the top of a text its line number `line` (from 0) stands, in pixels."""
+    """Return the distance of line number `line` (from 0) of a text from its top, in pixels."""
     return 0.97 * size * DPI / 72 + line * line_height(size)
 
 
@@ -379,7 +379,7 @@ def height_of(text: str, size: float) -> float:
 
 
 def wrap(text: str, width: float, size: float, *, bold: bool = False, max_lines: int = _MOST_LINES) -> str:
-    """Return `text` in at most `max_lines` lines, none wider than `width` pixels, all of like length.
+    """Wrap `text` to at most `max_lines` lines of similar length, none wider than `width` pixels.
 
     What is left out ends in `…`.
     """
@@ -409,7 +409,7 @@ _LONGEST = 400  # characters of a name from a file
 
 
 def plain(text: str) -> str:
-    """Return `text` of a user without what cannot be printed, and no longer than a caption could be."""
+    """Return user text without unprintable characters, cut to the length of a caption."""
     printable_text = re.sub(r"[^\S\n]", " ", printable(str(text)[: _LONGEST + 1]))
     return printable_text if len(printable_text) <= _LONGEST else printable_text[: _LONGEST - 1] + "…"
 
@@ -426,7 +426,7 @@ def short(text: str, max_length: int = 28) -> str:
 
 
 def in_rows(items: Sequence[_Item], columns: int) -> list[list[_Item]]:
-    """Cut `items` into rows of at most `columns`."""
+    """Split `items` into rows of at most `columns`."""
     return [list(items[k : k + columns]) for k in range(0, len(items), columns)]
 
 
@@ -436,13 +436,13 @@ def scan_over(mesh: Mesh) -> Layer:
 
 
 def mean_mm(fit: StagedFit, stage: str = "final") -> float:
-    """Return the mean distance to the scan of the vertices that it shows; not-a-number where it shows none."""
+    """Return the mean distance to the scan over the overlap; NaN without overlap."""
     values = measured_mm(fit.model_to_scan_mm[stage])
     return float(values.mean()) if len(values) else float("nan")
 
 
 def mean_words(fits: Sequence[StagedFit]) -> str:
-    """Return what the means below the pictures of `fits` are of."""
+    """Return the caption for the mean distances of `fits`."""
     cloud = " That to a point cloud is to its points." if any(fit.scan.faces is None for fit in fits) else ""
     return f"In mm: mean distance to the scan of the vertices that the scan shows.{cloud}"
 

@@ -1,4 +1,4 @@
-"""Figures of one fit: its stages, its distances both ways, how it went, and what it ended in."""
+"""Figures of one fit: stages, signed distances, convergence, and coefficients."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ _TEXT_ROOM = 1.42
 
 
 def stages_figure(fit: StagedFit, *, title: str = "") -> Figure:
-    """Draw the scan, then the model before the fit, after phase 1, after phase 2 and, where there is one, dense.
+    """Draw the scan, then the model before the fit, after phase 1, after phase 2, and after the dense stage if present.
 
     A notebook makes the fit out of a result:
 
@@ -93,7 +93,7 @@ def stages_figure(fit: StagedFit, *, title: str = "") -> Figure:
 
 
 def overlay_figure(fit: StagedFit, *, title: str = "") -> Figure:
-    """Draw scan and model over each other at each stage, from two sides (the paper's figures 4 to 7)."""
+    """Draw scan and model superimposed at each stage, from two sides (the paper's figures 4 to 7)."""
     scan = scan_over(fit.scan)
     layers = [[scan, Layer(mesh, _colour(stage))] for stage, mesh in fit.surfaces.items()]
     captions = [f"{_SHORT_STAGES.get(stage, stage)}\n{mm(mean_mm(fit, stage))}" for stage in fit.surfaces]
@@ -194,7 +194,7 @@ def threshold_figure(fits: StagedFit | Sequence[StagedFit], *, title: str = "") 
 
 
 def distance_histograms(fit: StagedFit, *, title: str = "", bins: int = 60) -> Figure:
-    """Draw how the closest distances of both directions are spread, stage by stage on one scale.
+    """Draw histograms of the distances of both directions, stage by stage on one scale.
 
     Distances from the model to the scan stand above each line, those from the scan to the model hang below it. Only
     vertices that the scan shows count, and scan points within the model's rim.
@@ -299,7 +299,7 @@ def history_figure(fit: StagedFit, *, title: str = "") -> Figure:
 
 
 def coefficients_figure(fit: StagedFit, population: FloatArray | None = None, *, title: str = "") -> Figure:
-    """Draw the coefficients of a fit in standard deviations, each with its uncertainty, over those of the population.
+    """Draw the coefficients of a fit in standard deviations, with uncertainty, over those of the population.
 
     Args:
         fit: gives z, b_stddev and shrinkage.
@@ -353,7 +353,7 @@ def coefficients_figure(fit: StagedFit, population: FloatArray | None = None, *,
 
 
 def z_stddev(fit: StagedFit) -> FloatArray:
-    """Return the standard deviation of z, (K,); not-a-number where z is 0 and does not tell that of its mode."""
+    """Return the standard deviation of z, (K,); NaN where z is 0, since its scale is then unknown."""
     known = (np.abs(fit.z) > 1e-12) & (np.abs(fit.b) > 0)
     ratio = np.full(len(fit.z), np.nan)
     ratio[known] = fit.z[known] / fit.b[known]
@@ -437,7 +437,7 @@ def _decades(values: FloatArray) -> tuple[float, float]:
 
 
 def _histogram(values: FloatArray, edges: FloatArray) -> FloatArray:
-    """Return the share of `values` in each bin; those beyond the ends count at the ends."""
+    """Return the share of `values` in each bin; values outside the range count in the end bins."""
     if not len(values):
         return np.zeros(len(edges) - 1)
     return np.histogram(np.clip(values, edges[0], edges[-1]), edges)[0] / len(values)

@@ -1,4 +1,4 @@
-"""Figures of many fits: which of them to look at first, and how close they are."""
+"""Figures of many fits: distances, and grids of pictures."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ _DOUBTFUL = as_hex((0.90, 0.55, 0.05))
 
 
 def error_curves(fits: Sequence[StagedFit], *, stage: str = "final", title: str = "") -> Figure:
-    """Draw cumulative curves: which share of the points lies within each distance.
+    """Draw cumulative curves of the share of points within each distance.
 
     Args:
         fits: for a thin curve each and a thick one of all together, over the vertices that their scans show.
@@ -122,7 +122,7 @@ def _curve(axes: Any, values: FloatArray, **style: Any) -> None:
 def faces_grid(
     meshes: Sequence[Mesh], labels: Sequence[str], *, title: str, columns: int = 4, colour: Colour = CLAY
 ) -> Figure:
-    """Draw `meshes` in one light and at one scale, each under its label (figures 1 and 8).
+    """Draw `meshes` with one light and one scale, each under its label (figures 1 and 8).
 
     Raises:
         InputError: no meshes, or another number of labels.
@@ -141,7 +141,7 @@ def portrait_figure(
     fits: Sequence[StagedFit], labels: Sequence[str] = (), *, title: str = "Raw scans and the models fitted to them",
     yaw_deg: float = 25.0,
 ) -> Figure:  # fmt: skip
-    """Draw for each fit: the scan, the model fitted to it, both together, and how far the model lies from the scan.
+    """Draw for each fit the scan, the fitted model, both superimposed, and the distances from model to scan.
 
     Raises:
         InputError: no fit is given.
@@ -175,7 +175,7 @@ def portrait_figure(
 def aligned_grid(
     fits: Sequence[StagedFit], *, title: str = "Scan and fitted model over each other", columns: int = 4
 ) -> Figure:
-    """Draw scan and fitted model over each other for many fits, in the order given."""
+    """Draw scan and fitted model superimposed for many fits, in the order given."""
     images = _equal_views(fits, columns, lambda fit: [scan_over(fit.scan), Layer(fit.surfaces["final"], MODEL_COLOUR)])
     return grid(
         _caption_rows(images, fits, columns),
@@ -216,12 +216,12 @@ def _unsigned(fits: Sequence[StagedFit], top: float) -> Scale:
 
 
 def _grey(fits: Sequence[StagedFit]) -> list[tuple[str, Colour]]:
-    """Return the key of what the maps of some of these fits leave grey."""
+    """Return the legend text for grey areas in the maps."""
     return [(NOT_SHOWN, UNKNOWN_COLOUR)] if any(unknown(fit.model_to_scan_mm["final"]) for fit in fits) else []
 
 
 def _equal_views(fits: Sequence[StagedFit], columns: int, layers: Callable[[StagedFit], list[Layer]]) -> list[Image]:
-    """Return one picture a fit, each from its own front, all of one size."""
+    """Return one view per fit, each from its own front, all of one size."""
     if not fits:
         raise InputError("There is nothing to draw without fits.")
     columns = min(columns, max(len(fits), 3))

@@ -1,4 +1,4 @@
-"""Figures of a shape space: its mean, what its modes do, and how many of them it needs."""
+"""Figures of a shape model: mean, modes, spectrum and quality."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def mean_figure(model: ShapeModel, *, title: str = "") -> Figure:
 
 
 def modes_figure(model: ShapeModel, modes: int = 5, deviations: float = 3.0, *, title: str = "") -> Figure:
-    """Draw what each of the first modes does (the paper's figures 2 and 3).
+    """Draw the first modes (the paper's figures 2 and 3).
 
     A row a mode: the mean less and plus `deviations` standard deviations of it, and how far each vertex then moves; one
     camera and one scale for all rows.
@@ -146,7 +146,7 @@ def _name_modes(n_shown: int, count: int) -> str:
 
 
 def mode_displacement(model: ShapeModel, mode: int, deviations: float = 1.0) -> FloatArray:
-    """Return how far each vertex moves, (V, 3) mm, when coefficient `mode` (from 0) rises by `deviations` of its own.
+    """Return the displacement of each vertex, (V, 3) mm, for coefficient `mode` (from 0) at `deviations` sd.
 
     Raises:
         InputError: the model has no such mode.
@@ -168,7 +168,7 @@ def mode_animation(
     yaw_deg: float = 25.0,
     milliseconds: int = 80,
 ) -> bytes:
-    """Return an animated WebP in which the mean sways along one mode and back, for ever.
+    """Return a looping animated WebP of the mean moving along one mode and back.
 
         Path("mode1.webp").write_bytes(mode_animation(model, 0))
 
@@ -219,7 +219,7 @@ def mode_animation(
 
 
 def _labelled(image: Image, name: str, z: float, deviations: float) -> PillowImage.Image:
-    """Add below a picture which mode it is, and where on its way from one end to the other."""
+    """Draw the mode number and a position marker below an image."""
     height, width = image.shape[:2]
     type_size = max(11, round(width / 19))
     strip = round(2.1 * type_size)
@@ -284,7 +284,7 @@ def spectrum_figure(model: ShapeModel, *, shares: Sequence[float] = SHARES, titl
 
 
 def quality_figure(quality: Quality | Mapping[str, object], *, title: str = "") -> Figure:
-    """Draw compactness, generalisation, specificity and more, those that are there, over the number of modes.
+    """Draw compactness, generalisation, specificity and other measures present against the number of modes.
 
     Args:
         quality: from `compactness` (shares of the variance, 0 to 1), `generalisation`, `specificity` and
@@ -334,7 +334,7 @@ _Line: TypeAlias = tuple[FloatArray, FloatArray, FloatArray | None, FloatArray |
 
 
 def _of(key: str, quality: Quality) -> dict[str, _Line]:
-    """Return the curves of a measure that are there: by surface, or without a word, and by vertices."""
+    """Return the curves of a measure that are present: by surface or unnamed, and by vertices."""
     by_surface, by_vertices = getattr(quality, key), getattr(quality, f"{key}_vertices", None)
     out: dict[str, _Line] = {}
     if by_surface is not None:
@@ -371,7 +371,7 @@ def _short(name: str) -> str:
 
 
 def _legend_above(axes: Axes) -> None:
-    """Add the legend, where there is one, above all curves of the plot, with room made for it."""
+    """Add a legend, if there are entries, above the curves, with enough room for it."""
     count = len(axes.get_legend_handles_labels()[1])
     if count:
         low, high = axes.get_ylim()

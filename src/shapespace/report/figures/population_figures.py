@@ -1,4 +1,4 @@
-"""Figures of very many fits: distributions, coefficients, and how they go with time and site."""
+"""Figures of large sets of fits: distributions, coefficients, and trends over time and site."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _BANDS = ((1, 99, 0.16), (5, 95, 0.3), (25, 75, 0.5))
 
 
 def distributions_figure(values: Mapping[str, FloatArray], trusted: Any, *, title: str) -> Figure:
-    """Draw histograms of measures, trusted fits and others on top of each other.
+    """Draw histograms of measures, stacked by trusted and other fits.
 
     Args:
         values: in words -> (n,); those that are not finite are left out.
@@ -123,7 +123,7 @@ def coefficients_spread(z: npt.NDArray[np.floating[Any]], *, title: str) -> Figu
 
 
 def density_figure(z: npt.NDArray[np.floating[Any]], distances: FloatArray, *, title: str) -> Figure:
-    """Draw how many fits lie where in the first coefficients, and how far all coefficients of a fit are from the mean.
+    """Draw the density of fits in the first coefficients, and of their distance from the mean.
 
     Args:
         z: (n, K) in standard deviations.

@@ -1,4 +1,4 @@
-"""Figures of recognition: what is confused with what, how well probabilities hold, and what carries the decision."""
+"""Figures of recognition: confusion, calibration, and importance of modes and regions."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def confusion_figure(counts: npt.ArrayLike, classes: Sequence[str], *, title: st
 
 
 def _confused(table: FloatArray, shares: FloatArray, classes: Sequence[str]) -> str:
-    """Return how many answers are right, and which class is most often taken for which other."""
+    """Return a headline with the share of correct answers and the most frequent confusion."""
     total = float(table.sum())
     headline = f"{percent(float(np.trace(table)) / total)} of {counted(round(total), 'answer')} are right"
     error_shares = shares * (1 - np.eye(len(classes)))
@@ -320,7 +320,7 @@ def face_map_figure(
     regions: Mapping[str, float] | None = None,
     title: str = "",
 ) -> Figure:
-    """Draw what carries the decision on the face, from the front and from aside, and the share of each region.
+    """Draw the importance of each vertex for the decision, from two sides, and the share of each region.
 
     Args:
         vertices: (V, 3) mm, a face that looks along +z with +y up.
@@ -410,7 +410,7 @@ def curve_figure(
     scales: tuple[CurveScale, CurveScale] = ("linear", "linear"),
     diagonal: bool = False,
 ) -> Figure:
-    """Draw one measure against another, a line a series.
+    """Draw one measure against another, one line per series.
 
     Args:
         series: for each line its name, empty for none, its (n,) places and its (n,) values.
@@ -512,7 +512,7 @@ def _scale_ends(kind: CurveScale, values: Sequence[FloatArray]) -> tuple[float, 
 
 
 def _to_scale(values: FloatArray, kind: CurveScale, limits: tuple[float, float]) -> FloatArray:
-    """Return numbers as they are drawn: normal deviates on `probit`, nothing for what has no place on `log`."""
+    """Transform numbers to the axis scale: normal deviates on `probit`, NaN for non-positive numbers on `log`."""
     if kind == "probit":
         from scipy.special import ndtri
 

@@ -1,4 +1,4 @@
-"""A folder that `shapespace correspond` wrote, read for report, viewer and terminal: surfaces are read one by one."""
+"""Reader of the output folder of `shapespace correspond`, for report, viewer and terminal, one surface at a time."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _OPEN_SHARE = 0.15  # share of the area that faces one way in an open surface
 
 @dataclass(frozen=True, eq=False)
 class PlacedSurface:
-    """One surface as pictures need it.
+    """One surface in the frame of the pictures.
 
     Args:
         vertices: (V, 3) in the frame of `Corresponded.mean`, size divided out; not-a-number where missing.
@@ -48,13 +48,13 @@ class PlacedSurface:
 
     @property
     def seen(self) -> BoolArray:
-        """(V,) which vertices the scan shows."""
+        """(V,) mask of observed vertices."""
         return observed_mask(self.vertices)
 
 
 @dataclass(frozen=True, eq=False)
 class Population:
-    """What all surfaces tell together; scans whose surface cannot be read are not in it.
+    """Summary of all readable surfaces.
 
     Args:
         names: of the scans.
@@ -70,7 +70,7 @@ class Population:
 
 
 class Corresponded:
-    """A folder in correspondence.
+    """Output folder of a correspondence.
 
     Args:
         folder: that `shapespace correspond` wrote.
@@ -100,13 +100,13 @@ class Corresponded:
 
     @property
     def mean(self) -> Mesh:
-        """The mean shape as pictures show it: upright, about the origin, of the size that it has in its file."""
+        """The mean shape, upright and centred at the origin, in the size of its file."""
         vertices = self._mean.vertices
         return self._mean.with_vertices((vertices - vertices.mean(axis=0)) @ self.turn.T)
 
     @property
     def holes(self) -> int:
-        """How many borders the mean shape has beside one, which an open surface may have."""
+        """Number of borders of the mean shape beyond the first, which an open surface may have."""
         from shapespace.geometry.topology import join, labels  # compiled
 
         edges = boundary_edges(faces_of(self._mean))
@@ -121,11 +121,11 @@ class Corresponded:
 
     @property
     def set_aside(self) -> list[CorrespondRecord]:
-        """The records of the others."""
+        """Records of excluded scans."""
         return [record for record in self.records.values() if record.status != "corresponding"]
 
     def surface(self, name: str) -> Mesh:
-        """Return the surface of the scan `name` in its own frame and unit, not-a-number where it is not observed.
+        """Return the surface of the scan `name` in its own frame and unit, NaN where it is not observed.
 
         Raises:
             FileError: it cannot be read.
@@ -160,7 +160,7 @@ class Corresponded:
         return PlacedSurface(np.where(is_observed[:, None], T.inverse().apply(vertices), np.nan), T)
 
     def raw_scan(self, record: CorrespondRecord) -> Mesh:
-        """Return the scan of a record, if it is still where it was, with the content it had.
+        """Return the scan of a record, if it is in the same place with the same content.
 
         Raises:
             FileFormatError: it is not, or cannot be read.
@@ -178,7 +178,7 @@ class Corresponded:
             raise FileFormatError("the scan cannot be read.") from error
 
     def population(self, on_scan: Callable[[str], None] | None = None) -> Population:
-        """Return what all surfaces tell together, and turn the mean shape upright; they are read once.
+        """Summarise all surfaces, and bring the mean shape upright; each surface is read once.
 
         Args:
             on_scan: told of each scan that was read.
@@ -209,13 +209,13 @@ class Corresponded:
 
     @property
     def settled(self) -> float:
-        """The share of the size by which vertices move at most in a round that is the last one."""
+        """Convergence threshold: the largest movement in the last round, as a share of the size."""
         value = self.run.settings.get("settled")
         return float(value) if isinstance(value, int | float) else 0.0
 
     @property
     def units_mixed(self) -> bool:
-        """Whether sizes differ so much that the scans cannot be in one unit."""
+        """Whether sizes differ so much that the scans must have different units."""
         scales = [record.scale for record in self.corresponding if record.scale]
         return bool(scales) and max(scales) > _ONE_UNIT * min(scales)
 
@@ -241,12 +241,12 @@ class Corresponded:
 
 
 def observed_mask(vertices: FloatArray) -> BoolArray:
-    """Return (V,) which of `vertices` (V, 3) are not missing."""
+    """Return the mask (V,) of `vertices` (V, 3) that are not missing."""
     return np.isfinite(vertices.sum(axis=1))
 
 
 def drawable(mesh: Mesh, values: FloatArray | None = None) -> tuple[Mesh, FloatArray | None]:
-    """Return `mesh` without its missing vertices, and `values` (V,) of those that are left."""
+    """Return `mesh` without missing vertices, and the `values` (V,) of the remaining ones."""
     is_observed = observed_mask(mesh.vertices)
     if is_observed.all():
         return mesh, values
@@ -255,7 +255,7 @@ def drawable(mesh: Mesh, values: FloatArray | None = None) -> tuple[Mesh, FloatA
 
 
 def upright(mean: Mesh, turns: Sequence[FloatArray] = ()) -> FloatArray:
-    """Return the rotation (3, 3) that brings the mean shape to how it is looked at: +y up, its front along +z.
+    """Return the rotation (3, 3) that brings the mean shape upright: +y up, its front along +z.
 
     Where the scans stand alike, it is how they stand, as everywhere else. Otherwise the longest axis stands upright
     with the narrower end below, and the front is where an open surface faces, or the shortest axis of a closed one.

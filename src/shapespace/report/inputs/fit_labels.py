@@ -1,4 +1,4 @@
-"""Labels of the fits in a folder: where their table is, and which fit has which."""
+"""Labels of the fits in a folder, and the location of their table."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from shapespace.report.inputs.saved_fits import Folder, SavedFit
 
 
 def find_labels(folder: Folder, fits: Sequence[SavedFit], labels_path: Path | None) -> tuple[dict[str, Label], str]:
-    """Return labels and a sentence that says where they come from, or why there are none.
+    """Return labels and a sentence on their source, or on the reason why there are none.
 
     They are looked for in `labels_path`, else in labels.csv in `folder`, else beside the scans.
 
@@ -40,7 +40,7 @@ def find_labels(folder: Folder, fits: Sequence[SavedFit], labels_path: Path | No
 
 
 def with_label(fit: SavedFit, labels: Mapping[str, Label]) -> SavedFit:
-    """Return `fit` with its label, found by the scan's file name or the name of the fit; as it is without one."""
+    """Return `fit` with its label, matched by the scan's file name or the name of the fit; unchanged without one."""
     scan = fit.record.scan.name
     label = labels.get(stem_of(scan) if scan else fit.name) or labels.get(fit.name)
     if label is None or not label.text:

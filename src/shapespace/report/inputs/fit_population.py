@@ -1,4 +1,4 @@
-"""Very many fits at once: their numbers by column, what they were listed with, and who stands out; read in one stream.
+"""Large sets of fits as columns, with the metadata of their list and unusual fits, read in one stream.
 
 Of each fit some forty bytes and its coefficients are kept (float32), no record and no surface.
 """
@@ -45,7 +45,7 @@ _MOST_REASONS = 5000  # limit on memory
 
 @dataclass(frozen=True, eq=False)
 class ListedColumn:
-    """A column of the list that the scans came from.
+    """A metadata column of the list of scans.
 
     Args:
         name: its head.
@@ -62,7 +62,7 @@ class ListedColumn:
     levels: tuple[str, ...] = ()
 
     def groups(self) -> list[tuple[str, npt.NDArray[np.bool_], float]]:
-        """Return levels, or stretches of equal length, each with its name, which fits are in it, and its middle.
+        """Return levels, or intervals of equal length, each with its name, its fits and its centre.
 
         Of very many levels, those with the most fits.
         """
@@ -90,7 +90,7 @@ class ListedColumn:
         return np.asarray(np.linspace(low, np.nextafter(high, np.inf), max_bins + 1), dtype=np.float64)
 
     def told(self, value: float) -> str:
-        """Return a value in words."""
+        """Format a value as text."""
         if self.kind == "time":
             return datetime.fromtimestamp(value, UTC).strftime("%Y-%m-%d")
         return f"{value:.4g}"
@@ -98,7 +98,7 @@ class ListedColumn:
 
 @dataclass(frozen=True)
 class Group:
-    """How the fits of one level, or one stretch, differ from all.
+    """Difference between the fits of one level, or one interval, and all fits.
 
     Args:
         name: of it.
@@ -186,30 +186,30 @@ class Population:
 
     @property
     def counts(self) -> Counter[str]:
-        """How many fits have which status."""
+        """Number of fits per status."""
         counts = np.bincount(self.status, minlength=len(ORDER_OF_CONCERN))
         return Counter({status: int(count) for status, count in zip(ORDER_OF_CONCERN, counts, strict=True) if count})
 
     @property
     def trusted(self) -> npt.NDArray[np.bool_]:
-        """(n,) which fits converged with nothing found against them."""
+        """(n,) mask of fits that converged without problems."""
         return self.status == _code("converged")
 
     def median(self, measure: str) -> float:
-        """Return the median of a measure over the trusted fits; not-a-number where none tells it."""
+        """Return the median of a measure over the trusted fits; NaN without values."""
         values = self.measures[measure][self.trusted]
         values = values[np.isfinite(values)]
         return float(np.median(values)) if len(values) else np.nan
 
     def far(self) -> FloatArray:
-        """Return (n,) the root mean square of each fit's coefficients in standard deviations; not-a-number without."""
+        """Return the root mean square (n,) of each fit's coefficients in standard deviations; NaN without any."""
         out = np.full(len(self), np.nan)
         has_coefficients = np.isfinite(self.z).any(axis=1) if self.z.shape[1] else np.zeros(len(self), dtype=bool)
         out[has_coefficients] = np.sqrt(np.nanmean(np.square(self.z[has_coefficients], dtype=np.float64), axis=1))
         return out
 
     def worst(self, status: str, max_count: int) -> list[str]:
-        """Return names of fits of a status: those that expect the largest error of themselves first."""
+        """Return names of fits of a status, sorted by expected error, largest first."""
         rows = np.flatnonzero(self.status == _code(status))
         error = self.measures["expected_error_mm"][rows]
         error = np.where(np.isfinite(error), error, self.measures["to_model_mm"][rows])
@@ -264,7 +264,7 @@ class Population:
             self.n_reasons[status, plain] += 1
 
     def _column(self, name: str, texts: Sequence[str], codes: npt.NDArray[np.int32]) -> ListedColumn | None:
-        """Return a column as times, numbers or levels; None of one whose values all differ, such as identifiers."""
+        """Return a column as times, numbers or levels; None if all values differ, as for identifiers."""
         if not (codes >= 0).any():
             return None
         for kind, parse in (("number", _number), ("time", _seconds)):
@@ -283,7 +283,7 @@ class Population:
 
 
 def most_concerning(results: Results, max_count: int) -> list[str]:
-    """Return the names of the fits that need a look most: by status, then by the error expected or seen."""
+    """Return the names of fits to review first: by status, then by the expected or measured error."""
     ranked: list[tuple[int, float, str]] = []
     columns = ("scan", "status", "expected_error_mm", "scan_to_model_mean_mm")
     for rows in results.iter_rows(columns):
@@ -304,7 +304,9 @@ def _code(status: str) -> int:
 
 
 def _coded(texts: Sequence[str | None], codes: dict[str, int], max_levels: int) -> npt.NDArray[np.int32]:
-    """Return the number of each text in `codes`, which grows; -1 for none, and beyond `max_levels` different ones."""
+    """Return the index of each text in `codes`, which grows; -1 for missing ones and beyond `max_levels` distinct
+    texts.
+    """
     out = np.full(len(texts), -1, dtype=np.int32)
     for k, text in enumerate(texts):
         if text and (text in codes or len(codes) < max_levels):

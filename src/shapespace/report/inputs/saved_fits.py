@@ -1,4 +1,4 @@
-"""What fits and the demo saved, read back for pictures: JSON, arrays, meshes and models, checked, inside one folder."""
+"""Reader of saved fits and the demo for reports: JSON, arrays, meshes and models, checked, inside one folder."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class Folder:
         return path
 
     def json(self, name: object) -> dict[str, Any]:
-        """Return the object in a JSON file, its strings free of what cannot be printed.
+        """Return the object in a JSON file, without unprintable characters in its strings.
 
         Raises:
             FileError: it cannot be read.
@@ -115,14 +115,14 @@ class Folder:
 
 @dataclass(frozen=True, eq=False)
 class SavedFit:
-    """One fit: its record, and what is known beside it, from demo.json or from the files of a folder."""
+    """One fit: its record, and metadata from demo.json or from the files of a folder."""
 
     entry: FitEntry
     record: FitRecord
 
     @property
     def name(self) -> str:
-        """What it is called."""
+        """Name of the fit."""
         return self.entry.name
 
     @property
@@ -143,21 +143,21 @@ class SavedFit:
 
     @property
     def fitted(self) -> bool:
-        """Whether there is a result, be it a doubtful one."""
+        """Whether there is a result, also a doubtful one."""
         return self.status not in ("failed", "unreadable")
 
     @property
     def pictured(self) -> bool:
-        """Whether there are surfaces to show."""
+        """Whether there are surfaces to draw."""
         return bool(self.entry.stages or self.entry.fitted) and self.fitted
 
     def summary_mm(self, stage: str, direction: Direction, measure: Measure) -> float:
-        """Return a distance over the whole model, or all of the scan, in mm; not-a-number where there is none."""
+        """Return a distance over the whole model, or the whole scan, in mm; NaN if there is none."""
         summary = self.record.distances_mm.get(stage)
         return _known(getattr(getattr(summary, direction), measure)) if summary else math.nan
 
     def distance_mm(self, direction: Direction, measure: Measure = "mean") -> float:
-        """Return a distance of the final stage over what the scan shows, in mm; not-a-number where there is none.
+        """Return a distance of the final stage over the overlap, in mm; NaN if there is none.
 
         Records of earlier versions do not have it, see `shown`; of them it is that of `summary_mm`.
         """
@@ -170,12 +170,12 @@ class SavedFit:
 
     @property
     def shown(self) -> bool:
-        """Whether distances are over what the scan shows."""
+        """Whether distances are over the overlap."""
         return self.record.shown is not None
 
     @property
     def expected_error_mm(self) -> float:
-        """The vertex error that the fit expects of itself, mm; not-a-number where it does not say."""
+        """Expected vertex error of the fit, mm; NaN if unknown."""
         value = self.record.evidence.get("expected_error_mm")
         return float(value) if isinstance(value, int | float) else math.nan
 
@@ -238,7 +238,7 @@ def _results(folder: Folder) -> Results:
 
 
 def saved_fit(folder: Folder, results: Results, name: str) -> SavedFit:
-    """Return one fit of `results`, which are those of `folder`; `unreadable` where it cannot be read."""
+    """Return one fit of `results`, which belong to `folder`; `unreadable` if it cannot be read."""
     fitted, dense, stages = (
         f"{name}{ENDINGS[kind]}" if results.has(name, kind) else None for kind in ("fitted", "dense", "stages")
     )
@@ -313,7 +313,7 @@ def raw_scan(folder: Folder, fit: SavedFit) -> Mesh:
 
 
 def model_of(folder: Folder, fits: Sequence[SavedFit], model_path: Path | None = None) -> ShapeModel:
-    """Return the model by which `fits` were made.
+    """Return the model that `fits` were made with.
 
     Args:
         folder: where the fits lie.

@@ -1,4 +1,4 @@
-"""A fit as pictures need it: scan and model in the model's frame in mm, moment by moment, with signed distances."""
+"""A fit in the frame of the pictures: scan and model in mm, iteration by iteration, with signed distances."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Moment:
 
 @dataclass(frozen=True, eq=False)
 class StagedFit:
-    """A fit as pictures need it, with scan and model in the model's frame in mm.
+    """A fit in the frame of the pictures, with scan and model in the model's frame in mm.
 
     Args:
         name: of the fit.
@@ -90,7 +90,7 @@ class StagedFit:
 
     @staticmethod
     def of(model: ShapeModel, result: FitResult, label: str = "") -> StagedFit:
-        """Return what pictures need of `result`, which was fitted by `model`."""
+        """Return the staged fit of `result`, which was fitted by `model`."""
         arrays = stage_arrays(result, model)
         return StagedFit.from_arrays(arrays, result, name=result.scan_name, label=label or result.scan_name)
 
@@ -98,7 +98,7 @@ class StagedFit:
     def from_surfaces(
         surfaces: Mapping[str, Mesh], scan: Mesh, record: FitRecord, *, name: str, label: str
     ) -> StagedFit:
-        """Return a fit from its saved surfaces and its scan, with distances that are measured now.
+        """Return a fit from its saved surfaces and its scan, and measure its distances.
 
         A vertex counts as not shown by the scan where its closest point lies on the border of the scan, and more than
         1 % of the size of the model to the side; nowhere where the record says that the scan shows the whole model.
@@ -202,7 +202,7 @@ class StagedFit:
 
 
 def measured_mm(distances_mm: FloatArray) -> FloatArray:
-    """Return the lengths of signed distances, those that were measured, (n,)."""
+    """Return the absolute values of the finite signed distances, (n,)."""
     return np.abs(distances_mm[np.isfinite(distances_mm)])
 
 
@@ -213,7 +213,7 @@ _MEDIANS = 5.0
 
 
 def scale_end(distances_mm: FloatArray) -> float:
-    """Return where a scale of signed distances (N,), mm, ends, whatever hair or one bad fit among them does."""
+    """Return the end of a colour scale for signed distances (N,), mm, robust against outliers."""
     known = measured_mm(distances_mm)
     if not len(known):
         return 1.0

@@ -1,4 +1,4 @@
-"""Which scans in correspondence to look at first, and why: what stands out beside the others, or is bad by itself."""
+"""Triage of scans in correspondence: scans to review first, with reasons."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _TO_STDDEV = 1.4826  # MAD to standard deviation of a normal distribution: 1 / 0
 
 @dataclass(frozen=True)
 class Concern:
-    """Why a scan in correspondence may need a look.
+    """Reasons to review a scan in correspondence.
 
     Args:
         weight: how much it stands out, 0 for not at all.
@@ -32,13 +32,13 @@ class Concern:
 
     @property
     def told(self) -> str:
-        """The reasons as a sentence."""
+        """Reasons as a sentence."""
         return sentence("; ".join(self.reasons)) if self.reasons else "Nothing about it stands out."
 
 
 @dataclass(frozen=True)
 class _Measure:
-    """What may stand out.
+    """A measure with its usual range.
 
     Args:
         of: the value of each scan, not-a-number where it is not known.
@@ -56,7 +56,7 @@ class _Measure:
 
 
 def concerns_of(folder: Corresponded) -> dict[str, Concern]:
-    """Return for each scan in correspondence, by its name, what stands out about it."""
+    """Return the concerns about each scan in correspondence, by name."""
     population = folder.population()
     records = [folder.records[name] for name in population.names]
     reasons_by_record: list[list[tuple[float, str]]] = [[] for _ in records]
@@ -133,12 +133,12 @@ def distance_share(record: CorrespondRecord, statistic: str, size: float) -> flo
 
 
 def known(value: float | None) -> float:
-    """Return a number that may be absent, not-a-number for none."""
+    """Return a number that may be absent, NaN for None."""
     return nan if value is None else value
 
 
 def median(values: Sequence[float]) -> float:
-    """Return the median of those that are numbers, not-a-number where none is."""
+    """Return the median of the finite numbers, NaN if there are none."""
     numbers = [value for value in values if isfinite(value)]
     return float(np.median(numbers)) if numbers else nan
 
@@ -154,7 +154,7 @@ def sentence(text: str) -> str:
 
 
 def scan_status(record: CorrespondRecord, concerns: Mapping[str, Concern]) -> str:
-    """Return `corresponding`, `look` for one that stands out, `set aside`, or `unreadable` where its surface is."""
+    """Return `corresponding`, `look` for an unusual scan, `set aside`, or `unreadable`."""
     if record.status != "corresponding":
         return "set aside"
     concern = concerns.get(record.name)

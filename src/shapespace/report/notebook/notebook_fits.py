@@ -1,4 +1,4 @@
-"""What a notebook shows of a model, a fit and a quality: a picture, the key numbers, the verdict; and their plots."""
+"""Notebook views of models, fits and model quality: a picture, key numbers, status; and their plots."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _CURVES = (
 
 
 def plot_model(model: ShapeModel, kind: str, **options: Any) -> Figure:
-    """Do what `ShapeModel.plot` says."""
+    """Draw a figure for `ShapeModel.plot`."""
     require_report_extra()
     from shapespace.report import figures
 
@@ -48,7 +48,7 @@ def plot_model(model: ShapeModel, kind: str, **options: Any) -> Figure:
 
 
 def plot_fit(result: FitResult, kind: str, **options: Any) -> Figure:
-    """Do what `FitResult.plot` says."""
+    """Draw a figure for `FitResult.plot`."""
     require_report_extra()
     from shapespace.report import figures
 
@@ -65,7 +65,7 @@ def plot_fit(result: FitResult, kind: str, **options: Any) -> Figure:
 
 
 def plot_quality(quality: ModelQuality, **options: Any) -> Figure:
-    """Do what `ModelQuality.plot` says."""
+    """Draw a figure for `ModelQuality.plot`."""
     require_report_extra()
     from shapespace.report import figures
 
@@ -88,7 +88,7 @@ def _choose(draw: Mapping[str, Callable[..., Figure]], kind: str) -> Callable[..
 
 
 def html_of_model(model: ShapeModel) -> str:
-    """Return a model for a notebook: its first modes, what it was made of, and what it may be used for."""
+    """Return a model for a notebook: its first modes, training data, and licence."""
     modes_needed = [
         f"{percent(share)} in {n}" for share in _SHARES if (n := model.modes_for_variance(share)) is not None
     ]
@@ -110,7 +110,7 @@ def html_of_model(model: ShapeModel) -> str:
 
 
 def html_of_fit(result: FitResult) -> str:
-    """Return a fit for a notebook: where it is how far from the scan, the verdict, and the largest coefficients."""
+    """Return a fit for a notebook: a map of distances, the status, and the largest coefficients."""
     overlap = result.shown
     largest = sorted(range(len(result.z)), key=lambda k: -abs(result.z[k]))[:_MOST_COEFFICIENTS]
     seen_share, covered_share = percent(overlap.model_seen_share), percent(overlap.scan_covered_share)

@@ -179,7 +179,7 @@ def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], caption: str, to
 
 
 def _shorten(table: Table) -> list[Block]:
-    """Return a table with at most `MOST_ROWS` rows, and how many there are beyond them."""
+    """Return a table with at most `MOST_ROWS` rows, and the number of further rows."""
     short_table = Table(table.columns, table.rows[:MOST_ROWS], table.caption)
     left = len(table.rows) - MOST_ROWS
     return [short_table] if left <= 0 else [short_table, Text(f"{left:,} more rows are left out.")]

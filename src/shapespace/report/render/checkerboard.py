@@ -1,4 +1,4 @@
-"""One checkerboard for all surfaces in correspondence: thrown onto the mean shape, carried to each by its vertices."""
+"""A checkerboard for all surfaces in correspondence: projected onto the mean shape, carried over by vertices."""
 
 from __future__ import annotations
 

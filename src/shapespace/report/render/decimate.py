@@ -1,4 +1,4 @@
-"""Surfaces and point clouds with fewer points, so that they can be sent; no point of them is new."""
+"""Decimation of surfaces and point clouds for transfer, without new points."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _MOST_COLLAPSED = 150_000  # triangles; larger scans are clustered on a grid fir
 
 
 def decimate(scan: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
-    """Return `scan` with at most `largest` triangles (points, where it has none), and which vertices are left.
+    """Return `scan` with at most `largest` triangles (or points), and the indices of the remaining vertices.
 
     No new point is made, so what was measured at a vertex stays true of it. Of surfaces, the shortest edges are
     collapsed. Points, surfaces that branch, and very large ones, which would take long, are thinned by a cubic grid
@@ -53,7 +53,7 @@ def decimate(scan: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
 
 
 def _collapsed(scan: Mesh, faces: IntArray, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]] | None:
-    """Return the surface with collapsed edges and its vertices that are left; None where it branches."""
+    """Return the surface after edge collapse and its remaining vertices; None for a non-manifold surface."""
     try:
         _, triangles, source_rows = collapse(scan.vertices, faces, largest, scan.name)
     except MeshError:

@@ -1,4 +1,4 @@
-"""Colours that report and viewer share, told apart with every common kind of colour blindness.
+"""Colours of report and viewer, distinguishable with every common kind of colour blindness.
 
 Both maps change evenly to the eye: they are drawn through a few colours in the space OKLab (Ottosson 2020) and stepped
 at equal lengths. The sequential one is pale where nothing is wrong, so that a surface looks like a surface there, and

@@ -1,4 +1,4 @@
-"""The compiled loops of the renderer: which triangle or ball a pixel shows, and what is interpolated there."""
+"""Compiled loops of the renderer: visibility of triangles and balls, and interpolation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stills of meshes and point clouds by a z-buffer: no GPU, no window, the same bytes every time.
+"""Renderer of meshes and point clouds by a z-buffer: no GPU, no window, reproducible to the byte.
 
 The nearest triangle of each pixel is found first; normals and scalars are interpolated for what is seen only.
 """
@@ -44,7 +44,7 @@ _SRGB = np.round(255.0 * ((np.arange(65536) + 0.5) / 65536) ** (1 / _GAMMA)).ast
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Where a picture is taken from; share one in a row so that its panels can be compared.
+    """Viewpoint of a picture; share one in a row so that its panels can be compared.
 
     With yaw and pitch 0 it looks along -z with +y up: the front of a face that looks along +z.
 
@@ -176,7 +176,7 @@ def distance_layer(mesh: Mesh, distances_mm: FloatArray, limit_mm: float, *, sig
 
 @dataclass(frozen=True, eq=False)
 class _Surfels:
-    """What a layer leaves in the picture: for each covered pixel, where, how deep and what."""
+    """Rasterised layer: position, depth and colour of each covered pixel."""
 
     pixel: npt.NDArray[np.int64]
     depth_mm: _Single
@@ -189,7 +189,7 @@ class _Surfels:
 def render(
     *layers: Layer, camera: Camera, size: tuple[int, int] = (480, 560), supersample: int = _SUPERSAMPLE
 ) -> Image:
-    """Return a picture of layers on white, the nearest one in each pixel.
+    """Render layers on white, the nearest layer in each pixel.
 
     Args:
         layers: what to draw.
@@ -213,7 +213,7 @@ def render_series(
     size: tuple[int, int] = (480, 560),
     supersample: int = _SUPERSAMPLE,
 ) -> list[Image]:
-    """Return several pictures from one camera; what takes part in several is rasterised once, whatever its colours.
+    """Render several pictures from one camera; layers in several pictures are rasterised once.
 
     Arguments and errors as in `render`.
     """
@@ -249,7 +249,7 @@ def _composed(pieces: Sequence[tuple[_Single, _Surfels]], size: tuple[int, int],
 
 
 def visible_triangles(mesh: Mesh, *, camera: Camera, size: tuple[int, int]) -> tuple[IntArray, FloatArray]:
-    """Return which triangle each pixel shows, and how deep.
+    """Return the triangle that each pixel shows, and its depth.
 
     Args:
         mesh: with faces.
@@ -347,7 +347,7 @@ def _surfels(layer: Layer, camera: Camera, size: tuple[int, int], supersample: i
 
 
 def squares(along: npt.NDArray[np.floating[Any]], across: npt.NDArray[np.floating[Any]]) -> _Single:
-    """Return codes (n,) of the squares of a checkerboard: 0 for every other one, the others 1, 2, ... in turn.
+    """Return square codes (n,) of a checkerboard: 0 for every second square, the others 1, 2, ... in turn.
 
     Those nearest to each other differ, also two columns or rows apart, so that a square is told from the next ones.
 
@@ -361,7 +361,7 @@ def squares(along: npt.NDArray[np.floating[Any]], across: npt.NDArray[np.floatin
 
 
 def _unit(vectors: _Single) -> _Single:
-    """Return (d, n) vectors at length one."""
+    """Return (d, n) vectors normalised to length one."""
     squares = vectors[0] ** 2 + vectors[1] ** 2 + vectors[2] ** 2
     return vectors / np.sqrt(np.maximum(squares, 1e-24))
 
@@ -418,7 +418,7 @@ def _cloud_surface(mesh: Mesh) -> tuple[float, FloatArray | None]:
 
 
 def point_spacing(mesh: Mesh) -> float:
-    """Return about how far the points of a cloud lie from each other, mm."""
+    """Return the typical distance between neighbouring points of a cloud, mm."""
     return _cloud_surface(mesh)[0]
 
 

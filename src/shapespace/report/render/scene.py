@@ -1,4 +1,4 @@
-"""What turns in the browser: arrays packed for scene.js, and the scripts that draw them.
+"""Interactive 3-D views for the browser: arrays packed for scene.js, and the scripts that draw them.
 
 The bytes of `pack` are a uint32 (little-endian) with the length of a JSON header, the header, zeros up to a multiple of
 8, then the arrays, each at a multiple of 8. `Shapespace.unpack` of scene.js reads them back.
@@ -125,7 +125,7 @@ def _coded(array: npt.NDArray[Any], reference: npt.NDArray[Any] | None) -> bytes
 
 
 def pack_model(model: ShapeModel, modes: int | None = None, *, small: bool = False) -> bytes:
-    """Return what `Shapespace.Model` and the widget of modes need.
+    """Return the data of `Shapespace.Model` and the modes widget.
 
     Arrays: `mean` (V, 3) mm; `faces` (F, 3), absent for point models; `modes` (K, V, 3) quantised, the displacement of
     one standard deviation of each mode, mm; `stddev` (K,) mm; `share` (K,) of the training variance.
@@ -178,7 +178,7 @@ def pack_model(model: ShapeModel, modes: int | None = None, *, small: bool = Fal
 
 
 def pack_morph(low: Mesh, high: Mesh, labels: tuple[str, str], *, largest: int = 20_000) -> bytes:
-    """Return what the widget of a morph needs: two shapes in correspondence as a mean and one mode, from -1 to 1.
+    """Return the data of the morph widget: two shapes in correspondence as a mean and one mode, from -1 to 1.
 
     Arrays: `mean` (V, 3) mm; `faces`, absent for points; `modes` (1, V, 3) mm, half of the difference.
 
@@ -201,7 +201,7 @@ def pack_morph(low: Mesh, high: Mesh, labels: tuple[str, str], *, largest: int =
 
 
 def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: int | None = None) -> bytes:
-    """Return what the widget of a fit needs: the scan, the model at each stage, distances, regions, iterations.
+    """Return the data of the fit widget: the scan, the model at each stage, distances, regions, iterations.
 
     Arrays: `scan` (S, 3) mm and `scan_faces`; `faces` of the model; by stage `surface_STAGE` (V, 3) mm,
     `model_to_scan_STAGE` (V,) and `scan_to_model_STAGE` (S,) mm, signed where the fact `signed` is true, lengths where
@@ -329,7 +329,7 @@ def _stage_arrays(
 def _colours(
     staged: StagedFit, of_model: npt.NDArray[np.intp], of_scan: npt.NDArray[np.intp]
 ) -> dict[str, npt.NDArray[Any] | Steps]:
-    """Return the colours of the scan, and those that the surfaces took from it, where there are any."""
+    """Return the colours of the scan, and the colours transferred from it to the surfaces, if there are any."""
     arrays: dict[str, npt.NDArray[Any] | Steps] = {}
     if staged.scan.colours is not None:
         arrays["scan_colours"] = staged.scan.colours[of_scan]
@@ -354,7 +354,7 @@ def _history(staged: StagedFit) -> dict[str, npt.NDArray[Any]]:
 def pack_scatter(
     points: FloatArray, labels: Sequence[str], names: Sequence[str], *, axes: Sequence[str], unit: str = "mm"
 ) -> bytes:
-    """Return what the widget of a scatter needs.
+    """Return the data of the scatter widget.
 
     Arrays: `points` (n, K) float32; `labels` (n,) int32 codes into the fact `labels`, by first appearance.
 
@@ -386,7 +386,7 @@ def pack_scatter(
 
 
 def scripts() -> str:
-    """Return the JavaScript of a page with scenes, for one inline `<script>`."""
+    """Return the JavaScript for the scenes of a page, for one inline `<script>`."""
     from shapespace.report.render import palette as colours
 
     folder = files("shapespace.report").joinpath("assets")
@@ -446,7 +446,7 @@ def _places(points: FloatArray, small: bool) -> npt.NDArray[Any] | Steps:
 
 
 def _shared_steps(surfaces: Mapping[str, FloatArray]) -> dict[str, Steps]:
-    """Return surfaces of the same vertices in one step, each but the first as what differs from the one before."""
+    """Quantise surfaces of the same vertices in one step, each after the first as the difference to the previous."""
     largest = max(float(np.abs(points).max(initial=0.0)) for points in surfaces.values())
     step = max(largest / _MOST_STEPS, _PLACE_STEP_MM)
     out: dict[str, Steps] = {}
@@ -458,7 +458,7 @@ def _shared_steps(surfaces: Mapping[str, FloatArray]) -> dict[str, Steps]:
 
 
 def _decimate(mesh: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
-    """Return `mesh` thinned, with neighbours near each other in the order, and the indices of its vertices."""
+    """Return `mesh` decimated, with neighbours close in the vertex order, and the indices of its vertices."""
     small_mesh, source_rows = decimate(mesh, largest)
     if small_mesh.faces is None:
         return small_mesh, source_rows
@@ -467,7 +467,7 @@ def _decimate(mesh: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
 
 
 def _neighbours_together(faces: IntArray, vertices: int) -> tuple[npt.NDArray[np.intp], IntArray]:
-    """Return an order of the vertices, (V,), in which neighbours are near, and the sorted triangles in that order."""
+    """Return a vertex order, (V,), that keeps neighbours close, and the sorted triangles in that order."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import reverse_cuthill_mckee
 

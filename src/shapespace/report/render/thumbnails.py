@@ -32,7 +32,7 @@ Still: TypeAlias = tuple[bytes, tuple[int, int]]
 
 
 def fit_strip(fit: StagedFit, limit_mm: float, panel: tuple[int, int] = PANEL) -> Still:
-    """Return three panels: the scan, scan and model over each other, distances from model to scan.
+    """Return three panels: the scan, scan and model superimposed, distances from model to scan.
 
     The distances are signed, on `colours.DIVERGING` from -limit_mm; those to a point cloud, which has no inside, are on
     `colours.SEQUENTIAL` from 0. Vertices that the scan does not show are grey.
@@ -91,7 +91,7 @@ def correspondence_strip(
 
 
 def _at_vertices(values: FloatArray, faces: IntArray, vertices: int) -> FloatArray:
-    """Return the mean (V,) of what is known of the triangles around each vertex."""
+    """Return the mean (V,) of the known values of the triangles around each vertex."""
     known = np.isfinite(values)
     flat = faces[known].ravel()
     count = np.bincount(flat, minlength=vertices)
@@ -100,7 +100,7 @@ def _at_vertices(values: FloatArray, faces: IntArray, vertices: int) -> FloatArr
 
 
 def mesh_still(mesh: Mesh, panel: tuple[int, int] = PANEL) -> Still:
-    """Return one mesh from the front, as its axes stand."""
+    """Render one mesh from the front, without rotation."""
     camera = Camera.framing(mesh.vertices, aspect=panel[0] / panel[1], margin=0.06)
     # Points are drawn as balls, of a size that joins them whatever the unit of the file.
     radius = 0.004 * float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
