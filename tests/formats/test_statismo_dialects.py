@@ -39,7 +39,7 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
             sandbox_child._walk(file, "", found, leave)
         return Tree(found.arrays, found.texts, found.attributes, tuple(found.groups))
 
-    monkeypatch.setattr("shapespace.formats.statismo.read_hdf5_apart", read)
+    monkeypatch.setattr("shapespace.formats.statismo.read_hdf5_sandboxed", read)
 
 
 def covariance(model: ShapeModel) -> Any:

@@ -280,14 +280,14 @@ def branching(n: int = 40) -> Mesh:
 @pytest.mark.parametrize("kind", ["surface", "points", "branching"])
 def test_thinning_keeps_the_limit_the_place_and_the_points(kind: str, largest: int, staged: StagedFit) -> None:
     mesh = {"surface": staged.scan, "points": Mesh(staged.scan.vertices), "branching": branching()}[kind]
-    few, kept = scene.thinned(mesh, largest)
+    few, kept = scene.decimate(mesh, largest)
     count = len(few.vertices) if mesh.faces is None else 0 if few.faces is None else len(few.faces)
     assert count <= largest
     assert np.array_equal(few.vertices, mesh.vertices[kept])
     if largest == 900:
         assert count > 0.5 * largest
         assert np.abs(np.ptp(few.vertices, axis=0) - np.ptp(mesh.vertices, axis=0)).max() < 15.0
-    assert scene.thinned(mesh, 10**6)[0] is mesh
+    assert scene.decimate(mesh, 10**6)[0] is mesh
 
 
 def test_a_scatter_has_its_labels_as_codes() -> None:
