@@ -1,4 +1,4 @@
-"""Loops that numpy cannot express, compiled by Numba on first use and kept on disk from then on."""
+"""Compilation of loops by Numba on first use, with a cache on disk."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
     written in the user's cache folder, or where there is none either in memory alone.
     """
 
-    def made(*, cache: bool) -> Callable[P, R]:
+    def compile_function(*, cache: bool) -> Callable[P, R]:
         return cast(Callable[P, R], cast(Any, numba).njit(cache=cache, nogil=True, error_model="numpy")(function))
 
     try:
-        return made(cache=True)
-    except RuntimeError:  # no folder to keep it in
-        return made(cache=False)
+        return compile_function(cache=True)
+    except RuntimeError:  # no folder for the cache
+        return compile_function(cache=False)
 
 
 @contextmanager
-def on_compiling(tell: Callable[[], None]) -> Generator[None]:
-    """Call `tell` once if any code is compiled in this block, before it is; code read from disk does not count."""
+def notify_compilation(notify: Callable[[], None]) -> Generator[None]:
+    """Call `notify` once before any code is compiled in this block; code read from disk does not count."""
 
-    class First(cast(Any, event).Listener):
-        told = False
+    class _FirstCompilation(cast(Any, event).Listener):
+        has_notified = False
 
         def on_start(self, event: object) -> None:
-            if not self.told:
-                self.told = True
-                tell()
+            if not self.has_notified:
+                self.has_notified = True
+                notify()
 
         def on_end(self, event: object) -> None:
             pass
 
-    with cast(Any, event).install_listener("numba:compile", First()):
+    with cast(Any, event).install_listener("numba:compile", _FirstCompilation()):
         yield

@@ -1,4 +1,4 @@
-"""The tree of errors that shapespace raises: one sentence each, saying what is wrong, where, and what to do."""
+"""Exceptions of shapespace, each with one sentence on the problem, the file or argument, and the remedy."""
 
 
 class ShapespaceError(Exception):
@@ -34,4 +34,4 @@ class DataError(ShapespaceError):
 
 
 class FitError(ShapespaceError):
-    """A scan cannot be fitted at all; a fit that merely went badly is a result with a status instead."""
+    """A scan cannot be fitted at all; a poor fit is a result with a status instead."""

@@ -1,4 +1,4 @@
-"""What lower layers hand on to higher ones, and to packages that are not required, when somebody asks for it.
+"""Lazy imports of functions in higher layers, and of packages that are not required.
 
 Imports point down only. A model can be plotted and a result saved all the same, since their methods look up here who
 does it: this list is all there is of that.
@@ -86,12 +86,12 @@ def lazy_import(name: str) -> Callable[..., Any]:
     return getattr(import_module(f"shapespace.{LAZY_FUNCTIONS[name]}"), name)
 
 
-def other_package(module: str, what: str, install: str = "") -> Any:
+def require_package(module: str, purpose: str, install: str = "") -> Any:
     """Return a module of a package that shapespace does not require.
 
     Args:
         module: its name.
-        what: needs it, at the beginning of a sentence.
+        purpose: needs it, at the beginning of a sentence.
         install: what pip is to install, where that is not called as the module.
 
     Raises:
@@ -102,7 +102,7 @@ def other_package(module: str, what: str, install: str = "") -> Any:
     except ImportError as error:
         package = module.partition(".")[0]
         if isinstance(error, ModuleNotFoundError) and error.name == package:
-            why = f"which is not installed; run pip install {install or package}."
+            cause = f"which is not installed; run pip install {install or package}."
         else:
-            why = f"which is installed and cannot be loaded ({error}); see how it is to be installed."
-        raise ShapespaceError(f"{what} needs {package}, {why}") from error
+            cause = f"which is installed and cannot be loaded ({error}); see how it is to be installed."
+        raise ShapespaceError(f"{purpose} needs {package}, {cause}") from error

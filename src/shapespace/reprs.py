@@ -1,4 +1,4 @@
-"""What a prompt shows of an object that holds arrays: one short line, whatever their size."""
+"""One-line representations of objects that contain arrays."""
 
 from __future__ import annotations
 
@@ -9,28 +9,28 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-_SMALL = 9
-_MOST_NAMES = 4
-_LONGEST = 80
+_SMALL = 9  # elements; a rotation matrix is printed in full
+_MOST_NAMES = 4  # entries in one line
+_LONGEST = 80  # characters; a terminal's line
 
 
 def short_repr(self: Any) -> str:
-    """Return the fields of a dataclass in one line: arrays by their shape and type, long things by how many they hold.
+    """Return the fields of a dataclass in one line: arrays by shape and type, long sequences by length.
 
     It stands in a class as `__repr__ = short_repr`.
     """
-    told = (f"{one.name}={told_briefly(getattr(self, one.name))}" for one in fields(self) if one.repr)
-    return f"{type(self).__name__}({', '.join(told)})"
+    shown_fields = (f"{item.name}={describe_briefly(getattr(self, item.name))}" for item in fields(self) if item.repr)
+    return f"{type(self).__name__}({', '.join(shown_fields)})"
 
 
-def listed_briefly(parts: Sequence[str]) -> str:
-    """Return the first of `parts`, and the number of the others, in one line."""
-    more = f"; and {len(parts) - _MOST_NAMES} more" if len(parts) > _MOST_NAMES else ""
-    return "; ".join(_clipped(part) for part in parts[:_MOST_NAMES]) + more
+def list_briefly(parts: Sequence[str]) -> str:
+    """Return the first of `parts`, and the number of further ones, in one line."""
+    others_note = f"; and {len(parts) - _MOST_NAMES} more" if len(parts) > _MOST_NAMES else ""
+    return "; ".join(_clip(part) for part in parts[:_MOST_NAMES]) + others_note
 
 
-def told_briefly(value: Any) -> str:
-    """Return a few words on `value`, of which nothing is measured or read for that."""
+def describe_briefly(value: Any) -> str:
+    """Return a short text for `value`, without computing or reading anything."""
     if isinstance(value, np.ndarray):
         return _of_array(cast(npt.NDArray[Any], value))
     if isinstance(value, Mapping):
@@ -44,13 +44,13 @@ def told_briefly(value: Any) -> str:
 
 def _of_mapping(value: Mapping[object, object]) -> str:
     names = [str(name) for name in value]
-    more = f", and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
-    return "{" + ", ".join(_clipped(name) for name in names[:_MOST_NAMES]) + more + "}"
+    others_note = f", and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+    return "{" + ", ".join(_clip(name) for name in names[:_MOST_NAMES]) + others_note + "}"
 
 
 def _of_other(value: object) -> str:
-    told = repr(value)
-    return f"{type(value).__name__}(…)" if is_dataclass(value) and len(told) > _LONGEST else _clipped(told)
+    text = repr(value)
+    return f"{type(value).__name__}(…)" if is_dataclass(value) and len(text) > _LONGEST else _clip(text)
 
 
 def _of_array(array: npt.NDArray[Any]) -> str:
@@ -59,5 +59,5 @@ def _of_array(array: npt.NDArray[Any]) -> str:
     return f"<{' x '.join(map(str, array.shape))} {array.dtype}>"
 
 
-def _clipped(text: str) -> str:
+def _clip(text: str) -> str:
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 2]} …"

@@ -1,4 +1,4 @@
-"""The plain data that travels between the parts: meshes, similarities and label volumes.
+"""Data types that all parts share: meshes, landmarks, similarities and label volumes.
 
 Arrays are float64 and read-only. Lengths are millimetres, except the vertices of a scan as read from its file,
 which are in the file's own unit until the fit has found that unit.
@@ -39,20 +39,20 @@ _FEW_DIGITS, _ROUNDING = 1e-4, 1e-12
 """By which the sum of barycentric coordinates may differ from 1: as written with few digits, and by rounding."""
 
 
-def require(value: object, wanted: type, function: str, how: str) -> None:
-    """Raise an error in one sentence if an argument has the wrong type.
+def require(value: object, expected: type, function: str, remedy: str) -> None:
+    """Raise an InputError if an argument has the wrong type.
 
     Args:
         value: the argument.
-        wanted: its type.
+        expected: its type.
         function: name of the function that takes it.
-        how: the caller gets one, as the end of the sentence.
+        remedy: the caller gets one, as the end of the sentence.
 
     Raises:
         InputError: it is of another type.
     """
-    if not isinstance(value, wanted):
-        raise InputError(f"{function} takes a {wanted.__name__}, not {type(value).__name__}; {how}.")
+    if not isinstance(value, expected):
+        raise InputError(f"{function} takes a {expected.__name__}, not {type(value).__name__}; {remedy}.")
 
 
 def require_path(value: object, function: str) -> None:
@@ -140,10 +140,10 @@ class Mesh:
                 raise MeshError(f"{self.name}: landmark {key!r} must be 3 numbers, not {point.shape}.")
         object.__setattr__(self, "landmarks", MappingProxyType(landmarks))
         if self.colours is not None:
-            given = np.asarray(self.colours)
-            if given.shape != vertices.shape or given.dtype != np.uint8:
-                raise MeshError(f"{self.name}: colours must be (V, 3) uint8, not {given.shape} {given.dtype}.")
-            colours = np.ascontiguousarray(given).view()
+            array = np.asarray(self.colours)
+            if array.shape != vertices.shape or array.dtype != np.uint8:
+                raise MeshError(f"{self.name}: colours must be (V, 3) uint8, not {array.shape} {array.dtype}.")
+            colours = np.ascontiguousarray(array).view()
             colours.setflags(write=False)
             object.__setattr__(self, "colours", colours)
         if self.observed is not None:
@@ -156,7 +156,7 @@ class Mesh:
 
     def __getstate__(self) -> dict[str, Any]:
         # For copies, other processes and skops, none of which takes read-only mappings.
-        fields = {one.name: getattr(self, one.name) for one in dataclasses.fields(self)}
+        fields = {item.name: getattr(self, item.name) for item in dataclasses.fields(self)}
         return {**fields, "landmarks": dict(self.landmarks)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -164,8 +164,8 @@ class Mesh:
 
     def with_vertices(self, vertices: npt.ArrayLike, landmarks: Mapping[str, FloatArray] | None = None) -> Mesh:
         """Return the same mesh with other `vertices` (V, 3); landmarks are dropped unless given."""
-        moved = np.asarray(vertices, dtype=np.float64)
-        return Mesh(moved, self.faces, landmarks or {}, self.name, self.colours, self.notes, self.observed)
+        positions = np.asarray(vertices, dtype=np.float64)
+        return Mesh(positions, self.faces, landmarks or {}, self.name, self.colours, self.notes, self.observed)
 
     def to_trimesh(self) -> Any:
         """Return a `trimesh.Trimesh` with the same vertices, or a `trimesh.PointCloud` where there are no triangles.
@@ -278,7 +278,7 @@ class SurfaceLandmarks(Mapping[str, int]):
 
     def __getstate__(self) -> dict[str, Any]:
         # Plain values, as of `Mesh`.
-        return {one.name: getattr(self, one.name) for one in dataclasses.fields(self)} | {"names": list(self.names)}
+        return {item.name: getattr(self, item.name) for item in dataclasses.fields(self)} | {"names": list(self.names)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__init__(**state)  # type: ignore[misc]
@@ -304,20 +304,20 @@ class SurfaceLandmarks(Mapping[str, int]):
 
     @staticmethod
     def of(landmarks: Mapping[str, int]) -> SurfaceLandmarks:
-        """Return `landmarks` themselves, or those at vertices where they are a mapping of name to vertex."""
+        """Return `landmarks`, or landmarks at vertices from a mapping of name to vertex."""
         if isinstance(landmarks, SurfaceLandmarks):
             return landmarks
         vertex = np.array([int(vertex) for vertex in landmarks.values()], dtype=object).reshape(-1, 1)
-        for name, (at,) in zip(landmarks, vertex, strict=True):
-            if not 0 <= at <= _MOST_VERTICES:
-                raise InputError(f"Landmark {str(name)!r} is at vertex {at}, which the model does not have.")
+        for name, (vertex_index,) in zip(landmarks, vertex, strict=True):
+            if not 0 <= vertex_index <= _MOST_VERTICES:
+                raise InputError(f"Landmark {str(name)!r} is at vertex {vertex_index}, which the model does not have.")
         weights = np.zeros((len(vertex), 3))
         weights[:, 0] = 1.0
         return SurfaceLandmarks(tuple(map(str, landmarks)), np.repeat(vertex, 3, axis=1).astype(np.int32), weights)
 
     @property
     def are_vertices(self) -> bool:
-        """Whether each landmark was given as a vertex: it is exactly at one, at no distance from the surface."""
+        """Whether each landmark was given as a vertex: exactly at a vertex, at no distance from the surface."""
         return bool((self.barycentric[:, 0] == 1.0).all()) and not self.distance_mm.any()
 
     def interpolate(self, values: npt.ArrayLike) -> FloatArray:
@@ -329,8 +329,8 @@ class SurfaceLandmarks(Mapping[str, int]):
         Returns:
             (L, ...) float64.
         """
-        there = np.asarray(values)[self.corners]
-        return np.asarray(np.einsum("lc,lc...->l...", self.barycentric, there), dtype=np.float64)
+        corner_values = np.asarray(values)[self.corners]
+        return np.asarray(np.einsum("lc,lc...->l...", self.barycentric, corner_values), dtype=np.float64)
 
     def positions(self, vertices: npt.ArrayLike) -> dict[str, FloatArray]:
         """Return name -> (3,) position on the surface with these `vertices` (V, 3)."""
@@ -342,7 +342,7 @@ class SurfaceLandmarks(Mapping[str, int]):
         return SurfaceLandmarks(tuple(names), self.corners[rows], self.barycentric[rows], self.distance_mm[rows])
 
     def joined(self, *others: SurfaceLandmarks) -> SurfaceLandmarks:
-        """Return these landmarks followed by `others`, of other names.
+        """Return these landmarks followed by `others`, which have different names.
 
         Raises:
             InputError: a name is in two of them.
@@ -356,16 +356,16 @@ class SurfaceLandmarks(Mapping[str, int]):
         )
 
     def within(self, vertices: npt.ArrayLike) -> SurfaceLandmarks:
-        """Return the landmarks that depend on no other vertices than those marked in `vertices` (V,) bool."""
+        """Return the landmarks whose vertices are all marked in `vertices` (V,) bool."""
         marked: BoolArray = np.asarray(vertices, dtype=np.bool_)[self.corners]
         rows = np.asarray(marked.all(axis=1))
         return self.select([name for name, is_inside in zip(self.names, rows, strict=True) if is_inside])
 
     def renumbered(self, vertices: npt.ArrayLike) -> SurfaceLandmarks:
-        """Return the same in the numbers that vertices have when only those marked in `vertices` (V,) bool remain."""
-        kept = self.within(vertices)
+        """Return the landmarks after removal of the vertices that are not marked in `vertices` (V,) bool."""
+        remaining = self.within(vertices)
         number = np.cumsum(np.asarray(vertices, dtype=np.bool_)) - 1
-        return dataclasses.replace(kept, corners=number[kept.corners].astype(np.int32))
+        return dataclasses.replace(remaining, corners=number[remaining.corners].astype(np.int32))
 
     def check(self, n_vertices: int) -> None:
         """Refuse landmarks on vertices that a surface of `n_vertices` does not have.
@@ -425,9 +425,9 @@ class Similarity:
 
     def apply(self, points: npt.ArrayLike) -> FloatArray:
         """Map `points` (..., 3) from the source frame to the target frame."""
-        moved = np.asarray(points, dtype=np.float64) @ (self.scale * self.rotation.T)
-        moved += self.translation
-        return moved
+        transformed = np.asarray(points, dtype=np.float64) @ (self.scale * self.rotation.T)
+        transformed += self.translation
+        return transformed
 
     def inverse(self) -> Similarity:
         """Return the similarity from the target frame back to the source frame."""
@@ -445,7 +445,7 @@ MAX_MEMORY_BYTES = 2**32
 
 @dataclass(frozen=True, eq=False)
 class LabelVolume:
-    """Labels in voxels, and where these lie in the patient.
+    """Labels in voxels, with the position of the voxels in the patient.
 
     Args:
         labels: (X, Y, Z) whole numbers of any type, read-only; 0 is what has no label.
@@ -483,7 +483,7 @@ class LabelVolume:
 
 
 def common_faces(meshes: Iterable[Mesh]) -> IntArray | None:
-    """Return the triangles that all `meshes` share, or None if they are point clouds.
+    """Return the triangles that all `meshes` share, or None for point clouds.
 
     Raises:
         CorrespondenceError: two of them differ; the message names the second.

@@ -19,7 +19,7 @@ from sklearn.pipeline import Pipeline
 
 import shapespace as ss
 from shapespace import cli
-from shapespace.lazy import other_package
+from shapespace.lazy import require_package
 from synthetic_shapes import blob_model, raw_scan, training_meshes
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -104,7 +104,7 @@ def test_a_tool_that_is_absent_is_one_sentence_with_the_command(
 
 def test_the_sentence_on_an_absent_package_names_the_command() -> None:
     with pytest.raises(ss.ShapespaceError, match=r"^Knitting needs no_such_wool, .*; run pip install wool\.$"):
-        other_package("no_such_wool", "Knitting", "wool")
+        require_package("no_such_wool", "Knitting", "wool")
 
 
 def like_other_tools(mesh: ss.Mesh) -> dict[str, Any]:

@@ -15,7 +15,7 @@ import pytest
 from shapespace.batch import workers
 from shapespace.batch.progress import telling_of_compiling
 from shapespace.batch.warm import COMPILING
-from shapespace.compiled import on_compiling
+from shapespace.compiled import notify_compilation
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="workers are copies of a server on Linux alone")
 STATE = """
@@ -83,7 +83,7 @@ def test_compiling_is_told_once_and_what_is_there_already_is_not(
     told: list[str] = []
     for _ in range(2):  # compiled, then read from disk
         loops = importlib.import_module("fresh_loops")
-        with on_compiling(lambda: told.append("compiling")):
+        with notify_compilation(lambda: told.append("compiling")):
             assert loops.first(1) == 2
             assert told == ["compiling"]
             assert loops.second(1) == 3

@@ -97,13 +97,13 @@ def test_the_browser_unpacks_and_moves_the_model_as_numpy_does(page_of, small: b
 def test_every_kind_of_array_is_unpacked(page_of) -> None:
     values = np.random.default_rng(0).normal(0, 40, (50, 3))
     values[3] = np.nan
-    coded = scene.quantised(values, step=0.04, coded=True)
+    coded = scene.quantise(values, step=0.04, coded=True)
     after = scene.Steps(np.roll(coded.values, 1, axis=0), coded.scale, True, "coded")
     faces = scene.Steps(np.random.default_rng(1).integers(0, 65536, (40, 3)).astype(np.uint16), coded=True)
     arrays = {
         "u8": np.arange(5, dtype=np.uint8),
         "f32": values.astype(np.float32),
-        "rows": scene.quantised(values.T, by_row=True),
+        "rows": scene.quantise(values.T, by_row=True),
         "coded": coded,
         "after": after,
         "faces": faces,

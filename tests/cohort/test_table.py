@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from shapespace.cohort.classes import notes_on_classes
-from shapespace.cohort.table import Table, named, numbers_as_text, read_table
+from shapespace.cohort.table import Table, list_names, numbers_as_text, read_table
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.files import write_text
 
@@ -153,7 +153,7 @@ def test_what_a_spreadsheet_would_run_loses_its_apostrophe_and_columns_of_lists_
 
 
 def test_names_are_told_until_they_are_many() -> None:
-    assert named(["a", "b", "c"]) == "a, b, c" and named(["a", "b", "c", "d"]) == "a, b, c and 1 more"
+    assert list_names(["a", "b", "c"]) == "a, b, c" and list_names(["a", "b", "c", "d"]) == "a, b, c and 1 more"
 
 
 def test_the_shapes_in_each_class_are_counted_and_likely_misspellings_named() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from shapespace.errors import FitError, InputError
-from shapespace.fit.dense.dense_fit import _field, _laplacian, dense_surface, unfolded
+from shapespace.fit.dense.dense_fit import _field, _laplacian, dense_surface, revert_folds
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.robust.prepared_model import prepare
 from shapespace.fit.robust.robust_settings import DenseSettings
@@ -152,7 +152,7 @@ def test_unfolding_holds_back_only_where_triangles_fold(step: tuple[float, float
     tip = int(start[:, 2].argmax())
     moved[tip] -= step
     assert turned(start, moved) > 0 or against_neighbours(moved).any()
-    kept, held = unfolded(start, start, moved, topology, SETTINGS.turn_cosine)
+    kept, held = revert_folds(start, start, moved, topology, SETTINGS.turn_cosine)
     assert turned(start, kept) == 0 and not (against_neighbours(kept) & ~against_neighbours(start)).any()
     assert held[tip] and held.sum() < 60
     assert np.array_equal(kept[~held], moved[~held])
@@ -162,7 +162,7 @@ def test_unfolding_holds_back_only_where_triangles_fold(step: tuple[float, float
 def test_unfolding_always_ends_without_a_fold(roughness_mm: float) -> None:
     start = fitted()
     moved = start + np.random.default_rng(4).normal(0, roughness_mm, start.shape)
-    kept, _ = unfolded(start, start, moved, prepare(model()).topology, SETTINGS.turn_cosine)
+    kept, _ = revert_folds(start, start, moved, prepare(model()).topology, SETTINGS.turn_cosine)
     assert turned(start, kept) == 0 and not (against_neighbours(kept) & ~against_neighbours(start)).any()
 
 

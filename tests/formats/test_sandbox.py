@@ -16,7 +16,7 @@ import statismo_by_hand as by_hand
 from own_file_fuzz import damaged_bytes, fuzzed
 from shapespace.errors import ModelFileError, ShapespaceError
 from shapespace.io import sandbox, sandbox_child
-from shapespace.io.sandbox import ApartError, read_hdf5_apart, read_matlab_apart
+from shapespace.io.sandbox import SandboxError, read_hdf5_sandboxed, read_matlab_sandboxed
 from shapespace.model.shape_model import ShapeModel
 
 Harm = Callable[[Any, Path], None]
@@ -94,7 +94,7 @@ def test_a_file_that_reaches_out_or_unfolds_is_refused(harm: Harm, harmless: Pat
 
 
 def test_a_file_is_read_apart_as_it_is_in_this_process(harmless: Path) -> None:
-    tree = read_hdf5_apart(harmless, leave=("/modelinfo",))
+    tree = read_hdf5_sandboxed(harmless, leave=("/modelinfo",))
     with h5py.File(harmless) as file:
         for path, array in tree.arrays.items():
             assert np.array_equal(array, file[path][()])  # type: ignore[index]
@@ -104,18 +104,18 @@ def test_a_file_is_read_apart_as_it_is_in_this_process(harmless: Path) -> None:
 
 def test_a_file_that_takes_too_long_or_too_much_is_given_up(harmless: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sandbox, "MOST_SECONDS", 0)
-    with pytest.raises(ApartError, match="longer than 0 s"):
-        read_hdf5_apart(harmless)
+    with pytest.raises(SandboxError, match="longer than 0 s"):
+        read_hdf5_sandboxed(harmless)
     monkeypatch.undo()
     if sys.platform == "linux":
         monkeypatch.setattr(sandbox, "PROGRAM_BYTES", -3 * 2**26)
-        with pytest.raises(ApartError, match=r"survive|cannot be read|memory"):
-            read_hdf5_apart(harmless)
+        with pytest.raises(SandboxError, match=r"survive|cannot be read|memory"):
+            read_hdf5_sandboxed(harmless)
 
 
 def test_a_library_that_dies_or_lies_half_way_is_no_model() -> None:
     for answer in (b"", b"half a line", b'{"arrays":[["/a","<f4",[4]]],"texts":{},"attributes":{},"groups":[]}\n1234'):
-        with pytest.raises(ApartError, match="does not survive"):
+        with pytest.raises(SandboxError, match="does not survive"):
             sandbox._tree(answer)
 
 
@@ -142,8 +142,8 @@ def test_matlab_variables_that_unfold_to_far_more_than_the_file_are_refused(
     scipy.io.savemat(tmp_path / "m.mat", {"mean": np.zeros(10**6)}, do_compression=True)
     assert (tmp_path / "m.mat").stat().st_size < 20_000
     monkeypatch.setattr(sandbox, "SPARE_BYTES", 2**20)
-    with pytest.raises(ApartError, match="out of proportion"):
-        read_matlab_apart(tmp_path / "m.mat", ["mean"])
+    with pytest.raises(SandboxError, match="out of proportion"):
+        read_matlab_sandboxed(tmp_path / "m.mat", ["mean"])
 
 
 @fuzzed(6)

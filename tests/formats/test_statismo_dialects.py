@@ -34,12 +34,12 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     def read(path: Path, leave: tuple[str, ...] = ()) -> Any:
         from shapespace.io.sandbox import Tree
 
-        found = sandbox_child._Found(2**26)
+        found = sandbox_child._FileContent(2**26)
         with h5py.File(path) as file:
             sandbox_child._walk(file, "", found, leave)
         return Tree(found.arrays, found.texts, found.attributes, tuple(found.groups))
 
-    monkeypatch.setattr("shapespace.formats.statismo.read_hdf5_apart", read)
+    monkeypatch.setattr("shapespace.formats.statismo.read_hdf5_sandboxed", read)
 
 
 def covariance(model: ShapeModel) -> Any:

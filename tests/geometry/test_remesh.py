@@ -4,7 +4,7 @@ import pytest
 from shapespace.errors import MeshError
 from shapespace.geometry import remesh
 from shapespace.geometry.closest import build_engine
-from shapespace.report.render.decimate import thinned
+from shapespace.report.render.decimate import decimate
 from shapespace.types import Mesh
 
 
@@ -38,7 +38,7 @@ def test_what_libigl_would_write_beyond_its_tables_for_never_reaches_it(
         remesh.collapse(mesh.vertices, faces, 100, "bump")
     with pytest.raises(MeshError, match="bump cannot be re-triangulated"):
         remesh.split(mesh.vertices, faces, "bump")
-    thin, kept = thinned(Mesh(mesh.vertices, faces, name="bump"), 100)
+    thin, kept = decimate(Mesh(mesh.vertices, faces, name="bump"), 100)
     assert 0 < len(thin.faces) <= 100
     np.testing.assert_array_equal(thin.vertices, mesh.vertices[kept])
 

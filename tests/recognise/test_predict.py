@@ -11,10 +11,10 @@ from shapespace.recognise.classifiers import CLASSIFIERS
 from shapespace.recognise.labelled_scans import (
     ScanCoefficients,
     from_record,
-    labelled,
     one_model,
     read_coefficients,
     relative_to_neutral,
+    with_labels,
 )
 from shapespace.recognise.predict import predict_scans, train_classifier, write_answers
 from shapespace.schemas import FitRecord
@@ -254,6 +254,6 @@ def test_a_damaged_record_is_refused_by_name(changes):
 def test_labels_are_found_by_the_file_of_the_scan_and_by_the_name_of_the_fit():
     scans = [from_record("scan_2", record("anna")), ScanCoefficients("ben", "converged", "", np.ones(2), HASH),
              ScanCoefficients("carl", "converged", "", np.ones(2), HASH)]  # fmt: skip
-    found = labelled(scans, {"anna": Label("smile", None, "Anna"), "ben": Label("", None, "Ben")})
+    found = with_labels(scans, {"anna": Label("smile", None, "Anna"), "ben": Label("", None, "Ben")})
     assert [(s.label, s.subject) for s in found] == [("smile", "Anna"), ("", "Ben"), ("", "")]
     assert one_model(found) == HASH

@@ -187,7 +187,7 @@ def test_vertices_without_extent_or_beyond_all_measure_are_no_surface(head: Call
     mesh = head(5)
     for vertices in (0 * mesh.vertices, 1e300 * mesh.vertices):
         with pytest.raises(InputError, match="no surface to draw"):
-            figures.looked_at(mesh.with_vertices(vertices))
+            figures.upright_views(mesh.with_vertices(vertices))
 
 
 def test_a_curve_without_a_place_on_its_scale_is_refused() -> None:
@@ -286,10 +286,10 @@ def test_a_surface_that_lies_is_turned_upright_and_one_that_stands_stays() -> No
     at = np.arange(20 * 24).reshape(20, 24)
     one, two, three, four = at[:-1], np.roll(at, -1, 1)[:-1], at[1:], np.roll(at, -1, 1)[1:]
     faces = np.concatenate([np.stack(f, -1).reshape(-1, 3) for f in ((one, two, three), (two, four, three))])
-    turn, sides = figures.looked_at(Mesh(standing, faces))
+    turn, sides = figures.upright_views(Mesh(standing, faces))
     assert np.array_equal(turn, np.eye(3)) and len(sides) == 4
     lying = Mesh(standing[:, [1, 2, 0]], faces)
-    turn, _ = figures.looked_at(lying)
+    turn, _ = figures.upright_views(lying)
     assert np.ptp(lying.vertices @ turn.T, axis=0).argmax() == 1
 
 

@@ -13,7 +13,7 @@ from shapespace.batch.store import Store
 from shapespace.errors import InputError
 from shapespace.report import figures
 from shapespace.report.inputs import fit_population as population
-from shapespace.report.inputs.fit_population import Listed, Population
+from shapespace.report.inputs.fit_population import ListedColumn, Population
 from shapespace.report.pages import many_page
 from shapespace.report.pages.write_html import LARGEST_REPORT_BYTES, write_report
 from shapespace.store.results import Results
@@ -124,13 +124,13 @@ def test_chance_alone_does_not_stand_out() -> None:
     one.measures = {"expected_error_mm": rng.lognormal(0, 0.4, 20_000)}
     one.z = rng.normal(0, 1, (20_000, 5)).astype(np.float32)
     codes = rng.integers(40, size=20_000).astype(np.int32)
-    column = Listed("site", "level", np.zeros(0), codes, tuple(map(str, range(40))))
+    column = ListedColumn("site", "level", np.zeros(0), codes, tuple(map(str, range(40))))
     assert [group.stands_out for group in one.compared(column) if group.stands_out] == []
 
 
 def test_whole_numbers_are_parted_at_whole_numbers() -> None:
     values = np.repeat(np.arange(18.0, 90.0), 50)
-    column = Listed("age", "number", values, np.zeros(len(values), dtype=np.int32))
+    column = ListedColumn("age", "number", values, np.zeros(len(values), dtype=np.int32))
     counts = [int(inside.sum()) for _, inside, _ in column.groups()]
     assert sum(counts) == len(values) and set(counts) == {100}
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from shapespace.errors import InputError
-from shapespace.report.render.renderer import Camera, Layer, covered, render, render_series
+from shapespace.report.render.renderer import Camera, Layer, render, render_series, visible_triangles
 from shapespace.types import FloatArray, Mesh
 
 SIZE = (57, 43)
@@ -62,7 +62,7 @@ def brute_force(mesh: Mesh, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 def test_each_pixel_shows_the_triangle_that_its_ray_meets_first(seed: int, distance_mm: float | None) -> None:
     mesh = soup(seed, 25)
     camera = Camera(np.array([1.0, -2.0, 0.5]), 40.0, 25.0, -10.0, distance_mm)
-    triangle, depth = covered(mesh, camera=camera, size=SIZE)
+    triangle, depth = visible_triangles(mesh, camera=camera, size=SIZE)
     expected, along = brute_force(mesh, camera)
     assert (triangle == expected).all()
     assert (expected >= 0).sum() > 500 and (expected < 0).sum() > 50
@@ -82,7 +82,7 @@ def test_triangles_that_share_edges_leave_no_gap_and_no_pixel_outside() -> None:
     i = np.arange(n * n).reshape(n, n)
     a, b, c, d = i[:-1, :-1].ravel(), i[:-1, 1:].ravel(), i[1:, 1:].ravel(), i[1:, :-1].ravel()
     mesh = Mesh(points, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]))
-    triangle, _ = covered(mesh, camera=Camera(np.zeros(3), 40.0), size=(400, 400))
+    triangle, _ = visible_triangles(mesh, camera=Camera(np.zeros(3), 40.0), size=(400, 400))
     inside = np.zeros((400, 400), dtype=bool)
     inside[100:300, 100:300] = True
     assert ((triangle >= 0) == inside).all()

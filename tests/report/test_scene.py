@@ -107,7 +107,7 @@ def test_rounding_stays_within_half_a_step(by_row: bool, coded: bool, step: floa
     values = np.random.default_rng(0).normal(0, [[[30.0]], [[0.5]], [[1e-4]]], (3, 40, 3))
     values[0, 3] = np.nan
     values[1, 4, 1] = np.inf
-    packed = scene.quantised(values, step=step, by_row=by_row, coded=coded)
+    packed = scene.quantise(values, step=step, by_row=by_row, coded=coded)
     _, arrays = unpack(scene.pack({"it": packed}, {}))
     known = np.isfinite(values)
     assert np.array_equal(np.isnan(arrays["it"]), ~known)
@@ -119,7 +119,7 @@ def test_rounding_stays_within_half_a_step(by_row: bool, coded: bool, step: floa
 
 @pytest.mark.parametrize("values", [np.zeros((0, 3)), np.zeros(5), np.full(4, np.nan)])
 def test_nothing_zeros_and_unknowns_can_be_rounded(values: np.ndarray) -> None:
-    _, arrays = unpack(scene.pack({"it": scene.quantised(values, by_row=len(values) > 0)}, {}))
+    _, arrays = unpack(scene.pack({"it": scene.quantise(values, by_row=len(values) > 0)}, {}))
     assert np.array_equal(arrays["it"], values, equal_nan=True)
 
 
@@ -280,14 +280,14 @@ def branching(n: int = 40) -> Mesh:
 @pytest.mark.parametrize("kind", ["surface", "points", "branching"])
 def test_thinning_keeps_the_limit_the_place_and_the_points(kind: str, largest: int, staged: StagedFit) -> None:
     mesh = {"surface": staged.scan, "points": Mesh(staged.scan.vertices), "branching": branching()}[kind]
-    few, kept = scene.thinned(mesh, largest)
+    few, kept = scene.decimate(mesh, largest)
     count = len(few.vertices) if mesh.faces is None else 0 if few.faces is None else len(few.faces)
     assert count <= largest
     assert np.array_equal(few.vertices, mesh.vertices[kept])
     if largest == 900:
         assert count > 0.5 * largest
         assert np.abs(np.ptp(few.vertices, axis=0) - np.ptp(mesh.vertices, axis=0)).max() < 15.0
-    assert scene.thinned(mesh, 10**6)[0] is mesh
+    assert scene.decimate(mesh, 10**6)[0] is mesh
 
 
 def test_a_scatter_has_its_labels_as_codes() -> None:

@@ -34,10 +34,10 @@ from shapespace.io.landmarks.landmark_io import read_landmarks
 from shapespace.io.memory_cache import LatestValue
 from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.io.read_limits import LARGEST_MESH_FILE_BYTES
-from shapespace.io.remote import fetched, is_address, name_of, version_of
+from shapespace.io.remote import fetch_copy, is_address, name_of, version_of
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import File, FitRecord, to_json
-from shapespace.store.results import wrote_landmarks
+from shapespace.store.results import has_written_landmarks
 from shapespace.types import FloatArray
 from shapespace.version import __version__
 
@@ -75,7 +75,7 @@ class Job:
         if not self.address:
             yield self.scan
             return
-        with fetched(self.address, LARGEST_MESH_FILE_BYTES) as file:
+        with fetch_copy(self.address, LARGEST_MESH_FILE_BYTES) as file:
             yield file
 
     def source(self, folder: Path) -> Source:
@@ -155,7 +155,7 @@ class _Files:
         """Return what an earlier fit may have left that this one does not write."""
         # Without a record they are no results of ours, but perhaps a scan and the landmarks that somebody placed.
         left = [self.dense] if dense and self.record.is_file() else []
-        left += self.landmarks.values() if landmarks and wrote_landmarks(self.record) else ()
+        left += self.landmarks.values() if landmarks and has_written_landmarks(self.record) else ()
         return [*left, self.stages] if stages else left
 
 

@@ -93,9 +93,9 @@ def telling_of_compiling(*, quiet: bool) -> AbstractContextManager[None]:
     if quiet:
         return nullcontext()
     from shapespace.batch.warm import tell_compiling
-    from shapespace.compiled import on_compiling
+    from shapespace.compiled import notify_compilation
 
-    return on_compiling(tell_compiling)
+    return notify_compilation(tell_compiling)
 
 
 @contextmanager

@@ -93,7 +93,7 @@ class Store:
             FileFormatError: the manifest is damaged.
         """
         manifest = read_manifest(self.folder)
-        return {} if manifest is None else reading.Store(self.folder, manifest).identities()
+        return {} if manifest is None else reading.ResultStore(self.folder, manifest).identities()
 
     def finish(self) -> list[str]:
         """Finish what a killed run began: remove files that no manifest names, and single files that a shard holds.
@@ -187,7 +187,7 @@ class Store:
 
     def _remove_singles(self, name: str) -> None:
         # The record goes last: what lies beside it is never without it.
-        landmarks = FIDUCIAL_ENDINGS if reading.wrote_landmarks(self.folder / f"{name}{ENDING}") else ()
+        landmarks = FIDUCIAL_ENDINGS if reading.has_written_landmarks(self.folder / f"{name}{ENDING}") else ()
         for ending in (*ENDINGS.values(), *landmarks, ENDING):
             remove_file(self.folder / f"{name}{ending}")
 

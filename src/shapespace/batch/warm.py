@@ -11,7 +11,7 @@ import sys
 import numpy as np
 
 from shapespace.batch.messages import is_first
-from shapespace.compiled import on_compiling
+from shapespace.compiled import notify_compilation
 from shapespace.errors import ShapespaceError
 from shapespace.fit.dense.residual_modes import residual_modes
 from shapespace.fit.fit_scan import FitConfig, fit_scan
@@ -30,7 +30,7 @@ def tell_compiling() -> None:
 
 def warm_up(*, tell: bool) -> None:
     """Fit a small model to small surfaces and to points, from no start; with `tell` say so if that compiles."""
-    with on_compiling(tell_compiling if tell else lambda: None):
+    with notify_compilation(tell_compiling if tell else lambda: None):
         _small_fits()
 
 

@@ -1,1 +1,1 @@
-"""Shapes of many subjects with what is known of each: what every statistical answer begins from."""
+"""Cohorts: shapes of many subjects with covariates, the input of every statistical analysis."""

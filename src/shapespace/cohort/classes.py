@@ -43,14 +43,16 @@ def notes_on_classes(column: str, cells: Sequence[str]) -> list[str]:
     notes: list[str] = []
     if not has_names:
         listed = counts.most_common(_LISTED)
-        rest = f" and {len(counts) - _LISTED} more classes" if len(counts) > _LISTED else ""
-        notes.append(f"Shapes in each class of {column}: {', '.join(f'{name} {n}' for name, n in listed)}{rest}.")
+        others_note = f" and {len(counts) - _LISTED} more classes" if len(counts) > _LISTED else ""
+        notes.append(
+            f"Shapes in each class of {column}: {', '.join(f'{name} {n}' for name, n in listed)}{others_note}."
+        )
         alone = [name for name, count in counts.items() if count == 1]
         if alone:
-            shown = ", ".join(repr(name[:40]) for name in alone[:3]) + (" ..." if len(alone) > 3 else "")
+            quoted_names = ", ".join(repr(name[:40]) for name in alone[:3]) + (" ..." if len(alone) > 3 else "")
             notes.append(
-                f"{column} has {len(alone)} {'class' if len(alone) == 1 else 'classes'} with one shape ({shown}); "
-                "check the spelling, or leave these shapes out."
+                f"{column} has {len(alone)} {'class' if len(alone) == 1 else 'classes'} with one shape "
+                f"({quoted_names}); check the spelling, or leave these shapes out."
             )
     for first, other, difference in _similar(list(counts), letters=not has_names):
         notes.append(
@@ -65,20 +67,22 @@ def _similar(names: Sequence[str], *, letters: bool) -> list[tuple[str, str, str
     plain: dict[str, list[str]] = {}
     for name in names:
         plain.setdefault("".join(name.casefold().split()), []).append(name)
-    found = [(group[0], other, "case or white space") for group in plain.values() for other in group[1:]]
+    pairs = [(group[0], second, "case or white space") for group in plain.values() for second in group[1:]]
     if letters and len(plain) <= _COMPARED:
-        found += [
-            (plain[one][0], plain[other][0], "one letter")
-            for one, other in combinations(plain, 2)
-            if max(len(one), len(other)) >= _LONG and (one + other).isalpha() and _one_edit(one, other)
+        pairs += [
+            (plain[first][0], plain[second][0], "one letter")
+            for first, second in combinations(plain, 2)
+            if max(len(first), len(second)) >= _LONG and (first + second).isalpha() and _one_edit(first, second)
         ]
-    return found
+    return pairs
 
 
-def _one_edit(one: str, other: str) -> bool:
-    """Return whether words differ by one inserted, removed or replaced letter, or by two exchanged neighbours."""
-    start = next((k for k, (a, b) in enumerate(zip(one, other, strict=False)) if a != b), min(len(one), len(other)))
-    rest, left = one[start:], other[start:]
-    replaced = rest[1:] == left[1:]
-    exchanged = rest[:2] == left[:2][::-1] and rest[2:] == left[2:]
-    return replaced or exchanged or rest[1:] == left or rest == left[1:]
+def _one_edit(first: str, second: str) -> bool:
+    """Return whether words differ by one inserted, removed or replaced letter, or by two adjacent letters swapped."""
+    start = next(
+        (k for k, (a, b) in enumerate(zip(first, second, strict=False)) if a != b), min(len(first), len(second))
+    )
+    first_rest, second_rest = first[start:], second[start:]
+    replaced = first_rest[1:] == second_rest[1:]
+    exchanged = first_rest[:2] == second_rest[:2][::-1] and first_rest[2:] == second_rest[2:]
+    return replaced or exchanged or first_rest[1:] == second_rest or first_rest == second_rest[1:]

@@ -1,4 +1,4 @@
-"""A cohort: N shapes in correspondence, as coefficients in an orthonormal basis, with a table of what is known of them.
+"""A cohort: N shapes in correspondence, as coefficients in an orthonormal basis, with a table of covariates.
 
 Squared distances of coefficients are those of the shapes, so what sums over vertices (Procrustes distance, sums of
 squares) needs the coefficients alone, whatever the number of vertices.
@@ -15,15 +15,15 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.cohort.classes import class_notes
-from shapespace.cohort.incomplete import completed_by, completed_shapes
-from shapespace.cohort.table import Table, named, numbers_as_text
+from shapespace.cohort.incomplete import complete_by_population, completed_shapes
+from shapespace.cohort.table import Table, list_names, numbers_as_text
 from shapespace.errors import CorrespondenceError, InputError
 from shapespace.geometry.procrustes import Gauge, align_in_place, centroid_size, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.lazy import lazy_import
 from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
-from shapespace.reprs import listed_briefly, short_repr
+from shapespace.reprs import list_briefly, short_repr
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, SurfaceLandmarks, read_only
 
 SUBJECT = "subject"
@@ -37,7 +37,7 @@ ShapeKind: TypeAlias = Literal["coefficients", "fitted", "dense", "corresponding
 _TRUNCATED: tuple[ShapeKind, ...] = ("coefficients", "fitted")
 _UNIT_SIZE = 1e-2
 """Tolerance of unit centroid sizes, which identify aligned coordinates; tangent projection changes sizes by less."""
-_ORTHONORMAL = 1e-9
+_ORTHONORMAL = 1e-9  # largest deviation of U U^T from the identity (rounding)
 # Of the size; single precision keeps a copy nearer than this.
 _SAME = 1e-6
 
@@ -64,7 +64,7 @@ class ShapeSource:
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """What the fits of a cohort tell beside its shapes.
+    """Fit diagnostics of a cohort, one row per shape.
 
     Args:
         model: they are by.
@@ -106,13 +106,13 @@ class Fitted:
 
     def take(self, rows: Sequence[int]) -> Fitted:
         """Return those of some rows."""
-        at = np.asarray(rows, dtype=np.intp)
+        indices = np.asarray(rows, dtype=np.intp)
         return replace(
             self,
-            b=read_only(self.b[at]),
-            b_stddev=read_only(self.b_stddev[at]),
+            b=read_only(self.b[indices]),
+            b_stddev=read_only(self.b_stddev[indices]),
             status=tuple(self.status[row] for row in rows),
-            beyond_mm=None if self.beyond_mm is None else read_only(self.beyond_mm[at]),
+            beyond_mm=None if self.beyond_mm is None else read_only(self.beyond_mm[indices]),
         )
 
 
@@ -178,10 +178,10 @@ class Cohort:
         return len(self.names)
 
     def __repr__(self) -> str:
-        what = "surfaces" if self.fitted is None else "fits"
-        columns = listed_briefly(list(self.table.columns)) or "no columns"
+        noun = "surfaces" if self.fitted is None else "fits"
+        columns = list_briefly(list(self.table.columns)) or "no columns"
         return (
-            f"<Cohort of {len(self)} {what} with {self.n_vertices:,} vertices, gauge {self.gauge}; "
+            f"<Cohort of {len(self)} {noun} with {self.n_vertices:,} vertices, gauge {self.gauge}; "
             f"{len(self.basis)} coefficients each; columns: {columns}>"
         )
 
@@ -208,25 +208,25 @@ class Cohort:
         return 1.0 - mask.mean(axis=1)
 
     def observed_in(self, rows: Sequence[int]) -> BoolArray | None:
-        """Return (V,) bool, whether all of these shapes observe an analysed vertex; None if they observe all."""
+        """Return the mask (V,) of vertices that every shape observes; None if all shapes observe all vertices."""
         if self.observed is None and self.analysed is None:
             return None
-        seen: BoolArray = np.ones(self.n_vertices, np.bool_)
+        observed: BoolArray = np.ones(self.n_vertices, np.bool_)
         if self.observed is not None:
-            seen = np.logical_and.reduce(self.observed[list(rows)], axis=0, dtype=np.bool_)
+            observed = np.logical_and.reduce(self.observed[list(rows)], axis=0, dtype=np.bool_)
         if self.analysed is not None:
-            seen = np.logical_and(seen, self.analysed)
-        return None if seen.all() else seen
+            observed = np.logical_and(observed, self.analysed)
+        return None if observed.all() else observed
 
     def vertices(self, shape: int | FloatArray) -> FloatArray:
         """Return the vertices (V, 3), mm, of a shape by its number, or of coefficients (K,)."""
-        own = self.coefficients[shape] if isinstance(shape, int) else shape
-        return self.reference + (own @ self.basis).reshape(-1, 3)
+        coefficients = self.coefficients[shape] if isinstance(shape, int) else shape
+        return self.reference + (coefficients @ self.basis).reshape(-1, 3)
 
     def mesh(self, shape: int | FloatArray, name: str = "") -> Mesh:
         """Return the same as a mesh."""
-        called = name or (self.names[shape] if isinstance(shape, int) else "shape")
-        return Mesh(self.vertices(shape), self.faces, name=called)
+        mesh_name = name or (self.names[shape] if isinstance(shape, int) else "shape")
+        return Mesh(self.vertices(shape), self.faces, name=mesh_name)
 
     def displacements(self, vertices: slice) -> FloatArray:
         """Return the (N, m, 3) displacements, mm, of some vertices from the reference, in all shapes."""
@@ -235,20 +235,21 @@ class Cohort:
 
     def take(self, rows: Sequence[int], *notes: str) -> Cohort:
         """Return the cohort of some of its shapes, in their order, with further notes."""
-        at = np.asarray(rows, dtype=np.intp)
+        indices = np.asarray(rows, dtype=np.intp)
         return replace(
             self,
             names=tuple(self.names[row] for row in rows),
-            coefficients=read_only(self.coefficients[at]),
-            sizes_mm=read_only(self.sizes_mm[at]),
+            coefficients=read_only(self.coefficients[indices]),
+            sizes_mm=read_only(self.sizes_mm[indices]),
             table=self.table.take(rows),
             fitted=None if self.fitted is None else self.fitted.take(rows),
-            observed=None if self.observed is None else self.observed[at],
+            observed=None if self.observed is None else self.observed[indices],
             notes=(*self.notes, *notes),
         )
 
     def complete(self, columns: Sequence[str], *, drop_missing: bool = False) -> Cohort:
-        """Return the cohort of the shapes of which all `columns` are known, with notes on the classes of these.
+        """Return the cohort of the shapes with values in all `columns`, with notes on the excluded shapes and the
+        classes.
 
         Args:
             columns: of the table.
@@ -261,18 +262,21 @@ class Cohort:
         if not missing:
             new = [note for note in class_notes(self.table, columns) if note not in self.notes]
             return replace(self, notes=(*self.notes, *new)) if new else self
-        who = named([self.names[row] for row in missing])
+        excluded_names = list_names([self.names[row] for row in missing])
         if not drop_missing:
             raise InputError(
                 f"{self.table.where}: {' or '.join(columns)} of {len(missing)} of {len(self)} shapes is missing "
-                f"({who}); fill it in, or leave them out with --drop-missing."
+                f"({excluded_names}); fill it in, or leave them out with --drop-missing."
             )
         if len(missing) == len(self):
             raise InputError(f"{self.table.where}: no shape has all of {', '.join(columns)}; fill them in.")
-        lost = set(missing)
-        note = f"{len(missing)} of {len(self)} shapes are left out, of which {' or '.join(columns)} is missing ({who})."
-        kept = self.take([row for row in range(len(self)) if row not in lost], note)
-        return kept.complete(columns)
+        excluded = set(missing)
+        note = (
+            f"{len(missing)} of {len(self)} shapes are left out, of which {' or '.join(columns)} is missing "
+            f"({excluded_names})."
+        )
+        complete_shapes = self.take([row for row in range(len(self)) if row not in excluded], note)
+        return complete_shapes.complete(columns)
 
     @staticmethod
     def of_shapes(
@@ -315,29 +319,29 @@ class Cohort:
         shapes = np.array(shapes, dtype=np.float64)
         fewest = least if onto is None else 1
         if shapes.ndim != 3 or shapes.shape[2] != 3 or len(shapes) < fewest or np.isinf(shapes).any():
-            said = {1: "one", 2: "two"}.get(fewest, str(fewest))
-            raise InputError(f"A cohort needs {said} or more finite shapes (N, V, 3), not {shapes.shape}.")
-        called = tuple(names) if names is not None else tuple(f"shape {k + 1}" for k in range(len(shapes)))
+            count_word = {1: "one", 2: "two"}.get(fewest, str(fewest))
+            raise InputError(f"A cohort needs {count_word} or more finite shapes (N, V, 3), not {shapes.shape}.")
+        shape_names = tuple(names) if names is not None else tuple(f"shape {k + 1}" for k in range(len(shapes)))
         cells = {name: tuple(_cell(value) for value in values) for name, values in columns.items()}
-        there: BoolArray = ~np.logical_or.reduce(np.isnan(shapes), axis=2)
-        there = there if observed is None else np.logical_and(there, observed)
-        mask, analysed = None if there.all() else there, None
+        is_observed: BoolArray = ~np.logical_or.reduce(np.isnan(shapes), axis=2)
+        is_observed = is_observed if observed is None else np.logical_and(is_observed, observed)
+        mask, analysed = None if is_observed.all() else is_observed, None
         sizes = read_only([centroid_size(shape) for shape in shapes])
         if onto is not None:
             gauge, analysed = onto.gauge, onto.analysed
             _refuse_other_vertices(shapes, onto)
             if analysed is not None:
-                mask = None if there[:, analysed].all() else np.logical_and(there, analysed)
+                mask = None if is_observed[:, analysed].all() else np.logical_and(is_observed, analysed)
             if mask is not None:
-                shapes = _completed_by(onto, shapes, there, called)
+                shapes = _complete_by(onto, shapes, is_observed, shape_names)
             if mask is not None or analysed is not None:
                 part = slice(None) if analysed is None else analysed
                 sizes = read_only([centroid_size(shape[part]) for shape in shapes])
-            _bring_onto(shapes, onto)
+            _align_to(shapes, onto)
         elif mask is not None:
-            found = completed_shapes(shapes, there, called, gauge, faces, align=align)
-            shapes, mask, sizes = found.shapes, found.observed, read_only(found.sizes_mm)
-            analysed = None if found.analysed.all() else found.analysed
+            completed = completed_shapes(shapes, is_observed, shape_names, gauge, faces, align=align)
+            shapes, mask, sizes = completed.shapes, completed.observed, read_only(completed.sizes_mm)
+            analysed = None if completed.analysed.all() else completed.analysed
         elif align:
             align_in_place(shapes, gauge)
             if gauge == "shape":
@@ -345,7 +349,7 @@ class Cohort:
         reference = shapes.mean(axis=0)
         basis, coefficients = _orthonormal((shapes - reference).reshape(len(shapes), -1))
         cohort = Cohort(
-            called, read_only(reference), basis, coefficients, sizes, Table(cells, called), gauge, faces,
+            shape_names, read_only(reference), basis, coefficients, sizes, Table(cells, shape_names), gauge, faces,
             None if landmarks is None else SurfaceLandmarks.of(landmarks), observed=mask, analysed=analysed,
             unit=unit if unit is not None else "" if np.abs(sizes - 1.0).max() < _UNIT_SIZE else "mm",
         )  # fmt: skip
@@ -376,12 +380,12 @@ class Cohort:
                 )
         shapes = np.stack([mesh.vertices for mesh in meshes])
         names = [mesh.name for mesh in meshes]
-        whole = np.ones(len(first.vertices), dtype=np.bool_)
-        observed = np.stack([whole if mesh.observed is None else mesh.observed for mesh in meshes])
-        found = Cohort.of_shapes(
+        all_observed = np.ones(len(first.vertices), dtype=np.bool_)
+        observed = np.stack([all_observed if mesh.observed is None else mesh.observed for mesh in meshes])
+        cohort = Cohort.of_shapes(
             shapes, {}, names=names, faces=first.faces, gauge=gauge, onto=onto, least=least, observed=observed
         )
-        return replace(found, table=table)
+        return replace(cohort, table=table)
 
     @staticmethod
     def of_fits(
@@ -407,10 +411,10 @@ class Cohort:
         b = fitted.b
         reference = model.mean_vertices
         if gauge == "form" and not np.isfinite(sizes_mm).all():
-            lacking = [name for name, size in zip(names, sizes_mm, strict=True) if not np.isfinite(size)]
+            without_size = [name for name, size in zip(names, sizes_mm, strict=True) if not np.isfinite(size)]
             raise InputError(
-                f"The size of {named(lacking)} is not known in mm, so forms cannot be compared; fit with --unit, "
-                "or compare shapes with --gauge shape."
+                f"The size of {list_names(without_size)} is not known in mm, so forms cannot be compared; fit with "
+                "--unit, or compare shapes with --gauge shape."
             )
         if gauge == "form" or model.gauge == "form":
             centre = reference.mean(axis=0)
@@ -433,21 +437,21 @@ class Cohort:
         return cohort
 
 
-def _bring_onto(shapes: FloatArray, onto: Cohort) -> None:
+def _align_to(shapes: FloatArray, onto: Cohort) -> None:
     """Move each of `shapes` (N, V, 3) in place to the mean of a cohort; in the `shape` gauge to its tangent plane."""
-    whole = onto.vertices(onto.coefficients.mean(axis=0))
+    mean_shape = onto.vertices(onto.coefficients.mean(axis=0))
     part = slice(None) if onto.analysed is None else onto.analysed
-    mean = whole[part]
+    mean = mean_shape[part]
     middle = mean - mean.mean(axis=0)
     for k, shape in enumerate(shapes[:, part]):
         if centroid_size(shape) <= 0:
             raise InputError("All vertices of a shape coincide, so it cannot be aligned; leave it out.")
-        moved = fit_similarity(shape, mean, with_scale=onto.gauge == "shape").apply(shape)
+        aligned = fit_similarity(shape, mean, with_scale=onto.gauge == "shape").apply(shape)
         if onto.gauge == "shape":
-            along = float(np.sum(moved * middle)) / float(np.sum(middle**2))
-            moved = mean.mean(axis=0) + (moved - moved.mean(axis=0)) / along
-        shapes[k] = whole
-        shapes[k, part] = moved
+            along = float(np.sum(aligned * middle)) / float(np.sum(middle**2))
+            aligned = mean.mean(axis=0) + (aligned - aligned.mean(axis=0)) / along
+        shapes[k] = mean_shape
+        shapes[k, part] = aligned
 
 
 def _refuse_other_vertices(shapes: FloatArray, onto: Cohort) -> None:
@@ -455,17 +459,20 @@ def _refuse_other_vertices(shapes: FloatArray, onto: Cohort) -> None:
         raise InputError(f"Shapes of {shapes.shape[1]} vertices cannot be compared with those of {onto.n_vertices}.")
 
 
-def _completed_by(onto: Cohort, shapes: FloatArray, there: BoolArray, names: Sequence[str]) -> FloatArray:
-    """Return shapes (M, V, 3) in which analysed vertices that are not `there` (M, V) are estimated by a cohort."""
+def _complete_by(onto: Cohort, shapes: FloatArray, observed: BoolArray, names: Sequence[str]) -> FloatArray:
+    """Estimate the unobserved analysed vertices of shapes (M, V, 3) from a cohort; `observed` is (M, V)."""
     part = np.ones(onto.n_vertices, dtype=np.bool_) if onto.analysed is None else onto.analysed
     population = np.stack([onto.vertices(k) for k in range(len(onto))])[:, part]
     out = shapes.copy()
-    out[:, part] = completed_by(population, population.mean(axis=0), shapes[:, part], there[:, part], names, onto.gauge)
+    out[:, part] = complete_by_population(
+        population, population.mean(axis=0), shapes[:, part], observed[:, part], names, onto.gauge
+    )
     return out
 
 
 def subjects_of(cohort: Cohort, column: str | None) -> tuple[str, ...]:
-    """Return whose each of the N shapes is: by `column`, or by `SUBJECT` where there is one; else each its own.
+    """Return the subject of each of the N shapes: from `column`, or from `SUBJECT`; without either, one subject per
+    shape.
 
     Raises:
         InputError: there is no such column, or a cell of it says nothing.
@@ -489,8 +496,8 @@ def refuse_twice(cohort: Cohort) -> None:
     """
     from scipy.spatial import cKDTree
 
-    near = _SAME * centroid_size(cohort.reference)
-    pairs: npt.NDArray[np.intp] = cKDTree(cohort.coefficients).query_pairs(near, output_type="ndarray")
+    tolerance = _SAME * centroid_size(cohort.reference)
+    pairs: npt.NDArray[np.intp] = cKDTree(cohort.coefficients).query_pairs(tolerance, output_type="ndarray")
     if len(pairs):
         least = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))[0]]
         first, second = cohort.names[int(least[0])], cohort.names[int(least[1])]
@@ -499,8 +506,8 @@ def refuse_twice(cohort: Cohort) -> None:
 
 def with_columns(cohort: Cohort, columns: Mapping[str, FloatArray]) -> Cohort:
     """Return the cohort with further columns of numbers (N,) in its table."""
-    told = {name: numbers_as_text(values) for name, values in columns.items()}
-    table = replace(cohort.table, columns={**cohort.table.columns, **told})
+    text_columns = {name: numbers_as_text(values) for name, values in columns.items()}
+    table = replace(cohort.table, columns={**cohort.table.columns, **text_columns})
     return replace(cohort, table=table)
 
 
@@ -511,15 +518,17 @@ def _orthonormal(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _in_basis(rows: FloatArray, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the same for combinations `coefficients` (N, K) of `rows` (K, D), which stay as they are if they can."""
+    """Return an orthonormal basis and coefficients equivalent to `coefficients` (N, K) of `rows` (K, D)."""
     if np.abs(rows @ rows.T - np.eye(len(rows))).max() <= _ORTHONORMAL:
         return read_only(rows), read_only(coefficients)
     q, r = np.linalg.qr(rows.T)
     return read_only(q.T), read_only(coefficients @ r.T)
 
 
-def _same_faces(one: npt.NDArray[np.int32] | None, other: npt.NDArray[np.int32] | None) -> bool:
-    return (one is None and other is None) or (one is not None and other is not None and np.array_equal(one, other))
+def _same_faces(first: npt.NDArray[np.int32] | None, second: npt.NDArray[np.int32] | None) -> bool:
+    return (first is None and second is None) or (
+        first is not None and second is not None and np.array_equal(first, second)
+    )
 
 
 def _cell(value: object) -> str:

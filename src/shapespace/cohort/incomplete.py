@@ -12,7 +12,7 @@ import numpy as np
 from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import spsolve
 
-from shapespace.cohort.table import named
+from shapespace.cohort.table import list_names
 from shapespace.errors import InputError
 from shapespace.geometry.procrustes import Gauge, centroid_size
 from shapespace.geometry.similarity import fit_similarity
@@ -26,6 +26,7 @@ _FEWEST_VERTICES = 3
 """Fewest observed vertices of a shape, which determine its pose."""
 _MODES_A_SHAPE, _MOST_MODES = 0.7, 60
 """As in `complete`: the prior removes modes without evidence."""
+# iterations of pose and completion, and the movement that ends them, as a share of the centroid size
 _POSES, _SETTLED = 50, 1e-9
 _ANCHOR = 1e-9
 """Weight of the centroid where vertices without any position are filled: it makes isolated parts determinate."""
@@ -33,7 +34,7 @@ _ANCHOR = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class CompletedShapes:
-    """Aligned shapes in which missing vertices are estimates.
+    """Aligned shapes with estimates at missing vertices.
 
     Args:
         shapes: (N, V, 3) mm; vertices that are not analysed have one position in all shapes.
@@ -76,21 +77,21 @@ def completed_shapes(
     known = observed & analysed
     _refuse_unobserved(known, names)
     masked = np.where(known[:, :, None], shapes, np.nan)[:, analysed]
-    found = complete(masked, names, gauge, align=align)
+    completion = complete(masked, names, gauge, align=align)
     # Poses of the original shapes, which determine size and other vertices, do not depend on estimates.
     poses = [
         fit_similarity(own[there], aligned[there], with_scale=align and gauge == "shape") if align else None
         for own, aligned, there in zip(masked, found.shapes, found.observed, strict=True)
     ]
     scales = np.array([1.0 if T is None else T.scale for T in poses])
-    sizes = np.array([centroid_size(shape) for shape in found.shapes]) / scales
+    sizes = np.array([centroid_size(shape) for shape in completion.shapes]) / scales
     out = np.empty_like(shapes)
-    out[:, analysed] = found.shapes
+    out[:, analysed] = completion.shapes
     if not analysed.all():
         # Positions that are not observed may be anything: other programs write zeros there.
-        given = np.where(observed[:, :, None], shapes, np.nan)
-        moved = np.stack([x if T is None else T.apply(x) for T, x in zip(poses, given, strict=True)])
-        out[:, ~analysed] = _one_position(moved, found.shapes.mean(axis=0), analysed, faces)
+        masked_shapes = np.where(observed[:, :, None], shapes, np.nan)
+        posed = np.stack([x if T is None else T.apply(x) for T, x in zip(poses, masked_shapes, strict=True)])
+        out[:, ~analysed] = _one_position(posed, completion.shapes.mean(axis=0), analysed, faces)
     return CompletedShapes(out, sizes, known, analysed)
 
 
@@ -100,23 +101,23 @@ def _refuse_unobserved(known: BoolArray, names: Sequence[str]) -> None:
             f"No vertex is observed by {100 * MIN_SEEN:g} % of the shapes and two of them, so nothing can be compared; "
             "give shapes with fewer missing vertices."
         )
-    few = [name for name, row in zip(names, known, strict=True) if row.sum() < _FEWEST_VERTICES]
-    if few:
-        raise InputError(f"{named(few)}: too few vertices are observed; leave it out.")
+    too_sparse = [name for name, row in zip(names, known, strict=True) if row.sum() < _FEWEST_VERTICES]
+    if too_sparse:
+        raise InputError(f"{list_names(too_sparse)}: too few vertices are observed; leave it out.")
 
 
-def _one_position(moved: FloatArray, mean: FloatArray, analysed: BoolArray, faces: IntArray | None) -> FloatArray:
-    """Return one position (M, 3) for each vertex that is not analysed: the mean of those known, or a smooth filling.
+def _one_position(shapes: FloatArray, mean: FloatArray, analysed: BoolArray, faces: IntArray | None) -> FloatArray:
+    """Return one position (M, 3) per excluded vertex: the mean of the observed positions, or a harmonic interpolation.
 
     Args:
-        moved: (N, V, 3) shapes as given, aligned; NaN where not observed.
+        shapes: (N, V, 3) shapes as given, aligned; NaN where not observed.
         mean: (A, 3) of the analysed vertices.
         analysed: (V,).
         faces: (F, 3).
     """
-    there: BoolArray = np.logical_and.reduce(np.isfinite(moved), axis=2)
-    count = there.sum(axis=0)
-    position = np.where(there[:, :, None], moved, 0.0).sum(axis=0) / np.maximum(count, 1)[:, None]
+    is_complete: BoolArray = np.logical_and.reduce(np.isfinite(shapes), axis=2)
+    count = is_complete.sum(axis=0)
+    position = np.where(is_complete[:, :, None], shapes, 0.0).sum(axis=0) / np.maximum(count, 1)[:, None]
     position[analysed] = mean
     empty = (count == 0) & ~analysed
     if empty.any():
@@ -129,14 +130,16 @@ def _harmonic(position: FloatArray, empty: BoolArray, faces: IntArray | None, ce
     n = len(position)
     edges = np.zeros((0, 2), dtype=np.int32) if faces is None else np.vstack([faces[:, [0, 1]], faces[:, [1, 2]],
                                                                             faces[:, [2, 0]]])  # fmt: skip
-    ends = np.vstack([edges, edges[:, ::-1]])
-    links = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(n, n)).tocsr()
+    directed_edges = np.vstack([edges, edges[:, ::-1]])
+    links = coo_matrix(
+        (np.ones(len(directed_edges)), (directed_edges[:, 0], directed_edges[:, 1])), shape=(n, n)
+    ).tocsr()
     laplacian = (diags(np.asarray(links.sum(axis=1)).ravel() + _ANCHOR) - links).tocsr()
     right = -(laplacian[empty][:, ~empty] @ position[~empty]) + _ANCHOR * centre
     return np.asarray(spsolve(laplacian[empty][:, empty].tocsc(), right), dtype=np.float64).reshape(-1, 3)
 
 
-def completed_by(
+def complete_by_population(
     population: FloatArray,
     mean: FloatArray,
     shapes: FloatArray,
@@ -158,32 +161,32 @@ def completed_by(
         InputError: hardly a vertex of a shape is observed.
     """
     _refuse_unobserved(observed, names)
-    every = np.ones(population.shape[:2], dtype=np.bool_)
+    all_observed = np.ones(population.shape[:2], dtype=np.bool_)
     modes = max(1, min(round(_MODES_A_SHAPE * len(population)), _MOST_MODES, len(population) - 2))
-    found = ppca(population.copy(), every, modes)
+    model = ppca(population.copy(), all_observed, modes)
     out = shapes.copy()
-    for at, (shape, there) in enumerate(zip(shapes, observed, strict=True)):
-        if there.all():
+    for row, (shape, is_observed) in enumerate(zip(shapes, observed, strict=True)):
+        if is_observed.all():
             continue
-        W = found.W[there][:, :, :modes].reshape(-1, modes)
-        precision = W.T @ W + found.noise * np.eye(modes)
-        T = fit_similarity(shape[there], mean[there], with_scale=gauge == "shape")
+        W = model.W[is_observed][:, :, :modes].reshape(-1, modes)
+        precision = W.T @ W + model.noise * np.eye(modes)
+        T = fit_similarity(shape[is_observed], mean[is_observed], with_scale=gauge == "shape")
         y = np.zeros(modes)
         for _ in range(_POSES):
-            placed = T.apply(shape[there])
-            y = np.linalg.solve(precision, W.T @ (placed - found.W[there][:, :, modes]).reshape(-1))
-            whole = found.W @ np.append(y, 1.0)
-            whole[there] = placed
-            previous, T = T, _pose(whole, mean, gauge) @ T
-            if _moved(previous, T, shape[there]) <= _SETTLED * centroid_size(mean):
+            placed = T.apply(shape[is_observed])
+            y = np.linalg.solve(precision, W.T @ (placed - model.W[is_observed][:, :, modes]).reshape(-1))
+            completed = model.W @ np.append(y, 1.0)
+            completed[is_observed] = placed
+            previous, T = T, _pose(completed, mean, gauge) @ T
+            if _moved(previous, T, shape[is_observed]) <= _SETTLED * centroid_size(mean):
                 break
-        out[at, ~there] = T.inverse().apply(found.W[~there] @ np.append(y, 1.0))
+        out[row, ~is_observed] = T.inverse().apply(model.W[~is_observed] @ np.append(y, 1.0))
     return out
 
 
-def _pose(whole: FloatArray, mean: FloatArray, gauge: Gauge) -> Similarity:
-    return fit_similarity(whole, mean, with_scale=gauge == "shape")
+def _pose(shape: FloatArray, mean: FloatArray, gauge: Gauge) -> Similarity:
+    return fit_similarity(shape, mean, with_scale=gauge == "shape")
 
 
-def _moved(one: Similarity, other: Similarity, points: FloatArray) -> float:
-    return float(np.abs(one.apply(points) - other.apply(points)).max())
+def _moved(first: Similarity, second: Similarity, points: FloatArray) -> float:
+    return float(np.abs(first.apply(points) - second.apply(points)).max())

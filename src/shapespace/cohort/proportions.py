@@ -15,7 +15,7 @@ from shapespace.types import FloatArray
 
 
 def zero_bound(subjects: int, level: float = 0.95) -> float:
-    """Return the upper end of the exact interval of a share if none of `subjects` has an error.
+    """Return the upper end of the exact interval of an error share if none of `subjects` has an error.
 
     Args:
         subjects: number of independent units; if it is 0, the bound is 1.

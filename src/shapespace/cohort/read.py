@@ -1,4 +1,4 @@
-"""Cohorts from files: results of fits, or surfaces in correspondence, with a table of what is known of them."""
+"""Cohorts from files: fit results, or surfaces in correspondence, with a table of covariates."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 
 from shapespace.cohort.cohort import Cohort, Fitted, ShapeSource
-from shapespace.cohort.table import Table, named, read_table
+from shapespace.cohort.table import Table, list_names, read_table
 from shapespace.errors import InputError
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.meshes.mesh_io import stem_of
@@ -32,7 +32,7 @@ _USED = ("converged", "max_iterations")
 
 @dataclass(frozen=True)
 class CohortOptions:
-    """Which shapes, and how they are made comparable.
+    """Options for the selection and comparison of shapes.
 
     Args:
         shapes: folder of results of fits, or of meshes in correspondence (default: the folder of the table).
@@ -67,7 +67,7 @@ def read_cohort(
     onto: Cohort | None = None,
     on_shape: Callable[[int, int], None] | None = None,
 ) -> Cohort:
-    """Return the shapes of the rows of a table, or of all fits in a folder with what their records know.
+    """Return the shapes of the rows of a table, or of all fits in a folder with the metadata of their records.
 
     Doubtful and failed fits are left out, counted and said in the notes, as are rows without a shape and shapes
     without a row.
@@ -123,27 +123,27 @@ def _rows(results: Results) -> list[_Row]:
     texts = ("scan", "status", "scan_name", "scan_hash", "model_hash")
     columns = (*texts, "centroid_size_mm", "mm_per_scan_unit", "beyond_model_mm", "modes", *known)
     numbers = [*(f"b{k}" for k in modes), *(f"b{k}_stddev" for k in modes)]
-    found: list[_Row] = []
+    rows: list[_Row] = []
     for part in results.iter_rows((*columns, *numbers)):
         values = np.array([part[column] for column in numbers], dtype=np.float64).reshape(2, len(modes), -1)
-        for at in range(len(part["scan"])):
-            own = int(part["modes"][at] or 0)
-            found.append(
+        for index in range(len(part["scan"])):
+            n_modes = int(part["modes"][index] or 0)
+            rows.append(
                 _Row(
-                    str(part["scan"][at] or ""),
-                    str(part["status"][at] or ""),
-                    str(part["scan_name"][at] or ""),
-                    str(part["scan_hash"][at] or ""),
-                    str(part["model_hash"][at] or ""),
-                    values[0, :own, at],
-                    values[1, :own, at],
-                    _number(part["centroid_size_mm"][at]),
-                    _number(part["mm_per_scan_unit"][at]),
-                    _number(part["beyond_model_mm"][at]),
-                    {column.removeprefix(META): str(part[column][at] or "").strip() for column in known},
+                    str(part["scan"][index] or ""),
+                    str(part["status"][index] or ""),
+                    str(part["scan_name"][index] or ""),
+                    str(part["scan_hash"][index] or ""),
+                    str(part["model_hash"][index] or ""),
+                    values[0, :n_modes, index],
+                    values[1, :n_modes, index],
+                    _number(part["centroid_size_mm"][index]),
+                    _number(part["mm_per_scan_unit"][index]),
+                    _number(part["beyond_model_mm"][index]),
+                    {column.removeprefix(META): str(part[column][index] or "").strip() for column in known},
                 )
             )
-    return sorted(found, key=lambda row: row.name)
+    return sorted(rows, key=lambda row: row.name)
 
 
 def _of_results(
@@ -161,27 +161,27 @@ def _of_results(
         heads = dict.fromkeys(head for row in rows for head in row.known)
         cells = {head: tuple(row.known.get(head, "") for row in rows) for head in heads}
         table = Table(cells, tuple(row.name for row in rows), str(results.folder))
-        pairs = [(row, at) for at, row in enumerate(rows)]
+        pairs = [(row, index) for index, row in enumerate(rows)]
     else:
         by_key = _by_key(rows)
-        pairs = [(by_key[key], at) for at, key in enumerate(keys) if key in by_key]
-        _tell_unmatched(
+        pairs = [(by_key[key], index) for index, key in enumerate(keys) if key in by_key]
+        _note_unmatched(
             notes, table, keys, by_key, [row.name for row, _ in pairs], [row.name for row in rows], results.folder
         )
-    kept = [(row, at) for row, at in pairs if row.status in used]
+    accepted = [(row, index) for row, index in pairs if row.status in used]
     for status, count in Counter(row.status for row, _ in pairs if row.status not in used).items():
-        who = named([row.name for row, _ in pairs if row.status == status])
-        notes.append(f"{count} of {len(pairs)} fits are left out, which are {status} ({who}).")
+        excluded_names = list_names([row.name for row, _ in pairs if row.status == status])
+        notes.append(f"{count} of {len(pairs)} fits are left out, which are {status} ({excluded_names}).")
     least = options.least if onto is None else 1
-    if len(kept) < least:
+    if len(accepted) < least:
         raise InputError(
-            f"{results.folder}: {len(kept)} of its fits can be used, and {_count_is(least)} the least; "
+            f"{results.folder}: {len(accepted)} of its fits can be used, and {_count_words(least)} the least; "
             + (notes[-1] if notes else "fit more scans.")
         )
-    fits = [row for row, _ in kept]
+    fits = [row for row, _ in accepted]
     _refuse_mixed(fits, results.folder)
     model, additive = _model_of(results, fits[0], None if options.model is None else Path(options.model))
-    stated = table.take([at for _, at in kept])
+    stated = table.take([index for _, index in accepted])
     names = tuple(row.name for row in fits)
     sizes = read_only([row.size_mm for row in fits])
     width = max(len(row.b) for row in fits)
@@ -198,23 +198,25 @@ def _of_results(
     if kind == "coefficients":
         cohort = Cohort.of_fits(fitted, names, stated, sizes, options.gauge)
     else:
-        lacking = [name for name in names if not results.has(name, kind)]
-        if lacking:
-            raise InputError(f"{results.folder} holds no {kind} surface of {named(lacking)}; fit them again"
-                             f"{' with --dense' if kind == 'dense' else ''}.")  # fmt: skip
+        without_surface = [name for name in names if not results.has(name, kind)]
+        if without_surface:
+            dense = " with --dense" if kind == "dense" else ""
+            raise InputError(
+                f"{results.folder} holds no {kind} surface of {list_names(without_surface)}; fit them again{dense}."
+            )
         unknown = [row.name for row in fits if not np.isfinite(row.mm_per_unit)]
         if unknown and options.gauge == "form":
             raise InputError(
-                f"The size of {named(unknown)} is not known in mm, so forms cannot be compared; fit with --unit, "
+                f"The size of {list_names(unknown)} is not known in mm, so forms cannot be compared; fit with --unit, "
                 "or compare shapes with --gauge shape."
             )
         meshes: list[Mesh] = []
-        for at, row in enumerate(fits):
+        for index, row in enumerate(fits):
             mesh = results.surface(row.name, kind)
             ratio = row.mm_per_unit if np.isfinite(row.mm_per_unit) else 1.0
             meshes.append(replace(mesh.with_vertices(mesh.vertices * ratio), name=row.name))
             if on_shape is not None:
-                on_shape(at + 1, len(fits))
+                on_shape(index + 1, len(fits))
         cohort = replace(
             Cohort.of_meshes(meshes, stated, options.gauge, onto, options.least),
             fitted=fitted,
@@ -226,11 +228,11 @@ def _of_results(
 
 
 def _kind(
-    asked: Surfaces, results: Results, names: Sequence[str], gauge: Gauge, fits: Sequence[_Row], onto: Cohort | None
+    surfaces: Surfaces, results: Results, names: Sequence[str], gauge: Gauge, fits: Sequence[_Row], onto: Cohort | None
 ) -> Literal["coefficients", "fitted", "dense"]:
     """Return the kind of shapes of fits to read: the requested one, or for `auto` the most complete one."""
-    if asked != "auto":
-        return asked
+    if surfaces != "auto":
+        return surfaces
     if onto is not None and onto.fitted is not None and onto.source.kind in ("coefficients", "fitted", "dense"):
         return onto.source.kind
     sized = gauge == "shape" or all(np.isfinite(row.mm_per_unit) for row in fits)
@@ -245,34 +247,38 @@ def _of_surfaces(
     onto: Cohort | None,
     on_shape: Callable[[int, int], None] | None,
 ) -> Cohort:
-    found = surface_files([folder])
-    notes = list(found.notes)
+    listing = surface_files([folder])
+    notes = list(listing.notes)
     if options.gauge == "form":
-        found.refuse_mixed_units()
-    files = {surface_stem(file): file for file in found.files if file.suffix.lower() != ".csv"}
-    kept = [(files[key], at) for at, key in enumerate(keys) if key in files]
-    _tell_unmatched(notes, table, keys, files, [surface_stem(file) for file, _ in kept], list(files), folder)
+        listing.refuse_mixed_units()
+    files = {surface_stem(file): file for file in listing.files if file.suffix.lower() != ".csv"}
+    matched = [(files[key], row_index) for row_index, key in enumerate(keys) if key in files]
+    _note_unmatched(notes, table, keys, files, [surface_stem(file) for file, _ in matched], list(files), folder)
     least = options.least if onto is None else 1
-    if len(kept) < least:
-        raise InputError(f"{folder}: {len(kept)} of its meshes are in {table.where}, and {_count_is(least)} the least.")
+    if len(matched) < least:
+        raise InputError(
+            f"{folder}: {len(matched)} of its meshes are in {table.where}, and {_count_words(least)} the least."
+        )
     meshes: list[Mesh] = []
-    for done, (file, _) in enumerate(kept, 1):
+    for n_read, (file, _) in enumerate(matched, 1):
         mesh = mesh_at(file)
-        ratio = found.unit_ratios.get(file, 1.0)
+        ratio = listing.unit_ratios.get(file, 1.0)
         meshes.append(replace(mesh.with_vertices(mesh.vertices / ratio), name=surface_stem(file)))
         if on_shape is not None:
-            on_shape(done, len(kept))
-    cohort = Cohort.of_meshes(meshes, table.take([at for _, at in kept]), options.gauge, onto, options.least)
-    corresponding = all(file.name.endswith(SURFACE) for file, _ in kept)
+            on_shape(n_read, len(matched))
+    cohort = Cohort.of_meshes(
+        meshes, table.take([row_index for _, row_index in matched]), options.gauge, onto, options.least
+    )
+    corresponding = all(file.name.endswith(SURFACE) for file, _ in matched)
     source = ShapeSource("corresponding" if corresponding else "surfaces")
     return replace(cohort, notes=(*notes, *cohort.notes), source=source)
 
 
-def _tell_unmatched(
+def _note_unmatched(
     notes: list[str],
     table: Table,
     keys: Sequence[str],
-    there: Mapping[str, Any],
+    available: Mapping[str, Any],
     used: Sequence[str],
     names: Sequence[str],
     folder: Path,
@@ -282,24 +288,27 @@ def _tell_unmatched(
     Raises:
         InputError: no row has a shape.
     """
-    unknown = [key for key in keys if key not in there]
+    unknown = [key for key in keys if key not in available]
     if len(unknown) == len(keys):
         raise InputError(
-            f"{folder} holds no shape of {table.where} (such as {named(unknown)}; there is {named(names)}); give the "
-            "folder of its shapes with --shapes."
+            f"{folder} holds no shape of {table.where} (such as {list_names(unknown)}; there is {list_names(names)}); "
+            "give the folder of its shapes with --shapes."
         )
     if unknown:
         notes.append(
             f"{len(unknown)} of {len(keys)} rows of {table.where} are left out, whose shape is not in "
-            f"{folder} ({named(unknown)})."
+            f"{folder} ({list_names(unknown)})."
         )
-    rest = sorted(set(names) - set(used))
-    if rest:
-        notes.append(f"{len(rest)} of {len(names)} shapes in {folder} have no row in {table.where} ({named(rest)}).")
+    unmatched = sorted(set(names) - set(used))
+    if unmatched:
+        notes.append(
+            f"{len(unmatched)} of {len(names)} shapes in {folder} have no row in {table.where} "
+            f"({list_names(unmatched)})."
+        )
 
 
 def _by_key(rows: Sequence[_Row]) -> dict[str, _Row]:
-    """Return fits by the names of their scans, and by their own, which count for more."""
+    """Return fits by scan name and by fit name; the fit name takes precedence."""
     scans = Counter(stem_of(row.scan_name) for row in rows)
     by_scan = {stem_of(row.scan_name): row for row in rows if scans[stem_of(row.scan_name)] == 1}
     return by_scan | {row.name: row for row in rows}
@@ -312,11 +321,13 @@ def _refuse_mixed(fits: Sequence[_Row], folder: Path) -> None:
             f"{folder} holds fits of {len(hashes)} different models ({', '.join(h[:12] for h in hashes[:3])}), whose "
             "coefficients cannot be compared; fit all scans with one model."
         )
-    first: dict[str, str] = {}
+    first_names: dict[str, str] = {}
     for row in fits:
-        known = first.setdefault(row.scan_hash or row.name, row.name)
-        if known != row.name:
-            raise InputError(f"{known} and {row.name} are fits of the same scan; leave one of them out of the table.")
+        first_name = first_names.setdefault(row.scan_hash or row.name, row.name)
+        if first_name != row.name:
+            raise InputError(
+                f"{first_name} and {row.name} are fits of the same scan; leave one of them out of the table."
+            )
 
 
 def _model_of(results: Results, fit: _Row, given: Path | None) -> tuple[ShapeModel, AdditiveModel | None]:
@@ -324,14 +335,14 @@ def _model_of(results: Results, fit: _Row, given: Path | None) -> tuple[ShapeMod
     path = given or results.folder / (source.path or source.name)
     if given is None and not path.is_file():
         raise InputError(f"{results.folder}: the model {path.name} is no longer at {path}; give it with --model.")
-    found = load_model(path)
-    model, additive = (found.shape, found) if isinstance(found, AdditiveModel) else (found, None)
+    read_model = load_model(path)
+    model, additive = (read_model.shape, read_model) if isinstance(read_model, AdditiveModel) else (read_model, None)
     if model.content_hash != fit.model_hash:
         raise InputError(f"{path} is not the model of the fits in {results.folder}; give the right one with --model.")
     return model, additive
 
 
-def _count_is(count: int) -> str:
+def _count_words(count: int) -> str:
     return {1: "one is", 2: "two are"}.get(count, f"{count} are")
 
 

@@ -20,8 +20,8 @@ from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, read_only
 
 _META = "meta_"
-_LARGEST_BYTES = 2**28
-_NAMED = 3
+_LARGEST_BYTES = 2**28  # 256 MiB, so that a wrong file cannot fill the memory
+_NAMED = 3  # names in a message before the rest is only counted
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,35 +61,35 @@ class Table:
         return len(self.rows)
 
     def texts(self, column: str) -> tuple[str, ...]:
-        """Return the N cells of a column; one that says nothing is empty.
+        """Return the N cells of a column; missing cells are empty.
 
         Raises:
             InputError: there is no such column.
         """
         if column not in self.columns:
-            there = ", ".join(self.columns) or "no other columns"
-            raise InputError(f"{self.where} has no column {column!r}; it has {there}.")
+            available = ", ".join(self.columns) or "no other columns"
+            raise InputError(f"{self.where} has no column {column!r}; it has {available}.")
         return self.columns[column]
 
     def kind(self, column: str) -> Literal["number", "text"]:
-        """Return whether a column holds numbers or classes; one of nothing but missing cells holds classes.
+        """Return whether a column contains numbers or classes; a column without values counts as classes.
 
         Raises:
             InputError: there is no such column, or most of its cells are numbers and some are not.
         """
         cells = {row: cell for row, cell in zip(self.rows, self.texts(column), strict=True) if cell}
-        odd = [row for row, cell in cells.items() if not is_number(cell)]
-        if len(odd) * 2 >= len(cells):
+        not_numeric = [row for row, cell in cells.items() if not is_number(cell)]
+        if len(not_numeric) * 2 >= len(cells):
             return "text"
-        if odd:
+        if not_numeric:
             raise InputError(
-                f"{self.where}: {column!r} holds numbers but {cells[odd[0]][:40]!r} at {odd[0]}"
-                f"{_more(len(odd) - 1)}; write a number there, or leave it empty."
+                f"{self.where}: {column!r} holds numbers but {cells[not_numeric[0]][:40]!r} at {not_numeric[0]}"
+                f"{_others_note(len(not_numeric) - 1)}; write a number there, or leave it empty."
             )
         return "number"
 
     def numbers(self, column: str) -> FloatArray:
-        """Return the (N,) numbers of a column; NaN where a cell says nothing.
+        """Return the (N,) numbers of a column; NaN for missing cells.
 
         Raises:
             InputError: there is no such column, or a cell is no finite number.
@@ -101,13 +101,13 @@ class Table:
         return read_only([float(cell) if cell else math.nan for cell in cells])
 
     def missing(self, columns: Sequence[str]) -> list[int]:
-        """Return the rows in which one of `columns` says nothing.
+        """Return the rows with a missing cell in one of `columns`.
 
         Raises:
             InputError: there is no such column.
         """
-        found = [self.texts(column) for column in columns]
-        return [row for row in range(len(self)) if not all(cells[row] for cells in found)]
+        texts = [self.texts(column) for column in columns]
+        return [row for row in range(len(self)) if not all(cells[row] for cells in texts)]
 
     def take(self, rows: Sequence[int]) -> Table:
         """Return the table of some rows, in their order."""
@@ -140,22 +140,23 @@ def read_table(path: Path) -> tuple[Table, tuple[str, ...]]:
     names = heads[key]
     places = [PurePath(row[key].replace("\\", "/")) for row in rows]
     # Scans of one name in different folders are called by their folders too, as their fits are.
-    several = {stem for stem, count in Counter(stem_of(place) for place in places).items() if count > 1}
-    keys = tuple(_with_folders(place) if stem_of(place) in several else stem_of(place) for place in places)
+    repeated = {stem for stem, count in Counter(stem_of(place) for place in places).items() if count > 1}
+    keys = tuple(_with_folders(place) if stem_of(place) in repeated else stem_of(place) for place in places)
     if "" in keys:
         raise FileFormatError(
             f"{path} has no {names} in row {keys.index('') + 1}; name the shape, or leave the row out."
         )
-    twice = [key for key, count in Counter(keys).items() if count > 1]
-    if twice:
+    repeated_keys = [key for key, count in Counter(keys).items() if count > 1]
+    if repeated_keys:
         raise FileFormatError(
-            f"{path} has two or more rows of {twice[0][:80]!r}{_more(len(twice) - 1)}; keep one row for each shape."
+            f"{path} has two or more rows of {repeated_keys[0][:80]!r}{_others_note(len(repeated_keys) - 1)}; "
+            "keep one row for each shape."
         )
     columns: dict[str, tuple[str, ...]] = {}
-    for at, head in enumerate(heads):
+    for index, head in enumerate(heads):
         if head and head not in (CHECKSUM, names):
-            called = head.removeprefix(_META)
-            columns[head if called in heads or not called else called] = tuple(row[at] for row in rows)
+            column = head.removeprefix(_META)
+            columns[head if column in heads or not column else column] = tuple(row[index] for row in rows)
     return Table(columns, keys, str(path)), keys
 
 
@@ -181,15 +182,15 @@ def is_number(cell: str) -> bool:
         return False
 
 
-def _more(count: int) -> str:
+def _others_note(count: int) -> str:
     return f" and {count} more" if count > 0 else ""
 
 
-def named(names: Sequence[str]) -> str:
+def list_names(names: Sequence[str]) -> str:
     """Return the first of `names` in words, and how many more there are."""
-    return ", ".join(names[:_NAMED]) + _more(len(names) - _NAMED)
+    return ", ".join(names[:_NAMED]) + _others_note(len(names) - _NAMED)
 
 
 def numbers_as_text(values: FloatArray) -> tuple[str, ...]:
-    """Return cells that read back as the same numbers; NaN is an empty one."""
+    """Return text cells that parse to the same numbers; NaN becomes an empty cell."""
     return tuple("" if np.isnan(value) else repr(float(value)) for value in values)

@@ -22,9 +22,9 @@ from shapespace.recognise.labelled_scans import (
     ScanCoefficients,
     from_record,
     from_results,
-    labelled,
     one_model,
     read_coefficients,
+    with_labels,
 )
 from shapespace.store.results import results_at
 from shapespace.types import FloatArray
@@ -96,7 +96,7 @@ def recognise_train(
     from shapespace.recognise.predict import train_classifier
 
     problems: list[str] = []
-    scans = labelled(read_scans(results, problems.append), read_labels(labels, of_subjects=False))
+    scans = with_labels(read_scans(results, problems.append), read_labels(labels, of_subjects=False))
     projection: FloatArray | None = None
     if expression_of is not None:
         model, fitted_with = AdditiveModel.load(expression_of), one_model(scans)
@@ -145,7 +145,7 @@ def recognise_predict(
             "subject."
         )
     scans = read_scans(results, say)
-    answers = predict_scans(saved, labelled(scans, read_labels(labels)) if labels is not None else scans)
+    answers = predict_scans(saved, with_labels(scans, read_labels(labels)) if labels is not None else scans)
     make_folder(output.absolute().parent)
     write_answers(output, answers, saved.classes)
     counts: dict[str, int] = dict.fromkeys(("answered", "unsure", "doubtful", "failed", "neutral"), 0)

@@ -61,7 +61,7 @@ def write_surfaces(
         InputError: a folder without volumes.
     """
     require_volumes_extra()
-    found = mesh_files(paths, recursive=recursive, apart_from=folder, endings=VOLUME_ENDINGS, what="volumes")
+    found = mesh_files(paths, recursive=recursive, apart_from=folder, endings=VOLUME_ENDINGS, kind_name="volumes")
     for sentence in found.left_out:
         say(sentence)
     make_folder(folder)

@@ -1,4 +1,4 @@
-"""Simulated bones of two groups: raw scans of small skulls, with a known difference and a known asymmetry.
+"""Simulated bones: raw scans of small skulls in two groups, with a known group difference and asymmetry.
 
 A skull is a star-shaped surface about its centre: an ellipsoid with bumps for snout, crest, cheek arches and condyles,
 and pits for the orbits. The second group has a longer snout; in all skulls the left arch protrudes further than the
@@ -25,13 +25,13 @@ from shapespace.types import FloatArray, Mesh
 TABLE = "bones.csv"
 GROUPS = ("coast", "island")
 """The second group has the longer snout."""
-EFFECT_MM = 4.0
+EFFECT_MM = 4.0  # mm, by which the snout of one group is longer
 LEFT_ARCH_MM = 1.5
 """Mean difference of the protrusion of the left and the right arch."""
 
 _HALF_MM = np.array([17.0, 15.0, 26.0])
 """Half axes of the ellipsoid: to the left (x), up (y) and to the snout (z)."""
-_SNOUT, _LEFT, _RIGHT = 0, 2, 3
+_SNOUT, _LEFT, _RIGHT = 0, 2, 3  # rows of `_BUMPS`
 _BUMPS = np.array(
     [
         # x, y, z of the direction; width; mean height and its standard deviation, as logarithms of the radius.
@@ -48,12 +48,13 @@ _BUMPS = np.array(
 _TWIN = np.array([0, 1, 3, 2, 5, 4, 7, 6])
 _FLUCTUATING = 0.015
 """Standard deviation of the height of a bump on one side alone."""
+# random bumps: their number, width (radians), and standard deviation of log radius, paired and on one side
 _WAVES, _WAVE_WIDTH, _WAVE, _WAVE_ONE_SIDE = 24, 0.3, 0.02, 0.004
-_SIZE = 0.08
-_POINTS = 2500
+_SIZE = 0.08  # standard deviation of log size
+_POINTS = 2500  # vertices of a raw surface
 _CUT_EVERY, _CUT_MM = 3, 9.0
 """Every n-th bone has a hole; n, and the mean radius of the hole."""
-_MOST = 10_000
+_MOST = 10_000  # limit on files written to the folder of a demonstration
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +77,8 @@ class Bone:
     def draw(rng: np.random.Generator, longer_mm: float = 0.0) -> Bone:
         """Return a random skull, with a snout that is longer than usual by `longer_mm`."""
         half = _HALF_MM * np.exp(0.03 * rng.standard_normal(3)) * np.exp(_SIZE * rng.standard_normal())
-        own = rng.standard_normal(len(_BUMPS))
-        paired = np.where(np.arange(len(_BUMPS)) <= _TWIN, own, own[_TWIN])
+        bump_weights = rng.standard_normal(len(_BUMPS))
+        paired = np.where(np.arange(len(_BUMPS)) <= _TWIN, bump_weights, bump_weights[_TWIN])
         heights = _BUMPS[:, 4] + _BUMPS[:, 5] * paired
         heights[_LEFT:] += _FLUCTUATING * rng.standard_normal(len(_BUMPS) - _LEFT)
         heights[_SNOUT] += np.log1p(longer_mm / (_HALF_MM[2] * np.exp(_BUMPS[_SNOUT, 4])))
@@ -150,6 +151,6 @@ def _with_hole(scan: Mesh, rng: np.random.Generator) -> Mesh:
     centre = scan.vertices[rng.integers(len(scan.vertices))]
     radius = _CUT_MM * rng.uniform(0.7, 1.3)
     assert scan.faces is not None
-    kept = np.linalg.norm(scan.vertices - centre, axis=1) > radius
-    vertices, faces = without_vertices(scan.vertices, scan.faces, kept)
+    is_kept = np.linalg.norm(scan.vertices - centre, axis=1) > radius
+    vertices, faces = without_vertices(scan.vertices, scan.faces, is_kept)
     return replace(scan, vertices=vertices, faces=faces)

@@ -1,4 +1,4 @@
-"""Downloads that go on where a broken run stopped, and locks between processes."""
+"""Downloads that resume after an interruption, and file locks between processes."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from tqdm import tqdm
 from shapespace.errors import DataError
 from shapespace.io.files import read_error, write_error
 
-_ATTEMPTS = 3
-_TIMEOUT_S = 30.0
-_BLOCK = 1 << 16
-_MAX_FILE_BYTES = 32 << 20
+_ATTEMPTS = 3  # tries of one file; each resumes the one before
+_TIMEOUT_S = 30.0  # seconds without a byte
+_BLOCK = 1 << 16  # bytes (64 KiB), between updates of the progress bar
+_MAX_FILE_BYTES = 32 << 20  # 32 MiB, for files without a published size
 
 
 def download(url: str, path: Path, bar: tqdm[Any], *, sha256: str | None = None, size: int | None = None) -> None:
@@ -60,11 +60,11 @@ def download(url: str, path: Path, bar: tqdm[Any], *, sha256: str | None = None,
 
 
 class NotThereError(DataError):
-    """The server says that it has no such file."""
+    """The server has no file at the address."""
 
 
 class _CutError(Exception):
-    """The connection ended before the file did."""
+    """The connection closed before the end of the file."""
 
 
 @dataclass(frozen=True)
@@ -106,29 +106,31 @@ class _ResumingDownload:
                 TimeoutError,
             ) as error:
                 reason = error
-        why = getattr(reason, "reason", None) or reason
+        cause = getattr(reason, "reason", None) or reason
         raise DataError(
-            f"Cannot download {fname} ({str(why).strip('.')}), and {self.part.parent} does not hold it yet: "
+            f"Cannot download {fname} ({str(cause).strip('.')}), and {self.part.parent} does not hold it yet: "
             "check the network and run again, which goes on where it stopped, or set SHAPESPACE_DATA to a local copy."
         ) from reason
 
     def _get_rest(self, url: str) -> None:
-        have = self.part.stat().st_size if self.part.is_file() else 0
-        if have > (self.expected_bytes or _MAX_FILE_BYTES):
+        offset = self.part.stat().st_size if self.part.is_file() else 0
+        if offset > (self.expected_bytes or _MAX_FILE_BYTES):
             self.part.unlink()
-            have = 0
-        if have and have == self.expected_bytes:
+            offset = 0
+        if offset and offset == self.expected_bytes:
             return
         request = urllib.request.Request(url, headers={"User-Agent": "shapespace", "Accept-Encoding": "identity"})
-        if have:
-            request.add_header("Range", f"bytes={have}-")
-        with urllib.request.urlopen(request, timeout=_TIMEOUT_S) as answer:
-            resumed = answer.status == 206 and str(answer.headers.get("Content-Range", "")).startswith(f"bytes {have}-")
-            if answer.status == 206 and not resumed:
+        if offset:
+            request.add_header("Range", f"bytes={offset}-")
+        with urllib.request.urlopen(request, timeout=_TIMEOUT_S) as response:
+            resumed = response.status == 206 and str(response.headers.get("Content-Range", "")).startswith(
+                f"bytes {offset}-"
+            )
+            if response.status == 206 and not resumed:
                 raise _CutError("the server sent another part than was asked for")
-            have = have if resumed else 0
-            length = answer.headers.get("Content-Length")
-            total = have + int(length) if length and length.isdigit() else self.expected_bytes
+            offset = offset if resumed else 0
+            length = response.headers.get("Content-Length")
+            total = offset + int(length) if length and length.isdigit() else self.expected_bytes
             limit = self.expected_bytes or _MAX_FILE_BYTES
             if total is not None and total > limit:
                 raise DataError(f"{url} is larger than the published file ({total} bytes); it is not the same file.")
@@ -137,15 +139,15 @@ class _ResumingDownload:
             except OSError as error:
                 raise write_error(self.part, error) from error
             with stream:
-                self.bar.update(have)
-                self._copy(answer, stream, url, limit - have)
+                self.bar.update(offset)
+                self._copy(response, stream, url, limit - offset)
                 size = stream.tell()
         if total is not None and size < total:
             self.bar.update(-size)
             raise _CutError(f"the connection was cut after {size} of {total} bytes")
 
-    def _copy(self, answer: Any, stream: BinaryIO, url: str, room: int) -> None:
-        while block := cast(bytes, answer.read(_BLOCK)):
+    def _copy(self, response: Any, stream: BinaryIO, url: str, room: int) -> None:
+        while block := cast(bytes, response.read(_BLOCK)):
             room -= len(block)
             if room < 0:
                 raise DataError(f"{url} is larger than the published file; it is not the same file.")
@@ -169,8 +171,8 @@ def _quiet_pooch() -> Generator[None]:
 
 
 @contextlib.contextmanager
-def locked(path: Path) -> Generator[None]:
-    """Hold a lock on the file `path`; the system lets go of it even if the process is killed."""
+def hold_lock(path: Path) -> Generator[None]:
+    """Hold a lock on the file `path`; the system releases it even if the process is killed."""
     try:
         stream = path.open("a+b")
     except OSError as error:

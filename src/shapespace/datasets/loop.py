@@ -61,17 +61,19 @@ def loop_operator(vertex_count: int, faces: npt.ArrayLike) -> tuple[Any, IntArra
     beta = np.where(valence == 3, 3 / 16, 3 / (8 * np.maximum(valence, 1)))
     boundary_valence = np.bincount(edges[is_boundary].ravel(), minlength=vertex_count)
     beta[on_boundary] = (0.25 / np.maximum(boundary_valence, 1))[on_boundary]
-    both = np.concatenate([edges, edges[:, ::-1]])
+    half_edges = np.concatenate([edges, edges[:, ::-1]])
     both_boundary = np.concatenate([is_boundary, is_boundary])
     # A boundary vertex listens to its boundary neighbours only, so that two patches meet along a shared rim.
-    used = ~on_boundary[both[:, 0]] | both_boundary
-    rows.append(both[used, 0])
-    cols.append(both[used, 1])
-    data.append(beta[both[used, 0]])
-    own = np.ones(vertex_count) - np.bincount(both[used, 0], beta[both[used, 0]], minlength=vertex_count)
+    used = ~on_boundary[half_edges[:, 0]] | both_boundary
+    rows.append(half_edges[used, 0])
+    cols.append(half_edges[used, 1])
+    data.append(beta[half_edges[used, 0]])
+    own_weight = np.ones(vertex_count) - np.bincount(
+        half_edges[used, 0], beta[half_edges[used, 0]], minlength=vertex_count
+    )
     rows.append(np.arange(vertex_count))
     cols.append(np.arange(vertex_count))
-    data.append(own)
+    data.append(own_weight)
 
     shape = (vertex_count + n_edges, vertex_count)
     triplets = (np.concatenate(data), (np.concatenate(rows), np.concatenate(cols)))

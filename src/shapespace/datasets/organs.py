@@ -1,4 +1,4 @@
-"""Simulated organs: smooth, closed, without a corner to hold on to, like spleens; as raw surfaces or as label volumes.
+"""Simulated organs without landmarks, such as spleens: smooth, closed, as raw surfaces or as label volumes.
 
 An organ is a star about the middle of a straight body, which is then tapered and bent: a point of the body is inside
 where it is nearer to the middle than the radius in its direction. So both surfaces and voxels follow from one formula.
@@ -25,16 +25,17 @@ from shapespace.types import FloatArray, LabelVolume, Mesh
 
 _HALF_MM = np.array([55.0, 34.0, 19.0])
 """Of the axes of the mean."""
+# random bumps: their number, width (radians), and standard deviation of log radius
 _CENTRES, _WIDTH, _ROUGHNESS = 40, 0.35, 0.05
 _NOTCH, _RIDGE = np.array([0.35, -0.9, 0.25]), np.array([-0.2, 0.3, 0.95])
-_NOISE_MM, _POINTS = 0.15, 3000
+_NOISE_MM, _POINTS = 0.15, 3000  # mm and vertices of a raw surface
 _VOXEL_MM, _MARGIN_MM = (1.5, 1.5, 2.5), 8.0
-_MOST = 10_000
+_MOST = 10_000  # limit on files written to the folder of a demonstration
 
 
 @dataclass(frozen=True, eq=False)
 class Organ:
-    """One organ in a frame of its own, mm.
+    """One organ in its own frame, mm.
 
     Args:
         half_mm: (3,) of its axes.
@@ -118,8 +119,8 @@ def raw_surface(organ: Star, rng: np.random.Generator, points: int = _POINTS) ->
 def label_volume(organ: Organ, rng: np.random.Generator) -> LabelVolume:
     """Return `organ` as voxels with the label 1, nearly along the axes of the patient, as a scanner gives them."""
     turn = Rotation.from_rotvec(0.15 * rng.standard_normal(3)).as_matrix()
-    there = organ.surface(_spread(400)) @ turn.T
-    low, high = there.min(axis=0) - _MARGIN_MM, there.max(axis=0) + _MARGIN_MM
+    surface_points = organ.surface(_spread(400)) @ turn.T
+    low, high = surface_points.min(axis=0) - _MARGIN_MM, surface_points.max(axis=0) + _MARGIN_MM
     counts = np.ceil((high - low) / _VOXEL_MM).astype(int)
     places = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, 3) * _VOXEL_MM + low
     labels = organ.inside(places @ turn).reshape(counts).astype(np.uint8)

@@ -160,7 +160,7 @@ def simulate_scan(
         parts.append(collar_part(mesh, collar, rng))
     on_surface = np.concatenate([~thrown, np.zeros(sum(len(v) for v, _ in parts[1:]), dtype=np.bool_)])
     vertices, faces = _merge(parts)
-    keep = _kept(vertices, mesh, holes, crop, rng)
+    keep = _mask_outside_holes(vertices, mesh, holes, crop, rng)
     faces = faces[keep[faces].all(axis=1)]
     if not len(faces):
         raise InputError(f"The holes and cuts leave nothing of {mesh.name}; make them smaller.")
@@ -240,7 +240,7 @@ def _slide(
     return remesh.onto(moved, surface_vertices, surface_faces)
 
 
-def _kept(
+def _mask_outside_holes(
     vertices: FloatArray, mesh: Mesh, holes: Sequence[Hole], crop: Sequence[Cut], rng: np.random.Generator
 ) -> BoolArray:
     keep = np.ones(len(vertices), dtype=np.bool_)

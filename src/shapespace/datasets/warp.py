@@ -1,4 +1,4 @@
-"""Smooth random changes of a shape at several scales: what people vary by beyond any list of shapes.
+"""Smooth random deformations at several scales, for variation beyond a fixed set of shapes.
 
 The shape is stretched along its axes, and displaced by Gaussian processes with squared-exponential covariance. Each is
 a sum of many cosine waves in space (random Fourier features: Rahimi and Recht, NIPS 2007), so what lies close together
@@ -14,12 +14,12 @@ import numpy as np
 from shapespace.geometry.mirror_plane import FLIP
 from shapespace.types import FloatArray, IntArray
 
-_WAVES = 96
+_WAVES = 96  # random Fourier features of the field
 
 
 @dataclass(frozen=True)
 class Warp:
-    """How far shapes vary; lengths in mm of a head.
+    """Amplitude and length scales of a random deformation, mm for a head.
 
     Args:
         stretch: standard deviation of the logarithm of the stretch along each axis; the volume stays.
@@ -42,9 +42,9 @@ class Warp:
         stretch = np.exp(self.stretch * rng.standard_normal(3))
         out = x * (stretch / stretch.prod() ** (1 / 3) - 1.0)
         for length_mm, stddev_mm in self.fields:
-            one = _field(x, length_mm, rng)
-            other = one[mirror] * FLIP
-            out += stddev_mm / np.sqrt(2.0) * (one + other + self.lopsided * (one - other))
+            component = _field(x, length_mm, rng)
+            other = component[mirror] * FLIP
+            out += stddev_mm / np.sqrt(2.0) * (component + other + self.lopsided * (component - other))
         return out
 
 

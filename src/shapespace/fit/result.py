@@ -24,7 +24,7 @@ from shapespace.geometry.closest import ClosestPoints
 from shapespace.geometry.distance import DistanceSummary, SurfaceDistances
 from shapespace.lazy import OpenViewer, lazy_import
 from shapespace.model.shape_model import ShapeModel
-from shapespace.reprs import short_repr, told_briefly
+from shapespace.reprs import describe_briefly, short_repr
 from shapespace.types import BoolArray, ByteArray, FloatArray, IntArray, Mesh, Similarity
 
 if TYPE_CHECKING:
@@ -151,8 +151,9 @@ class FitResult:
     def __repr__(self) -> str:
         far = int(np.abs(self.z).argmax())
         return (
-            f"<FitResult of {told_briefly(self.scan_name)}: {self.status}. {self.reason} {len(self.z)} coefficients, "
-            f"the largest {self.z[far]:+.1f} sd (mode {far + 1}); {self.method}, {sum(self.seconds.values()):.2f} s>"
+            f"<FitResult of {describe_briefly(self.scan_name)}: {self.status}. {self.reason} {len(self.z)} "
+            f"coefficients, the largest {self.z[far]:+.1f} sd (mode {far + 1}); {self.method}, "
+            f"{sum(self.seconds.values()):.2f} s>"
         )
 
     @property

@@ -11,19 +11,19 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import ModelFileError
-from shapespace.formats.model_parts import LinearModel, Modes, orthonormal, scaled
+from shapespace.formats.model_parts import LinearModel, Modes, orthonormal, scale_columns
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import read_bytes, write_bytes
 from shapespace.types import FloatArray, SurfaceLandmarks
 
 _AGAIN = "give a model that eos has saved"
 _BLENDSHAPES_AGAIN = "give the blendshapes that eos has saved"
-_LARGEST_BYTES = 2**32
-_NEWEST = 4
-_MOST_NAME_BYTES = 4096
-_PCA, _BLENDSHAPES = 0, 1
+_LARGEST_BYTES = 2**32  # 4 GiB
+_NEWEST = 4  # newest version of eos::morphablemodel::MorphableModel; it is the one written
+_MOST_NAME_BYTES = 4096  # limit on damaged files; names of blendshapes are words
+_PCA, _BLENDSHAPES = 0, 1  # index of the std::variant of expression models in eos::morphablemodel::MorphableModel
 _NOTHING: Final = np.zeros((0, 0))
-_SFM = (3448, 63, 6736)
+_SFM = (3448, 63, 6736)  # vertices, modes and triangles of the Surrey Face Model
 _SFM_LICENCE = "Surrey Face Model (3448): non-commercial use only, see its README"
 Item = TypeVar("Item")
 
@@ -77,10 +77,10 @@ class Eos:
             out += struct.pack("<B", 1)
         out += struct.pack("<QQ", 0, 0)
         write_bytes(path, bytes(out))
-        said = ["Numbers are in single precision.", *_moved_landmarks(model)]
+        notes = ["Numbers are in single precision.", *_moved_landmarks(model)]
         if model.provenance or model.licence:
-            said.append("Provenance and licence are left out: eos has no place for them.")
-        return said
+            notes.append("Provenance and licence are left out: eos has no place for them.")
+        return notes
 
 
 def _moved_landmarks(model: LinearModel) -> list[str]:
@@ -106,14 +106,18 @@ def read_blendshapes(path: Path) -> Modes:
     archive = _Archive(read_bytes(path))
     try:
         with np.errstate(invalid="ignore"):
-            found = archive.many(lambda: (archive.text(), archive.matrix().ravel()), 16)
+            blendshapes = archive.many(lambda: (archive.text(), archive.matrix().ravel()), 16)
         if not archive.at_end:
             raise _DamagedError("there is more in it than blendshapes")
-        if not found or any(len(moved) != len(found[0][1]) or len(moved) % 3 for _, moved in found):
+        if not blendshapes or any(
+            len(displacements) != len(blendshapes[0][1]) or len(displacements) % 3 for _, displacements in blendshapes
+        ):
             raise _DamagedError("they have different numbers of vertices")
     except (_DamagedError, ValueError, OverflowError) as error:
         raise ModelFileError(f"{path} holds no blendshapes of eos: {error}; {_BLENDSHAPES_AGAIN}.") from error
-    return Modes(np.stack([moved for _, moved in found], axis=1), tuple(name for name, _ in found))
+    return Modes(
+        np.stack([displacements for _, displacements in blendshapes], axis=1), tuple(name for name, _ in blendshapes)
+    )
 
 
 def _are_blendshapes(head: bytes) -> bool:
@@ -123,7 +127,7 @@ def _are_blendshapes(head: bytes) -> bool:
 
 
 class _DamagedError(ValueError):
-    """The bytes are not such an archive."""
+    """The bytes are not an eos archive."""
 
 
 class _Archive:
@@ -142,8 +146,8 @@ class _Archive:
 
     def array(self, kind: str, count: int, *row: int) -> npt.NDArray[Any]:
         dtype = np.dtype(kind)
-        taken = self._take(count * int(np.prod(row, dtype=np.int64)) * dtype.itemsize)
-        return np.frombuffer(taken, dtype).reshape(count, *row)
+        content = self._take(count * int(np.prod(row, dtype=np.int64)) * dtype.itemsize)
+        return np.frombuffer(content, dtype).reshape(count, *row)
 
     def matrix(self) -> FloatArray:
         rows, columns = self.fields("ii")
@@ -160,11 +164,11 @@ class _Archive:
             raise _DamagedError("a name is too long")
         return self._take(size).decode(errors="replace")
 
-    def many(self, read: Callable[[], Item], least_bytes: int) -> list[Item]:
+    def many(self, read_item: Callable[[], Item], least_bytes: int) -> list[Item]:
         count = self.one("Q")
         if count * least_bytes > len(self._data) - self._at:
             raise _DamagedError("it is cut short")
-        return [read() for _ in range(count)]
+        return [read_item() for _ in range(count)]
 
     def _take(self, size: int) -> bytes:
         if size > len(self._data) - self._at:
@@ -177,7 +181,7 @@ def _model(archive: _Archive) -> LinearModel:
     version = archive.one("I")
     if not 1 <= version <= _NEWEST:
         raise _DamagedError(f"it is of version {version}, and versions 1 to {_NEWEST} are known")
-    mean, moved, faces = _pca(archive)
+    mean, displacements, faces = _pca(archive)
     colour = _pca(archive)[0]
     expression, notes = None, list[str]()
     if version >= 2 and not archive.one("B"):
@@ -195,10 +199,10 @@ def _model(archive: _Archive) -> LinearModel:
         notes.append("Its model of colour is left out.")
     if textured:
         notes.append("Its texture coordinates are left out.")
-    is_sfm = (len(mean) // 3, moved.shape[1], len(faces)) == _SFM
+    is_sfm = (len(mean) // 3, displacements.shape[1], len(faces)) == _SFM
     return LinearModel(
         mean=mean.reshape(-1, 3),
-        shape=Modes(moved),
+        shape=Modes(displacements),
         expression=expression,
         faces=faces.astype(np.int32) if len(faces) else None,
         landmarks=SurfaceLandmarks.of(landmarks),
@@ -214,27 +218,29 @@ def _pca(archive: _Archive) -> tuple[FloatArray, FloatArray, npt.NDArray[Any]]:
     faces = archive.vector("<i4", 3)
     if mean.shape[1] > 1 or basis.shape != (mean.size, variance.size) or (variance < 0).any() or mean.size % 3:
         raise _DamagedError(f"its parts have the shapes {mean.shape}, {basis.shape} and {variance.shape}")
-    return mean.ravel(), scaled(basis, np.sqrt(variance.ravel())), faces
+    return mean.ravel(), scale_columns(basis, np.sqrt(variance.ravel())), faces
 
 
 def _expression(archive: _Archive, size: int) -> tuple[Modes, FloatArray]:
     """Return the modes of expressions, and their mean displacement (D,)."""
     kind = archive.one("i")
     if kind == _PCA:
-        displaced, moved, _ = _pca(archive)
-        if len(displaced) != size:
+        mean_displacement, displacements, _ = _pca(archive)
+        if len(mean_displacement) != size:
             raise _DamagedError("expressions have another number of vertices")
-        return Modes(moved), displaced
+        return Modes(displacements), mean_displacement
     if kind != _BLENDSHAPES:
         raise _DamagedError(f"there is no kind {kind} of expressions")
-    found = archive.many(lambda: (archive.text(), archive.matrix().ravel()), 16)
-    if not found or any(len(moved) != size for _, moved in found):
+    blendshapes = archive.many(lambda: (archive.text(), archive.matrix().ravel()), 16)
+    if not blendshapes or any(len(displacements) != size for _, displacements in blendshapes):
         raise _DamagedError("blendshapes have another number of vertices")
-    return Modes(np.stack([moved for _, moved in found], axis=1), tuple(name for name, _ in found)), np.zeros(size)
+    return Modes(
+        np.stack([displacements for _, displacements in blendshapes], axis=1), tuple(name for name, _ in blendshapes)
+    ), np.zeros(size)
 
 
-def _pca_bytes(mean: FloatArray, moved: FloatArray, model: LinearModel | None) -> bytes:
-    basis, stddev = (moved, np.zeros(0)) if not moved.size else orthonormal(moved)[:2]
+def _pca_bytes(mean: FloatArray, displacements: FloatArray, model: LinearModel | None) -> bytes:
+    basis, stddev = (displacements, np.zeros(0)) if not displacements.size else orthonormal(displacements)[:2]
     faces = None if model is None else model.faces
     triangles = np.zeros((0, 3), dtype="<i4") if faces is None else faces.astype("<i4")
     column = mean.reshape(-1, 1)

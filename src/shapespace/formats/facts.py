@@ -1,4 +1,4 @@
-"""What a model says beside its numbers, as JSON for formats that leave room for what others bring along."""
+"""Metadata of a model (landmarks, provenance, licence) as JSON, for formats with a free text field."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ KEY: Final = "shapespace"
 """Under which the facts stand."""
 _PLACES: Final = "landmark_triangles"
 """Landmarks between vertices: name -> vertices, barycentric coordinates, and distance of the given point in mm."""
-_LONGEST_WORDS = 20_000
-_MOST_LANDMARKS = 10_000
+_LONGEST_WORDS = 20_000  # characters; longer than any licence text
+_MOST_LANDMARKS = 10_000  # limit on damaged files, far above published markups
 
 
 def facts_of(model: LinearModel) -> dict[str, Any]:
@@ -40,7 +40,7 @@ def facts_of(model: LinearModel) -> dict[str, Any]:
 
 
 def with_facts(model: LinearModel, facts: object) -> LinearModel:
-    """Return `model` with what `facts` of `facts_of` tells; what is not as that writes it is passed over.
+    """Return `model` with the metadata in `facts`.
 
     Landmarks are in triangles of vertices, so they are read only where the number of vertices is still the same.
     """
@@ -53,8 +53,8 @@ def with_facts(model: LinearModel, facts: object) -> LinearModel:
     if marks and known.get("vertices") != n:
         notes = (*notes, "Its landmarks are left out: the number of vertices has changed since they were set.")
     elif len(marks) <= _MOST_LANDMARKS:
-        own = _landmarks(marks, json_object(known.get(_PLACES)), n, model.mm or 1.0)
-        landmarks = landmarks.select([name for name in landmarks if name not in own]).joined(own)
+        file_landmarks = _landmarks(marks, json_object(known.get(_PLACES)), n, model.mm or 1.0)
+        landmarks = landmarks.select([name for name in landmarks if name not in file_landmarks]).joined(file_landmarks)
     training, total = _count(known.get("n_training")), known.get("total_variance_mm2")
     shape = model.shape
     if isinstance(total, float) and math.isfinite(total) and total > 0:
@@ -86,28 +86,28 @@ def _places_of(landmarks: SurfaceLandmarks, mm: float) -> dict[str, dict[str, An
 
 def _landmarks(vertices: Mapping[str, Any], places: Mapping[str, Any], n: int, mm: float) -> SurfaceLandmarks:
     """Return the landmarks of facts: in their triangles where these are given, else at their vertices."""
-    found: list[SurfaceLandmarks] = []
+    landmarks: list[SurfaceLandmarks] = []
     for name, value in vertices.items():
         vertex, place = _count(value), json_object(places.get(name))
         if vertex is None or vertex >= n:
             continue
-        one = SurfaceLandmarks.of({name: vertex})
+        landmark = SurfaceLandmarks.of({name: vertex})
         try:
             corners = np.array([place["vertices"]], dtype=np.int32)
             weights = np.array([place["barycentric"]], dtype=np.float64)
             distance = np.array([place["distance_mm"]], dtype=np.float64) / mm
             exact = SurfaceLandmarks((name,), corners, weights, distance)
-            one = exact if dict(exact) == dict(one) and corners.max() < n else one
+            landmark = exact if dict(exact) == dict(landmark) and corners.max() < n else landmark
         except (KeyError, ValueError, TypeError, OverflowError):
             pass  # not as `facts_of` writes it, which leaves the vertex
-        found.append(one)
-    return SurfaceLandmarks().joined(*found)
+        landmarks.append(landmark)
+    return SurfaceLandmarks().joined(*landmarks)
 
 
 def total_variance(model: LinearModel) -> float | None:
     """Return the variance of all modes, in the unit of the model squared; None where it is not told."""
-    told = [block.total_variance for block in (model.shape, model.expression) if block is not None]
-    known = [one for one in told if one is not None]
+    variances = [block.total_variance for block in (model.shape, model.expression) if block is not None]
+    known = [variance for variance in variances if variance is not None]
     return sum(known) if known else None
 
 

@@ -1,4 +1,4 @@
-"""FLAME and the SMPL family: a template and what each coefficient does to it, in metres, as `.npz` or as a pickle."""
+"""FLAME and the SMPL family: a template and blend shapes in metres, as `.npz` or as a pickle."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from shapespace.io.containers.pickled_arrays import PickleRefusedError, pickled_
 from shapespace.io.files import read_bytes
 
 _AGAIN = "give the file as it was downloaded"
-_LARGEST_BYTES = 2**30
-_MM = 1000.0
+_LARGEST_BYTES = 2**30  # 1 GiB
+_MM = 1000.0  # FLAME is in metres
 _KEYS: Final = {"template": ("v_template", "default_v"), "modes": ("shapedirs",), "faces": ("f", "faces")}
 _JOINTS = ("weights", "J", "joints")
 _FAMILY: Final = {5: "FLAME", 16: "MANO", 24: "SMPL", 52: "SMPL+H", 55: "SMPL-X"}
@@ -28,7 +28,7 @@ _BY_VERTICES: Final = {5023: "FLAME", 778: "MANO", 6890: "SMPL", 10475: "SMPL-X"
 _WITH_EXPRESSION = ("FLAME", "SMPL-X")
 _IDENTITY: Final = {150: 100, 20: 10}
 """Modes of identity among so many, the others being of expression; of more than `_MOST_IDENTITY` the first."""
-_MOST_IDENTITY = 300
+_MOST_IDENTITY = 300  # FLAME: shapedirs has 300 identity modes before the expression modes
 
 
 class Flame:
@@ -47,13 +47,15 @@ class Flame:
     def read(self, path: Path) -> LinearModel:
         """As `ModelReader.read`."""
         check_file(path, _LARGEST_BYTES, _AGAIN)
-        wanted = [name for names in (*_KEYS.values(), _JOINTS) for name in names]
+        array_names = [name for names in (*_KEYS.values(), _JOINTS) for name in names]
         if path.suffix.lower() == ".npz":
-            arrays: Mapping[str, npt.NDArray[Any]] = read_arrays(path, _AGAIN, wanted)
+            arrays: Mapping[str, npt.NDArray[Any]] = read_arrays(path, _AGAIN, array_names)
         else:
-            arrays = _unpickled(path, wanted)
-        found = {what: next((arrays[name] for name in names if name in arrays), None) for what, names in _KEYS.items()}
-        template, modes, faces = (found[what] for what in _KEYS)
+            arrays = _unpickled(path, array_names)
+        members = {
+            role: next((arrays[name] for name in names if name in arrays), None) for role, names in _KEYS.items()
+        }
+        template, modes, faces = (members[role] for role in _KEYS)
         if template is None or modes is None:
             raise ModelFileError(
                 f"{path} holds no v_template and shapedirs, as models of the SMPL family do; {_AGAIN}."
@@ -64,18 +66,18 @@ class Flame:
                 f"{path} is damaged: its template and modes have the shapes {template.shape} and {modes.shape}; "
                 f"{_AGAIN}."
             )
-        if any(one.dtype.kind not in "iuf" for one in (template, modes, *([] if faces is None else [faces]))):
+        if any(array.dtype.kind not in "iuf" for array in (template, modes, *([] if faces is None else [faces]))):
             raise ModelFileError(f"{path} is damaged: its arrays are not of numbers; {_AGAIN}.")
         family = _family(arrays, n)
-        moved = np.asarray(modes, dtype=np.float64).reshape(3 * n, -1)
+        displacements = np.asarray(modes, dtype=np.float64).reshape(3 * n, -1)
         n_identity = None
         if family in (*_WITH_EXPRESSION, ""):
-            n_modes = moved.shape[1]
+            n_modes = displacements.shape[1]
             n_identity = _MOST_IDENTITY if n_modes > _MOST_IDENTITY else _IDENTITY.get(n_modes)
         return LinearModel(
             mean=np.asarray(template, dtype=np.float64),
-            shape=Modes(moved[:, :n_identity]),
-            expression=None if n_identity is None else Modes(moved[:, n_identity:]),
+            shape=Modes(displacements[:, :n_identity]),
+            expression=None if n_identity is None else Modes(displacements[:, n_identity:]),
             faces=None if faces is None else faces.astype(np.int32),
             mm=_MM,
             provenance=f"{family or 'SMPL family'} model {path.name}",
@@ -103,9 +105,9 @@ def _has_template(path: Path) -> bool:
         return False
 
 
-def _unpickled(path: Path, wanted: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
+def _unpickled(path: Path, array_names: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
     try:
         values = pickled_dict(read_bytes(path))
-        return {name: pickled_array(values[name]) for name in wanted if name in values}
+        return {name: pickled_array(values[name]) for name in array_names if name in values}
     except PickleRefusedError as error:
         raise ModelFileError(f"{path} is not read: {error}; {_AGAIN}.") from error

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from shapespace.errors import ModelFileError
-from shapespace.formats.model_parts import LinearModel, Modes, scaled
+from shapespace.formats.model_parts import LinearModel, Modes, scale_columns
 from shapespace.io.containers.archives import LARGEST_BYTES, npy_array, zip_members
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import open_file
@@ -20,7 +20,7 @@ from shapespace.types import FloatArray, IntArray
 _AGAIN = "save the principal components again"
 _NEEDED = ("mean", "weights", "modes")
 _FIRST_MEMBERS = (b"mean.npy", b"weights.npy", b"modes.npy")
-_SAME = 1e-4
+_SAME = 1e-4  # share of the extent: single precision and rounding in text
 
 
 class Gias:
@@ -34,8 +34,8 @@ class Gias:
         """Whether it is an `.npz` that is called so, or begins with the mean as GIAS2 saves it."""
         if not path.name.lower().endswith(".npz") or head[:2] != b"PK":
             return False
-        named = head[30 : 30 + int.from_bytes(head[26:28], "little")]
-        return path.name.lower().endswith(".pc.npz") and named in _FIRST_MEMBERS
+        member_name = head[30 : 30 + int.from_bytes(head[26:28], "little")]
+        return path.name.lower().endswith(".pc.npz") and member_name in _FIRST_MEMBERS
 
     def read(self, path: Path) -> LinearModel:
         """As `ModelReader.read`."""
@@ -45,8 +45,8 @@ class Gias:
                 members = zip_members(stream, path.stat().st_size)
             mean, variance, modes = (_numbers(members[f"{name}.npy"]) for name in _NEEDED)
         except (KeyError, ValueError, OSError) as error:
-            what = f"it has no {error}" if isinstance(error, KeyError) else str(error)
-            raise ModelFileError(f"{path} holds no principal components of GIAS2 ({what}); {_AGAIN}.") from error
+            problem = f"it has no {error}" if isinstance(error, KeyError) else str(error)
+            raise ModelFileError(f"{path} holds no principal components of GIAS2 ({problem}); {_AGAIN}.") from error
         mean, variance = mean.ravel(), variance.ravel()
         if modes.ndim != 2 or mean.size % 3 or len(modes) != mean.size or modes.shape[1] > variance.size:
             raise ModelFileError(
@@ -54,11 +54,11 @@ class Gias:
                 f"{variance.shape}; {_AGAIN}."
             )
         variance = variance[: modes.shape[1]]
-        moved = scaled(modes, np.sqrt(np.maximum(variance, 0.0)))
+        displacements = scale_columns(modes, np.sqrt(np.maximum(variance, 0.0)))
         notes: list[str] = []
-        each = _optional(members, "SD")
-        if each is not None and each.size == mean.size:
-            moved = moved * each.reshape(-1, 1)
+        spread = _optional(members, "SD")
+        if spread is not None and spread.size == mean.size:
+            displacements = displacements * spread.reshape(-1, 1)
             notes.append("Each coordinate was divided by its standard deviation, which is undone.")
         scores = _optional(members, "projectedWeights")
         surface = _surface(path)
@@ -69,11 +69,11 @@ class Gias:
             points, faces, blocked = _fitting(surface, mean, path)
             if blocked:
                 mean = points.ravel()
-                moved = moved.reshape(3, len(points), -1).transpose(1, 0, 2).reshape(mean.size, -1)
+                displacements = displacements.reshape(3, len(points), -1).transpose(1, 0, 2).reshape(mean.size, -1)
                 notes.append("Its coordinates stood one after another, all x first.")
         return LinearModel(
             mean=mean.reshape(-1, 3),
-            shape=Modes(moved),
+            shape=Modes(displacements),
             faces=faces,
             n_training=scores.shape[1] if scores is not None and scores.ndim == 2 and scores.shape[1] > 1 else None,
             provenance=f"GIAS2 principal components {path.name}",
@@ -98,8 +98,8 @@ def _optional(members: dict[str, bytes], name: str) -> FloatArray | None:
 
 def _surface(path: Path) -> Path | None:
     stem = path.name[: -len(".pc.npz")] if path.name.lower().endswith(".pc.npz") else path.stem
-    beside = (path.with_name(f"{stem}_mean{ending}") for ending in MESH_ENDINGS)
-    return next((one for one in beside if one.is_file()), None)
+    candidates = (path.with_name(f"{stem}_mean{ending}") for ending in MESH_ENDINGS)
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
 def _fitting(surface: Path, mean: FloatArray, path: Path) -> tuple[FloatArray, IntArray | None, bool]:

@@ -1,4 +1,4 @@
-"""glTF 2.0 morph targets: a mesh and what each mode adds to it, which Blender, three.js and game engines move."""
+"""glTF 2.0 morph targets: a mesh with the displacement of each mode, for Blender, three.js and game engines."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _MM: Final = 1000.0
 """In one unit of glTF, which is a metre."""
 _AGAIN = "export it again"
 _TARGETS = b'"targets"'
-_FLOAT, _INDEX = 5126, 5125
-_VERTICES, _TRIANGLES = 34962, 34963
-_POINT_CLOUD, _SURFACE = 0, 4
+_FLOAT, _INDEX = 5126, 5125  # glTF 2.0 accessor.componentType: FLOAT, UNSIGNED_INT
+_VERTICES, _TRIANGLES = 34962, 34963  # glTF 2.0 bufferView.target: ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER
+_POINT_CLOUD, _SURFACE = 0, 4  # glTF 2.0 primitive.mode: POINTS, TRIANGLES
 _IDENTITY = re.compile(r"identity[ _.-]?\d+", re.IGNORECASE)
 _FAR = 16.0
 """Times its own size; from there on single precision is too coarse, so that the centre goes into the node."""
@@ -54,22 +54,22 @@ class Gltf:
     def read(self, path: Path) -> LinearModel:
         """As `ModelReader.read`."""
         check_file(path, LARGEST_MESH_FILE_BYTES, _AGAIN)
-        found = read_morphs(read_bytes(path, LARGEST_MESH_FILE_BYTES), path)
-        facts = json_object(json_object(found.extras).get(KEY))
-        mean, faces = found.vertices, None if found.faces is None else found.faces.astype(np.int32)
-        moved = found.targets.reshape(len(found.targets), -1).T
+        morphs = read_morphs(read_bytes(path, LARGEST_MESH_FILE_BYTES), path)
+        facts = json_object(json_object(morphs.extras).get(KEY))
+        mean, faces = morphs.vertices, None if morphs.faces is None else morphs.faces.astype(np.int32)
+        displacements = morphs.targets.reshape(len(morphs.targets), -1).T
         notes: list[str] = []
         if facts.get("vertices") != len(mean):
-            mean, moved, faces, merged = _without_seams(mean, moved, faces)
+            mean, displacements, faces, merged = _without_seams(mean, displacements, faces)
             if merged:
                 notes.append(f"{merged} vertices that lie and move with another, as seams have them, are joined to it.")
-        if found.n_others:
-            notes.append(f"{found.n_others} more meshes of the scene are left out.")
-        if any(found.weights):
+        if morphs.n_others:
+            notes.append(f"{morphs.n_others} more meshes of the scene are left out.")
+        if any(morphs.weights):
             notes.append("Its weights are not zero; the mean is the shape without them.")
         if not facts:
             notes.append("A weight of one is taken as one standard deviation.")
-        shape, expression = _parted(moved, found, facts.get("n_identity"))
+        shape, expression = _split_identity(displacements, morphs, facts.get("n_identity"))
         return with_facts(
             LinearModel(
                 mean=mean,
@@ -77,7 +77,7 @@ class Gltf:
                 expression=expression,
                 faces=faces,
                 mm=_MM,
-                licence=found.copyright,
+                licence=morphs.copyright,
                 notes=tuple(notes),
             ),
             facts,
@@ -87,48 +87,52 @@ class Gltf:
         """As `ModelFormat.write`; single precision, metres, normals of mean and targets."""
         tree, binary = _content(model, path)
         write_bytes(path, (gltf_bytes if path.suffix.lower() == ".gltf" else glb_bytes)(tree, binary))
-        said = [
+        notes = [
             "Lengths are in metres, as glTF demands, and numbers in single precision.",
             "A weight of one is one standard deviation; weights run both ways, so widen the sliders to -3 to 3.",
         ]
         if model.faces is None:
-            said.append("It is a point model, so there are no normals.")
-        return said
+            notes.append("It is a point model, so there are no normals.")
+        return notes
 
 
 def _without_seams(
-    mean: FloatArray, moved: FloatArray, faces: IntArray | None
+    mean: FloatArray, displacements: FloatArray, faces: IntArray | None
 ) -> tuple[FloatArray, FloatArray, IntArray | None, int]:
     """Return them with vertices joined that are equal in all, and how many that were; in order of first appearance."""
     if faces is None:
-        return mean, moved, faces, 0
+        return mean, displacements, faces, 0
     n = len(mean)
-    rows = np.ascontiguousarray(np.concatenate([mean, moved.reshape(n, -1)], axis=1) + 0.0)
-    whole = rows.view([("", np.void, rows.shape[1] * 8)]).ravel()
-    _, first, where = np.unique(whole, return_index=True, return_inverse=True)
+    rows = np.ascontiguousarray(np.concatenate([mean, displacements.reshape(n, -1)], axis=1) + 0.0)
+    row_keys = rows.view([("", np.void, rows.shape[1] * 8)]).ravel()
+    _, first, distinct_of_row = np.unique(row_keys, return_index=True, return_inverse=True)
     if len(first) == n:
-        return mean, moved, faces, 0
+        return mean, displacements, faces, 0
     order = np.argsort(first)
     rank = np.empty(len(first), dtype=np.int32)
     rank[order] = np.arange(len(first), dtype=np.int32)
-    kept = first[order]
-    joined = rank[where.reshape(-1)[faces]]
-    flat = (joined[:, 0] == joined[:, 1]) | (joined[:, 1] == joined[:, 2]) | (joined[:, 2] == joined[:, 0])
-    columns = moved.reshape(n, 3, -1)[kept].reshape(3 * len(kept), -1)
-    return mean[kept], columns, joined[~flat], n - len(kept)
+    kept_rows = first[order]
+    joined_faces = rank[distinct_of_row.reshape(-1)[faces]]
+    flat = (
+        (joined_faces[:, 0] == joined_faces[:, 1])
+        | (joined_faces[:, 1] == joined_faces[:, 2])
+        | (joined_faces[:, 2] == joined_faces[:, 0])
+    )
+    columns = displacements.reshape(n, 3, -1)[kept_rows].reshape(3 * len(kept_rows), -1)
+    return mean[kept_rows], columns, joined_faces[~flat], n - len(kept_rows)
 
 
-def _parted(moved: FloatArray, found: Morphs, n_identity: object) -> tuple[Modes, Modes | None]:
+def _split_identity(displacements: FloatArray, morphs: Morphs, n_identity: object) -> tuple[Modes, Modes | None]:
     """Return the modes of identity and of expression, or all of them and None."""
-    k = moved.shape[1]
-    identity = [bool(_IDENTITY.fullmatch(name)) for name in found.names]
+    k = displacements.shape[1]
+    identity = [bool(_IDENTITY.fullmatch(name)) for name in morphs.names]
     if not identity and isinstance(n_identity, int):
         identity = [number < n_identity for number in range(k)]
     if not 0 < sum(identity) < k:
-        return Modes(moved, found.names), None
+        return Modes(displacements, morphs.names), None
     chosen = [[number for number in range(k) if identity[number] is part] for part in (True, False)]
-    names = [tuple(found.names[number] for number in part) if found.names else () for part in chosen]
-    return Modes(moved[:, chosen[0]], names[0]), Modes(moved[:, chosen[1]], names[1])
+    names = [tuple(morphs.names[number] for number in part) if morphs.names else () for part in chosen]
+    return Modes(displacements[:, chosen[0]], names[0]), Modes(displacements[:, chosen[1]], names[1])
 
 
 def target_names(model: LinearModel) -> list[str]:
@@ -144,26 +148,26 @@ def _content(model: LinearModel, path: Path) -> tuple[dict[str, Any], bytes]:
     scale = (model.mm or 1.0) / _MM
     mean = model.mean * scale
     blocks = [model.shape] if model.expression is None else [model.shape, model.expression]
-    moved = np.concatenate([block.moved for block in blocks], axis=1) * scale
+    displacements = np.concatenate([block.moved for block in blocks], axis=1) * scale
     low, high = mean.min(axis=0), mean.max(axis=0)
-    far = bool(np.abs([low, high]).max() > _FAR * float((high - low).max()))
-    centre = (low + high) / 2 if far else np.zeros(3)
+    is_far = bool(np.abs([low, high]).max() > _FAR * float((high - low).max()))
+    centre = (low + high) / 2 if is_far else np.zeros(3)
     buffer = _Buffer()
     attributes = {"POSITION": buffer.vectors(mean - centre)}
-    steps = [column.reshape(-1, 3) for column in moved.T]
+    steps = [column.reshape(-1, 3) for column in displacements.T]
     targets = [{"POSITION": buffer.vectors(step)} for step in steps]
     primitive: dict[str, Any] = {"attributes": attributes, "targets": targets, "mode": _POINT_CLOUD}
     if model.faces is not None:
         attributes["NORMAL"] = buffer.vectors(_normals(mean, model.faces, upright=True), bounds=False)
         for target, step in zip(targets, steps, strict=True):
             # As much to either side, since weights run both ways.
-            turned = (_normals(mean + step, model.faces) - _normals(mean - step, model.faces)) / 2
-            target["NORMAL"] = buffer.vectors(turned, bounds=False)
+            normal_changes = (_normals(mean + step, model.faces) - _normals(mean - step, model.faces)) / 2
+            target["NORMAL"] = buffer.vectors(normal_changes, bounds=False)
         primitive |= {"mode": _SURFACE, "indices": buffer.indices(model.faces)}
     if not buffer.is_finite:
         raise InputError(f"{path} cannot be written: glTF is of single precision, and the model is too large for it.")
     node: dict[str, Any] = {"mesh": 0, "name": path.stem}
-    if far:
+    if is_far:
         node["translation"] = centre.tolist()
     extras = {"targetNames": target_names(model), KEY: facts_of(model)}
     asset = {"version": "2.0", "generator": "shapespace"}
@@ -189,7 +193,7 @@ def _normals(vertices: FloatArray, faces: IntArray, *, upright: bool = False) ->
 
 
 class _Buffer:
-    """The numbers of a file, and where each array lies."""
+    """Binary data of a file, with the offset of each array."""
 
     def __init__(self) -> None:
         self.parts: list[bytes] = []
@@ -203,8 +207,8 @@ class _Buffer:
         with np.errstate(over="ignore"):
             single = values.astype("<f4")
         self.is_finite &= bool(np.isfinite(single).all())
-        said = {"min": single.min(axis=0).tolist(), "max": single.max(axis=0).tolist()} if bounds else {}
-        return self._add(single.tobytes(), _VERTICES, {"componentType": _FLOAT, "type": "VEC3", **said}, len(single))
+        limits = {"min": single.min(axis=0).tolist(), "max": single.max(axis=0).tolist()} if bounds else {}
+        return self._add(single.tobytes(), _VERTICES, {"componentType": _FLOAT, "type": "VEC3", **limits}, len(single))
 
     def indices(self, faces: IntArray) -> int:
         """Add triangles and return the number of their accessor."""

@@ -1,4 +1,4 @@
-"""Face models in MATLAB files: the Basel Face Model of 2009, LSFM, LYHM; of version 7.3 too, which is HDF5."""
+"""Face models in MATLAB files: the Basel Face Model of 2009, LSFM and LYHM, also in version 7.3 (HDF5)."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import ModelFileError
-from shapespace.formats.model_parts import LinearModel, Modes, are_measurable, scaled
+from shapespace.formats.model_parts import LinearModel, Modes, are_measurable, scale_columns
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import open_file
-from shapespace.io.sandbox import HDF5_SIGNATURE, ApartError, Tree, read_hdf5_apart, read_matlab_apart
+from shapespace.io.sandbox import HDF5_SIGNATURE, SandboxError, Tree, read_hdf5_sandboxed, read_matlab_sandboxed
 from shapespace.types import FloatArray
 
 _AGAIN = "give the file as it was downloaded"
-_LARGEST_BYTES = 2**31
-_HDF5_AT = 512
+_LARGEST_BYTES = 2**31  # 2 GiB
+_HDF5_AT = 512  # MAT-file 7.3: HDF5 begins after a user block of 512 bytes
 
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where a kind of file has its parts, and what they mean.
+    """Variable names of one kind of file, and their meaning.
 
     Args:
         title: of the model, for provenance.
@@ -87,12 +87,19 @@ class Matlab:
         check_file(path, _LARGEST_BYTES, _AGAIN)
         try:
             tree = _tree(path)
-            layout = next((one for one in _LAYOUTS if {one.mean, one.basis, one.spread} <= tree.arrays.keys()), None)
+            layout = next(
+                (
+                    candidate
+                    for candidate in _LAYOUTS
+                    if {candidate.mean, candidate.basis, candidate.spread} <= tree.arrays.keys()
+                ),
+                None,
+            )
             if layout is None:
-                known = ", ".join(one.title for one in _LAYOUTS)
+                known = ", ".join(candidate.title for candidate in _LAYOUTS)
                 raise ModelFileError(f"{path} holds no shape model of a kind that is known ({known}).")
             return _model(tree, layout)
-        except ApartError as error:
+        except SandboxError as error:
             raise ModelFileError(f"{path} is damaged or cut short: {error}; {_AGAIN}.") from error
 
 
@@ -100,8 +107,10 @@ def _tree(path: Path) -> Tree:
     with open_file(path) as stream:
         head = stream.read(_HDF5_AT + len(HDF5_SIGNATURE))
     if not (head.startswith(HDF5_SIGNATURE) or head[_HDF5_AT:] == HDF5_SIGNATURE):
-        return read_matlab_apart(path, _WANTED)
-    tree = read_hdf5_apart(path, leave=("/texMU", "/texPC", "/tex", "/segbin", "/segbb", "/segMM", "/segMB", "/#refs#"))
+        return read_matlab_sandboxed(path, _WANTED)
+    tree = read_hdf5_sandboxed(
+        path, leave=("/texMU", "/texPC", "/tex", "/segbin", "/segbb", "/segMM", "/segMB", "/#refs#")
+    )
     # MATLAB has the last axis first.
     return Tree({name: array.T for name, array in tree.arrays.items()}, groups=tree.groups)
 
@@ -112,18 +121,20 @@ def _model(tree: Tree, layout: _Layout) -> LinearModel:
     if basis.shape == (len(spread), len(mean)) != (len(mean), len(spread)):
         basis = basis.T
     if not all(map(are_measurable, (mean, basis, spread))) or not (spread >= 0).all():
-        raise ApartError("its numbers are not finite, too large, or spread below 0")
+        raise SandboxError("its numbers are not finite, too large, or spread below 0")
     if len(mean) % 3 or basis.shape != (len(mean), len(spread)):
-        raise ApartError(f"its mean, basis and spread have the shapes {mean.shape}, {basis.shape} and {spread.shape}")
+        raise SandboxError(f"its mean, basis and spread have the shapes {mean.shape}, {basis.shape} and {spread.shape}")
     n_training = layout.n_training
     if isinstance(n_training, str):
-        told = tree.arrays.get(n_training)
+        training_count = tree.arrays.get(n_training)
         n_training = (
-            int(told.reshape(-1)[0]) if told is not None and told.size == 1 and told.reshape(-1)[0] > 1 else None
+            int(training_count.reshape(-1)[0])
+            if training_count is not None and training_count.size == 1 and training_count.reshape(-1)[0] > 1
+            else None
         )
     return LinearModel(
         mean=mean.reshape(-1, 3),
-        shape=Modes(scaled(basis, spread if layout.is_stddev else np.sqrt(spread))),
+        shape=Modes(scale_columns(basis, spread if layout.is_stddev else np.sqrt(spread))),
         faces=_faces(tree.arrays.get(layout.faces), layout, len(mean) // 3),
         mm=layout.mm,
         n_training=n_training,
@@ -137,12 +148,12 @@ def _floats(array: npt.NDArray[Any]) -> FloatArray:
     return np.asarray(array, dtype=np.float64)
 
 
-def _faces(found: npt.NDArray[Any] | None, layout: _Layout, n: int) -> npt.NDArray[np.int32] | None:
-    if found is None or not found.size:
+def _faces(triangles: npt.NDArray[Any] | None, layout: _Layout, n: int) -> npt.NDArray[np.int32] | None:
+    if triangles is None or not triangles.size:
         return None
-    faces = found.T if found.ndim == 2 and found.shape[0] == 3 != found.shape[1] else found
+    faces = triangles.T if triangles.ndim == 2 and triangles.shape[0] == 3 != triangles.shape[1] else triangles
     if faces.ndim != 2 or faces.shape[1] != 3 or not np.isfinite(faces).all() or np.abs(faces).max() > n:
-        raise ApartError(f"its triangles have the shape {found.shape}, or name vertices that it does not have")
+        raise SandboxError(f"its triangles have the shape {triangles.shape}, or name vertices that it does not have")
     # Those of menpo count from 0, those of MATLAB's own from 1.
     faces = faces.astype(np.int32) - (layout.first_vertex or int(faces.min() > 0 and faces.max() == n))
     return faces[:, [0, 2, 1]] if layout.is_clockwise else faces

@@ -1,4 +1,4 @@
-"""Folders written whole or not at all."""
+"""Atomic writing of folders."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         # Beside it, so that one step puts it there.
         with temporary_folder(path.parent) as temporary:
-            whole = temporary / "whole"
-            whole.mkdir()
+            complete = temporary / "whole"
+            complete.mkdir()
             for name, data in files.items():
-                (whole / name).write_bytes(data)
+                (complete / name).write_bytes(data)
             if path.exists():
                 path.rmdir()
-            shutil.move(whole, path)
+            shutil.move(complete, path)
     except OSError as error:
         raise write_error(path, error) from error

@@ -1,4 +1,4 @@
-"""What the model files of others say, before it becomes a model of ours, and what they are to be told of one.
+"""Linear models as files of other tools store them, and the protocols of readers and writers.
 
 Modes are held as what one standard deviation of each does, U sqrt(lambda), in the unit of the file: every convention of
 basis and spread is that product, and a basis that is not orthonormal loses nothing by it.
@@ -19,8 +19,8 @@ from threadpoolctl import threadpool_limits
 from shapespace.errors import ModelFileError
 from shapespace.types import FloatArray, IntArray, SurfaceLandmarks, read_only
 
-ORTHOGONAL: Final = 1e-3
-_LARGEST = 1e30
+ORTHOGONAL: Final = 1e-3  # largest |U^T U - I|; single precision stays below
+_LARGEST = 1e30  # coordinates whose squares stay finite in float64
 _NO_STDDEV = 1e-6
 """Of the largest one; what single precision makes of a mode that is not there."""
 
@@ -46,7 +46,7 @@ class Modes:
 
 @dataclass(frozen=True, eq=False)
 class LinearModel:
-    """One linear shape model as its file has it.
+    """One linear shape model as stored in a file.
 
     Args:
         mean: (V, 3) vertices where all coefficients are zero, with the mean of the expressions.
@@ -80,7 +80,7 @@ class LinearModel:
         object.__setattr__(self, "landmarks", SurfaceLandmarks.of(self.landmarks))
 
     def noting(self, *notes: str) -> LinearModel:
-        """Return it with more `notes`."""
+        """Return the model with more `notes`."""
         return replace(self, notes=(*self.notes, *notes))
 
     def check(self, path: Path) -> None:
@@ -97,7 +97,7 @@ class LinearModel:
         elif any(block.moved.ndim != 2 or len(block.moved) != 3 * n or not block.moved.shape[1] for block in blocks):
             shapes = " and ".join(str(block.moved.shape) for block in blocks)
             wrong = f"its modes have the shape {shapes}, which {n} vertices do not"
-        elif not all(are_measurable(one) for one in (self.mean, *(block.moved for block in blocks))):
+        elif not all(are_measurable(array) for array in (self.mean, *(block.moved for block in blocks))):
             wrong = "it holds numbers that are not finite, or too large for lengths"
         elif any(block.names and len(block.names) != block.moved.shape[1] for block in blocks):
             wrong = "it has another number of names than of modes"
@@ -119,32 +119,35 @@ def are_measurable(array: FloatArray) -> bool:
     return bool((np.abs(array) <= _LARGEST).all())
 
 
-def scaled(basis: npt.ArrayLike, stddev: npt.ArrayLike) -> FloatArray:
+def scale_columns(basis: npt.ArrayLike, stddev: npt.ArrayLike) -> FloatArray:
     """Return U sqrt(lambda), float64, of `basis` (D, K) and `stddev` (K,)."""
     return np.asarray(basis, dtype=np.float64) * np.asarray(stddev, dtype=np.float64)
 
 
-def orthonormal(moved: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return U (D, K), s (K,) and W (M, K) with `moved` (D, M) = U s W^T; modes that do not vary are left out."""
-    length = np.linalg.norm(moved, axis=0)
+def orthonormal(displacements: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return U (D, K), s (K,) and W (M, K) with `displacements` (D, M) = U s W^T, without modes that do not vary."""
+    length = np.linalg.norm(displacements, axis=0)
     order = np.argsort(-length, kind="stable")
     keep = order[length[order] > _NO_STDDEV * length.max()] if length.size and length.max() > 0 else order[:0]
-    unit = moved[:, keep] / length[keep]
+    unit = displacements[:, keep] / length[keep]
     # The last bits hang on the number of threads, and workers, which have one, must find the same model.
     with threadpool_limits(1, user_api="blas"):
-        if np.abs(unit.T @ unit - np.eye(len(keep))).max(initial=0.0) <= ORTHOGONAL and len(keep) == moved.shape[1]:
+        if (
+            np.abs(unit.T @ unit - np.eye(len(keep))).max(initial=0.0) <= ORTHOGONAL
+            and len(keep) == displacements.shape[1]
+        ):
             # As it stands but for the rounding of single precision, so that modes stay the file's own.
-            found, upper = qr(unit, mode="economic")
-            exact = np.asarray(found * np.sign(np.diag(upper)), dtype=np.float64)
-            return exact, length[keep], np.eye(moved.shape[1])[:, keep]
-        left, stddev, right = svd(moved, full_matrices=False)
-    kept = stddev > _NO_STDDEV * stddev.max(initial=0.0)
+            directions, upper = qr(unit, mode="economic")
+            exact = np.asarray(directions * np.sign(np.diag(upper)), dtype=np.float64)
+            return exact, length[keep], np.eye(displacements.shape[1])[:, keep]
+        left, stddev, right = svd(displacements, full_matrices=False)
+    is_kept = stddev > _NO_STDDEV * stddev.max(initial=0.0)
     sign = np.sign(left[np.abs(left).argmax(axis=0), np.arange(left.shape[1])])
-    return (left * sign)[:, kept], stddev[kept], (right.T * sign)[:, kept]
+    return (left * sign)[:, is_kept], stddev[is_kept], (right.T * sign)[:, is_kept]
 
 
 class ModelReader(Protocol):
-    """A format of model files: one module, one class, one place in `MODEL_FORMATS` or `READ_ONLY_MODELS`."""
+    """A reader of one model format: one module, one class, one entry in `MODEL_FORMATS` or `READ_ONLY_MODELS`."""
 
     name: str
     """By which `shapespace convert --to` asks for it."""
@@ -168,7 +171,7 @@ class ModelReader(Protocol):
 
 
 class ModelFormat(ModelReader, Protocol):
-    """A format that is written too."""
+    """A model format with a writer."""
 
     def write(self, model: LinearModel, path: Path) -> Sequence[str]:
         """Write `model` to `path`, whole or not at all, and return sentences on what was changed or left out.

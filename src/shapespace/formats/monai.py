@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from shapespace.errors import FileFormatError, ModelFileError
 from shapespace.formats.facts import json_object
-from shapespace.formats.model_parts import LinearModel, Modes, scaled
+from shapespace.formats.model_parts import LinearModel, Modes, scale_columns
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import read_bytes
 from shapespace.io.meshes.mesh_io import read_mesh
@@ -18,7 +18,7 @@ from shapespace.io.parsing import json_value
 from shapespace.types import FloatArray
 
 _MODEL, _SURFACE = "pca_model.json", "pca_mean_surface.vtp"
-_LARGEST_BYTES = 2**29
+_LARGEST_BYTES = 2**29  # 512 MiB
 _AGAIN = "export the model again"
 _KEYS = (b'"eigenvalues"', b'"explained_variance_ratio"')
 
@@ -60,7 +60,7 @@ class Monai:
             )
         return LinearModel(
             mean=mean.vertices,
-            shape=Modes(scaled(components.T, np.sqrt(variance)), total_variance=_total(variance, ratio)),
+            shape=Modes(scale_columns(components.T, np.sqrt(variance)), total_variance=_total(variance, ratio)),
             faces=mean.faces,
             provenance=f"MONAI-Physio model in {file.parent.name}",
         )

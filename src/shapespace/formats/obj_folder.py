@@ -1,4 +1,4 @@
-"""Folders of OBJ files, one for each shape, as ICT-FaceKit is published: a neutral mesh, identities and expressions."""
+"""Folders of OBJ files, one per shape, in the layout of ICT-FaceKit: a neutral mesh, identities and expressions."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ _NEUTRALS: Final = (_ICT, "neutral", "neutral_mesh")
 _IDENTITY = re.compile(r"identity[ _.-]?\d+", re.IGNORECASE)
 _FACTS = f"{KEY}.json"
 _LICENCES = ("LICENSE", "LICENSE.txt", "LICENSE.md", "LICENCE", "LICENCE.txt")
-_MOST_LICENCE_BYTES = 2**16
-_LOOKED_AT_BYTES = 2**26
-_MOST_SHAPES = 4096
+_MOST_LICENCE_BYTES = 2**16  # 64 KiB
+_LOOKED_AT_BYTES = 2**26  # 64 MiB
+_MOST_SHAPES = 4096  # limit on files that are opened
 _AGAIN = "export all of them again with the same vertices and triangles"
 
 
@@ -43,34 +43,36 @@ class ObjFolder:
     def recognises(self, path: Path, head: bytes) -> bool:
         """Whether one OBJ file there is called neutral and another has as many vertices and faces."""
         try:
-            neutral, others = _files(path)
-            if neutral is None or not others:
+            neutral, mode_files = _files(path)
+            if neutral is None or not mode_files:
                 return False
-            return _counts(neutral) == _counts(others[0]) != (0, 0)
+            return _counts(neutral) == _counts(mode_files[0]) != (0, 0)
         except (OSError, ShapespaceError):
             return False
 
     def read(self, path: Path) -> LinearModel:
         """As `ModelReader.read`."""
-        neutral, others = _files(path)
-        if neutral is None or not others or len(others) > _MOST_SHAPES:
+        neutral, mode_files = _files(path)
+        if neutral is None or not mode_files or len(mode_files) > _MOST_SHAPES:
             raise ModelFileError(
                 f"{path} is no folder of blendshapes: it needs one OBJ file called neutral or {_ICT}, and 1 to "
                 f"{_MOST_SHAPES} others."
             )
-        rest = read_mesh(neutral)
+        neutral_mesh = read_mesh(neutral)
         steps: list[FloatArray] = []
-        for file in others:
+        for file in mode_files:
             shape = read_mesh(file)
-            same = len(shape.vertices) == len(rest.vertices) and _same(shape.faces, rest.faces)
+            same = len(shape.vertices) == len(neutral_mesh.vertices) and _have_same_faces(
+                shape.faces, neutral_mesh.faces
+            )
             if not same:
                 raise ModelFileError(
                     f"{file} has other vertices or triangles than {neutral.name}, so that they are no blendshapes; "
                     f"{_AGAIN}."
                 )
-            steps.append((shape.vertices - rest.vertices).ravel())
-        names = [file.stem for file in others]
-        shape, expression = _parted(np.stack(steps), names)
+            steps.append((shape.vertices - neutral_mesh.vertices).ravel())
+        names = [file.stem for file in mode_files]
+        shape, expression = _split_modes(np.stack(steps), names)
         facts = json_object(read_json(path / _FACTS, "remove it") if (path / _FACTS).is_file() else None)
         notes: list[str] = []
         if not facts:
@@ -78,12 +80,12 @@ class ObjFolder:
         ict = neutral.stem.lower() == _ICT
         return with_facts(
             LinearModel(
-                mean=rest.vertices,
+                mean=neutral_mesh.vertices,
                 shape=shape,
                 expression=expression,
-                faces=rest.faces,
+                faces=neutral_mesh.faces,
                 mm=1.0 if facts else _ICT_MM if ict else None,
-                provenance=f"{len(others)} blendshapes of {path.name}",
+                provenance=f"{len(mode_files)} blendshapes of {path.name}",
                 licence=_licence(path),
                 notes=tuple(notes),
             ),
@@ -93,48 +95,48 @@ class ObjFolder:
     def write(self, model: LinearModel, path: Path) -> Sequence[str]:
         """As `ModelFormat.write`; a new folder, in mm."""
         mm = model.mm or 1.0
-        rest = model.mean * mm
-        files = {f"{_ICT}.obj": write_obj(Mesh(rest, model.faces))}
-        said = ["Each shape is the mean and one standard deviation of a mode, in mm."]
+        mean_mm = model.mean * mm
+        files = {f"{_ICT}.obj": write_obj(Mesh(mean_mm, model.faces))}
+        notes = ["Each shape is the mean and one standard deviation of a mode, in mm."]
         for word, block in (("identity", model.shape), ("expression", model.expression)):
             if block is None:
                 continue
             names = block.names if word == "expression" and _are_file_names(block.names) else ()
             for number, step in enumerate(block.moved.T):
                 name = names[number] if names else f"{word}{number:03d}"
-                files[f"{name}.obj"] = write_obj(Mesh(rest + step.reshape(-1, 3) * mm, model.faces))
+                files[f"{name}.obj"] = write_obj(Mesh(mean_mm + step.reshape(-1, 3) * mm, model.faces))
         files[_FACTS] = json.dumps(facts_of(model), indent=1).encode()
         write_folder(path, files)
-        return said
+        return notes
 
 
 def _files(folder: Path) -> tuple[Path | None, list[Path]]:
     """Return the neutral mesh, if there is exactly one, and the other OBJ files, sorted."""
     if not folder.is_dir():
         return None, []
-    found = sorted(p for p in folder.iterdir() if p.suffix.lower() == ".obj" and not p.name.startswith("."))
-    neutral = [p for p in found if p.stem.lower() in _NEUTRALS]
+    obj_files = sorted(p for p in folder.iterdir() if p.suffix.lower() == ".obj" and not p.name.startswith("."))
+    neutral = [p for p in obj_files if p.stem.lower() in _NEUTRALS]
     if len(neutral) != 1:
-        return None, found
-    return neutral[0], [p for p in found if p != neutral[0]]
+        return None, obj_files
+    return neutral[0], [p for p in obj_files if p != neutral[0]]
 
 
 def _counts(path: Path) -> tuple[int, int]:
-    """Return about how many vertices and faces an OBJ file has, without reading its numbers."""
+    """Return approximate numbers of vertices and faces of an OBJ file, without parsing it."""
     content = b"\n" + read_bytes(path, _LOOKED_AT_BYTES)
     return content.count(b"\nv "), content.count(b"\nf ")
 
 
-def _same(first: IntArray | None, second: IntArray | None) -> bool:
+def _have_same_faces(first: IntArray | None, second: IntArray | None) -> bool:
     return first is second if first is None or second is None else np.array_equal(first, second)
 
 
-def _parted(steps: FloatArray, names: list[str]) -> tuple[Modes, Modes | None]:
+def _split_modes(steps: FloatArray, names: list[str]) -> tuple[Modes, Modes | None]:
     identity = np.array([bool(_IDENTITY.fullmatch(name)) for name in names])
     if not 0 < identity.sum() < len(names):
         return Modes(steps.T, tuple(names)), None
     parts = [
-        Modes(steps[chosen].T, tuple(name for name, one in zip(names, chosen, strict=True) if one))
+        Modes(steps[chosen].T, tuple(name for name, is_chosen in zip(names, chosen, strict=True) if is_chosen))
         for chosen in (identity, ~identity)
     ]
     return parts[0], parts[1]

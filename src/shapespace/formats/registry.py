@@ -1,4 +1,4 @@
-"""The one list of formats, and which of them a file is."""
+"""Registry of model formats, and detection of the format of a file."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ MODEL_FORMATS: Mapping[str, ModelFormat] = {
 """Formats that are read and written, by their names, in the order in which they are asked whether a file is theirs."""
 READ_ONLY_MODELS: Mapping[str, ModelReader] = {one.name: one for one in (Gias(), Flame(), Matlab(), Monai())}
 """Those that are only read, which are asked next."""
-LARGEST_BYTES = 2**34
-_HEAD_BYTES = 4096
+LARGEST_BYTES = 2**34  # 16 GiB
+_HEAD_BYTES = 4096  # signatures and first fields of every format lie within it
 
 
 def read_linear(path: Path) -> tuple[ModelReader, LinearModel]:
@@ -41,15 +41,15 @@ def read_linear(path: Path) -> tuple[ModelReader, LinearModel]:
         ModelFileError: no format is recognised, or it is damaged.
     """
     check_file(path, LARGEST_BYTES, "give a model file")
-    found = _format_of(path)
-    if found is None:
-        known = ", ".join(one.title for one in _readers())
+    model_format = _format_of(path)
+    if model_format is None:
+        known = ", ".join(reader.title for reader in _readers())
         raise ModelFileError(f"{path} is in no format of shape models that shapespace reads: its own, {known}.")
     # The last bits hang on the number of threads, and workers, which have one, must find the same model.
     with threadpool_limits(1, user_api="blas"), np.errstate(invalid="ignore", over="ignore"):
-        model = found.read(path)
+        model = model_format.read(path)
     model.check(path)
-    return found, model
+    return model_format, model
 
 
 def is_known(path: Path) -> bool:
@@ -64,17 +64,19 @@ def format_to_write(path: Path, name: str | None) -> ModelFormat:
         InputError: there is none, or it is only read.
     """
 
-    def is_meant(one: ModelReader) -> bool:
-        return one.name == name or (name is None and path.name.lower().endswith(tuple(one.suffixes)))
+    def is_meant(candidate: ModelReader) -> bool:
+        return candidate.name == name or (name is None and path.name.lower().endswith(tuple(candidate.suffixes)))
 
-    if (found := next(filter(is_meant, MODEL_FORMATS.values()), None)) is not None:
-        return found
-    if (only := next(filter(is_meant, READ_ONLY_MODELS.values()), None)) is not None:
-        what = f"Cannot write {path}: {only.title} is only read"
+    if (meant := next(filter(is_meant, MODEL_FORMATS.values()), None)) is not None:
+        return meant
+    if (read_only := next(filter(is_meant, READ_ONLY_MODELS.values()), None)) is not None:
+        problem = f"Cannot write {path}: {read_only.title} is only read"
     else:
-        what = f"There is no format {name!r}" if name else f"The name {path.name!r} names no format"
-    names = ", ".join(f"{one.name} ({one.suffixes[0]})" if one.suffixes else one.name for one in MODEL_FORMATS.values())
-    raise InputError(f"{what}; choose one of {names}, or .h5 for shapespace's own.")
+        problem = f"There is no format {name!r}" if name else f"The name {path.name!r} names no format"
+    names = ", ".join(
+        f"{writer.name} ({writer.suffixes[0]})" if writer.suffixes else writer.name for writer in MODEL_FORMATS.values()
+    )
+    raise InputError(f"{problem}; choose one of {names}, or .h5 for shapespace's own.")
 
 
 def _readers() -> list[ModelReader]:
@@ -86,4 +88,4 @@ def _format_of(path: Path) -> ModelReader | None:
     if not path.is_dir():
         with open_file(path) as file:
             head = file.read(_HEAD_BYTES)
-    return next((one for one in _readers() if one.recognises(path, head)), None)
+    return next((reader for reader in _readers() if reader.recognises(path, head)), None)

@@ -19,13 +19,13 @@ from shapespace.formats.statismo import model_of
 from shapespace.formats.statismo_tree import tree_of
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import atomic_path, read_bytes
-from shapespace.io.sandbox import ApartError, Tree
+from shapespace.io.sandbox import SandboxError, Tree
 
 _AGAIN = "export it again from where it was made"
-_LARGEST_BYTES = 2**31
-_MOST_NODES = 4096
-_DEEPEST = 16
-_LONGEST_NAME = 1024
+_LARGEST_BYTES = 2**31  # 2 GiB
+_MOST_NODES = 4096  # limit on damaged files; models have tens
+_DEEPEST = 16  # limit on damaged files; models have three levels
+_LONGEST_NAME = 1024  # characters; limit on damaged files
 _MARKS = (b'"apiVersion"', b"H5T_", b"H5S_", b"H5L_")
 _FLOAT: Final = {"class": "H5T_FLOAT", "base": "H5T_IEEE_F32LE"}
 _INTEGER: Final = {"class": "H5T_INTEGER", "base": "H5T_STD_I32LE"}
@@ -58,16 +58,16 @@ class ScalismoJson:
         try:
             tree = _tree(read_bytes(path))
         except (ValueError, OverflowError, RecursionError, MemoryError) as error:
-            told = " ".join(str(error).split())[:120].rstrip(".")
-            raise ModelFileError(f"{path} is damaged, or no HDF5/JSON: {told}; {_AGAIN}.") from error
+            message = " ".join(str(error).split())[:120].rstrip(".")
+            raise ModelFileError(f"{path} is damaged, or no HDF5/JSON: {message}; {_AGAIN}.") from error
         return model_of(tree, path)
 
     def write(self, model: LinearModel, path: Path) -> Sequence[str]:
         """As `ModelFormat.write`."""
-        tree, said = tree_of(model)
+        tree, notes = tree_of(model)
         with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as out:
             out.writelines(_text_of(tree))
-        return said
+        return notes
 
 
 class _Link(msgspec.Struct):
@@ -101,7 +101,7 @@ class _File(msgspec.Struct):
 
 
 def _tree(text: bytes) -> Tree:
-    """Return the tree by the links from its root; what nothing links to is not looked at.
+    """Return the tree of linked objects from the root; objects without a link are ignored.
 
     Raises:
         ValueError: it is no such file, as a clause.
@@ -115,23 +115,23 @@ def _tree(text: bytes) -> Tree:
     while waiting:
         path, known_as = waiting.pop()
         if known_as not in file.groups:
-            raise ApartError(f"there is no group {path or '/'} in it")
+            raise SandboxError(f"there is no group {path or '/'} in it")
         if len(groups) + len(arrays) + len(waiting) > _MOST_NODES or path.count("/") > _DEEPEST:
-            raise ApartError("it has more groups than a model")
+            raise SandboxError("it has more groups than a model")
         group = file.groups[known_as]
         groups.append(path or "/")
         attributes[path or "/"] = _attributes(group.attributes)
         for link in group.links:
             inner = f"{path}/{link.title}"
             if link.kind != "H5L_TYPE_HARD" or len(link.title) > _LONGEST_NAME:
-                raise ApartError(f"{inner[:_LONGEST_NAME]} is a link to elsewhere")
+                raise SandboxError(f"{inner[:_LONGEST_NAME]} is a link to elsewhere")
             if link.collection == "groups":
                 waiting.append((inner, link.id))
             elif link.id in file.datasets:
                 dataset = file.datasets[link.id]
                 left -= len(bytes(dataset.value))
                 if left < 0:
-                    raise ApartError("it links to the same values again and again")
+                    raise SandboxError("it links to the same values again and again")
                 attributes[inner] = _attributes(dataset.attributes)
                 value = _value(dataset, inner)
                 if isinstance(value, str):
@@ -141,16 +141,16 @@ def _tree(text: bytes) -> Tree:
     return Tree(arrays, texts, attributes, tuple(groups))
 
 
-def _attributes(found: Sequence[_Attribute]) -> dict[str, Any]:
+def _attributes(entries: Sequence[_Attribute]) -> dict[str, Any]:
     """Return numbers and texts by name; converters of HDF5 files write single ones as lists of one."""
-    told: dict[str, Any] = {}
-    for one in found:
-        value = one.value
+    values: dict[str, Any] = {}
+    for entry in entries:
+        value = entry.value
         while isinstance(value, list) and len(cast(list[Any], value)) == 1:
             value = cast(list[Any], value)[0]
         if isinstance(value, str | int | float):
-            told[one.name] = value.rstrip("\0") if isinstance(value, str) else value
-    return told
+            values[entry.name] = value.rstrip("\0") if isinstance(value, str) else value
+    return values
 
 
 def _value(dataset: _Dataset, path: str) -> npt.NDArray[Any] | str | None:
@@ -164,17 +164,17 @@ def _value(dataset: _Dataset, path: str) -> npt.NDArray[Any] | str | None:
         return value.rstrip("\0") if isinstance(value, str) else None
     if kind not in ("H5T_FLOAT", "H5T_INTEGER"):
         return None
-    one: Any = int if kind == "H5T_INTEGER" else float
+    number_type: Any = int if kind == "H5T_INTEGER" else float
     dims = _of(dataset.shape, "dims")
     shape = cast(list[Any], dims) if isinstance(dims, list) else []
     if len(shape) > 2 or not all(isinstance(size, int) and size >= 0 for size in shape):
         return None
     if shape and math.prod(shape) == 0:
         return np.empty(shape)
-    typed = one if not shape else list[one] if len(shape) == 1 else list[list[one]]
+    typed = number_type if not shape else list[number_type] if len(shape) == 1 else list[list[number_type]]
     array = np.array(msgspec.json.decode(dataset.value, type=typed, strict=True))
     if array.shape != tuple(shape) or array.dtype.kind not in "iuf":
-        raise ApartError(f"{path} is cut short, or not of the shape {shape} that it says")
+        raise SandboxError(f"{path} is cut short, or not of the shape {shape} that it says")
     # Characters of legacy VTK files are such numbers.
     return array.astype(np.uint8) if base.endswith(("I8LE", "U8LE", "I8BE", "U8BE")) else array
 
@@ -201,11 +201,11 @@ def _text_of(tree: Tree) -> Generator[str]:
             }
             for child in children
         ]
-        told = [
+        entries = [
             {"name": name, "type": _TEXT, "shape": _SCALAR, "value": str(value)}
             for name, value in tree.attributes.get(path, {}).items()
         ]
-        groups[known_as[path]] = {"alias": [path], "attributes": told, "links": links}
+        groups[known_as[path]] = {"alias": [path], "attributes": entries, "links": links}
     yield f'{{"apiVersion":"1.0.0","root":"{known_as["/"]}","groups":{_json(groups)},"datasets":{{'
     comma = ""
     for path, text in tree.texts.items():

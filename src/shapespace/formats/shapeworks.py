@@ -25,7 +25,7 @@ from shapespace.formats.model_folder import write_folder
 from shapespace.formats.model_parts import LinearModel, Modes
 from shapespace.geometry.procrustes import align_in_place
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.io.containers.json_files import check_file, json_of
+from shapespace.io.containers.json_files import check_file, parse_json
 from shapespace.io.files import read_bytes, write_text
 from shapespace.io.meshes.mesh_io import MESH_ENDINGS, read_mesh
 from shapespace.io.meshes.vtk import write_vtk
@@ -35,10 +35,10 @@ from shapespace.io.tables.workbook import sheet_rows
 from shapespace.types import FloatArray, IntArray, Mesh
 
 _AGAIN = "run optimize in ShapeWorks again, or copy its folder of particles beside the project"
-_LARGEST_PROJECT_BYTES = 2**26
+_LARGEST_PROJECT_BYTES = 2**26  # 64 MiB
 _PARTICLES = re.compile(r"(world|local)_particles_(.+)")
 _SURFACES = ("groomed", "shape", "mesh")
-_ON_PARTICLES = 1e-6
+_ON_PARTICLES = 1e-6  # share of the extent: rounding of particles in text
 MOST_DENSE = 2_000
 """Largest number of particles for one spline; it takes 1.0 s for 2,000 and would take 45 s for 12,000."""
 NEIGHBOURS = 32
@@ -74,7 +74,7 @@ class ShapeWorks:
         if path.suffix.lower() == ".xlsx":
             rows = _sheet(content, path)
         else:
-            tree = json_object(json_of(content, path, _AGAIN))
+            tree = json_object(parse_json(content, path, _AGAIN))
             rows = _rows(tree.get("data"))
             facts = json_object(tree.get(KEY))
         return with_facts(_model(_Project(path, rows, Allowance(len(content), path))), facts)
@@ -88,15 +88,15 @@ class ShapeWorks:
         if path.suffix.lower() == ".xlsx":
             raise InputError(f"{path} cannot be written: workbooks are only read; give a name that ends in .swproj.")
         blocks = [model.shape] if model.expression is None else [model.shape, model.expression]
-        moved = np.concatenate([block.moved for block in blocks], axis=1) * (model.mm or 1.0)
+        displacements = np.concatenate([block.moved for block in blocks], axis=1) * (model.mm or 1.0)
         mean = model.mean * (model.mm or 1.0)
-        count = moved.shape[1] + 1
+        count = displacements.shape[1] + 1
         z = np.asarray(dct(np.eye(count), norm="ortho", axis=0), dtype=np.float64)[1:] * np.sqrt(count - 1)
         folder = path.with_name(f"{path.stem}_particles")
         files: dict[str, bytes] = {}
         rows: list[dict[str, str]] = []
         for number in range(count):
-            vertices = mean + (moved @ z[:, number]).reshape(-1, 3)
+            vertices = mean + (displacements @ z[:, number]).reshape(-1, 3)
             name = f"shape_{number:03d}"
             particles, surface = f"{name}.particles", f"{name}.vtk"
             files[particles] = number_lines(vertices, "%.17g %.17g %.17g").encode()
@@ -109,14 +109,14 @@ class ShapeWorks:
         write_folder(folder, files)
         tree = {"data": rows, "optimize": {"number_of_particles": str(len(mean))}, KEY: facts_of(model)}
         write_text(path, json.dumps(tree, indent=1) + "\n")
-        said = [
+        notes = [
             f"The model is {count} shapes in {folder.name}, whose mean and covariance (n - 1) are its own; they are no "
             "subjects.",
             f"Each of the {len(mean)} vertices is a particle, in mm.",
         ]
         if model.expression is not None:
-            said.append("Identity and expression are no longer apart.")
-        return said
+            notes.append("Identity and expression are no longer apart.")
+        return notes
 
 
 @dataclass
@@ -183,7 +183,7 @@ def _model(project: _Project) -> LinearModel:
     _, stddev, directions = np.linalg.svd((flat - mean) / np.sqrt(len(flat) - 1), full_matrices=False)
     modes = directions.T * stddev
     # One less than there are subjects; the last is rounding.
-    moved = modes[:, : len(flat) - 1]
+    displacements = modes[:, : len(flat) - 1]
     surface = _surface(project, rows, domains, shapes, mean.reshape(-1, 3), counts)
     points: FloatArray = mean.reshape(-1, 3)
     faces: IntArray | None = None
@@ -191,10 +191,10 @@ def _model(project: _Project) -> LinearModel:
         notes.append(f"It is a point model of {len(points)} particles: {surface}.")
     elif surface.carry is None:
         faces = surface.faces
-    elif isinstance(carried := surface.carried(points, moved), str):
+    elif isinstance(carried := surface.carried(points, displacements), str):
         notes.append(f"It is a point model of {len(points)} particles: {carried}.")
     else:
-        points, moved = carried
+        points, displacements = carried
         faces = surface.faces
         notes.append(
             f"Its surface is the mesh of {surface.subject}, the most average subject, carried by the particles with "
@@ -202,7 +202,7 @@ def _model(project: _Project) -> LinearModel:
         )
     return LinearModel(
         mean=points,
-        shape=Modes(moved),
+        shape=Modes(displacements),
         faces=faces,
         n_training=len(rows),
         provenance=f"ShapeWorks project {project.path.name}: {len(rows)} subjects, {sum(counts)} particles",
@@ -212,12 +212,12 @@ def _model(project: _Project) -> LinearModel:
 
 def _domains(project: _Project) -> tuple[str, list[str]]:
     """Return whether particles are `world` or `local`, and the names of the domains."""
-    found: dict[str, list[str]] = {"world": [], "local": []}
+    names_by_space: dict[str, list[str]] = {"world": [], "local": []}
     for key, value in project.rows[0].items() if project.rows else ():
         match = _PARTICLES.fullmatch(key)
         if match and value:
-            found[match[1]].append(match[2])
-    for kind, domains in found.items():
+            names_by_space[match[1]].append(match[2])
+    for kind, domains in names_by_space.items():
         if domains:
             return kind, domains
     raise ModelFileError(f"{project.path} names no particles; {_AGAIN}.")
@@ -225,7 +225,7 @@ def _domains(project: _Project) -> tuple[str, list[str]]:
 
 @dataclass(frozen=True, eq=False)
 class _Surface:
-    """The mesh of a subject.
+    """Mesh of a subject.
 
     Args:
         subject: its name.
@@ -238,23 +238,23 @@ class _Surface:
     faces: IntArray
     carry: Sequence[tuple[FloatArray, FloatArray]] | None
 
-    def carried(self, mean: FloatArray, moved: FloatArray) -> tuple[FloatArray, FloatArray] | str:
+    def carried(self, mean: FloatArray, displacements: FloatArray) -> tuple[FloatArray, FloatArray] | str:
         """Return the vertices (V, 3) and modes (3V, K) that the particles `mean` and their modes carry, or why not."""
-        if 24 * sum(len(mesh) for _, mesh in self.carry or ()) * (1 + moved.shape[1]) > _MOST_CARRIED_BYTES:
+        if 24 * sum(len(mesh) for _, mesh in self.carry or ()) * (1 + displacements.shape[1]) > _MOST_CARRIED_BYTES:
             return f"its modes on the mesh of {self.subject} would take more than {_MOST_CARRIED_BYTES >> 30} GiB"
-        steps = moved.reshape(len(mean), -1)
-        at, vertices, modes = 0, list[FloatArray](), list[FloatArray]()
+        steps = displacements.reshape(len(mean), -1)
+        start, vertices, modes = 0, list[FloatArray](), list[FloatArray]()
         for particles, mesh in self.carry or ():
-            rows = slice(at, at + len(particles))
-            at += len(particles)
+            rows = slice(start, start + len(particles))
+            start += len(particles)
             # Splines are linear in what the particles do, so that the model stays a linear one.
-            what = np.concatenate([mean[rows] - particles, steps[rows]], axis=1)
+            particle_values = np.concatenate([mean[rows] - particles, steps[rows]], axis=1)
             try:
-                found = interpolate_displacements(particles, what, mesh)
+                carried_values = interpolate_displacements(particles, particle_values, mesh)
             except np.linalg.LinAlgError:
                 return "its particles lie in a plane or nearly coincide, so that they carry no mesh"
-            vertices.append(mesh + found[:, :3])
-            modes.append(found[:, 3:].reshape(3 * len(mesh), -1))
+            vertices.append(mesh + carried_values[:, :3])
+            modes.append(carried_values[:, 3:].reshape(3 * len(mesh), -1))
         return np.concatenate(vertices), np.concatenate(modes)
 
 
@@ -288,8 +288,8 @@ def interpolate_displacements(
     nearest = np.asarray(KDTree(particles).query(points, NEIGHBOURS)[1], dtype=np.int64)
     weights = np.concatenate(
         [
-            _spline_weights(points[at : at + _BATCH], particles[nearest[at : at + _BATCH]])
-            for at in range(0, len(points), _BATCH)
+            _spline_weights(points[start : start + _BATCH], particles[nearest[start : start + _BATCH]])
+            for start in range(0, len(points), _BATCH)
         ]
     )
     starts = np.arange(0, nearest.size + 1, NEIGHBOURS)
@@ -321,9 +321,9 @@ def _surface(
     number = int(((shapes - mean) ** 2).sum(axis=(1, 2)).argmin())
     row, points = rows[number], shapes[number]
     bounds = np.cumsum([0, *counts])
-    found: list[tuple[FloatArray, FloatArray]] = []
+    pairs: list[tuple[FloatArray, FloatArray]] = []
     faces: list[IntArray] = []
-    before, exact = 0, True
+    n_vertices, exact = 0, True
     for k, domain in enumerate(domains):
         name = next((row[f"{key}_{domain}"] for key in _SURFACES if row.get(f"{key}_{domain}")), "")
         if not name.lower().endswith(tuple(MESH_ENDINGS)):
@@ -336,36 +336,36 @@ def _surface(
             if local:
                 source = project.particles(local)
                 T = fit_similarity(source, world)
-                apart = float(np.sqrt(((T.apply(source) - world) ** 2).sum(axis=1).mean()))
+                distance = float(np.sqrt(((T.apply(source) - world) ** 2).sum(axis=1).mean()))
                 vertices = vertices if np.array_equal(source, world) else T.apply(vertices)
             else:
-                apart = 0.0
+                distance = 0.0
         except ShapespaceError as error:
             # A project without its meshes is a model still.
             return f"the mesh of the most average subject cannot be used ({str(error).rstrip('.')[:160]})"
         size = float(np.ptp(world, axis=0).max())
         if mesh.faces is None:
             return "the mesh of the most average subject has no triangles"
-        beside = np.maximum(vertices.min(axis=0) - world.min(axis=0), world.max(axis=0) - vertices.max(axis=0))
-        if apart > _MOST_APART * size or float(beside.max()) > _MOST_APART * size:
+        gap = np.maximum(vertices.min(axis=0) - world.min(axis=0), world.max(axis=0) - vertices.max(axis=0))
+        if distance > _MOST_APART * size or float(gap.max()) > _MOST_APART * size:
             return "the mesh of the most average subject does not lie where its particles are"
         is_vertices = vertices.shape == world.shape and np.abs(vertices - world).max() <= _ON_PARTICLES * size
         exact = exact and bool(is_vertices)
-        found.append((world, vertices))
-        faces.append(mesh.faces + before)
-        before += len(vertices)
+        pairs.append((world, vertices))
+        faces.append(mesh.faces + n_vertices)
+        n_vertices += len(vertices)
     subject = row.get("name") or Path(row.get(f"world_particles_{domains[0]}", "")).stem
-    joined = np.concatenate(faces)
+    all_faces = np.concatenate(faces)
     if exact:
-        return _Surface(subject, joined, None)
-    if any(len(np.unique(world, axis=0)) < len(world) or len(world) < 5 for world, _ in found):
+        return _Surface(subject, all_faces, None)
+    if any(len(np.unique(world, axis=0)) < len(world) or len(world) < 5 for world, _ in pairs):
         return "particles coincide or are too few to carry a mesh"
-    return _Surface(subject, joined, found)
+    return _Surface(subject, all_faces, pairs)
 
 
 def _rows(data: object) -> list[Row]:
-    found = cast(list[object], data) if isinstance(data, list) else []
-    return [{key: value for key, value in json_object(row).items() if isinstance(value, str)} for row in found]
+    rows = cast(list[object], data) if isinstance(data, list) else []
+    return [{key: value for key, value in json_object(row).items() if isinstance(value, str)} for row in rows]
 
 
 def _sheet(content: bytes, path: Path) -> list[Row]:
@@ -374,4 +374,4 @@ def _sheet(content: bytes, path: Path) -> list[Row]:
         table = sheet_rows(content, "data")
     except ValueError as error:
         raise ModelFileError(f"{path} {error}, so it is no project of ShapeWorks; {_AGAIN}.") from error
-    return [{table[0][at]: text for at, text in cells.items() if at in table[0]} for cells in table[1:]]
+    return [{table[0][column]: text for column, text in cells.items() if column in table[0]} for cells in table[1:]]

@@ -1,4 +1,4 @@
-"""statismo and scalismo models: HDF5 files, and one tree of groups that their other container shares.
+"""statismo and scalismo models in HDF5, and the tree of groups that both of their containers share.
 
 Dialects differ in how texts, attributes and sizes are stored, in whether a column of the basis is of length 1, and in
 where the points are; all are told apart by what the tree holds. A Morphable Model (Basel Face Model, scalismo-faces) is
@@ -16,24 +16,24 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import ModelFileError, ShapespaceError
-from shapespace.formats.model_parts import ORTHOGONAL, LinearModel, Modes, are_measurable, are_triangles, scaled
+from shapespace.formats.model_parts import ORTHOGONAL, LinearModel, Modes, are_measurable, are_triangles, scale_columns
 from shapespace.formats.statismo_tree import PARAMETERS, hdf5_of, tree_of
 from shapespace.geometry.landmark_placement import place_landmarks
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import write_bytes
 from shapespace.io.landmarks.landmark_io import LANDMARK_FORMATS
 from shapespace.io.meshes.vtk import read_vtk
-from shapespace.io.sandbox import HDF5_SIGNATURE, ApartError, Tree, read_hdf5_apart
+from shapespace.io.sandbox import HDF5_SIGNATURE, SandboxError, Tree, read_hdf5_sandboxed
 from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks
 
 _AGAIN = "export it again from where it was made"
-_LARGEST_BYTES = 2**31
+_LARGEST_BYTES = 2**31  # 2 GiB
 _POINTS_AT = 1e-3
 """Share of the extent of the model; landmarks farther from its surface are left out."""
 _SINGLE = 2e-6
 """Share of the size of the model by which single precision may move a point."""
-_UNIT_LENGTH = 1e-2
-_BFM_MODES = 199
+_UNIT_LENGTH = 1e-2  # deviation of a column's norm from 1 from which the basis counts as scaled
+_BFM_MODES = 199  # Basel Face Model 2017 and 2019: shape modes
 _BFM_LICENCE = "Basel Face Model: non-commercial research only, see its licence"
 _LEGACY_POINTS = "representer/reference-mesh/vertex-coordinates"
 _LEGACY_CELLS = "representer/reference-mesh/triangle-list"
@@ -56,15 +56,15 @@ class Statismo:
         """As `ModelReader.read`."""
         check_file(path, _LARGEST_BYTES, _AGAIN)
         try:
-            return model_of(read_hdf5_apart(path, leave=("/color",)), path)
-        except ApartError as error:
+            return model_of(read_hdf5_sandboxed(path, leave=("/color",)), path)
+        except SandboxError as error:
             raise ModelFileError(f"{path} is damaged or cut short: {error}; {_AGAIN}.") from error
 
     def write(self, model: LinearModel, path: Path) -> Sequence[str]:
         """As `ModelFormat.write`; version 0.9, single precision, a Morphable Model where there are expressions."""
-        tree, said = tree_of(model)
+        tree, notes = tree_of(model)
         write_bytes(path, hdf5_of(tree))
-        return said
+        return notes
 
 
 def model_of(tree: Tree, path: Path) -> LinearModel:
@@ -86,8 +86,8 @@ def model_of(tree: Tree, path: Path) -> LinearModel:
 
 
 @dataclass(frozen=True, eq=False)
-class _Part:
-    """One model of a tree: mean (D,), moved (D, K), and variance that no mode holds."""
+class _ModelBlock:
+    """One model of a tree: mean (D,), displacements (D, K), and the variance of the noise."""
 
     mean: FloatArray
     moved: FloatArray
@@ -109,12 +109,12 @@ def _model(tree: Tree, path: Path) -> LinearModel:
         mean, expression = mean + added.mean, added.modes()
     if "/color" in tree.groups:
         notes.append("Its model of colour is left out.")
-    told = _parameters(tree, root)
-    points, faces, kept = _surface(tree, root, mean.reshape(-1, 3), notes)
+    parameters = _parameters(tree, root)
+    points, faces, used_rows = _surface(tree, root, mean.reshape(-1, 3), notes)
     shape = part.modes()
-    if kept is not None:
-        rows = (3 * kept[:, None] + np.arange(3)).ravel()
-        mean, points, shape = mean[rows], points[kept], Modes(shape.moved[rows])
+    if used_rows is not None:
+        rows = (3 * used_rows[:, None] + np.arange(3)).ravel()
+        mean, points, shape = mean[rows], points[used_rows], Modes(shape.moved[rows])
     representer = str(tree.attributes.get(f"{root}/representer", {}).get("name", ""))
     is_bfm = root == "/shape" and part.moved.shape[1] == _BFM_MODES
     return LinearModel(
@@ -122,21 +122,21 @@ def _model(tree: Tree, path: Path) -> LinearModel:
         shape=shape,
         expression=expression,
         faces=faces,
-        mm=_mm(tree, root, told),
+        mm=_mm(tree, root, parameters),
         landmarks=_landmarks(tree, (points, mean.reshape(-1, 3)), faces, notes, path),
-        n_training=_n_training(tree, root, part, told),
+        n_training=_n_training(tree, root, part, parameters),
         # Not so of Gaussian processes: fits that took their variances as they stand were too sure of themselves.
-        held_out=told.get("held_out") == "yes",
-        provenance=told.get("provenance") or " ".join(f"statismo model {representer}".split()),
-        licence=told.get("licence") or (_BFM_LICENCE if is_bfm else ""),
+        held_out=parameters.get("held_out") == "yes",
+        provenance=parameters.get("provenance") or " ".join(f"statismo model {representer}".split()),
+        licence=parameters.get("licence") or (_BFM_LICENCE if is_bfm else ""),
         notes=tuple(notes),
     )
 
 
 def _roots(tree: Tree) -> list[str]:
     """Return where the catalogue says that models are, without doubled slashes."""
-    found = [text for path, text in tree.texts.items() if path.startswith("/catalog/") and path.endswith("/modelPath")]
-    return ["/" + "/".join(part for part in text.split("/") if part) for text in found]
+    paths = [text for path, text in tree.texts.items() if path.startswith("/catalog/") and path.endswith("/modelPath")]
+    return ["/" + "/".join(part for part in text.split("/") if part) for text in paths]
 
 
 def _root(tree: Tree, path: Path) -> str:
@@ -149,15 +149,15 @@ def _root(tree: Tree, path: Path) -> str:
 
 
 def _version(tree: Tree, root: str) -> tuple[int, int] | None:
-    for where in (root, ""):
-        found = [tree.arrays.get(f"{where}/version/{name}") for name in ("majorVersion", "minorVersion")]
-        if all(one is not None and one.size == 1 for one in found):
-            major, minor = (int(one.reshape(-1)[0]) for one in found if one is not None)
+    for prefix in (root, ""):
+        numbers = [tree.arrays.get(f"{prefix}/version/{name}") for name in ("majorVersion", "minorVersion")]
+        if all(number is not None and number.size == 1 for number in numbers):
+            major, minor = (int(number.reshape(-1)[0]) for number in numbers if number is not None)
             return major, minor
     return None
 
 
-def _part(tree: Tree, root: str) -> _Part:
+def _part(tree: Tree, root: str) -> _ModelBlock:
     mean, variance = _array(tree, f"{root}/model/mean").ravel(), _array(tree, f"{root}/model/pcaVariance").ravel()
     basis = _array(tree, f"{root}/model/pcaBasis")
     if basis.shape == (len(variance), len(mean)) != (len(mean), len(variance)):
@@ -182,12 +182,12 @@ def _part(tree: Tree, root: str) -> _Part:
     else:
         raise ValueError(f"it is of version {version[0]}.{version[1]}, and 0.8, 0.9 and 1 are known")
     unit = basis / np.where(is_scaled & (length > 0), length, 1.0)
-    there = length > 0
-    skew = np.abs(unit[:, there].T @ unit[:, there] - np.eye(int(there.sum()))).max(initial=0.0)
+    is_used = length > 0
+    skew = np.abs(unit[:, is_used].T @ unit[:, is_used] - np.eye(int(is_used.sum()))).max(initial=0.0)
     # The file has variances less the noise, which every direction has.
-    within = len(variance) if skew <= ORTHOGONAL else 0
-    moved = scaled(unit, np.sqrt(variance + (noise if within else 0.0)))
-    return _Part(mean, moved, noise * (len(mean) - within))
+    n_orthogonal = len(variance) if skew <= ORTHOGONAL else 0
+    displacements = scale_columns(unit, np.sqrt(variance + (noise if n_orthogonal else 0.0)))
+    return _ModelBlock(mean, displacements, noise * (len(mean) - n_orthogonal))
 
 
 def _array(tree: Tree, path: str) -> FloatArray:
@@ -201,8 +201,8 @@ def _surface(
 ) -> tuple[FloatArray, IntArray | None, npt.NDArray[np.int64] | None]:
     """Return the reference's points (V, 3), triangles or None, and of a solid the vertices of its surface or None."""
     n = len(mean)
-    told = tree.attributes.get(f"{root}/representer", {})
-    kind = str(told.get("datasetType", "")).upper()
+    representer = tree.attributes.get(f"{root}/representer", {})
+    kind = str(representer.get("datasetType", "")).upper()
     if kind.startswith("IMAGE") or kind == "VECTOR":
         raise ValueError(f"it is a model of {kind.lower()}s and not of surfaces")
     points, is_by_column = _points(tree, root, mean)
@@ -221,11 +221,11 @@ def _surface(
     if cells.min() < 0 or cells.max() >= n:
         raise ValueError("its cells name points that it does not have")
     if cells.shape[1] == 4:
-        faces = _outside(cells.astype(np.int64), mean)
-        kept = np.unique(faces)
-        notes.append(f"Of its tetrahedra the surface is read, {len(faces)} triangles; {n - len(kept)} points within "
+        faces = _outer_triangles(cells.astype(np.int64), mean)
+        used = np.unique(faces)
+        notes.append(f"Of its tetrahedra the surface is read, {len(faces)} triangles; {n - len(used)} points within "
                      "are left out.")  # fmt: skip
-        return points, np.searchsorted(kept, faces).astype(np.int32), kept
+        return points, np.searchsorted(used, faces).astype(np.int32), used
     if cells.shape[1] != 3:
         notes.append(f"Its cells of {cells.shape[1]} points are left out.")
         return points, None, None
@@ -233,22 +233,22 @@ def _surface(
 
 
 def _points(tree: Tree, root: str, mean: FloatArray) -> tuple[FloatArray, bool]:
-    """Return the points of the reference (V, 3), the mean where there are none, and whether they stand in columns."""
-    found = tree.arrays.get(f"{root}/{_LEGACY_POINTS}")
-    if found is not None and found.shape == mean.shape:
-        return found.astype(np.float64), False
-    found = tree.arrays.get(f"{root}/representer/points")
-    if found is None:
+    """Return the points of the reference (V, 3), or the mean without one, and whether they are stored in columns."""
+    points = tree.arrays.get(f"{root}/{_LEGACY_POINTS}")
+    if points is not None and points.shape == mean.shape:
+        return points.astype(np.float64), False
+    points = tree.arrays.get(f"{root}/representer/points")
+    if points is None:
         return mean, True
-    if found.shape == mean.shape[::-1]:
-        return found.T.astype(np.float64), True
-    if found.shape != mean.shape:
-        raise ValueError(f"its mean has {len(mean)} vertices and its points the shape {found.shape}")
-    return found.astype(np.float64), False
+    if points.shape == mean.shape[::-1]:
+        return points.T.astype(np.float64), True
+    if points.shape != mean.shape:
+        raise ValueError(f"its mean has {len(mean)} vertices and its points the shape {points.shape}")
+    return points.astype(np.float64), False
 
 
-def _outside(cells: npt.NDArray[np.int64], mean: FloatArray) -> npt.NDArray[np.int64]:
-    """Return the triangles (M, 3) of tetrahedra (C, 4) that belong to one of them alone, turned outward."""
+def _outer_triangles(cells: npt.NDArray[np.int64], mean: FloatArray) -> npt.NDArray[np.int64]:
+    """Return the boundary triangles (M, 3) of tetrahedra (C, 4), oriented outward."""
     a, b, c, d = (mean[cells[:, corner]] for corner in range(4))
     volume = np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a)
     cells = np.where((volume < 0)[:, None], cells[:, [0, 2, 1, 3]], cells)
@@ -257,11 +257,11 @@ def _outside(cells: npt.NDArray[np.int64], mean: FloatArray) -> npt.NDArray[np.i
     return sides[np.sort(first[count == 1])]
 
 
-def _mm(tree: Tree, root: str, told: Mapping[str, str]) -> float | None:
+def _mm(tree: Tree, root: str, attributes: Mapping[str, str]) -> float | None:
     length = tree.arrays.get(f"{root}/representer/length-unit")
     if length is not None and length.size == 1 and 0 < float(length.reshape(-1)[0]) < np.inf:
         return round(1000 * float(length.reshape(-1)[0]), 9)
-    return 1.0 if told.get("unit") == "mm" or root == "/shape" else None
+    return 1.0 if attributes.get("unit") == "mm" or root == "/shape" else None
 
 
 def _parameters(tree: Tree, root: str) -> dict[str, str]:
@@ -270,9 +270,9 @@ def _parameters(tree: Tree, root: str) -> dict[str, str]:
     return {path.removeprefix(start): text for path, text in tree.texts.items() if path.startswith(start)}
 
 
-def _n_training(tree: Tree, root: str, part: _Part, told: Mapping[str, str]) -> int | None:
-    if told.get("n_training", "").isdecimal():
-        return int(told["n_training"][:9])
+def _n_training(tree: Tree, root: str, part: _ModelBlock, parameters: Mapping[str, str]) -> int | None:
+    if parameters.get("n_training", "").isdecimal():
+        return int(parameters["n_training"][:9])
     scores = tree.arrays.get(f"{root}/modelinfo/scores")
     if scores is not None and scores.ndim == 2 and len(scores) == part.moved.shape[1] and scores.shape[1] > 1:
         return scores.shape[1]
@@ -291,19 +291,19 @@ def _landmarks(
         notes: takes a sentence on landmarks that are left out.
         path: of the file.
     """
-    found = _landmark_points(tree, path)
-    if not found:
+    landmark_points = _landmark_points(tree, path)
+    if not landmark_points:
         return SurfaceLandmarks()
-    own = faces if faces is not None and are_triangles(faces, len(surfaces[0])) else None
-    placed = [place_landmarks(Mesh(surface, own), found, precision=_SINGLE) for surface in surfaces]
-    best = min(placed, key=lambda one: float(one.distance_mm.sum()))
-    there = best.distance_mm <= _POINTS_AT * float(np.ptp(surfaces[0], axis=0).max())
-    if not there.all():
+    usable_faces = faces if faces is not None and are_triangles(faces, len(surfaces[0])) else None
+    placed = [place_landmarks(Mesh(surface, usable_faces), landmark_points, precision=_SINGLE) for surface in surfaces]
+    best = min(placed, key=lambda candidate: float(candidate.distance_mm.sum()))
+    is_on_surface = best.distance_mm <= _POINTS_AT * float(np.ptp(surfaces[0], axis=0).max())
+    if not is_on_surface.all():
         notes.append(
-            f"{int((~there).sum())} of {len(found)} landmarks lie more than {100 * _POINTS_AT:g} % of the extent of "
-            "the model off its surface and are left out."
+            f"{int((~is_on_surface).sum())} of {len(landmark_points)} landmarks lie more than "
+            f"{100 * _POINTS_AT:g} % of the extent of the model off its surface and are left out."
         )
-    return best.select([name for name, is_there in zip(best.names, there, strict=True) if is_there])
+    return best.select([name for name, is_there in zip(best.names, is_on_surface, strict=True) if is_there])
 
 
 def _landmark_points(tree: Tree, path: Path) -> dict[str, FloatArray]:

@@ -1,4 +1,4 @@
-"""A model as the tree of groups that statismo 0.9 has, and that as HDF5."""
+"""Conversion of a model to the tree of groups of statismo 0.9, and to HDF5."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from shapespace.types import FloatArray
 
 PARAMETERS: Final = "modelinfo/modelBuilder-0/parameters"
 """Texts by name in each model, where we leave what statismo has no place for."""
-_GREY = 0.5
-_LEFT_OUT = 1e-6
+_GREY = 0.5  # mean colour of a model without colours, of 0 to 1
+_LEFT_OUT = 1e-6  # relative; rounding in single precision
 
 
 @dataclass
-class _Growing:
-    """A tree that is being made, of `model`."""
+class _TreeBuilder:
+    """Builder of the tree of `model`."""
 
     model: LinearModel
     told: Mapping[str, str]
@@ -38,9 +38,9 @@ class _Growing:
         self.arrays[f"{root}/version/majorVersion"] = np.array(0, dtype=np.int32)
         self.arrays[f"{root}/version/minorVersion"] = np.array(9, dtype=np.int32)
 
-    def add_model(self, root: str, mean: FloatArray, moved: FloatArray, representer: str) -> None:
-        """Add one model: `mean` (D,), and what one standard deviation of each mode does, `moved` (D, K)."""
-        basis, stddev, _ = orthonormal(moved)
+    def add_model(self, root: str, mean: FloatArray, displacements: FloatArray, representer: str) -> None:
+        """Add one model: `mean` (D,), and what one standard deviation of each mode does, `displacements` (D, K)."""
+        basis, stddev, _ = orthonormal(displacements)
         if not len(stddev):
             basis, stddev = np.full((len(mean), 1), len(mean) ** -0.5), np.zeros(1)
         numbers = {"mean": mean, "pcaBasis": basis, "pcaVariance": stddev**2, "noiseVariance": np.zeros(1)}
@@ -82,34 +82,38 @@ def tree_of(model: LinearModel) -> tuple[Tree, list[str]]:
 
     With expressions it is a Morphable Model of scalismo-faces, with a grey stand-in for the colour that it asks for.
     """
-    told = {"provenance": model.provenance, "licence": model.licence, "held_out": "yes" if model.held_out else "no"}
-    told |= {"unit": "mm"} if model.mm == 1.0 else {}
-    told |= {"n_training": str(model.n_training)} if model.n_training else {}
-    told = {name: text.replace("\0", " ") for name, text in told.items() if text}
-    growing = _Growing(model, told, datetime.now(UTC).strftime("%a %b %d %H:%M:%S UTC %Y"))
-    said = ["Numbers are in single precision."]
+    provenance = {
+        "provenance": model.provenance,
+        "licence": model.licence,
+        "held_out": "yes" if model.held_out else "no",
+    }
+    provenance |= {"unit": "mm"} if model.mm == 1.0 else {}
+    provenance |= {"n_training": str(model.n_training)} if model.n_training else {}
+    provenance = {name: text.replace("\0", " ") for name, text in provenance.items() if text}
+    growing = _TreeBuilder(model, provenance, datetime.now(UTC).strftime("%a %b %d %H:%M:%S UTC %Y"))
+    notes = ["Numbers are in single precision."]
     mean = model.mean.ravel()
     if model.expression is None:
         growing.add_model("", mean, model.shape.moved, "itkStandardMeshRepresenter")
     else:
-        still, grey = np.zeros(len(mean)), np.full(len(mean), _GREY)
+        no_motion, grey = np.zeros(len(mean)), np.full(len(mean), _GREY)
         growing.add_model("/shape", mean, model.shape.moved, "gravis::MeshShapeRepresenter")
         growing.add_model("/color", grey, np.zeros((len(mean), 0)), "gravis::MeshColorRepresenter")
-        growing.add_model("/expression", still, model.expression.moved, "gravis::MeshExpressionRepresenter")
+        growing.add_model("/expression", no_motion, model.expression.moved, "gravis::MeshExpressionRepresenter")
         growing.texts["/color/representer/colorspace"] = "RGB"
         growing.add_version("")
         growing.add_catalogue("shape", "color", "expression")
-        said.append("It is a Morphable Model of scalismo-faces, whose colour is a grey stand-in.")
+        notes.append("It is a Morphable Model of scalismo-faces, whose colour is a grey stand-in.")
     if model.landmarks:
         # Placed on the surface in single precision, as in the file.
-        at = model.landmarks.positions(model.mean.astype(np.float32).astype(np.float64))
-        growing.texts["/metadata/landmarks/json"] = LANDMARK_FORMATS[".json"].write(at)
+        positions = model.landmarks.positions(model.mean.astype(np.float32).astype(np.float64))
+        growing.texts["/metadata/landmarks/json"] = LANDMARK_FORMATS[".json"].write(positions)
     blocks = [model.shape] if model.expression is None else [model.shape, model.expression]
-    kept = sum(float((block.moved**2).sum()) for block in blocks)
+    kept_variance = sum(float((block.moved**2).sum()) for block in blocks)
     total = model.shape.total_variance
-    if total is not None and total > kept * (1 + _LEFT_OUT):
-        said.append(f"The {1 - kept / total:.2g} of the variance that no mode holds is left out.")
-    return growing.tree(), said
+    if total is not None and total > kept_variance * (1 + _LEFT_OUT):
+        notes.append(f"The {1 - kept_variance / total:.2g} of the variance that no mode holds is left out.")
+    return growing.tree(), notes
 
 
 def hdf5_of(tree: Tree) -> bytes:
@@ -133,13 +137,13 @@ def hdf5_of(tree: Tree) -> bytes:
         for path, array in tree.arrays.items():
             file.create_dataset(path, data=array, track_order=False)
         for path, text in tree.texts.items():
-            above, _, name = path.rpartition("/")
+            group_path, _, name = path.rpartition("/")
             kind, value = fixed(text)
-            parent: Any = file[above or "/"]
+            parent: Any = file[group_path or "/"]
             low.h5d.create(parent.id, name.encode(), kind, scalar).write(low.h5s.ALL, low.h5s.ALL, value)
-        for path, told in tree.attributes.items():
+        for path, attributes in tree.attributes.items():
             owner: Any = file[path]
-            for name, text in told.items():
+            for name, text in attributes.items():
                 kind, value = fixed(str(text))
                 low.h5a.create(owner.id, name.encode(), kind, scalar).write(value)
     return memory.getvalue()

@@ -32,8 +32,8 @@ _OFF = ("no", "off", "0")
 
 def cache_folder() -> Path:
     """Return the folder of downloads and kept arrays: `SHAPESPACE_CACHE`, or the platform's own cache folder."""
-    named = os.environ.get("SHAPESPACE_CACHE")
-    return Path(named) if named else user_cache_path("shapespace")
+    configured = os.environ.get("SHAPESPACE_CACHE")
+    return Path(configured) if configured else user_cache_path("shapespace")
 
 
 def entries_folder() -> Path | None:
@@ -84,8 +84,8 @@ def recall(name: str) -> dict[str, npt.NDArray[Any]] | None:
         return None
     try:
         with path.open("rb") as stream:
-            said = stream.read(_DIGEST_BYTES)
-            if hashlib.file_digest(stream, "sha256").hexdigest().encode() != said:
+            stored_digest = stream.read(_DIGEST_BYTES)
+            if hashlib.file_digest(stream, "sha256").hexdigest().encode() != stored_digest:
                 return None
             stream.seek(_DIGEST_BYTES)
             arrays = arrays_in(stream, path.stat().st_size)
@@ -115,13 +115,13 @@ def keep(name: str, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
 
 
 def _drop_oldest(folder: Path) -> None:
-    found: list[tuple[float, int, Path]] = []
+    entries: list[tuple[float, int, Path]] = []
     for file in folder.iterdir():
         with contextlib.suppress(OSError):  # another process dropped it first
             about = file.stat()
-            found.append((about.st_mtime, about.st_size, file))
+            entries.append((about.st_mtime, about.st_size, file))
     total = 0
-    for _, size, file in sorted(found, reverse=True):
+    for _, size, file in sorted(entries, reverse=True):
         total += size
         if total > MOST_BYTES:
             with contextlib.suppress(OSError):

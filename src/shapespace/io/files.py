@@ -1,4 +1,4 @@
-"""Files that are either whole or not there: atomic writing, hashes, and errors that name the file."""
+"""Atomic writing of files, hashes, and errors that name the file."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def atomic_path(path: Path) -> Generator[Path]:
     temporary = _temporary_beside(path)
     try:
         yield temporary
-        _put(temporary, path)
+        _move_into_place(temporary, path)
     except OSError as error:
         raise write_error(path, error) from error
     finally:
@@ -143,7 +143,7 @@ def atomic_path(path: Path) -> Generator[Path]:
 
 
 def write_together(files: Mapping[Path, Callable[[Path], object]], remove: Iterable[Path] = ()) -> None:
-    """Write files of which the last vouches for the others: stopped at any moment, it is whole and theirs, or absent.
+    """Write several files so that the last is complete and matches the others, or is absent, after any interruption.
 
     Args:
         files: what writes each, given a temporary path.
@@ -165,7 +165,7 @@ def write_together(files: Mapping[Path, Callable[[Path], object]], remove: Itera
             remove_file(path)
         for path, temporary in written.items():
             try:
-                _put(temporary, path)
+                _move_into_place(temporary, path)
             except OSError as error:
                 raise write_error(path, error) from error
 
@@ -210,7 +210,7 @@ def _sweep_once(folder: Path) -> None:
         sweep(folder)
 
 
-def _put(temporary: Path, path: Path) -> None:
+def _move_into_place(temporary: Path, path: Path) -> None:
     umask = os.umask(0)
     os.umask(umask)
     temporary.chmod(0o666 & ~umask)
@@ -227,14 +227,14 @@ def sweep(folder: Path) -> None:
         host, pid = path.name.removeprefix(_TEMPORARY).split("-")[:2]
         with contextlib.suppress(OSError, ValueError, OverflowError):
             known = host == _HOST and os.name != "nt"  # Windows has no harmless signal that tests a process
-            if _has_ended(int(pid)) if known else time.time() - path.lstat().st_mtime > _LEFT_S:
+            if _is_process_over(int(pid)) if known else time.time() - path.lstat().st_mtime > _LEFT_S:
                 if path.is_dir() and not path.is_symlink():
                     shutil.rmtree(path, ignore_errors=True)
                 else:
                     path.unlink(missing_ok=True)
 
 
-def _has_ended(pid: int) -> bool:
+def _is_process_over(pid: int) -> bool:
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

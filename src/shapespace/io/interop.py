@@ -1,4 +1,4 @@
-"""Meshes of other tools, to and from: by what their objects have, so that none of these tools is required."""
+"""Conversion of meshes from and to other tools by the attributes of their objects; none of these tools is required."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from shapespace.errors import InputError, MeshError
 from shapespace.io.meshes.mesh_io import read_mesh
-from shapespace.lazy import other_package
+from shapespace.lazy import require_package
 from shapespace.types import ByteArray, IntArray, Mesh
 
 MeshLike: TypeAlias = Mesh | str | os.PathLike[str] | Any
@@ -38,18 +38,20 @@ def as_mesh(x: MeshLike, name: str = "") -> Mesh:
         return x
     if isinstance(x, str | os.PathLike):
         return read_mesh(Path(cast("str | os.PathLike[str]", x)))
-    called = name or _name_of(x)
-    held = _held(x)
-    vertices, faces = _parts(held, called)
+    mesh_name = name or _name_of(x)
+    mesh_parts = _as_simple_mesh(x)
+    vertices, faces = _mesh_arrays(mesh_parts, mesh_name)
     try:
-        return Mesh(np.array(vertices, dtype=np.float64), faces, name=called, colours=_colours_of(held, len(vertices)))
+        return Mesh(
+            np.array(vertices, dtype=np.float64), faces, name=mesh_name, colours=_colours_of(mesh_parts, len(vertices))
+        )
     except (TypeError, ValueError) as error:
         if isinstance(error, MeshError):
             raise
-        raise InputError(f"{called}: its vertices are no numbers of the shape (V, 3).") from error
+        raise InputError(f"{mesh_name}: its vertices are no numbers of the shape (V, 3).") from error
 
 
-class _AsMeshes(Sequence[Mesh]):
+class _MeshSequence(Sequence[Mesh]):
     """A sequence of meshes that are converted when they are accessed."""
 
     def __init__(self, items: Any) -> None:
@@ -64,7 +66,7 @@ class _AsMeshes(Sequence[Mesh]):
     def __getitem__(self, index: slice) -> Sequence[Mesh]: ...
     def __getitem__(self, index: int | slice) -> Mesh | Sequence[Mesh]:
         if isinstance(index, slice):
-            return _AsMeshes(self._items[index])
+            return _MeshSequence(self._items[index])
         return as_mesh(self._items[index], name=f"mesh {index + 1}")
 
 
@@ -83,38 +85,38 @@ def as_meshes(items: Any, function: str) -> Sequence[Mesh]:
             f"{function} takes a list of meshes, not {type(cast(object, items)).__name__}; give meshes, their paths, "
             "or arrays (V, 3)."
         )
-    return _AsMeshes(items)
+    return _MeshSequence(items)
 
 
-def _held(x: Any) -> Any:
-    """Return the mesh that an object of another tool stands for."""
+def _as_simple_mesh(x: Any) -> Any:
+    """Convert tensors of Open3D and scenes of trimesh to a simple mesh of the same tool."""
     if hasattr(x, "to_legacy"):  # Open3D's tensors
         return x.to_legacy()
     return x.to_mesh() if hasattr(x, "geometry") and hasattr(x, "to_mesh") else x  # a scene of trimesh
 
 
-def _parts(x: Any, called: str) -> tuple[Any, Any]:
+def _mesh_arrays(x: Any, mesh_name: str) -> tuple[Any, Any]:
     """Return vertices, and triangles or None."""
     if isinstance(x, np.ndarray):
         return cast(Any, x), None
     if isinstance(x, list | tuple):
-        return _pair(cast(Sequence[Any], x), called)
-    return _parts_of_object(x, called)
+        return _check_pair(cast(Sequence[Any], x), mesh_name)
+    return _object_arrays(x, mesh_name)
 
 
-def _pair(x: Sequence[Any], called: str) -> tuple[Any, Any]:
+def _check_pair(x: Sequence[Any], mesh_name: str) -> tuple[Any, Any]:
     if len(x) != 2:
-        raise InputError(f"{called}: give vertices and triangles as a pair of arrays, not {len(x)} things.")
+        raise InputError(f"{mesh_name}: give vertices and triangles as a pair of arrays, not {len(x)} things.")
     return x[0], x[1]
 
 
-def _parts_of_object(x: Any, called: str) -> tuple[Any, Any]:
+def _object_arrays(x: Any, mesh_name: str) -> tuple[Any, Any]:
     if hasattr(x, "points") and hasattr(x, "cells") and hasattr(x, "cells_dict"):  # meshio
-        return x.points, _of_cells(x.cells_dict, called)
+        return x.points, _triangles_of_cells(x.cells_dict, mesh_name)
     if hasattr(x, "points") and hasattr(x, "trilist"):  # menpo
         return x.points, x.trilist
     if hasattr(x, "points") and hasattr(x, "n_points"):  # PyVista, and menpo's clouds
-        return _of_pyvista(x, called)
+        return _pyvista_arrays(x, mesh_name)
     if hasattr(x, "vertices"):  # trimesh and Open3D
         faces = getattr(x, "faces", getattr(x, "triangles", None))
         return x.vertices, None if faces is None or not len(faces) else np.asarray(faces)
@@ -126,23 +128,23 @@ def _parts_of_object(x: Any, called: str) -> tuple[Any, Any]:
     )
 
 
-def _of_cells(cells: Mapping[str, Any], called: str) -> IntArray | None:
-    found = [np.asarray(cells["triangle"])] if "triangle" in cells else []
+def _triangles_of_cells(cells: Mapping[str, Any], mesh_name: str) -> IntArray | None:
+    blocks = [np.asarray(cells["triangle"])] if "triangle" in cells else []
     if "quad" in cells:
         quads = np.asarray(cells["quad"])
-        found += [quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]
+        blocks += [quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]
     others = sorted(set(cells) - {"triangle", "quad", "vertex", "line"})
     if others:
         raise InputError(
-            f"{called}: it has cells of type {others[0]}, which are no surface; extract the surface first."
+            f"{mesh_name}: it has cells of type {others[0]}, which are no surface; extract the surface first."
         )
-    return np.concatenate(found).astype(np.int32) if found else None
+    return np.concatenate(blocks).astype(np.int32) if blocks else None
 
 
-def _of_pyvista(x: Any, called: str) -> tuple[Any, Any]:
+def _pyvista_arrays(x: Any, mesh_name: str) -> tuple[Any, Any]:
     if not hasattr(x, "faces"):
         if hasattr(x, "extract_surface"):
-            raise InputError(f"{called}: a grid is no surface; give what its extract_surface() returns.")
+            raise InputError(f"{mesh_name}: a grid is no surface; give what its extract_surface() returns.")
         return x.points, None
     if not len(x.faces):
         return x.points, None
@@ -154,23 +156,25 @@ def _of_pyvista(x: Any, called: str) -> tuple[Any, Any]:
 
 def _colours_of(x: Any, count: int) -> ByteArray | None:
     """Return the colours (V, 3) of the vertices of an object of another tool, where it has some for each."""
-    told: Any = None
+    values: Any = None
     if getattr(getattr(x, "visual", None), "kind", None) == "vertex":  # trimesh
-        told = x.visual.vertex_colors
+        values = x.visual.vertex_colors
     elif hasattr(x, "colors"):  # trimesh's and Open3D's clouds
-        told = x.colors
+        values = x.colors
     elif hasattr(x, "vertex_colors"):  # Open3D
-        told = x.vertex_colors
+        values = x.vertex_colors
     elif hasattr(x, "colours"):  # menpo
-        told = x.colours
+        values = x.colours
     elif hasattr(x, "point_data"):  # PyVista, and meshio with the columns of PLY
-        named = {str(name).lower(): name for name in x.point_data}
-        if "rgb" in named or "rgba" in named:
-            told = x.point_data[named.get("rgb", named.get("rgba"))]
-        elif {"red", "green", "blue"} <= set(named):
-            told = np.column_stack([np.asarray(x.point_data[named[one]]) for one in ("red", "green", "blue")])
+        array_names = {str(name).lower(): name for name in x.point_data}
+        if "rgb" in array_names or "rgba" in array_names:
+            values = x.point_data[array_names.get("rgb", array_names.get("rgba"))]
+        elif {"red", "green", "blue"} <= set(array_names):
+            values = np.column_stack(
+                [np.asarray(x.point_data[array_names[channel]]) for channel in ("red", "green", "blue")]
+            )
     try:
-        colours = np.asarray([] if told is None else told)
+        colours = np.asarray([] if values is None else values)
     except ValueError:
         return None
     if colours.ndim != 2 or len(colours) != count or colours.shape[1] not in (3, 4):
@@ -185,33 +189,37 @@ def _colours_of(x: Any, count: int) -> ByteArray | None:
 
 
 def _name_of(x: Any) -> str:
-    told: Any = getattr(x, "path", None) or getattr(getattr(x, "source", None), "file_name", None)
+    source_path: Any = getattr(x, "path", None) or getattr(getattr(x, "source", None), "file_name", None)
     metadata: Any = getattr(x, "metadata", None)
-    if not told and isinstance(metadata, Mapping):
-        told = cast(Mapping[str, Any], metadata).get("file_name") or cast(Mapping[str, Any], metadata).get("name")
-    if not isinstance(told, str | os.PathLike):
+    if not source_path and isinstance(metadata, Mapping):
+        source_path = cast(Mapping[str, Any], metadata).get("file_name") or cast(Mapping[str, Any], metadata).get(
+            "name"
+        )
+    if not isinstance(source_path, str | os.PathLike):
         return "mesh"
-    return Path(cast("str | os.PathLike[str]", told)).name or "mesh"
+    return Path(cast("str | os.PathLike[str]", source_path)).name or "mesh"
 
 
 def to_trimesh(mesh: Mesh) -> Any:
     """Return a `trimesh.Trimesh`, or a `trimesh.PointCloud` without triangles; vertices keep their order."""
-    trimesh = other_package("trimesh", "Mesh.to_trimesh")
-    told = {"name": mesh.name}
+    trimesh = require_package("trimesh", "Mesh.to_trimesh")
+    metadata = {"name": mesh.name}
     colours = None if mesh.colours is None else mesh.colours.copy()
     if mesh.faces is None:
-        return trimesh.PointCloud(mesh.vertices.copy(), colors=colours, metadata=told)
-    return trimesh.Trimesh(mesh.vertices.copy(), mesh.faces.copy(), vertex_colors=colours, process=False, metadata=told)
+        return trimesh.PointCloud(mesh.vertices.copy(), colors=colours, metadata=metadata)
+    return trimesh.Trimesh(
+        mesh.vertices.copy(), mesh.faces.copy(), vertex_colors=colours, process=False, metadata=metadata
+    )
 
 
 def to_pyvista(mesh: Mesh) -> Any:
     """Return a `pyvista.PolyData`."""
-    pyvista = other_package("pyvista", "Mesh.to_pyvista")
+    pyvista = require_package("pyvista", "Mesh.to_pyvista")
     if mesh.faces is None:
         out = pyvista.PolyData(mesh.vertices.copy())
     else:
-        counted = np.insert(mesh.faces.astype(np.int64), 0, 3, axis=1)
-        out = pyvista.PolyData(mesh.vertices.copy(), counted.ravel())
+        cells = np.insert(mesh.faces.astype(np.int64), 0, 3, axis=1)
+        out = pyvista.PolyData(mesh.vertices.copy(), cells.ravel())
     if mesh.colours is not None:
         out.point_data["RGB"] = mesh.colours.copy()
     return out
@@ -219,7 +227,7 @@ def to_pyvista(mesh: Mesh) -> Any:
 
 def to_open3d(mesh: Mesh) -> Any:
     """Return an `open3d.geometry.TriangleMesh`, or a `PointCloud` without triangles."""
-    open3d = other_package("open3d", "Mesh.to_open3d")
+    open3d = require_package("open3d", "Mesh.to_open3d")
     points = open3d.utility.Vector3dVector(mesh.vertices.copy())
     colours = None if mesh.colours is None else open3d.utility.Vector3dVector(mesh.colours / 255.0)
     if mesh.faces is None:
@@ -235,17 +243,19 @@ def to_open3d(mesh: Mesh) -> Any:
 
 def to_meshio(mesh: Mesh) -> Any:
     """Return a `meshio.Mesh`."""
-    meshio = other_package("meshio", "Mesh.to_meshio")
+    meshio = require_package("meshio", "Mesh.to_meshio")
     cells = np.arange(len(mesh.vertices))[:, None] if mesh.faces is None else mesh.faces.copy()
-    told = {}
+    point_data = {}
     if mesh.colours is not None:
-        told = {name: mesh.colours[:, k].copy() for k, name in enumerate(("red", "green", "blue"))}
-    return meshio.Mesh(mesh.vertices.copy(), [("vertex" if mesh.faces is None else "triangle", cells)], point_data=told)
+        point_data = {name: mesh.colours[:, k].copy() for k, name in enumerate(("red", "green", "blue"))}
+    return meshio.Mesh(
+        mesh.vertices.copy(), [("vertex" if mesh.faces is None else "triangle", cells)], point_data=point_data
+    )
 
 
 def to_menpo(mesh: Mesh) -> Any:
     """Return a `menpo.shape.TriMesh`, or a `PointCloud` without triangles."""
-    shape = other_package("menpo.shape", "Mesh.to_menpo")
+    shape = require_package("menpo.shape", "Mesh.to_menpo")
     if mesh.faces is None:
         return shape.PointCloud(mesh.vertices.copy())
     return shape.TriMesh(mesh.vertices.copy(), trilist=mesh.faces.copy())

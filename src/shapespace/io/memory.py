@@ -1,4 +1,4 @@
-"""How much memory there is for arrays: what the system can give, or less where a container is held to a limit."""
+"""Memory available for arrays, from the system and the limits of a container."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ _MEMINFO, _CGROUP = Path("/proc/meminfo"), Path("/sys/fs/cgroup")
 
 def available_bytes() -> int | None:
     """Return the bytes that this process can still take; None where the system does not tell."""
-    found = [size for size in (_of_system(), _of_container()) if size is not None]
-    return min(found) if found else None
+    sizes = [size for size in (_system_bytes(), _container_bytes()) if size is not None]
+    return min(sizes) if sizes else None
 
 
-def _of_system() -> int | None:
+def _system_bytes() -> int | None:
     try:
         lines = _MEMINFO.read_text().splitlines()
         return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
@@ -26,7 +26,7 @@ def _of_system() -> int | None:
         return None
 
 
-def _of_container() -> int | None:
+def _container_bytes() -> int | None:
     try:
         limit, used = ((_CGROUP / f"memory.{name}").read_text().strip() for name in ("max", "current"))
         return None if limit == "max" else max(int(limit) - int(used), 0)

@@ -1,4 +1,4 @@
-"""What the readers share: numbers from text, polygons to triangles, and XML and JSON from strangers."""
+"""Parsing functions of all readers: numbers from text, polygons to triangles, untrusted XML and JSON."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ _SPACE = re.compile(rb"\s")
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 
 
-def damaged(path: Path, what: str) -> FileFormatError:
-    """Return the one-sentence error that `path` cannot be read because of `what`."""
-    return FileFormatError(f"Cannot read {path}: {what}.")
+def damage_error(path: Path, problem: str) -> FileFormatError:
+    """Return the one-sentence error that `path` cannot be read because of `problem`."""
+    return FileFormatError(f"Cannot read {path}: {problem}.")
 
 
 def is_number(text: str) -> bool:
@@ -46,30 +46,30 @@ def plain_text(data: bytes) -> bytes:
     return data.removeprefix(_BYTE_ORDER_MARK)
 
 
-def _block(text: bytes, at: int, end: re.Pattern[bytes], size: int = _BLOCK_BYTES) -> tuple[bytes, int]:
-    found = end.search(text, at + min(size, _BLOCK_BYTES))
-    stop = found.end() if found else len(text)
-    return text[at:stop], stop
+def _block(text: bytes, start: int, end: re.Pattern[bytes], size: int = _BLOCK_BYTES) -> tuple[bytes, int]:
+    match = end.search(text, start + min(size, _BLOCK_BYTES))
+    stop = match.end() if match else len(text)
+    return text[start:stop], stop
 
 
 def line_blocks(text: bytes) -> Iterator[list[bytes]]:
     """Yield the lines of `text` in lists of some thousand, so that cutting it takes little memory."""
-    at = 0
-    while at < len(text):
-        block, at = _block(text, at, _LINE_END)
+    offset = 0
+    while offset < len(text):
+        block, offset = _block(text, offset, _LINE_END)
         yield block.splitlines()
 
 
-def word_block(text: bytes, at: int, size: int = _BLOCK_BYTES) -> tuple[list[bytes], int]:
-    """Return the words in about `size` bytes of `text` from byte `at`, and where the next begin."""
-    block, stop = _block(text, at, _SPACE, size)
+def word_block(text: bytes, start: int, size: int = _BLOCK_BYTES) -> tuple[list[bytes], int]:
+    """Return the words in about `size` bytes of `text` from byte `start`, and where the next begin."""
+    block, stop = _block(text, start, _SPACE, size)
     return block.split(), stop
 
 
 def _word_blocks(text: bytes) -> Iterator[list[bytes]]:
-    at = 0
-    while at < len(text):
-        words, at = word_block(text, at)
+    offset = 0
+    while offset < len(text):
+        words, offset = word_block(text, offset)
         yield words
 
 
@@ -79,7 +79,7 @@ def floats_of(text: bytes, path: Path) -> FloatArray:
     Raises:
         FileFormatError: one of them is not a number.
     """
-    return joined([floats(words, path) for words in _word_blocks(text)], np.float64)
+    return join_parts([floats(words, path) for words in _word_blocks(text)], np.float64)
 
 
 def ints_of(text: bytes, path: Path) -> IndexArray:
@@ -88,10 +88,10 @@ def ints_of(text: bytes, path: Path) -> IndexArray:
     Raises:
         FileFormatError: one of them is not a whole number, or is too large for 64 bits.
     """
-    return joined([ints(words, path) for words in _word_blocks(text)], np.int64)
+    return join_parts([ints(words, path) for words in _word_blocks(text)], np.int64)
 
 
-def joined(parts: Sequence[npt.NDArray[Any]], kind: npt.DTypeLike, *row: int) -> npt.NDArray[Any]:
+def join_parts(parts: Sequence[npt.NDArray[Any]], kind: npt.DTypeLike, *row: int) -> npt.NDArray[Any]:
     """Return `parts` one after another, or an empty array with rows of shape `row`."""
     return np.concatenate(parts) if parts else np.zeros((0, *row), dtype=kind)
 
@@ -105,7 +105,7 @@ def floats(tokens: Iterable[bytes], path: Path) -> FloatArray:
     try:
         return np.fromiter(map(float, tokens), dtype=np.float64)
     except ValueError as error:
-        raise damaged(path, f"it has text where a number should be ({_short(error)})") from error
+        raise damage_error(path, f"it has text where a number should be ({_short(error)})") from error
 
 
 def ints(tokens: Iterable[bytes], path: Path) -> IndexArray:
@@ -117,7 +117,7 @@ def ints(tokens: Iterable[bytes], path: Path) -> IndexArray:
     try:
         return np.fromiter(map(int, tokens), dtype=np.int64)
     except (ValueError, OverflowError) as error:
-        raise damaged(path, f"it has no whole number where one should be ({_short(error)})") from error
+        raise damage_error(path, f"it has no whole number where one should be ({_short(error)})") from error
 
 
 def _short(error: Exception) -> str:
@@ -148,12 +148,12 @@ def fan_triangles(counts: npt.ArrayLike, corners: npt.ArrayLike) -> IndexArray:
     fans = np.maximum(sizes - 2, 0)
     first = np.repeat(starts, fans)
     # The second corner of a triangle is one past the first of its polygon, and one more for each before it there.
-    at = np.arange(1, len(first) + 1, dtype=np.int64)
-    at += np.repeat(starts - (np.cumsum(fans) - fans), fans)
+    corner = np.arange(1, len(first) + 1, dtype=np.int64)
+    corner += np.repeat(starts - (np.cumsum(fans) - fans), fans)
     out = np.empty((len(first), 3), dtype=np.int64)
-    out[:, 0], out[:, 1] = flat[first], flat[at]
-    at += 1
-    out[:, 2] = flat[at]
+    out[:, 0], out[:, 1] = flat[first], flat[corner]
+    corner += 1
+    out[:, 2] = flat[corner]
     return out
 
 
@@ -167,12 +167,14 @@ def strip_triangles(counts: npt.ArrayLike, corners: npt.ArrayLike) -> IndexArray
     sizes = np.asarray(counts, dtype=np.int64).reshape(-1)
     flat = np.asarray(corners, dtype=np.int64).reshape(-1)
     starts = np.cumsum(sizes) - sizes
-    each = np.maximum(sizes - 2, 0)
-    step = np.arange(int(each.sum()), dtype=np.int64) - np.repeat(np.cumsum(each) - each, each)
-    at = np.repeat(starts, each) + step
+    triangle_counts = np.maximum(sizes - 2, 0)
+    step = np.arange(int(triangle_counts.sum()), dtype=np.int64) - np.repeat(
+        np.cumsum(triangle_counts) - triangle_counts, triangle_counts
+    )
+    first_corner = np.repeat(starts, triangle_counts) + step
     step %= 2
-    out = np.empty((len(at), 3), dtype=np.int64)
-    out[:, 0], out[:, 1], out[:, 2] = flat[at], flat[at + 1 + step], flat[at + 2 - step]
+    out = np.empty((len(first_corner), 3), dtype=np.int64)
+    out[:, 0], out[:, 1], out[:, 2] = flat[first_corner], flat[first_corner + 1 + step], flat[first_corner + 2 - step]
     return out
 
 
@@ -243,9 +245,9 @@ def xml_root(data: bytes, path: Path) -> ET.Element:
         parser.feed(data)
         return parser.close()
     except ET.ParseError as error:
-        raise damaged(path, f"it is not well-formed XML ({_short(error)})") from error
+        raise damage_error(path, f"it is not well-formed XML ({_short(error)})") from error
     except (ValueError, LookupError) as error:
-        raise damaged(path, _short(error)) from error
+        raise damage_error(path, _short(error)) from error
 
 
 def json_value(data: bytes, path: Path) -> Any:
@@ -257,26 +259,26 @@ def json_value(data: bytes, path: Path) -> Any:
     try:
         return json.loads(data.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:
-        raise damaged(path, f"it is not valid JSON ({_short(error)})") from error
+        raise damage_error(path, f"it is not valid JSON ({_short(error)})") from error
 
 
-def check_count(declared: int, bytes_each: int, available: int, what: str, path: Path) -> None:
+def check_count(declared: int, bytes_each: int, available: int, item_name: str, path: Path) -> None:
     """Refuse a header that declares more than the file can hold, before anything is allocated for it.
 
     Args:
         declared: how many the header declares.
         bytes_each: the least that each takes in the file.
         available: the bytes that are there.
-        what: "vertices", "faces": used in the sentence.
+        item_name: "vertices", "faces": used in the sentence.
         path: the file.
 
     Raises:
         FileFormatError: there are too many of them, or fewer than none.
     """
     if declared < 0:
-        raise damaged(path, f"its header declares {declared} {what}")
+        raise damage_error(path, f"its header declares {declared} {item_name}")
     if declared * bytes_each > available:
-        raise damaged(
+        raise damage_error(
             path,
-            f"its header declares {declared} {what}, but only {max(available, 0)} bytes follow; {CUT_SHORT}",
+            f"its header declares {declared} {item_name}, but only {max(available, 0)} bytes follow; {CUT_SHORT}",
         )

@@ -1,4 +1,4 @@
-"""What one file may cost to read: the ceilings of all readers of meshes and landmarks, in this one place.
+"""Limits on the size and memory of files that the readers of meshes and landmarks accept.
 
 Readers go through each byte once, so that time and memory grow with the file. Where a format lets one piece of a file
 be used again and again, or unpacks it, an `Allowance` stops the file that is small and makes much.
@@ -27,7 +27,7 @@ SPARE_BYTES = 2**26
 
 
 class Allowance:
-    """What may still be made from one file.
+    """Remaining memory that data from one file may use.
 
     Args:
         file_bytes: how long the file is; buffers beside it are added by `more_file`.

@@ -1,4 +1,4 @@
-"""Scans that lie elsewhere, at any address that fsspec knows, such as s3://bucket/scan.ply: fetched for a fit."""
+"""Scans at remote addresses that fsspec supports, such as s3://bucket/scan.ply, copied for a fit."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from shapespace.errors import FileError, InputError, ShapespaceError
 
 TRIES = 3
 """Times that a download is tried."""
-_WAIT_S = 0.5
-_PIECE = 1 << 20
+_WAIT_S = 0.5  # seconds; doubled at each try
+_PIECE = 1 << 20  # bytes (1 MiB)
 _GLOB = frozenset("*?[")
 
 
@@ -31,7 +31,7 @@ def name_of(address: str) -> str:
 
 
 def addresses(address: str, endings: Sequence[str], *, recursive: bool) -> list[str]:
-    """Return the files that an address stands for: itself, those of a pattern, or those of a folder.
+    """Return the files at an address: itself, the matches of a pattern, or the files in a folder.
 
     Args:
         address: a file, a folder, or a pattern with * or ?.
@@ -43,37 +43,37 @@ def addresses(address: str, endings: Sequence[str], *, recursive: bool) -> list[
         FileError: the place cannot be reached.
         ShapespaceError: what reads such addresses is not installed.
     """
-    with _told(address):
+    with _translate_errors(address):
         files, path = _files(address)
         head, sep, chain = address.partition("::")
         scheme = head.split("://", 1)[0]
         if _GLOB & set(path):
-            found = files.glob(path)
+            paths = files.glob(path)
         elif head.lower().endswith(tuple(endings)):
             return [address]
         else:
-            found = files.find(path, maxdepth=None if recursive else 1)
-        named = [f"{scheme}://{str(one).removeprefix(f'{scheme}://')}{sep}{chain}" for one in sorted(found)]
-    taken = [one for one in named if name_of(one).lower().endswith(tuple(endings))]
-    if not taken:
+            paths = files.find(path, maxdepth=None if recursive else 1)
+        full_addresses = [f"{scheme}://{str(item).removeprefix(f'{scheme}://')}{sep}{chain}" for item in sorted(paths)]
+    readable = [item for item in full_addresses if name_of(item).lower().endswith(tuple(endings))]
+    if not readable:
         raise InputError(f"{address} holds no meshes; shapespace reads {', '.join(endings)}.")
-    return taken
+    return readable
 
 
 def version_of(address: str) -> str:
-    """Return a word that changes with the file at an address, without reading it.
+    """Return a hash that changes with the file at an address, without reading it.
 
     Raises:
         FileError: it cannot be reached.
         ShapespaceError: what reads such addresses is not installed.
     """
-    with _told(address):
+    with _translate_errors(address):
         files, path = _files(address)
         return hashlib.sha256(str(files.ukey(path)).encode()).hexdigest()
 
 
 @contextlib.contextmanager
-def fetched(address: str, most_bytes: int) -> Generator[Path]:
+def fetch_copy(address: str, most_bytes: int) -> Generator[Path]:
     """Yield a copy of the file at an address, of the same name, which is there during the block.
 
     Raises:
@@ -94,7 +94,7 @@ def fetched(address: str, most_bytes: int) -> Generator[Path]:
 
 
 def _copy(address: str, file: Path, most_bytes: int) -> None:
-    with _told(address):
+    with _translate_errors(address):
         files, path = _files(address)
         with files.open(path, "rb") as source, file.open("wb") as copy:
             count = 0
@@ -109,28 +109,28 @@ def _files(address: str) -> tuple[Any, str]:
     try:
         from fsspec.core import url_to_fs  # pyright: ignore[reportUnknownVariableType]
     except ImportError as error:
-        raise _missing("remote") from error
-    found: tuple[Any, str] = url_to_fs(address)  # pyright: ignore[reportUnknownVariableType]
-    return found
+        raise _missing_extra_error("remote") from error
+    filesystem: tuple[Any, str] = url_to_fs(address)  # pyright: ignore[reportUnknownVariableType]
+    return filesystem
 
 
 @contextlib.contextmanager
-def _told(address: str) -> Generator[None]:
-    """Turn what the many libraries below fsspec raise into one sentence."""
+def _translate_errors(address: str) -> Generator[None]:
+    """Convert exceptions of fsspec and the libraries below it to one error message."""
     try:
         yield
     except ShapespaceError:
         raise
     except ImportError as error:
-        raise _missing("remote") from error
+        raise _missing_extra_error("remote") from error
     except FileNotFoundError as error:
         raise FileError(f"Cannot read {address}: there is no such file; check the address.") from error
     except Exception as error:
-        why = " ".join(str(error).split())[:200] or type(error).__name__
-        raise FileError(f"Cannot read {address}: {why}; check the address and the connection.") from error
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise FileError(f"Cannot read {address}: {reason}; check the address and the connection.") from error
 
 
-def _missing(extra: str) -> ShapespaceError:
+def _missing_extra_error(extra: str) -> ShapespaceError:
     return ShapespaceError(
         f"Addresses need the extra '{extra}', and s3:// and gs:// need s3fs and gcsfs too; run "
         f"pip install 'shapespace[{extra}]' s3fs gcsfs, or give files."

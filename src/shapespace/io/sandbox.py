@@ -1,4 +1,4 @@
-"""HDF5 and MATLAB files of others, which a library reads in a process of its own that may be ended.
+"""HDF5 and MATLAB files from other tools, read by a library in a sandboxed process.
 
 Those libraries take what memory a file asks for, follow links to other files, and hang or crash in damaged structures.
 In that process they see one open file and can open no other, are held to a share of memory and time, and only numbers
@@ -32,18 +32,18 @@ PROGRAM_BYTES: Final = 2**30
 """Memory of the process besides three times the arrays: Python and the libraries (1 GiB)."""
 MOST_SECONDS: Final = 60
 """Time that the process has, and a second more for each `BYTES_A_SECOND` of the file."""
-BYTES_A_SECOND: Final = 2**22
+BYTES_A_SECOND: Final = 2**22  # 4 MiB; far below the reading speed of a disk
 
 HDF5_SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
 
 
-class ApartError(ValueError):
-    """The file is damaged, or made to harm; the text says how, as a clause."""
+class SandboxError(ValueError):
+    """The file is damaged or malicious; the text gives the reason, as a clause."""
 
 
 @dataclass(frozen=True)
 class Tree:
-    """What is in a file of HDF5, or in one of the same shape, by path: "/model/mean".
+    """Content of an HDF5 file, or of a file with the same structure, by path: "/model/mean".
 
     Args:
         arrays: of numbers.
@@ -58,8 +58,8 @@ class Tree:
     groups: Sequence[str] = ("/",)
 
 
-def read_hdf5_apart(path: Path, leave: Sequence[str] = ()) -> Tree:
-    """Return what is in an HDF5 file, but for what stands at the paths `leave`, and objects of other kinds.
+def read_hdf5_sandboxed(path: Path, leave: Sequence[str] = ()) -> Tree:
+    """Return the content of an HDF5 file, without the paths in `leave` and objects of other kinds.
 
     Raises:
         FileError: it cannot be read.
@@ -68,60 +68,60 @@ def read_hdf5_apart(path: Path, leave: Sequence[str] = ()) -> Tree:
     return _read(path, {"kind": "hdf5", "leave": list(leave)})
 
 
-def read_matlab_apart(path: Path, wanted: Sequence[str]) -> Tree:
-    """Return the variables `wanted` of a MATLAB file of version 4 to 7, structures as groups, those that are there.
+def read_matlab_sandboxed(path: Path, variables: Sequence[str]) -> Tree:
+    """Return the variables `variables` of a MATLAB file of version 4 to 7, structures as groups, those that are there.
 
     Raises:
         FileError: it cannot be read.
-        ApartError: as of `read_hdf5_apart`.
+        ApartError: as of `read_hdf5_sandboxed`.
     """
-    return _read(path, {"kind": "matlab", "wanted": list(wanted)})
+    return _read(path, {"kind": "matlab", "wanted": list(variables)})
 
 
-def _read(path: Path, asked: dict[str, Any]) -> Tree:
+def _read(path: Path, request: dict[str, Any]) -> Tree:
     with open_file(path) as stream:
         size = os.fstat(stream.fileno()).st_size
         most_bytes = min(SPARE_BYTES + GROWTH * size, MOST_BYTES)
         seconds = MOST_SECONDS + size // BYTES_A_SECOND
-        asked |= {
+        request |= {
             "most_bytes": most_bytes,
             "most_memory": PROGRAM_BYTES + 3 * most_bytes,
             "most_seconds": seconds,
         }
         # A program of its own and not a copy: a copy of a process with threads may hang, and a script without a guard
         # would be run again. -P, since modules beside the program are none of its own.
-        command = [sys.executable, "-P", str(Path(sandbox_child.__file__)), json.dumps(asked)]
+        command = [sys.executable, "-P", str(Path(sandbox_child.__file__)), json.dumps(request)]
         environment = os.environ | {
             "PYTHONPATH": os.pathsep.join(entry for entry in sys.path if entry),  # not the folder that one stands in
             "OPENBLAS_NUM_THREADS": "1",
             "HDF5_PLUGIN_PRELOAD": "::",  # no code of filters from elsewhere
         }
         try:
-            ended = subprocess.run(
+            completed = subprocess.run(
                 command, stdin=stream, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment,
                 timeout=seconds, check=False,
             )  # fmt: skip
         except subprocess.TimeoutExpired as error:
-            raise ApartError(f"reading it takes longer than {seconds} s") from error
+            raise SandboxError(f"reading it takes longer than {seconds} s") from error
         except OSError as error:
-            raise ApartError(f"the system does not let a process start that reads it ({error.strerror})") from error
-    return _tree(ended.stdout)
+            raise SandboxError(f"the system does not let a process start that reads it ({error.strerror})") from error
+    return _tree(completed.stdout)
 
 
-def _tree(answer: bytes) -> Tree:
-    head, newline, _ = answer.partition(b"\n") if len(answer) < 2**16 else (answer[: answer.find(b"\n")], b"\n", b"")
+def _tree(output: bytes) -> Tree:
+    head, newline, _ = output.partition(b"\n") if len(output) < 2**16 else (output[: output.find(b"\n")], b"\n", b"")
     if not newline or not head:
-        raise ApartError("the library that reads it does not survive it")
-    told = json.loads(head)
-    if "wrong" in told:
-        raise ApartError(told["wrong"])
+        raise SandboxError("the library that reads it does not survive it")
+    header = json.loads(head)
+    if "wrong" in header:
+        raise SandboxError(header["wrong"])
     arrays: dict[str, npt.NDArray[Any]] = {}
-    at = len(head) + 1
-    for path, kind, shape in told["arrays"]:
+    offset = len(head) + 1
+    for path, kind, shape in header["arrays"]:
         dtype = np.dtype(kind)
         count = int(np.prod(shape, dtype=np.int64))
-        if at + count * dtype.itemsize > len(answer):
-            raise ApartError("the library that reads it does not survive it")
-        arrays[path] = np.frombuffer(answer, dtype, count, at).reshape(shape)
-        at += count * dtype.itemsize
-    return Tree(arrays, told["texts"], told["attributes"], tuple(told["groups"]))
+        if offset + count * dtype.itemsize > len(output):
+            raise SandboxError("the library that reads it does not survive it")
+        arrays[path] = np.frombuffer(output, dtype, count, offset).reshape(shape)
+        offset += count * dtype.itemsize
+    return Tree(arrays, header["texts"], header["attributes"], tuple(header["groups"]))

@@ -1,4 +1,4 @@
-"""Program of the sandbox process: a program of its own, which imports nothing of shapespace.
+"""Program of the sandbox process, which imports nothing of shapespace.
 
 Its standard input is the file. It writes one line of JSON on what it found and, after it, the bytes of the arrays.
 """
@@ -14,23 +14,23 @@ from typing import Any, BinaryIO, Final
 import numpy as np
 import numpy.typing as npt
 
-_MOST_NODES = 4096
-_MOST_ATTRIBUTES = 64
-_DEEPEST = 16
-_MOST_AXES = 8
-_LONGEST_TEXT = 2**20
-_LONGEST_NAME = 1024
+_MOST_NODES = 4096  # limits on damaged files from here on; models have tens of nodes
+_MOST_ATTRIBUTES = 64  # of one group or array
+_DEEPEST = 16  # levels of groups
+_MOST_AXES = 8  # of one array
+_LONGEST_TEXT = 2**20  # bytes (1 MiB)
+_LONGEST_NAME = 1024  # characters
 _FILTERS = {1, 2, 3}
 """Deflate, shuffle and checksums: those that HDF5 itself brings, and that models use."""
 _NUMBERS: Final = "biuf"
 
 
 class _RefusedError(ValueError):
-    """The file asks for what no model needs; the text says what, as a clause."""
+    """The file uses a feature that no model needs; the text names it, as a clause."""
 
 
-class _Found:
-    """What has been read, and how many bytes more may be."""
+class _FileContent:
+    """Content read so far, and the number of bytes that remain allowed."""
 
     def __init__(self, most_bytes: int) -> None:
         self.arrays: dict[str, npt.NDArray[Any]] = {}
@@ -40,7 +40,7 @@ class _Found:
         self._left, self._most = most_bytes, most_bytes
 
     def charge(self, count: int, path: str) -> None:
-        """Take `count` bytes from what the file may fill in memory, before they are taken there."""
+        """Subtract `count` bytes from the memory allowed, before they are allocated."""
         self._left -= count
         if self._left < 0:
             raise _RefusedError(f"{path} unfolds to more than {self._most >> 20} MiB, out of proportion to the file")
@@ -49,90 +49,90 @@ class _Found:
         self.arrays[path] = np.asarray(array, array.dtype.newbyteorder("<"), order="C")
 
     def write(self, out: BinaryIO) -> None:
-        about = [[path, array.dtype.str, array.shape] for path, array in self.arrays.items()]
-        told = {"arrays": about, "texts": self.texts, "attributes": self.attributes, "groups": self.groups}
-        out.write(json.dumps(told).encode() + b"\n")
+        descriptions = [[path, array.dtype.str, array.shape] for path, array in self.arrays.items()]
+        header = {"arrays": descriptions, "texts": self.texts, "attributes": self.attributes, "groups": self.groups}
+        out.write(json.dumps(header).encode() + b"\n")
         for array in self.arrays.values():
             out.write(array.tobytes())
 
 
-def _hdf5(stream: BinaryIO, asked: dict[str, Any], found: _Found) -> None:
+def _hdf5(stream: BinaryIO, request: dict[str, Any], content: _FileContent) -> None:
     import h5py
 
     with h5py.File(stream, "r") as file:
-        _close_the_door()
-        _walk(file, "", found, tuple(asked["leave"]))
+        _forbid_opening_files()
+        _walk(file, "", content, tuple(request["leave"]))
 
 
-def _walk(group: Any, path: str, found: _Found, leave: tuple[str, ...]) -> None:
+def _walk(group: Any, path: str, content: _FileContent, leave: tuple[str, ...]) -> None:
     import h5py
 
-    found.groups.append(path or "/")
-    _attributes(group, path or "/", found)
-    if path.count("/") > _DEEPEST or len(found.groups) + len(found.arrays) + len(group) > _MOST_NODES:
+    content.groups.append(path or "/")
+    _attributes(group, path or "/", content)
+    if path.count("/") > _DEEPEST or len(content.groups) + len(content.arrays) + len(group) > _MOST_NODES:
         raise _RefusedError("it has more groups than a model")
     for name in group:
         if len(name) > _LONGEST_NAME:
             raise _RefusedError("it has longer names than a model")
         inner = f"{path}/{name}"
         if inner in leave:
-            found.groups.append(inner)
+            content.groups.append(inner)
             continue
         if group.get(name, getclass=True, getlink=True) is not h5py.HardLink:
             raise _RefusedError(f"{inner} is a link to elsewhere")
-        one = group[name]
-        if isinstance(one, h5py.Group):
-            _walk(one, inner, found, leave)
-        elif isinstance(one, h5py.Dataset):
-            _dataset(one, inner, found)
+        item = group[name]
+        if isinstance(item, h5py.Group):
+            _walk(item, inner, content, leave)
+        elif isinstance(item, h5py.Dataset):
+            _dataset(item, inner, content)
 
 
-def _attributes(one: Any, path: str, found: _Found) -> None:
+def _attributes(item: Any, path: str, content: _FileContent) -> None:
     import h5py
 
-    told: dict[str, Any] = {}
-    if len(one.attrs) > _MOST_ATTRIBUTES:
+    values: dict[str, Any] = {}
+    if len(item.attrs) > _MOST_ATTRIBUTES:
         raise _RefusedError(f"{path} has more attributes than one of a model")
-    for name in one.attrs:
-        about = one.attrs.get_id(name)
-        is_text = h5py.check_string_dtype(about.dtype) is not None
-        if about.shape is None or math.prod(about.shape) != 1 or about.dtype.itemsize > _LONGEST_TEXT:
+    for name in item.attrs:
+        identifier = item.attrs.get_id(name)
+        is_text = h5py.check_string_dtype(identifier.dtype) is not None
+        if identifier.shape is None or math.prod(identifier.shape) != 1 or identifier.dtype.itemsize > _LONGEST_TEXT:
             continue
-        if is_text or about.dtype.kind in _NUMBERS:
-            value = np.asarray(one.attrs[name]).reshape(-1)[0]
-            told[name] = _text(value) if is_text else value.item()
-            found.charge(len(str(told[name])), path)
-    if told:
-        found.attributes[path] = told
+        if is_text or identifier.dtype.kind in _NUMBERS:
+            value = np.asarray(item.attrs[name]).reshape(-1)[0]
+            values[name] = _text(value) if is_text else value.item()
+            content.charge(len(str(values[name])), path)
+    if values:
+        content.attributes[path] = values
 
 
-def _dataset(one: Any, path: str, found: _Found) -> None:
+def _dataset(dataset: Any, path: str, content: _FileContent) -> None:
     import h5py as library
 
     h5py: Any = library
-    stored = one.id.get_create_plist()
+    stored = dataset.id.get_create_plist()
     if stored.get_external_count() or stored.get_layout() == h5py.h5d.VIRTUAL:
         raise _RefusedError(f"{path} lies in another file")
-    if one.shape is None or len(one.shape) > _MOST_AXES:
+    if dataset.shape is None or len(dataset.shape) > _MOST_AXES:
         return
     used = {stored.get_filter(index)[0] for index in range(stored.get_nfilters())}
     if not used <= _FILTERS:
         raise _RefusedError(f"{path} is packed in a way that no model needs")
-    count, each = math.prod(one.shape), one.dtype.itemsize
-    of_text = h5py.check_string_dtype(one.dtype)
-    if of_text is None and one.dtype.kind not in _NUMBERS:
+    count, item_bytes = math.prod(dataset.shape), dataset.dtype.itemsize
+    of_text = h5py.check_string_dtype(dataset.dtype)
+    if of_text is None and dataset.dtype.kind not in _NUMBERS:
         return
     if of_text is not None and count > 1 and of_text.length != 1:
         return
-    found.charge(count * each + (math.prod(one.chunks) * each if one.chunks else 0), path)
-    _attributes(one, path, found)
+    content.charge(count * item_bytes + (math.prod(dataset.chunks) * item_bytes if dataset.chunks else 0), path)
+    _attributes(dataset, path, content)
     if of_text is None:
-        found.add(path, one[()])
+        content.add(path, dataset[()])
     elif count == 1:
-        found.texts[path] = _text(np.asarray(one[()]).reshape(-1)[0])
-        found.charge(len(found.texts[path]), path)
+        content.texts[path] = _text(np.asarray(dataset[()]).reshape(-1)[0])
+        content.charge(len(content.texts[path]), path)
     elif count:
-        found.add(path, np.frombuffer(one[()].tobytes(), np.uint8))
+        content.add(path, np.frombuffer(dataset[()].tobytes(), np.uint8))
 
 
 def _text(value: Any) -> str:
@@ -140,37 +140,37 @@ def _text(value: Any) -> str:
     return data.partition(b"\0")[0].decode("utf-8", "replace")[:_LONGEST_TEXT]
 
 
-def _matlab(stream: BinaryIO, asked: dict[str, Any], found: _Found) -> None:
+def _matlab(stream: BinaryIO, request: dict[str, Any], content: _FileContent) -> None:
     from scipy import io as scipy_io
 
     library: Any = scipy_io
-    _close_the_door()
-    there = [(name, shape) for name, shape, _ in library.whosmat(stream)]
-    wanted = [(name, shape) for name, shape in there if name in asked["wanted"]]
-    found.groups.extend(f"/{name}" for name, _ in there if name not in asked["wanted"])
-    for name, shape in wanted:
-        found.charge(8 * math.prod(shape), f"/{name}")
+    _forbid_opening_files()
+    variables = [(name, shape) for name, shape, _ in library.whosmat(stream)]
+    requested = [(name, shape) for name, shape in variables if name in request["wanted"]]
+    content.groups.extend(f"/{name}" for name, _ in variables if name not in request["wanted"])
+    for name, shape in requested:
+        content.charge(8 * math.prod(shape), f"/{name}")
     stream.seek(0)
-    loaded = library.loadmat(stream, variable_names=[name for name, _ in wanted])
-    for name, _ in wanted:
+    loaded = library.loadmat(stream, variable_names=[name for name, _ in requested])
+    for name, _ in requested:
         if name in loaded:
-            _unfold(loaded[name], f"/{name}", found)
+            _add_variable(loaded[name], f"/{name}", content)
 
 
-def _unfold(value: Any, path: str, found: _Found) -> None:
-    """Add a variable, or the fields of a structure, as groups of HDF5 would hold them."""
+def _add_variable(value: Any, path: str, content: _FileContent) -> None:
+    """Add a variable, or the fields of a structure, as HDF5 groups."""
     if path.count("/") > _DEEPEST or type(value) is not np.ndarray:
         return
     if value.dtype.kind in _NUMBERS:
-        found.add(path, value)
+        content.add(path, value)
     elif value.dtype.names and value.size == 1:
-        found.groups.append(path)
+        content.groups.append(path)
         for name in value.dtype.names:
-            _unfold(value.reshape(-1)[0][name], f"{path}/{name}", found)
+            _add_variable(value.reshape(-1)[0][name], f"{path}/{name}", content)
 
 
-def _close_the_door() -> None:
-    """Open no more files, where the system can hold a process to that."""
+def _forbid_opening_files() -> None:
+    """Limit this process to the files that are open, where the system supports it."""
     if sys.platform != "win32":
         import resource
 
@@ -179,8 +179,8 @@ def _close_the_door() -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (3, 3))
 
 
-def _hold(most_memory: int, most_seconds: int) -> None:
-    """Hold this process to so much memory and work, where the system can."""
+def _limit_resources(most_memory: int, most_seconds: int) -> None:
+    """Limit memory and processor time of this process, where the system supports it."""
     if sys.platform != "win32":
         import resource
 
@@ -191,20 +191,20 @@ def _hold(most_memory: int, most_seconds: int) -> None:
 
 
 def _main() -> None:
-    asked = json.loads(sys.argv[1])
-    _hold(asked["most_memory"], asked["most_seconds"])
-    found, out = _Found(asked["most_bytes"]), sys.stdout.buffer
+    request = json.loads(sys.argv[1])
+    _limit_resources(request["most_memory"], request["most_seconds"])
+    content, out = _FileContent(request["most_bytes"]), sys.stdout.buffer
     try:
-        {"hdf5": _hdf5, "matlab": _matlab}[asked["kind"]](sys.stdin.buffer, asked, found)
+        {"hdf5": _hdf5, "matlab": _matlab}[request["kind"]](sys.stdin.buffer, request, content)
     except _RefusedError as error:
         out.write(json.dumps({"wrong": str(error)}).encode() + b"\n")
     except MemoryError:
         out.write(json.dumps({"wrong": "it asks for more memory than such a file can"}).encode() + b"\n")
     except Exception as error:  # libraries may raise anything at all in a damaged file
-        told = " ".join(str(error).split())[:120].rstrip(".;")
-        out.write(json.dumps({"wrong": f"it cannot be read ({told})"}).encode() + b"\n")
+        message = " ".join(str(error).split())[:120].rstrip(".;")
+        out.write(json.dumps({"wrong": f"it cannot be read ({message})"}).encode() + b"\n")
     else:
-        found.write(out)
+        content.write(out)
     out.flush()
 
 

@@ -1,1 +1,1 @@
-"""recognise."""
+"""Recognition of classes from fitted coefficients: training, prediction, evaluation."""

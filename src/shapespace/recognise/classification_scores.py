@@ -1,4 +1,4 @@
-"""How right answers are, and how much their probabilities can be trusted: scores of arrays of labels."""
+"""Scores of predicted classes and their probabilities."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from shapespace.types import FloatArray
 
 IndexArray: TypeAlias = npt.NDArray[np.integer[Any]]
 
-_LEAST_PROBABILITY = 1e-6
+_LEAST_PROBABILITY = 1e-6  # keeps the logarithm finite
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Whether probabilities are what they say.
+    """Calibration of predicted probabilities.
 
     Args:
         confidence: (B,) mean highest probability in each bin that is not empty.
@@ -44,7 +44,7 @@ class Calibration:
 
 @dataclass(frozen=True)
 class ClassScores:
-    """One class.
+    """Precision, recall and F1 score of one class.
 
     Args:
         precision: share of right ones among those called so; NaN where none was.
@@ -64,27 +64,33 @@ def macro_accuracy(labels: Sequence[str] | Any, predicted: Sequence[str] | Any, 
 
     Classes without a sample do not count; any answer but the right class is wrong, also none and "unsure".
     """
-    truth, answer = np.asarray(labels, dtype=str), np.asarray(predicted, dtype=str)
-    own = [truth == name for name in classes]
+    truth, answers = np.asarray(labels, dtype=str), np.asarray(predicted, dtype=str)
+    class_masks = [truth == name for name in classes]
     # recall_score(average="macro") gives the same in 2 ms instead of 0.06, which is asked for by the thousand.
-    recalls = [float((answer[mine] == name).mean()) for mine, name in zip(own, classes, strict=True) if mine.any()]
+    recalls = [
+        float((answers[is_member] == name).mean())
+        for is_member, name in zip(class_masks, classes, strict=True)
+        if is_member.any()
+    ]
     if not recalls:
         raise InputError("Accuracy needs at least one sample of the classes.")
     return float(np.mean(recalls))
 
 
 def confusion(labels: Sequence[str], predicted: Sequence[str], classes: Sequence[str]) -> IndexArray:
-    """Return counts (C, C + 1): rows are the true classes, columns the answers; the last holds all other answers."""
-    answers = [answer if answer in classes else "" for answer in predicted]
+    """Return counts (C, C + 1): rows are true classes, columns predicted classes; the last column has all other
+    answers.
+    """
+    answers = [prediction if prediction in classes else "" for prediction in predicted]
     return confusion_matrix(list(labels), answers, labels=[*classes, ""])[:-1]
 
 
 def per_class(labels: Sequence[str], predicted: Sequence[str], classes: Sequence[str]) -> dict[str, ClassScores]:
     """Return precision, recall, F1 and count of each class."""
-    found = precision_recall_fscore_support(list(labels), list(predicted), labels=list(classes), zero_division=np.nan)
+    scores = precision_recall_fscore_support(list(labels), list(predicted), labels=list(classes), zero_division=np.nan)
     return {
         name: ClassScores(float(precision), float(recall), float(f1), int(count))
-        for name, precision, recall, f1, count in zip(classes, *found, strict=True)
+        for name, precision, recall, f1, count in zip(classes, *scores, strict=True)
     }
 
 
@@ -121,18 +127,18 @@ def subject_bootstrap(
 def calibration(
     labels: Sequence[str], probabilities: FloatArray, classes: Sequence[str], *, bins: int = 10
 ) -> Calibration:
-    """Compare probabilities (n, C) with how often they come true; rows that are not finite are left out.
+    """Compare probabilities (n, C) with observed frequencies; rows that are not finite are excluded.
 
     Raises:
         InputError: arrays that do not belong together, or no row with probabilities.
     """
     truth, p = _with_probabilities(labels, probabilities, classes)
     confidence, right = p.max(axis=1), p.argmax(axis=1) == truth
-    where = np.minimum((confidence * bins).astype(np.int64), bins - 1)
-    count = np.bincount(where, minlength=bins)
+    bin_index = np.minimum((confidence * bins).astype(np.int64), bins - 1)
+    count = np.bincount(bin_index, minlength=bins)
     used = count > 0
-    mean = np.bincount(where, confidence, bins)[used] / count[used]
-    accuracy = np.bincount(where, right, bins)[used] / count[used]
+    mean = np.bincount(bin_index, confidence, bins)[used] / count[used]
+    accuracy = np.bincount(bin_index, right, bins)[used] / count[used]
     target = np.eye(len(classes))[truth]
     return Calibration(
         mean,
@@ -145,7 +151,7 @@ def calibration(
 
 
 def fit_temperature(labels: Sequence[str], probabilities: FloatArray, classes: Sequence[str]) -> float:
-    """Return the temperature at which probabilities (n, C) of samples left out are most likely (Guo et al., ICML 2017).
+    """Return the temperature that maximises the likelihood of held-out probabilities (n, C) (Guo et al., ICML 2017).
 
     The true class counts for 1 - 1 / (n + 2), as in Platt's calibration (1999): few samples that all are right do not
     show that the next is.
@@ -159,7 +165,7 @@ def fit_temperature(labels: Sequence[str], probabilities: FloatArray, classes: S
 
 
 def calibrated(probabilities: FloatArray, temperature: float) -> FloatArray:
-    """Return probabilities (n, C) at another temperature; which class is likeliest stays."""
+    """Return probabilities (n, C) at another temperature; the likeliest class is unchanged."""
     logits = np.log(np.maximum(probabilities, _LEAST_PROBABILITY))
     return np.asarray(softmax(logits / temperature, axis=1), dtype=np.float64)
 

@@ -1,4 +1,4 @@
-"""A trained classifier and its file: one .skops archive that holds data alone, and is checked before it is read.
+"""Trained classifiers and their file: one .skops archive without executable content, checked before it is loaded.
 
 skops writes the pipeline as a schema in JSON and arrays in .npy. Beside them stands `shapespace.json`: the format, the
 model's hash, the classes, how it was trained. Nothing in the file is run: types that are not in `TRUSTED` are refused.
@@ -31,7 +31,7 @@ from shapespace.types import FloatArray
 from shapespace.version import __version__
 
 FORMAT = "shapespace classifier"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 1  # increase when files of an older version cannot be read any more
 FACTS = "shapespace.json"
 _SCHEMA = "schema.json"
 _PROJECTION = "projection.npy"
@@ -80,15 +80,15 @@ _SETTINGS: Mapping[str, Mapping[str, Any]] = {
 }  # fmt: skip
 """Where scikit-learn's compiled code would trust what stands in the file."""
 _OURS = sorted(name for name in TRUSTED if name.startswith("shapespace."))
-_LARGEST_BYTES = 2**28
-_LARGEST_JSON = 2**24
+_LARGEST_BYTES = 2**28  # 256 MiB
+_LARGEST_JSON = 2**24  # 16 MiB
 _AGAIN = "train it again with shapespace recognise train"
-_PROBE_TOLERANCE = 1e-6
+_PROBE_TOLERANCE = 1e-6  # probabilities recomputed by another version of the libraries
 
 
 @dataclass(frozen=True, eq=False)
 class SavedClassifier:
-    """A trained classifier with all that its use needs.
+    """A trained classifier with its class names, calibration, model hash and training summary.
 
     Args:
         pipeline: of scikit-learn, fitted.
@@ -136,8 +136,10 @@ class SavedClassifier:
         Raises:
             InputError: fewer coefficients than the classifier sees, or values that are not finite.
         """
-        enough = z.ndim == 2 and (z.shape[1] >= self.width if self.projection is None else z.shape[1] == self.width)
-        if not enough or not np.isfinite(z).all():
+        is_valid_shape = z.ndim == 2 and (
+            z.shape[1] >= self.width if self.projection is None else z.shape[1] == self.width
+        )
+        if not is_valid_shape or not np.isfinite(z).all():
             least = "at least " if self.projection is None else ""
             raise InputError(
                 f"This classifier takes (n, K) finite coefficients with K {least}{self.width}, not {z.shape}."
@@ -160,7 +162,7 @@ class SavedClassifier:
             )
 
     def facts(self) -> dict[str, Any]:
-        """Return what the JSON part of the file says."""
+        """Return the JSON part of the file."""
         return {
             "format": FORMAT,
             "format_version": FORMAT_VERSION,
@@ -179,7 +181,7 @@ class SavedClassifier:
         }
 
     def save(self, path: Path | str) -> None:
-        """Write it to one file, whole or not at all.
+        """Write the classifier to one file, atomically.
 
         Raises:
             InputError: the name does not end in .skops.
@@ -201,7 +203,7 @@ class SavedClassifier:
 
 
 def software_versions() -> dict[str, str]:
-    """Return the versions of what trains a classifier."""
+    """Return the versions of the packages that train a classifier."""
     return {"shapespace": __version__, **{name: version(name) for name in ("scikit-learn", "skops", "numpy")}}
 
 
@@ -230,21 +232,27 @@ def load_classifier(path: Path | str) -> SavedClassifier:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
             _check_arrays(saved)
-            answer = saved.probabilities(_probe(saved.width))
-            told = np.asarray(facts["probe"], dtype=np.float64)
-            same = answer.shape == told.shape and bool(np.abs(answer - told).max() <= _PROBE_TOLERANCE)
+            probabilities = saved.probabilities(_probe(saved.width))
+            expected = np.asarray(facts["probe"], dtype=np.float64)
+            same = probabilities.shape == expected.shape and bool(
+                np.abs(probabilities - expected).max() <= _PROBE_TOLERANCE
+            )
             same = same and tuple(str(name) for name in pipeline.classes_) == saved.classes
     except Exception as error:  # whatever stands in its arrays
         raise FileFormatError(f"{path} holds a classifier that does not work; {_AGAIN}.") from error
     if not same:
-        made, here = saved.versions.get("scikit-learn", "unknown"), version("scikit-learn")
-        why = f"(scikit-learn {made} then, {here} now)" if made != here else "(the file is damaged)"
-        raise FileFormatError(f"{path} answers otherwise than when it was trained {why}; {_AGAIN}.")
+        saved_version, installed_version = saved.versions.get("scikit-learn", "unknown"), version("scikit-learn")
+        cause = (
+            f"(scikit-learn {saved_version} then, {installed_version} now)"
+            if saved_version != installed_version
+            else "(the file is damaged)"
+        )
+        raise FileFormatError(f"{path} answers otherwise than when it was trained {cause}; {_AGAIN}.")
     return saved
 
 
 def _probe(modes: int) -> FloatArray:
-    """Return fixed coefficients (4, modes) on which a classifier is tried."""
+    """Return fixed coefficients (4, modes) for a test of a loaded classifier."""
     return 2.0 * np.sin(np.arange(1.0, 4 * modes + 1).reshape(4, modes) ** 2)
 
 
@@ -302,10 +310,11 @@ def _facts(path: Path, members: Mapping[str, bytes]) -> dict[str, Any]:
     if not isinstance(facts, dict) or cast(dict[str, Any], facts).get("format") != FORMAT:
         raise FileFormatError(f"{path} is not a classifier of shapespace; {_AGAIN}.")
     known = cast(dict[str, Any], facts)
-    found: Any = known.get("format_version")
-    if found != FORMAT_VERSION:
+    format_version: Any = known.get("format_version")
+    if format_version != FORMAT_VERSION:
         raise FileFormatError(
-            f"{path} is of format version {str(found)[:40]}, and this shapespace reads {FORMAT_VERSION}; {_AGAIN}."
+            f"{path} is of format version {str(format_version)[:40]}, and this shapespace reads "
+            f"{FORMAT_VERSION}; {_AGAIN}."
         )
     return known
 
@@ -330,7 +339,7 @@ def _saved(path: Path, pipeline: Any, facts: Mapping[str, Any], projection: byte
             {str(name): str(number) for name, number in dict(facts["versions"]).items()},
             None if projection is None else _projection(projection),
         )
-        good = (
+        is_valid = (
             saved.classifier in CLASSIFIERS
             and 1 <= saved.modes <= 100_000
             and (saved.projection is None or saved.modes <= len(saved.projection))
@@ -341,18 +350,18 @@ def _saved(path: Path, pipeline: Any, facts: Mapping[str, Any], projection: byte
         )
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise FileFormatError(f"{path}: {FACTS} in it is damaged; {_AGAIN}.") from error
-    if not good:
+    if not is_valid:
         raise FileFormatError(f"{path}: {FACTS} in it is damaged; {_AGAIN}.")
     return saved
 
 
 def _check_arrays(saved: SavedClassifier) -> None:
     """Raise ValueError where arrays do not fit together: compiled code would read, and broadcasts grow, beyond them."""
-    found: Any = saved.pipeline
-    wanted: Any = CLASSIFIERS[saved.classifier](0)
-    if [type(step) for _, step in found.steps] != [type(step) for _, step in wanted.steps]:
+    pipeline: Any = saved.pipeline
+    expected: Any = CLASSIFIERS[saved.classifier](0)
+    if [type(step) for _, step in pipeline.steps] != [type(step) for _, step in expected.steps]:
         raise ValueError
-    classes, fitted = len(saved.classes), found.steps[-1][1]
+    classes, fitted = len(saved.classes), pipeline.steps[-1][1]
     fitted = getattr(fitted, "machine_", fitted)
     sizes = {"C": classes, "K": saved.modes, "O": classes - 1, "P": classes * (classes - 1) // 2}
     for name, letters in _SHAPES[saved.classifier].items():

@@ -1,4 +1,4 @@
-"""Classifiers of whitened coefficients z: scikit-learn pipelines by name, and our own nearest mean direction."""
+"""Classifiers of whitened coefficients z: scikit-learn pipelines by name, and nearest mean direction."""
 
 from __future__ import annotations
 
@@ -59,11 +59,13 @@ class NearestMeanDirection(ClassifierMixin, BaseEstimator):
         check_classification_targets(y)
         if self.temperature is not None and not self.temperature > 0:
             raise ValueError(f"The temperature must be above 0, not {self.temperature!r}.")
-        self.classes_, own = np.unique(y, return_inverse=True)
+        self.classes_, class_index = np.unique(y, return_inverse=True)
         unit = _directions(X)
-        sums = np.eye(len(self.classes_))[own].T @ unit
+        sums = np.eye(len(self.classes_))[class_index].T @ unit
         self.directions_ = _directions(sums)
-        self.temperature_ = self.temperature or likeliest_temperature(_left_out_cosines(unit, sums, own), own)
+        self.temperature_ = self.temperature or likeliest_temperature(
+            _left_out_cosines(unit, sums, class_index), class_index
+        )
         return self
 
     def predict_proba(self, X: Any) -> FloatArray:
@@ -82,7 +84,7 @@ class NearestMeanDirection(ClassifierMixin, BaseEstimator):
 
 
 class _Discriminants(ClassifierMixin, BaseEstimator):
-    """What linear and quadratic discriminants share: a `shrinkage` from 0 to 1, and `_scores`, log probabilities."""
+    """Base of linear and quadratic discriminants, with `shrinkage` from 0 to 1 and log probabilities `_scores`."""
 
     shrinkage: float
     classes_: Any
@@ -97,13 +99,13 @@ class _Discriminants(ClassifierMixin, BaseEstimator):
         return self.classes_[best]
 
     def _begin(self, X: Any, y: Any) -> tuple[FloatArray, Any]:
-        """Return the samples (n, K) and the index of each one's class, after the checks that `fit` names."""
+        """Validate the samples and return them (n, K) with the class index of each."""
         X, y = validate_data(self, X, y, dtype=np.float64)
         check_classification_targets(y)
         if not 0 <= self.shrinkage <= 1:
             raise ValueError(f"The shrinkage must lie from 0 to 1, not {self.shrinkage!r}.")
-        self.classes_, own = np.unique(y, return_inverse=True)
-        return X, own
+        self.classes_, class_index = np.unique(y, return_inverse=True)
+        return X, class_index
 
     def _checked_scores(self, X: Any) -> FloatArray:
         check_is_fitted(self)
@@ -138,8 +140,8 @@ class ShrinkageLDA(_Discriminants):
         Raises:
             ValueError: arrays that do not belong together, values that are not finite, shrinkage outside 0 to 1.
         """
-        X, own = self._begin(X, y)
-        self.coef_, self.intercept_ = linear_rule(X, np.eye(len(self.classes_))[own], X.T @ X, self.shrinkage)
+        X, class_index = self._begin(X, y)
+        self.coef_, self.intercept_ = linear_rule(X, np.eye(len(self.classes_))[class_index], X.T @ X, self.shrinkage)
         return self
 
     def _scores(self, X: FloatArray) -> FloatArray:
@@ -190,16 +192,18 @@ class ShrinkageQDA(_Discriminants):
         Raises:
             ValueError: arrays that do not belong together, values that are not finite, shrinkage outside 0 to 1.
         """
-        X, own = self._begin(X, y)
-        K, counts = X.shape[1], np.bincount(own)
-        self.means_ = np.stack([X[own == c].mean(axis=0) for c in range(len(counts))])
-        deviation = X - self.means_[own]
+        X, class_index = self._begin(X, y)
+        K, counts = X.shape[1], np.bincount(class_index)
+        self.means_ = np.stack([X[class_index == c].mean(axis=0) for c in range(len(counts))])
+        deviation = X - self.means_[class_index]
         pooled = deviation.T @ deviation / len(X)
         pooled = (1 - LDA_SHRINKAGE) * pooled + LDA_SHRINKAGE * np.trace(pooled) / K * np.eye(K)
         whiten, offsets = np.zeros((len(counts), K, K)), np.zeros(len(counts))
         for c, count in enumerate(counts):
-            mine = deviation[own == c]
-            values, vectors = np.linalg.eigh((1 - self.shrinkage) * (mine.T @ mine / count) + self.shrinkage * pooled)
+            class_deviation = deviation[class_index == c]
+            values, vectors = np.linalg.eigh(
+                (1 - self.shrinkage) * (class_deviation.T @ class_deviation / count) + self.shrinkage * pooled
+            )
             # One sample a class has no spread of its own.
             values = np.maximum(values, max(1e-12 * float(values[-1]), 1e-12 * float(X.var(axis=0).mean()), 1e-100))
             whiten[c] = vectors / np.sqrt(values)
@@ -208,8 +212,10 @@ class ShrinkageQDA(_Discriminants):
         return self
 
     def _scores(self, X: FloatArray) -> FloatArray:
-        far = [(((X - mean) @ whiten) ** 2).sum(axis=1) for mean, whiten in zip(self.means_, self.whiten_, strict=True)]
-        return self.offsets_ - 0.5 * np.stack(far, axis=1)
+        squared_distances = [
+            (((X - mean) @ whiten) ** 2).sum(axis=1) for mean, whiten in zip(self.means_, self.whiten_, strict=True)
+        ]
+        return self.offsets_ - 0.5 * np.stack(squared_distances, axis=1)
 
 
 class CalibratedSVC(ClassifierMixin, BaseEstimator):
@@ -243,18 +249,18 @@ class CalibratedSVC(ClassifierMixin, BaseEstimator):
         """
         X, y = validate_data(self, X, y, dtype=np.float64)
         check_classification_targets(y)
-        self.classes_, own = np.unique(y, return_inverse=True)
+        self.classes_, class_index = np.unique(y, return_inverse=True)
         if self.temperature is not None and not self.temperature > 0:
             raise ValueError(f"The temperature must be above 0, not {self.temperature!r}.")
         if len(self.classes_) < 2:
             raise ValueError("A support vector machine needs at least two classes; the samples have one class.")
-        self.machine_ = SVC(C=self.C).fit(X, own)
-        folds = min(3, int(np.bincount(own).min()))
+        self.machine_ = SVC(C=self.C).fit(X, class_index)
+        folds = min(3, int(np.bincount(class_index).min()))
         self.temperature_ = self.temperature or 1.0
         if self.temperature is None and folds > 1:
             parts = StratifiedKFold(folds, shuffle=True, random_state=self.random_state)
-            left_out = cross_val_predict(SVC(C=self.C), X, own, cv=parts, method="decision_function")
-            self.temperature_ = likeliest_temperature(_margins(left_out), own)
+            held_out_margins = cross_val_predict(SVC(C=self.C), X, class_index, cv=parts, method="decision_function")
+            self.temperature_ = likeliest_temperature(_margins(held_out_margins), class_index)
         return self
 
     def predict_proba(self, X: Any) -> FloatArray:
@@ -272,7 +278,7 @@ class CalibratedSVC(ClassifierMixin, BaseEstimator):
 
 
 def _margins(decision: Any) -> FloatArray:
-    """Return decision values (n, C); of two classes scikit-learn gives one column."""
+    """Return decision values (n, C), also for two classes, where scikit-learn returns one column."""
     values = np.asarray(decision, dtype=np.float64)
     return values if values.ndim == 2 else np.stack([-values, values], axis=1)
 
@@ -285,33 +291,33 @@ def _directions(X: FloatArray) -> FloatArray:
     return np.divide(scaled, length, out=np.zeros_like(X), where=length > 0)
 
 
-def _left_out_cosines(unit: FloatArray, sums: FloatArray, own: Any) -> FloatArray:
-    """Return cosines (n, C) of each sample with the mean directions of the others."""
+def _left_out_cosines(unit: FloatArray, sums: FloatArray, class_index: Any) -> FloatArray:
+    """Return leave-one-out cosines (n, C) of each sample with the mean directions of the classes."""
     cosines = unit @ _directions(sums).T
     rows = np.arange(len(unit))
-    cosines[rows, own] = (_directions(sums[own] - unit) * unit).sum(axis=1)
+    cosines[rows, class_index] = (_directions(sums[class_index] - unit) * unit).sum(axis=1)
     return cosines
 
 
 def likeliest_temperature(
-    scores: FloatArray, own: Any, *, doubt: float = 0.0, bounds: tuple[float, float] = (0.02, 10.0)
+    scores: FloatArray, class_index: Any, *, doubt: float = 0.0, bounds: tuple[float, float] = (0.02, 10.0)
 ) -> float:
-    """Return the temperature at which a softmax of `scores` (n, C) makes the true classes likeliest.
+    """Return the temperature that maximises the likelihood of the true classes under a softmax of `scores` (n, C).
 
     Args:
         scores: of samples left out, logits up to the temperature.
-        own: (n,) index of each sample's class.
+        class_index: (n,) index of each sample's class.
         doubt: share of each sample that counts for all classes alike.
         bounds: coldest and hottest temperature; few samples alone would go anywhere.
     """
     C = scores.shape[1]
-    target = (1 - doubt) * np.eye(C)[own] + doubt / C
+    target = (1 - doubt) * np.eye(C)[class_index] + doubt / C
 
     def surprise(log_temperature: float) -> float:
         return -float((target * log_softmax(scores / np.exp(log_temperature), axis=1)).sum(axis=1).mean())
 
-    found: Any = minimize_scalar(surprise, bounds=(math.log(bounds[0]), math.log(bounds[1])), method="bounded")
-    return float(np.exp(found.x))
+    minimum: Any = minimize_scalar(surprise, bounds=(math.log(bounds[0]), math.log(bounds[1])), method="bounded")
+    return float(np.exp(minimum.x))
 
 
 def _mean_direction(seed: int) -> Pipeline:

@@ -1,4 +1,4 @@
-"""Where on the face classes differ."""
+"""Maps of the vertices and regions at which classes differ."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from shapespace.types import FloatArray
 def decision_map(
     vertex_basis: FloatArray, stddev: FloatArray, v: FloatArray, labels: Sequence[str], *, noise_mm: float = 0.1
 ) -> FloatArray:
-    """Return how far each vertex tells the classes apart, (V,): its Fisher ratio, to be drawn on the face.
+    """Return the Fisher ratio of the classes at each vertex, (V,), as a map on the face.
 
     The ratio is the variance of the class means of a vertex's displacement over its variance within classes, both
     summed over the three coordinates. `noise_mm` stands below, so that vertices which hardly move do not stand out.
@@ -30,7 +30,7 @@ def decision_map(
     Raises:
         InputError: arrays that do not belong together, or one class only.
     """
-    names, own = np.unique(np.asarray(labels, dtype=str), return_inverse=True)
+    names, class_index = np.unique(np.asarray(labels, dtype=str), return_inverse=True)
     V, K = vertex_basis.shape[0], vertex_basis.shape[-1]
     if vertex_basis.shape != (V, 3, K) or v.shape != (len(labels), K) or stddev.shape != (K,):
         raise InputError(
@@ -39,7 +39,7 @@ def decision_map(
         )
     if len(names) < 2 or not np.isfinite(v).all():
         raise InputError("A decision map needs finite coefficients of at least two classes.")
-    between, within = _scatter(v * stddev, own)
+    between, within = _scatter(v * stddev, class_index)
     return _vertex_variance(vertex_basis, between) / (_vertex_variance(vertex_basis, within) + noise_mm**2)
 
 
@@ -55,11 +55,11 @@ def region_shares(decision: FloatArray, regions: Mapping[str, IndexArray]) -> di
     return {name: mean / total if total > 0 else 0.0 for name, mean in means.items()}
 
 
-def _scatter(b: FloatArray, own: Any) -> tuple[FloatArray, FloatArray]:
+def _scatter(b: FloatArray, class_index: Any) -> tuple[FloatArray, FloatArray]:
     """Return the covariance (K, K) of the class means and that within classes, over all samples."""
-    member = np.eye(int(own.max()) + 1)[own]
+    member = np.eye(int(class_index.max()) + 1)[class_index]
     means = (member.T @ b) / member.sum(axis=0)[:, None]
-    inner, outer = b - means[own], means[own] - b.mean(axis=0)
+    inner, outer = b - means[class_index], means[class_index] - b.mean(axis=0)
     return outer.T @ outer / len(b), inner.T @ inner / len(b)
 
 

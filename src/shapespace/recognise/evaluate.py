@@ -1,4 +1,4 @@
-"""How well classes are recognised in people who were not trained on: all of it, by the names that one asks for.
+"""Evaluation of classifiers in subjects who were not trained on.
 
 `predictions` has folds by subject and the choice nested inside them, `scores` what answers are worth, `resampling`
 tests against shuffled labels and curves, `decision` where on the face classes differ.
@@ -21,9 +21,9 @@ from shapespace.recognise.predictions import (
     Choice,
     Fold,
     Predictions,
+    cross_validated_probabilities,
     fixed_predictions,
     folds_of,
-    left_out,
     nested_predictions,
     predict_probabilities,
     subject_folds,
@@ -48,12 +48,12 @@ __all__ = [
     "calibrated",
     "calibration",
     "confusion",
+    "cross_validated_probabilities",
     "decision_map",
     "fit_temperature",
     "fixed_predictions",
     "folds_of",
     "learning_curve",
-    "left_out",
     "macro_accuracy",
     "mode_importance",
     "nested_predictions",

@@ -1,4 +1,4 @@
-"""The paper's next step: first the type of face, then an expression model for that type (section 5).
+"""Hierarchical classification: first the type of face, then an expression model for that type (the paper, section 5).
 
 Types are the components of a Gaussian mixture of identity coefficients, as many as the Bayesian information criterion
 asks for. The hard form takes the likeliest type; the soft one weighs the answers of all by how likely each type is.
@@ -17,8 +17,8 @@ from shapespace.errors import InputError
 from shapespace.recognise.classifiers import ShrinkageLDA
 from shapespace.types import FloatArray
 
-_LEAST_VARIANCE = 1e-3
-_KEPT = 0.995
+_LEAST_VARIANCE = 1e-3  # added to each variance, of coefficients in sd; keeps components from collapsing
+_KEPT = 0.995  # share of the variance
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,14 +39,14 @@ class FaceTypes:
 
     @classmethod
     def fit(
-        cls, a: FloatArray, *, types: int | None = None, most: int = 6, leading: int = 10, seed: int = 0
+        cls, a: FloatArray, *, types: int | None = None, max_types: int = 6, leading: int = 10, seed: int = 0
     ) -> FaceTypes:
         """Fit to identity coefficients, one row a person.
 
         Args:
             a: (S, Ka) in standard deviations.
             types: how many; None for the number with the least BIC.
-            most: numbers tried then.
+            max_types: numbers tried then.
             leading: coefficients that count.
             seed: of the mixture's starts.
 
@@ -56,17 +56,17 @@ class FaceTypes:
         from sklearn.mixture import GaussianMixture
 
         people = np.asarray(a, dtype=np.float64)[:, :leading]
-        tried = range(1, min(most, len(people) // 4) + 1)
+        tried = range(1, min(max_types, len(people) // 4) + 1)
         if not tried or (types is not None and not 1 <= types <= len(people)):
             raise InputError(f"{len(people)} people are too few for {types or 'any'} types of face.")
-        found: dict[int, Any] = {}
+        mixtures: dict[int, Any] = {}
         for number in {*tried} if types is None else {*tried, types}:
             mixture = cast(Any, GaussianMixture)(
                 number, covariance_type="diag", n_init=4, random_state=seed, reg_covar=_LEAST_VARIANCE
             )
-            found[number] = mixture.fit(people)
-        bic = {number: float(found[number].bic(people)) for number in found}
-        best = found[min(tried, key=lambda number: bic[number]) if types is None else types]
+            mixtures[number] = mixture.fit(people)
+        bic = {number: float(mixtures[number].bic(people)) for number in mixtures}
+        best = mixtures[min(tried, key=lambda number: bic[number]) if types is None else types]
         return cls(
             np.asarray(best.weights_), np.asarray(best.means_), np.asarray(best.covariances_),
             tuple(bic[number] for number in tried),
@@ -110,17 +110,17 @@ class ExpressionByType:
         """
         names = np.asarray(labels, dtype=str)
         self.classes = tuple(np.unique(names).tolist())
-        own = self.types.posterior(a).argmax(axis=1)
+        type_index = self.types.posterior(a).argmax(axis=1)
         self._models = []
         for number in range(self.types.count):
-            mine = own == number
-            if set(names[mine]) != set(self.classes):
+            is_member = type_index == number
+            if set(names[is_member]) != set(self.classes):
                 raise InputError(
                     f"Type {number + 1} of {self.types.count} has too few faces for a classifier of its own; "
                     "ask for fewer types."
                 )
-            modes = _modes(e[mine])
-            self._models.append((modes, ShrinkageLDA().fit(e[mine] @ modes, names[mine])))
+            modes = _modes(e[is_member])
+            self._models.append((modes, ShrinkageLDA().fit(e[is_member] @ modes, names[is_member])))
         return self
 
     def predict_proba(self, a: FloatArray, e: FloatArray) -> FloatArray:
@@ -135,5 +135,5 @@ class ExpressionByType:
 def _modes(e: FloatArray) -> FloatArray:
     """Return (Ke, k) the type's own modes of expression, through neutral."""
     _, size, rows = np.linalg.svd(e, full_matrices=False)
-    kept = int(np.searchsorted(np.cumsum(size**2) / (size**2).sum(), _KEPT)) + 1
-    return rows[: min(kept, len(rows))].T
+    n_kept = int(np.searchsorted(np.cumsum(size**2) / (size**2).sum(), _KEPT)) + 1
+    return rows[: min(n_kept, len(rows))].T

@@ -1,4 +1,4 @@
-"""Coefficients of fitted scans with what is known of them: from records or a coefficients.csv, in the order given."""
+"""Coefficients of fitted scans with labels, from records or a coefficients.csv, in the order given."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ NEUTRAL = "neutral"
 """The label of neutral faces, unless another is given."""
 
 STATUSES = ("converged", "max_iterations", "doubtful", "failed")
-_LARGEST_BYTES = 2**28
+_LARGEST_BYTES = 2**28  # 256 MiB
 _TABLE_AGAIN = "run shapespace fit to write it again, or take the column checksum out if that was meant"
 
 
 @dataclass(frozen=True, eq=False)
 class ScanCoefficients:
-    """One fitted scan, as far as recognition knows it.
+    """Coefficients, labels and status of one fitted scan.
 
     Args:
         name: of the fit.
@@ -84,18 +84,20 @@ def from_results(results: Results) -> list[ScanCoefficients]:
     """
     texts = ("scan", "status", "reason", "model_hash", "scan_name")
     columns = [f"z{k}" for k in range(1, modes_of(results) + 1)]
-    found: list[ScanCoefficients] = []
+    scans: list[ScanCoefficients] = []
     for rows in results.iter_rows((*texts, "modes", *columns)):
         z = np.array([rows[column] for column in columns], dtype=np.float64).reshape(len(columns), -1).T
-        for told, modes, values in zip(
+        for labels, modes, values in zip(
             zip(*(rows[text] for text in texts), strict=True), rows["modes"], z, strict=True
         ):
-            name, status, reason, model, file = (text or "" for text in told)
-            own = None if status == "failed" else read_only(values[: modes or 0])
-            found.append(_checked(ScanCoefficients(name, status, reason, own, model, file=file), f"The fit {name}"))
-    if not found:
+            name, status, reason, model, file = (text or "" for text in labels)
+            coefficients = None if status == "failed" else read_only(values[: modes or 0])
+            scans.append(
+                _check(ScanCoefficients(name, status, reason, coefficients, model, file=file), f"The fit {name}")
+            )
+    if not scans:
         raise InputError(f"{results.folder} holds no results of fits; fit some scans first.")
-    return sorted(found, key=lambda scan: scan.name)
+    return sorted(scans, key=lambda scan: scan.name)
 
 
 def read_coefficients(path: Path) -> list[ScanCoefficients]:
@@ -137,40 +139,40 @@ def _modes(heads: Sequence[str], path: Path) -> int:
     return modes
 
 
-def _from_row(row: Mapping[str, str], modes: int, where: str) -> ScanCoefficients:
+def _from_row(row: Mapping[str, str], modes: int, row_name: str) -> ScanCoefficients:
     status = row["status"]
     z: FloatArray | None = None
     if status != "failed":
         try:
             z = read_only(np.asarray([float(row[f"z{k}"]) for k in range(1, modes + 1)]))
         except ValueError as error:
-            raise FileFormatError(f"{where}: a coefficient is not a number; fit the scan again.") from error
+            raise FileFormatError(f"{row_name}: a coefficient is not a number; fit the scan again.") from error
     scan = ScanCoefficients(row["scan"], status, row["reason"], z, row["model_hash"])
-    return _checked(scan, where)
+    return _check(scan, row_name)
 
 
-def _checked(scan: ScanCoefficients, where: str) -> ScanCoefficients:
+def _check(scan: ScanCoefficients, row_name: str) -> ScanCoefficients:
     if scan.status not in STATUSES:
-        raise FileFormatError(f"{where} has the status {scan.status[:40]!r}, which no fit has; fit the scan again.")
+        raise FileFormatError(f"{row_name} has the status {scan.status[:40]!r}, which no fit has; fit the scan again.")
     if scan.z is not None and (scan.z.ndim != 1 or not len(scan.z) or not np.isfinite(scan.z).all()):
-        raise FileFormatError(f"{where} has coefficients that are not finite numbers; fit the scan again.")
+        raise FileFormatError(f"{row_name} has coefficients that are not finite numbers; fit the scan again.")
     if not scan.model_hash:
-        raise FileFormatError(f"{where} does not say of which model its coefficients are; fit the scan again.")
+        raise FileFormatError(f"{row_name} does not say of which model its coefficients are; fit the scan again.")
     return scan
 
 
-def labelled(scans: Sequence[ScanCoefficients], labels: Mapping[str, Label]) -> list[ScanCoefficients]:
+def with_labels(scans: Sequence[ScanCoefficients], labels: Mapping[str, Label]) -> list[ScanCoefficients]:
     """Return `scans` with labels and subjects, found by the name of the scan's file or of the fit."""
-    found: list[ScanCoefficients] = []
+    matched: list[ScanCoefficients] = []
     for scan in scans:
         label = labels.get(stem_of(scan.file)) if scan.file else None
         label = label or labels.get(scan.name) or labels.get(stem_of(scan.name))
-        found.append(replace(scan, label=label.text, subject=label.subject) if label else scan)
-    return found
+        matched.append(replace(scan, label=label.text, subject=label.subject) if label else scan)
+    return matched
 
 
 def one_model(scans: Sequence[ScanCoefficients]) -> str:
-    """Return the hash of the one model that all `scans` were fitted with.
+    """Return the hash of the model that all `scans` were fitted with.
 
     Raises:
         InputError: there are several, or no scans.
@@ -203,16 +205,16 @@ def relative_to_neutral(z: FloatArray, subjects: Sequence[str], is_neutral: Sequ
             f"Coefficients (n, K) need a subject and a mark each, not {z.shape}, {people.shape} and {neutral.shape}."
         )
     neutral = neutral & np.isfinite(z).all(axis=1)
-    lacking = sorted(set(people.tolist()) - set(people[neutral].tolist()))
-    if lacking:
-        more = f" and {len(lacking) - 5} more" if len(lacking) > 5 else ""
-        named = ", ".join(name or "(no name)" for name in lacking[:5])
+    without_neutral = sorted(set(people.tolist()) - set(people[neutral].tolist()))
+    if without_neutral:
+        others_note = f" and {len(without_neutral) - 5} more" if len(without_neutral) > 5 else ""
+        subject_names = ", ".join(name or "(no name)" for name in without_neutral[:5])
         raise InputError(
-            f"There is no usable neutral face of {named}{more}; add it with its label, or recognise without neutral "
-            "faces."
+            f"There is no usable neutral face of {subject_names}{others_note}; add it with its label, or "
+            "recognise without neutral faces."
         )
     relative = np.empty_like(z)
     for name in cast(list[str], np.unique(people).tolist()):
-        mine = people == name
-        relative[mine] = z[mine] - z[mine & neutral].mean(axis=0)
+        is_subject = people == name
+        relative[is_subject] = z[is_subject] - z[is_subject & neutral].mean(axis=0)
     return relative

@@ -1,4 +1,4 @@
-"""What is taken from scikit-learn and skops, or one sentence when they are not installed."""
+"""Imports from scikit-learn and skops, with one error message if they are not installed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How an expression shows in coefficients: the lines of figures 9 and 10, and how far apart they lie.
+"""Expressions as lines in coefficient space (figures 9 and 10), and scores of their separation.
 
 With v_i = (b_i - b_neutral) / stddev, samples of one expression at rising
 intensity are expected on a line through neutral, and different expressions on different lines.
@@ -16,12 +16,12 @@ from scipy.stats import rankdata
 from shapespace.errors import InputError
 from shapespace.types import FloatArray
 
-_SHRINKAGE = 0.1
+_SHRINKAGE = 0.1  # towards a multiple of the identity, so that the covariance of few scans is invertible
 
 
 @dataclass(frozen=True)
 class LineScores:
-    """One expression's line.
+    """Scores of the line of one expression.
 
     Args:
         r2_through_neutral: share of the summed squares that the best line through neutral explains.
@@ -41,7 +41,7 @@ class LineScores:
 
 @dataclass(frozen=True)
 class PooledLineScores:
-    """All expressions together.
+    """Scores of the lines of all expressions together.
 
     Args:
         r2_through_neutral: by expression, as in `LineScores`.
@@ -62,7 +62,7 @@ class PooledLineScores:
 
 @dataclass(frozen=True)
 class DisjointnessScores:
-    """How far apart the expressions lie.
+    """Scores of the separation of the expressions.
 
     Args:
         leave_one_out_accuracy: of the nearest mean direction by cosine.
@@ -155,17 +155,17 @@ def pooled_line_scores(
     rho = monotonicity_p = None
     if intensity is not None:
         groups = [np.flatnonzero(classes == c) for c in range(len(names))]
-        along = [_position(v[mine]) for mine in groups]
-        rho = float(np.mean([_spearman(a, intensity[mine]) for a, mine in zip(along, groups, strict=True)]))
+        along = [_position(v[rows]) for rows in groups]
+        rho = float(np.mean([_spearman(a, intensity[rows]) for a, rows in zip(along, groups, strict=True)]))
         drawn = [
             float(np.mean([_spearman(a, rng.permutation(intensity[m])) for a, m in zip(along, groups, strict=True)]))
             for _ in range(permutations)
         ]
         monotonicity_p = _permutation_p(rho, drawn)
-    told = [str(name) for name in names]
+    class_names = [str(name) for name in names]
     return PooledLineScores(
-        r2_through_neutral=dict(zip(told, observed.tolist(), strict=True)),
-        r2_p={name: _permutation_p(float(observed[c]), shuffled[:, c].tolist()) for c, name in enumerate(told)},
+        r2_through_neutral=dict(zip(class_names, observed.tolist(), strict=True)),
+        r2_p={name: _permutation_p(float(observed[c]), shuffled[:, c].tolist()) for c, name in enumerate(class_names)},
         mean_r2_p=_permutation_p(float(observed.mean()), shuffled.mean(axis=1).tolist()),
         spearman=rho,
         monotonicity_p=monotonicity_p,
@@ -176,8 +176,8 @@ def _line_r2(gram: FloatArray, classes: np.ndarray) -> FloatArray:
     """Return R2 of the line through neutral of each class, from the products (n, n) of the samples."""
     scores: list[float] = []
     for c in range(int(classes.max()) + 1):
-        mine = np.flatnonzero(classes == c)
-        part = gram[np.ix_(mine, mine)]
+        rows = np.flatnonzero(classes == c)
+        part = gram[np.ix_(rows, rows)]
         energy = float(np.trace(part))
         # The squared singular values of the samples are the eigenvalues of their products.
         scores.append(float(np.linalg.eigvalsh(part)[-1]) / energy if energy > 0 else 0.0)
@@ -214,10 +214,10 @@ def disjointness(v: FloatArray, labels: Sequence[str], *, permutations: int = 99
         chance=float(counts.max() / counts.sum()),
         cosine_silhouette=silhouette,
         separability=separability,
-        accuracy_p=_permutation_p(accuracy, _each(_accuracy, unit, shuffles)),
-        silhouette_p=_permutation_p(silhouette, _each(_silhouette, unit, shuffles)),
-        separability_p=_permutation_p(separability, _each(_separability, inside, shuffles)),
-        margin_p=_permutation_p(margin, _each(lambda x, c: _smallest_margin(x, c)[0], inside, shuffles)),
+        accuracy_p=_permutation_p(accuracy, _permuted_scores(_accuracy, unit, shuffles)),
+        silhouette_p=_permutation_p(silhouette, _permuted_scores(_silhouette, unit, shuffles)),
+        separability_p=_permutation_p(separability, _permuted_scores(_separability, inside, shuffles)),
+        margin_p=_permutation_p(margin, _permuted_scores(lambda x, c: _smallest_margin(x, c)[0], inside, shuffles)),
         smallest_margin=margin,
         smallest_margin_pair=(str(names[pair[0]]), str(names[pair[1]])),
     )
@@ -241,12 +241,12 @@ def _accuracy(unit: FloatArray, classes: np.ndarray) -> float:
     n_classes = int(classes.max()) + 1
     sums = np.stack([unit[classes == c].sum(axis=0) for c in range(n_classes)])
     hits = 0
-    for i, own in enumerate(classes):
+    for i, class_index in enumerate(classes):
         without = sums.copy()
-        without[own] -= unit[i]
+        without[class_index] -= unit[i]
         norms = np.linalg.norm(without, axis=1)
         cosine = (without @ unit[i]) / np.where(norms > 0, norms, np.inf)
-        hits += int(cosine.argmax() == own)
+        hits += int(cosine.argmax() == class_index)
     return hits / len(unit)
 
 
@@ -289,15 +289,15 @@ def _smallest_margin(v: FloatArray, classes: np.ndarray) -> tuple[float, tuple[i
     for a, b in itertools.combinations(range(n_classes), 2):
         w = np.asarray(np.linalg.solve(shrunk, means[b] - means[a]), dtype=np.float64)
         along = v @ w
-        gap = float(along[classes == b].min() - along[classes == a].max())
+        separation = float(along[classes == b].min() - along[classes == a].max())
         spread = float(np.sqrt(w @ within @ w))
-        scaled = gap / spread if spread > 0 else 0.0
+        scaled = separation / spread if spread > 0 else 0.0
         if scaled < best[0]:
             best = (scaled, (a, b))
     return best
 
 
-def _each(
+def _permuted_scores(
     score: Callable[[FloatArray, np.ndarray], float], unit: FloatArray, shuffles: Sequence[np.ndarray]
 ) -> list[float]:
     return [score(unit, shuffled) for shuffled in shuffles]

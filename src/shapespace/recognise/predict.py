@@ -1,4 +1,4 @@
-"""Train a classifier on fitted scans with labels, and answer for others: each scan gets a row, none is guessed."""
+"""Training of a classifier on labelled fits, and prediction for other fits, one row per scan."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from shapespace.recognise.classification_scores import fit_temperature, macro_ac
 from shapespace.recognise.classifier_file import SavedClassifier, software_versions
 from shapespace.recognise.classifiers import CLASSIFIERS
 from shapespace.recognise.labelled_scans import NEUTRAL, ScanCoefficients, one_model, relative_to_neutral
-from shapespace.recognise.predictions import left_out, subject_folds
+from shapespace.recognise.predictions import cross_validated_probabilities, subject_folds
 from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, require
 
@@ -27,12 +27,12 @@ UNSURE = "unsure"
 CONFIDENCE = 0.5
 """The confidence unless another is given: below it the likeliest class is more likely wrong than right."""
 
-_FOLDS = 5
+_FOLDS = 5  # folds by subject of the calibration
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
-    """What recognition says of one scan.
+class ScanPrediction:
+    """Predicted class of one scan, with probabilities and status.
 
     Args:
         scan: name of the fit.
@@ -64,7 +64,7 @@ def train_classifier(
     projection: FloatArray | None = None,
     seed: int = 0,
 ) -> tuple[SavedClassifier, list[str]]:
-    """Train a classifier on fitted scans with labels; return it and what the user should know.
+    """Train a classifier on fitted scans with labels; return it with notes for the user.
 
     Failed and doubtful fits and scans without a label are left out and counted. Probabilities are calibrated on people
     left out in turn (on scans left out where no people are named), which also gives the accuracy that is told.
@@ -124,24 +124,24 @@ def _with_labels(scans: Sequence[ScanCoefficients]) -> tuple[list[ScanCoefficien
     """Return the scans to train on, how many are left out and why, and the same in sentences."""
     labelled = [scan for scan in scans if scan.label]
     used = [scan for scan in labelled if scan.trusted]
-    lost = Counter(scan.status for scan in labelled if not scan.trusted)
+    untrusted = Counter(scan.status for scan in labelled if not scan.trusted)
     without_label = len(scans) - len(labelled)
     if not used:
         raise InputError(
             f"None of the {len(scans)} scans has both a label and a fit to be trusted; check that the table of labels "
             "names the scans."
         )
-    notes = [f"{count} {status} of the fits with a label left out." for status, count in sorted(lost.items())]
+    notes = [f"{count} {status} of the fits with a label left out." for status, count in sorted(untrusted.items())]
     if without_label:
         notes.append(f"{without_label} of {len(scans)} scans have no label and are left out.")
-    return used, {**dict(lost), "without_label": without_label}, notes
+    return used, {**dict(untrusted), "without_label": without_label}, notes
 
 
 def _samples(
     scans: Sequence[ScanCoefficients], neutral: str | None, projection: FloatArray | None
 ) -> tuple[FloatArray, Any, list[str]]:
     """Return features (n, k), labels (n,) and subjects; with `neutral`, relative to the faces that it labels."""
-    z = _stacked(scans)
+    z = _stack_coefficients(scans)
     if projection is not None:
         if projection.shape[1:] != z.shape[1:]:
             raise InputError(
@@ -158,15 +158,21 @@ def _samples(
         )
     expressive = labels != neutral
     z = relative_to_neutral(z, subjects, ~expressive)[expressive]
-    return z, labels[expressive], [name for name, mine in zip(subjects, expressive, strict=True) if mine]
+    return (
+        z,
+        labels[expressive],
+        [name for name, is_expressive in zip(subjects, expressive, strict=True) if is_expressive],
+    )
 
 
 def _classes(labels: Any) -> tuple[list[str], list[int]]:
-    """Return the classes and how many samples each has, or raise where they cannot be learned."""
+    """Return the classes and their sample counts; raise if they cannot be learned."""
     classes, counts = np.unique(labels, return_counts=True)
     if len(classes) < 2 or counts.min() < 2:
-        few = ", ".join(f"{name} ({n})" for name, n in zip(classes, counts, strict=True)) or "none"
-        raise InputError(f"Training needs at least two classes with at least two scans each; these were found: {few}.")
+        counts_text = ", ".join(f"{name} ({n})" for name, n in zip(classes, counts, strict=True)) or "none"
+        raise InputError(
+            f"Training needs at least two classes with at least two scans each; these were found: {counts_text}."
+        )
     if UNSURE in classes:
         raise InputError(f"The label {UNSURE!r} is what shapespace answers below the confidence; give it another name.")
     return classes.tolist(), counts.tolist()
@@ -175,7 +181,7 @@ def _classes(labels: Any) -> tuple[list[str], list[int]]:
 def _calibrate(
     z: FloatArray, labels: Any, subjects: Sequence[str], classes: Sequence[str], classifier: str, seed: int
 ) -> tuple[float, dict[str, Any], str]:
-    """Return the temperature, what cross-validation found, and what the user should know about it."""
+    """Return the temperature, the cross-validation result, and notes for the user."""
     by_subject = all(subjects)
     groups = list(subjects) if by_subject else [str(i) for i in range(len(z))]
     folds = min(_FOLDS, len(set(groups)))
@@ -184,7 +190,7 @@ def _calibrate(
     if not splits or any(len(np.unique(labels[train])) < 2 for train, _ in splits):
         note = "There are too few subjects for cross-validation: accuracy is unknown, probabilities are not calibrated."
         return 1.0, {"macro_accuracy": None, "by": None, "folds": 0}, note
-    probabilities = left_out(z, labels, splits, classes, classifier, {}, seed)
+    probabilities = cross_validated_probabilities(z, labels, splits, classes, classifier, {}, seed)
     temperature = fit_temperature(labels.tolist(), probabilities, classes)
     answers = np.asarray(classes)[probabilities.argmax(axis=1)]
     accuracy = macro_accuracy(labels, answers, classes)
@@ -194,8 +200,8 @@ def _calibrate(
     return temperature, {"macro_accuracy": accuracy, "by": "subject" if by_subject else "scan", "folds": folds}, note
 
 
-def predict_scans(saved: SavedClassifier, scans: Sequence[ScanCoefficients]) -> list[Answer]:
-    """Return one answer for each of `scans`, in their order.
+def predict_scans(saved: SavedClassifier, scans: Sequence[ScanCoefficients]) -> list[ScanPrediction]:
+    """Return one prediction per scan, in the order of `scans`.
 
     A failed fit gets no answer; a doubtful one, or one below the confidence, gets `UNSURE`; each with its reason.
 
@@ -204,32 +210,36 @@ def predict_scans(saved: SavedClassifier, scans: Sequence[ScanCoefficients]) -> 
     """
     saved.refuse_other_model(one_model(scans))
     zero = _neutral_of(saved, scans) if saved.relative_to_neutral else {}
-    answers: list[Answer] = []
+    answers: list[ScanPrediction] = []
     for scan in scans:
         is_reference = saved.relative_to_neutral and scan.label == saved.neutral
         refusal = _refusal(saved, scan, zero, is_reference)
         if refusal is not None or scan.z is None:
             doubtful = scan.status == "doubtful" and not is_reference
             answers.append(
-                Answer(scan.name, scan.status, UNSURE if doubtful else "", None, refusal or scan.reason, is_reference)
+                ScanPrediction(
+                    scan.name, scan.status, UNSURE if doubtful else "", None, refusal or scan.reason, is_reference
+                )
             )
             continue
         z = scan.z - zero[scan.subject] if saved.relative_to_neutral else scan.z
         p = saved.probabilities(z[None])[0]
         best = int(p.argmax())
-        sure = bool(p[best] >= saved.confidence)
+        is_certain = bool(p[best] >= saved.confidence)
         name = saved.classes[best]
-        why = f"The likeliest class, {name}, has the probability {p[best]:.2f}, below {saved.confidence:g}."
-        answers.append(Answer(scan.name, scan.status, name if sure else UNSURE, p, "" if sure else why))
+        reason = f"The likeliest class, {name}, has the probability {p[best]:.2f}, below {saved.confidence:g}."
+        answers.append(
+            ScanPrediction(scan.name, scan.status, name if is_certain else UNSURE, p, "" if is_certain else reason)
+        )
     return answers
 
 
 def _neutral_of(saved: SavedClassifier, scans: Sequence[ScanCoefficients]) -> dict[str, FloatArray]:
-    found: dict[str, list[FloatArray]] = {}
+    neutrals: dict[str, list[FloatArray]] = {}
     for scan in scans:
         if scan.label == saved.neutral and scan.subject and scan.trusted and scan.z is not None:
-            found.setdefault(scan.subject, []).append(scan.z)
-    return {name: np.mean(z, axis=0) for name, z in found.items()}
+            neutrals.setdefault(scan.subject, []).append(scan.z)
+    return {name: np.mean(z, axis=0) for name, z in neutrals.items()}
 
 
 def _refusal(
@@ -251,7 +261,7 @@ def _refusal(
     return None
 
 
-def write_answers(path: Path, answers: Sequence[Answer], classes: Sequence[str]) -> None:
+def write_answers(path: Path, answers: Sequence[ScanPrediction], classes: Sequence[str]) -> None:
     """Write a CSV table: scan, status, prediction, p_CLASS for each class, reason.
 
     Raises:
@@ -260,27 +270,31 @@ def write_answers(path: Path, answers: Sequence[Answer], classes: Sequence[str])
     header = ("scan", "status", "prediction", *(f"p_{name}" for name in classes), "reason")
     rows = [
         (
-            answer.scan,
-            answer.status,
-            answer.prediction,
-            *(["" for _ in classes] if answer.probabilities is None else [f"{p:.6f}" for p in answer.probabilities]),
-            answer.reason,
+            prediction.scan,
+            prediction.status,
+            prediction.prediction,
+            *(
+                ["" for _ in classes]
+                if prediction.probabilities is None
+                else [f"{p:.6f}" for p in prediction.probabilities]
+            ),
+            prediction.reason,
         )
-        for answer in answers
+        for prediction in answers
     ]
     write_rows(path, header, rows)
 
 
-def _stacked(scans: Sequence[ScanCoefficients]) -> FloatArray:
+def _stack_coefficients(scans: Sequence[ScanCoefficients]) -> FloatArray:
     rows = [scan.z for scan in scans if scan.z is not None]
     if len({len(z) for z in rows}) != 1:
         raise InputError("The fits have different numbers of coefficients; fit all scans with one model.")
     return np.stack(rows)
 
 
-def _modes(known: int, modes: int | None) -> int:
+def _modes(available: int, modes: int | None) -> int:
     if modes is None:
-        return known
-    if not 1 <= modes <= known:
-        raise InputError(f"There are {known} coefficients, so a classifier cannot see {modes} of them.")
+        return available
+    if not 1 <= modes <= available:
+        raise InputError(f"There are {available} coefficients, so a classifier cannot see {modes} of them.")
     return modes

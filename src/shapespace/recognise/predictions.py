@@ -1,4 +1,4 @@
-"""Classes predicted in people who were not trained on: folds by subject, and a choice nested inside them.
+"""Cross-validated predictions: folds by subject, and nested selection of hyperparameters.
 
 Everything here works on arrays of whitened coefficients, (n, K). A `Fold` carries its own training and test arrays, so
 that the shape model behind them may be another one in each fold, made without the people tested. A test row that is not
@@ -66,14 +66,16 @@ class Fold:
                 f"A fold needs (n, K) training and (m, K) test coefficients with a label and a subject each, not "
                 f"{self.train.shape} with {n} labels and {self.test.shape} with {m} labels."
             )
-        both = sorted(set(self.train_subjects) & set(self.test_subjects))
-        if both:
-            raise InputError(f"{', '.join(both[:3])} would be trained on and tested; split the samples by subject.")
+        shared_subjects = sorted(set(self.train_subjects) & set(self.test_subjects))
+        if shared_subjects:
+            raise InputError(
+                f"{', '.join(shared_subjects[:3])} would be trained on and tested; split the samples by subject."
+            )
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What nested cross-validation chose within the training people of one fold.
+    """Hyperparameters that nested cross-validation selected within the training subjects of one fold.
 
     Args:
         classifier: a name of `CLASSIFIERS`.
@@ -92,7 +94,7 @@ class Choice:
 
 @dataclass(frozen=True, eq=False)
 class Predictions:
-    """Answers for the test samples of all folds.
+    """Predicted classes and probabilities of the test samples of all folds.
 
     Args:
         classes: C names, sorted.
@@ -126,8 +128,8 @@ def subject_folds(subjects: Sequence[str], n_folds: int, seed: int = 0) -> list[
     if not 2 <= n_folds <= count:
         raise InputError(f"{count} subjects cannot be split into {n_folds} folds; ask for 2 to {count}.")
     # One class for all: then it evens out the number of samples, which GroupKFold does only unshuffled.
-    parted: Any = StratifiedGroupKFold(n_folds, shuffle=True, random_state=seed)
-    return list(parted.split(people, np.zeros(len(people)), people))
+    splitter: Any = StratifiedGroupKFold(n_folds, shuffle=True, random_state=seed)
+    return list(splitter.split(people, np.zeros(len(people)), people))
 
 
 def folds_of(
@@ -160,7 +162,7 @@ def nested_predictions(
     modes: Sequence[int | None] = MODES,
     on_fold: Callable[[int, int], None] | None = None,
 ) -> Predictions:
-    """Predict the test samples of each fold by what was chosen among its training people alone.
+    """Predict the test samples of each fold with hyperparameters selected in its training subjects alone.
 
     Inside the training people, again split by person: first the number of leading modes is chosen by LDA, then the
     classifier and its parameters with that many, each by macro accuracy of the samples left out. The probabilities of
@@ -181,13 +183,13 @@ def nested_predictions(
     refuse_unknown(classifiers)
     if not classifiers or not modes:
         raise InputError("Nested cross-validation needs at least one classifier and one number of modes.")
-    found: list[tuple[FloatArray, Choice]] = []
+    results: list[tuple[FloatArray, Choice]] = []
     with threadpool_limits(1):  # small matrices: more threads cost more than they give
         for number, fold in enumerate(folds, 1):
-            found.append(_nested(fold, classes, classifiers, inner_folds, seed, modes))
+            results.append(_nested(fold, classes, classifiers, inner_folds, seed, modes))
             if on_fold is not None:
                 on_fold(number, len(folds))
-    return _gather(folds, classes, found)
+    return _gather(folds, classes, results)
 
 
 def _nested(
@@ -198,12 +200,12 @@ def _nested(
     seed: int,
     modes: Sequence[int | None],
 ) -> tuple[FloatArray, Choice]:
-    X, labels, subjects = usable(fold)
+    X, labels, subjects = usable_training_rows(fold)
     inner = subject_folds(subjects.tolist(), inner_folds, seed)
     K = X.shape[1]
     counts = sorted({min(K if m is None else m, K) for m in modes})
-    by_modes = [left_out(X[:, :m], labels, inner, classes, "lda", {}, seed) for m in counts]
-    tried = [macro_accuracy(labels, answers_of(found, classes), classes) for found in by_modes]
+    by_modes = [cross_validated_probabilities(X[:, :m], labels, inner, classes, "lda", {}, seed) for m in counts]
+    tried = [macro_accuracy(labels, likeliest_classes(candidate, classes), classes) for candidate in by_modes]
     m = counts[int(np.argmax(tried))]
     best: tuple[float, str, dict[str, Any], FloatArray] | None = None
     fewest = min(len(train) for train, _ in inner)
@@ -211,36 +213,36 @@ def _nested(
         for parameters in _grid(name):
             if int(parameters.get("classify__n_neighbors", 1)) > fewest:
                 continue  # so many neighbours there are not
-            probabilities = left_out(X[:, :m], labels, inner, classes, name, parameters, seed)
-            accuracy = macro_accuracy(labels, answers_of(probabilities, classes), classes)
+            probabilities = cross_validated_probabilities(X[:, :m], labels, inner, classes, name, parameters, seed)
+            accuracy = macro_accuracy(labels, likeliest_classes(probabilities, classes), classes)
             if best is None or accuracy > best[0] + 1e-12:
                 best = accuracy, name, parameters, probabilities
     if best is None:
         raise InputError("None of the classifiers can be had with so few training samples; add samples.")
     accuracy, name, parameters, probabilities = best
     temperature = fit_temperature(labels.tolist(), probabilities, classes)
-    answer = predict_probabilities(X[:, :m], labels, fold.test[:, :m], classes, name, parameters, seed)
-    return calibrated(answer, temperature), Choice(name, parameters, m, temperature, accuracy)
+    fold_probabilities = predict_probabilities(X[:, :m], labels, fold.test[:, :m], classes, name, parameters, seed)
+    return calibrated(fold_probabilities, temperature), Choice(name, parameters, m, temperature, accuracy)
 
 
 def fixed_predictions(
     folds: Sequence[Fold], classifier: str, *, modes: int | None = None, seed: int = 0
 ) -> Predictions:
-    """Predict the test samples of each fold by one classifier with its own settings, with nothing to choose.
+    """Predict the test samples of each fold by one classifier with fixed hyperparameters.
 
     Raises:
         InputError: no folds, or an unknown classifier.
     """
     classes = classes_of(folds)
     refuse_unknown([classifier])
-    found: list[tuple[FloatArray, Choice]] = []
+    results: list[tuple[FloatArray, Choice]] = []
     with threadpool_limits(1):
         for fold in folds:
-            X, labels, _ = usable(fold)
+            X, labels, _ = usable_training_rows(fold)
             m = min(modes or X.shape[1], X.shape[1])
-            answer = predict_probabilities(X[:, :m], labels, fold.test[:, :m], classes, classifier, {}, seed)
-            found.append((answer, Choice(classifier, {}, m, 1.0, float("nan"))))
-    return _gather(folds, classes, found)
+            probabilities = predict_probabilities(X[:, :m], labels, fold.test[:, :m], classes, classifier, {}, seed)
+            results.append((probabilities, Choice(classifier, {}, m, 1.0, float("nan"))))
+    return _gather(folds, classes, results)
 
 
 def predict_probabilities(
@@ -261,23 +263,23 @@ def predict_probabilities(
     if neighbours > len(X):
         raise InputError(f"{neighbours} nearest neighbours cannot be had among {len(X)} training samples; add samples.")
     finite = np.isfinite(test).all(axis=1)
-    only = np.unique(np.asarray(labels, dtype=str))
-    if len(only) == 1:  # as happens in inner folds of very few people; several classifiers refuse it
-        answer = np.full((len(test), len(classes)), np.nan)
-        answer[finite] = 0.0
-        answer[finite, list(classes).index(str(only[0]))] = 1.0
-        return answer
+    present = np.unique(np.asarray(labels, dtype=str))
+    if len(present) == 1:  # as happens in inner folds of very few people; several classifiers refuse it
+        probabilities = np.full((len(test), len(classes)), np.nan)
+        probabilities[finite] = 0.0
+        probabilities[finite, list(classes).index(str(present[0]))] = 1.0
+        return probabilities
     pipeline.fit(X, labels)
-    answer = np.full((len(test), len(classes)), np.nan)
+    probabilities = np.full((len(test), len(classes)), np.nan)
     if finite.any():
         columns = [classes.index(name) for name in pipeline.classes_.tolist()]
-        known = np.zeros((int(finite.sum()), len(classes)))
-        known[:, columns] = pipeline.predict_proba(test[finite])
-        answer[finite] = known
-    return answer
+        probabilities_known = np.zeros((int(finite.sum()), len(classes)))
+        probabilities_known[:, columns] = pipeline.predict_proba(test[finite])
+        probabilities[finite] = probabilities_known
+    return probabilities
 
 
-def left_out(
+def cross_validated_probabilities(
     X: FloatArray,
     labels: Any,
     folds: Sequence[tuple[IndexArray, IndexArray]],
@@ -287,10 +289,12 @@ def left_out(
     seed: int = 0,
 ) -> FloatArray:
     """Return probabilities (n, C) of each sample by the classifier fitted to the folds that do not hold it."""
-    answer = np.full((len(X), len(classes)), np.nan)
+    probabilities = np.full((len(X), len(classes)), np.nan)
     for train, test in folds:
-        answer[test] = predict_probabilities(X[train], labels[train], X[test], classes, classifier, parameters, seed)
-    return answer
+        probabilities[test] = predict_probabilities(
+            X[train], labels[train], X[test], classes, classifier, parameters, seed
+        )
+    return probabilities
 
 
 def classes_of(folds: Sequence[Fold]) -> tuple[str, ...]:
@@ -304,13 +308,13 @@ def classes_of(folds: Sequence[Fold]) -> tuple[str, ...]:
 
 
 def refuse_unknown(names: Sequence[str]) -> None:
-    """Raise InputError where a name is none of `CLASSIFIERS`."""
+    """Raise InputError for names that are not in `CLASSIFIERS`."""
     for name in names:
         if name not in CLASSIFIERS:
             raise InputError(f"There is no classifier {name!r}; choose among {', '.join(CLASSIFIERS)}.")
 
 
-def usable(fold: Fold) -> tuple[FloatArray, Any, Any]:
+def usable_training_rows(fold: Fold) -> tuple[FloatArray, Any, Any]:
     """Return the finite training rows with labels and subjects as arrays."""
     finite = np.isfinite(fold.train).all(axis=1)
     labels = np.asarray(fold.train_labels, dtype=str)[finite]
@@ -319,11 +323,11 @@ def usable(fold: Fold) -> tuple[FloatArray, Any, Any]:
     return fold.train[finite], labels, np.asarray(fold.train_subjects, dtype=str)[finite]
 
 
-def answers_of(probabilities: FloatArray, classes: Sequence[str]) -> Any:
+def likeliest_classes(probabilities: FloatArray, classes: Sequence[str]) -> Any:
     """Return the likeliest classes (n,); empty where a fit failed."""
-    lost = np.isnan(probabilities).any(axis=1)
+    undefined = np.isnan(probabilities).any(axis=1)
     best = np.where(np.isnan(probabilities), -1.0, probabilities).argmax(axis=1)
-    return np.where(lost, "", np.asarray(classes)[best])
+    return np.where(undefined, "", np.asarray(classes)[best])
 
 
 def _grid(name: str) -> Iterator[dict[str, Any]]:
@@ -332,8 +336,10 @@ def _grid(name: str) -> Iterator[dict[str, Any]]:
         yield dict(zip(grid, values, strict=True))
 
 
-def _gather(folds: Sequence[Fold], classes: tuple[str, ...], found: Sequence[tuple[FloatArray, Choice]]) -> Predictions:
-    probabilities = np.concatenate([answer for answer, _ in found])
+def _gather(
+    folds: Sequence[Fold], classes: tuple[str, ...], results: Sequence[tuple[FloatArray, Choice]]
+) -> Predictions:
+    probabilities = np.concatenate([fold_probabilities for fold_probabilities, _ in results])
     labels = np.concatenate([np.asarray(fold.test_labels, dtype=str) for fold in folds])
     subjects = np.concatenate([np.asarray(fold.test_subjects, dtype=str) for fold in folds])
     index = np.arange(len(labels))
@@ -343,9 +349,9 @@ def _gather(folds: Sequence[Fold], classes: tuple[str, ...], found: Sequence[tup
     return Predictions(
         classes,
         tuple(labels[order].tolist()),
-        tuple(answers_of(probabilities, classes)[order].tolist()),
+        tuple(likeliest_classes(probabilities, classes)[order].tolist()),
         probabilities[order],
         tuple(subjects[order].tolist()),
         index[order],
-        tuple(choice for _, choice in found),
+        tuple(choice for _, choice in results),
     )

@@ -1,4 +1,4 @@
-"""What accuracy is worth: against shuffled labels, fewer people to learn from, and modes taken away."""
+"""Permutation tests, learning curves and mode importance of classifiers."""
 
 from __future__ import annotations
 
@@ -13,13 +13,20 @@ from threadpoolctl import threadpool_limits
 from shapespace.errors import InputError
 from shapespace.recognise.classification_scores import IndexArray, macro_accuracy
 from shapespace.recognise.classifiers import CLASSIFIERS, LDA_SHRINKAGE, linear_rule
-from shapespace.recognise.predictions import Fold, answers_of, classes_of, predict_probabilities, refuse_unknown, usable
+from shapespace.recognise.predictions import (
+    Fold,
+    classes_of,
+    likeliest_classes,
+    predict_probabilities,
+    refuse_unknown,
+    usable_training_rows,
+)
 from shapespace.types import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class PermutationTest:
-    """Macro accuracy, and what it is where labels mean nothing.
+    """Macro accuracy, and its null distribution under permuted labels.
 
     Args:
         observed: with the labels as they are.
@@ -34,7 +41,7 @@ class PermutationTest:
 
 @dataclass(frozen=True, eq=False)
 class LearningCurve:
-    """Macro accuracy against the number of people trained on.
+    """Macro accuracy against the number of training subjects.
 
     Args:
         subjects: (S,) people in each training set.
@@ -95,7 +102,9 @@ def permutation_test(
 
 @dataclass(frozen=True, eq=False)
 class _Prepared:
-    """A fold made ready for many labellings: rows of each person, finite training rows, scaled arrays, their Gram."""
+    """A fold with data that does not depend on the labels: rows of each subject, scaled training rows, their Gram
+    matrix.
+    """
 
     fold: Fold
     train_labels: Any
@@ -137,8 +146,8 @@ def _shuffled(labels: Any, rows: Mapping[str, IndexArray], order: Mapping[str, I
     if not order:
         return labels
     out = labels.copy()
-    for name, mine in rows.items():
-        out[mine] = labels[mine][order[name]]
+    for name, subject_rows in rows.items():
+        out[subject_rows] = labels[subject_rows][order[name]]
     return out
 
 
@@ -149,13 +158,13 @@ def _score_lda(
     unit = np.eye(len(classes))
     for p in folds:
         member = unit[_shuffled(p.train_labels, p.train_rows, order)[p.finite]]
-        there = np.flatnonzero(member.any(axis=0))
-        coef, intercept = linear_rule(p.X, member[:, there], p.gram, LDA_SHRINKAGE)
+        present = np.flatnonzero(member.any(axis=0))
+        coef, intercept = linear_rule(p.X, member[:, present], p.gram, LDA_SHRINKAGE)
         scores = p.test @ coef.T + intercept
-        lost = np.isnan(scores).any(axis=1)
-        answer = np.where(lost, -1, there[np.where(np.isnan(scores), -np.inf, scores).argmax(axis=1)])
+        undefined = np.isnan(scores).any(axis=1)
+        predicted = np.where(undefined, -1, present[np.where(np.isnan(scores), -np.inf, scores).argmax(axis=1)])
         truth = _shuffled(p.test_labels, p.test_rows, order)
-        hits += np.bincount(truth[answer == truth], minlength=len(classes))
+        hits += np.bincount(truth[predicted == truth], minlength=len(classes))
         counts += np.bincount(truth, minlength=len(classes))
     return float((hits[counts > 0] / counts[counts > 0]).mean())
 
@@ -168,9 +177,11 @@ def _score_any(
     answers: list[str] = []
     for p in folds:
         labels = names[_shuffled(p.train_labels, p.train_rows, order)][p.finite]
-        found = predict_probabilities(p.fold.train[p.finite], labels, p.fold.test, classes, classifier, {}, seed)
+        probabilities = predict_probabilities(
+            p.fold.train[p.finite], labels, p.fold.test, classes, classifier, {}, seed
+        )
         truth += names[_shuffled(p.test_labels, p.test_rows, order)].tolist()
-        answers += answers_of(found, classes).tolist()
+        answers += likeliest_classes(probabilities, classes).tolist()
     return macro_accuracy(truth, answers, classes)
 
 
@@ -209,11 +220,13 @@ def learning_curve(
         for i, j in itertools.product(range(len(counts)), range(repeats)):
             answers: list[str] = []
             for fold in folds:
-                X, labels, subjects = usable(fold)
+                X, labels, subjects = usable_training_rows(fold)
                 people = rng.choice(np.unique(np.asarray(fold.train_subjects, dtype=str)), counts[i], replace=False)
-                mine = np.isin(subjects, people)
-                found = predict_probabilities(X[mine], labels[mine], fold.test, classes, classifier, {}, seed)
-                answers += answers_of(found, classes).tolist()
+                is_train = np.isin(subjects, people)
+                probabilities = predict_probabilities(
+                    X[is_train], labels[is_train], fold.test, classes, classifier, {}, seed
+                )
+                answers += likeliest_classes(probabilities, classes).tolist()
             curve[i, j] = macro_accuracy(truth, answers, classes)
     return LearningCurve(np.asarray(counts, dtype=np.int64), curve)
 
@@ -221,7 +234,7 @@ def learning_curve(
 def mode_importance(
     folds: Sequence[Fold], classifier: str = "lda", *, modes: int | None = None, repeats: int = 5, seed: int = 0
 ) -> FloatArray:
-    """Return how much macro accuracy a fold loses when one mode's values are shuffled among its test samples, (F, K).
+    """Return the loss of macro accuracy, (F, K), when one mode is permuted among the test samples of a fold.
 
     Modes of folds with shape models of their own agree only about; read the mean over the folds with that in mind.
 
@@ -246,14 +259,14 @@ def mode_importance(
     loss = np.zeros((len(folds), folds[0].train.shape[1]))
     with threadpool_limits(1):
         for f, fold in enumerate(folds):
-            X, labels, _ = usable(fold)
+            X, labels, _ = usable_training_rows(fold)
             m = min(modes or X.shape[1], X.shape[1])
             finite = np.isfinite(fold.test).all(axis=1)
             test, truth = fold.test[finite, :m], np.asarray(fold.test_labels, dtype=str)[finite]
             pipeline: Any = CLASSIFIERS[classifier](seed)
             pipeline.fit(X[:, :m], labels)
-            found = cast(Any, permutation_importance)(
+            importances = cast(Any, permutation_importance)(
                 pipeline, test, truth, scoring=score, n_repeats=repeats, random_state=seed
             )
-            loss[f, :m] = found.importances_mean
+            loss[f, :m] = importances.importances_mean
     return loss

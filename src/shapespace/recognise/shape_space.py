@@ -1,4 +1,4 @@
-"""The shape space as a scikit-learn transformer: surfaces or their fits become whitened coefficients."""
+"""Shape space as a scikit-learn transformer: meshes or fits to whitened coefficients."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Surface: TypeAlias = Mesh | FitResult | FitRecord | Mapping[str, Any]
 
 
 class ShapeSpace(TransformerMixin, BaseEstimator):
-    """Meshes or fits to coefficients in standard deviations, z, as the first step of a scikit-learn pipeline.
+    """Transformer of meshes or fits to coefficients in standard deviations, z, for scikit-learn pipelines.
 
     `fit` builds a `ShapeModel` from meshes in correspondence, or takes `model` as it is. `transform` takes a mix of:
 

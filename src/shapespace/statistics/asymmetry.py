@@ -23,7 +23,7 @@ from shapespace.errors import InputError
 from shapespace.geometry.normals import vertex_normals
 from shapespace.geometry.procrustes import align_in_place, centroid_size, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.reprs import listed_briefly, short_repr
+from shapespace.reprs import list_briefly, short_repr
 from shapespace.schemas import Methods, SampleSize, TestScheme
 from shapespace.statistics.analysis_result import AnalysisResult
 from shapespace.statistics.methods import methods_of
@@ -190,7 +190,7 @@ class AsymmetryResult(AnalysisResult):
         return next(effect for effect in self.anova if effect.source == source)
 
     def __repr__(self) -> str:
-        rows = listed_briefly([f"{row.source}: p {row.p:.3g}" for row in self.anova if row.p is not None])
+        rows = list_briefly([f"{row.source}: p {row.p:.3g}" for row in self.anova if row.p is not None])
         return f"<AsymmetryResult of {len(self.subjects)} subjects, {len(self.cohort)} shapes; {rows or 'no test'}>"
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from shapespace.cohort.cohort import Cohort
-from shapespace.cohort.table import named
+from shapespace.cohort.table import list_names
 from shapespace.errors import InputError
 from shapespace.geometry.normals import boundary_edges, vertex_areas
 from shapespace.geometry.similarity import fit_similarity

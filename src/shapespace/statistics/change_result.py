@@ -12,7 +12,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from shapespace.cohort.cohort import Cohort
-from shapespace.reprs import listed_briefly, short_repr
+from shapespace.reprs import list_briefly, short_repr
 from shapespace.schemas import Methods, TestScheme
 from shapespace.statistics.analysis_result import AnalysisResult
 from shapespace.statistics.change_align import stable_vertices

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
 
-from shapespace.cohort.table import Table, named
+from shapespace.cohort.table import Table, list_names
 from shapespace.errors import InputError
 from shapespace.reprs import short_repr
 
@@ -133,8 +133,8 @@ def _places(table: Table, column: str, order: Sequence[str] | None) -> tuple[lis
     if table.kind(column) == "text":
         words = list(dict.fromkeys(cells))
         raise InputError(
-            f"{table.where}: {column!r} holds words ({named(words)}), which have no order of their own; give it, the "
-            "earliest first, as with --order before,after."
+            f"{table.where}: {column!r} holds words ({list_names(words)}), which have no order of their own; give it, "
+            "the earliest first, as with --order before,after."
         )
     return [float(value) for value in table.numbers(column)], f"unit of {column}"
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort, with_columns
 from shapespace.errors import InputError
-from shapespace.reprs import listed_briefly, short_repr
+from shapespace.reprs import list_briefly, short_repr
 from shapespace.schemas import Methods, TestScheme
 from shapespace.statistics.analysis_result import AnalysisResult
 from shapespace.statistics.compare_formula import (
@@ -252,7 +252,7 @@ class CompareResult(AnalysisResult):
         return matches[0]
 
     def __repr__(self) -> str:
-        terms = listed_briefly([f"{test.term}: R² {100 * test.r2:.1f} %, p {test.p:.3g}" for test in self.tests])
+        terms = list_briefly([f"{test.term}: R² {100 * test.r2:.1f} %, p {test.p:.3g}" for test in self.tests])
         return f"<CompareResult of {len(self.cohort)} shapes of {self.n_subjects} subjects; {terms}>"
 
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from shapespace.cohort.table import Table
 from shapespace.errors import InputError, ShapespaceError
-from shapespace.lazy import other_package
+from shapespace.lazy import require_package
 from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, read_only
 
@@ -136,7 +136,7 @@ class Design:
         key = tuple(products)
         if key in self._parts:
             return self._parts[key]
-        formulaic = other_package("formulaic", "A formula", INSTALL)
+        formulaic = require_package("formulaic", "A formula", INSTALL)
         ordered = [[factor for factor in self.factors if factor in product] for product in products]
         written = [":".join(self._codes[factor] for factor in product) or "1" for product in ordered]
         with np.errstate(all="ignore"):
@@ -155,7 +155,7 @@ class Design:
         return made
 
     def _frame(self, values: Mapping[str, Sequence[str | float]]) -> Any:
-        pandas = other_package("pandas", "A formula", INSTALL)
+        pandas = require_package("pandas", "A formula", INSTALL)
         frame: dict[str, Any] = {}
         for one in self.variables:
             own = list(values[one.column])
@@ -273,8 +273,8 @@ def design_of(formula: str, table: Table) -> Design:
         ShapespaceError: the extra `statistics` is not installed.
     """
     parsed = _parsed(formula, table)
-    pandas = other_package("pandas", "A formula", INSTALL)
-    formulaic = other_package("formulaic", "A formula", INSTALL)
+    pandas = require_package("pandas", "A formula", INSTALL)
+    formulaic = require_package("formulaic", "A formula", INSTALL)
     inside: dict[tuple[str, bool], Variable] = {}
     frame: dict[str, Any] = {}
     own_values: dict[str, Sequence[str | float]] = {}
@@ -370,7 +370,7 @@ def _renamed(tree: ast.expr, column: str) -> ast.expr:
 
 
 def _parsed(formula: str, table: Table) -> list[list[_Factor]]:
-    formulaic = other_package("formulaic", "A formula", INSTALL)
+    formulaic = require_package("formulaic", "A formula", INSTALL)
     where = f"The formula {formula[:80]!r}"
     right = formula.strip().removeprefix("~")
     stars = len(re.findall(r"\*", _POWER.sub("", right)))

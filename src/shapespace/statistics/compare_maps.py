@@ -17,7 +17,7 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.geometry.normals import vertex_normals
-from shapespace.lazy import other_package
+from shapespace.lazy import require_package
 from shapespace.reprs import short_repr
 from shapespace.statistics.compare_formula import INSTALL
 from shapespace.statistics.compare_strata import Stratum
@@ -241,7 +241,7 @@ def _bumps(ahead: FloatArray, mean: FloatArray, width_mm: float, precision: Floa
 
 def _precision(cohort: Cohort, residual: FloatArray) -> FloatArray:
     """Return the (K, K) inverse covariance of residuals; no order of them gives another, so tests stay exact."""
-    sklearn: Any = other_package("sklearn.covariance", "Seeking bumps", INSTALL)
+    sklearn: Any = require_package("sklearn.covariance", "Seeking bumps", INSTALL)
     prior = np.eye(len(cohort.basis))
     if cohort.fitted is not None:
         model = cohort.fitted.model

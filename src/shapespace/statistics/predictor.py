@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.cohort.cohort import Cohort
-from shapespace.cohort.table import named
+from shapespace.cohort.table import list_names
 from shapespace.errors import CorrespondenceError, FileFormatError, InputError
 from shapespace.geometry.procrustes import Gauge
 from shapespace.geometry.similarity import fit_similarity
@@ -25,7 +25,7 @@ from shapespace.io.containers.archives import read_arrays
 from shapespace.io.containers.arrays import write_arrays
 from shapespace.io.containers.json_files import plain_json
 from shapespace.lazy import lazy_import
-from shapespace.reprs import short_repr, told_briefly
+from shapespace.reprs import describe_briefly, short_repr
 from shapespace.statistics.linear_regressors import IndexArray
 from shapespace.types import FloatArray, read_only
 
@@ -100,7 +100,7 @@ class Predictor:
 
     def __repr__(self) -> str:
         return (
-            f"<Predictor of {told_briefly(self.target)} from {self.subjects} subjects; {self.method}; targets from "
+            f"<Predictor of {describe_briefly(self.target)} from {self.subjects} subjects; {self.method}; targets from "
             f"{self.lowest:.4g} to {self.highest:.4g}>"
         )
 
@@ -272,6 +272,6 @@ def refuse_known(known: tuple[str, ...], new: tuple[str, ...], where: str) -> No
     both = sorted(set(known) & set(new))
     if both:
         raise InputError(
-            f"{where}: {named(both)} {'was' if len(both) == 1 else 'were'} learned from too, so what is predicted of "
-            "them says nothing; leave them out."
+            f"{where}: {list_names(both)} {'was' if len(both) == 1 else 'were'} learned from too, so what is predicted "
+            "of them says nothing; leave them out."
         )

@@ -11,10 +11,10 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort, subjects_of
 from shapespace.cohort.proportions import widen_share
-from shapespace.cohort.table import named
+from shapespace.cohort.table import list_names
 from shapespace.errors import InputError
 from shapespace.geometry.normals import vertex_normals
-from shapespace.reprs import listed_briefly, told_briefly
+from shapespace.reprs import list_briefly, describe_briefly
 from shapespace.schemas import Methods, TestScheme
 from shapespace.statistics.analysis_result import AnalysisResult
 from shapespace.statistics.linear_regressors import (
@@ -151,8 +151,8 @@ class RegressionResult(AnalysisResult):
         figures = [f"{name} {one.value:.3g} ({one.low:.3g} to {one.high:.3g})" for name, one in self.measures.items()]
         tested = [] if self.p is None else [f"p {self.p:.3g}"]
         return (
-            f"<RegressionResult of {told_briefly(self.target)} on {len(self.cohort)} shapes of {self.n_subjects} "
-            f"subjects; {listed_briefly([*tested, *figures])}>"
+            f"<RegressionResult of {describe_briefly(self.target)} on {len(self.cohort)} shapes of {self.n_subjects} "
+            f"subjects; {list_briefly([*tested, *figures])}>"
         )
 
 
@@ -328,8 +328,8 @@ def _check_target(cohort: Cohort, target: str, y: FloatArray) -> None:
     missing = [cohort.names[at] for at in np.flatnonzero(np.isnan(y))]
     if missing:
         raise InputError(
-            f"{cohort.table.where}: {target} of {len(missing)} of {len(cohort)} shapes is missing ({named(missing)}); "
-            "fill it in, or leave them out with --drop-missing."
+            f"{cohort.table.where}: {target} of {len(missing)} of {len(cohort)} shapes is missing "
+            f"({list_names(missing)}); fill it in, or leave them out with --drop-missing."
         )
     if np.ptp(y) == 0:
         raise InputError(f"{cohort.table.where}: {target} is {y[0]:g} for all shapes, so there is nothing to learn.")

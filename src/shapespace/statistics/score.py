@@ -15,12 +15,12 @@ from scipy.spatial.distance import cdist
 from scipy.stats import f as f_distribution
 
 from shapespace.cohort.cohort import Cohort
-from shapespace.cohort.table import named
+from shapespace.cohort.table import list_names
 from shapespace.errors import CorrespondenceError, InputError
 from shapespace.fit.robust.posterior import variance_of_new_shapes
 from shapespace.geometry.normals import vertex_normals
 from shapespace.geometry.procrustes import centroid_size
-from shapespace.reprs import listed_briefly
+from shapespace.reprs import list_briefly
 from shapespace.schemas import Methods, SampleSize, TestScheme
 from shapespace.statistics.analysis_result import AnalysisResult
 from shapespace.statistics.methods import methods_of
@@ -161,7 +161,7 @@ class ScoreResult(AnalysisResult):
         )  # fmt: skip
 
     def __repr__(self) -> str:
-        percentiles = listed_briefly(
+        percentiles = list_briefly(
             [f"{name}: percentile {at:.0f}" for name, at in zip(self.names, self.percentile, strict=True)]
         )
         return (
@@ -332,7 +332,7 @@ def _refuse_known(
         both = sorted({*reference.table.texts(column)} & {*subjects.table.texts(column)})
         if both:
             raise InputError(
-                f"{named(both)} of {column} is among the subjects and in the reference; leave out one scan."
+                f"{list_names(both)} of {column} is among the subjects and in the reference; leave out one scan."
             )
 
 

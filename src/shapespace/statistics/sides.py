@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from shapespace.cohort.cohort import Cohort
-from shapespace.cohort.table import named
+from shapespace.cohort.table import list_names
 from shapespace.errors import FileFormatError, InputError
 from shapespace.geometry.mirror_plane import FLIP, find_mirror, mirror_pairs
 from shapespace.geometry.normals import rms_size
@@ -228,8 +228,10 @@ def read_pairs(path: Path, cohort: Cohort) -> tuple[tuple[int, int], ...]:
         {cell for row in rows for cell in row if not (cell.isdecimal() and len(cell) < 12) and cell not in landmarks}
     )
     if unknown:
-        there = named(sorted(landmarks)) if landmarks else "none are known"
-        raise InputError(f"{path}: {named(unknown)} is neither a vertex number nor a landmark (landmarks: {there}).")
+        there = list_names(sorted(landmarks)) if landmarks else "none are known"
+        raise InputError(
+            f"{path}: {list_names(unknown)} is neither a vertex number nor a landmark (landmarks: {there})."
+        )
     pairs = [tuple(landmarks[cell] if cell in landmarks else int(cell) for cell in row) for row in rows]
     return tuple((a, b) for a, b in pairs)
 

@@ -1,4 +1,4 @@
-"""Folders that `correspond` wrote: which surfaces are in them, and in which unit."""
+"""Output folders of `correspond`: their surfaces and their unit."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SURFACE, RECORD = CorrespondRecord.SURFACE, CorrespondRecord.ENDING
 SUMMARY, MEAN = CorrespondenceRecord.FILE, CorrespondenceRecord.MEAN
 LANDMARKS = "landmarks.csv"
 _ENDINGS = (*ENDINGS.values(), SURFACE)
-_NAMED = 3
+_NAMED = 3  # names in a message before the rest is only counted
 
 
 @dataclass(frozen=True)
@@ -51,10 +51,10 @@ class SurfaceFiles:
             )
 
     def _others(self) -> str:
-        named = ", ".join(path.name for path in list(self.unit_ratios)[:_NAMED])
-        named += ", ..." if len(self.unit_ratios) > _NAMED else ""
+        file_names = ", ".join(path.name for path in list(self.unit_ratios)[:_NAMED])
+        file_names += ", ..." if len(self.unit_ratios) > _NAMED else ""
         of = "meshes is" if len(self.unit_ratios) == 1 else "meshes are"
-        return f"{len(self.unit_ratios)} of {len(self.files)} {of} in another unit than most ({named})"
+        return f"{len(self.unit_ratios)} of {len(self.files)} {of} in another unit than most ({file_names})"
 
 
 def surface_stem(path: Path) -> str:
@@ -74,12 +74,12 @@ def surface_files(paths: Sequence[Path], *, recursive: bool = False) -> SurfaceF
     notes: list[str] = []
     for path in paths:
         summary = _summary_of(path)
-        if summary is None and (kept := _kept_surfaces(path, notes)):
-            files += kept
+        if summary is None and (summary_files := _stored_surfaces(path, notes)):
+            files += summary_files
         elif summary is None:
-            found = mesh_files([path], recursive=recursive)
-            files += found.files
-            notes += found.left_out
+            listing = mesh_files([path], recursive=recursive)
+            files += listing.files
+            notes += listing.left_out
         else:
             files += _surfaces(path, summary)
             if summary.set_aside:
@@ -87,8 +87,8 @@ def surface_files(paths: Sequence[Path], *, recursive: bool = False) -> SurfaceF
     ratios: dict[Path, float] = {}
     for folder in dict.fromkeys(file.parent for file in files if file.name.endswith(SURFACE)):
         if (summary := _summary_of(folder)) is not None:
-            other = {folder / f"{name}{SURFACE}": ratio for name, ratio in summary.other_units.items()}
-            ratios |= {file: other[file] for file in files if file in other}
+            other_units = {folder / f"{name}{SURFACE}": ratio for name, ratio in summary.other_units.items()}
+            ratios |= {file: other_units[file] for file in files if file in other_units}
     return SurfaceFiles(tuple(files), ratios, tuple(notes))
 
 
@@ -114,15 +114,15 @@ def json_of(file: Path) -> object:
 
 def _surfaces(folder: Path, summary: CorrespondenceRecord) -> list[Path]:
     files = [folder / f"{name}{SURFACE}" for name in summary.corresponding]
-    gone = [file.name for file in files if not file.is_file()]
-    if gone or not files:
+    missing = [file.name for file in files if not file.is_file()]
+    if missing or not files:
         raise InputError(
-            f"{folder}: {', '.join(gone[:_NAMED]) or 'every surface'} is no longer in it; {CORRESPOND_AGAIN}."
+            f"{folder}: {', '.join(missing[:_NAMED]) or 'every surface'} is no longer in it; {CORRESPOND_AGAIN}."
         )
     return files
 
 
-def _kept_surfaces(path: Path, notes: list[str]) -> list[Path]:
+def _stored_surfaces(path: Path, notes: list[str]) -> list[Path]:
     """Return the surfaces of the fits in a folder with a store, as files for `mesh_at`; none of other folders."""
     results = results_at(path) if path.is_dir() else None
     if results is None:

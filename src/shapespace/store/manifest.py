@@ -1,4 +1,4 @@
-"""The manifest of a store: which shards are in it, with the size and hash of each of their files."""
+"""The manifest of a store: its shards, with the size and hash of each file."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ TABLE, SURFACES, STAGES = "table", "surfaces", "stages"
 PARTS: Mapping[str, str] = {TABLE: ".parquet", SURFACES: ".zarr.zip", STAGES: ".zip"}
 """Folder -> ending of the files in it."""
 
-LARGEST_MANIFEST = 64 * 2**20
+LARGEST_MANIFEST = 64 * 2**20  # 64 MiB
 MOST_ROWS = 100_000
 """Rows that one shard may have."""
 
@@ -98,7 +98,7 @@ class StoredFile(Struct, frozen=True, kw_only=True):
 
 
 class ShardEntry(Struct, frozen=True, kw_only=True):
-    """One shard: a table with a row for each fit, and the surfaces of those that have one.
+    """One shard: a table with a row for each fit, and surfaces of some of them.
 
     Args:
         table: its Parquet file.
@@ -166,10 +166,10 @@ def read_manifest(folder: Path) -> Manifest | None:
         return None
     if known.get("format_version") != Manifest.VERSION and known.get("format") == Manifest.FORMAT:
         raise FileFormatError(f"{path} is of a version of stores that this shapespace does not know; update it.")
-    found = read(Manifest, cast(object, content), str(path), "copy it again")
-    if any(not 0 < shard.rows <= MOST_ROWS for shard in found.shards):
+    manifest = read(Manifest, cast(object, content), str(path), "copy it again")
+    if any(not 0 < shard.rows <= MOST_ROWS for shard in manifest.shards):
         raise FileFormatError(f"{path} is damaged: a shard has no rows, or too many; copy it again.")
-    return found
+    return manifest
 
 
 def require_store_extra() -> None:

@@ -1,4 +1,4 @@
-"""The results of fits in a folder, be they single files, shards of a store, or both: read one at a time, or as rows."""
+"""Results of fits in a folder, from single files or shards of a store, read one at a time or as rows."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ import numpy.typing as npt
 
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.io.containers.archives import arrays_in, read_arrays
-from shapespace.io.containers.json_files import LARGEST_BYTES, json_of, read_json
+from shapespace.io.containers.json_files import LARGEST_BYTES, parse_json, read_json
 from shapespace.io.files import read_bytes, read_error
 from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.io.tables.table_io import CHECKSUM
-from shapespace.lazy import lazy_import, other_package
-from shapespace.reprs import told_briefly
+from shapespace.lazy import lazy_import, require_package
+from shapespace.reprs import describe_briefly
 from shapespace.schemas import FIT_AGAIN, FitRecord
 from shapespace.store.manifest import Manifest, read_manifest
 from shapespace.store.rows import FLAGS, META, coefficient_columns, kind_of, store_row
@@ -35,13 +35,13 @@ ENDING = ".fit.json"
 ENDINGS: Mapping[str, str] = {"fitted": ".fitted.ply", "dense": ".dense.ply", "stages": ".stages.npz"}
 """What may lie beside it, by what it is."""
 
-BATCH = 1000
-_NEAR = 3
-_OPEN = 4
+BATCH = 1000  # rows; a few MB with all columns
+_NEAR = 3  # similar names in a message
+_OPEN = 4  # folders
 
 
-class Stored(NamedTuple):
-    """Where a store keeps a fit, and what it has of it.
+class StoredFit(NamedTuple):
+    """Location of a fit in a store, and its files.
 
     Args:
         shard: which one, in the order of the manifest.
@@ -68,8 +68,8 @@ class _Identity(msgspec.Struct, frozen=True):
     id: str = ""
 
 
-class Store:
-    """The shards of a folder.
+class ResultStore:
+    """Shards of a folder.
 
     Args:
         folder: of the store.
@@ -80,16 +80,16 @@ class Store:
         self.folder, self.manifest = folder, manifest
         self.shards = [Shard(folder, entry) for entry in manifest.shards]
         self.problems: list[str] = []
-        self._index: dict[str, Stored] | None = None
+        self._index: dict[str, StoredFit] | None = None
 
     @property
-    def index(self) -> Mapping[str, Stored]:
+    def index(self) -> Mapping[str, StoredFit]:
         """Name -> where it is kept, in the order of the shards; those of damaged shards are missing.
 
         One sentence for each damaged shard goes to `problems`. A name that is in two shards is that of the later one.
         """
         if self._index is None:
-            found: dict[str, Stored] = {}
+            index: dict[str, StoredFit] = {}
             for number, shard in enumerate(self.shards):
                 try:
                     columns = shard.columns(("scan", "id", "status", ROW, *FLAGS))
@@ -97,10 +97,14 @@ class Store:
                     if str(error) not in self.problems:
                         self.problems.append(str(error))
                     continue
-                for row, (name, identity, status, at, *flags) in enumerate(zip(*columns.values(), strict=True)):
-                    found.pop(name, None)
-                    found[name] = Stored(number, row, at, identity or "", status, *(flag is True for flag in flags))
-            self._index = found
+                for row, (name, identity, status, content_hash, *flags) in enumerate(
+                    zip(*columns.values(), strict=True)
+                ):
+                    index.pop(name, None)
+                    index[name] = StoredFit(
+                        number, row, content_hash, identity or "", status, *(flag is True for flag in flags)
+                    )
+            self._index = index
         return self._index
 
     def identities(self) -> dict[str, str]:
@@ -126,22 +130,24 @@ class Store:
         index = self.index
         for number, shard in enumerate(self.shards):
             try:
-                found = shard.columns(("scan", *columns))
+                table = shard.columns(("scan", *columns))
             except ShapespaceError as error:
                 if str(error) not in self.problems:
                     self.problems.append(str(error))
                 continue
-            kept = [
+            current = [
                 row
-                for row, name in enumerate(found["scan"])
-                if name not in without and (where := index.get(name)) and (where.shard, where.row) == (number, row)
+                for row, name in enumerate(table["scan"])
+                if name not in without
+                and (location := index.get(name))
+                and (location.shard, location.row) == (number, row)
             ]
-            whole = len(kept) == len(found["scan"])
-            yield {column: found[column] if whole else [found[column][row] for row in kept] for column in columns}
+            is_whole = len(current) == len(table["scan"])
+            yield {column: table[column] if is_whole else [table[column][row] for row in current] for column in columns}
 
 
 class Results:
-    """The results of fits in a folder, single files and those of a store alike.
+    """Results of fits in a folder, from single files and from a store.
 
     A fit that is in both is that of the single files, which are newer. Names and flags are those of the moment when
     this was made.
@@ -156,18 +162,18 @@ class Results:
         ShapespaceError: there is a store, and the extra `store` is not installed.
     """
 
-    def __init__(self, folder: Path | str, store: Store | None = None) -> None:
+    def __init__(self, folder: Path | str, store: ResultStore | None = None) -> None:
         require_path(folder, "Results")
         self.folder = Path(folder)
         manifest = None if store is not None else read_manifest(self.folder)
-        self.store = store if manifest is None else Store(self.folder, manifest)
+        self.store = store if manifest is None else ResultStore(self.folder, manifest)
         try:
-            there = {entry.name for entry in os.scandir(self.folder)}
+            file_names = {entry.name for entry in os.scandir(self.folder)}
         except OSError as error:
             raise read_error(self.folder, error) from error
         self.files: Mapping[str, frozenset[str]] = {
-            name: frozenset(kind for kind, ending in ENDINGS.items() if f"{name}{ending}" in there)
-            for name in sorted(file.removesuffix(ENDING) for file in there if file.endswith(ENDING))
+            name: frozenset(kind for kind, ending in ENDINGS.items() if f"{name}{ending}" in file_names)
+            for name in sorted(file.removesuffix(ENDING) for file in file_names if file.endswith(ENDING))
         }
         self._problems: list[str] = []
 
@@ -182,7 +188,7 @@ class Results:
         }
 
     def is_moved(self, name: str) -> bool:
-        """Return whether the record of a single file stands in a shard, to the byte."""
+        """Return whether a shard contains the record of a single file, byte for byte."""
         try:
             stored = self.store.record_text(name) if self.store and name in self._stored else None
             return stored is not None and stored.encode() == read_bytes(self.folder / f"{name}{ENDING}")
@@ -195,7 +201,7 @@ class Results:
         return list(dict.fromkeys([*(self.store.problems if self.store else ()), *self._problems]))
 
     @property
-    def _stored(self) -> Mapping[str, Stored]:
+    def _stored(self) -> Mapping[str, StoredFit]:
         return self.store.index if self.store else {}
 
     def names(self) -> list[str]:
@@ -203,7 +209,7 @@ class Results:
         return sorted({*self.singles, *self._stored})
 
     def __repr__(self) -> str:
-        return f"<Results in {told_briefly(str(self.folder))}: {len(self):,} fits>"
+        return f"<Results in {describe_briefly(str(self.folder))}: {len(self):,} fits>"
 
     def _repr_html_(self) -> str:
         return lazy_import("html_of_results")(self)
@@ -249,7 +255,7 @@ class Results:
         return self._checked(name, self._content(name))
 
     def _content(self, name: str) -> object:
-        return json_of(self.record_bytes(name), self.folder / f"{name}{ENDING}", FIT_AGAIN)
+        return parse_json(self.record_bytes(name), self.folder / f"{name}{ENDING}", FIT_AGAIN)
 
     def _checked(self, name: str, content: object) -> FitRecord:
         return FitRecord.from_json(content, str(self.folder / f"{name}{ENDING}"))
@@ -284,7 +290,7 @@ class Results:
             raise FileFormatError(f"{self.folder}: the stages of {name} were not kept; fit it again with --stages.")
         return store.stages(name)
 
-    def _store_of(self, name: str) -> Store:
+    def _store_of(self, name: str) -> ResultStore:
         """Return the store that holds a fit which is no single file, as `known` checks."""
         self.known(name)
         assert self.store is not None
@@ -292,20 +298,20 @@ class Results:
 
     def identities(self) -> dict[str, str]:
         """Return name -> identity of each fit; empty for records that have none, or cannot be read."""
-        found = dict(self.store.identities()) if self.store else {}
+        identities = dict(self.store.identities()) if self.store else {}
         for name in self.singles:
             try:
-                found[name] = msgspec.json.decode(self.record_bytes(name), type=_Identity).id
+                identities[name] = msgspec.json.decode(self.record_bytes(name), type=_Identity).id
             except (msgspec.DecodeError, ShapespaceError):
-                found[name] = ""
-        return found
+                identities[name] = ""
+        return identities
 
     def counts(self) -> Counter[str]:
         """Return how many fits have which status."""
-        found: Counter[str] = Counter()
+        counts: Counter[str] = Counter()
         for rows in self.iter_rows(("status",)):
-            found.update(rows["status"])
-        return found
+            counts.update(rows["status"])
+        return counts
 
     def iter_rows(self, columns: Sequence[str], batch: int = BATCH) -> Iterator[dict[str, list[Any]]]:
         """Yield columns of all fits, some rows at a time: those of each shard in turn, then single ones by their names.
@@ -325,13 +331,13 @@ class Results:
 
     def column_names(self) -> set[str]:
         """Return the columns that some shard, or the first single record that can be read, has."""
-        found: set[str] = set()
+        names: set[str] = set()
         for shard in self.store.shards if self.store else ():
             try:
-                found |= shard.column_names()
+                names |= shard.column_names()
             except ShapespaceError as error:
                 self._tell(str(error))
-        return found.union(*([next((row.keys() for name in self.singles if (row := self._row(name))), ())]))
+        return names.union(*([next((row.keys() for name in self.singles if (row := self._row(name))), ())]))
 
     def to_dataframe(self, columns: Sequence[str] | None = None) -> Any:
         """Return the fits as a `pandas.DataFrame`, a row each, by their names in the order of these.
@@ -343,22 +349,22 @@ class Results:
             InputError: no fit has such a column.
             ShapespaceError: pandas is not installed.
         """
-        pandas = other_package("pandas", "Results.to_dataframe")
-        there = self.column_names()
+        pandas = require_package("pandas", "Results.to_dataframe")
+        available = self.column_names()
         if columns is None:
-            known = sorted(column for column in there if column.startswith(META))
-            columns = [one for one in coefficient_columns(modes_of(self), known) if one != CHECKSUM]
-        elif unknown := [one for one in columns if one not in there]:
+            known = sorted(column for column in available if column.startswith(META))
+            columns = [head for head in coefficient_columns(modes_of(self), known) if head != CHECKSUM]
+        elif unknown := [head for head in columns if head not in available]:
             raise InputError(
                 f"{self.folder}: no fit has a column {unknown[0]!r}; column_names() lists those there are."
             )
-        wanted = list(dict.fromkeys(["scan", *columns]))
-        found: dict[str, list[Any]] = {column: [] for column in wanted}
-        for rows in self.iter_rows(wanted):
-            for column in wanted:
-                found[column] += rows[column]
-        frame = pandas.DataFrame(found).set_index("scan").sort_index()
-        numbers = [one for one in frame.columns if kind_of(one) in ("number", "count")]
+        requested = list(dict.fromkeys(["scan", *columns]))
+        values: dict[str, list[Any]] = {column: [] for column in requested}
+        for rows in self.iter_rows(requested):
+            for column in requested:
+                values[column] += rows[column]
+        frame = pandas.DataFrame(values).set_index("scan").sort_index()
+        numbers = [head for head in frame.columns if kind_of(head) in ("number", "count")]
         # Of scans that could not be fitted nothing is known, which pandas would keep as objects.
         frame[numbers] = frame[numbers].astype("float64")
         return frame
@@ -369,14 +375,14 @@ class Results:
         Raises:
             ShapespaceError: xarray or pandas is not installed.
         """
-        xarray = other_package("xarray", "Results.to_xarray")
+        xarray = require_package("xarray", "Results.to_xarray")
         frame, modes = self.to_dataframe(), range(1, modes_of(self) + 1)
         of_modes = {
             "b": [f"b{k}" for k in modes], "z": [f"z{k}" for k in modes], "b_stddev": [f"b{k}_stddev" for k in modes]
         }  # fmt: skip
-        rest = frame.drop(columns=[column for columns in of_modes.values() for column in columns])
+        other_columns = frame.drop(columns=[column for columns in of_modes.values() for column in columns])
         by_mode = {name: (("scan", "mode"), frame[columns].to_numpy()) for name, columns in of_modes.items()}
-        by_scan = {name: ("scan", rest[name].to_numpy()) for name in rest.columns}
+        by_scan = {name: ("scan", other_columns[name].to_numpy()) for name in other_columns.columns}
         return xarray.Dataset({**by_mode, **by_scan}, coords={"scan": list(frame.index), "mode": list(modes)})
 
     def _row(self, name: str) -> dict[str, Any] | None:
@@ -400,20 +406,20 @@ class Results:
             InputError: there is none; the sentence names those that are called nearly so.
         """
         if name not in self:
-            near = difflib.get_close_matches(name, [*self.singles, *self._stored], _NEAR, 0.6)
-            hint = f"; there is {', '.join(near)}" if near else ""
-            lost = "; some shards cannot be read" if self.problems else ""
-            raise InputError(f"{self.folder} holds no fit called {name[:80]}{hint}{lost}.")
+            suggestions = difflib.get_close_matches(name, [*self.singles, *self._stored], _NEAR, 0.6)
+            hint = f"; there is {', '.join(suggestions)}" if suggestions else ""
+            damage_note = "; some shards cannot be read" if self.problems else ""
+            raise InputError(f"{self.folder} holds no fit called {name[:80]}{hint}{damage_note}.")
 
 
 # Files of a store, by the names that they would have as single ones
 
 
-def named(file: str) -> tuple[str, str]:
-    """Return NAME and what it is of the name of a result file: `record`, one of `ENDINGS`, or nothing."""
-    for what, ending in {"record": ENDING, **ENDINGS}.items():
+def split_file_name(file: str) -> tuple[str, str]:
+    """Return the scan name and the kind of a result file: `record`, one of `ENDINGS`, or nothing."""
+    for kind, ending in {"record": ENDING, **ENDINGS}.items():
         if file.endswith(ending) and file != ending:
-            return file.removesuffix(ending), what
+            return file.removesuffix(ending), kind
     return file, ""
 
 
@@ -425,35 +431,35 @@ def results_at(folder: Path) -> Results | None:
         FileFormatError: the manifest is damaged.
     """
     try:
-        changed = (folder / Manifest.FILE).stat().st_mtime_ns
-        return _results_at(folder.resolve(), folder, changed, folder.stat().st_mtime_ns)
+        modified_ns = (folder / Manifest.FILE).stat().st_mtime_ns
+        return _results_at(folder.resolve(), folder, modified_ns, folder.stat().st_mtime_ns)
     except OSError:
         return None if read_manifest(folder) is None else Results(folder)
 
 
 @lru_cache(maxsize=_OPEN)
-def _results_at(resolved: Path, called: Path, changed: int, _files_changed: int) -> Results | None:
+def _results_at(resolved: Path, folder: Path, modified_ns: int, _files_changed: int) -> Results | None:
     # Shards stay open where only single files came.
-    store = _store_at(resolved, called, changed)
-    return None if store is None else Results(called, store)
+    store = _store_at(resolved, folder, modified_ns)
+    return None if store is None else Results(folder, store)
 
 
 @lru_cache(maxsize=_OPEN)
-def _store_at(_resolved: Path, called: Path, _changed: int) -> Store | None:
-    manifest = read_manifest(called)
-    return None if manifest is None else Store(called, manifest)
+def _store_at(_resolved: Path, folder: Path, _changed: int) -> ResultStore | None:
+    manifest = read_manifest(folder)
+    return None if manifest is None else ResultStore(folder, manifest)
 
 
-def kept_at(path: Path) -> bool:
-    """Return whether a store in the folder of `path` keeps what a single file of that name would hold."""
-    name, what = named(path.name)
-    if not what or path.is_file() or (results := results_at(path.parent)) is None:
+def is_stored_at(path: Path) -> bool:
+    """Return whether a store in the folder of `path` contains the content of a single file of that name."""
+    name, kind = split_file_name(path.name)
+    if not kind or path.is_file() or (results := results_at(path.parent)) is None:
         return False
-    return name in results and (what == "record" or results.has(name, what))
+    return name in results and (kind == "record" or results.has(name, kind))
 
 
-def wrote_landmarks(record: Path) -> bool:
-    """Return whether the fit that `record` is of wrote landmarks beside it; files of that name may be a user's own."""
+def has_written_landmarks(record: Path) -> bool:
+    """Return whether the fit of `record` wrote landmark files; files of that name may be a user's own."""
     try:
         return b'"found_landmarks"' in read_bytes(record)
     except ShapespaceError:
@@ -462,7 +468,7 @@ def wrote_landmarks(record: Path) -> bool:
 
 def is_result(path: Path) -> bool:
     """Return whether `path` is a file, or a store in its folder keeps what such a file would hold."""
-    return path.is_file() or kept_at(path)
+    return path.is_file() or is_stored_at(path)
 
 
 def mesh_at(path: Path) -> Mesh:
@@ -471,8 +477,8 @@ def mesh_at(path: Path) -> Mesh:
     Raises:
         As `read_mesh`, and FileFormatError: the store is damaged.
     """
-    if kept_at(path):
-        name, kind = named(path.name)
+    if is_stored_at(path):
+        name, kind = split_file_name(path.name)
         results = results_at(path.parent)
         assert results is not None
         return results.surface(name, kind)
@@ -486,55 +492,55 @@ def bytes_at(path: Path) -> bytes:
         FileError: it cannot be read.
         FileFormatError: the store is damaged.
     """
-    if kept_at(path):
-        name, what = named(path.name)
+    if is_stored_at(path):
+        name, kind = split_file_name(path.name)
         results = results_at(path.parent)
         assert results is not None
-        return results.stages(name) if what == "stages" else results.record_bytes(name)
+        return results.stages(name) if kind == "stages" else results.record_bytes(name)
     return read_bytes(path)
 
 
-def json_at(path: Path, again: str, most_bytes: int = LARGEST_BYTES) -> Any:
+def json_at(path: Path, remedy: str, most_bytes: int = LARGEST_BYTES) -> Any:
     """Return the value in a JSON file, or in the record of a store that such a file would hold.
 
     Args:
         path: of the file.
-        again: what a reader can do about a file that is wrong.
+        remedy: what a reader can do about a file that is wrong.
         most_bytes: that such a file can have.
 
     Raises:
         FileError: it cannot be read.
         FileFormatError: it is too large, or not plain JSON.
     """
-    if not kept_at(path):
-        return read_json(path, again, most_bytes)
+    if not is_stored_at(path):
+        return read_json(path, remedy, most_bytes)
     content = bytes_at(path)
     if len(content) > most_bytes:
-        raise FileFormatError(f"{path} is larger ({len(content) / 2**20:.0f} MiB) than such a file can be; {again}.")
-    return json_of(content, path, again)
+        raise FileFormatError(f"{path} is larger ({len(content) / 2**20:.0f} MiB) than such a file can be; {remedy}.")
+    return parse_json(content, path, remedy)
 
 
-def arrays_at(path: Path, again: str) -> dict[str, npt.NDArray[Any]]:
+def arrays_at(path: Path, remedy: str) -> dict[str, npt.NDArray[Any]]:
     """Return the arrays of an .npz file, or of stages of a store that such a file would hold, by name.
 
     Raises:
         FileError: it cannot be read.
         FileFormatError: it is damaged, or holds other things than arrays.
     """
-    if not kept_at(path):
-        return read_arrays(path, again)
+    if not is_stored_at(path):
+        return read_arrays(path, remedy)
     content = bytes_at(path)
     try:
         return arrays_in(io.BytesIO(content), len(content))
     except ValueError as error:
-        raise FileFormatError(f"{path} is not an .npz file of arrays ({error}); {again}.") from error
+        raise FileFormatError(f"{path} is not an .npz file of arrays ({error}); {remedy}.") from error
 
 
 def surfaces_of(results: Results) -> list[Path]:
     """Return the files that the surfaces of a store would be: the dense ones where there are any, else the fitted."""
     for kind in ("dense", "fitted"):
-        if found := [results.folder / f"{name}{ENDINGS[kind]}" for name in results.names() if results.has(name, kind)]:
-            return found
+        if paths := [results.folder / f"{name}{ENDINGS[kind]}" for name in results.names() if results.has(name, kind)]:
+            return paths
     return []
 
 

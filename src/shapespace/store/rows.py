@@ -127,14 +127,16 @@ def _pose_cells(pose: Pose) -> dict[str, float]:
     return cells | {f"translation_{axis}": at for axis, at in zip(_AXES, pose.translation, strict=True)}
 
 
-def coefficient_columns(n_modes: int, known: Sequence[str] = ()) -> list[str]:
-    """Return the columns of coefficients.csv in order, for `n_modes` coefficients; `known` came with the scans."""
+def coefficient_columns(n_modes: int, metadata_columns: Sequence[str] = ()) -> list[str]:
+    """Return the columns of coefficients.csv in order: for `n_modes` coefficients, and for metadata of the scans."""
     modes = range(1, n_modes + 1)
     # The two means come first: older readers look for them there.
     lead = [_distance_column(direction, "mean") for direction in _DIRECTIONS]
-    every = [_distance_column(direction, measure) for direction in _DIRECTIONS for measure in _DISTANCE_COLUMNS]
+    distance_columns = [
+        _distance_column(direction, measure) for direction in _DIRECTIONS for measure in _DISTANCE_COLUMNS
+    ]
     columns = ["scan", "status", "reason", *(f"b{k}" for k in modes), *(f"z{k}" for k in modes), *lead]
-    columns += [column for column in every if column not in lead]
+    columns += [column for column in distance_columns if column not in lead]
     columns += [
         "scale",
         "mm_per_scan_unit",
@@ -142,7 +144,7 @@ def coefficient_columns(n_modes: int, known: Sequence[str] = ()) -> list[str]:
         *(f"b{k}_rms_mm" for k in modes),
         *_LAST_COLUMNS,
     ]
-    return [*columns, *known, CHECKSUM, "model_hash"]
+    return [*columns, *metadata_columns, CHECKSUM, "model_hash"]
 
 
 def store_row(name: str, record: FitRecord) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""One shard of a store, read with care: nothing is taken that its manifest and the bytes of its files do not cover."""
+"""Reader of one shard of a store, checked against the manifest."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ ROW = "row"
 MOST_EXPANSION, LEAST_BYTES = 200, 16 * 2**20
 """A table may hold this many times its bytes on disk, and this many bytes in any case."""
 
-_OPEN = 16
-_RECORDS_KEPT = 2
+_OPEN = 16  # files
+_RECORDS_KEPT = 2  # row groups; records are read one after the other
 
 
 class Shard:
-    """One shard; its files are opened when they are first needed.
+    """One shard; its files are opened on first use.
 
     Args:
         root: folder of the store.
@@ -57,7 +57,7 @@ class Shard:
         """What it is called in messages."""
         return str(self.root / self.entry.table.file)
 
-    def columns(self, wanted: Sequence[str]) -> dict[str, list[Any]]:
+    def columns(self, names: Sequence[str]) -> dict[str, list[Any]]:
         """Return columns of the table, one value a row; None where a fit, or the whole shard, does not tell.
 
         Raises:
@@ -65,12 +65,12 @@ class Shard:
             FileFormatError: it is damaged, or not what the manifest says.
         """
         with self._table() as table:
-            there = [column for column in wanted if column in self._names_of_columns]
-            read = table.read(columns=there)
-            found: dict[str, list[Any]] = {column: read.column(column).to_pylist() for column in there}
-        for column, values in found.items():
+            stored = [column for column in names if column in self._names_of_columns]
+            columns = table.read(columns=stored)
+            column_values: dict[str, list[Any]] = {column: columns.column(column).to_pylist() for column in stored}
+        for column, values in column_values.items():
             _check_values(column, values, self.name)
-        return {column: found.get(column, [None] * self.entry.rows) for column in wanted}
+        return {column: column_values.get(column, [None] * self.entry.rows) for column in names}
 
     def has(self, column: str) -> bool:
         """Return whether the table has a column of that name."""
@@ -90,18 +90,18 @@ class Shard:
             FileFormatError: it is damaged.
         """
         with self._table():
-            ends = np.cumsum(self._row_groups)
-        group = int(np.searchsorted(ends, row, side="right"))
-        text = _records(self, group)[row - int(ends[group - 1] if group else 0)]
+            group_ends = np.cumsum(self._row_groups)
+        group = int(np.searchsorted(group_ends, row, side="right"))
+        text = _records(self, group)[row - int(group_ends[group - 1] if group else 0)]
         if not isinstance(text, str):
             raise FileFormatError(f"{self.name} lacks a record; {AGAIN}.")
         return text
 
-    def surface(self, at: int, kind: str, name: str) -> Mesh:
+    def surface(self, row: int, kind: str, name: str) -> Mesh:
         """Return a surface in the frame and unit of its scan.
 
         Args:
-            at: its value in the column `ROW`.
+            row: its value in the column `ROW`.
             kind: of `KINDS`.
             name: for the mesh.
 
@@ -112,7 +112,7 @@ class Shard:
         if self.entry.surfaces is None:
             raise FileFormatError(f"{self.name} has no surfaces; {AGAIN}.")
         path = self.entry.surfaces.path(self.root)
-        vertices, faces, colours = _surfaces(path, path.stat().st_mtime_ns).read(kind, at)
+        vertices, faces, colours = _surfaces(path, path.stat().st_mtime_ns).read(kind, row)
         return Mesh(vertices, faces, name=name, colours=colours)
 
     def stages(self, name: str) -> bytes:
@@ -140,13 +140,13 @@ class Shard:
     def _check(self, metadata: Any, schema: Any, path: Path) -> None:
         """Refuse a table that is not one of ours, or whose columns would grow far beyond the bytes of its file."""
         groups = [metadata.row_group(k) for k in range(metadata.num_row_groups)]
-        held = sum(group.total_byte_size for group in groups)
+        total_bytes = sum(group.total_byte_size for group in groups)
         kinds = {"text": "string", "number": "double", "count": "int64", "flag": "bool"}
         if (
             metadata.num_rows != self.entry.rows
             or sum(group.num_rows for group in groups) != self.entry.rows
             or any(group.num_rows < 0 for group in groups)
-            or held > max(MOST_EXPANSION * self.entry.table.bytes, LEAST_BYTES)
+            or total_bytes > max(MOST_EXPANSION * self.entry.table.bytes, LEAST_BYTES)
             or len(set(schema.names)) != len(schema.names)
             or any(str(field.type) != kinds["count" if field.name == ROW else kind_of(field.name)] for field in schema)
             or not {"scan", "status", RECORD, ROW} <= set(schema.names)
@@ -179,13 +179,13 @@ def is_plain_name(name: object) -> bool:
     )
 
 
-def _check_values(column: str, values: Sequence[object], where: str) -> None:
+def _check_values(column: str, values: Sequence[object], path_name: str) -> None:
     if column == "scan" and not (all(map(is_plain_name, values)) and len(set(values)) == len(values)):
-        raise FileFormatError(f"{where} has names that no results can have; {AGAIN}.")
+        raise FileFormatError(f"{path_name} has names that no results can have; {AGAIN}.")
     if column == ROW and any(not isinstance(value, int) or value < -1 for value in values):
-        raise FileFormatError(f"{where} does not say where its surfaces are; {AGAIN}.")
+        raise FileFormatError(f"{path_name} does not say where its surfaces are; {AGAIN}.")
     if column == "status" and not all(isinstance(value, str) for value in values):
-        raise FileFormatError(f"{where} has rows without a status; {AGAIN}.")
+        raise FileFormatError(f"{path_name} has rows without a status; {AGAIN}.")
 
 
 @contextmanager
@@ -240,7 +240,7 @@ def _surfaces(path: Path, _changed: int) -> _Surfaces:
 
 
 class _Surfaces:
-    """The Zarr file of a shard, kept open; arrays are checked before the library sees them."""
+    """The open Zarr file of a shard; arrays are checked before the library reads them."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -248,9 +248,9 @@ class _Surfaces:
             with zipfile.ZipFile(path) as archive:
                 _check_members(archive, path)
                 self._sizes = {member.filename: member.file_size for member in archive.infolist()}
-                told = {name: archive.read(name) for name in self._sizes if name.endswith("/zarr.json")}
+                metadata = {name: archive.read(name) for name in self._sizes if name.endswith("/zarr.json")}
             self._shapes = {
-                name.removesuffix("/zarr.json"): self._shape(json.loads(text)) for name, text in told.items()
+                name.removesuffix("/zarr.json"): self._shape(json.loads(text)) for name, text in metadata.items()
             }
             import zarr
             from zarr.storage import ZipStore
@@ -260,35 +260,35 @@ class _Surfaces:
             if "faces" in self._shapes:
                 self._faces = self._chunk("faces", 0)
 
-    def read(self, kind: str, at: int) -> tuple[FloatArray, npt.NDArray[np.int32] | None, ByteArray | None]:
-        """Return vertices (V, 3) of row `at`, the faces, and the colours (V, 3) where there are some."""
+    def read(self, kind: str, row: int) -> tuple[FloatArray, npt.NDArray[np.int32] | None, ByteArray | None]:
+        """Return vertices (V, 3) of row `row`, the faces, and the colours (V, 3) where there are some."""
         with _damage(self._path):
-            offsets, origin = self._chunk(kind, at)[0], self._chunk(f"{kind}_origin", 0)[at]
+            offsets, origin = self._chunk(kind, row)[0], self._chunk(f"{kind}_origin", 0)[row]
             # Only what has colours has a chunk there.
-            painted = f"{kind}_colours"
-            colours = self._chunk(painted, at)[0] if f"{painted}/c/{at}/0/0" in self._sizes else None
+            colour_kind = f"{kind}_colours"
+            colours = self._chunk(colour_kind, row)[0] if f"{colour_kind}/c/{row}/0/0" in self._sizes else None
             return offsets.astype(np.float64) + origin, self._faces, colours
 
-    def _chunk(self, name: str, at: int) -> npt.NDArray[Any]:
-        """Return the chunk `at` of an array, which must be in the file with its full size."""
+    def _chunk(self, name: str, row: int) -> npt.NDArray[Any]:
+        """Return the chunk `row` of an array, which must be in the file with its full size."""
         shape, chunk, item = self._shapes[name]
-        key = f"{name}/c/{at}" + "/0" * (len(shape) - 1)
-        if at < 0 or self._sizes.get(key) != item * int(np.prod(chunk, dtype=np.int64)):
+        key = f"{name}/c/{row}" + "/0" * (len(shape) - 1)
+        if row < 0 or self._sizes.get(key) != item * int(np.prod(chunk, dtype=np.int64)):
             raise FileFormatError(f"{self._path} lacks a surface that its table has; {AGAIN}.")
-        return np.asarray(self._group[name][at * chunk[0] : (at + 1) * chunk[0]])
+        return np.asarray(self._group[name][row * chunk[0] : (row + 1) * chunk[0]])
 
-    def _shape(self, told: Any) -> tuple[tuple[int, ...], tuple[int, ...], int]:
-        shape, chunk = tuple(told["shape"]), tuple(told["chunk_grid"]["configuration"]["chunk_shape"])
-        kind = str(told["data_type"])
+    def _shape(self, metadata: Any) -> tuple[tuple[int, ...], tuple[int, ...], int]:
+        shape, chunk = tuple(metadata["shape"]), tuple(metadata["chunk_grid"]["configuration"]["chunk_shape"])
+        kind = str(metadata["data_type"])
         expected = array_metadata(shape, chunk, kind)
-        found = {key: told.get(key) for key in expected}
-        if kind == "uint8" and found["codecs"] == [{"name": "bytes"}]:
-            found["codecs"] = expected["codecs"]  # bytes have no order, which zarr says since 3.1
+        values = {key: metadata.get(key) for key in expected}
+        if kind == "uint8" and values["codecs"] == [{"name": "bytes"}]:
+            values["codecs"] = expected["codecs"]  # bytes have no order, which zarr says since 3.1
         if (
-            found != expected
+            values != expected
             or kind not in _ITEM
-            or not set(told) <= {*expected, "fill_value", "attributes", "storage_transformers"}
-            or told.get("storage_transformers") or told.get("attributes")
+            or not set(metadata) <= {*expected, "fill_value", "attributes", "storage_transformers"}
+            or metadata.get("storage_transformers") or metadata.get("attributes")
             or len(shape) not in (2, 3) or len(chunk) != len(shape)
             or not all(type(n) is int and 0 < n < 2**31 for n in (*shape, *chunk))
             or shape[-1] != 3 or chunk[1:] != shape[1:]

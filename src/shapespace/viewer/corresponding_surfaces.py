@@ -18,7 +18,7 @@ from shapespace.report.inputs.correspondence_folder import Corresponded
 from shapespace.report.inputs.triage import Concern, concerns_of, distance_share, scan_status, sentence
 from shapespace.report.render import palette as colours
 from shapespace.report.render.checkerboard import SQUARES, checker_places
-from shapespace.report.render.scene import pack, quantised
+from shapespace.report.render.scene import pack, quantise
 from shapespace.version import __version__
 
 MAX_MARKED = 100
@@ -124,7 +124,7 @@ class Surfaces:
         with self._lock:
             self._corresponded.population()
         vertices = self._corresponded.placed(name).vertices
-        return pack({"positions": quantised(vertices, coded=True)}, {"name": name})
+        return pack({"positions": quantise(vertices, coded=True)}, {"name": name})
 
     def positions_csv(self, vertices: Sequence[int]) -> str:
         """Return a CSV of the positions of `vertices` on every scan, in its own frame and unit; empty where missing.

@@ -136,7 +136,7 @@ def _preview(model: ShapeModel, upload: Upload) -> dict[str, Any]:
     from shapespace.fit.search.initialisation import find_unit
     from shapespace.geometry.doctor import repair
     from shapespace.io.meshes.mesh_io import read_mesh
-    from shapespace.report.render.scene import pack, thinned
+    from shapespace.report.render.scene import decimate, pack
     from shapespace.types import MM_PER_UNIT
 
     scan, _ = repair(read_mesh(upload.scan))
@@ -146,7 +146,7 @@ def _preview(model: ShapeModel, upload: Upload) -> dict[str, Any]:
         mm = 1.0
     # The frame that the states of the fit are in.
     T_mm_scan = mm_frame(scan, mm)
-    placed, _ = thinned(scan.with_vertices(T_mm_scan.apply(scan.vertices)), MAX_TRIANGLES)
+    placed, _ = decimate(scan.with_vertices(T_mm_scan.apply(scan.vertices)), MAX_TRIANGLES)
     arrays: dict[str, Any] = {"vertices": placed.vertices.astype(np.float32)}
     if placed.faces is not None:
         arrays["faces"] = placed.faces.astype(np.uint32)

@@ -17,7 +17,7 @@ from shapespace.errors import FileError, FileFormatError, InputError, Shapespace
 from shapespace.model.foreign import looks_like_model
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report.blocks.wording import without_folders
-from shapespace.report.inputs.fit_population import neediest
+from shapespace.report.inputs.fit_population import most_concerning
 from shapespace.report.inputs.saved_fits import (
     Folder,
     SavedFit,
@@ -240,7 +240,7 @@ def listed_fits(folder: Folder) -> list[SavedFit]:
     results = results_at(folder.root)
     if results is None or len(results) <= MAX_LISTED:
         return find_fits(folder)
-    return [saved_fit(folder, results, name) for name in sorted(neediest(results, MAX_LISTED))]
+    return [saved_fit(folder, results, name) for name in sorted(most_concerning(results, MAX_LISTED))]
 
 
 def shape_of(model: ShapeModel, z: Sequence[float]) -> Mesh:

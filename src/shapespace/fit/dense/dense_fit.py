@@ -1,4 +1,4 @@
-"""From the fitted surface the rest of the way to the scan, by smooth fields on the model's own triangles.
+"""Dense stage of a fit: smooth displacement fields from the fitted surface to the scan, on the model's triangles.
 
 The field d is a Gaussian process of the Matern kind, written as a stochastic differential equation on the surface
 (Lindgren, Rue and Lindstrom, J. R. Stat. Soc. B 73, 2011), so that its precision is sparse. Its posterior mean given
@@ -32,16 +32,16 @@ from shapespace.io.memory_cache import cached_with_owner
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
 
-_FEWEST_MATCHES = 30
-_FEWEST_PAIRS = 100
-_HALVINGS = 8
+_FEWEST_MATCHES = 30  # below it no robust standard deviation is estimated
+_FEWEST_PAIRS = 100  # below it the noise is not separated from the residual
+_HALVINGS = 8  # halvings of a step before a folded vertex goes back: 1/256 of it
 _SEEN = 0.1
 """Matches that together weigh as much show a vertex; a good one weighs 1."""
 
 
 @dataclass(frozen=True, eq=False)
 class DenseSurface:
-    """The model's surface on the scan.
+    """The fitted surface displaced onto the scan.
 
     Args:
         vertices_scan_mm: (V, 3) in the scan's mm frame.
@@ -67,7 +67,7 @@ def dense_surface(
     T_scan_model: Similarity,
     settings: DenseSettings,
 ) -> DenseSurface:
-    """Return the surface `vertices_scan_mm` moved onto the scan where the scan shows it.
+    """Displace the surface `vertices_scan_mm` onto the scan where the scan observes it.
 
     No triangle folds: none turns over, or against its neighbours, that does not in `vertices_scan_mm`.
 
@@ -88,35 +88,35 @@ def dense_surface(
     up = surface.normals
     matcher = _matcher(target, topology, settings)
     size_mm = rms_size(model.mean_vertices)
-    now = _match(matcher, surface, T, matcher.first_hint(surface, T), settings)
-    noise_mm, left_mm = now.noise_mm, now.unexplained_mm
-    moved = np.zeros_like(start)
+    matches = _match(matcher, surface, T, matcher.first_hint(surface, T), settings)
+    noise_mm, left_mm = matches.noise_mm, matches.unexplained_mm
+    displacement = np.zeros_like(start)
     if left_mm > settings.least_unexplained_mm:
         coarse = _field(model, settings.range_share * size_mm, settings.amplitude * left_mm)
         for _ in range(settings.rounds):
-            seen_at, pull_at = now.gathered(max(noise_mm, now.spread_mm))
-            want = seen_at * np.einsum("vd,vd->v", surface.normals, moved) - pull_at
-            coarse.solve(seen_at, want, surface.normals, moved, settings)
-            surface = ModelSurface.of(topology, start + moved)
-            now = _match(matcher, surface, T, now.matches.hint, settings)
+            seen_at, pull_at = matches.gathered(max(noise_mm, matches.spread_mm))
+            want = seen_at * np.einsum("vd,vd->v", surface.normals, displacement) - pull_at
+            coarse.solve(seen_at, want, surface.normals, displacement, settings)
+            surface = ModelSurface.of(topology, start + displacement)
+            matches = _match(matcher, surface, T, matches.matches.hint, settings)
             # Neighbours also disagree where the surface is steep beside the scan, so the last is the best.
-            noise_mm = min(noise_mm, now.noise_mm)
+            noise_mm = min(noise_mm, matches.noise_mm)
 
     fine = _field(model, settings.fine_range_share * size_mm, settings.fine_amplitude_mm)
-    base, held = unfolded(start, start, start + moved, topology, settings.turn_cosine)
+    base, is_folded = revert_folds(start, start, start + displacement, topology, settings.turn_cosine)
     out, along, normals = np.zeros((len(start), 1)), np.ones((len(start), 1)), surface.normals
     seen_at = np.zeros(len(start))
     for round_ in range(settings.fine_rounds):
         if round_:
             surface = ModelSurface.of(topology, base + out * normals)
-            now = _match(matcher, surface, T, now.matches.hint, settings)
-        seen_at, pull_at = now.gathered(noise_mm)
+            matches = _match(matcher, surface, T, matches.matches.hint, settings)
+        seen_at, pull_at = matches.gathered(noise_mm)
         fine.solve(seen_at, seen_at * out[:, 0] - pull_at, along, out, settings)
-    kept, held_back = unfolded(start, base, base + out * normals, topology, settings.turn_cosine)
-    seen, damped = seen_at * noise_mm**2 > _SEEN, int((held | held_back).sum())
-    along_mm = np.einsum("vd,vd->v", up[seen], (kept - start)[seen])
+    is_unfolded, held_back = revert_folds(start, base, base + out * normals, topology, settings.turn_cosine)
+    is_determined, damped = seen_at * noise_mm**2 > _SEEN, int((is_folded | held_back).sum())
+    along_mm = np.einsum("vd,vd->v", up[is_determined], (is_unfolded - start)[is_determined])
     moved_mm = float(np.sqrt((along_mm**2).sum() / max(len(along_mm), 1)))
-    return DenseSurface(T.apply(kept), seen, noise_mm, left_mm, damped, moved_mm)
+    return DenseSurface(T.apply(is_unfolded), is_determined, noise_mm, left_mm, damped, moved_mm)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +152,7 @@ class WeightedMatches:
         return float(np.sqrt(max(left, 0.0)))
 
     def gathered(self, spread_mm: float) -> tuple[FloatArray, FloatArray]:
-        """Return the precision (V,), mm^-2, of what the scan says of each vertex, and the same times the residual."""
+        """Return the precision (V,), mm^-2, of the matches at each vertex, and the precision times the residual."""
         gathered = self.matches.gathered(self._weights(spread_mm), self.faces, self.vertices)
         return gathered.W / spread_mm**2, gathered.h / spread_mm**2
 
@@ -183,8 +183,8 @@ def _match(
     nearest = matches.points.nearest
     points = points[np.argsort(nearest[points], kind="stable")]
     pairs = nearest[points[1:]] == nearest[points[:-1]]
-    apart = np.diff(residual[points])[pairs]
-    noise_mm = spread(apart) / np.sqrt(2.0) if len(apart) >= _FEWEST_PAIRS else spread_mm
+    differences = np.diff(residual[points])[pairs]
+    noise_mm = spread(differences) / np.sqrt(2.0) if len(differences) >= _FEWEST_PAIRS else spread_mm
     return WeightedMatches(
         matches, surface.topology.faces, len(surface.vertices), settings, spread_mm,
         max(noise_mm, settings.least_noise_mm),
@@ -193,7 +193,7 @@ def _match(
 
 @dataclass(frozen=True, eq=False)
 class Field:
-    """A Matern field on a surface: its precision is A M^-1 A.
+    """A Matern field on a surface, with precision A M^-1 A.
 
     Args:
         topology: whose rings the off-diagonal entries follow.
@@ -233,12 +233,12 @@ def _field(model: ShapeModel, range_mm: float, amplitude_mm: float) -> Field:
     laplacian = _mean_laplacian(model)
     kappa = np.sqrt(8.0) / range_mm
     tau = 1.0 / (np.sqrt(4.0 * np.pi) * kappa * amplitude_mm)
-    off = tau * laplacian.off_diagonal
+    off_diagonal = tau * laplacian.off_diagonal
     diagonal = tau * (laplacian.diagonal + kappa**2 * laplacian.area)
     inverse = 1.0 / laplacian.area
     rows = np.repeat(np.arange(len(diagonal)), np.diff(t.ring_start))
-    stiffness = diagonal**2 * inverse + np.bincount(rows, off**2 * inverse[t.ring], len(diagonal))
-    return Field(t, off, diagonal, inverse, stiffness)
+    stiffness = diagonal**2 * inverse + np.bincount(rows, off_diagonal**2 * inverse[t.ring], len(diagonal))
+    return Field(t, off_diagonal, diagonal, inverse, stiffness)
 
 
 @cached_with_owner()
@@ -250,54 +250,54 @@ def _laplacian(x: FloatArray, topology: Topology) -> _Laplacian:
     """Return the cotangent Laplacian (positive) of the surface `x` (V, 3) and the area of each vertex."""
     faces, count = topology.faces.astype(np.int64), len(x)
     keys = np.repeat(np.arange(count), np.diff(topology.ring_start)) * count + topology.ring
-    off = np.zeros(len(keys))
+    off_diagonal = np.zeros(len(keys))
     for k in range(3):
         i, j, o = faces[:, k], faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]
         half = half_cotangents(x, i, j, o)
         for a, b in ((i, j), (j, i)):
-            off -= np.bincount(np.searchsorted(keys, a * count + b), half, len(keys))
+            off_diagonal -= np.bincount(np.searchsorted(keys, a * count + b), half, len(keys))
     rows = np.repeat(np.arange(count), np.diff(topology.ring_start))
-    diagonal: FloatArray = np.asarray(-np.bincount(rows, off, count), dtype=np.float64)
-    return _Laplacian(off, diagonal, owned_areas(Mesh(x, topology.faces)))
+    diagonal: FloatArray = np.asarray(-np.bincount(rows, off_diagonal, count), dtype=np.float64)
+    return _Laplacian(off_diagonal, diagonal, owned_areas(Mesh(x, topology.faces)))
 
 
-def unfolded(
-    start: FloatArray, base: FloatArray, moved: FloatArray, topology: Topology, turn_cosine: float
+def revert_folds(
+    start: FloatArray, base: FloatArray, displaced: FloatArray, topology: Topology, turn_cosine: float
 ) -> tuple[FloatArray, BoolArray]:
-    """Return `moved` (V, 3) held back towards `base` where triangles would fold, and (V,) where that is.
+    """Return `displaced` (V, 3) held back towards `base` where triangles would fold, and (V,) where that is.
 
     A triangle folds when it turns over, or against its neighbours, and did not do so in `start`.
 
     Args:
         start: (V, 3) the surface to compare with.
         base: (V, 3) one on which nothing is folded.
-        moved: (V, 3) the one that is wanted.
+        displaced: (V, 3) the requested surface.
         topology: its triangles.
         turn_cosine: cosine of the angle that no triangle turns further than.
     """
     faces = topology.faces
-    before = face_vectors(start, faces)
-    before /= np.maximum(np.linalg.norm(before, axis=1, keepdims=True), 1e-300)
+    normals_before = face_vectors(start, faces)
+    normals_before /= np.maximum(np.linalg.norm(normals_before, axis=1, keepdims=True), 1e-300)
     normals = np.empty_like(start)
     cosine, was_even, even = np.empty(len(faces)), np.empty(len(faces), np.bool_), np.empty(len(faces), np.bool_)
     normals_into(start, faces, normals)
-    compare_triangles(start, normals, faces, before, cosine, was_even)
-    share, out, halvings = np.ones(len(start)), moved, 0
+    compare_triangles(start, normals, faces, normals_before, cosine, was_even)
+    share, out, halvings = np.ones(len(start)), displaced, 0
     can_turn = cosine > turn_cosine  # all but those without area
     while True:
         normals_into(out, faces, normals)
-        compare_triangles(out, normals, faces, before, cosine, even)
+        compare_triangles(out, normals, faces, normals_before, cosine, even)
         folded = (can_turn & (cosine < turn_cosine)) | (was_even & ~even)
         if not folded.any():
             return out, share < 1.0
-        held, beside = np.zeros(len(start), dtype=np.bool_), np.zeros(len(start), dtype=np.bool_)
-        held[faces[folded]] = True
-        beside[faces[held[faces].any(axis=1)]] = True
+        is_held, is_neighbour = np.zeros(len(start), dtype=np.bool_), np.zeros(len(start), dtype=np.bool_)
+        is_held[faces[folded]] = True
+        is_neighbour[faces[is_held[faces].any(axis=1)]] = True
         halvings += 1
         if halvings <= _HALVINGS:
-            share[held] *= 0.5
-            share[beside & ~held] *= 0.75
+            share[is_held] *= 0.5
+            share[is_neighbour & ~is_held] *= 0.75
         else:
             # A triangle is as it is by its neighbours' corners, so with all of them on `base` it is no longer folded.
-            share[beside] = 0.0
-        out = base + share[:, None] * (moved - base)
+            share[is_neighbour] = 0.0
+        out = base + share[:, None] * (displaced - base)

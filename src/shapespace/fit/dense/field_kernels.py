@@ -1,4 +1,4 @@
-"""The loops of the dense stage, compiled: a smooth field on a surface, solved for by conjugate gradients."""
+"""Compiled loops of the dense stage: a smooth field on a surface by conjugate gradients."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ def compare_triangles(
     vertices: FloatArray,
     normals: FloatArray,
     faces: IntArray,
-    before: FloatArray,
+    normals_before: FloatArray,
     cosine: FloatArray,
     even: BoolArray,
 ) -> None:
-    """Say how far triangles have turned, and which agree with the surface around them.
+    """Compute the rotation of each triangle, and whether it agrees with its neighbours.
 
     Args:
         vertices: (V, 3),
         normals: (V, 3) unit.
         faces: (F, 3).
-        before: (F, 3) their unit normals before.
+        normals_before: (F, 3) their unit normals before.
         cosine: (F,) to be written: of the angle between then and now; 0 without area.
         even: (F,) to be written: whether each lies within 90 degrees of the normals at its corners.
     """
@@ -35,7 +35,7 @@ def compare_triangles(
             i, j = (k + 1) % 3, (k + 2) % 3
             n[k] = (b[i] - a[i]) * (c[j] - a[j]) - (b[j] - a[j]) * (c[i] - a[i])
             length += n[k] * n[k]
-            along += n[k] * before[f, k]
+            along += n[k] * normals_before[f, k]
         cosine[f] = along / np.sqrt(length) if length > 0.0 else 0.0
         even[f] = True
         for corner in range(3):
@@ -58,8 +58,8 @@ def _times_into(
     if x.shape[1] == 3:
         for v in range(len(x)):
             a, b, c = diagonal[v] * x[v, 0], diagonal[v] * x[v, 1], diagonal[v] * x[v, 2]
-            for at in range(ring_start[v], ring_start[v + 1]):
-                w, r = off_diagonal[at], ring[at]
+            for entry in range(ring_start[v], ring_start[v + 1]):
+                w, r = off_diagonal[entry], ring[entry]
                 a += w * x[r, 0]
                 b += w * x[r, 1]
                 c += w * x[r, 2]
@@ -67,8 +67,8 @@ def _times_into(
     else:
         for v in range(len(x)):
             a = diagonal[v] * x[v, 0]
-            for at in range(ring_start[v], ring_start[v + 1]):
-                a += off_diagonal[at] * x[ring[at], 0]
+            for entry in range(ring_start[v], ring_start[v + 1]):
+                a += off_diagonal[entry] * x[ring[entry], 0]
             out[v, 0] = scale[v] * a
 
 
@@ -156,8 +156,8 @@ def solve_field(
             for d in range(x.shape[1]):
                 x[v, d] += step * direction[v, d]
                 left[v, d] -= step * image[v, d]
-        before, product = product, _conditioned_into(left, along, seen_at, stiffness, z)
-        keep = product / before
+        previous_product, product = product, _conditioned_into(left, along, seen_at, stiffness, z)
+        keep = product / previous_product
         for v in range(len(x)):
             for d in range(x.shape[1]):
                 direction[v, d] = z[v, d] + keep * direction[v, d]

@@ -1,4 +1,4 @@
-"""Back to the span of the model: the pose and the coefficients that a fitted surface has there.
+"""Projection of a fitted surface onto the span of the model.
 
 A surface that was met beside the model is told by the model's own coefficients, so it is projected. Plain least squares
 send faint modes, and modes that lie nearly inside the motions of the pose, anywhere to win a hair; weighed by the prior
@@ -18,7 +18,7 @@ from shapespace.types import FloatArray
 def in_span(
     prepared: PreparedModel,
     vertices: FloatArray,
-    at: Estimate,
+    estimate: Estimate,
     prior_stddev: FloatArray,
     uncertainty_mm: float,
     modes: int,
@@ -30,7 +30,7 @@ def in_span(
     Args:
         prepared: the model.
         vertices: (V, 3) in the model's order, in its frame.
-        at: pose of that frame in the scan's; what the modes left out have done to the pose is given back to it.
+        estimate: pose of that frame in the scan's; what the modes left out have done to the pose is given back to it.
         prior_stddev: (K,) of the coefficients, mm.
         uncertainty_mm: how well the surface is known, RMS over its vertices.
         modes: how many.
@@ -39,14 +39,14 @@ def in_span(
     P, free = prepared.model.vertex_basis[:, :modes], POSE if with_scale else POSE - 1
     pose, inside = prepared.pose[:, :free], prepared.pose_in_span[:modes, :free]
     noise = uncertainty_mm**2 / 3.0
-    kept = prior_stddev[:modes] ** 2 / (prior_stddev[:modes] ** 2 + noise)
+    kept_share = prior_stddev[:modes] ** 2 / (prior_stddev[:modes] ** 2 + noise)
     y = (vertices - prepared.model.mean_vertices).ravel()
     b = P.T @ y
     # What leaves the span may have moved the pose as far as it reaches itself, and hardly further.
-    reach = max(float(y @ y - b @ b), 0.0) + len(y) * noise
+    residual_energy = max(float(y @ y - b @ b), 0.0) + len(y) * noise
     unit = 1.0 / np.linalg.norm(pose, axis=0)
-    normal = (pose.T @ pose - (inside.T * kept) @ inside) * np.outer(unit, unit)
-    normal[np.diag_indices(free)] += noise / reach
+    normal = (pose.T @ pose - (inside.T * kept_share) @ inside) * np.outer(unit, unit)
+    normal[np.diag_indices(free)] += noise / residual_energy
     delta = np.zeros(POSE)
     delta[:free] = unit * np.linalg.solve(normal, unit * (pose.T @ y - inside.T @ (kept * b)))  # R18
     small = small_similarity(delta)

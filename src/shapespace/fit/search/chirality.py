@@ -41,7 +41,7 @@ _CAP, _POINTS, _VERTICES = 0.05, 2_000, 1_000
 
 @cached_with_owner()
 def is_asymmetric(model: ShapeModel) -> bool:
-    """Return whether the mean is so far from its own mirror image that the modes do not absorb a reflection.
+    """Return whether the mean differs from its mirror image by more than the modes can represent.
 
     It is computed once for each model. A model without triangles counts as symmetric.
     """
@@ -70,24 +70,24 @@ def mirrored_log_odds(
     scan, flip = target.mesh, np.diag([-1.0, 1.0, 1.0])
     reflected = scan.vertices @ flip
     T = fitted.T_scan_fitted
-    own = refine(model, scan.vertices, [T], with_scale=with_scale)[0]
+    scan_pose = refine(model, scan.vertices, [T], with_scale=with_scale)[0]
     starts = [_reflected_pose(T, flip, Q, model.mean_vertices.mean(axis=0)) for Q in _reflections(model)]
     coarse = refine(model, reflected, starts, with_scale=with_scale, step=MIDDLE)
     best = min(coarse, key=lambda pose: pose.score_mm)
-    other = refine(model, reflected, [best.T_scan_model], with_scale=with_scale)[0]
-    if not math.isfinite(own.score_mm):
+    mirrored_pose = refine(model, reflected, [best.T_scan_model], with_scale=with_scale)[0]
+    if not math.isfinite(scan_pose.score_mm):
         return None
-    ratio = other.score_mm / max(own.score_mm, 1e-12)
+    ratio = mirrored_pose.score_mm / max(scan_pose.score_mm, 1e-12)
     if ratio > _CLEARLY_WORSE:
         return -_PATCHES * math.log(min(ratio, 1e6))
     faces = None if scan.faces is None else scan.faces[:, ::-1]
     mirror = ScanTarget(Mesh(reflected, faces, name=scan.name))
-    start = Start(other.T_scan_model, "given", float("nan"), other.b)
+    start = Start(mirrored_pose.T_scan_model, "given", float("nan"), mirrored_pose.b)
     try:
-        found = last_of(robust_icp(model, mirror, start, settings, with_scale=with_scale))
+        fit_result = last_of(robust_icp(model, mirror, start, settings, with_scale=with_scale))
     except (FitError, InputError):
         return -_PATCHES * math.log(_CLEARLY_WORSE)
-    return _cost(model, target, fitted) - _cost(model, mirror, found)
+    return _cost(model, target, fitted) - _cost(model, mirror, fit_result)
 
 
 def _reflections(model: ShapeModel) -> list[FloatArray]:

@@ -1,4 +1,4 @@
-"""Where to begin: the scan's unit, and a pose of the model from landmarks or from anywhere.
+"""Initialisation of a fit: the unit of the scan, and a pose from landmarks or by global search.
 
 A start with centroids together holds to about 45 degrees. Beyond that, and where it does not fit clearly, many
 rotations are tried (`any_pose`), and what they reach with the leading modes free is compared both ways.
@@ -18,16 +18,16 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.types import MM_PER_UNIT, FloatArray, Mesh, Similarity
 
 _SAME_TURN_TRACE = 1 + 2 * np.cos(np.radians(25.0))
-_TYPICAL_COVER = 1.2
-_INCH_IS_RARE = 0.5
-_PLAUSIBLE_COVER = (0.45, 2.6)
-_LIKELIER_BY_FAR = 0.5
-_STANDS_OUT = 0.8
+_TYPICAL_COVER = 1.2  # scan size over model size of a typical crop
+_INCH_IS_RARE = 0.5  # penalty in log size
+_PLAUSIBLE_COVER = (0.45, 2.6)  # scan size over model size that a unit may leave
+_LIKELIER_BY_FAR = 0.5  # difference in log size from which the second unit is ruled out
+_STANDS_OUT = 0.8  # score relative to that of the runner-up below which a start is unambiguous
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """A pose to begin from.
+    """A pose that initialises a fit.
 
     Args:
         T_scan_model: from the model's frame to the scan's frame in mm.
@@ -50,7 +50,7 @@ class Start:
 
 
 def find_unit(model: ShapeModel, scan: Mesh) -> str:
-    """Return the unit, a name of `MM_PER_UNIT`, that makes the scan's size most like the model's.
+    """Return the unit, a name of `MM_PER_UNIT`, for which the sizes of scan and model agree best.
 
     Where two units are about as likely by size, as centimetres and inches are for a part of a face, the likelier one in
     which a pose of the model stands out wins, else the one in which the model fits better.
@@ -74,20 +74,20 @@ def find_unit(model: ShapeModel, scan: Mesh) -> str:
     if not low < ratio * MM_PER_UNIT[second] < high or penalty[second] > penalty[best] + _LIKELIER_BY_FAR:
         return best
     centred = scan.vertices - np.median(scan.vertices, axis=0)
-    found: dict[str, float] = {}
+    scores: dict[str, float] = {}
     for unit in (best, second):
         start = start_from_any_pose(model, MM_PER_UNIT[unit] * centred, seed=0)
         # In a wrong unit no pose stands out from the others.
         if start.score_mm <= _STANDS_OUT * start.runner_up_score_mm:
             return unit
-        found[unit] = start.score_mm
-    return min(found, key=lambda unit: found[unit])
+        scores[unit] = start.score_mm
+    return min(scores, key=lambda unit: scores[unit])
 
 
 def start_from_landmarks(
     model: ShapeModel, scan_landmarks_mm: Mapping[str, FloatArray], scan_name: str, *, with_scale: bool
 ) -> Start:
-    """Return the least-squares pose of the model's landmarks on those of the scan that share their names.
+    """Return the least-squares pose from the landmarks that model and scan share by name.
 
     Raises:
         FitError: the model has no landmarks, or fewer than three names are shared.
@@ -118,7 +118,7 @@ def start_from_landmarks(
 def start_from_any_pose(
     model: ShapeModel, scan_vertices_mm: FloatArray, *, seed: int, with_scale: bool | None = None
 ) -> Start:
-    """Return the best pose over all rotations, with the leading modes adapted, and the best of the others.
+    """Return the best pose of a search over all rotations, with the leading modes adapted, and the alternatives.
 
     A scan that clearly fits without a rotation is not searched further. Another rotation wins only when it is clearly
     better, since scans mostly come upright and some objects look the same from several sides.
@@ -133,14 +133,14 @@ def start_from_any_pose(
 
     scaled = model.gauge == "shape" if with_scale is None else with_scale
     upright, poses = search(model, scan_vertices_mm, with_scale=scaled, seed=seed)
-    turned = [float(np.trace(upright.T_scan_model.rotation @ pose.T_scan_model.rotation.T)) for pose in poses]
+    traces = [float(np.trace(upright.T_scan_model.rotation @ pose.T_scan_model.rotation.T)) for pose in poses]
     starts = [
         Start(pose.T_scan_model, "upright" if trace > _SAME_TURN_TRACE else "rotations", pose.score_mm, pose.b)
-        for pose, trace in zip(poses, turned, strict=True)
+        for pose, trace in zip(poses, traces, strict=True)
     ]
-    best, others = starts[0], tuple(starts[1:])
-    runner_up = min((other.score_mm for other in others), default=float("inf"))
-    return replace(best, runner_up_score_mm=runner_up, alternatives=others)
+    best, alternatives = starts[0], tuple(starts[1:])
+    runner_up = min((other.score_mm for other in alternatives), default=float("inf"))
+    return replace(best, runner_up_score_mm=runner_up, alternatives=alternatives)
 
 
 def _size(points: FloatArray) -> float:

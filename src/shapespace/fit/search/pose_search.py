@@ -1,4 +1,4 @@
-"""The search for a pose from nowhere: many rotations coarsely, the best of them with scale and leading modes.
+"""Global pose search: many rotations on a coarse level, the best of them with scale and leading modes.
 
 The mean shape alone cannot tell a face from the back of a bald head: what tells them apart is how close, both ways, the
 model comes once its leading modes have adapted. So poses are narrowed down in four steps, each dearer and sharper than
@@ -25,7 +25,7 @@ from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 
 
 class Step(NamedTuple):
-    """One step of the search.
+    """Settings of one step of the search.
 
     Args:
         points: how many points of each side look for the other.
@@ -56,24 +56,27 @@ RIGID = Step(points=500, widest=0.2, narrowest=0.06, iterations=14, modes=0, kep
 MIDDLE = Step(points=200, widest=0.3, narrowest=0.06, iterations=12, modes=3, kept=5)
 FINE = Step(points=400, widest=0.1, narrowest=0.03, iterations=10, modes=10, kept=2)
 LONG = Step(points=400, widest=0.15, narrowest=0.03, iterations=30, modes=10, kept=4)
-ROTATIONS = 96
+ROTATIONS = 96  # spread evenly over SO(3), about 55 degrees apart
 
-_MODEL_CELL, _SCAN_CELL = 0.07, 0.04
-_MAX_THINNING_CELLS = 4_000_000
+_MODEL_CELL, _SCAN_CELL = 0.07, 0.04  # grid cells for thinning, as shares of the model's size
+_MAX_THINNING_CELLS = 4_000_000  # memory limit
+# largest distance that counts in the score, as shares of the model's size: rigid, and with shape
 _RIGID_CAP, _CAP = 0.1, 0.06
-_PRIOR = 10.0
-_SCALE_STDDEV = 0.15
+_PRIOR = 10.0  # weight of the prior on the coefficients
+_SCALE_STDDEV = 0.15  # of the prior on the relative scale
+# poses within 20 degrees and this share of the model's size are the same one
 _SAME_TURN, _SAME_PLACE = math.cos(math.radians(20.0)), 0.3
-_OTHER_TURN = math.cos(math.radians(40.0))
+_OTHER_TURN = math.cos(math.radians(40.0))  # alternatives to report differ by 40 degrees
+# scores that end the search early: as a share of the cap, and of the best flipped pose
 _CLEARLY_CLOSE, _CLEARLY_BETTER = 0.45, 0.75
-_SURE = 0.85
-_CLEARLY_WORSE, _WORTH = 0.93, 0.05
-_MORE_ROUNDS = 3
+_SURE = 0.85  # score relative to the runner-up below which no more iterations are run
+_CLEARLY_WORSE, _WORTH = 0.93, 0.05  # how much worse an upright pose may score: ratio to the best, or share of the cap
+_MORE_ROUNDS = 3  # repetitions of the last step for ambiguous poses
 
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """A pose of the adapted model, and how well it fits there.
+    """A pose with adapted coefficients, and its score.
 
     Args:
         T_scan_model: from the model's frame to the scan's, mm.
@@ -185,7 +188,7 @@ class _ModelSide:
 
 @dataclass(frozen=True, eq=False)
 class _Sides:
-    """A model and a scan to be brought together."""
+    """A model and a scan with the data of their registration."""
 
     model: _ModelSide
     scan: FloatArray
@@ -211,11 +214,11 @@ class _Sides:
         return pose if self.is_close(pose) else min(pose, self.refined(GLANCE, R[1], t[1]), key=_score)
 
     def is_close(self, pose: Pose) -> bool:
-        """Return whether the model fits so well there that it is worth asking whether anything else fits better."""
+        """Return whether the score is so good that only flipped poses remain to be tested."""
         return pose.score_mm <= _CLEARLY_CLOSE * _CAP * self.model.size
 
     def flips(self, pose: Pose) -> list[Pose]:
-        """Return the poses turned by half a turn about each axis of the model: what it is likeliest mistaken for."""
+        """Return the poses rotated by 180 degrees about each axis of the model, its likeliest confusions."""
         out: list[Pose] = []
         T, centre = pose.T_scan_model, self.model.points.mean(axis=0)
         for axis in self.model.axes:
@@ -235,41 +238,43 @@ class _Sides:
                 step.reaches(size), _RIGID_CAP * size,
             )  # fmt: skip
             order = np.argsort(score)
-            kept = order[_distinct_rows(R[order], t[order], step.kept, _SAME_TURN, _SAME_PLACE * size)]
-            R, t = R[kept], t[kept]
+            kept_rows = order[_distinct_rows(R[order], t[order], step.kept, _SAME_TURN, _SAME_PLACE * size)]
+            R, t = R[kept_rows], t[kept_rows]
         coarse = sorted((self.refined(MIDDLE, *start) for start in zip(R, t, strict=True)), key=_score)
         coarse = _distinct(coarse, len(coarse), _SAME_TURN)
         poses = [self._again(FINE, pose) for pose in coarse[: MIDDLE.kept]]
         poses = sorted([upright, *poses], key=_score)
         poses = [self._again(LONG, pose) for pose in poses[: FINE.kept]] + poses[FINE.kept :]
-        found = _best_distinct(poses)
-        if not _is_sure(found):
-            late = coarse[MIDDLE.kept : 2 * MIDDLE.kept]
-            poses = poses[: FINE.kept] + [self._again(LONG, pose) for pose in [*poses[FINE.kept :], *late]]
-            found = _best_distinct(poses)
+        distinct_poses = _best_distinct(poses)
+        if not _is_sure(distinct_poses):
+            second_batch = coarse[MIDDLE.kept : 2 * MIDDLE.kept]
+            poses = poses[: FINE.kept] + [self._again(LONG, pose) for pose in [*poses[FINE.kept :], *second_batch]]
+            distinct_poses = _best_distinct(poses)
         # A large part missing lets the model slide for long before it locks in.
         for _ in range(_MORE_ROUNDS):
-            if _is_sure(found):
+            if _is_sure(distinct_poses):
                 break
-            found = _best_distinct([self._again(LONG, pose) for pose in found[: FINE.kept]] + found[FINE.kept :])
-        return found
+            distinct_poses = _best_distinct(
+                [self._again(LONG, pose) for pose in distinct_poses[: FINE.kept]] + distinct_poses[FINE.kept :]
+            )
+        return distinct_poses
 
-    def upright_unless_clearly_worse(self, upright: Pose, found: list[Pose]) -> list[Pose]:
-        """Return `found` with the pose nearest to `upright` first, unless the best is clearly better."""
-        limit = max(found[0].score_mm / _CLEARLY_WORSE, found[0].score_mm + _WORTH * _CAP * self.model.size)
-        near = [pose for pose in found if len(_distinct([upright, pose], 2, _SAME_TURN)) == 1]
-        first = min([upright, *near], key=_score)
+    def upright_unless_clearly_worse(self, upright: Pose, ranked: list[Pose]) -> list[Pose]:
+        """Return `ranked` with the pose nearest to `upright` first, unless the best is clearly better."""
+        limit = max(ranked[0].score_mm / _CLEARLY_WORSE, ranked[0].score_mm + _WORTH * _CAP * self.model.size)
+        similar = [pose for pose in ranked if len(_distinct([upright, pose], 2, _SAME_TURN)) == 1]
+        first = min([upright, *similar], key=_score)
         if first.score_mm > limit:
-            return found
-        return _distinct([first, *found], LONG.kept, _OTHER_TURN)
+            return ranked
+        return _distinct([first, *ranked], LONG.kept, _OTHER_TURN)
 
     def _placed(self, rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return two poses for each of `rotations` (N, 3, 3): centres together, and the model's front at the scan's."""
         centre, towards = self.scan.mean(axis=0), rotations @ self.model.outward
         translation = centre - rotations @ self.model.points.mean(axis=0)
-        ahead = np.quantile((self.scan[:1000] - centre) @ towards.T, 0.95, axis=0) - self.model.front
+        front_offset = np.quantile((self.scan[:1000] - centre) @ towards.T, 0.95, axis=0) - self.model.front
         return np.concatenate([rotations, rotations]), np.concatenate(
-            [translation, translation + ahead[:, None] * towards]
+            [translation, translation + front_offset[:, None] * towards]
         )
 
     def _again(self, step: Step, pose: Pose) -> Pose:
@@ -280,7 +285,7 @@ class _Sides:
         self, step: Step, R: FloatArray, t: FloatArray, scale: float = 1.0, b: FloatArray | None = None
     ) -> Pose:
         """Return the pose after `step`, from a pose and the coefficients `b` of the leading modes."""
-        begun = Similarity(scale, R, t)
+        start_pose = Similarity(scale, R, t)
         shape = self.model.shapes[min(step.modes, max(self.model.shapes))]
         R, t, out = np.array(R), np.array(t), np.empty(3)
         free = np.zeros(len(shape.precision))
@@ -293,7 +298,7 @@ class _Sides:
                 1.0 / _SCALE_STDDEV**2 if self.with_scale else math.inf, self.slack, _CAP * self.model.size, out,
             )  # fmt: skip
         except np.linalg.LinAlgError:
-            return Pose(begun, np.zeros(len(free)), math.inf, 0.0)
+            return Pose(start_pose, np.zeros(len(free)), math.inf, 0.0)
         return Pose(Similarity(scale, R, t), free, 0.5 * float(out[0] + out[1]), float(out[2]))
 
 
@@ -301,47 +306,47 @@ def _best_distinct(poses: Sequence[Pose]) -> list[Pose]:
     return _distinct(sorted(poses, key=_score), LONG.kept, _OTHER_TURN)
 
 
-def _is_sure(found: Sequence[Pose]) -> bool:
-    return len(found) < 2 or found[0].score_mm <= _SURE * found[1].score_mm
+def _is_sure(poses: Sequence[Pose]) -> bool:
+    return len(poses) < 2 or poses[0].score_mm <= _SURE * poses[1].score_mm
 
 
 def _distinct(poses: Sequence[Pose], limit: int, same_turn: float) -> list[Pose]:
-    """Return up to `limit` of `poses`, without those that turn as an earlier one does."""
+    """Return up to `limit` of `poses`, without rotations close to an earlier one."""
     R = np.stack([pose.T_scan_model.rotation for pose in poses])
     return [poses[i] for i in _distinct_rows(R, np.zeros((len(R), 3)), limit, same_turn, math.inf)]
 
 
 def _distinct_rows(R: FloatArray, t: FloatArray, limit: int, same_turn: float, same_place: float) -> list[int]:
     cosine = 0.5 * (R.reshape(-1, 9) @ R.reshape(-1, 9).T - 1.0)
-    kept: list[int] = []
+    distinct: list[int] = []
     for i in range(len(R)):
-        near = np.linalg.norm(t[kept] - t[i], axis=1) <= same_place
-        if not (near & (cosine[i, kept] >= same_turn)).any():
-            kept.append(i)
-            if len(kept) == limit:
+        is_near = np.linalg.norm(t[distinct] - t[i], axis=1) <= same_place
+        if not (is_near & (cosine[i, distinct] >= same_turn)).any():
+            distinct.append(i)
+            if len(distinct) == limit:
                 break
-    return kept
+    return distinct
 
 
 def _evenly(points: FloatArray, cell: float, size: float) -> IntArray:
-    """Return the indices of one point for each cell of edge `cell`; lone points far outside are left out."""
+    """Return the indices of one point for each cell of edge `cell`; isolated points far outside are excluded."""
     columns = np.ascontiguousarray(points.T)
     low, high = np.quantile(columns[:, :: max(1, len(points) // 4000)], [0.005, 0.995], axis=1)
     low, high = np.maximum(columns.min(axis=1), low - size), np.minimum(columns.max(axis=1), high + size)
     cell = max(cell, edge_of(high - low + cell, _MAX_THINNING_CELLS))
     cells, dims = np.rint((columns - low[:, None]) / cell), np.rint((high - low) / cell) + 1
     inside = np.flatnonzero(((cells >= 0) & (cells < dims[:, None])).all(axis=0))
-    at = (cells[0] * dims[1] + cells[1])[inside] * dims[2] + cells[2, inside]
-    at = at.astype(np.int64)
+    cell_index = (cells[0] * dims[1] + cells[1])[inside] * dims[2] + cells[2, inside]
+    cell_index = cell_index.astype(np.int64)
     holder = np.empty(int(dims.prod()), dtype=np.int64)
-    holder[at] = inside
-    return inside[holder[at] == inside].astype(np.int32)
+    holder[cell_index] = inside
+    return inside[holder[cell_index] == inside].astype(np.int32)
 
 
 def _normals(points: FloatArray) -> FloatArray:
-    """Return the directions (N, 3) in which the neighbourhoods of `points` are thinnest."""
-    _, near = cKDTree(points).query(points, k=min(9, len(points)))
-    around = points[np.asarray(near).reshape(len(points), -1)]
+    """Return the normals (N, 3) of `points`: the direction of least variance in each neighbourhood."""
+    _, neighbours = cKDTree(points).query(points, k=min(9, len(points)))
+    around = points[np.asarray(neighbours).reshape(len(points), -1)]
     around = around - around.mean(axis=1, keepdims=True)
     return np.linalg.eigh(around.transpose(0, 2, 1) @ around)[1][:, :, 0]
 

@@ -1,4 +1,4 @@
-"""The first steps of the search for a start: two-way rigid ICP from many poses at once, on grids of near points.
+"""Rigid steps of the pose search: symmetric ICP from many poses at once, on grids of near points.
 
 A grid holds a near point for each cell, so that a match is one look-up. Weights are Geman and McClure's, with a reach
 that falls from step to step (graduated, as in Zhang, Yao and Deng, PAMI 44(7), 2022).
@@ -13,11 +13,12 @@ from scipy.ndimage import distance_transform_edt
 
 from shapespace.types import FloatArray, IntArray
 
+# grid of near points: margin and cell as shares of the size, and memory limit (cells)
 _MARGIN, _CELL, _MAX_CELLS = 0.5, 0.08, 400_000
 
 
 class NearGrid(NamedTuple):
-    """A near point for each cell of a box.
+    """Grid with a near point for each cell.
 
     Args:
         near: (X, Y, Z) int32, for each cell, of the points that stand for a cell, that of the nearest such cell.
@@ -47,13 +48,15 @@ class NearGrid(NamedTuple):
     def look_up(self, places: FloatArray) -> FloatArray:
         """Return a point near to each of `places` (S, 3, N), in the same order; outside the box that of its border."""
         _, ny, nz = self.near.shape
-        at = np.clip((places - self.origin) / self.cell, 0.0, np.array(self.near.shape)[:, None] - 1.0).astype(np.int32)
-        found: IntArray = self.near.reshape(-1)[(at[:, 0] * ny + at[:, 1]) * nz + at[:, 2]]
-        return self.points.take(found, axis=1).transpose(1, 0, 2)
+        cells = np.clip((places - self.origin) / self.cell, 0.0, np.array(self.near.shape)[:, None] - 1.0).astype(
+            np.int32
+        )
+        nearest: IntArray = self.near.reshape(-1)[(cells[:, 0] * ny + cells[:, 1]) * nz + cells[:, 2]]
+        return self.points.take(nearest, axis=1).transpose(1, 0, 2)
 
 
 def edge_of(sides: FloatArray, cells: int) -> float:
-    """Return the edge of the cubes of which a box of `sides` (3,) holds `cells`."""
+    """Return the edge of `cells` cubes that fill a box of `sides` (3,)."""
     return float(sides.prod() / cells) ** (1 / 3)
 
 
@@ -64,7 +67,7 @@ def rigid_search(
     scan: FloatArray,
     model_grid: NearGrid,
     scan_grid: NearGrid,
-    reaches: FloatArray,
+    radii: FloatArray,
     cap: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return rotations, translations and scores (S,), mm, of two-way rigid ICP from each of S poses.
@@ -76,12 +79,12 @@ def rigid_search(
         scan: (N, 3) points of the scan that look for the model.
         model_grid: near points of the model, in its own frame.
         scan_grid: near points of the scan.
-        reaches: (I,) distance at which a match loses three quarters of its weight, for each iteration, mm.
+        radii: (I,) distance at which a match loses three quarters of its weight, for each iteration, mm.
         cap: distance beyond which a match counts no more in the score, mm.
     """
-    for reach in reaches:
+    for radius in radii:
         y, x, forward, backward = _matches(R, t, model, scan, model_grid, scan_grid)
-        w, v = ((reach**2 / (reach**2 + squared)) ** 2 for squared in (forward, backward))
+        w, v = ((radius**2 / (radius**2 + squared)) ** 2 for squared in (forward, backward))
         total = (w.sum(axis=1) + v.sum(axis=1))[:, None]
         y, x = y * w[:, None], x * v[:, None]
         model_mean = (w @ model + x.sum(axis=2)) / total

@@ -26,18 +26,21 @@ from shapespace.types import FloatArray, Mesh, Similarity
 
 # Chosen on fits of `benchmarks/reliability.py`, heads, hair and collars, and a real scan with hair and neck.
 _NEAR = 0.05
-_EXPLAINED = 0.75
-_LEAST_REST = 0.25
-_SCORED = 0.075
-_AS_GOOD = 2.0
-_APART = 0.011
+_EXPLAINED = 0.75  # share of the scan near the fit above which no second instance is sought
+_LEAST_REST = 0.25  # smallest share of the scan that a second instance may have
+_SCORED = 0.075  # largest mean capped distance of a second instance, as a share of its size
+_AS_GOOD = 2.0  # ratio of residual standard deviations up to which the second fit counts as an equal
+_APART = 0.011  # residual standard deviation, share of the size, below which one surface explains the scan
+# trimmed ICP: model points, start positions, iterations, inlier share, distance caps (share of the size)
 _GLANCED, _PLACES, _ROUNDS, _TRIMMED, _FARTHEST, _CAP = 150, 40, 25, 0.7, 0.5, 0.1
+# sampled scan points, nearest points of each (with itself), fewest points to judge by
 _POINTS, _NEIGHBOURS, _FEWEST = 2_000, 7, 100
-_TIGHT, _LEAST_SIDE = 0.5, 2
+_TIGHT, _LEAST_SIDE = 0.5, 2  # two layers: largest width of one relative to the gap, and fewest points on each side
 
 # Chosen on the development seeds of `benchmarks/odd_cases.py`, and on 42 heads with hair.
 _ALL_EXPLAINED = 0.97
-_DISPLACED = (0.04, 0.45)
+_DISPLACED = (0.04, 0.45)  # range of the distance to the fit, as shares of the model's size
+# distance in residual sd, relative variation among neighbours, cosine to the normal
 _SPREADS, _ALIKE, _ALONG_NORMAL = 3.0, 0.35, 0.8
 
 
@@ -66,7 +69,7 @@ class SecondInstance:
 def find_second_instance(
     model: ShapeModel, target: ScanTarget, fitted: RobustFitted, settings: RobustSettings, *, with_scale: bool
 ) -> SecondInstance | None:
-    """Return the second instance that the model fits about as well as the first; None where there is none.
+    """Return a second instance that the model fits about as well as the first, or None.
 
     The model is fitted to the unexplained part of the scan, and the status of that fit is estimated as usual.
 
@@ -81,24 +84,26 @@ def find_second_instance(
         return None
     size_mm, scale = rms_size(model.mean_vertices), fitted.T_scan_fitted.scale
     placed = build_engine(Mesh(fitted.vertices_scan_mm, model.faces))
-    far = placed.query(target.mesh.vertices).distance > _NEAR * size_mm * scale
-    if far.sum() < max(_FEWEST, _LEAST_REST * len(far)):
+    is_far = placed.query(target.mesh.vertices).distance > _NEAR * size_mm * scale
+    if is_far.sum() < max(_FEWEST, _LEAST_REST * len(is_far)):
         return None
-    rest = ScanTarget(part_of(target.mesh, far))
-    T = _same_moved(fitted, rest.mesh.vertices, size_mm)
+    remaining_target = ScanTarget(part_of(target.mesh, is_far))
+    T = _fit_pose_again(fitted, remaining_target.mesh.vertices, size_mm)
     if T is None:
         return None
     try:
-        other = last_of(robust_icp(model, rest, Start(T, "given", float("nan")), settings, with_scale=with_scale))
+        second_fit = last_of(
+            robust_icp(model, remaining_target, Start(T, "given", float("nan")), settings, with_scale=with_scale)
+        )
     except (FitError, InputError):
         return None
     own, others = fitted.match_evidence, other.match_evidence
     if failure_score(others) > 0.0 or others.spread_mm > _AS_GOOD * own.spread_mm:
         return None
-    first, second = fitted.vertices_scan_mm, other.vertices_scan_mm
-    apart = second.mean(axis=0) - first.mean(axis=0)
-    away = float(np.linalg.norm(apart))
-    towards = apart / max(away, 1e-12)
+    first, second = fitted.vertices_scan_mm, second_fit.vertices_scan_mm
+    offset = second.mean(axis=0) - first.mean(axis=0)
+    away = float(np.linalg.norm(offset))
+    towards = offset / max(away, 1e-12)
     gap = float((second @ towards).min() - (first @ towards).max())
     return SecondInstance(away / scale, gap / scale)
 
@@ -141,8 +146,8 @@ def find_displaced(model: ShapeModel, target: ScanTarget, fitted: RobustFitted) 
     size, spread = rms_size(model.mean_vertices) * scale, fitted.match_evidence.spread_mm * scale
     points = target.mesh.vertices[target.draw(_POINTS, np.random.default_rng(0))]
     surface = Mesh(fitted.vertices_scan_mm, model.faces)
-    at = build_engine(surface).query(points)
-    height = np.einsum("ij,ij->i", points - at.points, vertex_normals(surface)[at.vertex])
+    nearest = build_engine(surface).query(points)
+    height = np.einsum("ij,ij->i", points - nearest.points, vertex_normals(surface)[nearest.vertex])
     around = height[np.asarray(cKDTree(points).query(points, _NEIGHBOURS)[1], dtype=np.int32)[:, 1:]]
     alike = np.median(np.abs(around - height[:, None]), axis=1) < _ALIKE * np.abs(height)
     inside = ~boundary_vertices(surface)[at.vertex]
@@ -198,17 +203,17 @@ def _same_moved(fitted: RobustFitted, rest: FloatArray, size_mm: float) -> Simil
 
     It is far cheaper than a search, which a head or a collar around a face would otherwise cost.
     """
-    T, tree, rng = fitted.T_scan_fitted, cKDTree(rest), np.random.default_rng(0)
+    T, tree, rng = fitted.T_scan_fitted, cKDTree(remaining_points), np.random.default_rng(0)
     x = fitted.vertices_scan_mm[rng.choice(len(fitted.vertices_scan_mm), _GLANCED)]
 
     def score(points: FloatArray, cap: float) -> FloatArray:
         return np.minimum(tree.query(points)[0], cap * size_mm * T.scale).mean(axis=-1)
 
-    places = rest[rng.choice(len(rest), _PLACES)] - x[rng.choice(_GLANCED, _PLACES)]
-    places = np.vstack([np.median(rest, axis=0) - np.median(x, axis=0), places])
+    places = remaining_points[rng.choice(len(remaining_points), _PLACES)] - x[rng.choice(_GLANCED, _PLACES)]
+    places = np.vstack([np.median(remaining_points, axis=0) - np.median(x, axis=0), places])
     move = Similarity(1.0, np.eye(3), places[int(np.argmin(score(x + places[:, None], _FARTHEST)))])
     for _ in range(_ROUNDS):
         distance, nearest = tree.query(move.apply(x))
-        kept = np.asarray(distance <= np.quantile(distance, _TRIMMED), dtype=np.bool_)
-        move = fit_similarity(x[kept], rest[np.asarray(nearest)[kept]], with_scale=False)
+        is_near = np.asarray(distance <= np.quantile(distance, _TRIMMED), dtype=np.bool_)
+        move = fit_similarity(x[is_near], remaining_points[np.asarray(nearest)[is_near]], with_scale=False)
     return move @ T if float(score(move.apply(x), _CAP)) < _SCORED * size_mm * T.scale else None

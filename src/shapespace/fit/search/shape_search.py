@@ -1,4 +1,4 @@
-"""The last steps of the search for a start: two-way Gauss-Newton over pose and leading modes, from one pose.
+"""Last steps of the pose search: symmetric Gauss-Newton over pose and leading modes, from one pose.
 
 Matches are exact. Residuals have no side, so the winding of triangles does not matter. Weights are those of
 `rigid_search`. The normal equations are its own: those of `robust` find the same poses, at 1.6 times the CPU time of a
@@ -17,7 +17,7 @@ from shapespace.types import FloatArray, IntArray
 
 
 class ShapePoints(NamedTuple):
-    """What the shape ICP knows of the model, in the model's frame.
+    """Points, normals and modes of the model for the shape search, in the model's frame.
 
     Args:
         points: (M, 3) of the mean, mm.
@@ -59,7 +59,7 @@ def shape_search(
     cap: float,
     out: FloatArray,
 ) -> float:
-    """Run two-way Gauss-Newton over pose and leading modes from one pose, in place, and return the scale it ends at.
+    """Run symmetric Gauss-Newton over pose and leading modes from one pose, in place, and return the final scale.
 
     All is solved in the model's frame, where the modes need no turning; a mean point x and a scan point q brought
     there differ by e = x - q, and the cost is sum w e^T (n n^T + eta I) e + prior_weight reach^2 (sum b_k^2 / lam_k + c
@@ -89,20 +89,20 @@ def shape_search(
     n_model, n_scan = counts[0], counts[1]
     guess = np.full(n_model + n_scan, -1, dtype=np.int32)
     x, q, e, n, y = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    held = not np.isfinite(scale_precision)
-    for step in range(len(reaches) + 1):
-        last = step == len(reaches)
-        nu = reaches[len(reaches) - 1] ** 2 if last else reaches[step] ** 2
+    is_scale_fixed = not np.isfinite(scale_precision)
+    for step in range(len(radii) + 1):
+        last = step == len(radii)
+        nu = radii[len(radii) - 1] ** 2 if last else radii[step] ** 2
         A[:], g[:], out[:] = 0.0, 0.0, 0.0
-        seen = 0
+        n_used = 0
         for i in range(n_model + n_scan):
             forward = i < n_model
             if forward:
-                at = i
+                best_index = i
                 for k in range(3):
-                    x[k] = shape.points[at, k]
+                    x[k] = shape.points[best_index, k]
                     for m in range(n_modes):
-                        x[k] += shape.modes[at, k, m] * b[m]
+                        x[k] += shape.modes[best_index, k, m] * b[m]
                 for k in range(3):
                     y[k] = scale * (R[k, 0] * x[0] + R[k, 1] * x[1] + R[k, 2] * x[2]) + t[k]
                 j, _ = nearest_one(tree, y[0], y[1], y[2], guess[i], stack)
@@ -119,43 +119,43 @@ def shape_search(
                 for k in range(3):
                     y[k] = q[k]
                 # The tree is of the mean, so the query goes back by the last match's displacement.
-                at = guess[i]
-                if at >= 0:
+                best_index = guess[i]
+                if best_index >= 0:
                     for k in range(3):
                         for m in range(n_modes):
-                            y[k] -= shape.modes[at, k, m] * b[m]
-                at, _ = nearest_one(shape.tree, y[0], y[1], y[2], at, stack)
-                guess[i] = at
+                            y[k] -= shape.modes[best_index, k, m] * b[m]
+                best_index, _ = nearest_one(shape.tree, y[0], y[1], y[2], best_index, stack)
+                guess[i] = best_index
                 for k in range(3):
-                    x[k] = shape.points[at, k]
+                    x[k] = shape.points[best_index, k]
                     for m in range(n_modes):
-                        x[k] += shape.modes[at, k, m] * b[m]
-            along, whole, facing = 0.0, 0.0, 0.0
+                        x[k] += shape.modes[best_index, k, m] * b[m]
+            along, total, facing = 0.0, 0.0, 0.0
             for k in range(3):
-                n[k] = shape.normals[at, k]
+                n[k] = shape.normals[best_index, k]
                 e[k] = x[k] - q[k]
                 along += n[k] * e[k]
-                whole += e[k] * e[k]
+                total += e[k] * e[k]
                 facing += n[k] * n[k]
             if facing == 0.0:
-                along = np.sqrt(whole)
-            sideways = np.sqrt(max(whole - along * along, 0.0))
+                along = np.sqrt(total)
+            sideways = np.sqrt(max(total - along * along, 0.0))
             allowed = slack[0] if forward else slack[1]
             if last:
-                covered = sideways <= allowed
+                is_within = sideways <= allowed
                 d = min(abs(along), cap)
                 if forward:
-                    out[0] += d if covered else cap
-                    out[2] += 1.0 if covered and d < cap else 0.0
-                elif covered:
-                    seen += 1
+                    out[0] += d if is_within else cap
+                    out[2] += 1.0 if is_within and d < cap else 0.0
+                elif is_within:
+                    n_used += 1
                     out[1] += d
                 continue
-            beyond = max(sideways - allowed, 0.0)
-            w = (nu / (nu + along * along + beyond * beyond * 4.0)) ** 2
+            excess = max(sideways - allowed, 0.0)
+            w = (nu / (nu + along * along + excess * excess * 4.0)) ** 2
             for m in range(n_modes):
                 for k in range(3):
-                    J[k, 7 + m] = shape.modes[at, k, m]
+                    J[k, 7 + m] = shape.modes[best_index, k, m]
             J[0, 0], J[0, 1], J[0, 2] = 0.0, q[2], -q[1]
             J[1, 0], J[1, 1], J[1, 2] = -q[2], 0.0, q[0]
             J[2, 0], J[2, 1], J[2, 2] = q[1], -q[0], 0.0
@@ -177,7 +177,7 @@ def shape_search(
         if last:
             out[0] /= n_model
             out[2] /= n_model
-            out[1] = out[1] / seen if seen > 0 else cap
+            out[1] = out[1] / n_used if n_used > 0 else cap
             break
         for m in range(n_modes):
             A[7 + m, 7 + m] += prior_weight * nu * shape.precision[m]
@@ -197,7 +197,7 @@ def shape_search(
         # A step of Gauss-Newton is only good nearby.
         shrink = min(1.0, 0.35 / max(angle, 1e-12))
         R[:] = R @ _turn(-shrink * g[:3])
-        if not held:
+        if not is_scale_fixed:
             scale *= np.exp(max(min(-g[6] * shrink, 0.1), -0.1))
             scale = max(min(scale, 1.6), 0.6)
         for k in range(3):

@@ -1,4 +1,4 @@
-"""Zip archives of arrays, .npz among them, from whoever sent them: no pickles, and memory in proportion to the file."""
+"""Readers of untrusted zip archives of arrays, such as .npz files: no pickles, memory proportional to the file size."""
 
 from __future__ import annotations
 
@@ -17,54 +17,56 @@ from shapespace.errors import FileFormatError
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import read_error
 
-LARGEST_BYTES: Final = 2**30
-_MOST_MEMBERS = 4096
+LARGEST_BYTES: Final = 2**30  # 1 GiB, packed
+_MOST_MEMBERS = 4096  # limit on damaged files; results have tens
 _MOST_PACKED = 100
 """Times its own size that an archive may unpack to; what we write unpacks to a few times."""
-_SMALL = 2**20
+_SMALL = 2**20  # 1 MiB that any file may unpack to, and elements that an array without data may declare
 _PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-_TOLD = 80
+_TOLD = 80  # characters of a library's message
 _PLAIN_KINDS = "biufU"
-_LONGEST_AXIS = 2**31 - 1
+_LONGEST_AXIS = 2**31 - 1  # indices are int32
 _HEADER_READERS: Final[Mapping[tuple[int, int], Callable[[IO[bytes]], tuple[Any, Any, Any]]]] = {
     (1, 0): npy.read_array_header_1_0,
     (2, 0): npy.read_array_header_2_0,
 }
 
 
-def read_arrays(path: Path, again: str, wanted: Collection[str] | None = None) -> dict[str, npt.NDArray[Any]]:
+def read_arrays(path: Path, remedy: str, member_names: Collection[str] | None = None) -> dict[str, npt.NDArray[Any]]:
     """Return the arrays of an .npz file by name.
 
     Args:
         path: of the file.
-        again: what a reader can do about a file that is wrong.
-        wanted: names of arrays; others are not looked at. None for all.
+        remedy: what a reader can do about a file that is wrong.
+        member_names: names of arrays; others are not looked at. None for all.
 
     Raises:
         FileError: it cannot be read.
         FileFormatError: it is damaged, holds other things than arrays, or unpacks to far more than its size.
     """
-    check_file(path, LARGEST_BYTES, again)
+    check_file(path, LARGEST_BYTES, remedy)
     try:
         with path.open("rb") as stream:
-            return arrays_in(stream, path.stat().st_size, wanted)
+            return arrays_in(stream, path.stat().st_size, member_names)
     except OSError as error:
         raise read_error(path, error) from error
     except ValueError as error:
         raise FileFormatError(
-            f"{path} is not an .npz file of arrays, or it is cut short ({error}); {again}."
+            f"{path} is not an .npz file of arrays, or it is cut short ({error}); {remedy}."
         ) from error
 
 
-def arrays_in(stream: BinaryIO, size: int, wanted: Collection[str] | None = None) -> dict[str, npt.NDArray[Any]]:
-    """Return the arrays of an .npz in `stream`, of `size` bytes, by name, those of `wanted` or all.
+def arrays_in(stream: BinaryIO, size: int, member_names: Collection[str] | None = None) -> dict[str, npt.NDArray[Any]]:
+    """Return the arrays of an .npz in `stream`, of `size` bytes, by name, those of `member_names` or all.
 
     Raises:
         OSError: it cannot be read.
         ValueError: as `read_arrays` refuses.
     """
     arrays: dict[str, npt.NDArray[Any]] = {}
-    for name, content in _members(stream, size, None if wanted is None else {f"{name}.npy" for name in wanted}):
+    for name, content in _members(
+        stream, size, None if member_names is None else {f"{name}.npy" for name in member_names}
+    ):
         try:
             arrays[name.removesuffix(".npy")] = npy_array(content)
         except ValueError as error:
@@ -72,17 +74,17 @@ def arrays_in(stream: BinaryIO, size: int, wanted: Collection[str] | None = None
     return arrays
 
 
-def zip_members(stream: BinaryIO, size: int, wanted: Collection[str] | None = None) -> dict[str, bytes]:
-    """Return the members of the archive in `stream`, of `size` bytes, by name, those of `wanted` or all.
+def zip_members(stream: BinaryIO, size: int, member_names: Collection[str] | None = None) -> dict[str, bytes]:
+    """Return the members of the archive in `stream`, of `size` bytes, by name, those of `member_names` or all.
 
     Raises:
         OSError: it cannot be read.
         ValueError: it is no archive, is damaged, or would unpack to far more than its size.
     """
-    return dict(_members(stream, size, wanted))
+    return dict(_members(stream, size, member_names))
 
 
-def _members(stream: BinaryIO, size: int, wanted: Collection[str] | None) -> Generator[tuple[str, bytes]]:
+def _members(stream: BinaryIO, size: int, member_names: Collection[str] | None) -> Generator[tuple[str, bytes]]:
     """Yield name and content of each member, so that one at a time is in memory."""
     try:
         with zipfile.ZipFile(stream) as archive:
@@ -95,7 +97,7 @@ def _members(stream: BinaryIO, size: int, wanted: Collection[str] | None) -> Gen
             if any(info.compress_type not in _PACKED for info in infos):
                 raise ValueError("it is packed in a way that we do not use")
             for name in names:
-                if wanted is None or name in wanted:
+                if member_names is None or name in member_names:
                     yield name, archive.read(name)
     except OSError:
         raise

@@ -1,4 +1,4 @@
-"""Named arrays in one `.npz` file, written whole; what is damaged counts as not there."""
+"""Named arrays in one `.npz` file, written atomically; a damaged file is treated as missing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Named arrays and attributes in one HDF5 file that shows any later change.
+"""Named arrays and attributes in one HDF5 file, with a hash that detects later changes.
 
 The first 512 bytes (an HDF5 user block, which HDF5 tools skip) hold the SHA-256 of the rest, and are checked before
 anything else is read. A content hash over the arrays and attributes themselves travels inside. The HDF5 library writes,
@@ -22,14 +22,14 @@ from shapespace.io.containers.hdf5_subset import SIGNATURE, Attribute, OtherHdf5
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import open_file, read_bytes, write_bytes
 
-_USER_BLOCK = 512
+_USER_BLOCK = 512  # bytes; smallest user block that HDF5 allows
 _MAGIC = b"shapespace sha256 "
 _HASH_NAME = "content_hash"
-_LARGEST_BYTES = 2**33
+_LARGEST_BYTES = 2**33  # 8 GiB
 
 
 def content_hash(arrays: Mapping[str, npt.NDArray[Any]], attributes: Mapping[str, Attribute]) -> str:
-    """Return the hexadecimal SHA-256 of all `arrays` and `attributes`, whatever file they stand in."""
+    """Return the hexadecimal SHA-256 of all `arrays` and `attributes`, independent of the file that contains them."""
     digest = hashlib.sha256()
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])

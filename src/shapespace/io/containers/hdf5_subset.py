@@ -1,4 +1,4 @@
-"""The part of HDF5 that our own writer uses, read without the HDF5 library.
+"""Reader of the subset of HDF5 that the shapespace writer uses, without the HDF5 library.
 
 That library follows links to other files and devices, takes what memory a header asks for, and hangs or crashes in
 damaged structures; a checksum does not help against who recomputes it. So only this is read, and all else refused:
@@ -21,14 +21,16 @@ Attribute: TypeAlias = str | int | float
 Arrays: TypeAlias = dict[str, npt.NDArray[Any]]
 
 SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
-_MOST = 256
-_MOST_AXES = 8
+_MOST = 256  # limit on names, messages and objects; a model has tens
+_MOST_AXES = 8  # limit on damaged files; arrays of a model have three
+# header message types of the HDF5 file format specification, section IV.A.2
 _SPACE, _TYPE, _LAYOUT, _ATTRIBUTE, _CONTINUED, _GROUP = 0x01, 0x03, 0x08, 0x0C, 0x10, 0x11
+# same section: NIL, old fill value, fill value, modification time
 _NOTHING, _OLD_FILL, _FILL, _CHANGED = 0x00, 0x04, 0x05, 0x12
 _IN_DATASET = {_NOTHING, _SPACE, _TYPE, _OLD_FILL, _FILL, _LAYOUT, _CHANGED}
 _IN_ROOT = {_NOTHING, _ATTRIBUTE, _GROUP, _CHANGED}
-_SHARED = 2
-_ONE_PIECE = (3, 1)
+_SHARED = 2  # header message flag, bit 1
+_ONE_PIECE = (3, 1)  # data layout message: version 3, contiguous storage
 # Each type as its message has it, zero bytes at the end left out: float64, then signed integers, little-endian.
 _NUMBERS = {
     bytes.fromhex("11203f000800000000004000340b0034ff03"): np.dtype("<f8"),
@@ -39,7 +41,7 @@ _TEXT = bytes.fromhex("19010100100000001000000001000000000008")
 
 
 class OtherHdf5Error(ValueError):
-    """It is HDF5, or claims to be, but not as our writer writes it; the text says why, as a clause."""
+    """An HDF5 file that does not use the layout of the shapespace writer; the text gives the reason, as a clause."""
 
 
 def hdf5_parts(data: memoryview) -> tuple[Arrays, dict[str, Attribute]]:
@@ -63,121 +65,121 @@ class _Parts:
         root = self._messages(self._fields("Q", 64)[0], _IN_ROOT, "the file")
         attributes = dict(self._attribute(body) for kind, body in root if kind == _ATTRIBUTE)
         arrays: Arrays = {}
-        for tree, heap in (_unpacked("QQ", body) for kind, body in root if kind == _GROUP):
+        for tree, heap in (_unpack("QQ", body) for kind, body in root if kind == _GROUP):
             for name, header in self._names(tree, heap):
                 if name in arrays:
                     raise OtherHdf5Error(f"it names {name!r} twice")
                 arrays[name] = self._array(name, header)
         return arrays, attributes
 
-    def _bytes(self, at: int, count: int) -> memoryview:
-        if at + count > len(self._data):
+    def _bytes(self, offset: int, count: int) -> memoryview:
+        if offset + count > len(self._data):
             raise OtherHdf5Error("it points past its own end")
-        return self._data[at : at + count]
+        return self._data[offset : offset + count]
 
-    def _fields(self, layout: str, at: int) -> tuple[Any, ...]:
-        return _unpacked(layout, self._bytes(at, struct.calcsize(f"<{layout}")))
+    def _fields(self, layout: str, offset: int) -> tuple[Any, ...]:
+        return _unpack(layout, self._bytes(offset, struct.calcsize(f"<{layout}")))
 
-    def _charge(self, count: int, what: str) -> None:
+    def _charge(self, count: int, part_name: str) -> None:
         """Take `count` bytes from what the file may fill in memory, before they are taken there."""
         self._left -= count
         if self._left < 0:
-            raise OtherHdf5Error(f"it declares {count} bytes in {what} but is only {len(self._data)} bytes long")
+            raise OtherHdf5Error(f"it declares {count} bytes in {part_name} but is only {len(self._data)} bytes long")
 
-    def _messages(self, at: int, allowed: set[int], where: str) -> list[tuple[int, memoryview]]:
-        """Return the messages of the object whose header begins at `at`, by kind."""
-        version, length = self._fields("B7xI", at)
+    def _messages(self, offset: int, allowed: set[int], part_name: str) -> list[tuple[int, memoryview]]:
+        """Return the messages of the object whose header begins at `offset`, by kind."""
+        version, length = self._fields("B7xI", offset)
         if version != 1:
-            raise OtherHdf5Error(f"{where} has a header of another version")
-        found: list[tuple[int, memoryview]] = []
-        blocks = [self._bytes(at + 16, length)]
+            raise OtherHdf5Error(f"{part_name} has a header of another version")
+        messages: list[tuple[int, memoryview]] = []
+        blocks = [self._bytes(offset + 16, length)]
         for block in blocks:  # grows while it is walked, by what is continued elsewhere
             place = 0
             while place + 8 <= len(block):
-                kind, size, flags = _unpacked("HHB", block[place : place + 5])
+                kind, size, flags = _unpack("HHB", block[place : place + 5])
                 body = block[place + 8 : place + 8 + size]
                 place += 8 + size
-                if place > len(block) or flags & _SHARED or len(found) + len(blocks) > _MOST:
-                    raise OtherHdf5Error(f"{where} has a header that is damaged")
+                if place > len(block) or flags & _SHARED or len(messages) + len(blocks) > _MOST:
+                    raise OtherHdf5Error(f"{part_name} has a header that is damaged")
                 if kind == _CONTINUED:
-                    blocks.append(self._bytes(*_unpacked("QQ", body)))
+                    blocks.append(self._bytes(*_unpack("QQ", body)))
                 elif kind in allowed:
-                    found.append((kind, body))
+                    messages.append((kind, body))
                 else:
-                    raise OtherHdf5Error(f"{where} holds a feature of HDF5 ({kind:#04x}) that no model needs")
-        return found
+                    raise OtherHdf5Error(f"{part_name} holds a feature of HDF5 ({kind:#04x}) that no model needs")
+        return messages
 
     def _names(self, tree: int, heap: int) -> list[tuple[str, int]]:
-        """Return each name in the group with the address of its header; all stand at one level of the tree."""
+        """Return each name in the group with the address of its header; all names are at one level of the tree."""
         mark, kind, level, count = self._fields("4sBBH", tree)
         heap_mark, texts = self._fields("4s20xQ", heap)
         if (mark, kind, level, heap_mark) != (b"TREE", 0, 0, b"HEAP") or count > _MOST:
             raise OtherHdf5Error("its names stand otherwise")
-        found: list[tuple[str, int]] = []
+        addresses: list[tuple[str, int]] = []
         for child in range(count):
             (node,) = self._fields("Q", tree + 32 + 16 * child)
             mark, entries = self._fields("4s2xH", node)
-            if mark != b"SNOD" or len(found) + entries > _MOST:
+            if mark != b"SNOD" or len(addresses) + entries > _MOST:
                 raise OtherHdf5Error("its names stand otherwise")
             for entry in range(entries):
                 name, header, link = self._fields("QQI", node + 8 + 40 * entry)
                 if link:
                     raise OtherHdf5Error("it holds a link or a group")
-                found.append((self._name(texts + name), header))
-        return found
+                addresses.append((self._name(texts + name), header))
+        return addresses
 
-    def _name(self, at: int) -> str:
-        return _text(bytes(self._data[at : at + _MOST]).partition(b"\0")[0])
+    def _name(self, offset: int) -> str:
+        return _text(bytes(self._data[offset : offset + _MOST]).partition(b"\0")[0])
 
-    def _array(self, name: str, at: int) -> npt.NDArray[Any]:
-        found = dict(self._messages(at, _IN_DATASET, repr(name)))
-        if not {_SPACE, _TYPE, _LAYOUT} <= found.keys():
+    def _array(self, name: str, offset: int) -> npt.NDArray[Any]:
+        messages = dict(self._messages(offset, _IN_DATASET, repr(name)))
+        if not {_SPACE, _TYPE, _LAYOUT} <= messages.keys():
             raise OtherHdf5Error(f"{name!r} is no array")
-        dtype = _NUMBERS.get(bytes(found[_TYPE]).rstrip(b"\0"))
+        dtype = _NUMBERS.get(bytes(messages[_TYPE]).rstrip(b"\0"))
         if dtype is None:
             raise OtherHdf5Error(f"{name!r} is of another type than float64 and int32")
-        shape = _shape(found[_SPACE])
+        shape = _shape(messages[_SPACE])
         size = math.prod(shape) * dtype.itemsize
         self._charge(size, repr(name))
-        if tuple(found[_LAYOUT][:2]) != _ONE_PIECE:
+        if tuple(messages[_LAYOUT][:2]) != _ONE_PIECE:
             raise OtherHdf5Error(f"{name!r} is not stored in one piece")
-        address, stored = _unpacked("QQ", found[_LAYOUT][2:18])
+        address, stored = _unpack("QQ", messages[_LAYOUT][2:18])
         if stored != size or not size:
             raise OtherHdf5Error(f"{name!r} is empty or cut short")
         return np.frombuffer(self._bytes(address, size), dtype).reshape(shape)
 
     def _attribute(self, body: memoryview) -> tuple[str, Attribute]:
-        version, *sizes = _unpacked("BxHHH", body[:8])
-        ends = np.cumsum([8, *(-(-size // 8) * 8 for size in sizes)]).tolist()
-        name, kind, space, value = (bytes(body[a:b]) for a, b in zip(ends, [*ends[1:], None], strict=True))
-        called = _text(name.partition(b"\0")[0])
+        version, *sizes = _unpack("BxHHH", body[:8])
+        bounds = np.cumsum([8, *(-(-size // 8) * 8 for size in sizes)]).tolist()
+        name, kind, space, value = (bytes(body[a:b]) for a, b in zip(bounds, [*bounds[1:], None], strict=True))
+        attribute = _text(name.partition(b"\0")[0])
         kind = kind.rstrip(b"\0")
         if version != 1 or _shape(memoryview(space)) or not (kind == _TEXT or kind in _NUMBERS):
-            raise OtherHdf5Error(f"its attribute {called!r} is neither a number nor a text")
+            raise OtherHdf5Error(f"its attribute {attribute!r} is neither a number nor a text")
         if kind == _TEXT:
-            length, heap, index = _unpacked("IQI", value[:16])
-            return called, self._text_in_heap(length, heap, index, called)
+            length, heap, index = _unpack("IQI", value[:16])
+            return attribute, self._text_in_heap(length, heap, index, attribute)
         number = np.frombuffer(value[: _NUMBERS[kind].itemsize], _NUMBERS[kind])
         if not len(number):
-            raise OtherHdf5Error(f"its attribute {called!r} is cut short")
-        return called, number[0].item()
+            raise OtherHdf5Error(f"its attribute {attribute!r} is cut short")
+        return attribute, number[0].item()
 
-    def _text_in_heap(self, length: int, heap: int, wanted: int, called: str) -> str:
+    def _text_in_heap(self, length: int, heap: int, text_index: int, attribute: str) -> str:
         mark, size = self._fields("4s4xQ", heap)
         objects = self._bytes(heap, size)
         place = 16
         for _ in range(_MOST if mark == b"GCOL" else 0):
-            index, held = _unpacked("H6xQ", objects[place : place + 16])
-            if index == wanted:
-                if held < length or place + 16 + held > size:
+            index, stored_length = _unpack("H6xQ", objects[place : place + 16])
+            if index == text_index:
+                if stored_length < length or place + 16 + stored_length > size:
                     break
-                self._charge(length, f"the attribute {called!r}")
+                self._charge(length, f"the attribute {attribute!r}")
                 return _text(bytes(objects[place + 16 : place + 16 + length]))
-            place += 16 + -(-held // 8) * 8
-        raise OtherHdf5Error(f"its attribute {called!r} is damaged")
+            place += 16 + -(-stored_length // 8) * 8
+        raise OtherHdf5Error(f"its attribute {attribute!r} is damaged")
 
 
-def _unpacked(layout: str, data: memoryview | bytes) -> tuple[Any, ...]:
+def _unpack(layout: str, data: memoryview | bytes) -> tuple[Any, ...]:
     try:
         return struct.unpack(f"<{layout}", data)
     except struct.error as error:
@@ -185,10 +187,10 @@ def _unpacked(layout: str, data: memoryview | bytes) -> tuple[Any, ...]:
 
 
 def _shape(space: memoryview) -> tuple[int, ...]:
-    version, rank = _unpacked("BB", space[:2])
+    version, rank = _unpack("BB", space[:2])
     if version != 1 or rank > _MOST_AXES:
         raise OtherHdf5Error("it holds an array of a strange shape")
-    return _unpacked(f"{rank}Q", space[8 : 8 + 8 * rank])
+    return _unpack(f"{rank}Q", space[8 : 8 + 8 * rank])
 
 
 def _text(data: bytes) -> str:

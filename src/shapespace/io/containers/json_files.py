@@ -1,4 +1,4 @@
-"""JSON of our own files, from whoever sent them: bounded in bytes, depth and the size of its numbers."""
+"""Reader and writer of untrusted JSON files, with limits on size, depth and numbers."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ import msgspec
 from shapespace.errors import FileFormatError
 from shapespace.io.files import read_bytes, read_error
 
-LARGEST_BYTES: Final = 64 * 2**20
-_DEEPEST = 64
-_LARGEST_INT = 2**63
+LARGEST_BYTES: Final = 64 * 2**20  # 64 MiB
+_DEEPEST = 64  # levels; limit on damaged files
+_LARGEST_INT = 2**63  # int64
 
 
-def read_json(path: Path, again: str, most_bytes: int = LARGEST_BYTES) -> Any:
+def read_json(path: Path, remedy: str, most_bytes: int = LARGEST_BYTES) -> Any:
     """Return what `plain_json` makes of the file `path`.
 
     Args:
         path: of the file.
-        again: what a reader can do about a file that is wrong.
+        remedy: what a reader can do about a file that is wrong.
         most_bytes: that such a file can have.
 
     Raises:
         FileError: it cannot be read.
         FileFormatError: it is no file of so few bytes, or not plain JSON.
     """
-    check_file(path, most_bytes, again)
-    return json_of(read_bytes(path), path, again)
+    check_file(path, most_bytes, remedy)
+    return parse_json(read_bytes(path), path, remedy)
 
 
-def json_of(content: bytes, path: Path, again: str) -> Any:
+def parse_json(content: bytes, path: Path, remedy: str) -> Any:
     """Return what `plain_json` makes of the content of the file `path`, wherever that was read.
 
     Raises:
@@ -44,10 +44,10 @@ def json_of(content: bytes, path: Path, again: str) -> Any:
     try:
         return plain_json(content)
     except ValueError as error:
-        raise FileFormatError(f"{path} is not JSON, or it is cut short ({error}); {again}.") from error
+        raise FileFormatError(f"{path} is not JSON, or it is cut short ({error}); {remedy}.") from error
 
 
-def check_file(path: Path, most_bytes: int, again: str) -> None:
+def check_file(path: Path, most_bytes: int, remedy: str) -> None:
     """Refuse what is no file, such as a pipe at which a reader would wait, or larger than such a file can be.
 
     Raises:
@@ -59,9 +59,9 @@ def check_file(path: Path, most_bytes: int, again: str) -> None:
     except (OSError, ValueError) as error:
         raise read_error(path, error if isinstance(error, OSError) else OSError(str(error))) from error
     if not (stat.S_ISREG(about.st_mode) or stat.S_ISDIR(about.st_mode)):
-        raise FileFormatError(f"{path} is no file but a pipe or a device; {again}.")
+        raise FileFormatError(f"{path} is no file but a pipe or a device; {remedy}.")
     if about.st_size > most_bytes:
-        raise FileFormatError(f"{path} is larger ({about.st_size / 2**20:.0f} MiB) than such a file can be; {again}.")
+        raise FileFormatError(f"{path} is larger ({about.st_size / 2**20:.0f} MiB) than such a file can be; {remedy}.")
 
 
 def plain_json(text: bytes | str) -> Any:
@@ -71,30 +71,32 @@ def plain_json(text: bytes | str) -> Any:
         ValueError: it is not JSON, is nested too deep, or holds a whole number of more than 64 bits.
     """
     try:
-        value: object = _decoded(text)
+        value: object = _decode(text)
     except RecursionError as error:
         raise ValueError("it is nested too deep") from error
-    held = [value]
-    _make_plain(held, 0)
-    return held[0]
+    holder = [value]
+    _make_plain(holder, 0)
+    return holder[0]
 
 
-def _make_plain(held: dict[Any, object] | list[object], depth: int) -> None:
+def _make_plain(container: dict[Any, object] | list[object], depth: int) -> None:
     """Check what a container holds, in place, since a large file is larger still in memory."""
     if depth > _DEEPEST + 1:
         raise ValueError("it is nested too deep")
-    for at, item in cast(Iterable[tuple[Any, object]], held.items() if isinstance(held, dict) else enumerate(held)):
+    for key, item in cast(
+        Iterable[tuple[Any, object]], container.items() if isinstance(container, dict) else enumerate(container)
+    ):
         kind = item.__class__  # nearly all there is are numbers and words, for which a call would take longest
         if kind is float:
             if not math.isfinite(cast(float, item)):
-                held[at] = None
+                container[key] = None
         elif kind is list or kind is dict:
             _make_plain(cast(list[object], item), depth + 1)
         elif kind is int and not -_LARGEST_INT <= cast(int, item) < _LARGEST_INT:
             raise ValueError("it holds a number that is too large")
 
 
-def _decoded(text: bytes | str) -> object:
+def _decode(text: bytes | str) -> object:
     """Return the value in `text`; what is not strict JSON, such as NaN, is left to the slower reader that takes it."""
     try:
         return msgspec.json.decode(text)

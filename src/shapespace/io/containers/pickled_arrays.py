@@ -1,4 +1,4 @@
-"""Arrays in a Python pickle, which is a program, without running it.
+"""Reader of arrays in Python pickles that does not execute them.
 
 Its steps are taken here, one by one, over numbers, texts, lists and dictionaries. What it would have Python call is
 looked up in a short list of what arrays are made of (numpy, sparse matrices, chumpy) and noted, never called; whatever
@@ -16,9 +16,9 @@ from typing import Any, Final, cast
 import numpy as np
 import numpy.typing as npt
 
-_MOST_STEPS = 400_000
-_MOST_AXES = 8
-_DEEPEST = 8
+_MOST_STEPS = 400_000  # opcodes; limit on time in damaged files
+_MOST_AXES = 8  # limit on damaged files
+_DEEPEST = 8  # nested chumpy objects
 _MULTIARRAY, _NUMERIC = (
     ("numpy.core.multiarray", "numpy._core.multiarray"),
     ("numpy.core.numeric", "numpy._core.numeric"),
@@ -52,12 +52,12 @@ _TUPLES = {"EMPTY_TUPLE": 0, "TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 
 
 class PickleRefusedError(ValueError):
-    """It is no pickle, is damaged, or asks for more than arrays; the text says what, as a clause."""
+    """A pickle that is damaged or contains more than arrays; the text gives the reason, as a clause."""
 
 
 @dataclass
-class _Made:
-    """What the pickle would have made: a word of `_KNOWN`, of what, and what it was then given as its state."""
+class _PickledObject:
+    """An object that the pickle would create: its kind from `_KNOWN`, its arguments, and its state."""
 
     what: str
     parts: tuple[Any, ...] = ()
@@ -71,9 +71,9 @@ class _Machine:
     memo: dict[int, Any] = field(default_factory=dict[int, Any])
 
     def since_mark(self) -> list[Any]:
-        at = self.marks.pop()
-        items = self.stack[at:]
-        del self.stack[at:]
+        start = self.marks.pop()
+        items = self.stack[start:]
+        del self.stack[start:]
         return items
 
     def pop(self) -> Any:
@@ -83,7 +83,7 @@ class _Machine:
 
 
 def pickled_dict(data: bytes) -> dict[str, Any]:
-    """Return the dictionary that a pickle is of; give its values to `pickled_array`.
+    """Return the dictionary in a pickle; pass its values to `pickled_array`.
 
     Raises:
         PickleRefusedError: it is none, is damaged, or names what no array needs.
@@ -93,19 +93,19 @@ def pickled_dict(data: bytes) -> dict[str, Any]:
         for step, (opcode, argument, _) in enumerate(pickletools.genops(data)):
             if step > _MOST_STEPS:
                 raise PickleRefusedError(f"it has more than {_MOST_STEPS} steps")
-            _take(machine, opcode.name, argument)
-        found = machine.pop()
+            _run_step(machine, opcode.name, argument)
+        content = machine.pop()
     except PickleRefusedError:
         raise
     except Exception as error:  # the parser of the standard library may raise anything at all
         raise PickleRefusedError("it is no pickle, or it is cut short") from error
-    if not isinstance(found, dict):
+    if not isinstance(content, dict):
         raise PickleRefusedError("it holds no dictionary")
-    return cast(dict[str, Any], found)
+    return cast(dict[str, Any], content)
 
 
 def pickled_array(value: object, depth: int = 0) -> npt.NDArray[Any]:
-    """Return the array that `value` of a pickle is, one inside chumpy too.
+    """Return the array that `value` of a pickle describes, also inside chumpy.
 
     Raises:
         PickleRefusedError: it is none of numbers, or is not as long as it says.
@@ -115,43 +115,43 @@ def pickled_array(value: object, depth: int = 0) -> npt.NDArray[Any]:
             return np.array(value, dtype=np.float64)
         except OverflowError as error:
             raise PickleRefusedError("a list in it is no array") from error
-    if not isinstance(value, _Made) or depth > _DEEPEST:
+    if not isinstance(value, _PickledObject) or depth > _DEEPEST:
         raise PickleRefusedError("what should be an array is none")
-    listed, named = _tuple(value.state), _dict(value.state)
-    if value.what == "array" and len(listed) == 5:
-        _, shape, dtype, fortran, data = listed
+    state_items, state_fields = _tuple(value.state), _dict(value.state)
+    if value.what == "array" and len(state_items) == 5:
+        _, shape, dtype, fortran, data = state_items
         return _numbers(data, _dtype(dtype), shape, bool(fortran))
     if value.what == "buffer" and len(value.parts) >= 4:
         data, dtype, shape, order = value.parts[:4]
         return _numbers(data, _dtype(dtype), shape, order == "F")
     if value.what == "scalar" and len(value.parts) == 2:
         return _numbers(value.parts[1], _dtype(value.parts[0]), (), False)
-    if value.what == "chumpy" and "x" in named:
-        return pickled_array(named["x"], depth + 1)
-    if value.what == "chumpy" and {"a", "idxs"} <= named.keys():
-        return _selected(named, depth)
+    if value.what == "chumpy" and "x" in state_fields:
+        return pickled_array(state_fields["x"], depth + 1)
+    if value.what == "chumpy" and {"a", "idxs"} <= state_fields.keys():
+        return _select_rows(state_fields, depth)
     raise PickleRefusedError("what should be an array is none")
 
 
-def _selected(state: dict[str, Any], depth: int) -> npt.NDArray[Any]:
-    """Return what chumpy's Select takes from an array."""
+def _select_rows(state: dict[str, Any], depth: int) -> npt.NDArray[Any]:
+    """Return the elements that chumpy's Select takes from an array."""
     flat = pickled_array(state["a"], depth + 1).ravel()
-    at = pickled_array(state["idxs"], depth + 1).astype(np.int64).ravel()
-    shape = state.get("preferred_shape") or (len(at),)
-    if at.size and (at.min() < 0 or at.max() >= len(flat)):
+    indices = pickled_array(state["idxs"], depth + 1).astype(np.int64).ravel()
+    shape = state.get("preferred_shape") or (len(indices),)
+    if indices.size and (indices.min() < 0 or indices.max() >= len(flat)):
         raise PickleRefusedError("it takes parts of an array that are not there")
-    return flat[at].reshape(_shape(shape, len(at)))
+    return flat[indices].reshape(_shape(shape, len(indices)))
 
 
-def _dtype(made: object) -> np.dtype[Any]:
-    kind = made.parts[0] if isinstance(made, _Made) and made.what == "dtype" and made.parts else None
-    found = _DTYPE.fullmatch(kind) if isinstance(kind, str) else None
-    if found is None:
+def _dtype(value: object) -> np.dtype[Any]:
+    kind = value.parts[0] if isinstance(value, _PickledObject) and value.what == "dtype" and value.parts else None
+    match = _DTYPE.fullmatch(kind) if isinstance(kind, str) else None
+    if match is None:
         raise PickleRefusedError("an array in it is not of numbers")
-    state = _tuple(cast(_Made, made).state)
+    state = _tuple(cast(_PickledObject, value).state)
     is_big = len(state) > 1 and state[1] == ">"
     try:
-        return np.dtype(found[1]).newbyteorder(">" if is_big or cast(str, kind)[0] == ">" else "<")
+        return np.dtype(match[1]).newbyteorder(">" if is_big or cast(str, kind)[0] == ">" else "<")
     except TypeError as error:
         raise PickleRefusedError("an array in it is not of numbers") from error
 
@@ -189,8 +189,8 @@ def _as_bytes(data: Any) -> bytes:
     raise PickleRefusedError("an array in it holds objects")
 
 
-def _take(machine: _Machine, name: str, argument: Any) -> None:
-    """Take one step of a pickle."""
+def _run_step(machine: _Machine, name: str, argument: Any) -> None:
+    """Execute one step of a pickle."""
     stack = machine.stack
     if name in _PLAIN:
         stack.append(argument)
@@ -203,21 +203,21 @@ def _take(machine: _Machine, name: str, argument: Any) -> None:
     elif name in ("GET", "BINGET", "LONG_BINGET"):
         stack.append(machine.memo[argument])
     elif name in ("GLOBAL", "STACK_GLOBAL"):
-        module, called = argument.split(" ", 1) if name == "GLOBAL" else (machine.pop(), machine.pop())[::-1]
-        stack.append(_named(str(module), str(called)))
+        module, name_in_module = argument.split(" ", 1) if name == "GLOBAL" else (machine.pop(), machine.pop())[::-1]
+        stack.append(_resolve_name(str(module), str(name_in_module)))
     elif name in ("REDUCE", "NEWOBJ"):
-        arguments, made = machine.pop(), machine.pop()
-        stack.append(_called(made, arguments))
+        arguments, function = machine.pop(), machine.pop()
+        stack.append(_call(function, arguments))
     elif name == "BUILD":
         state = machine.pop()
-        if not isinstance(stack[-1], _Made):
+        if not isinstance(stack[-1], _PickledObject):
             raise PickleRefusedError("it changes what is no array")
         stack[-1].state = state
     else:
-        _take_container(machine, name)
+        _run_container_step(machine, name)
 
 
-def _take_container(machine: _Machine, name: str) -> None:
+def _run_container_step(machine: _Machine, name: str) -> None:
     stack = machine.stack
     match name:
         case "PROTO" | "FRAME" | "STOP":
@@ -262,24 +262,24 @@ def _items(pairs: list[Any]) -> dict[Any, Any]:
     return dict(zip(pairs[::2], pairs[1::2], strict=True))
 
 
-def _named(module: str, called: str) -> _Made:
-    if _CHUMPY.fullmatch(module) and called.isidentifier():
-        return _Made("name", ("chumpy",))
-    if (module, called) not in _KNOWN:
-        raise PickleRefusedError(f"it asks for {module[:40]}.{called[:40]}, which no array needs")
-    return _Made("name", (_KNOWN[module, called],))
+def _resolve_name(module: str, name: str) -> _PickledObject:
+    if _CHUMPY.fullmatch(module) and name.isidentifier():
+        return _PickledObject("name", ("chumpy",))
+    if (module, name) not in _KNOWN:
+        raise PickleRefusedError(f"it asks for {module[:40]}.{name[:40]}, which no array needs")
+    return _PickledObject("name", (_KNOWN[module, name],))
 
 
-def _called(made: Any, arguments: Any) -> Any:
-    """Return what a call of `made` stands for."""
-    if not isinstance(made, _Made) or made.what != "name" or not isinstance(arguments, tuple):
+def _call(function: Any, arguments: Any) -> Any:
+    """Return the object that a call of `function` creates."""
+    if not isinstance(function, _PickledObject) or function.what != "name" or not isinstance(arguments, tuple):
         raise PickleRefusedError("it calls what is no name")
-    given = cast(tuple[Any, ...], arguments)
-    what = made.parts[0]
-    if what == "object" and given and isinstance(given[0], _Made) and given[0].what == "name":
-        return _Made(given[0].parts[0])
-    if what == "bytes":
-        if len(given) != 2 or not isinstance(given[0], str) or given[1] not in ("latin1", "latin-1"):
+    values = cast(tuple[Any, ...], arguments)
+    kind = function.parts[0]
+    if kind == "object" and values and isinstance(values[0], _PickledObject) and values[0].what == "name":
+        return _PickledObject(values[0].parts[0])
+    if kind == "bytes":
+        if len(values) != 2 or not isinstance(values[0], str) or values[1] not in ("latin1", "latin-1"):
             raise PickleRefusedError("it asks for a strange text")
-        return given[0].encode("latin-1", "replace")
-    return _Made(what, given)
+        return values[0].encode("latin-1", "replace")
+    return _PickledObject(kind, values)

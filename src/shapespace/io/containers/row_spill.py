@@ -1,4 +1,4 @@
-"""Rows of single precision in one file, for tables that do not fit into memory.
+"""Rows of single precision in a temporary file, for tables that do not fit into memory.
 
 The file holds panels of columns one after the other, each a C-ordered (rows, width) block of little-endian float32, so
 that both a block of rows and a block of columns are read in long runs. There is no header.
@@ -20,13 +20,13 @@ from shapespace.errors import FileFormatError
 from shapespace.io.files import read_error, write_error
 from shapespace.types import FloatArray
 
-_PANEL = 1024
-_BLOCK_BYTES = 64 << 20
+_PANEL = 1024  # columns; 8 KiB of each row are read in one piece
+_BLOCK_BYTES = 64 << 20  # 64 MiB of memory for a block
 _FLOAT32 = np.dtype("<f4")
 
 
 class Spill:
-    """A table (rows, columns) of float32 on the disk; what is read of it is float64.
+    """A table (rows, columns) of float32 on disk, read as float64.
 
     Args:
         path: its file.
@@ -69,7 +69,9 @@ class Spill:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
         self.close()
 
     def close(self) -> None:
@@ -134,7 +136,7 @@ class Spill:
             raise write_error(self.path, error) from error
 
     def _panels(self) -> list[slice]:
-        return [slice(at, min(at + _PANEL, self.columns)) for at in range(0, self.columns, _PANEL)]
+        return [slice(start, min(start + _PANEL, self.columns)) for start in range(0, self.columns, _PANEL)]
 
     def _seek(self, columns: slice, row: int) -> None:
         width = columns.stop - columns.start

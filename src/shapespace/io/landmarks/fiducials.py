@@ -1,4 +1,4 @@
-"""Landmarks that a fit found, with their standard deviations, as the files that it writes beside its surface."""
+"""Landmarks predicted by a fit, with their standard deviations, as files of other programs."""
 
 from __future__ import annotations
 
@@ -21,20 +21,28 @@ Found = Mapping[str, Mapping[str, Any]]
 """Name -> `at` (x, y, z) in the scan's frame and unit, and `stddev_mm` along its axes, None where it is not known."""
 
 
-def fiducial_texts(found: Found) -> dict[str, str]:
+def fiducial_texts(fiducials: Found) -> dict[str, str]:
     """Return ending -> text of each file: a table, and 3D Slicer's two formats, all in the scan's frame and unit.
 
     Slicer takes the coordinates of a mesh as they are, for LPS and mm, so it shows the points on the scan.
     """
-    points = {name: np.array(one["at"], dtype=np.float64) for name, one in found.items()}
-    descriptions = {name: _described(one["stddev_mm"]) for name, one in found.items()}
-    texts = _table(found), _markups(points, descriptions), fcsv_text(points, descriptions)
+    points = {name: np.array(fiducial["at"], dtype=np.float64) for name, fiducial in fiducials.items()}
+    descriptions = {name: _describe(fiducial["stddev_mm"]) for name, fiducial in fiducials.items()}
+    texts = _table(fiducials), _markups(points, descriptions), fcsv_text(points, descriptions)
     return dict(zip(FIDUCIAL_ENDINGS, texts, strict=True))
 
 
-def _table(found: Found) -> str:
+def _table(fiducials: Found) -> str:
     header = ["name", *_AXES, *(f"stddev_{axis}_mm" for axis in _AXES)]
-    return rows_text([header, *([name, *_told(one["at"]), *_told(one["stddev_mm"])] for name, one in found.items())])
+    return rows_text(
+        [
+            header,
+            *(
+                [name, *_format_numbers(fiducial["at"]), *_format_numbers(fiducial["stddev_mm"])]
+                for name, fiducial in fiducials.items()
+            ),
+        ]
+    )
 
 
 def _markups(points: Mapping[str, FloatArray], descriptions: Mapping[str, str]) -> str:
@@ -44,9 +52,9 @@ def _markups(points: Mapping[str, FloatArray], descriptions: Mapping[str, str]) 
     return json.dumps(content, indent=1) + "\n"
 
 
-def _told(numbers: Sequence[float] | None) -> list[str]:
+def _format_numbers(numbers: Sequence[float] | None) -> list[str]:
     return [""] * len(_AXES) if numbers is None else [repr(float(number)) for number in numbers]
 
 
-def _described(stddev_mm: Sequence[float] | None) -> str:
+def _describe(stddev_mm: Sequence[float] | None) -> str:
     return "" if stddev_mm is None else f"standard deviation {' '.join(f'{mm:.2f}' for mm in stddev_mm)} mm"

@@ -1,4 +1,4 @@
-"""Landmarks in and out: named points from the programs that people pick them with."""
+"""Readers and writers of landmark files."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ import numpy as np
 
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.files import read_bytes, write_text
-from shapespace.io.parsing import damaged, is_number, json_value, xml_root
+from shapespace.io.parsing import damage_error, is_number, json_value, xml_root
 from shapespace.io.read_limits import LARGEST_LANDMARK_FILE_BYTES
-from shapespace.io.tables.table_io import as_written, rows_text
+from shapespace.io.tables.table_io import rows_text, unescape_formula
 from shapespace.types import FloatArray, SurfaceLandmarks
 
 Pairs = list[tuple[str, FloatArray]]
@@ -70,15 +70,15 @@ def read_landmarks(path: Path | str) -> dict[str, FloatArray]:
     read = READ_ONLY_LANDMARKS.get(path.suffix.lower()) or _format(path, "read").read
     pairs = read(_content(path), path)
     if not pairs:
-        raise damaged(path, "it holds no landmarks")
+        raise damage_error(path, "it holds no landmarks")
     landmarks: dict[str, FloatArray] = {}
     for name, point in pairs:
         if not name:
-            raise damaged(path, "it has a landmark without a name, so name them all")
+            raise damage_error(path, "it has a landmark without a name, so name them all")
         if name in landmarks:
-            raise damaged(path, f"it has two landmarks named '{name[:60]}', so rename one")
+            raise damage_error(path, f"it has two landmarks named '{name[:60]}', so rename one")
         if not np.isfinite(point).all():
-            raise damaged(path, f"landmark '{name[:60]}' has a coordinate that is not finite, so remove it")
+            raise damage_error(path, f"landmark '{name[:60]}' has a coordinate that is not finite, so remove it")
         landmarks[name] = point
     return landmarks
 
@@ -122,13 +122,13 @@ def read_landmark_indices(path: Path | str) -> dict[str, int]:
     path = Path(path)
     rows = csv_rows(_content(path), path)
     if not _has_vertex_header(rows):
-        raise damaged(path, "it does not start with the header 'name,vertex'")
+        raise damage_error(path, "it does not start with the header 'name,vertex'")
     indices: dict[str, int] = {}
     for row in rows[1:]:
         if len(row) < 2 or not row[1].isascii() or not row[1].isdecimal() or len(row[1]) > 18:
-            raise damaged(path, f"landmark '{row[0][:60]}' has no vertex number (a whole number from 0)")
+            raise damage_error(path, f"landmark '{row[0][:60]}' has no vertex number (a whole number from 0)")
         if not row[0] or row[0] in indices:
-            raise damaged(path, f"it has the name '{row[0][:60]}' twice or empty, so rename it")
+            raise damage_error(path, f"it has the name '{row[0][:60]}' twice or empty, so rename it")
         indices[row[0]] = int(row[1])
     return indices
 
@@ -183,7 +183,7 @@ def read_surface_landmarks(path: Path | str) -> SurfaceLandmarks:
     except InputError as error:
         raise FileFormatError(f"Cannot read {path}: {error}") from error
     except (KeyError, ValueError, OverflowError) as error:
-        raise damaged(path, "it has a row without three vertices and their weights") from error
+        raise damage_error(path, "it has a row without three vertices and their weights") from error
 
 
 def _index(cell: str) -> int:
@@ -241,8 +241,10 @@ def _format(path: Path, verb: str) -> LandmarkFormat:
         if path.name.lower().endswith(ending):
             return LANDMARK_FORMATS[ending]
     endings = [*LANDMARK_FORMATS, *(READ_ONLY_LANDMARKS if verb == "read" else ())]
-    what = "can be read, not written" if path.suffix.lower() in READ_ONLY_LANDMARKS else "is not a landmark format"
-    raise FileFormatError(f"Cannot {verb} {path}: the ending '{path.suffix}' {what}; use one of {', '.join(endings)}.")
+    problem = "can be read, not written" if path.suffix.lower() in READ_ONLY_LANDMARKS else "is not a landmark format"
+    raise FileFormatError(
+        f"Cannot {verb} {path}: the ending '{path.suffix}' {problem}; use one of {', '.join(endings)}."
+    )
 
 
 def _content(path: Path) -> bytes:
@@ -252,27 +254,27 @@ def _content(path: Path) -> bytes:
     return data
 
 
-def _point(values: Iterable[Any], what: str, path: Path) -> FloatArray:
+def _point(values: Iterable[Any], landmark_name: str, path: Path) -> FloatArray:
     try:
         numbers = [float(value) for value in values]
     except (TypeError, ValueError, OverflowError) as error:
-        raise damaged(path, f"{what} has a coordinate that is not a number") from error
+        raise damage_error(path, f"{landmark_name} has a coordinate that is not a number") from error
     if len(numbers) != 3:
-        raise damaged(path, f"{what} has {len(numbers)} coordinates, not 3")
+        raise damage_error(path, f"{landmark_name} has {len(numbers)} coordinates, not 3")
     return np.array(numbers, dtype=np.float64)
 
 
-def _from_json(read: Callable[[Any, Path], Pairs]) -> Callable[[bytes, Path], Pairs]:
-    """Wrap a reader of parsed JSON: what is missing or of the wrong type there is one clear error here."""
+def _from_json(parse: Callable[[Any, Path], Pairs]) -> Callable[[bytes, Path], Pairs]:
+    """Wrap a reader of parsed JSON so that missing or wrong values raise one clear error."""
 
     def wrapped(data: bytes, path: Path) -> Pairs:
         value = json_value(data, path)
         try:
-            return read(value, path)
+            return parse(value, path)
         except FileError:
             raise
         except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError) as error:
-            raise damaged(path, "it is JSON, but not laid out as a landmark file, so export it again") from error
+            raise damage_error(path, "it is JSON, but not laid out as a landmark file, so export it again") from error
 
     return wrapped
 
@@ -284,7 +286,7 @@ def _ljson(value: Any, path: Path) -> Pairs:
     if version == 2:
         return _ljson_group(value, "", path)
     if version != 3:
-        raise damaged(path, f"it is LJSON of version {str(version)[:20]}, but only 1 to 3 are known")
+        raise damage_error(path, f"it is LJSON of version {str(version)[:20]}, but only 1 to 3 are known")
     groups = value["groups"]
     out: Pairs = []
     for name, group in groups.items():
@@ -299,7 +301,7 @@ def _ljson_1(value: Any, path: Path) -> Pairs:
         points = [entry["point"] for entry in group["landmarks"]]
         label = _label(group["label"], path)
         for i, point in enumerate(points):
-            if not _absent(point):
+            if not _is_missing(point):
                 name = label if len(points) == 1 else f"{label}_{i}"
                 out.append((name, _point(point, f"landmark '{name[:60]}'", path)))
     return out
@@ -312,14 +314,14 @@ def _ljson_group(group: Any, prefix: str, path: Path) -> Pairs:
         mask, label = entry["mask"], _label(entry["label"], path)
         for position, index in enumerate(mask):
             if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index < len(points):
-                raise damaged(path, f"label '{label[:60]}' names a point that is not there")
+                raise damage_error(path, f"label '{label[:60]}' names a point that is not there")
             name = label if len(mask) == 1 else f"{label}_{position}"
             names.setdefault(index, prefix + name)
     ordered = [*names, *(i for i in range(len(points)) if i not in names)]
     out: Pairs = []
     for i in ordered:
         name = names.get(i, f"{prefix}point_{i}")
-        if not _absent(points[i]):
+        if not _is_missing(points[i]):
             out.append((name, _point(points[i], f"landmark '{name[:60]}'", path)))
     return out
 
@@ -327,12 +329,12 @@ def _ljson_group(group: Any, prefix: str, path: Path) -> Pairs:
 def _label(value: Any, path: Path) -> str:
     label = str(value)
     if len(label) > _LONGEST_LABEL:
-        raise damaged(path, f"it has a label of {len(label)} characters ('{label[:60]}...'), so shorten it")
+        raise damage_error(path, f"it has a label of {len(label)} characters ('{label[:60]}...'), so shorten it")
     return label
 
 
-def _absent(point: Any) -> bool:
-    """Whether LJSON has no point here: null, or null coordinates."""
+def _is_missing(point: Any) -> bool:
+    """Return whether LJSON has no point here: null, or null coordinates."""
     return point is None or all(value is None for value in point)
 
 
@@ -349,7 +351,7 @@ def _slicer(value: Any, path: Path) -> Pairs:
     for markup in value["markups"]:
         system = str(markup.get("coordinateSystem", "LPS")).upper()
         if system not in ("LPS", "RAS"):
-            raise damaged(path, f"its coordinate system is '{system[:20]}', neither LPS nor RAS")
+            raise damage_error(path, f"its coordinate system is '{system[:20]}', neither LPS nor RAS")
         sign = np.array([-1.0, -1.0, 1.0]) if system == "RAS" else np.ones(3)
         for entry in markup["controlPoints"]:
             if entry.get("positionStatus", "defined") != "defined":
@@ -398,7 +400,7 @@ def _numbers(point: FloatArray) -> list[float]:
 def _read_pp(data: bytes, path: Path) -> Pairs:
     root = xml_root(data, path)
     if root.tag != "PickedPoints":
-        raise damaged(path, "it is not a MeshLab file of picked points")
+        raise damage_error(path, "it is not a MeshLab file of picked points")
     out: Pairs = []
     for entry in root.iter("point"):
         if entry.get("active", "1").strip().lower() not in ("0", "false"):
@@ -425,9 +427,9 @@ def csv_rows(data: bytes, path: Path) -> list[list[str]]:
     try:
         text = data.decode("utf-8-sig")
         lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-        return [[as_written(cell.strip()) for cell in row] for row in csv.reader(lines, strict=True)]
+        return [[unescape_formula(cell.strip()) for cell in row] for row in csv.reader(lines, strict=True)]
     except (UnicodeDecodeError, csv.Error) as error:
-        raise damaged(path, "it is not comma-separated text") from error
+        raise damage_error(path, "it is not comma-separated text") from error
 
 
 def _read_csv(data: bytes, path: Path) -> Pairs:
@@ -436,17 +438,17 @@ def _read_csv(data: bytes, path: Path) -> Pairs:
     if rows and not all(is_number(cell) for cell in rows[0][1:4]):
         header = [cell.lower() for cell in rows[0]]
         if header[:2] == ["name", "vertex"]:
-            raise damaged(path, "it holds vertex numbers, not coordinates ('name,x,y,z')")
+            raise damage_error(path, "it holds vertex numbers, not coordinates ('name,x,y,z')")
         if not {"x", "y", "z"} <= set(header[1:]):
-            raise damaged(path, "its first line is neither 'name,x,y,z' nor a landmark")
+            raise damage_error(path, "its first line is neither 'name,x,y,z' nor a landmark")
         columns = [header.index(axis, 1) for axis in "xyz"]
         rows = rows[1:]
     elif rows and len(rows[0]) != 4:
-        raise damaged(path, f"its first line has {len(rows[0])} columns, not the four of 'name,x,y,z'")
+        raise damage_error(path, f"its first line has {len(rows[0])} columns, not the four of 'name,x,y,z'")
     out: Pairs = []
     for row in rows:
         if len(row) <= max(columns):
-            raise damaged(path, f"landmark '{row[0][:60]}' has fewer than 3 coordinates")
+            raise damage_error(path, f"landmark '{row[0][:60]}' has fewer than 3 coordinates")
         out.append((row[0], _point((row[c] for c in columns), f"landmark '{row[0][:60]}'", path)))
     return out
 
@@ -466,22 +468,22 @@ def _read_bnd(data: bytes, path: Path) -> Pairs:
         words = line.replace(",", " ").split()
         name = f"point_{len(out)}"
         if len(words) != 4 or not words[0].isascii() or not words[0].isdecimal():
-            raise damaged(path, f"{name} is not a row of a vertex number and x y z; it is damaged or cut short")
+            raise damage_error(path, f"{name} is not a row of a vertex number and x y z; it is damaged or cut short")
         out.append((name, _point(words[1:], name, path)))
     return out
 
 
 def _read_lm3(data: bytes, path: Path) -> Pairs:
     lines = [line for line in _text_lines(data) if line]
-    counted = (re.fullmatch(r"(\d{1,6})(?:\s+landmarks?\s*:?)?", line, re.IGNORECASE) for line in lines)
-    at, count = next(((i, int(m[1])) for i, m in enumerate(counted) if m), (0, -1))
+    header_matches = (re.fullmatch(r"(\d{1,6})(?:\s+landmarks?\s*:?)?", line, re.IGNORECASE) for line in lines)
+    header_row, count = next(((i, int(m[1])) for i, m in enumerate(header_matches) if m), (0, -1))
     if count < 0:
-        raise damaged(path, "it does not say how many landmarks it holds, so it is not an .lm3 file")
-    rest = lines[at + 1 :]
-    if len(rest) != 2 * count:
-        raise damaged(path, f"it says {count} landmarks, but {len(rest)} lines follow; it is damaged or cut short")
+        raise damage_error(path, "it does not say how many landmarks it holds, so it is not an .lm3 file")
+    body = lines[header_row + 1 :]
+    if len(body) != 2 * count:
+        raise damage_error(path, f"it says {count} landmarks, but {len(body)} lines follow; it is damaged or cut short")
     return [
-        (n, _point(xyz.split(), f"landmark '{n[:60]}'", path)) for n, xyz in zip(rest[::2], rest[1::2], strict=True)
+        (n, _point(xyz.split(), f"landmark '{n[:60]}'", path)) for n, xyz in zip(body[::2], body[1::2], strict=True)
     ]
 
 
@@ -491,16 +493,16 @@ _FCSV_COLUMNS = "id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID"
 def _read_fcsv(data: bytes, path: Path) -> Pairs:
     columns, system = _FCSV_COLUMNS.split(","), "RAS"
     for line in _text_lines(data):
-        name, found, value = line.lstrip("# ").partition("=")
-        if line.startswith("#") and found:
+        name, separator, value = line.lstrip("# ").partition("=")
+        if line.startswith("#") and separator:
             if name.strip().lower() == "columns":
                 columns = [cell.strip() for cell in value.split(",")]
             elif name.strip().lower() == "coordinatesystem":
                 system = {"0": "RAS", "1": "LPS"}.get(value.strip(), value.strip().upper())
     if system not in ("LPS", "RAS"):
-        raise damaged(path, f"its coordinate system is '{system[:20]}', neither LPS nor RAS")
+        raise damage_error(path, f"its coordinate system is '{system[:20]}', neither LPS nor RAS")
     if not {"x", "y", "z"} <= set(columns):
-        raise damaged(path, "its columns are not those of 3D Slicer's fiducials, so export it again")
+        raise damage_error(path, "its columns are not those of 3D Slicer's fiducials, so export it again")
     sign = np.array([-1.0, -1.0, 1.0]) if system == "RAS" else np.ones(3)
     out: Pairs = []
     for row in csv_rows(data, path):
@@ -524,17 +526,19 @@ def fcsv_text(landmarks: Mapping[str, FloatArray], descriptions: Mapping[str, st
 def _read_tps(data: bytes, path: Path) -> Pairs:
     lines = [line for line in _text_lines(data) if line]
     heads = [re.fullmatch(r"LM(3?)\s*=\s*(\d{1,6})", line, re.IGNORECASE) for line in lines]
-    starts = [at for at, head in enumerate(heads) if head]
+    starts = [row for row, head in enumerate(heads) if head]
     if len(starts) != 1:
-        what = f"it has {len(starts)} specimens, so save each in a file of its own" if starts else "it has no LM3="
-        raise damaged(path, what)
+        problem = f"it has {len(starts)} specimens, so save each in a file of its own" if starts else "it has no LM3="
+        raise damage_error(path, problem)
     head = heads[starts[0]]
     if head is None or not head[1]:
-        raise damaged(path, "its landmarks are of two dimensions (LM=), and those of a surface have three (LM3=)")
-    rest = lines[starts[0] + 1 :]
-    points = [line for line in rest if "=" not in line]
+        raise damage_error(path, "its landmarks are of two dimensions (LM=), and those of a surface have three (LM3=)")
+    body = lines[starts[0] + 1 :]
+    points = [line for line in body if "=" not in line]
     if len(points) != int(head[2]):
-        raise damaged(path, f"it says {head[2]} landmarks, but {len(points)} rows follow; it is damaged or cut short")
+        raise damage_error(
+            path, f"it says {head[2]} landmarks, but {len(points)} rows follow; it is damaged or cut short"
+        )
     return [
         (f"point_{i}", _point(line.split(), f"point_{i}", path))
         for i, line in enumerate(points)
@@ -548,7 +552,7 @@ def _read_tlms(data: bytes, path: Path) -> Pairs:
     for line in filter(None, _text_lines(data)):
         words = line.split()
         if len(words) != 5 or words[1] not in ("0", "1"):
-            raise damaged(path, "it has a line other than 'name visible x y z', so it is not scalismo's .tlms")
+            raise damage_error(path, "it has a line other than 'name visible x y z', so it is not scalismo's .tlms")
         if words[1] == "1":
             out.append((words[0], _point(words[2:], f"landmark '{words[0][:60]}'", path)))
     return out
@@ -560,22 +564,24 @@ _POINTS_HEAD = re.compile(r"version\b.*|n_points\s*:\s*(\d{1,6})|(?:s\s+)?(\d{1,
 def _read_points(data: bytes, path: Path) -> Pairs:
     """Read rows `x y z` or `name x y z`, after a count or a header perhaps, as landmark editors save them."""
     out: Pairs = []
-    said = None
+    declared = None
     for line in _text_lines(data):
         row = line.partition("#")[0].strip()
         head = _POINTS_HEAD.fullmatch(row)
         if not row or head:
-            said = int(next(filter(None, head.groups()), 0)) or said if head else said
+            declared = int(next(filter(None, head.groups()), 0)) or declared if head else declared
             continue
         words = re.split(r"[\s,;]+", row.rstrip(",;"))
         name = words[0] if len(words) == 4 else f"point_{len(out)}"
         if not out and not any(map(is_number, words)):
             continue  # names of columns
         if len(words) not in (3, 4):
-            raise damaged(path, f"{name} is not a row of 'x y z' or 'name x y z' but has {len(words)} columns")
+            raise damage_error(path, f"{name} is not a row of 'x y z' or 'name x y z' but has {len(words)} columns")
         out.append((name, _point(words[-3:], f"landmark '{name[:60]}'", path)))
-    if said is not None and said != len(out):
-        raise damaged(path, f"it says {said} landmarks, but {len(out)} rows follow; it is damaged or cut short")
+    if declared is not None and declared != len(out):
+        raise damage_error(
+            path, f"it says {declared} landmarks, but {len(out)} rows follow; it is damaged or cut short"
+        )
     return out
 
 

@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from shapespace.io.parsing import CUT_SHORT, IndexArray, check_count, damaged, mesh_of
+from shapespace.io.parsing import CUT_SHORT, IndexArray, check_count, damage_error, mesh_of
 from shapespace.types import FloatArray, Mesh
 
 _HEADER = struct.Struct("<HHdH")
 _COUNT = struct.Struct("<I")
-_COLUMNS = 5
+_COLUMNS = 5  # x, y, z and two image coordinates
 # Of a surface seen at an angle the steps grow by 1 / cos: 8 keeps what is turned up to 82 degrees from the camera.
 _LONGEST_STEPS = 8.0
 
@@ -39,31 +39,31 @@ def read_bnt(data: bytes, path: Path) -> Mesh:
         FileFormatError: the header contradicts itself or the length of the file, or no point is there.
     """
     if len(data) < _HEADER.size:
-        raise damaged(path, f"it is too short to be a Bosphorus file; {CUT_SHORT}")
+        raise damage_error(path, f"it is too short to be a Bosphorus file; {CUT_SHORT}")
     rows, columns, zmin, name_length = _HEADER.unpack_from(data)
-    at = _HEADER.size + name_length
-    if len(data) < at + _COUNT.size:
-        raise damaged(path, f"its header is cut off; {CUT_SHORT}")
-    (count,) = _COUNT.unpack_from(data, at)
-    at += _COUNT.size
+    data_start = _HEADER.size + name_length
+    if len(data) < data_start + _COUNT.size:
+        raise damage_error(path, f"its header is cut off; {CUT_SHORT}")
+    (count,) = _COUNT.unpack_from(data, data_start)
+    data_start += _COUNT.size
     points = rows * columns
     if not points or count != _COLUMNS * points:
-        raise damaged(
+        raise damage_error(
             path,
             f"its header declares {rows} rows, {columns} columns and {count} numbers, which is no Bosphorus file "
             "(5 numbers a point)",
         )
-    check_count(count, 8, len(data) - at, "numbers", path)
+    check_count(count, 8, len(data) - data_start, "numbers", path)
     if not math.isfinite(zmin):
-        raise damaged(path, "its depth of missing points is not finite, so it is damaged")
-    grid = np.frombuffer(data, dtype="<f8", count=3 * points, offset=at).reshape(3, points).T.astype(np.float64)
+        raise damage_error(path, "its depth of missing points is not finite, so it is damaged")
+    grid = np.frombuffer(data, dtype="<f8", count=3 * points, offset=data_start).reshape(3, points).T.astype(np.float64)
     # zmin is the least depth there is.
-    there = ~(grid[:, 2] <= zmin)
-    if not there.any():
-        raise damaged(path, "all its points are missing")
+    is_measured = ~(grid[:, 2] <= zmin)
+    if not is_measured.any():
+        raise damage_error(path, "all its points are missing")
     number = np.full(points, -1, dtype=np.int64)
-    number[there] = np.arange(int(there.sum()))
-    vertices = grid[there]
+    number[is_measured] = np.arange(int(is_measured.sum()))
+    vertices = grid[is_measured]
     faces = grid_triangles(number.reshape(rows, columns), vertices)
     return mesh_of(vertices, faces, path)
 
@@ -84,21 +84,23 @@ def grid_triangles(number: IndexArray, vertices: FloatArray) -> IndexArray:
         (has_a & has_c & has_d & ~has_b, (a, c, d)),
         (has_a & has_b & has_d & ~has_c, (a, d, b)),
     ]
-    faces = np.concatenate([np.stack([corner[whole] for corner in triple], axis=1) for whole, triple in corners])
+    faces = np.concatenate(
+        [np.stack([corner[is_complete] for corner in triple], axis=1) for is_complete, triple in corners]
+    )
     steps = np.concatenate([_steps(number[:, :-1], number[:, 1:], vertices), _steps(number[:-1], number[1:], vertices)])
     steps = steps[np.isfinite(steps)]
     if not len(steps):
         return faces[:0]
-    at = vertices[faces]
-    edges = np.linalg.norm(at - np.roll(at, 1, axis=1), axis=2)
+    positions = vertices[faces]
+    edges = np.linalg.norm(positions - np.roll(positions, 1, axis=1), axis=2)
     # A comparison with NaN is false, so that triangles at points that are no numbers go too.
     keep = (edges <= _LONGEST_STEPS * np.median(steps)).all(axis=1)
-    faces, at = faces[keep], at[keep]
-    along, across = at[:, 1] - at[:, 0], at[:, 2] - at[:, 0]
+    faces, positions = faces[keep], positions[keep]
+    along, across = positions[:, 1] - positions[:, 0], positions[:, 2] - positions[:, 0]
     towards = float((along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]).sum())
     return faces[:, ::-1] if towards < 0 else faces
 
 
-def _steps(one: IndexArray, other: IndexArray, vertices: FloatArray) -> FloatArray:
-    both = (one >= 0) & (other >= 0)
-    return np.linalg.norm(vertices[one[both]] - vertices[other[both]], axis=1)
+def _steps(first: IndexArray, second: IndexArray, vertices: FloatArray) -> FloatArray:
+    is_edge = (first >= 0) & (second >= 0)
+    return np.linalg.norm(vertices[first[is_edge]] - vertices[second[is_edge]], axis=1)

@@ -1,4 +1,4 @@
-"""glTF 2.0, as `.gltf` with its buffers and as one `.glb` file; after the Khronos specification.
+"""glTF 2.0 reader and writer, as `.gltf` with its buffers and as one `.glb` file; see the Khronos specification.
 
 trimesh reads glTF too, but it decodes textures, merges by material and reports damage by internal errors.
 """
@@ -20,12 +20,12 @@ import numpy.typing as npt
 
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.files import read_bytes
-from shapespace.io.meshes.textures import FilesBeside, Pictures, TextureError
+from shapespace.io.meshes.textures import CompanionFiles, Pictures, TextureError
 from shapespace.io.parsing import (
     CUT_SHORT,
     IndexArray,
     check_count,
-    damaged,
+    damage_error,
     fan_triangles,
     json_value,
     mesh_of,
@@ -36,6 +36,7 @@ from shapespace.types import GREY, ByteArray, FloatArray, Mesh
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+# glTF 2.0 primitive.mode: POINTS, TRIANGLES, TRIANGLE_STRIP, TRIANGLE_FAN
 _POINTS, _TRIANGLES, _STRIP, _FAN = 0, 4, 5, 6
 _COMPRESSIONS = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 # What a file may require without its points and triangles becoming others.
@@ -83,10 +84,10 @@ class _Gltf:
     allowance: Allowance
     buffers: dict[str | None, bytes] = field(default_factory=lambda: dict[str | None, bytes]())
     pictures: Pictures = field(default_factory=Pictures)
-    files: FilesBeside = field(init=False)
+    files: CompanionFiles = field(init=False)
 
     def __post_init__(self) -> None:
-        self.files = FilesBeside(self.path)
+        self.files = CompanionFiles(self.path)
 
     def buffer(self, index: int) -> bytes:
         entry = self.tree["buffers"][index]
@@ -99,7 +100,7 @@ class _Gltf:
             self.buffers[uri] = b"" if data is None else data
         data = self.buffers[uri]
         if len(data) < entry["byteLength"]:
-            raise damaged(self.path, f"its buffer {index} is shorter than declared; {CUT_SHORT}")
+            raise damage_error(self.path, f"its buffer {index} is shorter than declared; {CUT_SHORT}")
         return data
 
     def fetch(self, uri: str) -> bytes:
@@ -107,22 +108,22 @@ class _Gltf:
         if uri.startswith("data:"):
             head, _, body = uri.partition(",")
             if not head.endswith(";base64"):
-                raise damaged(self.path, "it has a buffer that is not base64; export it again")
+                raise damage_error(self.path, "it has a buffer that is not base64; export it again")
             return base64.b64decode(body, validate=True)
         folder = self.path.parent.resolve()
         try:
             target = (folder / unquote(uri)).resolve()
             is_there = target.exists()
         except OSError as error:  # a name too long for the system
-            raise damaged(self.path, f"it names a buffer '{uri[:80]}' that is no file; {CUT_SHORT}") from error
+            raise damage_error(self.path, f"it names a buffer '{uri[:80]}' that is no file; {CUT_SHORT}") from error
         if "://" in uri or not target.is_relative_to(folder):
-            raise damaged(self.path, f"it names a buffer outside its own folder ('{uri[:80]}'), which is not read")
+            raise damage_error(self.path, f"it names a buffer outside its own folder ('{uri[:80]}'), which is not read")
         if not is_there:
-            raise damaged(self.path, f"its buffer '{uri[:80]}' is missing beside it; copy that file there too")
+            raise damage_error(self.path, f"its buffer '{uri[:80]}' is missing beside it; copy that file there too")
         try:
             data = read_bytes(target, max(LARGEST_MESH_FILE_BYTES - self.allowance.file_bytes, 0))
         except FileError as error:
-            raise damaged(
+            raise damage_error(
                 self.path, f"its buffer '{uri[:80]}' is no file that can be read or it is too long"
             ) from error
         self.allowance.more_file(len(data))
@@ -131,10 +132,10 @@ class _Gltf:
     def compressed(self, otherwise: str) -> FileFormatError:
         """Return the error for data that are not there, by compression where the file says that it uses one."""
         used = self.tree.get("extensionsUsed", [])
-        how = next((name for name in _COMPRESSIONS if name in used), None)
-        if how is None:
-            return damaged(self.path, f"{otherwise}; {CUT_SHORT}")
-        return damaged(self.path, f"it is compressed ({how}), so export it again without compression")
+        extension = next((name for name in _COMPRESSIONS if name in used), None)
+        if extension is None:
+            return damage_error(self.path, f"{otherwise}; {CUT_SHORT}")
+        return damage_error(self.path, f"it is compressed ({extension}), so export it again without compression")
 
     def view(self, index: int, offset: int, kind: np.dtype[Any], count: int, width: int) -> Values:
         """Return (count, width) numbers from a buffer view."""
@@ -172,11 +173,11 @@ class _Gltf:
             raise self.compressed("its points or triangles have no data")
         if "sparse" in entry:
             sparse = entry["sparse"]
-            where, what = sparse["indices"], sparse["values"]
-            index_kind = np.dtype(_COMPONENTS[where["componentType"]])
+            index_view, value_view = sparse["indices"], sparse["values"]
+            index_kind = np.dtype(_COMPONENTS[index_view["componentType"]])
             n = int(sparse["count"])
-            at = self.view(where["bufferView"], where.get("byteOffset", 0), index_kind, n, 1)[:, 0]
-            values[at] = self.view(what["bufferView"], what.get("byteOffset", 0), kind, n, width)
+            element_rows = self.view(index_view["bufferView"], index_view.get("byteOffset", 0), index_kind, n, 1)[:, 0]
+            values[element_rows] = self.view(value_view["bufferView"], value_view.get("byteOffset", 0), kind, n, width)
         if entry.get("normalized") and kind.kind in "iu":
             return np.maximum(values / np.iinfo(kind).max, -1.0)
         return values
@@ -198,7 +199,7 @@ def read_gltf(data: bytes, path: Path) -> Mesh:
             holds no points, or makes more of its bytes than `io.limits` allows.
         MeshError: faces that point past the end of the vertices.
     """
-    return _parsed(data, path, _scene)
+    return _parse(data, path, _scene)
 
 
 def read_morphs(data: bytes, path: Path) -> Morphs:
@@ -211,10 +212,10 @@ def read_morphs(data: bytes, path: Path) -> Morphs:
     Raises:
         FileFormatError: as `read_gltf`, or no mesh has morph targets.
     """
-    return _parsed(data, path, _morphs)
+    return _parse(data, path, _morphs)
 
 
-def _parsed(data: bytes, path: Path, read: Callable[[_Gltf], Found]) -> Found:
+def _parse(data: bytes, path: Path, build: Callable[[_Gltf], Found]) -> Found:
     binary: bytes | None = None
     if data[:4] == b"glTF":
         text, binary = _chunks(data, path)
@@ -224,23 +225,23 @@ def _parsed(data: bytes, path: Path, read: Callable[[_Gltf], Found]) -> Found:
     # Any part of the JSON may be missing or of the wrong type, so that is met in this one place.
     try:
         if not str(tree["asset"]["version"]).startswith("2"):
-            raise damaged(path, "it is not glTF of version 2")
+            raise damage_error(path, "it is not glTF of version 2")
         _refuse_unknown(tree.get("extensionsRequired", []), path)
-        return read(_Gltf(path, tree, binary, Allowance(len(data), path)))
+        return build(_Gltf(path, tree, binary, Allowance(len(data), path)))
     except (KeyError, IndexError, TypeError, AttributeError, OverflowError, binascii.Error) as error:
-        raise damaged(path, f"it is not valid glTF; {CUT_SHORT}") from error
+        raise damage_error(path, f"it is not valid glTF; {CUT_SHORT}") from error
     except ValueError as error:
         if isinstance(error, (FileError, InputError)):
             raise
-        raise damaged(path, f"it is not valid glTF; {CUT_SHORT}") from error
+        raise damage_error(path, f"it is not valid glTF; {CUT_SHORT}") from error
 
 
 def _refuse_unknown(required: list[Any], path: Path) -> None:
     for name in map(str, required):
         if name in _COMPRESSIONS:
-            raise damaged(path, f"it is compressed ({name}), so export it again without compression")
+            raise damage_error(path, f"it is compressed ({name}), so export it again without compression")
         if name not in _HARMLESS_TOO and not name.startswith(_HARMLESS):
-            raise damaged(
+            raise damage_error(
                 path, f"it requires the extension '{name[:60]}', which is not known here, so export it again without it"
             )
 
@@ -248,20 +249,20 @@ def _refuse_unknown(required: list[Any], path: Path) -> None:
 def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes | None]:
     version, length = int.from_bytes(data[4:8], "little"), int.from_bytes(data[8:12], "little")
     if version != 2:
-        raise damaged(path, f"it is GLB of version {version}, not 2")
+        raise damage_error(path, f"it is GLB of version {version}, not 2")
     if length > len(data):
-        raise damaged(path, f"it declares {length} bytes, but has {len(data)}; {CUT_SHORT}")
-    at = 12
-    found: dict[bytes, bytes] = {}
-    while at + 8 <= length:
-        size, kind = int.from_bytes(data[at : at + 4], "little"), data[at + 4 : at + 8]
-        if at + 8 + size > length:
-            raise damaged(path, f"it ends inside a chunk; {CUT_SHORT}")
-        found.setdefault(kind, data[at + 8 : at + 8 + size])
-        at += 8 + size
-    if b"JSON" not in found:
-        raise damaged(path, f"it has no JSON chunk; {CUT_SHORT}")
-    return found[b"JSON"], found.get(b"BIN\0")
+        raise damage_error(path, f"it declares {length} bytes, but has {len(data)}; {CUT_SHORT}")
+    offset = 12
+    chunks: dict[bytes, bytes] = {}
+    while offset + 8 <= length:
+        size, kind = int.from_bytes(data[offset : offset + 4], "little"), data[offset + 4 : offset + 8]
+        if offset + 8 + size > length:
+            raise damage_error(path, f"it ends inside a chunk; {CUT_SHORT}")
+        chunks.setdefault(kind, data[offset + 8 : offset + 8 + size])
+        offset += 8 + size
+    if b"JSON" not in chunks:
+        raise damage_error(path, f"it has no JSON chunk; {CUT_SHORT}")
+    return chunks[b"JSON"], chunks.get(b"BIN\0")
 
 
 def _nodes_with_meshes(gltf: _Gltf) -> Iterator[tuple[dict[str, Any], FloatArray]]:
@@ -277,13 +278,13 @@ def _nodes_with_meshes(gltf: _Gltf) -> Iterator[tuple[dict[str, Any], FloatArray
         roots = [i for i in range(len(nodes)) if i not in children]
     if not nodes and tree.get("meshes"):
         nodes, roots = [{"mesh": i} for i in range(len(tree["meshes"]))], list(range(len(tree["meshes"])))
-    seen: set[int] = set()
+    visited: set[int] = set()
     stack: list[tuple[int, FloatArray]] = [(int(root), np.eye(4)) for root in reversed(roots)]
     while stack:
         index, parent = stack.pop()
-        if index in seen or index < 0:
-            raise damaged(gltf.path, "its nodes do not form a tree; export it again")
-        seen.add(index)
+        if index in visited or index < 0:
+            raise damage_error(gltf.path, "its nodes do not form a tree; export it again")
+        visited.add(index)
         gltf.allowance.part()
         node = nodes[index]
         matrix = parent @ _local(node)
@@ -297,19 +298,19 @@ def _scene(gltf: _Gltf) -> Mesh:
     colours: list[ByteArray | None] = []
     notes: list[str] = []
     faces: list[IndexArray] = []
-    before = 0
+    n_vertices = 0
     for node, matrix in _nodes_with_meshes(gltf):
-        for vertices, triangles, painted in _primitives(gltf, node, notes):
+        for vertices, triangles, vertex_colours in _primitives(gltf, node, notes):
             gltf.allowance.take(3 * (len(vertices) + (0 if triangles is None else len(triangles))), 8)
             points.append(vertices @ matrix[:3, :3].T + matrix[:3, 3])
             if triangles is not None:
                 # A mirroring transform turns triangles inside out.
                 mirrored = np.linalg.det(matrix[:3, :3]) < 0
-                faces.append((triangles[:, ::-1] if mirrored else triangles) + before)
-            colours.append(painted)
-            before += len(vertices)
+                faces.append((triangles[:, ::-1] if mirrored else triangles) + n_vertices)
+            colours.append(vertex_colours)
+            n_vertices += len(vertices)
     if not points:
-        raise damaged(gltf.path, "its scene holds no points and no triangles")
+        raise damage_error(gltf.path, "its scene holds no points and no triangles")
     joined = np.concatenate(faces) if faces else None
     return mesh_of(
         np.concatenate(points), joined, gltf.path, _joined_colours(points, colours), tuple(dict.fromkeys(notes))
@@ -321,16 +322,18 @@ def _joined_colours(points: list[FloatArray], colours: list[ByteArray | None]) -
     if all(part is None for part in colours):
         return None
     pairs = zip(points, colours, strict=True)
-    return np.concatenate([np.full(at.shape, GREY, np.uint8) if part is None else part for at, part in pairs])
+    return np.concatenate(
+        [np.full(positions.shape, GREY, np.uint8) if part is None else part for positions, part in pairs]
+    )
 
 
 def _morphs(gltf: _Gltf) -> Morphs:
     """Return the mesh with morph targets of most vertices."""
-    shown = list(_nodes_with_meshes(gltf))
-    sizes = [_morphed_vertices(gltf, node) for node, _ in shown]
+    mesh_nodes = list(_nodes_with_meshes(gltf))
+    sizes = [_morphed_vertices(gltf, node) for node, _ in mesh_nodes]
     if not any(sizes):
-        raise damaged(gltf.path, "it has no mesh with morph targets")
-    node, matrix = shown[int(np.argmax(sizes))]
+        raise damage_error(gltf.path, "it has no mesh with morph targets")
+    node, matrix = mesh_nodes[int(np.argmax(sizes))]
     mesh = gltf.tree["meshes"][node["mesh"]]
     count = len(mesh["primitives"][0]["targets"])
     gltf.allowance.part(count)
@@ -339,36 +342,38 @@ def _morphs(gltf: _Gltf) -> Morphs:
     vertices = np.concatenate([points for points, _, _ in parts])
     gltf.allowance.take(vertices.size * (count + 1), 8)
     targets = np.zeros((count, len(vertices), 3))
-    before, done, faces = 0, set[int](), list[IndexArray]()
+    n_vertices, visited, faces = 0, set[int](), list[IndexArray]()
     for primitive in mesh["primitives"]:
         key = primitive["attributes"]["POSITION"]
-        if primitive.get("mode", _TRIANGLES) not in (_POINTS, _TRIANGLES, _STRIP, _FAN) or key in done:
+        if primitive.get("mode", _TRIANGLES) not in (_POINTS, _TRIANGLES, _STRIP, _FAN) or key in visited:
             continue
-        done.add(key)
-        points, triangles, _ = parts[len(done) - 1]
+        visited.add(key)
+        points, triangles, _ = parts[len(visited) - 1]
         for k, target in enumerate(primitive.get("targets", ())):
             gltf.allowance.part()
             if "POSITION" in target:
-                targets[k, before : before + len(points)] = gltf.accessor(target["POSITION"]).reshape(len(points), 3)
+                targets[k, n_vertices : n_vertices + len(points)] = gltf.accessor(target["POSITION"]).reshape(
+                    len(points), 3
+                )
         if triangles is not None:
-            faces.append(triangles + before)
-        before += len(points)
-    turned = matrix[:3, :3]
+            faces.append(triangles + n_vertices)
+        n_vertices += len(points)
+    rotation = matrix[:3, :3]
     joined_faces = np.concatenate(faces) if faces else None
-    if joined_faces is not None and np.linalg.det(turned) < 0:
+    if joined_faces is not None and np.linalg.det(rotation) < 0:
         joined_faces = joined_faces[:, ::-1]
     extras: Any = mesh.get("extras", {})
     names = tuple(map(str, extras.get("targetNames", ()) if isinstance(extras, dict) else ()))  # pyright: ignore[reportUnknownMemberType, reportUnknownArgumentType]
     weights = node.get("weights", mesh.get("weights", []))
     return Morphs(
-        vertices=vertices @ turned.T + matrix[:3, 3],
+        vertices=vertices @ rotation.T + matrix[:3, 3],
         faces=joined_faces,
-        targets=targets @ turned.T,
+        targets=targets @ rotation.T,
         names=names if len(names) == count else (),
         weights=tuple(float(weight) for weight in weights),
         extras=extras,
         copyright=str(gltf.tree["asset"].get("copyright", "")),
-        n_others=len(shown) - 1,
+        n_others=len(mesh_nodes) - 1,
     )
 
 
@@ -376,7 +381,11 @@ def _morphed_vertices(gltf: _Gltf, node: dict[str, Any]) -> int:
     primitives = gltf.tree["meshes"][node["mesh"]]["primitives"]
     gltf.allowance.part(len(primitives))
     accessors = gltf.tree["accessors"]
-    return sum(int(accessors[one["attributes"]["POSITION"]]["count"]) for one in primitives if one.get("targets"))
+    return sum(
+        int(accessors[primitive["attributes"]["POSITION"]]["count"])
+        for primitive in primitives
+        if primitive.get("targets")
+    )
 
 
 def _local(node: dict[str, Any]) -> FloatArray:
@@ -428,13 +437,13 @@ def _primitives(
         gltf.allowance.take(len(corners) if mode == _TRIANGLES else 3 * len(corners), 8)
         if mode == _TRIANGLES:
             if len(corners) % 3:
-                raise damaged(gltf.path, f"its triangles have {len(corners)} corners; {CUT_SHORT}")
-            found = corners.reshape(-1, 3)
+                raise damage_error(gltf.path, f"its triangles have {len(corners)} corners; {CUT_SHORT}")
+            corner_triples = corners.reshape(-1, 3)
         else:
-            found = (strip_triangles if mode == _STRIP else fan_triangles)([len(corners)], corners)
+            corner_triples = (strip_triangles if mode == _STRIP else fan_triangles)([len(corners)], corners)
         # Checked here: joined, an index past this primitive would point into the next.
-        mesh_of(vertices[key], found, gltf.path)
-        triangles.setdefault(key, []).append(found)
+        mesh_of(vertices[key], corner_triples, gltf.path)
+        triangles.setdefault(key, []).append(corner_triples)
     return [(v, np.concatenate(triangles[k]) if k in triangles else None, colours[k]) for k, v in vertices.items()]
 
 
@@ -482,14 +491,14 @@ def _from_linear(values: Values) -> ByteArray | None:
     if not np.isfinite(light).all():
         return None
     light = np.clip(light, 0.0, 1.0)
-    shown = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
-    return np.rint(255.0 * shown).astype(np.uint8)
+    srgb = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
+    return np.rint(255.0 * srgb).astype(np.uint8)
 
 
 def _to_linear(colours: ByteArray) -> Values:
     """Return (N, 4) uint16 of sRGB colours (N, 3), linear in light and opaque, fine enough to come back as they are."""
-    shown = np.arange(256) / 255.0
-    light = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
+    srgb = np.arange(256) / 255.0
+    light = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     out = np.full((len(colours), 4), 65535, dtype="<u2")
     out[:, :3] = np.rint(65535.0 * light).astype(np.uint16)[colours]
     return out
@@ -501,8 +510,8 @@ def _content(mesh: Mesh) -> tuple[dict[str, Any], bytes]:
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         raise InputError(f"{mesh.name} has points that are not finite, which glTF cannot hold; write it as PLY.")
-    far = np.abs([low, high]).max() > _FAR * max(float((high - low).max()), np.finfo(np.float64).tiny)
-    centre = (low + high) / 2 if far else np.zeros(3)
+    is_far = np.abs([low, high]).max() > _FAR * max(float((high - low).max()), np.finfo(np.float64).tiny)
+    centre = (low + high) / 2 if is_far else np.zeros(3)
     with np.errstate(over="ignore"):
         positions = (mesh.vertices - centre).astype("<f4")
     if not np.isfinite(positions).all():
@@ -522,16 +531,16 @@ def _content(mesh: Mesh) -> tuple[dict[str, Any], bytes]:
         primitive = {"attributes": {"POSITION": 0}, "indices": 1, "mode": _TRIANGLES}
         binary += indices
     if mesh.colours is not None:
-        painted = _to_linear(mesh.colours).tobytes()
+        colour_bytes = _to_linear(mesh.colours).tobytes()
         primitive["attributes"]["COLOR_0"] = len(accessors)
-        views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(painted), "target": 34962})
+        views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(colour_bytes), "target": 34962})
         accessors.append({
             "bufferView": len(views) - 1, "componentType": 5123, "normalized": True, "count": len(mesh.colours),
             "type": "VEC4",
         })  # fmt: skip
-        binary += painted
+        binary += colour_bytes
     node: dict[str, Any] = {"mesh": 0, "name": mesh.name}
-    if far:
+    if is_far:
         node["translation"] = centre.tolist()
     tree: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "shapespace"},

@@ -1,4 +1,4 @@
-"""A mesh in a MATLAB file, as MeshMonk and others keep templates: a structure with `Vertices` and `Faces`."""
+"""Meshes in MATLAB files: a structure with `Vertices` and `Faces`, as in MeshMonk."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.io.parsing import CUT_SHORT, damaged, mesh_of
-from shapespace.io.sandbox import HDF5_SIGNATURE, ApartError, Tree, read_matlab_apart
+from shapespace.io.parsing import CUT_SHORT, damage_error, mesh_of
+from shapespace.io.sandbox import HDF5_SIGNATURE, SandboxError, Tree, read_matlab_sandboxed
 from shapespace.types import Mesh
 
-_HDF5_AT = 512
-_MOST_VARIABLES = 64
+_HDF5_AT = 512  # MAT-file 7.3: HDF5 begins after a user block of 512 bytes
+_MOST_VARIABLES = 64  # limit on what one file may ask to be read
 _SAVE = (
     "save it in MATLAB by s = struct('Vertices', T.Vertices, 'Faces', T.Faces); save('t.mat', '-struct', 's', '-v7')"
 )
@@ -33,32 +33,34 @@ def read_mat_mesh(data: bytes, path: Path) -> Mesh:
         MeshError: faces that point past the end of the vertices.
     """
     if HDF5_SIGNATURE in (data[: len(HDF5_SIGNATURE)], data[_HDF5_AT : _HDF5_AT + len(HDF5_SIGNATURE)]):
-        raise damaged(path, f"it is of MATLAB 7.3; {_SAVE}")
+        raise damage_error(path, f"it is of MATLAB 7.3; {_SAVE}")
     try:
         # What it holds is not known before: once for the names, once for what they stand for.
-        names = [name.removeprefix("/") for name in read_matlab_apart(path, ()).groups]
-        tree = read_matlab_apart(path, names[:_MOST_VARIABLES])
-    except ApartError as error:
-        raise damaged(path, f"{error}; {CUT_SHORT}") from error
-    found = _mesh(tree)
-    if found is None:
-        raise damaged(path, f"it has no structure with Vertices and Faces; {_SAVE}")
-    vertices, faces = (np.asarray(array, dtype=np.float64) for array in found)
+        names = [name.removeprefix("/") for name in read_matlab_sandboxed(path, ()).groups]
+        tree = read_matlab_sandboxed(path, names[:_MOST_VARIABLES])
+    except SandboxError as error:
+        raise damage_error(path, f"{error}; {CUT_SHORT}") from error
+    mesh = _mesh(tree)
+    if mesh is None:
+        raise damage_error(path, f"it has no structure with Vertices and Faces; {_SAVE}")
+    vertices, faces = (np.asarray(array, dtype=np.float64) for array in mesh)
     points = vertices if vertices.shape[1] == 3 else vertices.T
     corners = faces if faces.shape[1] == 3 else faces.T
     if points.shape[1] != 3 or corners.shape[1] != 3 or not np.isfinite(corners).all():
-        raise damaged(path, f"its Vertices are of the shape {vertices.shape} and its Faces of {faces.shape}; {_SAVE}")
+        raise damage_error(
+            path, f"its Vertices are of the shape {vertices.shape} and its Faces of {faces.shape}; {_SAVE}"
+        )
     with np.errstate(invalid="ignore"):
         return mesh_of(points, corners.astype(np.int64) - 1, path)
 
 
 def _mesh(tree: Tree) -> tuple[npt.NDArray[Any], npt.NDArray[Any]] | None:
-    """Return the vertices and faces that stand in one place, if there are such."""
+    """Return the vertices and faces of one structure, if there is one."""
     places: dict[str, dict[str, npt.NDArray[Any]]] = {}
     arrays: Mapping[str, npt.NDArray[Any]] = tree.arrays
     for name, array in arrays.items():
         place, _, last = name.rpartition("/")
         if array.ndim == 2:
             places.setdefault(place, {})[last.lower()] = array
-    whole = (place for place in places.values() if {"vertices", "faces"} <= place.keys())
-    return next(((place["vertices"], place["faces"]) for place in whole), None)
+    complete = (place for place in places.values() if {"vertices", "faces"} <= place.keys())
+    return next(((place["vertices"], place["faces"]) for place in complete), None)

@@ -1,4 +1,4 @@
-"""Meshes and other files in folders: which are taken, and what is left out, in words."""
+"""Lists of meshes and other files in folders, with notes on the files that are skipped."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from shapespace.errors import InputError
 from shapespace.io.files import read_error
 from shapespace.io.meshes.mesh_io import MESH_ENDINGS, MESH_FILE_ENDINGS
 
-_NAMED = 3
+_NAMED = 3  # names in a message before the rest is only counted
 
 
 @dataclass(frozen=True)
 class MeshFiles:
-    """What `mesh_files` found.
+    """Result of `mesh_files`.
 
     Args:
         files: in the order given, those of a folder in the order of their names.
@@ -27,7 +27,7 @@ class MeshFiles:
 
 
 @dataclass
-class _Found:
+class _FolderListing:
     endings: tuple[str, ...]
     files: list[Path] = field(default_factory=list[Path])
     folders: list[str] = field(default_factory=list[str])
@@ -42,7 +42,7 @@ def mesh_files(
     recursive: bool = False,
     apart_from: Path | None = None,
     endings: Sequence[str] = MESH_FILE_ENDINGS,
-    what: str = "meshes",
+    kind_name: str = "meshes",
 ) -> MeshFiles:
     """Return `paths` with each folder replaced by the meshes in it, or by other files of some kind.
 
@@ -51,7 +51,7 @@ def mesh_files(
         recursive: whether to take what lies in folders below these too. Links to folders are not followed.
         apart_from: a folder below that is not looked into, such as that of the results.
         endings: of the files to take, in small letters.
-        what: they are called.
+        kind_name: they are called.
 
     Raises:
         InputError: a folder without meshes.
@@ -63,15 +63,15 @@ def mesh_files(
         if not _is_folder(path):
             files.append(path)
             continue
-        found = _Found(tuple(endings))
-        _look_into(path, path, found, recursive, None if apart_from is None else apart_from.resolve())
-        if not found.files:
-            below = "; give --recursive for what lies in the folders below it" if found.folders else ""
-            below += "; unpack those that are compressed with gunzip" if found.packed else ""
+        listing = _FolderListing(tuple(endings))
+        _list_folder(path, path, listing, recursive, None if apart_from is None else apart_from.resolve())
+        if not listing.files:
+            advice = "; give --recursive for what lies in the folders below it" if listing.folders else ""
+            advice += "; unpack those that are compressed with gunzip" if listing.packed else ""
             known = MESH_ENDINGS if endings is MESH_FILE_ENDINGS else endings
-            raise InputError(f"{path} holds no {what}{below}; shapespace reads {', '.join(known)}.")
-        files += found.files
-        left_out += _sentences(path, found, what)
+            raise InputError(f"{path} holds no {kind_name}{advice}; shapespace reads {', '.join(known)}.")
+        files += listing.files
+        left_out += _omission_notes(path, listing, kind_name)
     return MeshFiles(tuple(files), tuple(left_out))
 
 
@@ -82,39 +82,39 @@ def _is_folder(path: Path) -> bool:
         raise read_error(path, error) from error
 
 
-def _look_into(folder: Path, top: Path, found: _Found, recursive: bool, apart_from: Path | None) -> None:
+def _list_folder(folder: Path, top: Path, listing: _FolderListing, recursive: bool, apart_from: Path | None) -> None:
     try:
         inside = sorted(p for p in folder.iterdir() if not p.name.startswith("."))
         for path in inside:
             name = path.relative_to(top).as_posix()
-            of_kind = path.name.lower().endswith(found.endings)
+            of_kind = path.name.lower().endswith(listing.endings)
             if path.is_dir():
                 if path.resolve() == apart_from:
                     continue
                 if not recursive:
-                    found.folders.append(name)
+                    listing.folders.append(name)
                 elif path.is_symlink():
-                    found.linked.append(name)
+                    listing.linked.append(name)
                 else:
-                    _look_into(path, top, found, recursive, apart_from)
+                    _list_folder(path, top, listing, recursive, apart_from)
             elif of_kind and path.is_file():
-                found.files.append(path)
-            elif path.name.lower().endswith(tuple(f"{ending}.gz" for ending in found.endings)):
-                found.packed.append(name)
+                listing.files.append(path)
+            elif path.name.lower().endswith(tuple(f"{ending}.gz" for ending in listing.endings)):
+                listing.packed.append(name)
             elif path.is_symlink() and not path.exists() and (of_kind or not path.suffix):
-                found.broken.append(name)
+                listing.broken.append(name)
     except OSError as error:
         raise read_error(folder, error) from error
 
 
-def _sentences(folder: Path, found: _Found, kind: str) -> Iterator[str]:
-    for names, one, several, done, advice in (
-        (found.folders, "folder", "folders", "looked into", f"--recursive takes the {kind} there"),
-        (found.linked, "link to a folder", "links to folders", "followed", "give that folder too"),
-        (found.broken, "broken link", "broken links", "taken", "mend or remove it"),
-        (found.packed, "compressed file", "compressed files", "taken", "unpack them with gunzip first"),
+def _omission_notes(folder: Path, listing: _FolderListing, kind_name: str) -> Iterator[str]:
+    for names, singular, plural, verb, advice in (
+        (listing.folders, "folder", "folders", "looked into", f"--recursive takes the {kind_name} there"),
+        (listing.linked, "link to a folder", "links to folders", "followed", "give that folder too"),
+        (listing.broken, "broken link", "broken links", "taken", "mend or remove it"),
+        (listing.packed, "compressed file", "compressed files", "taken", "unpack them with gunzip first"),
     ):
         if names:
-            what = f"1 {one} is" if len(names) == 1 else f"{len(names)} {several} are"
-            shown = ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")
-            yield f"{folder}: {what} not {done} ({shown}); {advice}."
+            count_words = f"1 {singular} is" if len(names) == 1 else f"{len(names)} {plural} are"
+            names_shown = ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")
+            yield f"{folder}: {count_words} not {verb} ({names_shown}); {advice}."

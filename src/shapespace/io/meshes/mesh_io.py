@@ -1,4 +1,4 @@
-"""Meshes and point clouds in and out: one plain dict says which file name ending means which format."""
+"""Readers and writers of meshes and point clouds, selected by file name ending from one dict."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TypeAlias
 import numpy as np
 
 from shapespace.errors import FileFormatError
-from shapespace.io.containers.gzip_files import GZIP, unpacked
+from shapespace.io.containers.gzip_files import GZIP, unpack_gzip
 from shapespace.io.files import open_file, read_bytes, read_error, write_bytes
 from shapespace.io.meshes.bnt import read_bnt
 from shapespace.io.meshes.gltf_mesh import read_gltf, write_glb, write_gltf
@@ -30,7 +30,7 @@ from shapespace.io.read_limits import LARGEST_MESH_FILE_BYTES
 from shapespace.types import Mesh, require
 
 _PACKED = ".gz"
-_PROBED_BYTES = 2**16
+_PROBED_BYTES = 2**16  # 64 KiB hold any usual header
 _Probe: TypeAlias = Callable[[bytes, int, Path], None]
 _PROBES: Mapping[str, _Probe] = {".ply": probe_ply, ".stl": probe_stl}
 _CONVERT: Mapping[str, str] = {
@@ -86,7 +86,7 @@ def read_mesh(path: Path | str) -> Mesh:
     read = READ_ONLY_FORMATS.get(ending) or NAMED_FORMATS.get(ending) or _format(path, "read").read
     data = read_bytes(path, LARGEST_MESH_FILE_BYTES)
     if data.startswith(GZIP):
-        data = unpacked(data, path, LARGEST_MESH_FILE_BYTES)
+        data = unpack_gzip(data, path, LARGEST_MESH_FILE_BYTES)
     if not data.strip():
         raise FileFormatError(f"Cannot read {path}: it is empty; export or copy it again.")
     # A NaN or infinity is for the mesh doctor to judge, not for numpy to warn about.
@@ -154,14 +154,14 @@ def _unpacked_name(path: PurePath | str) -> PurePath:
 
 def _format(path: Path, verb: str) -> MeshFormat:
     ending = ending_of(path) if verb == "read" else path.suffix.lower()
-    found = MESH_FORMATS.get(ending)
-    if found is None:
+    mesh_format = MESH_FORMATS.get(ending)
+    if mesh_format is None:
         known = ending in READ_ONLY_FORMATS
-        what = "can be read, not written" if known else "is not a mesh format"
+        problem = "can be read, not written" if known else "is not a mesh format"
         endings = MESH_ENDINGS if verb == "read" else MESH_FORMATS
         advice = _CONVERT.get(ending, f"use one of {', '.join(endings)}")
-        raise FileFormatError(f"Cannot {verb} {path}: the ending '{path.suffix}' {what}; {advice}.")
-    return found
+        raise FileFormatError(f"Cannot {verb} {path}: the ending '{path.suffix}' {problem}; {advice}.")
+    return mesh_format
 
 
 def _read_any_vtk(data: bytes, path: Path) -> Mesh:

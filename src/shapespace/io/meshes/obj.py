@@ -1,4 +1,4 @@
-"""Wavefront OBJ: its `v` and `f` lines and its colours; texture seams, normals and groups change nothing."""
+"""Wavefront OBJ: `v` and `f` lines and vertex colours; texture seams, normals and groups are ignored."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from shapespace.io.parsing import (
     CUT_SHORT,
     IndexArray,
     bytes_of_colours,
-    damaged,
+    damage_error,
     fan_triangles,
     floats,
     ints,
-    joined,
+    join_parts,
     line_blocks,
     mesh_of,
     number_lines,
@@ -53,7 +53,7 @@ def read_obj(data: bytes, path: Path) -> Mesh:
     for lines in line_blocks(data):
         points: list[list[bytes]] = []
         polygons: list[list[bytes]] = []
-        above: list[int] = []
+        vertices_above: list[int] = []
         for line in lines:
             words = line.split()
             if not words:
@@ -62,29 +62,29 @@ def read_obj(data: bytes, path: Path) -> Mesh:
                 points.append(words)
             elif words[0] == b"f":
                 polygons.append(words)
-                above.append(count + len(points))
+                vertices_above.append(count + len(points))
         if points:
             vertices.append(_points(points, count, path))
             colours.append(_colours(points, path))
             count += len(points)
         if polygons:
-            faces.append(_faces(polygons, above, polygon_count, path))
+            faces.append(_faces(polygons, vertices_above, polygon_count, path))
             polygon_count += len(polygons)
     if not count:
-        raise damaged(path, "it has no 'v' lines, so it is not an OBJ file or holds no points")
-    own = [part for part in colours if part is not None]
-    painted = bytes_of_colours(np.concatenate(own)) if len(own) == len(colours) else None
+        raise damage_error(path, "it has no 'v' lines, so it is not an OBJ file or holds no points")
+    known_colours = [part for part in colours if part is not None]
+    vertex_colours = bytes_of_colours(np.concatenate(known_colours)) if len(known_colours) == len(colours) else None
     notes: tuple[str, ...] = ()
-    if painted is None:
-        painted, notes = texture_colours(data, count, path)
-    return mesh_of(np.concatenate(vertices), joined(faces, np.int64, 3), path, painted, notes)
+    if vertex_colours is None:
+        vertex_colours, notes = texture_colours(data, count, path)
+    return mesh_of(np.concatenate(vertices), join_parts(faces, np.int64, 3), path, vertex_colours, notes)
 
 
-def _points(points: list[list[bytes]], before: int, path: Path) -> FloatArray:
+def _points(points: list[list[bytes]], lines_before: int, path: Path) -> FloatArray:
     widths = set(map(len, points))
     if min(widths) < 4:
-        at = before + next(i for i, words in enumerate(points) if len(words) < 4)
-        raise damaged(path, f"vertex {at + 1} has fewer than three numbers; {CUT_SHORT}")
+        line_number = lines_before + next(i for i, words in enumerate(points) if len(words) < 4)
+        raise damage_error(path, f"vertex {line_number + 1} has fewer than three numbers; {CUT_SHORT}")
     if len(widths) == 1:
         flat = list(chain.from_iterable(points))
         return np.stack([floats(flat[axis :: len(points[0])], path) for axis in (1, 2, 3)], axis=1)
@@ -92,7 +92,7 @@ def _points(points: list[list[bytes]], before: int, path: Path) -> FloatArray:
 
 
 def _colours(points: list[list[bytes]], path: Path) -> FloatArray | None:
-    """Return what stands after the coordinates, (n, 3), where that is three numbers of each vertex."""
+    """Return the numbers after the coordinates, (n, 3), if every vertex has three."""
     if set(map(len, points)) != {_COLOURED_WORDS}:
         return None
     try:
@@ -101,22 +101,22 @@ def _colours(points: list[list[bytes]], path: Path) -> FloatArray | None:
         return None
 
 
-def _faces(polygons: list[list[bytes]], above: list[int], before: int, path: Path) -> IndexArray:
+def _faces(polygons: list[list[bytes]], vertices_above: list[int], lines_before: int, path: Path) -> IndexArray:
     # A comment after the corners is rare, and is looked for only where there is a mark.
     if any(b"#" in word for words in polygons for word in (words[-1], *words[4:])):
         polygons = [b" ".join(words).partition(b"#")[0].split() for words in polygons]
     counts = np.fromiter(map(len, polygons), dtype=np.int64, count=len(polygons)) - 1
     if counts.min() < 3:
-        at = before + int(np.argmin(counts))
-        raise damaged(path, f"face {at + 1} has fewer than three corners; {CUT_SHORT}")
+        line_number = lines_before + int(np.argmin(counts))
+        raise damage_error(path, f"face {line_number + 1} has fewer than three corners; {CUT_SHORT}")
     tokens = chain.from_iterable(words[1:] for words in polygons)
     corners = ints((token.partition(b"/")[0] for token in tokens), path)
     if (corners == 0).any():
-        raise damaged(path, "a face points at vertex 0, but OBJ counts from 1; export it again")
-    behind = np.repeat(np.array(above, dtype=np.int64), counts)
-    absolute = np.where(corners > 0, corners - 1, corners + behind)
+        raise damage_error(path, "a face points at vertex 0, but OBJ counts from 1; export it again")
+    declared = np.repeat(np.array(vertices_above, dtype=np.int64), counts)
+    absolute = np.where(corners > 0, corners - 1, corners + declared)
     if absolute.min() < 0:
-        raise damaged(path, f"a face points back past the first vertex; {CUT_SHORT}")
+        raise damage_error(path, f"a face points back past the first vertex; {CUT_SHORT}")
     return fan_triangles(counts, absolute)
 
 

@@ -1,4 +1,4 @@
-"""OFF, the text format of Geomview, with its normals, texture coordinates and the colours of faces ignored."""
+"""OFF, the text format of Geomview; normals, texture coordinates and face colours are ignored."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from shapespace.io.parsing import (
     IndexArray,
     bytes_of_colours,
     check_count,
-    damaged,
+    damage_error,
     fan_triangles,
     floats,
     ints,
-    joined,
+    join_parts,
     line_blocks,
     mesh_of,
     number_lines,
@@ -29,7 +29,7 @@ from shapespace.types import FloatArray, Mesh
 
 # Geomview writes CN, MeshLab NC.
 _KEYWORD = re.compile(rb"(?:ST)?(CN?|NC?)?(4?n?)OFF")
-_ROWS = 1 << 13
+_ROWS = 1 << 13  # rows parsed at once; a few MB as words
 
 
 def read_off(data: bytes, path: Path) -> Mesh:
@@ -47,29 +47,33 @@ def read_off(data: bytes, path: Path) -> Mesh:
     first = next(rows, [b""])
     keyword = _KEYWORD.match(first[0])
     if keyword is None:
-        raise damaged(path, "it does not start with 'OFF', so it is not an OFF file")
+        raise damage_error(path, "it does not start with 'OFF', so it is not an OFF file")
     if keyword[2] or first[-1].upper() == b"BINARY":
-        raise damaged(path, "it is a binary or four-dimensional OFF file, so save it as plain text OFF")
+        raise damage_error(path, "it is a binary or four-dimensional OFF file, so save it as plain text OFF")
     head = [first[0][keyword.end() :], *first[1:]] if len(first[0]) > keyword.end() else first[1:]
     counts = ints((head or next(rows, first[:0]))[:2], path).tolist()
     if len(counts) < 2:
-        raise damaged(path, f"it does not say how many vertices and faces it has; {CUT_SHORT}")
+        raise damage_error(path, f"it does not say how many vertices and faces it has; {CUT_SHORT}")
     n, m = counts
     check_count(n, 6, len(data), "vertices", path)
     check_count(m, 2, len(data), "faces", path)
     # Normals stand before colours, whichever the keyword names first.
     kinds = keyword[1] or b""
-    at = 0 if b"C" not in kinds else 6 if b"N" in kinds else 3
+    colour_column = 0 if b"C" not in kinds else 6 if b"N" in kinds else 3
     points: list[FloatArray] = []
     colours: list[FloatArray | None] = []
     for part in _batches(rows, n, "vertices", path):
         points.append(_points(part, path))
-        colours.append(_colours(part, at, path) if at else None)
-    vertices = joined(points, np.float64, 3)
-    own = [part for part in colours if part is not None]
-    painted = bytes_of_colours(np.concatenate(own)) if own and len(own) == len(colours) else None
-    faces = joined([_faces(part, path) for part in _batches(rows, m, "faces", path)], np.int64, 3)
-    return mesh_of(vertices, faces, path, painted)
+        colours.append(_colours(part, colour_column, path) if colour_column else None)
+    vertices = join_parts(points, np.float64, 3)
+    known_colours = [part for part in colours if part is not None]
+    vertex_colours = (
+        bytes_of_colours(np.concatenate(known_colours))
+        if known_colours and len(known_colours) == len(colours)
+        else None
+    )
+    faces = join_parts([_faces(part, path) for part in _batches(rows, m, "faces", path)], np.int64, 3)
+    return mesh_of(vertices, faces, path, vertex_colours)
 
 
 def _rows(data: bytes) -> Iterator[list[bytes]]:
@@ -82,13 +86,13 @@ def _rows(data: bytes) -> Iterator[list[bytes]]:
                 yield words
 
 
-def _batches(rows: Iterator[list[bytes]], count: int, what: str, path: Path) -> Iterator[list[list[bytes]]]:
+def _batches(rows: Iterator[list[bytes]], count: int, row_kind: str, path: Path) -> Iterator[list[list[bytes]]]:
     left = count
     while left:
         part = list(islice(rows, min(left, _ROWS)))
         if not part:
-            raise damaged(
-                path, f"its header declares {count} {what}, but only {count - left} lines follow; {CUT_SHORT}"
+            raise damage_error(
+                path, f"its header declares {count} {row_kind}, but only {count - left} lines follow; {CUT_SHORT}"
             )
         left -= len(part)
         yield part
@@ -96,16 +100,18 @@ def _batches(rows: Iterator[list[bytes]], count: int, what: str, path: Path) -> 
 
 def _points(rows: list[list[bytes]], path: Path) -> FloatArray:
     if min(map(len, rows)) < 3:
-        raise damaged(path, f"a vertex has fewer than three numbers; {CUT_SHORT}")
+        raise damage_error(path, f"a vertex has fewer than three numbers; {CUT_SHORT}")
     return floats(chain.from_iterable(words[:3] for words in rows), path).reshape(-1, 3)
 
 
-def _colours(rows: list[list[bytes]], at: int, path: Path) -> FloatArray | None:
-    """Return the three numbers from word `at` of each line, (n, 3); None where some line has none."""
-    if min(map(len, rows)) < at + 3:
+def _colours(rows: list[list[bytes]], first_column: int, path: Path) -> FloatArray | None:
+    """Return the three numbers from word `first_column` of each line, (n, 3); None where some line has none."""
+    if min(map(len, rows)) < first_column + 3:
         return None
     try:
-        return floats(chain.from_iterable(words[at : at + 3] for words in rows), path).reshape(-1, 3)
+        return floats(chain.from_iterable(words[first_column : first_column + 3] for words in rows), path).reshape(
+            -1, 3
+        )
     except FileFormatError:
         return None
 
@@ -114,7 +120,7 @@ def _faces(rows: list[list[bytes]], path: Path) -> IndexArray:
     sizes = ints((words[0] for words in rows), path)
     lengths = np.fromiter(map(len, rows), dtype=np.int64, count=len(rows))
     if (sizes < 1).any() or (lengths <= sizes).any():
-        raise damaged(path, f"a face has fewer corners than it says; {CUT_SHORT}")
+        raise damage_error(path, f"a face has fewer corners than it says; {CUT_SHORT}")
     corners = ints(chain.from_iterable(w[1 : 1 + k] for w, k in zip(rows, sizes.tolist(), strict=True)), path)
     return fan_triangles(sizes, corners)
 

@@ -1,4 +1,4 @@
-"""PCD of the Point Cloud Library: text, binary, and binary packed by LZF.
+"""PCD of the Point Cloud Library: text, binary, and binary compressed by LZF.
 
 After "The PCD (Point Cloud Data) file format", https://pointclouds.org/documentation/tutorials/pcd_file_format.html.
 """
@@ -10,16 +10,25 @@ from pathlib import Path
 
 import numpy as np
 
-from shapespace.io.parsing import CUT_SHORT, check_count, damaged, floats, joined, line_blocks, mesh_of, plain_text
+from shapespace.io.parsing import (
+    CUT_SHORT,
+    check_count,
+    damage_error,
+    floats,
+    join_parts,
+    line_blocks,
+    mesh_of,
+    plain_text,
+)
 from shapespace.io.read_limits import Allowance
 from shapespace.types import FloatArray, Mesh
 
-_MOST_HEADER = 1 << 16
-_MOST_COUNT = 1 << 14
+_MOST_HEADER = 1 << 16  # bytes (64 KiB)
+_MOST_COUNT = 1 << 14  # values of one field in a point; limit on damaged files
 _KINDS = {"I": "i", "U": "u", "F": "f"}
 _SIZES = ("1", "2", "4", "8")
-_LITERAL = 32
-_LONG = 7
+_LITERAL = 32  # LZF: control bytes below it are followed by literals
+_LONG = 7  # LZF: this length is continued in the next byte
 
 
 def read_pcd(data: bytes, path: Path) -> Mesh:
@@ -32,41 +41,41 @@ def read_pcd(data: bytes, path: Path) -> Mesh:
     Raises:
         FileFormatError: it is no PCD, has no x, y and z, or is cut short.
     """
-    head, at = _header(plain_text(data), path)
+    head, data_start = _header(plain_text(data), path)
     data = plain_text(data)
     row, n = _row(head, path)
     kind = head["DATA"][0].lower()
     if kind == "ascii":
-        points = _text(data[at:], head, n, path)
+        points = _text(data[data_start:], head, n, path)
     elif kind == "binary":
-        check_count(n, row.itemsize, len(data) - at, "points", path)
-        table = np.frombuffer(data, row, n, at)
+        check_count(n, row.itemsize, len(data) - data_start, "points", path)
+        table = np.frombuffer(data, row, n, data_start)
         points = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
     elif kind == "binary_compressed":
-        points = _unpacked(data, at, row, n, path)
+        points = _unpack_columns(data, data_start, row, n, path)
     else:
-        raise damaged(path, f"its data are '{kind[:40]}', but only ascii, binary and binary_compressed are read")
-    seen = ~np.isnan(points).any(axis=1)
-    if not seen.any():
-        raise damaged(path, "none of its points is there")
-    return mesh_of(points[seen], None, path)
+        raise damage_error(path, f"its data are '{kind[:40]}', but only ascii, binary and binary_compressed are read")
+    is_measured = ~np.isnan(points).any(axis=1)
+    if not is_measured.any():
+        raise damage_error(path, "none of its points is there")
+    return mesh_of(points[is_measured], None, path)
 
 
 def _header(data: bytes, path: Path) -> tuple[dict[str, list[str]], int]:
     """Return the words of each line of the header by the first, and where the data begin."""
-    found: dict[str, list[str]] = {}
-    at = 0
-    while "DATA" not in found:
-        end = data.find(b"\n", at, _MOST_HEADER)
+    fields: dict[str, list[str]] = {}
+    offset = 0
+    while "DATA" not in fields:
+        end = data.find(b"\n", offset, _MOST_HEADER)
         if end < 0:
-            raise damaged(path, "it has no header that ends in DATA, so it is not a PCD file")
-        words = data[at:end].decode("ascii", "replace").split()
-        at = end + 1
+            raise damage_error(path, "it has no header that ends in DATA, so it is not a PCD file")
+        words = data[offset:end].decode("ascii", "replace").split()
+        offset = end + 1
         if words and not words[0].startswith("#"):
-            found[words[0].upper()] = words[1:]
-    if not found["DATA"]:
-        raise damaged(path, "its header does not say how the data are written")
-    return found, at
+            fields[words[0].upper()] = words[1:]
+    if not fields["DATA"]:
+        raise damage_error(path, "its header does not say how the data are written")
+    return fields, offset
 
 
 def _row(head: dict[str, list[str]], path: Path) -> tuple[np.dtype[np.void], int]:
@@ -75,21 +84,21 @@ def _row(head: dict[str, list[str]], path: Path) -> tuple[np.dtype[np.void], int
     sizes, kinds = head.get("SIZE", []), head.get("TYPE", [])
     counts = head.get("COUNT", ["1"] * len(names))
     if not {"x", "y", "z"} <= set(names) or not len(names) == len(sizes) == len(kinds) == len(counts):
-        raise damaged(path, "its header does not say where x, y and z are; save it again")
+        raise damage_error(path, "its header does not say where x, y and z are; save it again")
     if any(names.count(axis) != 1 or counts[names.index(axis)] != "1" for axis in "xyz"):
-        raise damaged(path, "its header has x, y or z more than once; save it again")
+        raise damage_error(path, "its header has x, y or z more than once; save it again")
     fields: list[tuple[str, str, tuple[int, ...]]] = []
     for number, (name, size, kind, count) in enumerate(zip(names, sizes, kinds, counts, strict=True)):
         if size not in _SIZES or kind not in _KINDS or (kind, size) == ("F", "1") or not count.isdecimal():
-            raise damaged(path, f"its field '{name[:40]}' is of a type that is not known; save it again")
+            raise damage_error(path, f"its field '{name[:40]}' is of a type that is not known; save it again")
         if len(count) > 5 or int(count) > _MOST_COUNT:
-            raise damaged(path, f"its field '{name[:40]}' has {count[:20]} numbers a point, far too many")
+            raise damage_error(path, f"its field '{name[:40]}' has {count[:20]} numbers a point, far too many")
         fields.append((name if name in "xyz" else f"{name}/{number}", f"<{_KINDS[kind]}{size}", (int(count),)))
     plain = [(name, kind, shape if shape != (1,) else ()) for name, kind, shape in fields]
     try:
         n = int(head["POINTS"][0]) if "POINTS" in head else int(head["WIDTH"][0]) * int(head["HEIGHT"][0])
     except (KeyError, IndexError, ValueError) as error:
-        raise damaged(path, "its header does not say how many points there are; save it again") from error
+        raise damage_error(path, "its header does not say how many points there are; save it again") from error
     return np.dtype(plain), n
 
 
@@ -101,26 +110,26 @@ def _text(text: bytes, head: dict[str, list[str]], n: int, path: Path) -> FloatA
     columns = [int(starts[names.index(axis)]) for axis in "xyz"]
     check_count(n, 6, len(text) + 1, "points", path)
     parts: list[FloatArray] = []
-    found = 0
+    row_count = 0
     for lines in line_blocks(text):
         rows = [words for words in (line.split() for line in lines) if words]
         if rows and min(map(len, rows)) < width:
-            raise damaged(path, f"a row has too few numbers; {CUT_SHORT}")
+            raise damage_error(path, f"a row has too few numbers; {CUT_SHORT}")
         parts.append(floats(chain.from_iterable([row[c] for c in columns] for row in rows), path).reshape(-1, 3))
-        found += len(rows)
-    if found != n:
-        raise damaged(path, f"its header declares {n} points, but {found} follow; {CUT_SHORT}")
-    return joined(parts, np.float64, 3)
+        row_count += len(rows)
+    if row_count != n:
+        raise damage_error(path, f"its header declares {n} points, but {row_count} follow; {CUT_SHORT}")
+    return join_parts(parts, np.float64, 3)
 
 
-def _unpacked(data: bytes, at: int, row: np.dtype[np.void], n: int, path: Path) -> FloatArray:
-    """Return the points of packed data, in which each field stands for all points before the next."""
-    sizes = np.frombuffer(data[at : at + 8].ljust(8, b"\0"), "<u4")
+def _unpack_columns(data: bytes, offset: int, row: np.dtype[np.void], n: int, path: Path) -> FloatArray:
+    """Return the points of compressed data, which stores field after field for all points."""
+    sizes = np.frombuffer(data[offset : offset + 8].ljust(8, b"\0"), "<u4")
     packed, size = int(sizes[0]), int(sizes[1])
-    if n < 0 or size != n * row.itemsize or at + 8 + packed > len(data):
-        raise damaged(path, f"its packed data have another length than its header says; {CUT_SHORT}")
+    if n < 0 or size != n * row.itemsize or offset + 8 + packed > len(data):
+        raise damage_error(path, f"its packed data have another length than its header says; {CUT_SHORT}")
     Allowance(len(data), path).take(size, 1)
-    content = _lzf(data[at + 8 : at + 8 + packed], size, path)
+    content = _lzf(data[offset + 8 : offset + 8 + packed], size, path)
     offsets = {name: n * int(field[1]) for name, field in (row.fields or {}).items()}
     runs = [np.frombuffer(content, row[axis], n, offsets[axis]).astype(np.float64) for axis in "xyz"]
     return np.stack(runs, axis=1)
@@ -129,29 +138,29 @@ def _unpacked(data: bytes, at: int, row: np.dtype[np.void], n: int, path: Path) 
 def _lzf(data: bytes, size: int, path: Path) -> bytes:
     """Return the `size` bytes that LZF made of `data`: runs as they are, and copies of what came before."""
     out = bytearray()
-    at = 0
+    position = 0
     try:
-        while at < len(data) and len(out) <= size:
-            control = data[at]
-            at += 1
+        while position < len(data) and len(out) <= size:
+            control = data[position]
+            position += 1
             if control < _LITERAL:
-                out += data[at : at + control + 1]
-                at += control + 1
+                out += data[position : position + control + 1]
+                position += control + 1
                 continue
             length = control >> 5
             if length == _LONG:
-                length += data[at]
-                at += 1
-            back = len(out) - ((control & 31) << 8) - data[at] - 1
-            at += 1
-            if back < 0:
+                length += data[position]
+                position += 1
+            copy_start = len(out) - ((control & 31) << 8) - data[position] - 1
+            position += 1
+            if copy_start < 0:
                 raise IndexError
             length += 2
-            run = bytes(out[back : back + length])
+            run = bytes(out[copy_start : copy_start + length])
             # What is copied may go on into the copy.
             out += (run * (length // len(run) + 1))[:length]
     except IndexError as error:
-        raise damaged(path, f"its packed data are wrong; {CUT_SHORT}") from error
+        raise damage_error(path, f"its packed data are wrong; {CUT_SHORT}") from error
     if len(out) != size:
-        raise damaged(path, f"its packed data have another length than its header says; {CUT_SHORT}")
+        raise damage_error(path, f"its packed data have another length than its header says; {CUT_SHORT}")
     return bytes(out)

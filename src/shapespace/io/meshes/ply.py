@@ -18,11 +18,11 @@ from shapespace.io.parsing import (
     IndexArray,
     bytes_of_colours,
     check_count,
-    damaged,
+    damage_error,
     fan_triangles,
     floats,
     ints,
-    joined,
+    join_parts,
     mesh_of,
     plain_text,
     word_block,
@@ -37,8 +37,8 @@ _SCALARS = {
     "int64": "i8", "uint64": "u8",
 }  # fmt: skip
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-_MAX_HEADER = 1 << 20
-_FIRST_LINES = 512
+_MAX_HEADER = 1 << 20  # bytes (1 MiB)
+_FIRST_LINES = 512  # bytes that hold the comment
 _COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 _OBSERVED = "observed"
 """Vertex property of surfaces in correspondence: 0 where the position is an estimate."""
@@ -73,11 +73,11 @@ class _Element:
 
 
 class _Words:
-    """The words of ascii data from byte `at`, one after another; few of them are in memory at a time."""
+    """Iterator over the words of ascii data from an offset; few words are in memory at a time."""
 
-    def __init__(self, data: bytes, at: int) -> None:
+    def __init__(self, data: bytes, offset: int) -> None:
         self.data = data
-        self.begin = self.end = at
+        self.begin = self.end = offset
         self.block: list[bytes] = []
         self.at = 0
 
@@ -139,27 +139,27 @@ def read_ply(data: bytes, path: Path) -> Mesh:
         MeshError: faces that point past the end of the vertices.
     """
     data = plain_text(data)
-    order, elements, at = _header(data, path)
+    order, elements, offset = _header(data, path)
     vertices: FloatArray | None = None
     colours: ByteArray | None = None
     observed: BoolArray | None = None
     faces: IndexArray | None = None
-    words = _Words(data, at)
+    words = _Words(data, offset)
     for element in elements:
         if element.name == "tristrips":
-            raise damaged(path, "it holds triangle strips, so export it again with plain triangles")
-        available = words.left if order == "" else len(data) - at
+            raise damage_error(path, "it holds triangle strips, so export it again with plain triangles")
+        available = words.left if order == "" else len(data) - offset
         check_count(element.count, element.least_bytes(order == ""), available, _plural(element.name), path)
         lists = any(p.count is not None for p in element.properties)
-        wanted = None
+        list_index = None
         if element.name == "face" and element.count:
-            wanted = element.index_list()
-            if wanted is None:
-                raise damaged(path, "its faces have no property vertex_indices, so export it again")
+            list_index = element.index_list()
+            if list_index is None:
+                raise damage_error(path, "its faces have no property vertex_indices, so export it again")
         if lists and order == "":
-            counts, corners = _ascii_lists(words, element, wanted, path)
+            counts, corners = _ascii_lists(words, element, list_index, path)
         elif lists:
-            counts, corners, at = _binary_lists(data, at, element, order, wanted, path)
+            counts, corners, offset = _binary_lists(data, offset, element, order, list_index, path)
         else:
             positions = element.name == "vertex"
             if positions:
@@ -171,17 +171,17 @@ def read_ply(data: bytes, path: Path) -> Mesh:
                     words.skip(element.count * len(element.properties))
             else:
                 if positions:
-                    vertices, colours, observed = _binary_vertices(data, at, element, order)
-                at += element.count * element.least_bytes(False)
+                    vertices, colours, observed = _binary_vertices(data, offset, element, order)
+                offset += element.count * element.least_bytes(False)
             continue
         if element.name == "vertex":
-            raise damaged(path, "its vertices carry lists, so export it again without them")
-        if wanted is not None:
+            raise damage_error(path, "its vertices carry lists, so export it again without them")
+        if list_index is not None:
             if len(counts) and counts.min() < 0:
-                raise damaged(path, f"a face has {int(counts.min())} corners; {CUT_SHORT}")
+                raise damage_error(path, f"a face has {int(counts.min())} corners; {CUT_SHORT}")
             faces = fan_triangles(counts, corners)
     if vertices is None:
-        raise damaged(path, "its header declares no vertices")
+        raise damage_error(path, "its header declares no vertices")
     return mesh_of(vertices, faces, path, colours, observed=observed)
 
 
@@ -196,13 +196,15 @@ def probe_ply(head: bytes, size: int, path: Path) -> None:
     Raises:
         FileFormatError: it is not PLY, or cut short.
     """
-    order, elements, at = _header(head, path)
+    order, elements, offset = _header(head, path)
     for element in elements:
-        check_count(element.count, 1, size - at + 1, _plural(element.name), path)
+        check_count(element.count, 1, size - offset + 1, _plural(element.name), path)
         corners = [p for p in element.properties if element.name == "face" and p.count is not None]
-        each = element.least_bytes(order == "") + sum(3 * (np.dtype(p.item).itemsize if order else 2) for p in corners)
-        check_count(element.count, each, size - at + 1, _plural(element.name), path)
-        at += element.count * each
+        element_bytes = element.least_bytes(order == "") + sum(
+            3 * (np.dtype(p.item).itemsize if order else 2) for p in corners
+        )
+        check_count(element.count, element_bytes, size - offset + 1, _plural(element.name), path)
+        offset += element.count * element_bytes
 
 
 def _plural(name: str) -> str:
@@ -211,10 +213,10 @@ def _plural(name: str) -> str:
 
 def _header(data: bytes, path: Path) -> tuple[str, list[_Element], int]:
     if data[:3] != b"ply" or data[3:4] not in (b"\n", b"\r", b" "):
-        raise damaged(path, "it does not start with 'ply', so it is not a PLY file")
+        raise damage_error(path, "it does not start with 'ply', so it is not a PLY file")
     end = data.find(b"end_header", 0, _MAX_HEADER)
     if end < 0:
-        raise damaged(path, f"its header has no end; {CUT_SHORT}")
+        raise damage_error(path, f"its header has no end; {CUT_SHORT}")
     head = data[:end]
     after = end + len(b"end_header")
     newline = b"\r\n" if b"\r\n" in head else (b"\n" if b"\n" in head else b"\r")
@@ -238,15 +240,15 @@ def _header(data: bytes, path: Path) -> tuple[str, list[_Element], int]:
             else:
                 raise ValueError(words[0])
         except (ValueError, KeyError, IndexError) as error:
-            raise damaged(path, f"its header has a line that is not PLY ('{line.strip()[:60]}')") from error
+            raise damage_error(path, f"its header has a line that is not PLY ('{line.strip()[:60]}')") from error
     if order is None:
-        raise damaged(path, "its header does not say whether it is ascii or binary")
+        raise damage_error(path, "its header does not say whether it is ascii or binary")
     return order, elements, start
 
 
 def _refuse_without_xyz(element: _Element, path: Path) -> None:
     if not set("xyz") <= {p.name for p in element.properties}:
-        raise damaged(path, "its vertices have no x, y and z")
+        raise damage_error(path, "its vertices have no x, y and z")
 
 
 def _colour_names(names: list[str]) -> tuple[str, ...]:
@@ -276,10 +278,10 @@ def _is_observed(element: _Element, column: npt.NDArray[Any] | None) -> BoolArra
     return None if column is None or "f" in kinds else np.asarray(column != 0)
 
 
-def _binary_vertices(data: bytes, at: int, element: _Element, order: str) -> _Vertices:
+def _binary_vertices(data: bytes, offset: int, element: _Element, order: str) -> _Vertices:
     names = [p.name for p in element.properties]
     row = np.dtype([(f"p{i}", order + p.item) for i, p in enumerate(element.properties)])
-    table = np.frombuffer(data, dtype=row, count=element.count, offset=at)
+    table = np.frombuffer(data, dtype=row, count=element.count, offset=offset)
     out = np.empty((element.count, 3), dtype=np.float64)
     for axis, name in enumerate("xyz"):
         out[:, axis] = table[f"p{names.index(name)}"]
@@ -293,26 +295,26 @@ def _ascii_vertices(words: _Words, element: _Element, path: Path) -> _Vertices:
     width = len(names)
     flags = (_OBSERVED,) if _OBSERVED in names else ()
     columns: dict[str, list[FloatArray]] = {name: [] for name in ("x", "y", "z", *_colour_names(names), *flags)}
-    taken = 0
+    n_read = 0
     for part in words.take(element.count * width):
         for axis, parts in columns.items():
             # A part may begin and end anywhere in a row.
-            parts.append(floats(part[(names.index(axis) - taken) % width :: width], path))
-        taken += len(part)
-    if taken < element.count * width:
-        raise _ended(element, path)
-    found = {name: joined(parts, np.float64) for name, parts in columns.items()}
-    positions = np.stack([found[axis] for axis in "xyz"], axis=1)
-    return positions, _colours(element, found), _is_observed(element, found.get(_OBSERVED))
+            parts.append(floats(part[(names.index(axis) - n_read) % width :: width], path))
+        n_read += len(part)
+    if n_read < element.count * width:
+        raise _truncation_error(element, path)
+    arrays = {name: join_parts(parts, np.float64) for name, parts in columns.items()}
+    positions = np.stack([arrays[axis] for axis in "xyz"], axis=1)
+    return positions, _colours(element, arrays), _is_observed(element, arrays.get(_OBSERVED))
 
 
-def _ended(element: _Element, path: Path) -> FileFormatError:
-    return damaged(path, f"it ends among its {_plural(element.name)}; {CUT_SHORT}")
+def _truncation_error(element: _Element, path: Path) -> FileFormatError:
+    return damage_error(path, f"it ends among its {_plural(element.name)}; {CUT_SHORT}")
 
 
-def _ascii_lists(words: _Words, element: _Element, wanted: int | None, path: Path) -> tuple[IndexArray, IndexArray]:
-    if len(element.properties) == 1 and element.count and wanted == 0:
-        table = _alike(words, element.count, path)
+def _ascii_lists(words: _Words, element: _Element, list_index: int | None, path: Path) -> tuple[IndexArray, IndexArray]:
+    if len(element.properties) == 1 and element.count and list_index == 0:
+        table = _read_equal_lists(words, element.count, path)
         if table is not None:
             return table[:, 0], table[:, 1:].ravel()
     sizes, corners = array("q"), array("q")
@@ -328,47 +330,47 @@ def _ascii_lists(words: _Words, element: _Element, wanted: int | None, path: Pat
                 part = words.some(size)
                 if len(part) < size:
                     raise StopIteration
-                if i == wanted:
+                if i == list_index:
                     sizes.append(size)
                     corners.extend(map(int, part))
     except (ValueError, OverflowError) as error:
-        raise damaged(path, f"a list has no whole number where one should be; {CUT_SHORT}") from error
+        raise damage_error(path, f"a list has no whole number where one should be; {CUT_SHORT}") from error
     except StopIteration as error:
-        raise _ended(element, path) from error
+        raise _truncation_error(element, path) from error
     return np.array(sizes, dtype=np.int64), np.array(corners, dtype=np.int64)
 
 
-def _alike(words: _Words, count: int, path: Path) -> IndexArray | None:
-    """Return (count, n + 1) the sizes and corners of lists that are all as long as the first; None if they are not."""
+def _read_equal_lists(words: _Words, count: int, path: Path) -> IndexArray | None:
+    """Return (count, n + 1) the sizes and corners of lists of equal length; None if their lengths differ."""
     start = words.mark()
     first = next(words, b"")
     size = int(ints([first], path)[0])
     words.back_to(start)
     if size <= 0 or count * (size + 1) * 2 > words.left:
         return None
-    taken = 0
+    n_read = 0
     parts: list[IndexArray] = []
     for part in words.take(count * (size + 1)):
-        lengths = part[-taken % (size + 1) :: size + 1]
+        lengths = part[-n_read % (size + 1) :: size + 1]
         if lengths.count(first) != len(lengths):
             break
         parts.append(ints(part, path))
-        taken += len(part)
-    if taken == count * (size + 1):
+        n_read += len(part)
+    if n_read == count * (size + 1):
         return np.concatenate(parts).reshape(count, size + 1)
     words.back_to(start)
     return None
 
 
 def _binary_lists(
-    data: bytes, at: int, element: _Element, order: str, wanted: int | None, path: Path
+    data: bytes, offset: int, element: _Element, order: str, list_index: int | None, path: Path
 ) -> tuple[IndexArray, IndexArray, int]:
     none = np.zeros(0, dtype=np.int64)
     if element.count == 0:
-        return none, none, at
+        return none, none, offset
     if any(p.count is not None and p.count[0] == "f" for p in element.properties):
-        raise damaged(path, "a list has a length that is not a whole number, so export it again")
-    uniform = _uniform_lists(data, at, element, order, wanted)
+        raise damage_error(path, "a list has a length that is not a whole number, so export it again")
+    uniform = _uniform_lists(data, offset, element, order, list_index)
     if uniform is not None:
         return uniform
     endian = "little" if order == "<" else "big"
@@ -376,39 +378,39 @@ def _binary_lists(
     for i, p in enumerate(element.properties):
         count_bytes = 0 if p.count is None else np.dtype(p.count).itemsize
         signed = p.count is not None and p.count[0] == "i"
-        plan.append((count_bytes, np.dtype(p.item).itemsize, signed, i == wanted))
+        plan.append((count_bytes, np.dtype(p.item).itemsize, signed, i == list_index))
     starts, sizes = array("q"), array("q")
     for _ in range(element.count):
         for count_bytes, item, signed, keep in plan:
             if count_bytes == 0:
-                at += item
+                offset += item
                 continue
-            size = int.from_bytes(data[at : at + count_bytes], endian, signed=signed)
-            at += count_bytes
+            size = int.from_bytes(data[offset : offset + count_bytes], endian, signed=signed)
+            offset += count_bytes
             if keep:
-                starts.append(at)
+                starts.append(offset)
                 sizes.append(size)
-            at += max(size, 0) * item
-        if at > len(data):
-            raise damaged(path, f"it ends among its {_plural(element.name)}; {CUT_SHORT}")
-    if wanted is None:
-        return none, none, at
-    kind = np.dtype(order + element.properties[wanted].item)
+            offset += max(size, 0) * item
+        if offset > len(data):
+            raise damage_error(path, f"it ends among its {_plural(element.name)}; {CUT_SHORT}")
+    if list_index is None:
+        return none, none, offset
+    kind = np.dtype(order + element.properties[list_index].item)
     counts = np.array(sizes, dtype=np.int64)
-    each = np.maximum(counts, 0)
-    step = np.arange(int(each.sum()), dtype=np.int64) - np.repeat(np.cumsum(each) - each, each)
-    first = np.repeat(np.array(starts, dtype=np.int64), each) + step * kind.itemsize
-    raw = np.frombuffer(data, dtype=np.uint8)[first[:, None] + np.arange(kind.itemsize)]
-    return counts, _indices(np.ascontiguousarray(raw).view(kind).ravel()), at
+    lengths = np.maximum(counts, 0)
+    step = np.arange(int(lengths.sum()), dtype=np.int64) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+    first_byte = np.repeat(np.array(starts, dtype=np.int64), lengths) + step * kind.itemsize
+    raw = np.frombuffer(data, dtype=np.uint8)[first_byte[:, None] + np.arange(kind.itemsize)]
+    return counts, _indices(np.ascontiguousarray(raw).view(kind).ravel()), offset
 
 
 def _uniform_lists(
-    data: bytes, at: int, element: _Element, order: str, wanted: int | None
+    data: bytes, start: int, element: _Element, order: str, list_index: int | None
 ) -> tuple[IndexArray, IndexArray, int] | None:
-    """Read the rows at one stroke if all lists have the lengths of the first row's; None if they do not."""
+    """Read all rows at once if all lists have the lengths of the first row; None otherwise."""
     fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
     expected: list[tuple[str, int]] = []
-    offset = at
+    offset = start
     for i, p in enumerate(element.properties):
         if p.count is None:
             fields.append((f"p{i}", order + p.item))
@@ -425,23 +427,23 @@ def _uniform_lists(
         expected.append((f"c{i}", size))
         offset += size * np.dtype(p.item).itemsize
     row = np.dtype(fields)
-    end = at + element.count * row.itemsize
+    end = start + element.count * row.itemsize
     if end > len(data):
         return None
-    table = np.frombuffer(data, dtype=row, count=element.count, offset=at)
+    table = np.frombuffer(data, dtype=row, count=element.count, offset=start)
     if any((table[name] != size).any() for name, size in expected):
         return None
-    if wanted is None:
+    if list_index is None:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), end
-    return table[f"c{wanted}"].astype(np.int64), _indices(table[f"p{wanted}"].ravel()), end
+    return table[f"c{list_index}"].astype(np.int64), _indices(table[f"p{list_index}"].ravel()), end
 
 
 def _indices(values: npt.NDArray[Any]) -> IndexArray:
-    """Return whole numbers of any scalar type as int64; what is not whole becomes -1, which no mesh accepts."""
+    """Return whole numbers of any scalar type as int64; other numbers become -1, which no mesh accepts."""
     if values.dtype.kind == "f":
         numbers = values.astype(np.float64)
-        whole = np.isfinite(numbers) & (numbers == np.floor(numbers)) & (np.abs(numbers) < 2**53)
-        return np.where(whole, numbers, -1.0).astype(np.int64)
+        is_whole = np.isfinite(numbers) & (numbers == np.floor(numbers)) & (np.abs(numbers) < 2**53)
+        return np.where(is_whole, numbers, -1.0).astype(np.int64)
     return values.astype(np.int64)
 
 
@@ -484,5 +486,5 @@ def ply_comment(path: Path) -> str:
             lines = stream.read(_FIRST_LINES).split(b"\n")
     except OSError:
         return ""
-    found = next((line for line in lines if line.startswith(b"comment ")), b"")
-    return found.removeprefix(b"comment ").decode("ascii", "replace").strip()
+    comment_line = next((line for line in lines if line.startswith(b"comment ")), b"")
+    return comment_line.removeprefix(b"comment ").decode("ascii", "replace").strip()

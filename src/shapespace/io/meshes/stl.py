@@ -1,4 +1,4 @@
-"""STL, ascii and binary: a soup of triangles whose equal corners become one vertex."""
+"""STL, ascii and binary: triangles whose equal corners become one vertex."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from shapespace.io.parsing import (
     CUT_SHORT,
     IndexArray,
     check_count,
-    damaged,
+    damage_error,
     floats,
-    joined,
+    join_parts,
     line_blocks,
     mesh_of,
     plain_text,
@@ -48,13 +48,13 @@ def read_stl(data: bytes, path: Path) -> Mesh:
     if not binary:
         corners = _ascii_corners(data, path)
     elif declared < 0:
-        raise damaged(path, "it is too short to be an STL file")
+        raise damage_error(path, "it is too short to be an STL file")
     else:
         check_count(declared, 50, len(data) - 84, "triangles", path)
         table = np.frombuffer(data, dtype=_ROW, count=declared, offset=84)
         corners = table["corners"].reshape(-1, 3).astype(np.float64)
     if not len(corners):
-        raise damaged(path, "it holds no triangles")
+        raise damage_error(path, "it holds no triangles")
     vertices, index = merge_equal(corners)
     return mesh_of(vertices, index.reshape(-1, 3), path)
 
@@ -76,12 +76,12 @@ def _ascii_corners(data: bytes, path: Path) -> FloatArray:
         facets += sum(split[0] == b"facet" for split in words)
         last = words[-1][0] if words else last
         if any(len(split) != 4 for split in rows):
-            raise damaged(path, f"a corner has not three numbers; {CUT_SHORT}")
+            raise damage_error(path, f"a corner has not three numbers; {CUT_SHORT}")
         corners.append(floats(chain.from_iterable(split[1:] for split in rows), path).reshape(-1, 3))
         count += len(rows)
     if last != b"endsolid" or count != 3 * facets:
-        raise damaged(path, f"it holds {count} corners for {facets} triangles, or has no end; {CUT_SHORT}")
-    return joined(corners, np.float64, 3)
+        raise damage_error(path, f"it holds {count} corners for {facets} triangles, or has no end; {CUT_SHORT}")
+    return join_parts(corners, np.float64, 3)
 
 
 def merge_equal(points: FloatArray) -> tuple[FloatArray, IndexArray]:
@@ -119,11 +119,11 @@ def write_stl(mesh: Mesh) -> bytes:
     if (np.abs(corners) > np.finfo(np.float32).max).any():
         raise InputError(f"{mesh.name} has coordinates too large for STL; write it as PLY instead.")
     used = np.unique(mesh.faces)
-    apart = len(merge_equal(mesh.vertices[used])[0])
+    n_distinct = len(merge_equal(mesh.vertices[used])[0])
     left = len(merge_equal(mesh.vertices[used].astype(np.float32).astype(np.float64))[0])
-    if apart - left > _MOST_MERGED * apart:
+    if n_distinct - left > _MOST_MERGED * n_distinct:
         raise InputError(
-            f"{mesh.name} lies so far from the origin, for its size, that STL's float32 would merge its {apart} "
+            f"{mesh.name} lies so far from the origin, for its size, that STL's float32 would merge its {n_distinct} "
             f"vertices into {left}; move it to the origin, or write it as PLY."
         )
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

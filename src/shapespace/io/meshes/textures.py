@@ -1,4 +1,4 @@
-"""Pictures that textured surfaces come with, sampled to colours of vertices; read by Pillow, of the extra `report`.
+"""Textures of surfaces, sampled to vertex colours; read by Pillow, of the extra `report`.
 
 What cannot be read leaves a surface without colours and says so in a note: a fit needs the shape alone.
 """
@@ -31,16 +31,16 @@ MOST_BYTES_IN_ALL = 2**29
 MOST_NAMES = 2**14
 """Limit of the files of materials and pictures that a surface names; finding one takes some 40 microseconds."""
 
-_SIDE = 2048
+_SIDE = 2048  # pixels; a texture is sampled at vertices, so finer ones cost memory only
 _KINDS = ("JPEG", "PNG", "BMP", "TIFF")
 
 
 class TextureError(Exception):
-    """Why a picture gives no colours, as a clause."""
+    """The reason why a texture cannot be used, as a clause."""
 
 
-class FilesBeside:
-    """Materials and pictures that a surface names: in its folder or below it, at most `MOST_BYTES_IN_ALL` together.
+class CompanionFiles:
+    """Materials and textures in the folder of a surface or below it, at most `MOST_BYTES_IN_ALL` together.
 
     Args:
         path: of the surface.
@@ -51,12 +51,12 @@ class FilesBeside:
         self._found: dict[str, Path] = {}
         self._bytes = MOST_BYTES_IN_ALL
 
-    def find(self, name: str, what: str) -> Path:
+    def find(self, name: str, file_kind: str) -> Path:
         """Return the resolved path of the file called `name`, so that two spellings of one file are recognised.
 
         Args:
             name: as the surface's file has it.
-            what: the file is, for messages.
+            file_kind: the file is, for messages.
 
         Raises:
             TextureError: it lies elsewhere or does not exist, or the surface names too many files.
@@ -69,20 +69,20 @@ class FilesBeside:
         try:
             target = (self._folder / PurePosixPath(name.replace("\\", "/"))).resolve()
             if "://" in name or not target.is_relative_to(self._folder):
-                raise TextureError(f"{what} '{short}' is outside its folder, where nothing is read")
+                raise TextureError(f"{file_kind} '{short}' is outside its folder, where nothing is read")
             if not target.is_file():
-                raise TextureError(f"{what} '{short}' is not in its folder")
+                raise TextureError(f"{file_kind} '{short}' is not in its folder")
         except (OSError, ValueError, RuntimeError) as error:
-            raise TextureError(f"{what} '{short}' cannot be read") from error
+            raise TextureError(f"{file_kind} '{short}' cannot be read") from error
         self._found[name] = target
         return target
 
-    def read(self, file: Path, what: str, at_most: int = LARGEST_FILE_BYTES) -> bytes:
+    def read(self, file: Path, file_kind: str, at_most: int = LARGEST_FILE_BYTES) -> bytes:
         """Return the content of a file that `find` returned.
 
         Args:
             file: its resolved path.
-            what: the file is, for messages.
+            file_kind: the file is, for messages.
             at_most: bytes; a longer file is not read.
 
         Raises:
@@ -91,13 +91,13 @@ class FilesBeside:
         try:
             content = read_bytes(file, min(at_most, self._bytes))
         except (ShapespaceError, OSError) as error:
-            raise TextureError(f"{what} '{_short(file.name)}' cannot be read") from error
+            raise TextureError(f"{file_kind} '{_short(file.name)}' cannot be read") from error
         self._bytes -= len(content)
         return content
 
 
 class Pictures:
-    """The pictures of one surface, each unpacked once, and in all no more than `MOST_PIXELS_IN_ALL`."""
+    """Textures of one surface, each unpacked once, with at most `MOST_PIXELS_IN_ALL` pixels together."""
 
     def __init__(self) -> None:
         self._unpacked: dict[str, ByteArray | TextureError] = {}
@@ -121,10 +121,10 @@ class Pictures:
                 self._unpacked[known] = self._unpack(content(), _short(name))
             except TextureError as reason:
                 self._unpacked[known] = reason
-        found = self._unpacked[known]
-        if isinstance(found, TextureError):
-            raise found
-        return _between(found, uv)
+        picture = self._unpacked[known]
+        if isinstance(picture, TextureError):
+            raise picture
+        return _interpolate(picture, uv)
 
     def _unpack(self, picture: bytes, name: str) -> ByteArray:
         try:
@@ -156,7 +156,7 @@ def _short(name: str) -> str:
     return "".join(letter if letter.isprintable() else "?" for letter in name[:80])
 
 
-def _between(pixels: ByteArray, uv: FloatArray) -> ByteArray:
+def _interpolate(pixels: ByteArray, uv: FloatArray) -> ByteArray:
     height, width = pixels.shape[:2]
     known = np.where(np.isfinite(uv), uv, 0.0)
     # 1 is the last pixel and not the first one again.

@@ -1,4 +1,4 @@
-"""VRML 1 and 2 (`.wrl`): the points and faces of its IndexedFaceSets; textures, normals and colours change nothing.
+"""VRML 1 and 2 (`.wrl`): points and faces of IndexedFaceSets; textures, normals and colours are ignored.
 
 Written from ISO/IEC 14772-1:1997 (VRML 2) and "VRML 1.0 Specification" (1995). BU-3DFE stores its scans as VRML 2: one
 Shape with `coord Coordinate { point [ ... ] }`, `coordIndex [ a, b, c, -1, ... ]`, and texture parts that are skipped.
@@ -16,7 +16,7 @@ from shapespace.errors import MeshError
 from shapespace.io.parsing import (
     CUT_SHORT,
     IndexArray,
-    damaged,
+    damage_error,
     fan_triangles,
     floats,
     floats_of,
@@ -31,7 +31,7 @@ from shapespace.types import FloatArray, Mesh
 _SKIPPED = re.compile(rb'(?:(?:"(?:[^"\\]|\\.)*+(?:"|\\?\Z)|#[^\r\n]*)[\s,]*+)++', re.DOTALL)
 _TO_BRACKET = re.compile(rb"[^{}\[\]]*+")
 _HEXADECIMAL = re.compile(rb"(?<!\S)0[xX][0-9a-fA-F]{1,16}(?!\S)")
-_DEEPEST = 500
+_DEEPEST = 500  # nodes; limit on damaged files
 _POINTS = (b"Coordinate", b"Coordinate3", b"CoordinateDouble")
 _MOVES_OF_VRML_1 = (b"MatrixTransform", b"Translation", b"Rotation", b"Scale")
 _FIELDS = {b"translation": 3, b"rotation": 4, b"scale": 3, b"scaleFactor": 3, b"scaleOrientation": 4, b"center": 3}
@@ -40,7 +40,7 @@ _KNOWN = {b"USE", b"ccw", b"vertexOrdering", *_FIELDS}
 
 @dataclass
 class _Node:
-    """A node, or a list of nodes, whose closing bracket has not come yet."""
+    """A node, or a list of nodes, whose closing bracket has not been read yet."""
 
     kind: bytes
     name: bytes = b""
@@ -56,7 +56,7 @@ class _Node:
 
 @dataclass
 class _Scene:
-    """What has been read so far: blocks of points, triangles with the block that each set points into, and frames.
+    """State of the parser: blocks of points, triangles with the block of their points, and frames.
 
     A frame is what a Transform moves: the frame outside of it, and its (3, 4) matrix, which is only known where the
     Transform ends. Frame 0 is the file's own.
@@ -78,7 +78,7 @@ class _Scene:
 
     def open(self, kind: bytes, name: bytes = b"") -> None:
         if len(self.stack) >= _DEEPEST:
-            raise damaged(self.path, f"its nodes are nested more than {_DEEPEST} deep")
+            raise damage_error(self.path, f"its nodes are nested more than {_DEEPEST} deep")
         self.allowance.part()
         frame = self.frame
         if kind == b"Transform":
@@ -93,11 +93,11 @@ class _Scene:
         return self.stack[-1].frame if self.stack else 0
 
     def words(self, words: list[bytes]) -> None:
-        """Take the plain fields that stand in the innermost node."""
+        """Read the plain fields of the innermost node."""
         node = self.stack[-1] if self.stack else _Node(b"")
-        for at in [at for at, word in enumerate(words) if word in _KNOWN]:
-            word = words[at]
-            after = words[at + 1 : at + 2]
+        for index in [index for index, word in enumerate(words) if word in _KNOWN]:
+            word = words[index]
+            after = words[index + 1 : index + 2]
             if word == b"USE" and after:
                 self.use(after[0], node)
             elif node.kind == b"IndexedFaceSet" and word == b"ccw" and after:
@@ -105,9 +105,9 @@ class _Scene:
             elif node.kind == b"ShapeHints" and word == b"vertexOrdering" and after:
                 self.clockwise = after[0] == b"CLOCKWISE"
             elif node.kind == b"Transform" and word in _FIELDS:
-                numbers = floats(words[at + 1 : at + 1 + _FIELDS[word]], self.path)
+                numbers = floats(words[index + 1 : index + 1 + _FIELDS[word]], self.path)
                 if len(numbers) < _FIELDS[word]:
-                    raise damaged(self.path, f"a Transform has a {word.decode()} of too few numbers; {CUT_SHORT}")
+                    raise damage_error(self.path, f"a Transform has a {word.decode()} of too few numbers; {CUT_SHORT}")
                 node.numbers[b"scale" if word == b"scaleFactor" else word] = numbers
 
     def use(self, name: bytes, node: _Node) -> None:
@@ -118,8 +118,10 @@ class _Scene:
             else:
                 self.last_points = self.named_points[name]
         elif name in self.named_shapes:
-            shown = name[:60].decode("ascii", "replace")
-            raise damaged(self.path, f"it shows the shape '{shown}' twice (USE), so export it again as plain triangles")
+            printable_name = name[:60].decode("ascii", "replace")
+            raise damage_error(
+                self.path, f"it shows the shape '{printable_name}' twice (USE), so export it again as plain triangles"
+            )
 
     def numbers(self, name: bytes, text: bytes) -> None:
         """Take a list that holds no nodes."""
@@ -127,7 +129,7 @@ class _Scene:
         if name == b"point" and node.kind in _POINTS:
             points = floats_of(text.replace(b",", b" "), self.path)
             if len(points) % 3:
-                raise damaged(self.path, f"its points have {len(points)} numbers, not three each; {CUT_SHORT}")
+                raise damage_error(self.path, f"its points have {len(points)} numbers, not three each; {CUT_SHORT}")
             self.blocks.append((points.reshape(-1, 3), node.frame))
             block = len(self.blocks) - 1
             if node.name:
@@ -149,7 +151,9 @@ class _Scene:
             self.move(node)
         elif node.kind in _MOVES_OF_VRML_1:
             kind = node.kind.decode()
-            raise damaged(self.path, f"it moves its shapes by '{kind}' of VRML 1, so export it again as VRML 2 or PLY")
+            raise damage_error(
+                self.path, f"it moves its shapes by '{kind}' of VRML 1, so export it again as VRML 2 or PLY"
+            )
         elif node.kind in (b"Separator", b"TransformSeparator"):
             self.last_points = node.outer_points
         holds_shapes = len(self.sets) > node.first_set or len(self.blocks) > node.first_block
@@ -159,12 +163,12 @@ class _Scene:
     def add_faces(self, node: _Node) -> None:
         block = self.last_points if node.points is None else node.points
         if block is None or node.index is None:
-            raise damaged(self.path, f"an IndexedFaceSet has no points; {CUT_SHORT}")
-        ends = np.flatnonzero(node.index == -1)
-        counts = np.diff(ends, prepend=-1) - 1
+            raise damage_error(self.path, f"an IndexedFaceSet has no points; {CUT_SHORT}")
+        face_ends = np.flatnonzero(node.index == -1)
+        counts = np.diff(face_ends, prepend=-1) - 1
         counts = counts[counts > 0]
         if len(counts) and counts.min() < 3:
-            raise damaged(self.path, f"a face has only {int(counts.min())} corners; {CUT_SHORT}")
+            raise damage_error(self.path, f"a face has only {int(counts.min())} corners; {CUT_SHORT}")
         corners = node.index[node.index >= 0]
         points = len(self.blocks[block][0])
         if len(corners) and corners.max() >= points:
@@ -176,20 +180,20 @@ class _Scene:
         self.sets.append((block, faces[:, ::-1] if node.clockwise else faces, node.frame))
 
     def move(self, node: _Node) -> None:
-        """Apply a Transform to what stands in it: T C R SR S -SR -C, section 6.52 of the standard."""
-        given = node.numbers
+        """Apply a Transform to its children: T C R SR S -SR -C, section 6.52 of the standard."""
+        values = node.numbers
         zero, none = np.zeros(3), np.array([0.0, 0.0, 1.0, 0.0])
-        turned = _turn(given.get(b"scaleOrientation", none))
-        linear = _turn(given.get(b"rotation", none)) @ turned * given.get(b"scale", np.ones(3)) @ turned.T
-        center = given.get(b"center", zero)
-        if (linear == np.eye(3)).all() and not given.get(b"translation", zero).any():
+        orientation = _turn(values.get(b"scaleOrientation", none))
+        linear = _turn(values.get(b"rotation", none)) @ orientation * values.get(b"scale", np.ones(3)) @ orientation.T
+        center = values.get(b"center", zero)
+        if (linear == np.eye(3)).all() and not values.get(b"translation", zero).any():
             return
         if self.version_1:
-            raise damaged(
+            raise damage_error(
                 self.path, "it moves its shapes by 'Transform' of VRML 1, so export it again as VRML 2 or PLY"
             )
         self.moved = True
-        shift = given.get(b"translation", zero) + center - linear @ center
+        shift = values.get(b"translation", zero) + center - linear @ center
         self.frames[node.frame] = (self.frames[node.frame][0], np.column_stack([linear, shift]))
 
     def placed(self) -> tuple[FloatArray, IndexArray | None]:
@@ -199,10 +203,13 @@ class _Scene:
             # An outer frame stands before those in it, so it is in the file's own frame already.
             of_outer = matrices[outer][1]
             matrices.append((outer, of_outer[:, :3] @ inner + np.column_stack([np.zeros((3, 3)), of_outer[:, 3]])))
-        points = [at if not k else at @ matrices[k][1][:, :3].T + matrices[k][1][:, 3] for at, k in self.blocks]
+        points = [
+            vertices if not k else vertices @ matrices[k][1][:, :3].T + matrices[k][1][:, 3]
+            for vertices, k in self.blocks
+        ]
         starts = np.cumsum([0, *map(len, points)])
         mirrored = np.linalg.det(np.stack([matrix[:, :3] for _, matrix in matrices])) < 0
-        faces = [(at[:, ::-1] if mirrored[k] else at) + starts[block] for block, at, k in self.sets]
+        faces = [(vertices[:, ::-1] if mirrored[k] else vertices) + starts[block] for block, vertices, k in self.sets]
         return np.concatenate(points), np.concatenate(faces) if faces else None
 
 
@@ -220,10 +227,10 @@ def _corners(text: bytes, path: Path) -> IndexArray:
     text = text.replace(b",", b" ")
     if b"x" in text or b"X" in text:
         # VRML allows hexadecimal whole numbers.
-        text = _HEXADECIMAL.sub(lambda found: b"%d" % int(found[0], 16), text)
+        text = _HEXADECIMAL.sub(lambda match: b"%d" % int(match[0], 16), text)
     index = ints_of(text, path)
     if len(index) and index.min() < -1:
-        raise damaged(path, f"a face points at vertex {int(index.min())}; {CUT_SHORT}")
+        raise damage_error(path, f"a face points at vertex {int(index.min())}; {CUT_SHORT}")
     # The last face may do without its end.
     return np.append(index, -1) if len(index) and index[-1] != -1 else index
 
@@ -246,11 +253,11 @@ def read_vrml(data: bytes, path: Path) -> Mesh:
     data = plain_text(data)
     scene = _Scene(path, data.lstrip()[:8].upper() == b"#VRML V1", Allowance(len(data), path))
     text = _SKIPPED.sub(b" ", data)
-    at = 0
-    while at < len(text):
-        stop = _to_bracket(text, at)
-        words = text[at:stop].replace(b",", b" ").split()
-        bracket, at = text[stop : stop + 1], stop + 1
+    offset = 0
+    while offset < len(text):
+        stop = _to_bracket(text, offset)
+        words = text[offset:stop].replace(b",", b" ").split()
+        bracket, offset = text[stop : stop + 1], stop + 1
         if bracket == b"{":
             name = words[-2] if words[-3:-2] == [b"DEF"] else b""
             kind = words.pop() if words else b""
@@ -259,33 +266,35 @@ def read_vrml(data: bytes, path: Path) -> Mesh:
         elif bracket == b"[":
             kind = words.pop() if words else b""
             scene.words(words)
-            close = _to_bracket(text, at)
+            close = _to_bracket(text, offset)
             if text[close : close + 1] == b"]":
                 scene.allowance.part()
-                scene.numbers(kind, text[at:close])
-                at = close + 1
+                scene.numbers(kind, text[offset:close])
+                offset = close + 1
             elif close == len(text):
-                raise damaged(path, f"a list has no end; {CUT_SHORT}")
+                raise damage_error(path, f"a list has no end; {CUT_SHORT}")
             elif text[close : close + 1] == b"[" or kind in (b"point", b"coordIndex"):
-                raise damaged(path, f"a list of numbers has brackets in it; {CUT_SHORT}")
+                raise damage_error(path, f"a list of numbers has brackets in it; {CUT_SHORT}")
             else:
                 scene.open(b"[")
         else:
             scene.words(words)
             if bracket:
                 if not scene.stack or (scene.stack[-1].kind == b"[") != (bracket == b"]"):
-                    raise damaged(path, f"its brackets do not match; {CUT_SHORT}")
+                    raise damage_error(path, f"its brackets do not match; {CUT_SHORT}")
                 scene.close()
     if scene.stack:
-        raise damaged(path, f"{len(scene.stack)} of its nodes have no end; {CUT_SHORT}")
+        raise damage_error(path, f"{len(scene.stack)} of its nodes have no end; {CUT_SHORT}")
     if not sum(len(points) for points, _ in scene.blocks):
-        raise damaged(path, "it holds no points of an IndexedFaceSet, so it is not VRML or holds other shapes")
+        raise damage_error(path, "it holds no points of an IndexedFaceSet, so it is not VRML or holds other shapes")
     if scene.shared and scene.moved:
-        raise damaged(path, "shapes that are moved share their points (USE), so export it again as plain triangles")
+        raise damage_error(
+            path, "shapes that are moved share their points (USE), so export it again as plain triangles"
+        )
     return mesh_of(*scene.placed(), path)
 
 
-def _to_bracket(text: bytes, at: int) -> int:
+def _to_bracket(text: bytes, offset: int) -> int:
     """Return where the next bracket is, or the end."""
-    found = _TO_BRACKET.match(text, at)
-    return found.end() if found else len(text)
+    match = _TO_BRACKET.match(text, offset)
+    return match.end() if match else len(text)

@@ -22,13 +22,13 @@ from shapespace.io.parsing import (
     CUT_SHORT,
     IndexArray,
     check_count,
-    damaged,
+    damage_error,
     fan_triangles,
     floats,
     floats_of,
     ints,
     ints_of,
-    joined,
+    join_parts,
     mesh_of,
     plain_text,
     strip_triangles,
@@ -57,14 +57,14 @@ _OFFSETS = re.compile(rb"\s*OFFSETS\s")
 _BLANK_LINE = re.compile(rb"\n[ \t\r]*\n")
 # zlib cannot shrink by more than this (1032 : 1), so a header that promises more lies.
 _MAX_INFLATION = 1040
-_COLOUR_WIDTHS = (3, 4)
-_MOST_ATTRIBUTES = 100
+_COLOUR_WIDTHS = (3, 4)  # RGB and RGBA
+_MOST_ATTRIBUTES = 100  # arrays searched for colours; limit on damaged files
 
 Values = npt.NDArray[Any]
 
 
 class _Cursor(ABC):
-    """Where a legacy file is being read: words here, and numbers as ascii or binary makes them."""
+    """Read position in a legacy file, with words read here and numbers by the ascii or binary subclass."""
 
     def __init__(self, data: bytes, path: Path) -> None:
         self.data, self.at, self.path = data, 0, path
@@ -95,22 +95,22 @@ class _Cursor(ABC):
         for _ in range(count):
             end = self.data.find(b"\n", self.at)
             if end < 0:
-                raise damaged(self.path, f"it ends among its fields; {CUT_SHORT}")
+                raise damage_error(self.path, f"it ends among its fields; {CUT_SHORT}")
             self.at = end + 1
 
     def skip_metadata(self) -> None:
         """Move past a METADATA section, which a blank line ends."""
         blank = _BLANK_LINE.search(self.data, max(self.at - 1, 0))
         if blank is None:
-            raise damaged(self.path, f"it ends among its METADATA; {CUT_SHORT}")
+            raise damage_error(self.path, f"it ends among its METADATA; {CUT_SHORT}")
         self.at = blank.end()
 
     def skip_if_offsets(self) -> bool:
         """Move past the word OFFSETS if it comes next, and return whether it did."""
         # As a number, 'OFFS' would be a polygon of a thousand million corners.
-        found = _OFFSETS.match(self.data, self.at)
-        self.at = found.end() if found else self.at
-        return found is not None
+        match = _OFFSETS.match(self.data, self.at)
+        self.at = match.end() if match else self.at
+        return match is not None
 
 
 class _TextCursor(_Cursor):
@@ -120,15 +120,15 @@ class _TextCursor(_Cursor):
         while count:
             words, stop = word_block(self.data, self.at, 16 * count)
             if not words and stop == len(self.data):
-                raise damaged(self.path, f"it ends among its numbers; {CUT_SHORT}")
+                raise damage_error(self.path, f"it ends among its numbers; {CUT_SHORT}")
             if len(words) > count:
                 # Cut again, to see where the last of them ends.
-                rest = self.data[self.at : stop].split(None, count)[count]
-                words, stop = words[:count], stop - len(rest)
+                remainder = self.data[self.at : stop].split(None, count)[count]
+                words, stop = words[:count], stop - len(remainder)
             parts.append(floats(words, self.path) if kind[0] == "f" else ints(words, self.path))
             self.at = stop
             count -= len(words)
-        return joined(parts, np.float64 if kind[0] == "f" else np.int64)
+        return join_parts(parts, np.float64 if kind[0] == "f" else np.int64)
 
     def skip_texts(self, count: int) -> None:
         self.skip_lines(count)
@@ -153,7 +153,7 @@ class _BinaryCursor(_Cursor):
             length = int.from_bytes(self.data[self.at : self.at + width], "big") & ((1 << (8 * width - 2)) - 1)
             self.at += width + length
             if self.at > len(self.data):
-                raise damaged(self.path, f"it ends among its fields; {CUT_SHORT}")
+                raise damage_error(self.path, f"it ends among its fields; {CUT_SHORT}")
 
     def skip_bits(self, count: int) -> None:
         self.array(-(-count // 8), "u1")
@@ -175,7 +175,7 @@ def read_vtk(data: bytes, path: Path) -> Mesh:
     data = plain_text(data)
     head = data[:1024].split(b"\n", 3)
     if len(head) < 4 or not head[0].startswith(b"# vtk DataFile"):
-        raise damaged(path, "it does not start with '# vtk DataFile', so it is not a VTK file")
+        raise damage_error(path, "it does not start with '# vtk DataFile', so it is not a VTK file")
     encoding = head[2].strip().upper()
     body = data[sum(len(line) + 1 for line in head[:3]) :]
     allowance = Allowance(len(data), path)
@@ -185,11 +185,11 @@ def read_vtk(data: bytes, path: Path) -> Mesh:
     elif encoding == b"BINARY":
         cursor = _BinaryCursor(body, path)
     else:
-        raise damaged(path, "its third line says neither ASCII nor BINARY")
+        raise damage_error(path, "its third line says neither ASCII nor BINARY")
     dataset = cursor.word() + b" " + cursor.word()
     if dataset != b"DATASET POLYDATA":
         kind = dataset.decode("ascii", "replace")[:40]
-        raise damaged(path, f"it has '{kind}', not DATASET POLYDATA; extract its surface first")
+        raise damage_error(path, f"it has '{kind}', not DATASET POLYDATA; extract its surface first")
     vertices: FloatArray | None = None
     faces: list[IndexArray] = []
     while (word := cursor.word()) not in (b"", b"POINT_DATA", b"CELL_DATA"):
@@ -213,11 +213,11 @@ def read_vtk(data: bytes, path: Path) -> Mesh:
             cursor.skip_metadata()
         else:
             name = word.decode("ascii", "replace")[:40]
-            raise damaged(path, f"it has an unknown section '{name}'; {CUT_SHORT}")
+            raise damage_error(path, f"it has an unknown section '{name}'; {CUT_SHORT}")
     if vertices is None:
-        raise damaged(path, f"it has no POINTS; {CUT_SHORT}")
+        raise damage_error(path, f"it has no POINTS; {CUT_SHORT}")
     colours = _legacy_colours(cursor, len(vertices)) if word == b"POINT_DATA" else None
-    return mesh_of(vertices, joined(faces, np.int64, 3), path, colours)
+    return mesh_of(vertices, join_parts(faces, np.int64, 3), path, colours)
 
 
 def _legacy_colours(cursor: _Cursor, vertices: int) -> ByteArray | None:
@@ -299,7 +299,7 @@ def _next_kind(cursor: _Cursor, path: Path) -> str:
 
 def _kind(name: str, path: Path) -> str:
     if name not in _LEGACY:
-        raise damaged(path, f"it has numbers of an unknown type '{name[:40]}'; {CUT_SHORT}")
+        raise damage_error(path, f"it has numbers of an unknown type '{name[:40]}'; {CUT_SHORT}")
     return _LEGACY[name]
 
 
@@ -308,7 +308,7 @@ def _legacy_cells(cursor: _Cursor, path: Path) -> tuple[IndexArray, IndexArray]:
     if cursor.skip_if_offsets():
         offsets = cursor.array(first, _next_kind(cursor, path)).astype(np.int64)
         if cursor.word() != b"CONNECTIVITY":
-            raise damaged(path, f"its cells have OFFSETS without CONNECTIVITY; {CUT_SHORT}")
+            raise damage_error(path, f"its cells have OFFSETS without CONNECTIVITY; {CUT_SHORT}")
         corners = cursor.array(second, _next_kind(cursor, path)).astype(np.int64)
         return _from_offsets(offsets, corners, path)
     packed = cursor.array(second, "i4").astype(np.int64)
@@ -317,12 +317,12 @@ def _legacy_cells(cursor: _Cursor, path: Path) -> tuple[IndexArray, IndexArray]:
         if (table[:, 0] == table.shape[1] - 1).all():
             return table[:, 0], table[:, 1:].ravel()
     sizes: list[int] = []
-    at, values = 0, packed.tolist()
-    while at < second and len(sizes) < first and values[at] >= 0:
-        sizes.append(values[at])
-        at += values[at] + 1
-    if at != second or len(sizes) != first:
-        raise damaged(path, f"its cells do not add up to the size that they declare; {CUT_SHORT}")
+    position, values = 0, packed.tolist()
+    while position < second and len(sizes) < first and values[position] >= 0:
+        sizes.append(values[position])
+        position += values[position] + 1
+    if position != second or len(sizes) != first:
+        raise damage_error(path, f"its cells do not add up to the size that they declare; {CUT_SHORT}")
     counts = np.array(sizes, dtype=np.int64)
     keep = np.ones(second, dtype=np.bool_)
     keep[np.cumsum(counts + 1) - counts - 1] = False
@@ -335,7 +335,7 @@ def _from_offsets(offsets: IndexArray, corners: IndexArray, path: Path) -> tuple
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     counts = np.diff(offsets)
     if offsets[0] != 0 or offsets[-1] != len(corners) or (counts < 0).any():
-        raise damaged(path, f"the offsets of its cells do not match their corners; {CUT_SHORT}")
+        raise damage_error(path, f"the offsets of its cells do not match their corners; {CUT_SHORT}")
     return counts, corners
 
 
@@ -351,13 +351,13 @@ def write_vtk(mesh: Mesh) -> bytes:
     surface = head.encode("ascii") + points + section.encode("ascii") + packed.tobytes() + b"\n"
     if mesh.colours is None:
         return surface
-    told = f"POINT_DATA {n}\nSCALARS RGB unsigned_char 3\nLOOKUP_TABLE default\n"
-    return surface + told.encode("ascii") + mesh.colours.tobytes() + b"\n"
+    colour_header = f"POINT_DATA {n}\nSCALARS RGB unsigned_char 3\nLOOKUP_TABLE default\n"
+    return surface + colour_header.encode("ascii") + mesh.colours.tobytes() + b"\n"
 
 
 @dataclass(frozen=True)
 class _Xml:
-    """What the arrays of one XML file have in common."""
+    """Common properties of the arrays of one XML file."""
 
     path: Path
     order: str
@@ -383,15 +383,15 @@ def read_vtp(data: bytes, path: Path) -> Mesh:
     appended = b""
     if mark:
         # Raw data are not XML, so the XML parser sees only what comes before them.
-        tag, _, rest = tail.partition(b">")
+        tag, _, body = tail.partition(b">")
         head += mark + tag + b"/></VTKFile>"
-        appended = rest.partition(b"_")[2]
+        appended = body.partition(b"_")[2]
     root = xml_root(head, path)
     if root.tag != "VTKFile" or root.get("type") != "PolyData":
-        raise damaged(path, "it is not a VTK file of type PolyData; extract its surface first")
+        raise damage_error(path, "it is not a VTK file of type PolyData; extract its surface first")
     compressor = root.get("compressor", "")
     if compressor not in ("", "vtkZLibDataCompressor"):
-        raise damaged(path, f"it is compressed by {compressor[:40]}, so save it with zlib or uncompressed")
+        raise damage_error(path, f"it is compressed by {compressor[:40]}, so save it with zlib or uncompressed")
     block = root.find("AppendedData")
     base = block is not None and block.get("encoding", "base64") == "base64"
     order = ">" if root.get("byte_order") == "BigEndian" else "<"
@@ -400,7 +400,7 @@ def read_vtp(data: bytes, path: Path) -> Mesh:
     points: list[FloatArray] = []
     colours: list[ByteArray | None] = []
     faces: list[IndexArray] = []
-    before = 0
+    n_vertices = 0
     for piece in root.iterfind("PolyData/Piece"):
         xml.allowance.part()
         vertices = _piece_points(piece, xml)
@@ -408,22 +408,22 @@ def read_vtp(data: bytes, path: Path) -> Mesh:
             arrays = {a.get("Name"): a for a in piece.iterfind(f"{section}/DataArray")}
             if not {"connectivity", "offsets"} <= arrays.keys():
                 continue
-            ends = _data_array(arrays["offsets"], xml).astype(np.int64)
+            face_ends = _data_array(arrays["offsets"], xml).astype(np.int64)
             corners = _data_array(arrays["connectivity"], xml).astype(np.int64)
-            if not len(ends):
+            if not len(face_ends):
                 continue
             xml.allowance.take(3 * len(corners), 8)
-            triangles = cut(*_from_offsets(np.concatenate([[0], ends]), corners, path))
+            triangles = cut(*_from_offsets(np.concatenate([[0], face_ends]), corners, path))
             # Checked piece by piece: joined, an index past one piece would point into the next.
-            faces.append(_faces_of(mesh_of(vertices, triangles, path)) + before)
+            faces.append(_faces_of(mesh_of(vertices, triangles, path)) + n_vertices)
         points.append(vertices)
         colours.append(_piece_colours(piece, len(vertices), xml))
-        before += len(vertices)
+        n_vertices += len(vertices)
     if not points:
-        raise damaged(path, f"it holds no points; {CUT_SHORT}")
-    own = [part for part in colours if part is not None]
-    painted = np.concatenate(own) if len(own) == len(colours) else None
-    return mesh_of(np.concatenate(points), joined(faces, np.int64, 3), path, painted)
+        raise damage_error(path, f"it holds no points; {CUT_SHORT}")
+    known_colours = [part for part in colours if part is not None]
+    vertex_colours = np.concatenate(known_colours) if len(known_colours) == len(colours) else None
+    return mesh_of(np.concatenate(points), join_parts(faces, np.int64, 3), path, vertex_colours)
 
 
 def _faces_of(mesh: Mesh) -> IndexArray:
@@ -436,10 +436,12 @@ def _piece_points(piece: ET.Element, xml: _Xml) -> FloatArray:
     if declared == 0:
         return np.zeros((0, 3))
     if array is None:
-        raise damaged(xml.path, f"it has a piece without points; {CUT_SHORT}")
+        raise damage_error(xml.path, f"it has a piece without points; {CUT_SHORT}")
     values = _data_array(array, xml).astype(np.float64)
     if len(values) != 3 * declared:
-        raise damaged(xml.path, f"it declares {declared} points, but holds {len(values)} numbers for them; {CUT_SHORT}")
+        raise damage_error(
+            xml.path, f"it declares {declared} points, but holds {len(values)} numbers for them; {CUT_SHORT}"
+        )
     return values.reshape(-1, 3)
 
 
@@ -461,82 +463,82 @@ def _data_array(array: ET.Element, xml: _Xml) -> Values:
     path = xml.path
     name = array.get("type", "")
     if name not in _XML:
-        raise damaged(path, f"it has numbers of an unknown type '{name[:40]}'")
+        raise damage_error(path, f"it has numbers of an unknown type '{name[:40]}'")
     kind = np.dtype(xml.order + _XML[name])
     form = array.get("format", "ascii")
     text = (array.text or "").encode("ascii", "replace")
     if form == "ascii":
         return floats_of(text, path) if kind.kind == "f" else ints_of(text, path)
     if form == "binary":
-        raw = _decoded(b"".join(text.split()), 0, True, xml)
+        raw = _decode(b"".join(text.split()), 0, True, xml)
     elif form == "appended":
         offset = int(ints([array.get("offset", "").encode()], path)[0])
         if not 0 <= offset < len(xml.appended):
-            raise damaged(path, f"it has data that start past its end; {CUT_SHORT}")
-        raw = _decoded(xml.appended, offset, xml.appended_base64, xml)
+            raise damage_error(path, f"it has data that start past its end; {CUT_SHORT}")
+        raw = _decode(xml.appended, offset, xml.appended_base64, xml)
     else:
-        raise damaged(path, f"it has data of an unknown form '{form[:40]}'")
+        raise damage_error(path, f"it has data of an unknown form '{form[:40]}'")
     if len(raw) % kind.itemsize:
-        raise damaged(path, f"it has data that end inside a number; {CUT_SHORT}")
+        raise damage_error(path, f"it has data that end inside a number; {CUT_SHORT}")
     # Every array becomes one of eight bytes a number.
     xml.allowance.take(len(raw) // kind.itemsize, 8)
     return np.frombuffer(raw, dtype=kind)
 
 
-def _decoded(data: bytes, at: int, is_base64: bool, xml: _Xml) -> bytes:
-    """Return the bytes of one array that starts at byte `at` of `data`."""
+def _decode(data: bytes, offset: int, is_base64: bool, xml: _Xml) -> bytes:
+    """Return the bytes of one array that starts at byte `offset` of `data`."""
     width = np.dtype(xml.header).itemsize
     if not xml.compressed:
-        (length,) = _words(data, at, 1, is_base64, xml)
+        (length,) = _words(data, offset, 1, is_base64, xml)
         chars = 4 * -(-width // 3)
         # Some writers encode the length by itself, which leaves padding, and others together with the data.
-        if is_base64 and data[at : at + chars].endswith(b"="):
-            return _stream(data, at + chars, 0, length, True, xml)
-        return _stream(data, at, width, length, is_base64, xml)
-    (blocks,) = _words(data, at, 1, is_base64, xml)
-    check_count(blocks, width, len(data) - at, "compressed blocks", xml.path)
+        if is_base64 and data[offset : offset + chars].endswith(b"="):
+            return _stream(data, offset + chars, 0, length, True, xml)
+        return _stream(data, offset, width, length, is_base64, xml)
+    (blocks,) = _words(data, offset, 1, is_base64, xml)
+    check_count(blocks, width, len(data) - offset, "compressed blocks", xml.path)
     xml.allowance.part(blocks)
-    _, size, last, *packed = _words(data, at, 3 + blocks, is_base64, xml)
+    _, size, last, *packed = _words(data, offset, 3 + blocks, is_base64, xml)
     header = (3 + blocks) * width
-    stream = _stream(data, at + (4 * -(-header // 3) if is_base64 else header), 0, sum(packed), is_base64, xml)
+    stream = _stream(data, offset + (4 * -(-header // 3) if is_base64 else header), 0, sum(packed), is_base64, xml)
     out: list[bytes] = []
     begin = 0
     for i, length in enumerate(packed):
         want = last if i == len(packed) - 1 and last else size
         if want > _MAX_INFLATION * (length + 16):
-            raise damaged(xml.path, f"it has a compressed block that claims {want} bytes; {CUT_SHORT}")
+            raise damage_error(xml.path, f"it has a compressed block that claims {want} bytes; {CUT_SHORT}")
         xml.allowance.take(want, 1)
         try:
             piece = zlib.decompressobj().decompress(stream[begin : begin + length], max_length=want or 1)
         except zlib.error as error:
-            raise damaged(xml.path, f"it has a block that cannot be unpacked; {CUT_SHORT}") from error
+            raise damage_error(xml.path, f"it has a block that cannot be unpacked; {CUT_SHORT}") from error
         if len(piece) != want:
-            raise damaged(xml.path, f"it has a compressed block of the wrong length; {CUT_SHORT}")
+            raise damage_error(xml.path, f"it has a compressed block of the wrong length; {CUT_SHORT}")
         out.append(piece)
         begin += length
     return b"".join(out)
 
 
-def _words(data: bytes, at: int, count: int, is_base64: bool, xml: _Xml) -> list[int]:
+def _words(data: bytes, offset: int, count: int, is_base64: bool, xml: _Xml) -> list[int]:
     """Return the `count` whole numbers at the start of an array."""
     kind = np.dtype(xml.header)
-    return np.frombuffer(_stream(data, at, 0, count * kind.itemsize, is_base64, xml), dtype=kind).tolist()
+    return np.frombuffer(_stream(data, offset, 0, count * kind.itemsize, is_base64, xml), dtype=kind).tolist()
 
 
-def _stream(data: bytes, at: int, start: int, length: int, is_base64: bool, xml: _Xml) -> bytes:
-    """Return `length` bytes from byte `start` of what `data` encodes from byte `at` on."""
+def _stream(data: bytes, offset: int, start: int, length: int, is_base64: bool, xml: _Xml) -> bytes:
+    """Return `length` bytes from byte `start` of what `data` encodes from byte `offset` on."""
     end = start + length
-    check_count(end, 1, len(data) - at, "bytes of data", xml.path)
+    check_count(end, 1, len(data) - offset, "bytes of data", xml.path)
     if not is_base64:
-        return data[at + start : at + end]
+        return data[offset + start : offset + end]
     # Arrays may lie on the same bytes, so that each counts by itself.
     xml.allowance.take(end, 1)
     try:
-        raw = base64.b64decode(data[at : at + 4 * -(-end // 3)], validate=True)
+        raw = base64.b64decode(data[offset : offset + 4 * -(-end // 3)], validate=True)
     except ValueError as error:
-        raise damaged(xml.path, f"it has data that are not base64; {CUT_SHORT}") from error
+        raise damage_error(xml.path, f"it has data that are not base64; {CUT_SHORT}") from error
     if len(raw) < end:
-        raise damaged(xml.path, f"it ends inside its data; {CUT_SHORT}")
+        raise damage_error(xml.path, f"it ends inside its data; {CUT_SHORT}")
     return raw[start:end]
 
 
@@ -544,7 +546,7 @@ def write_vtp(mesh: Mesh) -> bytes:
     """Return `mesh` as XML VTK poly data with inline base64, Float64 points, uncompressed."""
     n = len(mesh.vertices)
     cells = np.arange(n, dtype=np.int32).reshape(-1, 1) if mesh.faces is None else mesh.faces
-    ends = np.arange(1, len(cells) + 1, dtype="<i8") * cells.shape[1]
+    face_ends = np.arange(1, len(cells) + 1, dtype="<i8") * cells.shape[1]
     section, verts, polys = ("Verts", n, 0) if mesh.faces is None else ("Polys", 0, len(cells))
 
     def array(name: str, kind: str, values: Values, components: str = "") -> str:
@@ -554,8 +556,8 @@ def write_vtp(mesh: Mesh) -> bytes:
 
     colours: list[str] = []
     if mesh.colours is not None:
-        told = array("RGB", "UInt8", mesh.colours, ' NumberOfComponents="3"')
-        colours = ['<PointData Scalars="RGB">', told, "</PointData>"]
+        colour_array = array("RGB", "UInt8", mesh.colours, ' NumberOfComponents="3"')
+        colours = ['<PointData Scalars="RGB">', colour_array, "</PointData>"]
     lines = [
         '<?xml version="1.0"?>',
         '<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt64">',
@@ -568,7 +570,7 @@ def write_vtp(mesh: Mesh) -> bytes:
         *colours,
         f"<{section}>",
         array("connectivity", "Int64", cells.astype("<i8").ravel()),
-        array("offsets", "Int64", ends),
+        array("offsets", "Int64", face_ends),
         f"</{section}>",
         "</Piece>",
         "</PolyData>",

@@ -1,4 +1,4 @@
-"""Labels of scans from a table such as `shapespace data faces` writes, matched by the names of the scans."""
+"""Labels of scans from a table such as `shapespace data faces` writes, matched by scan name."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from shapespace.io.tables.table_io import KEYS, key_column, table_rows
 
 LABELS_FILE = "labels.csv"
 _LABELS = ("label", "expression", "class", "group", "subject")
-_LARGEST_BYTES = 16 * 2**20
+_LARGEST_BYTES = 16 * 2**20  # 16 MiB
 
 
 @dataclass(frozen=True)
 class Label:
-    """What is known of one scan.
+    """Class, subject and intensity of one scan.
 
     Args:
         text: its class, such as an expression; empty where the table has only its subject.
@@ -74,20 +74,20 @@ def read_labels(path: Path, *, of_subjects: bool = True, of_any: bool = False) -
             f"{path} is no table of labels; it needs rows, a column {' or '.join(KEYS)}, and a column {_LABELS[0]} or "
             f"{_LABELS[1]}."
         )
-    named: dict[str, dict[PurePath, Label]] = {}
+    labels_by_stem: dict[str, dict[PurePath, Label]] = {}
     for row in rows:
         text, subject = row[label], "" if owner is None else row[owner]
         if row[name] and (text or subject):
             place = PurePath(row[name].replace("\\", "/").removesuffix(".gz")).with_suffix("")
             known = None if intensity is None else _intensity(row[intensity])
-            named.setdefault(place.name, {})[place] = Label(text, known, subject)
-    found: dict[str, Label] = {}
-    for stem, group in named.items():
+            labels_by_stem.setdefault(place.name, {})[place] = Label(text, known, subject)
+    labels: dict[str, Label] = {}
+    for stem, group in labels_by_stem.items():
         if len(set(group.values())) == 1:
-            found[stem] = next(iter(group.values()))
+            labels[stem] = next(iter(group.values()))
         else:
-            found |= {"_".join(place.parts): one for place, one in group.items()}
-    return found
+            labels |= {"_".join(place.parts): group_label for place, group_label in group.items()}
+    return labels
 
 
 def label_of(labels: Mapping[str, Label], file: Path) -> Label | None:
@@ -97,12 +97,12 @@ def label_of(labels: Mapping[str, Label], file: Path) -> Label | None:
     return next((labels[name] for name in names if name in labels), None)
 
 
-def _first_classes(heads: Sequence[str], rows: Sequence[Sequence[str]], others: set[int | None]) -> int | None:
+def _first_classes(heads: Sequence[str], rows: Sequence[Sequence[str]], other_columns: set[int | None]) -> int | None:
     """Return the first column of words with repeated values, or None."""
-    for at, head in enumerate(heads):
-        cells = [row[at] for row in rows if row[at]]
-        if head and at not in others and len(set(cells)) < len(cells) and not any(map(is_number, cells)):
-            return at
+    for column, head in enumerate(heads):
+        cells = [row[column] for row in rows if row[column]]
+        if head and column not in other_columns and len(set(cells)) < len(cells) and not any(map(is_number, cells)):
+            return column
     return None
 
 

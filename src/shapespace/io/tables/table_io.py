@@ -58,7 +58,7 @@ def rows_text(rows: Iterable[Sequence[object]]) -> str:
     text = io.StringIO()
     write_row = _row_writer(text)
     for row in rows:
-        write_row([_written(cell) for cell in row])
+        write_row([_escape_formula(cell) for cell in row])
     return text.getvalue()
 
 
@@ -71,13 +71,13 @@ def checked_table_text(header: Sequence[str], rows: Iterable[Sequence[object]]) 
 
 def write_checked(stream: TextIO, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Write the same to `stream`, a row at a time."""
-    at = header.index(CHECKSUM)
-    header = [str(_written(name)) for name in header]
+    checksum_column = header.index(CHECKSUM)
+    header = [str(_escape_formula(name)) for name in header]
     write_row = _row_writer(stream)
     write_row(header)
     for row in rows:
-        cells = ["" if cell is None else str(_written(cell)) for cell in row]
-        write_row([*cells[:at], row_checksum(header, cells), *cells[at + 1 :]])
+        cells = ["" if cell is None else str(_escape_formula(cell)) for cell in row]
+        write_row([*cells[:checksum_column], row_checksum(header, cells), *cells[checksum_column + 1 :]])
 
 
 def _row_writer(stream: TextIO) -> Callable[[Sequence[object]], object]:
@@ -93,24 +93,24 @@ def _row_writer(stream: TextIO) -> Callable[[Sequence[object]], object]:
     return write_row
 
 
-def _written(cell: object) -> object:
-    """Return a cell as it is written: text with an apostrophe where a spreadsheet would run it, others as they are."""
+def _escape_formula(cell: object) -> object:
+    """Return a cell for writing, with an apostrophe before text that a spreadsheet would execute."""
     if not isinstance(cell, str):
         return cell
     text = cell.encode("utf-8", "backslashreplace").decode("utf-8")
     return f"'{text}" if _FORMULA.match(text) and not _NUMBER.fullmatch(text) else text
 
 
-def as_written(cell: str) -> str:
-    """Return the text of a cell without the apostrophe that the writer puts before what a spreadsheet would run."""
+def unescape_formula(cell: str) -> str:
+    """Return the text of a cell without the apostrophe that `_escape_formula` adds."""
     return cell[1:] if cell[:1] == "'" and _FORMULA.match(cell) else cell
 
 
 def row_checksum(header: Sequence[str], cells: Sequence[str]) -> str:
-    """Return what stands in the column `CHECKSUM` of a row; no number is written so, which a program might round."""
+    """Return the value of the column `CHECKSUM` for a row."""
     pairs = sorted((name, cell) for name, cell in zip(header, cells, strict=True) if name != CHECKSUM)
-    said = "\0".join(f"{name}\1{cell}" for name, cell in pairs)
-    return f"sha256:{hashlib.sha256(said.encode('utf-8', 'surrogatepass')).hexdigest()[:16]}"
+    row_text = "\0".join(f"{name}\1{cell}" for name, cell in pairs)
+    return f"sha256:{hashlib.sha256(row_text.encode('utf-8', 'surrogatepass')).hexdigest()[:16]}"
 
 
 def key_column(header: Sequence[str], names: Sequence[str] = KEYS) -> int | None:
@@ -138,24 +138,24 @@ def table_rows(content: bytes) -> Iterator[list[str]]:
             raw.pop()
         if any("\0" in name for name in raw):
             raise ValueError("is not a table but binary, or UTF-16 without a byte order mark")
-        header = [as_written(name).strip() for name in raw]
+        header = [unescape_formula(name).strip() for name in raw]
         known = [name for name in header if name]
         if len(set(known)) != len(known):
-            twice = next(name for name in known if known.count(name) > 1)
-            raise ValueError(f"has two columns of one name ({twice[:40]!r})")
+            repeated = next(name for name in known if known.count(name) > 1)
+            raise ValueError(f"has two columns of one name ({repeated[:40]!r})")
         yield header
-        at, lacking = header.index(CHECKSUM) if CHECKSUM in header else None, 0
+        checksum_column, n_unchecked = header.index(CHECKSUM) if CHECKSUM in header else None, 0
         for number, row in enumerate(lines, 1):
             if len(row) > len(raw) and not any(cell.strip() for cell in row[len(raw) :]):
                 del row[len(raw) :]
-            if len(row) > len(raw) or (at is not None and len(row) != len(raw)):
+            if len(row) > len(raw) or (checksum_column is not None and len(row) != len(raw)):
                 raise ValueError(f"has {len(row)} cells in row {number}, and {len(raw)} columns")
-            if at is not None and row_checksum(raw, row) != row[at]:
+            if checksum_column is not None and row_checksum(raw, row) != row[checksum_column]:
                 raise ValueError(f"was changed in row {number} since it was written, as its column {CHECKSUM} tells")
-            lacking += len(raw) - len(row)
-            if lacking > _MOST_LACKING:
+            n_unchecked += len(raw) - len(row)
+            if n_unchecked > _MOST_LACKING:
                 raise ValueError(f"has rows with far fewer cells than its {len(raw)} columns, such as row {number}")
-            yield [*map(as_written, row), *[""] * (len(raw) - len(row))]
+            yield [*map(unescape_formula, row), *[""] * (len(raw) - len(row))]
     except csv.Error as error:
         raise ValueError(f"is not a CSV table ({error})") from error
 
@@ -172,8 +172,8 @@ def decoded_text(content: bytes) -> str:
         if content.startswith(_UTF_16):
             raise ValueError("is not text, or UTF-16 that is cut short") from error
         # Five bytes have no character in the code page of Windows; Latin-1 has one for each.
-        odd = any(byte in content for byte in (b"\x81", b"\x8d", b"\x8f", b"\x90", b"\x9d"))
-        return content.decode("latin-1" if odd else "cp1252")
+        is_undefined = any(byte in content for byte in (b"\x81", b"\x8d", b"\x8f", b"\x90", b"\x9d"))
+        return content.decode("latin-1" if is_undefined else "cp1252")
 
 
 def _csv_lines(text: str) -> Iterator[list[str]]:
@@ -202,17 +202,17 @@ def _with_decimal_points(lines: list[list[str]]) -> list[list[str]]:
     Raises:
         ValueError: a column has both, or points for thousands.
     """
-    for at, name in enumerate(lines[0] if lines else []):
-        cells = {number: line[at].strip() for number, line in enumerate(lines) if number and at < len(line)}
+    for column, name in enumerate(lines[0] if lines else []):
+        cells = {number: line[column].strip() for number, line in enumerate(lines) if number and column < len(line)}
         cells = {number: cell for number, cell in cells.items() if cell.lower() not in MISSING}
         with_comma = [n for n, cell in cells.items() if _DECIMAL_COMMA.fullmatch(cell) or _THOUSANDS.fullmatch(cell)]
-        rest = [cell for number, cell in cells.items() if number not in set(with_comma)]
-        if not with_comma or not all(_NUMBER.fullmatch(cell) for cell in rest):
+        other_cells = [cell for number, cell in cells.items() if number not in set(with_comma)]
+        if not with_comma or not all(_NUMBER.fullmatch(cell) for cell in other_cells):
             continue
-        if any(_THOUSANDS.fullmatch(cells[n]) for n in with_comma) or not all(map(_INTEGER.fullmatch, rest)):
+        if any(_THOUSANDS.fullmatch(cells[n]) for n in with_comma) or not all(map(_INTEGER.fullmatch, other_cells)):
             raise ValueError(f"writes numbers with commas and with points in the column {name[:40]!r}; use one of them")
         for number in with_comma:
-            lines[number][at] = cells[number].replace(",", ".")
+            lines[number][column] = cells[number].replace(",", ".")
     return lines
 
 
@@ -227,6 +227,6 @@ def _sheet(content: bytes) -> Iterator[list[str]]:
                 f"has a cell outside its table ({row[last - 1][:40]!r}); give that column a name, and leave no title"
                 " above the names of columns"
             )
-        line = [row.get(at, "") for at in range(width)]
+        line = [row.get(column, "") for column in range(width)]
         if any(cell.strip() for cell in line):
             yield line

@@ -1,4 +1,4 @@
-"""Sheets of Excel workbooks (.xlsx, Office Open XML, ECMA-376 part 1) as rows of text, read as a stream and bounded.
+"""Sheets of Excel workbooks (.xlsx, Office Open XML, ECMA-376 part 1) as rows of text, read as a stream with limits.
 
 Numbers are the text that the file stores, dates are ISO 8601, cells with the error #N/A are empty. Formulas have the
 value that was computed last; nothing is computed.
@@ -20,12 +20,12 @@ WORKBOOK_START: Final = b"PK\x03\x04"
 
 _MOST_UNPACKED = 2**26
 """Bytes that a workbook may unpack to (64 MiB), a million cells or more."""
-_MOST_CELLS = 2_000_000
+_MOST_CELLS = 2_000_000  # limit on memory
 _MOST_TEXT = 2**26
 """Characters in all cells together; one shared string may stand in many of them."""
 _MOST_COLUMNS = 16_384
 """Columns of a sheet in Excel (XFD)."""
-_DIGITS = 7
+_DIGITS = 7  # of the index of a text or a style; a damaged file may have any number
 _CELL = re.compile(r"([A-Z]{1,3})[0-9]{1,7}")
 _RELATIONS = "xl/_rels/workbook.xml.rels"
 _LAST_DAY = 2_958_466
@@ -56,13 +56,13 @@ def sheet_rows(content: bytes, sheet: str | None = None) -> list[Row]:
     book = _Elements(("sheet", "workbookPr"))
     _parse(members, "xl/workbook.xml", book)
     sheets = [attributes for tag, attributes in book.found if tag == "sheet"]
-    chosen = next((one for one in sheets if sheet is None or one.get("name") == sheet), None)
+    chosen = next((entry for entry in sheets if sheet is None or entry.get("name") == sheet), None)
     if chosen is None:
         raise ValueError(f"has no sheet called {sheet}" if sheet else "has no sheet, so it is no workbook")
     key = next((value for name, value in chosen.items() if name.endswith("}id")), "")
     relations = _Elements(("Relationship",))
     _parse(members, _RELATIONS, relations)
-    targets = {one.get("Id"): one.get("Target", "") for _, one in relations.found}
+    targets = {entry.get("Id"): entry.get("Target", "") for _, entry in relations.found}
     target = targets.get(key, "").removeprefix("/xl/").removeprefix("xl/")
     shared = _Strings()
     if "xl/sharedStrings.xml" in members:
@@ -70,7 +70,7 @@ def sheet_rows(content: bytes, sheet: str | None = None) -> list[Row]:
     styles = _Elements(("numFmt", "xf", "cellXfs", "cellStyleXfs"))
     if "xl/styles.xml" in members:
         _parse(members, "xl/styles.xml", styles)
-    since_1904 = any(tag == "workbookPr" and one.get("date1904") in ("1", "true") for tag, one in book.found)
+    since_1904 = any(tag == "workbookPr" and entry.get("date1904") in ("1", "true") for tag, entry in book.found)
     cells = _Cells(shared.strings, _date_styles(styles), since_1904=since_1904)
     _parse(members, f"xl/{target}", cells)
     return cells.rows
@@ -85,7 +85,7 @@ class _Target(Protocol):
 
 
 class _Handler:
-    """A target of the XML parser that keeps no tree; document types, and with them entities, are refused."""
+    """A target of the XML parser that builds no tree, and refuses document types and entities."""
 
     def start(self, tag: str, attrs: dict[str, str], /) -> None: ...
 
@@ -100,7 +100,7 @@ class _Handler:
 
 
 class _Elements(_Handler):
-    """The attributes of all elements of some names, in their order."""
+    """Attributes of all elements with given names, in order."""
 
     def __init__(self, names: tuple[str, ...]) -> None:
         self.names = names
@@ -160,9 +160,9 @@ class _Cells(_Handler):
         if name == "row":
             self._row, self._column = {}, -1
         elif name == "c":
-            at = _CELL.fullmatch(attrs.get("r", ""))
+            reference = _CELL.fullmatch(attrs.get("r", ""))
             # A cell without a place follows the one before it.
-            self._column = _column(at[1]) if at else self._column + 1
+            self._column = _column(reference[1]) if reference else self._column + 1
             if self._column >= _MOST_COLUMNS:
                 raise ValueError("has more columns than a sheet can have")
             self._kind, self._style, self._parts = attrs.get("t", "n"), attrs.get("s", "0"), []
@@ -231,20 +231,24 @@ def _parse(members: Mapping[str, bytes], name: str, target: _Target) -> None:
 
 def _date_styles(styles: _Elements) -> frozenset[str]:
     """Return the numbers, as text, of the styles of cells that show dates or times."""
-    codes = {one.get("numFmtId", ""): one.get("formatCode", "") for tag, one in styles.found if tag == "numFmt"}
-    found: set[str] = set()
+    codes = {
+        attributes.get("numFmtId", ""): attributes.get("formatCode", "")
+        for tag, attributes in styles.found
+        if tag == "numFmt"
+    }
+    date_styles: set[str] = set()
     of_cells, number = False, 0
-    for tag, one in styles.found:
+    for tag, attributes in styles.found:
         if tag in ("cellXfs", "cellStyleXfs"):
             of_cells, number = tag == "cellXfs", 0
         elif tag == "xf" and of_cells:
-            key = one.get("numFmtId", "0")
-            own = _NO_CODE.sub("", codes.get(key, "")).lower()
+            key = attributes.get("numFmtId", "0")
+            code = _NO_CODE.sub("", codes.get(key, "")).lower()
             built_in = key not in codes and key.isascii() and key.isdecimal() and len(key) < _DIGITS
-            if (built_in and int(key) in _DATES) or (own != "general" and re.search(r"[ymdhs]", own)):
-                found.add(str(number))
+            if (built_in and int(key) in _DATES) or (code != "general" and re.search(r"[ymdhs]", code)):
+                date_styles.add(str(number))
             number += 1
-    return frozenset(found)
+    return frozenset(date_styles)
 
 
 def _column(letters: str) -> int:

@@ -1,4 +1,5 @@
-"""Label volumes in: NIfTI (`.nii`, `.nii.gz`) and NRRD (`.nrrd`, header and data in one file), as RAS millimetres.
+"""Readers of label volumes: NIfTI (`.nii`, `.nii.gz`) and NRRD (`.nrrd`, header and data in one file), as RAS
+millimetres.
 
 nibabel and pynrrd read the headers; the voxels are decoded here, so that a header that declares more than its file
 holds, a volume that takes more memory than allowed, and a compressed stream that grows without end are refused before
@@ -26,15 +27,15 @@ import numpy.typing as npt
 
 from shapespace.errors import FileError, InputError, ShapespaceError
 from shapespace.io.files import open_file, read_error
-from shapespace.io.parsing import CUT_SHORT, damaged
+from shapespace.io.parsing import CUT_SHORT, damage_error
 from shapespace.types import MAX_MEMORY_BYTES, FloatArray, LabelVolume
 
 VOLUME_ENDINGS = (".nii", ".nii.gz", ".nrrd")
 """The endings that `read_volume` takes."""
 
-_MOST_BYTES = 1 << 31
-_MOST_HEADER = 1 << 20
-_PIECE = 1 << 20
+_MOST_BYTES = 1 << 31  # 2 GiB
+_MOST_HEADER = 1 << 20  # 1 MiB
+_PIECE = 1 << 20  # bytes (1 MiB)
 _WORK_BYTES = 1 << 26
 """Memory of reading besides the labels: libraries, and pieces of 1 MiB as float64 (64 MiB, measured 40)."""
 # No deflate stream grows by more than 1032 to 1.
@@ -66,16 +67,16 @@ _NRRD_SPACES = {
     "left-posterior-superior": (-1, -1, 1), "lps": (-1, -1, 1),
 }  # fmt: skip
 _UNORIENTED = "Its header does not say how it lies in the patient, so that left and right may be swapped."
-_LEAST_MM, _MOST_MM = 1e-4, 1e3
-_FLAT = 1e-4
-_APART_MM = 0.1
+_LEAST_MM, _MOST_MM = 1e-4, 1e3  # mm, voxel sizes from microscopy to thick slices; beyond them the unit is wrong
+_FLAT = 1e-4  # volume of unit axes below which they are coplanar
+_APART_MM = 0.1  # mm by which sform and qform may differ at the corners: rounding, below a voxel
 _ROUNDING = 1e-4
 """Labels that were stored with a slope, or as float32, come back whole but for rounding."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Head:
-    """What a header declares.
+class _VolumeHeader:
+    """Shape, type and orientation that a header declares.
 
     Args:
         shape: of the voxels, in the order of the file, which runs along the first axis first.
@@ -117,7 +118,7 @@ def require_volumes_extra() -> None:
 
 
 def volume_name(path: Path) -> str:
-    """Return the name of the file without its ending, of which `.nii.gz` and `.seg.nrrd` have two parts."""
+    """Return the name of the file without its ending; `.nii.gz` and `.seg.nrrd` are endings of two parts."""
     for ending in (*sorted(VOLUME_ENDINGS, key=len, reverse=True), ".seg"):
         if path.name.lower().endswith(ending) and len(path.name) > len(ending):
             path = path.with_name(path.name[: -len(ending)])
@@ -145,9 +146,9 @@ def read_volume(path: Path | str, *, max_memory_bytes: int = MAX_MEMORY_BYTES) -
     require_volumes_extra()
     name = path.name.lower()
     if name.endswith((".nhdr", ".hdr", ".img")):
-        raise damaged(path, "its header and its data are two files; save it as one, .nii.gz or .nrrd")
+        raise damage_error(path, "its header and its data are two files; save it as one, .nii.gz or .nrrd")
     if not name.endswith(VOLUME_ENDINGS):
-        raise damaged(path, f"it is not a volume by its ending; use one of {', '.join(VOLUME_ENDINGS)}")
+        raise damage_error(path, f"it is not a volume by its ending; use one of {', '.join(VOLUME_ENDINGS)}")
     with open_file(path) as file, ExitStack() as stack:
         try:
             size = os.fstat(file.fileno()).st_size
@@ -156,8 +157,8 @@ def read_volume(path: Path | str, *, max_memory_bytes: int = MAX_MEMORY_BYTES) -
             head, stream = (_open_nrrd if is_nrrd else _open_nifti)(file, size, stack, path)
         except OSError as error:
             raise read_error(path, error) from error
-        shape = _three(head, path)
-        affine = _sound(head.affine, path)
+        shape = _spatial_shape(head, path)
+        affine = _check_affine(head.affine, path)
         labels = _labels(stream, head, max_memory_bytes, path)
     return LabelVolume(labels.reshape(shape, order="F"), affine, path.name, head.notes)
 
@@ -168,10 +169,10 @@ def _check_size(size: int, path: Path) -> None:
             f"Cannot read {path}: it has {size:,} bytes, over the bound of {_MOST_BYTES:,}; crop it, as by 3D Slicer."
         )
     if not size:
-        raise damaged(path, "it is empty; export or copy it again")
+        raise damage_error(path, "it is empty; export or copy it again")
 
 
-def _open_nifti(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tuple[_Head, IO[bytes]]:
+def _open_nifti(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tuple[_VolumeHeader, IO[bytes]]:
     """Return the header of a NIfTI file, and a stream at its first voxel."""
     zipped = file.read(2) == b"\x1f\x8b"
     file.seek(0)
@@ -188,48 +189,53 @@ def _unpacking(path: Path) -> Generator[None]:
     try:
         yield
     except (OSError, EOFError, zlib.error) as error:
-        raise damaged(path, f"its compressed data end early or are wrong; {CUT_SHORT}") from error
+        raise damage_error(path, f"its compressed data end early or are wrong; {CUT_SHORT}") from error
 
 
-def _labels(stream: IO[bytes], head: _Head, max_memory_bytes: int, path: Path) -> npt.NDArray[np.integer[Any]]:
+def _labels(stream: IO[bytes], head: _VolumeHeader, max_memory_bytes: int, path: Path) -> npt.NDArray[np.integer[Any]]:
     """Return the labels as a flat array, decoded in pieces so that no more than the array is in memory at a time."""
-    whole = head.kind.kind in "iu" and (head.slope, head.shift) == (1.0, 0.0)
-    kind: np.dtype[Any] = head.kind.newbyteorder("=") if whole else np.dtype(np.int32)
+    is_integral = head.kind.kind in "iu" and (head.slope, head.shift) == (1.0, 0.0)
+    kind: np.dtype[Any] = head.kind.newbyteorder("=") if is_integral else np.dtype(np.int32)
     count = math.prod(head.shape)
-    needed = count * kind.itemsize + _WORK_BYTES
-    if needed > max_memory_bytes:
+    needed_bytes = count * kind.itemsize + _WORK_BYTES
+    if needed_bytes > max_memory_bytes:
         raise InputError(
-            f"{path} has {' x '.join(map(str, head.shape))} voxels, which take {needed / 2**30:.2g} GiB of memory, "
-            f"over the limit of {max_memory_bytes / 2**30:.2g} GiB; crop or resample it, or allow more (--max-memory)."
+            f"{path} has {' x '.join(map(str, head.shape))} voxels, which take {needed_bytes / 2**30:.2g} GiB of "
+            f"memory, over the limit of {max_memory_bytes / 2**30:.2g} GiB; crop or resample it, or allow "
+            "more (--max-memory)."
         )
     # Pages that stay zero, as most of a mask is, take no memory.
     labels = np.zeros(count, dtype=kind)
     values = _Values()
     buffer = memoryview(bytearray(min(_PIECE, head.bytes)))
-    at = 0
+    offset = 0
     with _unpacking(path):
-        while at < count:
-            wanted = min(len(buffer), (count - at) * head.kind.itemsize)
-            read = _filled(stream, buffer[:wanted])
-            if read < wanted:
-                there = at * head.kind.itemsize + read
-                raise damaged(path, f"it ends after {there:,} of {head.bytes:,} bytes of voxels; {CUT_SHORT}")
-            piece: npt.NDArray[Any] = np.frombuffer(buffer[:wanted], dtype=head.kind)
-            if piece.any() or not whole:
-                labels[at : at + len(piece)] = piece if whole else values.rounded(piece * head.slope + head.shift, path)
-            at += len(piece)
+        while offset < count:
+            request_bytes = min(len(buffer), (count - offset) * head.kind.itemsize)
+            read = _fill_buffer(stream, buffer[:request_bytes])
+            if read < request_bytes:
+                available_values = offset * head.kind.itemsize + read
+                raise damage_error(
+                    path, f"it ends after {available_values:,} of {head.bytes:,} bytes of voxels; {CUT_SHORT}"
+                )
+            piece: npt.NDArray[Any] = np.frombuffer(buffer[:request_bytes], dtype=head.kind)
+            if piece.any() or not is_integral:
+                labels[offset : offset + len(piece)] = (
+                    piece if is_integral else values.rounded(piece * head.slope + head.shift, path)
+                )
+            offset += len(piece)
         # The checksum of a stream is only looked at where it ends.
         stream.read(1)
     values.check(path)
     return labels
 
 
-def _filled(stream: IO[bytes], view: memoryview) -> int:
+def _fill_buffer(stream: IO[bytes], view: memoryview) -> int:
     """Read into `view` until it is full or the stream ends, and return how many bytes were read."""
-    at = 0
-    while at < len(view) and (count := cast(Any, stream).readinto(view[at:])):
-        at += count
-    return at
+    filled = 0
+    while filled < len(view) and (count := cast(Any, stream).readinto(view[filled:])):
+        filled += count
+    return filled
 
 
 @dataclass
@@ -246,9 +252,9 @@ class _Values:
         if not math.isfinite(low) or not math.isfinite(high):
             raise InputError(f"{path} has voxels that are not finite, so it holds no labels; give the label map.")
         self.low, self.high = min(self.low, low), max(self.high, high)
-        found = np.rint(values)
-        self.off = max(self.off, float(np.abs(values - found).max()))
-        return found if self._are_labels() else np.zeros(len(values))
+        whole_values = np.rint(values)
+        self.off = max(self.off, float(np.abs(values - whole_values).max()))
+        return whole_values if self._are_labels() else np.zeros(len(values))
 
     def _are_labels(self) -> bool:
         return max(-self.low, self.high) < 2**31 and self.off <= _ROUNDING
@@ -266,15 +272,15 @@ class _Values:
             )
 
 
-def _nifti_head(start: bytes, path: Path) -> _Head:
+def _nifti_head(start: bytes, path: Path) -> _VolumeHeader:
     import nibabel
 
     size = next((n for n in _HEADS for order in ("<", ">") if start[:4] == np.array(n, order + "i4").tobytes()), 0)
     magic = start[_MAGIC_AT[size] :][:3] if size else b""
     if magic in _PAIR:
-        raise damaged(path, "its header and its data are two files; save it as one, .nii.gz")
+        raise damage_error(path, "its header and its data are two files; save it as one, .nii.gz")
     if magic not in _SINGLE or len(start) < size:
-        raise damaged(path, "its header is not that of a NIfTI volume; export it again as .nii.gz")
+        raise damage_error(path, "its header is not that of a NIfTI volume; export it again as .nii.gz")
     try:
         header: Any = getattr(nibabel, _HEADS[size]).from_fileobj(io.BytesIO(start[:size]), check=False)
         slope, shift = header.get_slope_inter()
@@ -284,13 +290,13 @@ def _nifti_head(start: bytes, path: Path) -> _Head:
         unit = str(header.get_xyzt_units()[0])
     except Exception as error:
         # What nibabel raises of a header that was tampered with is of any kind.
-        raise damaged(path, f"its header is damaged ({_brief(error)}), so export it again") from error
+        raise damage_error(path, f"its header is damaged ({_first_words(error)}), so export it again") from error
     if unit not in _NIFTI_MM:
-        raise damaged(path, f"its header gives lengths in '{unit}', so export it again in mm")
+        raise damage_error(path, f"its header gives lengths in '{unit}', so export it again in mm")
     if offset < size:
-        raise damaged(path, f"its header says that the voxels begin within the header; {CUT_SHORT}")
+        raise damage_error(path, f"its header says that the voxels begin within the header; {CUT_SHORT}")
     slope, shift = (1.0, 0.0) if slope is None else (float(slope), float(shift or 0.0))
-    return _Head(shape, kind, offset, _in_mm(affine, _NIFTI_MM[unit]), slope, shift, notes)
+    return _VolumeHeader(shape, kind, offset, _in_mm(affine, _NIFTI_MM[unit]), slope, shift, notes)
 
 
 def _nifti_affine(header: Any) -> tuple[FloatArray, tuple[str, ...]]:
@@ -303,10 +309,12 @@ def _nifti_affine(header: Any) -> tuple[FloatArray, tuple[str, ...]]:
     affine = np.array(form, dtype=np.float64)
     notes: tuple[str, ...] = ()
     if other_code and other is not None:
-        ends = np.array([[0, 0, 0, 1], [*np.array(header.get_data_shape())[:3], 1]], dtype=np.float64)
-        apart = float(np.abs(ends @ (affine - np.asarray(other)).T).max())
-        if apart > _APART_MM:
-            notes = (f"Its header says in two ways where it lies, up to {apart:.3g} mm apart; the sform is taken.",)
+        corners = np.array([[0, 0, 0, 1], [*np.array(header.get_data_shape())[:3], 1]], dtype=np.float64)
+        distance_mm = float(np.abs(corners @ (affine - np.asarray(other)).T).max())
+        if distance_mm > _APART_MM:
+            notes = (
+                f"Its header says in two ways where it lies, up to {distance_mm:.3g} mm apart; the sform is taken.",
+            )
     return affine, notes
 
 
@@ -317,26 +325,26 @@ def _quiet_qform(header: Any) -> tuple[Any, int]:
         return None, 0
 
 
-def _open_nrrd(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tuple[_Head, IO[bytes]]:
+def _open_nrrd(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tuple[_VolumeHeader, IO[bytes]]:
     """Return the header of a NRRD file, and a stream at its first voxel."""
     import nrrd
 
     data = file.read(_MOST_HEADER)
     if data[:4] != b"NRRD":
-        raise damaged(path, "its header is not that of a NRRD volume; export it again as .nrrd")
-    ends = [(at, len(blank)) for blank in (b"\n\n", b"\r\n\r\n") if (at := data.find(blank)) >= 0]
-    if not ends:
-        raise damaged(path, f"its header has no end; {CUT_SHORT}")
-    start = sum(min(ends))
+        raise damage_error(path, "its header is not that of a NRRD volume; export it again as .nrrd")
+    header_ends = [(position, len(blank)) for blank in (b"\n\n", b"\r\n\r\n") if (position := data.find(blank)) >= 0]
+    if not header_ends:
+        raise damage_error(path, f"its header has no end; {CUT_SHORT}")
+    start = sum(min(header_ends))
     try:
         fields: dict[str, Any] = dict(nrrd.read_header(io.BytesIO(data[:start])))
     except Exception as error:
         # What pynrrd raises of a header that was tampered with is of any kind.
-        raise damaged(path, f"its header is damaged ({_brief(error)}), so export it again") from error
+        raise damage_error(path, f"its header is damaged ({_first_words(error)}), so export it again") from error
     if "data file" in fields or "datafile" in fields:
-        raise damaged(path, "its data are in another file; save it with header and data in one")
+        raise damage_error(path, "its data are in another file; save it with header and data in one")
     if any(fields.get(key) for key in ("line skip", "lineskip", "byte skip", "byteskip")):
-        raise damaged(path, "its header skips a part of the data, which is not read; save it again")
+        raise damage_error(path, "its header skips a part of the data, which is not read; save it again")
     head = _nrrd_head(fields, path)
     encoding = str(fields.get("encoding", "")).lower()
     file.seek(start)
@@ -349,19 +357,19 @@ def _open_nrrd(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tuple
     if encoding in ("bzip2", "bz2"):
         _check_declared(head, _BZIP2_SPARE + _BZIP2_GROWTH * (size - start), path)
         return head, stack.enter_context(bz2.BZ2File(file))
-    raise damaged(path, f"its encoding is '{encoding}', but only raw, gzip and bzip2 are read; save it again")
+    raise damage_error(path, f"its encoding is '{encoding}', but only raw, gzip and bzip2 are read; save it again")
 
 
-def _nrrd_head(fields: dict[str, Any], path: Path) -> _Head:
+def _nrrd_head(fields: dict[str, Any], path: Path) -> _VolumeHeader:
     kinds = {name: code for code, names in _NRRD_TYPES.items() for name in names}
     code = kinds.get(str(fields.get("type", "")).lower())
     if code is None:
-        raise damaged(
+        raise damage_error(
             path, f"its voxels are of the type '{fields.get('type')}', which holds no labels; export it again"
         )
     order = str(fields.get("endian", "little")).lower()
     if order not in ("little", "big"):
-        raise damaged(path, f"its header says endian '{order[:40]}', so export it again")
+        raise damage_error(path, f"its header says endian '{order[:40]}', so export it again")
     try:
         shape = tuple(int(n) for n in fields["sizes"])
         if len(shape) != int(fields["dimension"]):
@@ -370,9 +378,9 @@ def _nrrd_head(fields: dict[str, Any], path: Path) -> _Head:
     except InputError:
         raise
     except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
-        raise damaged(path, f"its header is damaged ({_brief(error)}), so export it again") from error
+        raise damage_error(path, f"its header is damaged ({_first_words(error)}), so export it again") from error
     kind = np.dtype(code).newbyteorder("<" if order == "little" else ">")
-    return _Head(shape, kind, 0, affine, notes=notes, axes=axes)
+    return _VolumeHeader(shape, kind, 0, affine, notes=notes, axes=axes)
 
 
 def _nrrd_affine(fields: dict[str, Any], path: Path) -> tuple[FloatArray, tuple[str, ...], tuple[int, ...]]:
@@ -384,8 +392,8 @@ def _nrrd_affine(fields: dict[str, Any], path: Path) -> tuple[FloatArray, tuple[
         spacings = np.asarray(fields["spacings"], dtype=np.float64)
         axes = tuple(map(int, np.flatnonzero(~np.isnan(spacings))))
         return _affine(np.diag(spacings[list(axes[:3])]), np.zeros(3)), (_UNORIENTED,), axes
-    given = [None if row is None else np.asarray(row, dtype=np.float64) for row in directions]
-    rows = {axis: row for axis, row in enumerate(given) if row is not None and not np.isnan(row).all()}
+    axis_vectors = [None if row is None else np.asarray(row, dtype=np.float64) for row in directions]
+    rows = {axis: row for axis, row in enumerate(axis_vectors) if row is not None and not np.isnan(row).all()}
     if len(rows) != 3 or any(row.shape != (3,) for row in rows.values()):
         raise InputError(f"{path}: it does not lie in a space of three dimensions; save one volume of labels as LPS.")
     signs = _NRRD_SPACES.get(space)
@@ -410,25 +418,25 @@ def _in_mm(affine: FloatArray, mm: float) -> FloatArray:
     return _affine(affine[:3, :3] * mm, affine[:3, 3] * mm)
 
 
-def _check_declared(head: _Head, most_bytes: int, path: Path) -> None:
-    """Refuse a header that declares no voxels of labels, or more than `most_bytes`, to which its file can unpack."""
+def _check_declared(head: _VolumeHeader, most_bytes: int, path: Path) -> None:
+    """Refuse a header that declares no label voxels, or more bytes than its file can unpack to."""
     size = " x ".join(map(str, head.shape)) or "no"
     if head.kind.kind not in "iuf":
         raise InputError(f"{path} has voxels of colours or complex numbers, not of labels; save the label map alone.")
     if not head.shape or min(head.shape) < 1:
-        raise damaged(path, f"its header declares {size} voxels, so that there are none; export it again")
+        raise damage_error(path, f"its header declares {size} voxels, so that there are none; export it again")
     if head.bytes > _MOST_BYTES:
-        raise damaged(
+        raise damage_error(
             path,
             f"its header declares {size} voxels, {head.bytes:,} bytes, over the bound of {_MOST_BYTES:,}; crop it, as "
             "by 3D Slicer",
         )
     if head.start + head.bytes > _MOST_BYTES + _MOST_HEADER or head.start + head.bytes > most_bytes:
-        raise damaged(path, f"its header declares {size} voxels, more than the file can hold; {CUT_SHORT}")
+        raise damage_error(path, f"its header declares {size} voxels, more than the file can hold; {CUT_SHORT}")
 
 
-def _three(head: _Head, path: Path) -> tuple[int, ...]:
-    """Return the lengths of the three axes of space; all others must have the length 1."""
+def _spatial_shape(head: _VolumeHeader, path: Path) -> tuple[int, ...]:
+    """Return the lengths of the three spatial axes; all other axes must have length 1."""
     size = " x ".join(map(str, head.shape))
     if len(head.shape) < 3 or len(head.axes) != 3:
         raise InputError(f"{path} has {len(head.shape)} dimensions ({size}), which is no volume; give one of labels.")
@@ -437,22 +445,22 @@ def _three(head: _Head, path: Path) -> tuple[int, ...]:
     return tuple(head.shape[axis] for axis in head.axes)
 
 
-def _sound(affine: FloatArray, path: Path) -> FloatArray:
+def _check_affine(affine: FloatArray, path: Path) -> FloatArray:
     steps = affine[:3, :3]
     wrong = ""
     if not np.isfinite(affine).all():
         wrong = "has numbers that are not finite"
     else:
         lengths = np.linalg.norm(steps, axis=0)
-        told = " x ".join(f"{length:.3g}" for length in lengths)
+        lengths_text = " x ".join(f"{length:.3g}" for length in lengths)
         if not lengths.all() or abs(np.linalg.det(steps / lengths)) < _FLAT:
             wrong = "is singular, so that voxels have no volume"
         elif lengths.min() < _LEAST_MM or lengths.max() > _MOST_MM:
-            wrong = f"gives voxels of {told} mm"
+            wrong = f"gives voxels of {lengths_text} mm"
     if wrong:
         raise InputError(f"{path}: its affine {wrong}; export it again with voxel sizes and directions.")
     return affine
 
 
-def _brief(error: Exception) -> str:
+def _first_words(error: Exception) -> str:
     return " ".join(str(error).rstrip(".").split())[:80] or type(error).__name__

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.cohort.table import named
+from shapespace.cohort.table import list_names
 from shapespace.geometry.distortion import factor_to_draw, flip_factor
 from shapespace.report.analyses.analysis_report import REDUCED_MORPH_NOTE, AnalysisReport, Rows
 from shapespace.report.analyses.methods_section import (

@@ -239,7 +239,7 @@ def surface_to_turn(page: Page, fit: SavedFit, surfaces: Mapping[str, Mesh], why
     still = thumbnails.mesh_still(surfaces["final"], (420, 420))
     return page.turning(
         "fit",
-        pack_surfaces(surfaces, fit.record, name=fit.name, label=fit.label, why=why, largest=SCAN_TRIANGLES),
+        pack_surfaces(surfaces, fit.record, name=fit.name, label=fit.label, reason=why, largest=SCAN_TRIANGLES),
         page.image(still, f"The fitted surface of {fit.name}"),
         f"{fit.label}: the fitted surface; {why.removesuffix('.')}.",
         label=f"Fitted surface of {fit.label}, to be turned",

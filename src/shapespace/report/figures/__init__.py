@@ -11,7 +11,7 @@ Pictures of one row share camera and light, one figure has one scale, and the ma
 readers. Importing this package needs the extra `report`.
 """
 
-from shapespace.report.figures.analysis_figures import histogram_figure, looked_at, morph_figure, surface_map_figure
+from shapespace.report.figures.analysis_figures import histogram_figure, morph_figure, surface_map_figure, upright_views
 from shapespace.report.figures.coefficient_figures import Coefficients, b_plane, b_space, scatter_matrix
 from shapespace.report.figures.correspondence_figures import (
     SIDE_DEG,
@@ -88,7 +88,6 @@ __all__ = [
     "history_figure",
     "learning_curve_figure",
     "levels_figure",
-    "looked_at",
     "mean_figure",
     "missing_figure",
     "mode_animation",
@@ -108,4 +107,5 @@ __all__ = [
     "stages_figure",
     "surface_map_figure",
     "threshold_figure",
+    "upright_views",
 ]

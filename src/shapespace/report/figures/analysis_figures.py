@@ -1,4 +1,4 @@
-"""Figures of analyses of cohorts: numbers on a surface from all sides, two shapes beside each other, histograms."""
+"""Figures of cohort analyses: maps on a surface, pairs of shapes, histograms."""
 
 from __future__ import annotations
 
@@ -29,20 +29,21 @@ from shapespace.report.figures.draw import (
 from shapespace.report.inputs.correspondence_folder import upright
 from shapespace.report.inputs.staged_fit import nice_ceiling
 from shapespace.report.render.palette import CATEGORIES, DIVERGING, SEQUENTIAL
-from shapespace.report.render.renderer import Camera, Image, Layer, covered, render
+from shapespace.report.render.renderer import Camera, Image, Layer, render, visible_triangles
 from shapespace.types import BoolArray, FloatArray, Mesh
 
 _CLOSED = (("front", 0.0), ("one side", 90.0), ("back", 180.0), ("other side", 270.0))
 _OPEN = (("one side", -55.0), ("front", 0.0), ("other side", 55.0))
+# share of the area that faces one way in an open surface, and cosine to the viewer that needs no rotation
 _OPEN_SHARE, _AS_IT_STANDS = 0.15, 0.7
-_PALE = 0.72
-_FARTHEST_MM = 1e7
-_MOST_SERIES = 12
-_MOST_BINS = 2000
+_PALE = 0.72  # share of white outside the mask
+_FARTHEST_MM = 1e7  # mm (10 km); single precision cannot draw beyond it
+_MOST_SERIES = 12  # colours that can be distinguished
+_MOST_BINS = 2000  # above the pixels of a figure nothing is gained
 
 
-def looked_at(mesh: Mesh) -> tuple[FloatArray, Sequence[tuple[str, float]]]:
-    """Return the rotation (3, 3) that brings `mesh` to how it is looked at, and names of views with their yaw, degrees.
+def upright_views(mesh: Mesh) -> tuple[FloatArray, Sequence[tuple[str, float]]]:
+    """Return the rotation (3, 3) that brings `mesh` upright, and names of views with their yaw, degrees.
 
     It stays as it stands where that is upright with its front along +z, as faces are; otherwise its principal axes
     turn it. A surface that is open to one side is seen from the other alone.
@@ -50,28 +51,30 @@ def looked_at(mesh: Mesh) -> tuple[FloatArray, Sequence[tuple[str, float]]]:
     Raises:
         InputError: it has no extent, or one beyond all measure.
     """
-    at = mesh.vertices
-    if not np.abs(at).max(initial=0.0) < _FARTHEST_MM or not np.ptp(at, axis=0).max(initial=0.0) > 0:
+    vertices = mesh.vertices
+    if not np.abs(vertices).max(initial=0.0) < _FARTHEST_MM or not np.ptp(vertices, axis=0).max(initial=0.0) > 0:
         raise InputError("There is no surface to draw in vertices without extent, or beyond 10 km.")
     if mesh.faces is None:
         return np.eye(3), _CLOSED
-    vectors = face_vectors(at, faces_of(mesh))
+    vectors = face_vectors(vertices, faces_of(mesh))
     facing, area = vectors.sum(axis=0), float(np.linalg.norm(vectors, axis=1).sum())
     is_open = float(np.linalg.norm(facing)) > _OPEN_SHARE * area
-    longest = np.linalg.eigh(np.cov(at.T))[1][:, 2]
-    stands = facing[2] > _AS_IT_STANDS * np.linalg.norm(facing) if is_open else abs(longest[1]) > _AS_IT_STANDS
-    return np.eye(3) if stands else upright(mesh), _OPEN if is_open else _CLOSED
+    longest = np.linalg.eigh(np.cov(vertices.T))[1][:, 2]
+    is_standing = facing[2] > _AS_IT_STANDS * np.linalg.norm(facing) if is_open else abs(longest[1]) > _AS_IT_STANDS
+    return np.eye(3) if is_standing else upright(mesh), _OPEN if is_open else _CLOSED
 
 
 def _views(points: FloatArray, yaws: Sequence[float], columns: int) -> tuple[list[Camera], tuple[int, int]]:
-    """Return cameras of one scale for all of `yaws`, and the size of their pictures."""
-    seen = [view(points, columns, yaw_deg=yaw) for yaw in yaws]
-    width, height = seen[0].size
-    tall = max(one.camera.height_mm for one in seen)
-    across = max(one.camera.height_mm * one.size[0] / one.size[1] for one in seen)
+    """Return cameras with one scale for all of `yaws`, and the size of their images."""
+    views = [view(points, columns, yaw_deg=yaw) for yaw in yaws]
+    width, height = views[0].size
+    tall = max(item.camera.height_mm for item in views)
+    across = max(item.camera.height_mm * item.size[0] / item.size[1] for item in views)
     height = min(max(round(width * tall / across), round(width / 3)), round(width * 1.5))
-    own = max(tall, across * height / width)
-    cameras = [Camera(one.camera.centre, own, one.camera.yaw_deg, 0.0, one.camera.distance_mm) for one in seen]
+    width_mm = max(tall, across * height / width)
+    cameras = [
+        Camera(item.camera.centre, width_mm, item.camera.yaw_deg, 0.0, item.camera.distance_mm) for item in views
+    ]
     return cameras, (width, height)
 
 
@@ -103,33 +106,33 @@ def surface_map_figure(
     if values.shape != (count,) or (mask is not None and mask.shape != (count,)):
         raise InputError(f"A surface of {count} vertices needs one number each, not {values.shape}.")
     known = np.isfinite(values)
-    shown = np.abs(values[known & mask] if mask is not None and (known & mask).any() else values[known])
-    if not len(shown):
+    magnitudes = np.abs(values[known & mask] if mask is not None and (known & mask).any() else values[known])
+    if not len(magnitudes):
         raise InputError("There is nothing to draw on a surface without numbers.")
     if limit is not None and not 0 < limit < np.inf:
         raise InputError(f"The colours of a map cannot end at {limit}.")
-    end = nice_ceiling(float(np.quantile(shown, 0.98)) or float(shown.max())) if limit is None else limit
-    turn, sides = looked_at(mesh)
-    turned = mesh.with_vertices(mesh.vertices @ turn.T)
+    end = nice_ceiling(float(np.quantile(magnitudes, 0.98)) or float(magnitudes.max())) if limit is None else limit
+    turn, sides = upright_views(mesh)
+    turned_mesh = mesh.with_vertices(mesh.vertices @ turn.T)
     scalars = np.clip(values, -4 * end, 4 * end)
     low, colours = (-end, DIVERGING) if signed else (0.0, SEQUENTIAL)
-    full = Layer(turned, scalars=scalars, colormap=colours, vmin=low, vmax=end)
-    faint = Layer(turned, scalars=scalars, colormap=_PALE + (1 - _PALE) * colours, vmin=low, vmax=end)
-    cameras, size = _views(turned.vertices, [yaw for _, yaw in sides], len(sides))
+    full = Layer(turned_mesh, scalars=scalars, colormap=colours, vmin=low, vmax=end)
+    faint = Layer(turned_mesh, scalars=scalars, colormap=_PALE + (1 - _PALE) * colours, vmin=low, vmax=end)
+    cameras, size = _views(turned_mesh.vertices, [yaw for _, yaw in sides], len(sides))
     panels: list[Image] = []
     for camera in cameras:
-        drawn = render(full, camera=camera, size=size)
+        image = render(full, camera=camera, size=size)
         if mask is not None and not mask.all():
-            drawn = _mixed(drawn, render(faint, camera=camera, size=size), _inside(turned, mask, camera, size))
-        panels.append(drawn)
-    ends = {(True, True): "both", (True, False): "low", (False, True): "high"}
-    beyond = ends.get((bool(values[known].min() < low), bool(values[known].max() > end)), "neither")
+            image = _blend(image, render(faint, camera=camera, size=size), _inside(turned_mesh, mask, camera, size))
+        panels.append(image)
+    extend_words = {(True, True): "both", (True, False): "low", (False, True): "high"}
+    extend = extend_words.get((bool(values[known].min() < low), bool(values[known].max() > end)), "neither")
     notes = ["Grey: no value."] if not known.all() else []
     notes += ["Pale: outside of what is marked."] if mask is not None and not mask.all() else []
     return grid(
         [Row(panels, [name for name, _ in sides])],
         title=None if title is None else title or f"{plain(unit)} on the surface",
-        scale=Scale(short(unit, 70), colours, low, end, beyond),
+        scale=Scale(short(unit, 70), colours, low, end, extend),
         note=" ".join(notes),
     )
 
@@ -139,19 +142,19 @@ def _inside(mesh: Mesh, mask: BoolArray, camera: Camera, size: tuple[int, int]) 
     width, height = size
     if mesh.faces is None:
         lit = Layer(mesh, scalars=mask.astype(float), colormap=np.eye(3)[[0, 1]], categories=True)
-        drawn = render(lit, camera=camera, size=size).astype(float)
-        return drawn[:, :, 1] / np.maximum(drawn[:, :, 0] + drawn[:, :, 1], 1.0)
-    triangle, _ = covered(mesh, camera=camera, size=(2 * width, 2 * height))
+        image = render(lit, camera=camera, size=size).astype(float)
+        return image[:, :, 1] / np.maximum(image[:, :, 0] + image[:, :, 1], 1.0)
+    triangle, _ = visible_triangles(mesh, camera=camera, size=(2 * width, 2 * height))
     inside = np.append(mask[mesh.faces].sum(axis=1) >= 2, [True])[triangle]
     return inside.reshape(height, 2, width, 2).mean(axis=(1, 3))
 
 
-def _mixed(one: Image, other: Image, share: FloatArray) -> Image:
-    return np.rint(other + (one.astype(float) - other) * share[:, :, None]).astype(np.uint8)
+def _blend(first: Image, second: Image, share: FloatArray) -> Image:
+    return np.rint(second + (first.astype(float) - second) * share[:, :, None]).astype(np.uint8)
 
 
 def morph_figure(low: Mesh, high: Mesh, labels: tuple[str, str], *, title: str | None = "") -> Figure:
-    """Draw two shapes in correspondence beside each other, from one camera.
+    """Draw two shapes in correspondence side by side, from one camera.
 
     Args:
         low: one shape.
@@ -162,13 +165,13 @@ def morph_figure(low: Mesh, high: Mesh, labels: tuple[str, str], *, title: str |
     Raises:
         InputError: no extent, or one beyond all measure.
     """
-    turn, sides = looked_at(low)
-    both = [mesh.with_vertices(mesh.vertices @ turn.T) for mesh in (low, high)]
+    turn, sides = upright_views(low)
+    end_meshes = [mesh.with_vertices(mesh.vertices @ turn.T) for mesh in (low, high)]
     # Half from the side, where a change of depth is seen too.
     yaws = [0.0, 40.0 if sides is _OPEN else 90.0]
-    points = np.concatenate([mesh.vertices for mesh in both])
+    points = np.concatenate([mesh.vertices for mesh in end_meshes])
     cameras, size = _views(points, yaws, 4)
-    panels = [render(Layer(mesh), camera=camera, size=size) for mesh in both for camera in cameras]
+    panels = [render(Layer(mesh), camera=camera, size=size) for mesh in end_meshes for camera in cameras]
     names = [short(label, 30) for label in labels for _ in yaws]
     both_named = f"{plain(labels[0])}, and {plain(labels[1])}"
     return grid([Row(panels, names)], title=None if title is None else title or both_named)
@@ -196,20 +199,20 @@ def histogram_figure(
     Raises:
         InputError: edges that do not rise, counts of another length or below 0, or nothing to draw.
     """
-    ends = np.asarray(edges, dtype=np.float64)
-    if not 2 <= len(ends) <= _MOST_BINS or not np.isfinite(ends).all() or not (np.diff(ends) > 0).all():
+    bin_edges = np.asarray(edges, dtype=np.float64)
+    if not 2 <= len(bin_edges) <= _MOST_BINS or not np.isfinite(bin_edges).all() or not (np.diff(bin_edges) > 0).all():
         raise InputError(f"A histogram needs 2 to {_MOST_BINS} edges that rise.")
     if not 1 <= len(series) <= _MOST_SERIES:
         raise InputError(f"A histogram has 1 to {_MOST_SERIES} series, not {len(series)}.")
     figure, axes = chart(title or f"Distribution of {plain(x)}", height=3.0)
     for k, (name, counts) in enumerate(series):
-        many = np.asarray(counts, dtype=np.float64)
-        if many.shape != (len(ends) - 1,) or not np.isfinite(many).all() or (many < 0).any():
-            raise InputError(f"The histogram {short(name)!r} needs {len(ends) - 1} counts that are not negative.")
+        heights = np.asarray(counts, dtype=np.float64)
+        if heights.shape != (len(bin_edges) - 1,) or not np.isfinite(heights).all() or (heights < 0).any():
+            raise InputError(f"The histogram {short(name)!r} needs {len(bin_edges) - 1} counts that are not negative.")
         colour, filled = CATEGORIES[k % len(CATEGORIES)], 0.55 if len(series) == 1 else 0.3
-        axes.stairs(many, ends, fill=True, color=colour, alpha=filled, label=escaped(short(name, 40)) or None)
-        axes.stairs(many, ends, color=colour, lw=1.6)
-    low, high = float(ends[0]), float(ends[-1])
+        axes.stairs(heights, bin_edges, fill=True, color=colour, alpha=filled, label=escaped(short(name, 40)) or None)
+        axes.stairs(heights, bin_edges, color=colour, lw=1.6)
+    low, high = float(bin_edges[0]), float(bin_edges[-1])
     if observed is not None:
         if not np.isfinite(observed):
             raise InputError("What was observed among the values of a histogram must be a finite number.")

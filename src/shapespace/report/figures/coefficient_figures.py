@@ -1,4 +1,4 @@
-"""Figures of coefficients: against each other, and as lines of expressions through the neutral face."""
+"""Figures of coefficients: scatter plots, and lines of expressions through the neutral face."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
-_MOST_IN_LEGEND = 16
-_MOST_DOTS_BIG = 60
+_MOST_IN_LEGEND = 16  # layout: entries
+_MOST_DOTS_BIG = 60  # layout: dots drawn at full size
 _LEGEND_MARK, _LEGEND_LINE = 3.6 * SMALL * DPI / 72, 1.1
-_SPACE_INCHES = 2.5
+_SPACE_INCHES = 2.5  # layout: inches per panel
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,7 @@ class Coefficients:
 
 
 def scatter_matrix(points: Sequence[Coefficients], modes: int = 4, *, title: str = "") -> Figure:
-    """Draw the first coefficients against each other, one colour a label, with their spread on the diagonal.
+    """Draw the first coefficients against each other, one colour per label, with distributions on the diagonal.
 
     Args:
         points: the scans.
@@ -71,27 +71,27 @@ def scatter_matrix(points: Sequence[Coefficients], modes: int = 4, *, title: str
     Raises:
         InputError: no scans, or scans with different numbers of coefficients.
     """
-    b = _stacked(points)
-    shown = min(modes, b.shape[1])
-    heading = title or f"The first {counted(shown, 'coefficient')} of {counted(len(points), 'scan')}, in mm"
-    if shown == 1:
+    b = _stack_coefficients(points)
+    n_shown = min(modes, b.shape[1])
+    heading = title or f"The first {counted(n_shown, 'coefficient')} of {counted(len(points), 'scan')}, in mm"
+    if n_shown == 1:
         heading = title or f"The one coefficient of {counted(len(points), 'scan')}, in mm"
     groups = _groups(points)
     handles = _handles(groups)
-    if shown == 1:
+    if n_shown == 1:
         figure, axes = chart(heading, height=2.8)
         _spread(axes, b[:, 0], groups)
         axes.set(xlabel="b1 (mm)", ylabel="scans")
         if handles:
             legend(axes, handles=handles, loc="upper right", handlelength=1.0)
         return finish(figure)
-    side = 5.6 / shown
-    figure, plots = charts(heading, [side] * shown, columns=shown)
-    dots = _dot_size(len(points)) * (0.8 if shown > 3 else 1.0)
-    limits = [_limits(b[:, k]) for k in range(shown)]
-    for r in range(shown):
-        for c in range(shown):
-            axes = plots[r * shown + c]
+    side = 5.6 / n_shown
+    figure, plots = charts(heading, [side] * n_shown, columns=n_shown)
+    dots = _dot_size(len(points)) * (0.8 if n_shown > 3 else 1.0)
+    limits = [_limits(b[:, k]) for k in range(n_shown)]
+    for r in range(n_shown):
+        for c in range(n_shown):
+            axes = plots[r * n_shown + c]
             if c > r:
                 axes.set_axis_off()
                 continue
@@ -99,14 +99,14 @@ def scatter_matrix(points: Sequence[Coefficients], modes: int = 4, *, title: str
                 _spread(axes, b[:, c], groups)
                 axes.set_yticks([])
             else:
-                for _, look, at in groups:
-                    axes.scatter(b[at, c], b[at, r], s=dots, **look, edgecolors="white", linewidths=0.5)
+                for _, marker_style, scores in groups:
+                    axes.scatter(b[scores, c], b[scores, r], s=dots, **marker_style, edgecolors="white", linewidths=0.5)
                 axes.set_ylim(*limits[r])
                 axes.locator_params(axis="y", nbins=3)
             axes.set_xlim(*limits[c])
             axes.locator_params(axis="x", nbins=3)
-            axes.tick_params(labelbottom=r == shown - 1, labelleft=c == 0 and r > 0)
-            if r == shown - 1:
+            axes.tick_params(labelbottom=r == n_shown - 1, labelleft=c == 0 and r > 0)
+            if r == n_shown - 1:
                 axes.set_xlabel(f"b{c + 1}")
             if c == 0 and r > 0:
                 axes.set_ylabel(f"b{r + 1}")
@@ -126,7 +126,7 @@ def b_plane(
     title: str = "",
     neutral: Coefficients | None = None,
 ) -> Figure:
-    """Draw b1 against b2 (figure 9), one colour an expression, larger for stronger.
+    """Draw b1 against b2 (figure 9), one colour per expression, with larger markers for stronger expressions.
 
     Args:
         scans: expressive ones.
@@ -136,17 +136,25 @@ def b_plane(
     Raises:
         InputError: no scans, or fewer than two coefficients.
     """
-    b = _stacked(scans)
+    b = _stack_coefficients(scans)
     if b.shape[1] < 2:
         raise InputError("b1 against b2 needs two coefficients a scan, but there is only one.")
     figure, axes = chart(title or "Each expression runs along its own line: b1 and b2", height=4.4)
     groups = _groups(scans)
-    for _, look, at in groups:
-        own = [scans[k] for k in at]
-        axes.scatter(b[at, 0], b[at, 1], s=_sizes(own), **look, edgecolors="white", linewidths=0.7, zorder=3)
-        line = _line(own, neutral)
+    for _, marker_style, scores in groups:
+        group_scans = [scans[k] for k in scores]
+        axes.scatter(
+            b[scores, 0],
+            b[scores, 1],
+            s=_sizes(group_scans),
+            **marker_style,
+            edgecolors="white",
+            linewidths=0.7,
+            zorder=3,
+        )
+        line = _line(group_scans, neutral)
         if line is not None:
-            axes.plot(line[:, 0], line[:, 1], color=look["color"], lw=1.8, alpha=0.8, zorder=2)
+            axes.plot(line[:, 0], line[:, 1], color=marker_style["color"], lw=1.8, alpha=0.8, zorder=2)
     if neutral is not None:
         axes.plot(*neutral.b[:2], marker="+", ms=16, mew=2.6, color=INK, ls="", zorder=4)
     axes.set(xlabel="b1 (mm)", ylabel="b2 (mm)")
@@ -168,11 +176,11 @@ def b_space(
     Raises:
         InputError: no scans, or fewer than three coefficients.
     """
-    b = _stacked(scans)
+    b = _stack_coefficients(scans)
     if b.shape[1] < 3:
         raise InputError(f"b1, b2 and b3 need three coefficients a scan, but there are only {b.shape[1]}.")
-    every = np.stack([scan.b[:3] for scan in (*scans, *([neutral] if neutral else []))])
-    low, high = every.min(axis=0), every.max(axis=0)
+    coefficients = np.stack([scan.b[:3] for scan in (*scans, *([neutral] if neutral else []))])
+    low, high = coefficients.min(axis=0), coefficients.max(axis=0)
     room = 0.06 * np.maximum(high - low, 1e-9 + 0.01 * float((high - low).max()))
     groups = _groups(scans)
     handles = _handles(groups, neutral)
@@ -185,24 +193,26 @@ def b_space(
         title or f"The first three coefficients {of}, from two sides", [_SPACE_INCHES + foot_px / DPI]
     )
     figure.delaxes(plots[0])
-    within = cast(tuple[float, float, float, float], cast(Any, figure).plots_within)
+    plot_box = cast(tuple[float, float, float, float], cast(Any, figure).plots_within)
     total = figure.get_figheight()
-    foot = within[1] + foot_px / DPI / total
+    foot = plot_box[1] + foot_px / DPI / total
     size = _dot_size(len(scans))
     for k, azimuth in enumerate((-62, 24)):
         # matplotlib's 3-D axes have no usable types.
-        place = (0.54 * k, foot + 0.06 / total, 0.44, within[3] - foot + 0.5 / total)
+        place = (0.54 * k, foot + 0.06 / total, 0.44, plot_box[3] - foot + 0.5 / total)
         axes = cast(Any, figure.add_axes(place, projection="3d"))
-        for _, look, at in groups:
-            own = [scans[i] for i in at]
-            sizes = _sizes(own) if neutral is not None or any(scan.intensity for scan in own) else size
-            axes.scatter(*b[at, :3].T, s=sizes, **look, edgecolors="white", linewidths=0.5, depthshade=False)
-            line = _line(own, neutral)
+        for _, marker_style, scores in groups:
+            group_scans = [scans[i] for i in scores]
+            sizes = _sizes(group_scans) if neutral is not None or any(scan.intensity for scan in group_scans) else size
+            axes.scatter(
+                *b[scores, :3].T, s=sizes, **marker_style, edgecolors="white", linewidths=0.5, depthshade=False
+            )
+            line = _line(group_scans, neutral)
             if line is not None:
-                axes.plot(*line[:, :3].T, color=look["color"], lw=1.5, alpha=0.85)
+                axes.plot(*line[:, :3].T, color=marker_style["color"], lw=1.5, alpha=0.85)
             if len(scans) <= 2 * _MOST_DOTS_BIG:
                 # Drop lines to the floor, without which a cloud of points has no depth.
-                for point in b[at, :3]:
+                for point in b[scores, :3]:
                     axes.plot([point[0]] * 2, [point[1]] * 2, [low[2] - room[2], point[2]], color="#cfd1d5", lw=0.6)
         if neutral is not None:
             axes.plot(*neutral.b[:3, None], marker="+", ms=14, mew=2.4, color=INK, ls="")
@@ -213,16 +223,16 @@ def b_space(
     if handles:
         figure.legend(
             handles=handles, loc="lower center", ncols=columns, fontsize=SMALL, frameon=False,
-            labelcolor=INK, handletextpad=0.2, columnspacing=1.2, bbox_to_anchor=(0.5, within[1]), borderpad=0.1,
+            labelcolor=INK, handletextpad=0.2, columnspacing=1.2, bbox_to_anchor=(0.5, plot_box[1]), borderpad=0.1,
         )  # fmt: skip
     return figure
 
 
 def _style_space(axes: Any, low: FloatArray, high: FloatArray) -> float:
-    """Give a plot in space its names, its ends (3,), and quiet panes; return the points by which it is wider."""
-    for axis, at in zip("xyz", range(3), strict=True):
-        getattr(axes, f"set_{axis}label")(f"b{at + 1} (mm)", fontsize=SMALL, color=INK, labelpad=2)
-        getattr(axes, f"set_{axis}lim")(low[at], high[at])
+    """Set names, end points (3,) and pale panes of a 3-D plot; return the extra width in points."""
+    for axis, dimension in zip("xyz", range(3), strict=True):
+        getattr(axes, f"set_{axis}label")(f"b{dimension + 1} (mm)", fontsize=SMALL, color=INK, labelpad=2)
+        getattr(axes, f"set_{axis}lim")(low[dimension], high[dimension])
         getattr(axes, f"{axis}axis").set_pane_color((0.965, 0.967, 0.972, 1.0))
         axes.locator_params(axis=axis, nbins=4)
     axes.zaxis.set_rotate_label(False)
@@ -239,13 +249,13 @@ def _wider_than_three(axis: Any) -> float:
     """Return by how many points the widest number of an axis is wider than three digits."""
     formatter = axis.get_major_formatter()
     low, high = axis.get_view_interval()
-    told = formatter.format_ticks([at for at in axis.get_majorticklocs() if low <= at <= high])
-    widest = max((measured(text, SMALL - 2) for text in told), default=0.0)
+    tick_labels = formatter.format_ticks([location for location in axis.get_majorticklocs() if low <= location <= high])
+    widest = max((measured(text, SMALL - 2) for text in tick_labels), default=0.0)
     return max(0.0, widest - measured("000", SMALL - 2)) * 72 / DPI
 
 
 def _legend_columns(names: Sequence[str]) -> int:
-    """Return into how many columns the entries of a legend below a figure go, so that none is cut."""
+    """Return the number of columns that a legend below a figure needs so that no entry is cut."""
     for columns in range(min(len(names), 5), 1, -1):
         parts = np.array_split(np.array([measured(name, SMALL) for name in names]), columns)
         if sum(float(part.max()) + _LEGEND_MARK for part in parts) < WIDTH:
@@ -253,7 +263,7 @@ def _legend_columns(names: Sequence[str]) -> int:
     return 1
 
 
-def _stacked(scans: Sequence[Coefficients]) -> FloatArray:
+def _stack_coefficients(scans: Sequence[Coefficients]) -> FloatArray:
     """Return the coefficients of all scans, (n, K) mm."""
     if not scans:
         raise InputError("There is nothing to draw of coefficients without scans.")
@@ -278,8 +288,8 @@ def _groups(scans: Sequence[Coefficients]) -> list[tuple[str, dict[str, Any], li
     ]
 
 
-def _handle(look: Mapping[str, Any], name: str, **style: Any) -> Line2D:
-    return Line2D([], [], ls="", ms=8, label=escaped(short(name, 22)), **{**look, **style})
+def _handle(marker_style: Mapping[str, Any], name: str, **style: Any) -> Line2D:
+    return Line2D([], [], ls="", ms=8, label=escaped(short(name, 22)), **{**marker_style, **style})
 
 
 def _handles(
@@ -289,22 +299,25 @@ def _handles(
     plus = [] if neutral is None else [_handle({"marker": "+", "color": INK}, "neutral", mew=2.6)]
     if not any(name for name, _, _ in groups):
         return plus
-    named = [(name or "no label", look) for name, look, _ in groups]
-    out = [_handle(look, name) for name, look in named[:_MOST_IN_LEGEND]]
-    if len(named) > _MOST_IN_LEGEND:
-        out.append(Line2D([], [], ls="", label=f"and {len(named) - _MOST_IN_LEGEND} more"))
+    labelled_groups = [(name or "no label", marker_style) for name, marker_style, _ in groups]
+    out = [_handle(marker_style, name) for name, marker_style in labelled_groups[:_MOST_IN_LEGEND]]
+    if len(labelled_groups) > _MOST_IN_LEGEND:
+        out.append(Line2D([], [], ls="", label=f"and {len(labelled_groups) - _MOST_IN_LEGEND} more"))
     return out + plus
 
 
 def _spread(axes: Axes, values: FloatArray, groups: Sequence[tuple[str, dict[str, Any], list[int]]]) -> None:
-    """Draw how `values` (n,) are spread, the labels on top of each other; a few of them as dots."""
+    """Draw the distribution of `values` (n,) per label; as dots if there are few."""
     if len(values) < FEWEST_BINNED:
-        for _, look, at in groups:
-            axes.plot(values[at], np.full(len(at), 0.5), ls="", ms=8, alpha=0.8, clip_on=False, **look)
+        for _, marker_style, scores in groups:
+            axes.plot(values[scores], np.full(len(scores), 0.5), ls="", ms=8, alpha=0.8, clip_on=False, **marker_style)
         axes.set_ylim(0, 1)
         return
     edges = np.linspace(*_limits(values), min(max(8, round(len(values) ** 0.5) + 4), 24))
-    parts, colours = [values[at] for _, _, at in groups], [look["color"] for _, look, _ in groups]
+    parts, colours = (
+        [values[scores] for _, _, scores in groups],
+        [marker_style["color"] for _, marker_style, _ in groups],
+    )
     axes.hist(parts, edges.tolist(), stacked=True, color=colours)
 
 
@@ -334,5 +347,5 @@ def _line(scans: Sequence[Coefficients], neutral: Coefficients | None) -> FloatA
     # Every scan of a model has b = z * sd, so their sizes give the sd of each mode.
     size_b, size_z = (np.abs(np.stack(rows)).sum(axis=0) for rows in ([s.b for s in scans], [s.z for s in scans]))
     stddev = np.divide(size_b, size_z, out=np.zeros_like(size_b), where=size_z > 0)
-    ends = np.array([min(0.0, along.min()), 1.08 * max(0.0, along.max())])
-    return neutral.b + ends[:, None] * (direction * stddev)
+    end_positions = np.array([min(0.0, along.min()), 1.08 * max(0.0, along.max())])
+    return neutral.b + end_positions[:, None] * (direction * stddev)

@@ -1,4 +1,4 @@
-"""Figures of a correspondence: the same places on every scan, where vertices are missing, how near, how settled."""
+"""Figures of a correspondence: checkerboards, missing vertices, distances, and convergence."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from shapespace.report.render.palette import SEQUENTIAL
 from shapespace.report.render.renderer import Camera, Image, Layer, render
 from shapespace.types import FloatArray, Mesh
 
-SIDE_DEG = 65.0
-_LONGEST = 16
+SIDE_DEG = 65.0  # degrees, between three quarters and profile
+_LONGEST = 16  # layout: characters above a panel
 _LINES = ("#9cc3e0", "#0072B2", "#D55E00", "#6b140f")
 
 
 def checkerboard_figure(
     mean: Mesh, surfaces: Sequence[FloatArray], labels: Sequence[str], *, yaw_deg: float = 0.0, title: str = ""
 ) -> Figure:
-    """Draw one checkerboard on the mean shape and carried to each scan: the same square is the same vertices.
+    """Draw one checkerboard on the mean shape and on each scan: the same square has the same vertices.
 
     Args:
         mean: the mean shape, upright.
@@ -52,18 +52,18 @@ def checkerboard_figure(
         raise InputError(f"{len(surfaces)} surfaces with {len(labels)} labels cannot be drawn in one figure.")
     places = checker_places(mean, yaw_deg)
     columns = 4
-    seen = view(mean.vertices, columns, yaw_deg=yaw_deg, margin=0.08)
+    mean_view = view(mean.vertices, columns, yaw_deg=yaw_deg, margin=0.08)
     images = [
-        render(checker_layer(mean.with_vertices(vertices), places), camera=seen.camera, size=seen.size)
+        render(checker_layer(mean.with_vertices(vertices), places), camera=mean_view.camera, size=mean_view.size)
         for vertices in (mean.vertices, *surfaces)
     ]
-    names = ["mean shape", *_told_apart(labels)]
+    names = ["mean shape", *_distinct_labels(labels)]
     rows = [Row(i, t) for i, t in zip(in_rows(images, columns), in_rows(names, columns), strict=True)]
     return grid(rows, title=title or "The same squares on every scan")
 
 
-def _told_apart(labels: Sequence[str]) -> list[str]:
-    """Return labels that fit above a panel; where cutting makes two of them equal, what they begin with alike goes."""
+def _distinct_labels(labels: Sequence[str]) -> list[str]:
+    """Return labels that fit above a panel; if two become equal when cut, their common beginning is removed."""
     cut = [short(label, _LONGEST) for label in labels]
     if len(set(cut)) == len(cut):
         return cut
@@ -72,7 +72,7 @@ def _told_apart(labels: Sequence[str]) -> list[str]:
 
 
 def missing_figure(mean: Mesh, missing_share: FloatArray, *, title: str = "") -> Figure:
-    """Draw on the mean shape, from four sides, which share of the scans does not show each vertex.
+    """Draw the share of scans with each vertex missing, on the mean shape from four sides.
 
     Args:
         mean: the mean shape, upright.
@@ -80,15 +80,15 @@ def missing_figure(mean: Mesh, missing_share: FloatArray, *, title: str = "") ->
         title: above the figure.
     """
     sides = (("front", 0.0), ("one side", 90.0), ("back", 180.0), ("other side", 270.0))
-    most = float(missing_share.max(initial=0.0))
-    top = next(limit for limit in (0.05, 0.1, 0.25, 0.5, 1.0) if most <= limit)
+    largest_share = float(missing_share.max(initial=0.0))
+    top = next(limit for limit in (0.05, 0.1, 0.25, 0.5, 1.0) if largest_share <= limit)
     layer = Layer(mean, scalars=100 * missing_share, colormap=SEQUENTIAL, vmax=100 * top)
     front = view(mean.vertices, len(sides))
     height = max(view(mean.vertices, len(sides), yaw_deg=yaw).camera.height_mm for _, yaw in sides)
     panels: list[Image] = []
     for _, yaw in sides:
-        found = view(mean.vertices, len(sides), yaw_deg=yaw).camera
-        camera = Camera(found.centre, height, yaw, 0.0, found.distance_mm)
+        view_camera = view(mean.vertices, len(sides), yaw_deg=yaw).camera
+        camera = Camera(view_camera.centre, height, yaw, 0.0, view_camera.distance_mm)
         panels.append(render(layer, camera=camera, size=front.size))
     scale = Scale("scans that do not show the vertex (%)", SEQUENTIAL, 0.0, 100 * top)
     return grid([Row(panels, [name for name, _ in sides])], title=title or "Where vertices are missing", scale=scale)
@@ -112,9 +112,11 @@ def nearness_figure(distances: FloatArray, *, title: str = "") -> Figure:
     low, high = 0.7 * float(known.min()), 1.4 * float(known.max())
     names = ("mean", "95 % of the points", "99 %", "farthest point")
     for column, (name, colour) in enumerate(zip(names, _LINES, strict=True)):
-        at = np.sort(known[:, column])
-        share = 100 * np.arange(len(at) + 1) / len(at)
-        axes.plot([low, *at, high], [*share, 100.0], drawstyle="steps-post", color=colour, lw=2.0, label=name)
+        sorted_values = np.sort(known[:, column])
+        share = 100 * np.arange(len(sorted_values) + 1) / len(sorted_values)
+        axes.plot(
+            [low, *sorted_values, high], [*share, 100.0], drawstyle="steps-post", color=colour, lw=2.0, label=name
+        )
     axes.set_xscale("log")
     _plain_decades(axes.xaxis)
     axes.set(xlabel="distance, % of the object's size", ylabel="scans up to there (%)")
@@ -124,14 +126,14 @@ def nearness_figure(distances: FloatArray, *, title: str = "") -> Figure:
 
 
 def movement_figure(
-    rounds: Sequence[float], scans: Sequence[Sequence[float]], settled: float, *, title: str = ""
+    rounds: Sequence[float], scans: Sequence[Sequence[float]], settled_mm: float, *, title: str = ""
 ) -> Figure:
     """Draw by how much vertices moved in each round: all together, and each scan.
 
     Args:
         rounds: RMS of each round, shares of the size.
         scans: the same of each scan; those that missed a round are left out.
-        settled: below which the rounds end.
+        settled_mm: below which the rounds end.
         title: above the figure.
 
     Raises:
@@ -140,13 +142,15 @@ def movement_figure(
     if not rounds:
         raise InputError("There are no rounds to draw.")
     figure, axes = chart(title or "How far vertices moved in each round", height=3.0)
-    at = np.arange(1, len(rounds) + 1)
-    for k, moved in enumerate([moved for moved in scans if len(moved) == len(rounds)]):
-        values = np.maximum(100 * np.array(moved), 1e-3)
-        axes.plot(at, values, color=_LINES[0], lw=1.0, alpha=float(np.clip(20 / len(scans), 0.15, 0.8)),
+    round_numbers = np.arange(1, len(rounds) + 1)
+    for k, series in enumerate([series for series in scans if len(series) == len(rounds)]):
+        values = np.maximum(100 * np.array(series), 1e-3)
+        axes.plot(round_numbers, values, color=_LINES[0], lw=1.0, alpha=float(np.clip(20 / len(scans), 0.15, 0.8)),
                   marker="o", ms=2.5, label="a scan" if k == 0 else None)  # fmt: skip
-    axes.plot(at, np.maximum(100 * np.array(rounds), 1e-3), color=INK, lw=2.6, marker="o", label="all together")
-    axes.axhline(100 * settled, color=_LINES[2], lw=1.2, ls="--", label="settled below")
+    axes.plot(
+        round_numbers, np.maximum(100 * np.array(rounds), 1e-3), color=INK, lw=2.6, marker="o", label="all together"
+    )
+    axes.axhline(100 * settled_mm, color=_LINES[2], lw=1.2, ls="--", label="settled below")
     axes.set_yscale("log")
     _plain_decades(axes.yaxis)
     axes.set(xlabel="round", ylabel="moved (RMS), % of the size")
@@ -156,6 +160,6 @@ def movement_figure(
 
 
 def _plain_decades(axis: Axis) -> None:
-    """Write 1, 2 and 5 of each decade of a logarithmic axis as people do, and nothing at its other ticks."""
+    """Label 1, 2 and 5 of each decade of a logarithmic axis in plain notation."""
     axis.set_major_formatter(lambda value, _: f"{value:g}")
     axis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in "25" else "")

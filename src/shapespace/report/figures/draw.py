@@ -1,4 +1,4 @@
-"""What all figures share: one width, one type, panels in rows pixel for pixel, charts, scales and keys, WebP.
+"""Common parts of all figures: width, type sizes, rows of panels, charts, scales, legends, WebP.
 
 A figure is 960 pixels wide, and its smallest type stays legible when a phone shows it 340 wide.
 """
@@ -52,19 +52,19 @@ NOT_SHOWN = "not shown by the scan"
 
 INK, GREY, RULE = "#1d1f22", "#5c6068", "#e4e5e8"
 FORWARD, BACKWARD = "#0072B2", "#D55E00"
-WIDTH, DPI = 960, 160
-TITLE, TEXT, SMALL = 12.0, 11.0, 9.5
-MOST_PANELS = 48
+WIDTH, DPI = 960, 160  # layout: pixels of the column, dots per inch
+TITLE, TEXT, SMALL = 12.0, 11.0, 9.5  # layout: type sizes, points
+MOST_PANELS = 48  # limit on the size of a figure
 FEWEST_BINNED = 10
 """Values of which a histogram tells something; fewer are drawn one by one."""
-_GAP, _EDGE = 8, 4
-_MOST_LINES = 4
+_GAP, _EDGE = 8, 4  # layout: pixels
+_MOST_LINES = 4  # layout: lines of a caption
 _STEPS, _MOST_NUMBERS = (1, 5, 10, 20, 50, 100, 200, 500), 22
 _Item = TypeVar("_Item")
 
 
-class ShownFigure(Figure):
-    """A figure that is displayed once as the value of a notebook's cell, also without pyplot."""
+class DisplayedFigure(Figure):
+    """A figure that a notebook displays once as the value of a cell, also without pyplot."""
 
     def _repr_png_(self) -> bytes:
         stream = io.BytesIO()
@@ -75,7 +75,7 @@ class ShownFigure(Figure):
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A camera, and the size in pixels of the panels that it fills."""
+    """A camera, and the size of its panels in pixels."""
 
     camera: Camera
     size: tuple[int, int]
@@ -116,7 +116,7 @@ class Scale:
 
 
 def view(points: FloatArray, columns: int, *, yaw_deg: float = 0.0, width: int = WIDTH, margin: float = 0.04) -> View:
-    """Return a camera that sees all `points` (N, 3) in panels of which `columns` fill the figure."""
+    """Return a camera that contains all `points` (N, 3), in panels of which `columns` fill the figure."""
     across = (width - (columns - 1) * _GAP) // columns
     flat = Camera.framing(points, yaw_deg=yaw_deg, aspect=1e-3, margin=0.0, perspective=False)
     tall = Camera.framing(points, yaw_deg=yaw_deg, aspect=1e3, margin=0.0, perspective=False)
@@ -131,13 +131,13 @@ def surroundings(fit: StagedFit) -> FloatArray:
     low, high = surface.min(axis=0), surface.max(axis=0)
     room = 0.16 * float((high - low).max())
     scan = fit.scan.vertices
-    near = ((scan > low - room) & (scan < high + room)).all(axis=1)
+    is_near = ((scan > low - room) & (scan < high + room)).all(axis=1)
     # Shreds that float near a scan are seen where they are, but do not make the rest small.
-    kept = scan[near]
-    if len(kept) > 100:
-        inner, outer = np.percentile(kept, [0.3, 99.7], axis=0)
-        kept = kept[((kept >= inner) & (kept <= outer)).all(axis=1)]
-    return np.concatenate([surface, kept])
+    cropped = scan[is_near]
+    if len(cropped) > 100:
+        inner, outer = np.percentile(cropped, [0.3, 99.7], axis=0)
+        cropped = cropped[((cropped >= inner) & (cropped <= outer)).all(axis=1)]
+    return np.concatenate([surface, cropped])
 
 
 def grid(
@@ -202,20 +202,20 @@ def grid(
     if note:
         y += 4 + write(_EDGE, note, total_w - 2 * _EDGE, SMALL, color=GREY)
     total_h = int(np.ceil(y + 6))
-    figure = _drawn(pictures, texts, total_w, total_h)
+    figure = _compose(pictures, texts, total_w, total_h)
     if scale is not None:
         _colour_bar(figure, scale, bar_at, total_w, total_h)
     return figure
 
 
-def _drawn(
+def _compose(
     pictures: Sequence[tuple[int, float, Image]],
     texts: Sequence[tuple[float, float, str, dict[str, Any]]],
     total_w: int,
     total_h: int,
 ) -> Figure:
     """Return a figure of this size in pixels with pictures and lines of text at their places, from the upper left."""
-    figure = ShownFigure(figsize=(total_w / DPI, total_h / DPI), dpi=DPI, facecolor="white")
+    figure = DisplayedFigure(figsize=(total_w / DPI, total_h / DPI), dpi=DPI, facecolor="white")
     for x, top, image in pictures:
         high, wide = image.shape[:2]
         axes = figure.add_axes((x / total_w, 1 - (round(top) + high) / total_h, wide / total_w, high / total_h))
@@ -229,7 +229,7 @@ def _drawn(
 def _place_keys(
     texts: list[tuple[float, float, str, dict[str, Any]]], keys: Sequence[tuple[str, Colour]], y: float, total_w: int
 ) -> float:
-    """Put coloured squares and their names in centred lines, and return the height that they take."""
+    """Draw legend entries in centred lines, and return their height."""
     square, between = measured("■ ", TEXT + 2), 28.0
     lines: list[list[tuple[str, Colour, float]]] = [[]]
     for name, colour in keys:
@@ -265,14 +265,14 @@ def _colour_bar(figure: Figure, scale: Scale, top: float, total_w: int, total_h:
 
 
 def without_empty_rows(panels: Sequence[Image]) -> list[Image]:
-    """Return pictures of one row without the white rows of pixels that all of them have above and below."""
+    """Return images of one row without the white rows of pixels at the top and bottom of all of them."""
     used = np.zeros(panels[0].shape[0], dtype=bool)
     for panel in panels:
         used |= (panel < 255).any(axis=(1, 2))
-    at = np.flatnonzero(used)
-    if not len(at):
+    used_rows = np.flatnonzero(used)
+    if not len(used_rows):
         return list(panels)
-    return [panel[max(at[0] - _EDGE, 0) : at[-1] + 1 + _EDGE] for panel in panels]
+    return [panel[max(used_rows[0] - _EDGE, 0) : used_rows[-1] + 1 + _EDGE] for panel in panels]
 
 
 def chart(title: str, *, height: float, note: str = "") -> tuple[Figure, Axes]:
@@ -284,21 +284,21 @@ def chart(title: str, *, height: float, note: str = "") -> tuple[Figure, Axes]:
 def charts(title: str, heights: Sequence[float], *, note: str = "", columns: int = 1) -> tuple[Figure, list[Axes]]:
     """Return a figure with rows of plots of `heights` in inches, and the plots row by row."""
     wrapped = wrap(title, WIDTH - 2 * _EDGE, TITLE, bold=True)
-    below = wrap(note, WIDTH - 2 * _EDGE, SMALL) if note else ""
+    note_lines = wrap(note, WIDTH - 2 * _EDGE, SMALL) if note else ""
     top = (height_of(wrapped, TITLE) + 14) / DPI
-    bottom = (height_of(below, SMALL) + 12) / DPI if below else 0.03
+    bottom = (height_of(note_lines, SMALL) + 12) / DPI if note_lines else 0.03
     total = sum(heights) + top + bottom
-    figure = ShownFigure(figsize=(WIDTH / DPI, total), dpi=DPI, facecolor="white")
+    figure = DisplayedFigure(figsize=(WIDTH / DPI, total), dpi=DPI, facecolor="white")
     places = figure.add_gridspec(len(heights), columns, height_ratios=list(heights))
     axes = [figure.add_subplot(places[r, c]) for r in range(len(heights)) for c in range(columns)]
-    start = total * DPI - height_of(below, SMALL) - 2
-    for text, first, size, look in (
+    start = total * DPI - height_of(note_lines, SMALL) - 2
+    for text, first, size, text_style in (
         (wrapped, 6.0, TITLE, {"color": INK, "fontweight": "bold"}),
-        (below, start, SMALL, {"color": GREY}),
+        (note_lines, start, SMALL, {"color": GREY}),
     ):
         for k, line in enumerate(text.split("\n")):
             up = 1 - (first + baseline(k, size)) / DPI / total
-            figure.text(_EDGE / WIDTH, up, escaped(line), in_layout=False, fontsize=size, **cast(Any, look))
+            figure.text(_EDGE / WIDTH, up, escaped(line), in_layout=False, fontsize=size, **cast(Any, text_style))
     # Where the plots may stand, for `finish`.
     cast(Any, figure).plots_within = (0.0, bottom / total, 1.0, 1 - top / total)
     return figure, axes
@@ -327,13 +327,13 @@ def style(axes: Axes) -> None:
 
 def legend(axes: Axes, **options: Any) -> None:
     """Add the legend of a plot."""
-    made = cast(Any, axes).legend(fontsize=SMALL, labelcolor=INK, framealpha=0.9, **{"handlelength": 1.5, **options})
-    made.get_frame().set_linewidth(0.0)
+    box = cast(Any, axes).legend(fontsize=SMALL, labelcolor=INK, framealpha=0.9, **{"handlelength": 1.5, **options})
+    box.get_frame().set_linewidth(0.0)
 
 
 @contextmanager
 def without_glyph_warnings() -> Generator[None]:
-    """Return a block in which a script that the font lacks is drawn as boxes without a warning."""
+    """Return a context that suppresses warnings about glyphs that the font lacks."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
         yield
@@ -369,7 +369,7 @@ def line_height(size: float) -> float:
 
 
 def baseline(line: int, size: float) -> float:
-    """Return how far below the top of a text its line number `line` (from 0) stands, in pixels."""
+    """Return the distance of line number `line` (from 0) of a text from its top, in pixels."""
     return 0.97 * size * DPI / 72 + line * line_height(size)
 
 
@@ -378,8 +378,8 @@ def height_of(text: str, size: float) -> float:
     return line_height(size) * (1 + text.count("\n")) if text else 0.0
 
 
-def wrap(text: str, width: float, size: float, *, bold: bool = False, most: int = _MOST_LINES) -> str:
-    """Return `text` in at most `most` lines, none wider than `width` pixels, all of like length.
+def wrap(text: str, width: float, size: float, *, bold: bool = False, max_lines: int = _MOST_LINES) -> str:
+    """Wrap `text` to at most `max_lines` lines of similar length, none wider than `width` pixels.
 
     What is left out ends in `…`.
     """
@@ -395,23 +395,23 @@ def wrap(text: str, width: float, size: float, *, bold: bool = False, most: int 
     longest = range(1, max(map(len, parts)) + 1)
     letters = max(bisect_left(longest, True, key=lambda n: any(map(wide, in_lines(n)))), 1)
     lines = in_lines(letters)
-    if len(lines) <= most:
+    if len(lines) <= max_lines:
         return "\n".join(
             in_lines(1 + bisect_left(longest[:letters], True, key=lambda n: len(in_lines(n)) <= len(lines)))
         )
-    last = lines[most - 1]
+    last = lines[max_lines - 1]
     while last and wide(last + "…"):
         last = last[:-1].rstrip()
-    return "\n".join([*lines[: most - 1], last + "…"])
+    return "\n".join([*lines[: max_lines - 1], last + "…"])
 
 
-_LONGEST = 400
+_LONGEST = 400  # characters of a name from a file
 
 
 def plain(text: str) -> str:
-    """Return `text` of a user without what cannot be printed, and no longer than a caption could be."""
-    kept = re.sub(r"[^\S\n]", " ", printable(str(text)[: _LONGEST + 1]))
-    return kept if len(kept) <= _LONGEST else kept[: _LONGEST - 1] + "…"
+    """Return user text without unprintable characters, cut to the length of a caption."""
+    printable_text = re.sub(r"[^\S\n]", " ", printable(str(text)[: _LONGEST + 1]))
+    return printable_text if len(printable_text) <= _LONGEST else printable_text[: _LONGEST - 1] + "…"
 
 
 def escaped(text: str) -> str:
@@ -419,14 +419,14 @@ def escaped(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-def short(text: str, most: int = 28) -> str:
-    """Return one line of at most `most` characters."""
+def short(text: str, max_length: int = 28) -> str:
+    """Return one line of at most `max_length` characters."""
     line = " ".join(plain(text).split())
-    return line if len(line) <= most else line[: most - 1] + "…"
+    return line if len(line) <= max_length else line[: max_length - 1] + "…"
 
 
 def in_rows(items: Sequence[_Item], columns: int) -> list[list[_Item]]:
-    """Cut `items` into rows of at most `columns`."""
+    """Split `items` into rows of at most `columns`."""
     return [list(items[k : k + columns]) for k in range(0, len(items), columns)]
 
 
@@ -436,13 +436,13 @@ def scan_over(mesh: Mesh) -> Layer:
 
 
 def mean_mm(fit: StagedFit, stage: str = "final") -> float:
-    """Return the mean distance to the scan of the vertices that it shows; not-a-number where it shows none."""
+    """Return the mean distance to the scan over the overlap; NaN without overlap."""
     values = measured_mm(fit.model_to_scan_mm[stage])
     return float(values.mean()) if len(values) else float("nan")
 
 
 def mean_words(fits: Sequence[StagedFit]) -> str:
-    """Return what the means below the pictures of `fits` are of."""
+    """Return the caption for the mean distances of `fits`."""
     cloud = " That to a point cloud is to its points." if any(fit.scan.faces is None for fit in fits) else ""
     return f"In mm: mean distance to the scan of the vertices that the scan shows.{cloud}"
 

@@ -1,4 +1,4 @@
-"""Figures of one fit: its stages, its distances both ways, how it went, and what it ended in."""
+"""Figures of one fit: stages, signed distances, convergence, and coefficients."""
 
 from __future__ import annotations
 
@@ -56,24 +56,24 @@ THRESHOLDS_MM = (2.0, 4.0, 6.0, 8.0, 10.0)
 
 _SHORT_STAGES = {"before": "before", "initial": "phase 1", "final": "phase 2", "dense": "dense"}
 _SIDES = (("from the right", -38.0), ("from the front", 0.0), ("from the left", 38.0))
-_FRONT_AND_SIDE = (0.0, 48.0)
+_FRONT_AND_SIDE = (0.0, 48.0)  # degrees of yaw
 _REGION_WORDS = {
     "followed": "followed",
     "rejected": "rejected: the scan shows something else",
     "border": "at the scan's border",
     "unseen": NOT_SHOWN,
 }
-_MOST_MODES = 30
-_NEAR_START = 0.35
+_MOST_MODES = 30  # layout: bars
+_NEAR_START = 0.35  # share of the extent within which the start fits into the picture of the result
 _TOWERS = 2.0
 """Times its neighbour, and percent, beyond which the first bar of a histogram needs a word."""
-_NEAREST_MM, _FARTHEST_MM = 0.01, 300.0
+_NEAREST_MM, _FARTHEST_MM = 0.01, 300.0  # mm, limits of a logarithmic axis
 _TEXT_ROOM = 1.42
 """How much farther than the tallest bar a half of a histogram reaches, for the line of text above it."""
 
 
 def stages_figure(fit: StagedFit, *, title: str = "") -> Figure:
-    """Draw the scan, then the model before the fit, after phase 1, after phase 2 and, where there is one, dense.
+    """Draw the scan, then the model before the fit, after phase 1, after phase 2, and after the dense stage if present.
 
     A notebook makes the fit out of a result:
 
@@ -93,7 +93,7 @@ def stages_figure(fit: StagedFit, *, title: str = "") -> Figure:
 
 
 def overlay_figure(fit: StagedFit, *, title: str = "") -> Figure:
-    """Draw scan and model over each other at each stage, from two sides (the paper's figures 4 to 7)."""
+    """Draw scan and model superimposed at each stage, from two sides (the paper's figures 4 to 7)."""
     scan = scan_over(fit.scan)
     layers = [[scan, Layer(mesh, _colour(stage))] for stage, mesh in fit.surfaces.items()]
     captions = [f"{_SHORT_STAGES.get(stage, stage)}\n{mm(mean_mm(fit, stage))}" for stage in fit.surfaces]
@@ -136,27 +136,27 @@ def signed_maps(fit: StagedFit, stage: str = "final", *, limit_mm: float | None 
     )
     panels: tuple[list[Image], list[Image]] = ([], [])
     for _, yaw in _SIDES:
-        seen = view(surroundings(fit), len(_SIDES), yaw_deg=yaw)
-        first = view(surroundings(fit), len(_SIDES))
+        camera_view = view(surroundings(fit), len(_SIDES), yaw_deg=yaw)
+        front_view = view(surroundings(fit), len(_SIDES))
         for row, layer in zip(panels, (on_model, on_scan), strict=True):
-            row.append(render(layer, camera=seen.camera, size=first.size))
-    unseen, beyond = unknown(forward), unknown(backward)
+            row.append(render(layer, camera=camera_view.camera, size=front_view.size))
+    unseen, uncovered = unknown(forward), unknown(backward)
     keys: list[tuple[str, Colour]] = []
     if unseen:
         keys.append((f"on the model: {NOT_SHOWN} ({percent(unseen)})", UNKNOWN_COLOUR))
-    if beyond:
-        keys.append((f"on the scan: beyond the model's rim, not counted ({percent(beyond)})", UNKNOWN_COLOUR))
+    if uncovered:
+        keys.append((f"on the scan: beyond the model's rim, not counted ({percent(uncovered)})", UNKNOWN_COLOUR))
     rows = [
         Row(panels[0], [side for side, _ in _SIDES], f"From the model to the scan: {_summary(forward)}"),
         Row(panels[1], [], f"From the scan to the model: {_summary(backward)}"),
     ]
-    what = "the dense surface" if stage == "dense" else f"the model {STAGE_WORDS.get(stage, stage)}"
+    surface_name = "the dense surface" if stage == "dense" else f"the model {STAGE_WORDS.get(stage, stage)}"
     if stage == "final":
-        what = "the fitted model"
+        surface_name = "the fitted model"
     return grid(
         rows,
         title=title
-        or f"{short(fit.label)}: how far scan and {what.removeprefix('the ')} lie from each other, both ways",
+        or f"{short(fit.label)}: how far scan and {surface_name.removeprefix('the ')} lie from each other, both ways",
         scale=distance_scale(limit_mm, signed=signed),
         keys=keys,
     )
@@ -168,23 +168,23 @@ def threshold_figure(fits: StagedFit | Sequence[StagedFit], *, title: str = "") 
     Raises:
         InputError: no fit is given.
     """
-    several = [fits] if isinstance(fits, StagedFit) else list(fits)
+    all_fits = [fits] if isinstance(fits, StagedFit) else list(fits)
     table = np.array([WITHIN_COLOUR, BEYOND_COLOUR])
     rows: list[Row] = []
-    for fit in several:
-        far = np.abs(fit.model_to_scan_mm["final"])
-        seen = view(fit.surfaces["final"].vertices, len(THRESHOLDS_MM))
+    for fit in all_fits:
+        distances = np.abs(fit.model_to_scan_mm["final"])
+        camera_view = view(fit.surfaces["final"].vertices, len(THRESHOLDS_MM))
         maps = [
-            [Layer(fit.surfaces["final"], scalars=far, colormap=table, vmin=limit - 1e-3, vmax=limit + 1e-3)]
+            [Layer(fit.surfaces["final"], scalars=distances, colormap=table, vmin=limit - 1e-3, vmax=limit + 1e-3)]
             for limit in THRESHOLDS_MM
         ]
-        panels = render_series(maps, camera=seen.camera, size=seen.size)
-        known = measured_mm(far)
+        panels = render_series(maps, camera=camera_view.camera, size=camera_view.size)
+        known = measured_mm(distances)
         within = [percent(float((known <= limit).mean())) if len(known) else "–" for limit in THRESHOLDS_MM]
         captions = [f"{limit:g} mm\n{share}" for limit, share in zip(THRESHOLDS_MM, within, strict=True)]
-        rows.append(Row(panels, captions, short(fit.label, 60) if len(several) > 1 else ""))
-    unseen = [(NOT_SHOWN, UNKNOWN_COLOUR)] if any(unknown(fit.model_to_scan_mm["final"]) for fit in several) else []
-    whose = f"{short(several[0].label)}: where" if len(several) == 1 else "Where"
+        rows.append(Row(panels, captions, short(fit.label, 60) if len(all_fits) > 1 else ""))
+    unseen = [(NOT_SHOWN, UNKNOWN_COLOUR)] if any(unknown(fit.model_to_scan_mm["final"]) for fit in all_fits) else []
+    whose = f"{short(all_fits[0].label)}: where" if len(all_fits) == 1 else "Where"
     return grid(
         rows,
         title=title or f"{whose} the model lies within 2 to 10 mm of the scan",
@@ -194,49 +194,59 @@ def threshold_figure(fits: StagedFit | Sequence[StagedFit], *, title: str = "") 
 
 
 def distance_histograms(fit: StagedFit, *, title: str = "", bins: int = 60) -> Figure:
-    """Draw how the closest distances of both directions are spread, stage by stage on one scale.
+    """Draw histograms of the distances of both directions, stage by stage on one scale.
 
     Distances from the model to the scan stand above each line, those from the scan to the model hang below it. Only
     vertices that the scan shows count, and scan points within the model's rim.
     """
-    both = {
+    distances_by_stage = {
         stage: (measured_mm(fit.model_to_scan_mm[stage]), measured_mm(fit.scan_to_model_mm[stage]))
         for stage in fit.surfaces
     }
-    every = np.concatenate([values for pair in both.values() for values in pair])
-    low, high = _decades(every)
+    all_distances = np.concatenate([values for pair in distances_by_stage.values() for values in pair])
+    low, high = _decades(all_distances)
     edges = np.geomspace(low, high, bins + 1)
-    heights = {stage: [100 * _histogram(values, edges) for values in pair] for stage, pair in both.items()}
+    heights = {
+        stage: [100 * _histogram(values, edges) for values in pair] for stage, pair in distances_by_stage.items()
+    }
     tallest = max(float(height.max()) for pair in heights.values() for height in pair) or 1.0
-    most = _TEXT_ROOM * tallest
+    axis_top = _TEXT_ROOM * tallest
     note = "Counted: the vertices that the scan shows, and scan points within the model's rim."
     if any(height[0] > max(_TOWERS * height[1], _TOWERS) for pair in heights.values() for height in pair):
         note += f" The first bar holds all distances below {mm(float(edges[1]))}, 0 among them."
     figure, plots = charts(
-        title or f"{short(fit.label)}: closest distances both ways, stage by stage", [1.6] * len(both), note=note
+        title or f"{short(fit.label)}: closest distances both ways, stage by stage",
+        [1.6] * len(distances_by_stage),
+        note=note,
     )
     for k, (axes, (stage, pair)) in enumerate(zip(plots, heights.items(), strict=True)):
         for height, values, sign, colour, name in zip(
-            pair, both[stage], (1, -1), (FORWARD, BACKWARD), ("model to scan", "scan to model"), strict=True
+            pair,
+            distances_by_stage[stage],
+            (1, -1),
+            (FORWARD, BACKWARD),
+            ("model to scan", "scan to model"),
+            strict=True,
         ):
             axes.stairs(sign * height, edges, fill=True, color=colour, alpha=0.45, lw=0)
             axes.stairs(sign * height, edges, color=colour, lw=1.2, baseline=None)
-            told = "no point counted"
+            summary = "no point counted"
             if len(values):
                 mean = float(values.mean())
-                told = f"mean {mm(mean)}, largest {mm(float(values.max()))}"
+                summary = f"mean {mm(mean)}, largest {mm(float(values.max()))}"
                 axes.plot([min(max(mean, low), high)] * 2, [0, sign * tallest], color=colour, lw=1.6, ls=(0, (3, 1.5)))
             axes.text(
-                0.012, 0.5 + 0.47 * sign, f"{name}: {told}", transform=axes.transAxes, color=colour, fontsize=SMALL - 1,
-                va="top" if sign > 0 else "bottom", bbox={"facecolor": "white", "lw": 0, "pad": 1.5},
+                0.012, 0.5 + 0.47 * sign, f"{name}: {summary}", transform=axes.transAxes, color=colour,
+                fontsize=SMALL - 1, va="top" if sign > 0 else "bottom",
+                bbox={"facecolor": "white", "lw": 0, "pad": 1.5},
             )  # fmt: skip
         axes.axhline(0, color=GREY, lw=0.8)
         axes.set_title(STAGE_WORDS.get(stage, stage), fontsize=TEXT, color=INK, loc="left", pad=4)
-        axes.set(xscale="log", xlim=(low, high), ylim=(-most, most))
+        axes.set(xscale="log", xlim=(low, high), ylim=(-axis_top, axis_top))
         axes.yaxis.set_major_locator(MaxNLocator(3, symmetric=True))
         axes.yaxis.set_major_formatter(lambda value, _: f"{abs(value):g}")
         axes.xaxis.set_major_formatter("{x:g}")
-        if k < len(both) - 1:
+        if k < len(distances_by_stage) - 1:
             axes.tick_params(labelbottom=False)
     to_points = " to the points" if fit.scan.faces is None else ""
     plots[-1].set_xlabel(f"closest distance{to_points} (mm, log scale); dashed: mean")
@@ -257,10 +267,18 @@ def history_figure(fit: StagedFit, *, title: str = "") -> Figure:
         axes.set_yticks([])
         return finish(figure)
     for number, colour, name in ((1, BACKWARD, "phase 1: pose"), (2, FORWARD, "phase 2: pose and shape")):
-        at = np.flatnonzero((phase == number) & usable)
-        if len(at):
-            ends = f"{name}, ends at {mm(float(rms[at[-1]]))}"
-            axes.plot(at, rms[at], color=colour, lw=2, marker="o", ms=4 if len(rms) < 80 else 2, label=ends)
+        iterations = np.flatnonzero((phase == number) & usable)
+        if len(iterations):
+            end_label = f"{name}, ends at {mm(float(rms[iterations[-1]]))}"
+            axes.plot(
+                iterations,
+                rms[iterations],
+                color=colour,
+                lw=2,
+                marker="o",
+                ms=4 if len(rms) < 80 else 2,
+                label=end_label,
+            )
     change = np.flatnonzero(np.diff(phase) > 0)
     if len(change):
         axes.axvline(float(change[0]) + 0.5, color="#c4c7cc", lw=1, ls=(0, (4, 3)))
@@ -281,7 +299,7 @@ def history_figure(fit: StagedFit, *, title: str = "") -> Figure:
 
 
 def coefficients_figure(fit: StagedFit, population: FloatArray | None = None, *, title: str = "") -> Figure:
-    """Draw the coefficients of a fit in standard deviations, each with its uncertainty, over those of the population.
+    """Draw the coefficients of a fit in standard deviations, with uncertainty, over those of the population.
 
     Args:
         fit: gives z, b_stddev and shrinkage.
@@ -292,9 +310,9 @@ def coefficients_figure(fit: StagedFit, population: FloatArray | None = None, *,
         InputError: the population has another number of coefficients.
     """
     count = len(fit.z)
-    shown = min(count, _MOST_MODES)
-    at = np.arange(1, shown + 1)
-    z = fit.z[:shown]
+    n_shown = min(count, _MOST_MODES)
+    numbers = np.arange(1, n_shown + 1)
+    z = fit.z[:n_shown]
     figure, axes = chart(
         title
         or f"{short(fit.label)}: its coefficient{'s, how sure they are' if count > 1 else ', how sure it is'}, "
@@ -308,31 +326,34 @@ def coefficients_figure(fit: StagedFit, population: FloatArray | None = None, *,
             raise InputError(
                 f"The population must hold {count} coefficients a shape, as the fit does, not {population.shape}."
             )
-        low, high = np.percentile(population[:, :shown], [2.5, 97.5], axis=0)
-        axes.bar(at, high - low, bottom=low, width=0.9, color="#e3e5e8", label="95 % of the training set")
-    deviation = z_stddev(fit)[:shown]
-    told = fit.shrinkage[:shown] >= 0.5
-    for mask, colour, name in ((told, FORWARD, "determined by the scan"), (~told, "#9cc3df", "mostly the prior")):
+        low, high = np.percentile(population[:, :n_shown], [2.5, 97.5], axis=0)
+        axes.bar(numbers, high - low, bottom=low, width=0.9, color="#e3e5e8", label="95 % of the training set")
+    deviation = z_stddev(fit)[:n_shown]
+    is_determined = fit.shrinkage[:n_shown] >= 0.5
+    for mask, colour, name in (
+        (is_determined, FORWARD, "determined by the scan"),
+        (~is_determined, "#9cc3df", "mostly the prior"),
+    ):
         if mask.any():
-            axes.bar(at[mask], z[mask], width=0.55, color=colour, label=name, zorder=2)
+            axes.bar(numbers[mask], z[mask], width=0.55, color=colour, label=name, zorder=2)
     known = np.isfinite(deviation)
     if known.any():
         axes.errorbar(
-            at[known], z[known], yerr=1.96 * deviation[known], fmt="none", ecolor=INK, elinewidth=1.4, capsize=2.5,
+            numbers[known], z[known], yerr=1.96 * deviation[known], fmt="none", ecolor=INK, elinewidth=1.4, capsize=2.5,
             zorder=3, label="95 % interval",
         )  # fmt: skip
     axes.axhline(0, color=INK, lw=0.8)
-    reach = np.abs(z) + np.where(known, 1.96 * np.nan_to_num(deviation), 0)
-    limit = max(3.0, 1.1 * float(reach.max()))
+    extent = np.abs(z) + np.where(known, 1.96 * np.nan_to_num(deviation), 0)
+    limit = max(3.0, 1.1 * float(extent.max()))
     axes.set(ylim=(-limit, 1.45 * limit), ylabel="z = b / sd")
-    axes.set_xlabel("mode" if shown == count else f"mode (first {shown} of {count})")
-    number_axis(axes, shown)
+    axes.set_xlabel("mode" if n_shown == count else f"mode (first {n_shown} of {count})")
+    number_axis(axes, n_shown)
     legend(axes, loc="upper center", ncols=2)
     return finish(figure)
 
 
 def z_stddev(fit: StagedFit) -> FloatArray:
-    """Return the standard deviation of z, (K,); not-a-number where z is 0 and does not tell that of its mode."""
+    """Return the standard deviation of z, (K,); NaN where z is 0, since its scale is then unknown."""
     known = (np.abs(fit.z) > 1e-12) & (np.abs(fit.b) > 0)
     ratio = np.full(len(fit.z), np.nan)
     ratio[known] = fit.z[known] / fit.b[known]
@@ -356,8 +377,8 @@ def regions_figure(fit: StagedFit, *, title: str = "") -> Figure:
     panels: list[Image] = []
     captions: list[str] = []
     for _, yaw in (_SIDES[0], _SIDES[2]):
-        seen = view(surroundings(fit), 4, yaw_deg=yaw)
-        panels += render_series([[scan], [layer]], camera=seen.camera, size=view(surroundings(fit), 4).size)
+        camera_view = view(surroundings(fit), 4, yaw_deg=yaw)
+        panels += render_series([[scan], [layer]], camera=camera_view.camera, size=view(surroundings(fit), 4).size)
         captions += ["scan", "model"]
     share = np.bincount(fit.regions, minlength=len(REGIONS)) / max(len(fit.regions), 1)
     keys = [
@@ -399,10 +420,10 @@ def _surface(fit: StagedFit, stage: str) -> Mesh:
 
 
 def _summary(values: FloatArray) -> str:
-    far = measured_mm(values)
-    if not len(far):
+    distances = measured_mm(values)
+    if not len(distances):
         return "no point counted"
-    return f"mean {mm(float(far.mean()))}, 95 % within {mm(float(np.percentile(far, 95)))}"
+    return f"mean {mm(float(distances.mean()))}, 95 % within {mm(float(np.percentile(distances, 95)))}"
 
 
 def _decades(values: FloatArray) -> tuple[float, float]:
@@ -416,7 +437,7 @@ def _decades(values: FloatArray) -> tuple[float, float]:
 
 
 def _histogram(values: FloatArray, edges: FloatArray) -> FloatArray:
-    """Return the share of `values` in each bin; those beyond the ends count at the ends."""
+    """Return the share of `values` in each bin; values outside the range count in the end bins."""
     if not len(values):
         return np.zeros(len(edges) - 1)
     return np.histogram(np.clip(values, edges[0], edges[-1]), edges)[0] / len(values)

@@ -1,4 +1,4 @@
-"""Figures of many fits: which of them to look at first, and how close they are."""
+"""Figures of many fits: distances, and grids of pictures."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ _DOUBTFUL = as_hex((0.90, 0.55, 0.05))
 
 
 def error_curves(fits: Sequence[StagedFit], *, stage: str = "final", title: str = "") -> Figure:
-    """Draw cumulative curves: which share of the points lies within each distance.
+    """Draw cumulative curves of the share of points within each distance.
 
     Args:
         fits: for a thin curve each and a thick one of all together, over the vertices that their scans show.
@@ -65,31 +65,31 @@ def error_curves(fits: Sequence[StagedFit], *, stage: str = "final", title: str 
         raise InputError("There is nothing to draw of cumulative errors without fits.")
     if any(stage not in fit.surfaces for fit in fits):
         raise InputError(f"Not every fit has the stage {stage!r}, so their errors cannot be compared there.")
-    far = [np.sort(measured_mm(fit.model_to_scan_mm[stage])) for fit in fits]
-    fits = [fit for fit, values in zip(fits, far, strict=True) if len(values)]
-    far = [values for values in far if len(values)]
-    if not far:
-        return _nothing_shown(title)
-    pooled = np.sort(np.concatenate(far))
+    sorted_distances = [np.sort(measured_mm(fit.model_to_scan_mm[stage])) for fit in fits]
+    fits = [fit for fit, values in zip(fits, sorted_distances, strict=True) if len(values)]
+    sorted_distances = [values for values in sorted_distances if len(values)]
+    if not sorted_distances:
+        return _empty_figure(title)
+    pooled = np.sort(np.concatenate(sorted_distances))
     figure, axes = chart(
         title or f"How close the model comes to the scan, over {counted(len(fits), 'fit')}", height=3.5
     )
     thin = {"lw": 1.1, "alpha": float(np.clip(12 / len(fits), 0.12, 0.8))}
-    seen: set[str] = set()
-    for fit, values in sorted(zip(fits, far, strict=True), key=lambda pair: pair[0].status != "converged"):
+    labelled_stages: set[str] = set()
+    for fit, values in sorted(zip(fits, sorted_distances, strict=True), key=lambda pair: pair[0].status != "converged"):
         doubtful = fit.status in ("doubtful", "failed")
         name = "a doubtful fit" if doubtful else "a fit"
         colour = _DOUBTFUL if doubtful else "#7fa8c9"
-        _curve(axes, values, color=colour, label=None if name in seen else name, **thin)
-        seen.add(name)
+        _curve(axes, values, color=colour, label=None if name in labelled_stages else name, **thin)
+        labelled_stages.add(name)
     if len(fits) > 1:
         _curve(axes, pooled, color=INK, lw=2.6, label="all together")
     for share in (0.5, 0.95):
-        at = float(np.quantile(pooled, share))
-        axes.plot([at], [100 * share], "o", color=INK, ms=6, zorder=5)
+        distance = float(np.quantile(pooled, share))
+        axes.plot([distance], [100 * share], "o", color=INK, ms=6, zorder=5)
         axes.annotate(
-            f"{100 * share:.0f} % within {mm(at)}", (at, 100 * share), xytext=(10, -5), textcoords="offset points",
-            fontsize=SMALL, color=INK, va="top",
+            f"{100 * share:.0f} % within {mm(distance)}", (distance, 100 * share), xytext=(10, -5),
+            textcoords="offset points", fontsize=SMALL, color=INK, va="top",
         )  # fmt: skip
     axes.set(xlabel="distance from the model to the scan (mm)", ylabel="vertices that the scan shows (%)")
     axes.set(xlim=(0, nice_ceiling(1.15 * float(np.quantile(pooled, 0.985)))), ylim=(0, 102))
@@ -97,7 +97,7 @@ def error_curves(fits: Sequence[StagedFit], *, stage: str = "final", title: str 
     return finish(figure)
 
 
-def _nothing_shown(title: str) -> Figure:
+def _empty_figure(title: str) -> Figure:
     figure, axes = chart(title or "How close the model comes to the scan", height=1.2)
     axes.text(
         0.5, 0.5, "No vertex of a model is shown by its scan.", transform=axes.transAxes, ha="center", va="center",
@@ -110,9 +110,9 @@ def _nothing_shown(title: str) -> Figure:
 def _curve(axes: Any, values: FloatArray, **style: Any) -> None:
     """Draw the share of sorted `values` up to each of them, in at most 400 steps."""
     share = np.linspace(0, 1, min(len(values), 400) + 1)
-    at = np.quantile(values, share, method="inverted_cdf") if len(values) > 400 else np.concatenate([[0.0], values])
+    sample = np.quantile(values, share, method="inverted_cdf") if len(values) > 400 else np.concatenate([[0.0], values])
     axes.plot(
-        np.concatenate([at, [10 * values[-1] + 1]]),
+        np.concatenate([sample, [10 * values[-1] + 1]]),
         100 * np.concatenate([share, [1.0]]),
         drawstyle="steps-post",
         **style,
@@ -122,7 +122,7 @@ def _curve(axes: Any, values: FloatArray, **style: Any) -> None:
 def faces_grid(
     meshes: Sequence[Mesh], labels: Sequence[str], *, title: str, columns: int = 4, colour: Colour = CLAY
 ) -> Figure:
-    """Draw `meshes` in one light and at one scale, each under its label (figures 1 and 8).
+    """Draw `meshes` with one light and one scale, each under its label (figures 1 and 8).
 
     Raises:
         InputError: no meshes, or another number of labels.
@@ -130,8 +130,8 @@ def faces_grid(
     if not meshes or len(meshes) != len(labels):
         raise InputError(f"{title}: {len(meshes)} meshes do not go with {len(labels)} labels.")
     columns = min(columns, max(len(meshes), 3))
-    seen = view(np.concatenate([m.vertices for m in meshes]), columns)
-    images = [render(Layer(mesh, colour), camera=seen.camera, size=seen.size) for mesh in meshes]
+    camera_view = view(np.concatenate([m.vertices for m in meshes]), columns)
+    images = [render(Layer(mesh, colour), camera=camera_view.camera, size=camera_view.size) for mesh in meshes]
     return grid(
         [Row(i, t) for i, t in zip(in_rows(images, columns), in_rows(list(labels), columns), strict=True)], title=title
     )
@@ -141,7 +141,7 @@ def portrait_figure(
     fits: Sequence[StagedFit], labels: Sequence[str] = (), *, title: str = "Raw scans and the models fitted to them",
     yaw_deg: float = 25.0,
 ) -> Figure:  # fmt: skip
-    """Draw for each fit: the scan, the model fitted to it, both together, and how far the model lies from the scan.
+    """Draw for each fit the scan, the fitted model, both superimposed, and the distances from model to scan.
 
     Raises:
         InputError: no fit is given.
@@ -153,11 +153,13 @@ def portrait_figure(
     signed = all(fit.scan.faces is not None for fit in fits)
     rows: list[Row] = []
     for k, fit in enumerate(fits):
-        seen = view(surroundings(fit), 4, yaw_deg=yaw_deg)
-        final, far = fit.surfaces["final"], fit.model_to_scan_mm["final"]
+        camera_view = view(surroundings(fit), 4, yaw_deg=yaw_deg)
+        final, distances = fit.surfaces["final"], fit.model_to_scan_mm["final"]
         scan, over, model = Layer(fit.scan, SCAN_COLOUR), scan_over(fit.scan), Layer(final, MODEL_COLOUR)
-        mapped = distance_layer(final, far, top, signed=signed)
-        panels = render_series([[scan], [model], [over, model], [mapped]], camera=seen.camera, size=seen.size)
+        mapped = distance_layer(final, distances, top, signed=signed)
+        panels = render_series(
+            [[scan], [model], [over, model], [mapped]], camera=camera_view.camera, size=camera_view.size
+        )
         captions = ["scan", "model, fitted", "both", "distance"] if k == 0 else []
         name = short(labels[k] if labels else fit.label, 60)
         rows.append(Row(panels, captions, f"{name}: mean {mm(mean_mm(fit))}"))
@@ -173,10 +175,10 @@ def portrait_figure(
 def aligned_grid(
     fits: Sequence[StagedFit], *, title: str = "Scan and fitted model over each other", columns: int = 4
 ) -> Figure:
-    """Draw scan and fitted model over each other for many fits, in the order given."""
+    """Draw scan and fitted model superimposed for many fits, in the order given."""
     images = _equal_views(fits, columns, lambda fit: [scan_over(fit.scan), Layer(fit.surfaces["final"], MODEL_COLOUR)])
     return grid(
-        _captioned(images, fits, columns),
+        _caption_rows(images, fits, columns),
         title=title,
         keys=[("scan", SCAN_COLOUR), ("model", MODEL_COLOUR)],
         note=mean_words(fits),
@@ -199,7 +201,7 @@ def distance_maps(
         ],
     )
     return grid(
-        _captioned(images, fits, columns),
+        _caption_rows(images, fits, columns),
         title=title,
         scale=_unsigned(fits, top),
         keys=_grey(fits),
@@ -214,17 +216,17 @@ def _unsigned(fits: Sequence[StagedFit], top: float) -> Scale:
 
 
 def _grey(fits: Sequence[StagedFit]) -> list[tuple[str, Colour]]:
-    """Return the key of what the maps of some of these fits leave grey."""
+    """Return the legend text for grey areas in the maps."""
     return [(NOT_SHOWN, UNKNOWN_COLOUR)] if any(unknown(fit.model_to_scan_mm["final"]) for fit in fits) else []
 
 
 def _equal_views(fits: Sequence[StagedFit], columns: int, layers: Callable[[StagedFit], list[Layer]]) -> list[Image]:
-    """Return one picture a fit, each from its own front, all of one size."""
+    """Return one view per fit, each from its own front, all of one size."""
     if not fits:
         raise InputError("There is nothing to draw without fits.")
     columns = min(columns, max(len(fits), 3))
     views = [view(fit.surfaces["final"].vertices, columns, margin=0.07) for fit in fits]
-    size = (views[0].size[0], int(np.median([seen.size[1] for seen in views])))
+    size = (views[0].size[0], int(np.median([item.size[1] for item in views])))
     return [
         render(
             *layers(fit),
@@ -235,7 +237,7 @@ def _equal_views(fits: Sequence[StagedFit], columns: int, layers: Callable[[Stag
     ]
 
 
-def _captioned(images: Sequence[Image], fits: Sequence[StagedFit], columns: int) -> list[Row]:
+def _caption_rows(images: Sequence[Image], fits: Sequence[StagedFit], columns: int) -> list[Row]:
     columns = min(columns, max(len(fits), 3))
     names = [f"{short(f.label, 30)}\n{mm(mean_mm(f))}" for f in fits]
     return [Row(i, t) for i, t in zip(in_rows(images, columns), in_rows(names, columns), strict=True)]

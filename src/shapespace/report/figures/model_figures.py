@@ -1,4 +1,4 @@
-"""Figures of a shape space: its mean, what its modes do, and how many of them it needs."""
+"""Figures of a shape model: mean, modes, spectrum and quality."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from shapespace.types import FloatArray, Mesh
 SHARES = (0.90, 0.95, 0.98, 0.99)
 """Shares of the variance for which the number of modes is told."""
 
-_LANDMARK = (0.78, 0.20, 0.14)
+_LANDMARK = (0.78, 0.20, 0.14)  # red, sRGB from 0 to 1
 _BARS = "#a9c9e2"
 _QUALITY = {
     "compactness": ("Compactness: share of the variance held", "share of the variance (%)"),
@@ -53,7 +53,7 @@ _QUALITY = {
     "specificity": ("Specificity: distance of random shapes from real ones", "mean distance (mm)"),
     "reconstruction": ("Reconstruction: error on unseen shapes that were given", "mean error (mm)"),
 }
-_LONGEST_NAME = 26
+_LONGEST_NAME = 26  # layout: characters
 _BY_SHAPES = "Generalisation with all modes, by the number of training shapes"
 _COLOURS, _BANDS = (FORWARD, BACKWARD), (_BARS, "#f2c6a5")
 
@@ -68,9 +68,9 @@ def mean_figure(model: ShapeModel, *, title: str = "") -> Figure:
     mean = model.mesh()
     layers = [Layer(mean)]
     if model.landmarks:
-        at = model.landmarks.interpolate(mean.vertices)
+        landmark_positions = model.landmarks.interpolate(mean.vertices)
         size = 0.008 * float(np.ptp(mean.vertices, axis=0).max())
-        layers.append(Layer(Mesh(at), _LANDMARK, point_radius_mm=size))
+        layers.append(Layer(Mesh(landmark_positions), _LANDMARK, point_radius_mm=size))
     panels: list[Image] = []
     sides = (("front", 0.0), ("three-quarter", 40.0), ("side", 90.0))
     # One height in mm for all three, so that they can be compared.
@@ -78,8 +78,8 @@ def mean_figure(model: ShapeModel, *, title: str = "") -> Figure:
     for _, yaw in sides:
         camera = view(mean.vertices, len(sides), yaw_deg=yaw).camera
         height = max(camera.height_mm, front.camera.height_mm)
-        turned = Camera(camera.centre, height, yaw, 0.0, camera.distance_mm)
-        panels.append(render(*layers, camera=turned, size=front.size))
+        turned_camera = Camera(camera.centre, height, yaw, 0.0, camera.distance_mm)
+        panels.append(render(*layers, camera=turned_camera, size=front.size))
     marks = f", with {counted(len(model.landmarks), 'landmark')}" if model.landmarks else ""
     return grid(
         [Row(panels, [name for name, _ in sides])],
@@ -88,7 +88,7 @@ def mean_figure(model: ShapeModel, *, title: str = "") -> Figure:
 
 
 def modes_figure(model: ShapeModel, modes: int = 5, deviations: float = 3.0, *, title: str = "") -> Figure:
-    """Draw what each of the first modes does (the paper's figures 2 and 3).
+    """Draw the first modes (the paper's figures 2 and 3).
 
     A row a mode: the mean less and plus `deviations` standard deviations of it, and how far each vertex then moves; one
     camera and one scale for all rows.
@@ -104,25 +104,27 @@ def modes_figure(model: ShapeModel, modes: int = 5, deviations: float = 3.0, *, 
     """
     if modes < 1 or not deviations > 0:
         raise InputError(f"There is nothing to draw of {modes} modes at {deviations} standard deviations.")
-    shown = min(modes, model.n_modes)
-    moves = [mode_displacement(model, k, deviations) for k in range(shown)]
+    n_shown = min(modes, model.n_modes)
+    moves = [mode_displacement(model, k, deviations) for k in range(n_shown)]
     mean = model.mesh()
-    seen = view(np.concatenate([mean.vertices + sign * move for move in moves for sign in (-1, 1)]), 4)
+    camera_view = view(np.concatenate([mean.vertices + sign * move for move in moves for sign in (-1, 1)]), 4)
     lengths = [np.linalg.norm(move, axis=1) for move in moves]
     top = nice_ceiling(max(float(length.max()) for length in lengths))
-    middle = render(Layer(mean), camera=seen.camera, size=seen.size)
+    middle = render(Layer(mean), camera=camera_view.camera, size=camera_view.size)
     rows: list[Row] = []
     for k, (move, length) in enumerate(zip(moves, lengths, strict=True)):
         low, high = (
-            render(Layer(mean.with_vertices(mean.vertices + sign * move)), camera=seen.camera, size=seen.size)
+            render(
+                Layer(mean.with_vertices(mean.vertices + sign * move)), camera=camera_view.camera, size=camera_view.size
+            )
             for sign in (-1, 1)
         )
         mapped = Layer(mean, scalars=length, colormap=SEQUENTIAL, vmax=top)
-        far = render(mapped, camera=seen.camera, size=seen.size)
+        displacement = render(mapped, camera=camera_view.camera, size=camera_view.size)
         share = float(model.stddev[k] ** 2 / model.total_variance)
         rows.append(
             Row(
-                [low, middle, high, far],
+                [low, middle, high, displacement],
                 [f"−{deviations:g} sd", "mean", f"+{deviations:g} sd", "movement"] if k == 0 else [],
                 f"Mode {k + 1}: {percent(share)} of the variance, moves up to {mm(float(length.max()))}",
             )
@@ -130,21 +132,21 @@ def modes_figure(model: ShapeModel, modes: int = 5, deviations: float = 3.0, *, 
     of_each = f"{deviations:g} standard deviation{'s' * (deviations != 1)}"
     return grid(
         rows,
-        title=title or f"What {_which(shown, model.n_modes)} to the mean",
+        title=title or f"What {_name_modes(n_shown, model.n_modes)} to the mean",
         scale=Scale(f"how far a point moves at {of_each} (mm)", SEQUENTIAL, 0.0, top),
     )
 
 
-def _which(shown: int, count: int) -> str:
+def _name_modes(n_shown: int, count: int) -> str:
     if count == 1:
         return "the one mode does"
-    if shown == count:
+    if n_shown == count:
         return f"each of the {count} modes does"
-    return f"the first of {count} modes does" if shown == 1 else f"the first {shown} of {count} modes do"
+    return f"the first of {count} modes does" if n_shown == 1 else f"the first {n_shown} of {count} modes do"
 
 
 def mode_displacement(model: ShapeModel, mode: int, deviations: float = 1.0) -> FloatArray:
-    """Return how far each vertex moves, (V, 3) mm, when coefficient `mode` (from 0) rises by `deviations` of its own.
+    """Return the displacement of each vertex, (V, 3) mm, for coefficient `mode` (from 0) at `deviations` sd.
 
     Raises:
         InputError: the model has no such mode.
@@ -166,7 +168,7 @@ def mode_animation(
     yaw_deg: float = 25.0,
     milliseconds: int = 80,
 ) -> bytes:
-    """Return an animated WebP in which the mean sways along one mode and back, for ever.
+    """Return a looping animated WebP of the mean moving along one mode and back.
 
         Path("mode1.webp").write_bytes(mode_animation(model, 0))
 
@@ -186,13 +188,15 @@ def mode_animation(
         raise InputError(f"An animation needs 4 frames or more that stand for a while, not {frames}.")
     move = mode_displacement(model, mode, 1.0)
     mean = model.mesh()
-    ends = np.concatenate([mean.vertices + sign * deviations * move for sign in (-1, 1)])
-    seen = view(ends, 1, yaw_deg=yaw_deg, width=width)
+    extremes = np.concatenate([mean.vertices + sign * deviations * move for sign in (-1, 1)])
+    camera_view = view(extremes, 1, yaw_deg=yaw_deg, width=width)
     half = frames // 2
     swings = deviations * np.sin(np.linspace(-np.pi / 2, np.pi / 2, half + 1))
     forth = [
         _labelled(
-            render(Layer(mean.with_vertices(mean.vertices + z * move)), camera=seen.camera, size=seen.size),
+            render(
+                Layer(mean.with_vertices(mean.vertices + z * move)), camera=camera_view.camera, size=camera_view.size
+            ),
             f"mode {mode + 1}",
             float(z),
             deviations,
@@ -215,7 +219,7 @@ def mode_animation(
 
 
 def _labelled(image: Image, name: str, z: float, deviations: float) -> PillowImage.Image:
-    """Add below a picture which mode it is, and where on its way from one end to the other."""
+    """Draw the mode number and a position marker below an image."""
     height, width = image.shape[:2]
     type_size = max(11, round(width / 19))
     strip = round(2.1 * type_size)
@@ -229,19 +233,21 @@ def _labelled(image: Image, name: str, z: float, deviations: float) -> PillowIma
     left, right = round(0.34 * width), round(0.66 * width)
     draw.line([(left, middle), (right, middle)], fill="#b9bcc2", width=2)
     draw.line([((left + right) // 2, middle - 4), ((left + right) // 2, middle + 4)], fill="#b9bcc2", width=2)
-    at = round(left + (right - left) * (z + deviations) / (2 * deviations))
+    column = round(left + (right - left) * (z + deviations) / (2 * deviations))
     radius = max(4, type_size // 3)
-    draw.ellipse((at - radius, middle - radius, at + radius, middle + radius), fill=FORWARD)
+    draw.ellipse((column - radius, middle - radius, column + radius, middle + radius), fill=FORWARD)
     return picture
 
 
 def spectrum_figure(model: ShapeModel, *, shares: Sequence[float] = SHARES, title: str = "") -> Figure:
     """Draw how much variance the first modes hold, and how many it takes for each of `shares`."""
     cumulative = model.cumulative_variance
-    needed = {share: model.modes_for_variance(share) for share in shares}
-    reached = [count for count in needed.values() if count is not None]
-    shown = min(len(cumulative), max(8, (max(reached) if len(reached) == len(needed) else len(cumulative)) + 3), 120)
-    count = np.arange(1, shown + 1)
+    modes_needed = {share: model.modes_for_variance(share) for share in shares}
+    reached = [count for count in modes_needed.values() if count is not None]
+    n_shown = min(
+        len(cumulative), max(8, (max(reached) if len(reached) == len(modes_needed) else len(cumulative)) + 3), 120
+    )
+    count = np.arange(1, n_shown + 1)
     shapes = counted(model.n_training, "shape")
     figure, axes = chart(
         title
@@ -252,33 +258,33 @@ def spectrum_figure(model: ShapeModel, *, shares: Sequence[float] = SHARES, titl
         ),
         height=3.3,
     )
-    axes.bar(count, 100 * np.diff(cumulative[:shown], prepend=0.0), color=_BARS, label="each mode")
+    axes.bar(count, 100 * np.diff(cumulative[:n_shown], prepend=0.0), color=_BARS, label="each mode")
     axes.plot(
         count,
-        100 * cumulative[:shown],
+        100 * cumulative[:n_shown],
         color=FORWARD,
         lw=2,
-        marker="o" if shown < 40 else "",
+        marker="o" if n_shown < 40 else "",
         ms=4,
         label="all up to it",
     )
     lines: list[str] = []
-    for share, modes in needed.items():
+    for share, modes in modes_needed.items():
         if modes is None:
             lines.append(f"{100 * share:g} %: more than {counted(len(cumulative), 'mode')}")
             continue
         lines.append(f"{100 * share:g} %: {counted(modes, 'mode')}")
-        if modes <= shown:
+        if modes <= n_shown:
             axes.plot([modes], [100 * cumulative[modes - 1]], "o", ms=9, mfc="none", mec=INK, mew=1.4, zorder=5)
     axes.plot([], [], "o", ms=9, mfc="none", mec=INK, mew=1.4, ls="", label="\n".join(lines))
     axes.set(xlabel="number of modes", ylabel="share of the variance (%)", ylim=(0, 104))
-    number_axis(axes, shown)
+    number_axis(axes, n_shown)
     legend(axes, loc="center right", bbox_to_anchor=(1.0, 0.42), labelspacing=0.6)
     return finish(figure)
 
 
 def quality_figure(quality: Quality | Mapping[str, object], *, title: str = "") -> Figure:
-    """Draw compactness, generalisation, specificity and more, those that are there, over the number of modes.
+    """Draw compactness, generalisation, specificity and other measures present against the number of modes.
 
     Args:
         quality: from `compactness` (shares of the variance, 0 to 1), `generalisation`, `specificity` and
@@ -294,28 +300,32 @@ def quality_figure(quality: Quality | Mapping[str, object], *, title: str = "") 
             quality = read(Quality, quality, "What was measured of a model", "give lists of numbers")
         except FileFormatError as error:
             raise InputError(str(error)) from error
-    named = [quality, *quality.others]
-    shown = [key for key in _QUALITY if any(getattr(one, key) is not None for one in named)]
-    sizes = [one.generalisation_by_shapes for one in named]
-    if not shown:
+    qualities = [quality, *quality.others]
+    measures = [key for key in _QUALITY if any(getattr(item, key) is not None for item in qualities)]
+    sizes = [item.generalisation_by_shapes for item in qualities]
+    if not measures:
         raise InputError(f"There is nothing to draw: give at least one of {', '.join(_QUALITY)}.")
-    drawn = {key: [_of(key, one) for one in named] for key in shown}
-    most = int(max(modes.max() for curves in drawn.values() for lines in curves for modes, *_ in lines.values()))
-    by_default = f"How good the shape space is, {'by its number of modes' if most > 1 else 'with its one mode'}"
-    more = [2.5] if any(sizes) else []
-    figure, plots = charts(title or by_default, [2.5] * len(shown) + more)
-    names = [_short(one.name) for one in named] if len(named) > 1 else [""]
-    for axes, (key, curves) in zip(plots, drawn.items(), strict=False):
+    curves_by_measure = {key: [_of(key, item) for item in qualities] for key in measures}
+    largest_mode_count = int(
+        max(modes.max() for curves in curves_by_measure.values() for lines in curves for modes, *_ in lines.values())
+    )
+    by_default = (
+        f"How good the shape space is, {'by its number of modes' if largest_mode_count > 1 else 'with its one mode'}"
+    )
+    extra_heights = [2.5] if any(sizes) else []
+    figure, plots = charts(title or by_default, [2.5] * len(measures) + extra_heights)
+    names = [_short(item.name) for item in qualities] if len(qualities) > 1 else [""]
+    for axes, (key, curves) in zip(plots, curves_by_measure.items(), strict=False):
         for name, lines, colour, band in zip(names, curves, _COLOURS, _BANDS, strict=False):
             _draw_lines(axes, key, name, lines, colour, band)
         heading, unit = _QUALITY[key]
         axes.set_title(heading, fontsize=TEXT, color=INK, loc="left")
         axes.set_ylabel(unit)
         axes.set_ylim(0, 104 if key == "compactness" else None)
-        number_axis(axes, most)
+        number_axis(axes, largest_mode_count)
         _legend_above(axes)
-    plots[len(shown) - 1].set_xlabel("number of modes")
-    if more:
+    plots[len(measures) - 1].set_xlabel("number of modes")
+    if extra_heights:
         _draw_sizes(plots[-1], names, sizes)
     return finish(figure, h_pad=1.2)
 
@@ -324,7 +334,7 @@ _Line: TypeAlias = tuple[FloatArray, FloatArray, FloatArray | None, FloatArray |
 
 
 def _of(key: str, quality: Quality) -> dict[str, _Line]:
-    """Return the curves of a measure that are there: by surface, or without a word, and by vertices."""
+    """Return the curves of a measure that are present: by surface or unnamed, and by vertices."""
     by_surface, by_vertices = getattr(quality, key), getattr(quality, f"{key}_vertices", None)
     out: dict[str, _Line] = {}
     if by_surface is not None:
@@ -361,7 +371,7 @@ def _short(name: str) -> str:
 
 
 def _legend_above(axes: Axes) -> None:
-    """Add the legend, where there is one, above all curves of the plot, with room made for it."""
+    """Add a legend, if there are entries, above the curves, with enough room for it."""
     count = len(axes.get_legend_handles_labels()[1])
     if count:
         low, high = axes.get_ylim()
@@ -377,8 +387,8 @@ def _measured(key: str, value: Measured | tuple[float, ...]) -> _Line:
     low, high = (None if band is None else np.array(band) for band in (measured.low, measured.high))
     if measured.stddev is not None and len(measured.stddev) == len(mean):
         low, high = mean - np.array(measured.stddev), mean + np.array(measured.stddev)
-    given = (modes, *(band for band in (low, high, measured.stddev) if band is not None))
-    if not len(mean) or any(len(part) != len(mean) for part in given):
+    curves = (modes, *(band for band in (low, high, measured.stddev) if band is not None))
+    if not len(mean) or any(len(part) != len(mean) for part in curves):
         raise InputError(f"The {key} of a model must be a list of numbers, one a number of modes.")
     return modes, mean, low, high
 

@@ -157,7 +157,7 @@ def calibration_figure(
     if not len(table):
         raise InputError("There is nothing to draw of a calibration without answers.")
     start, end = 100 * np.clip(table[:, :2].T, 0, 1)
-    stated, right, many = *(100 * table[:, 2:4].T), table[:, 4]
+    stated, right, counts = *(100 * table[:, 2:4].T), table[:, 4]
     if not ((table[:, 2:4] >= 0) & (table[:, 2:4] <= 1)).all():
         raise InputError("What is stated and what is right in a calibration must lie within 0 to 1.")
     headline = "How often answers are right, against the probability stated for them"
@@ -166,10 +166,10 @@ def calibration_figure(
     note = "" if brier is None else f"Brier score {brier:.3f} (0 is best)."
     figure, (above, below) = charts(title or headline, [2.9, 1.25], note=note)
     floor = min(float(start.min()), 100 - 1e-3)
-    above.plot([0, 100], [0, 100], color=GREY, ls=(0, (4, 3)), lw=1.4, label="right as often as stated")
-    size = 26 + 190 * many / many.max()
-    above.plot(stated, right, color=FORWARD, lw=1.6, zorder=2)
-    above.scatter(
+    curve_axes.plot([0, 100], [0, 100], color=GREY, ls=(0, (4, 3)), lw=1.4, label="right as often as stated")
+    size = 26 + 190 * counts / counts.max()
+    curve_axes.plot(stated, right, color=FORWARD, lw=1.6, zorder=2)
+    curve_axes.scatter(
         stated,
         right,
         s=size,
@@ -179,11 +179,13 @@ def calibration_figure(
         zorder=3,
         label="answers, more in larger dots",
     )
-    above.set(xlim=(floor, 101.5), ylim=(min(floor, float(right.min()) - 5, 100.0), 104), ylabel="right answers (%)")
-    legend(above, loc="lower right" if right[-1] > 60 else "upper left")
-    below.bar(start, many, width=end - start, align="edge", color=_BARS, edgecolor="white")
-    below.set(xlim=(floor, 101.5), xlabel="probability stated (%)", ylabel="answers")
-    below.locator_params(axis="y", nbins=3, integer=True)
+    curve_axes.set(
+        xlim=(floor, 101.5), ylim=(min(floor, float(right.min()) - 5, 100.0), 104), ylabel="right answers (%)"
+    )
+    legend(curve_axes, loc="lower right" if right[-1] > 60 else "upper left")
+    count_axes.bar(start, counts, width=end - start, align="edge", color=_BARS, edgecolor="white")
+    count_axes.set(xlim=(floor, 101.5), xlabel="probability stated (%)", ylabel="answers")
+    count_axes.locator_params(axis="y", nbins=3, integer=True)
     return finish(figure, h_pad=0.8)
 
 
@@ -227,9 +229,9 @@ def learning_curve_figure(
     figure, axes = chart(title or headline, height=3.3)
     bottom = float(y.min())
     if low is not None and high is not None:
-        ends = [100 * _numbers(values, "the interval of a learning curve")[order] for values in _like(x, low, high)]
-        axes.fill_between(x, ends[0], ends[1], color=_BARS, alpha=0.5, lw=0, label=escaped(short(band, 40)))
-        bottom = min(bottom, float(ends[0].min()))
+        interval = [100 * _numbers(values, "the interval of a learning curve")[order] for values in _like(x, low, high)]
+        axes.fill_between(x, interval[0], interval[1], color=_BARS, alpha=0.5, lw=0, label=escaped(short(band, 40)))
+        bottom = min(bottom, float(interval[0].min()))
     axes.plot(x, y, color=FORWARD, lw=2, marker="o", ms=5, label="right answers")
     if ceiling is not None:
         axes.axhline(100 * ceiling, color=INK, ls=(0, (4, 3)), lw=1.4, label=f"ceiling: {_share(100 * ceiling)}")
@@ -252,7 +254,7 @@ def curve_figure(
     scales: tuple[CurveScale, CurveScale] = ("linear", "linear"),
     diagonal: bool = False,
 ) -> Figure:
-    """Draw one measure against another, a line a series.
+    """Draw one measure against another, one line per series.
 
     Args:
         series: for each line its name, empty for none, its (n,) places and its (n,) values.
@@ -318,8 +320,8 @@ def curve_figure(
     axes.margins(y=0.12)
     axes.set_xscale("log" if scales[0] == "log" else "linear")
     axes.set_yscale("log" if scales[1] == "log" else "linear")
-    for axis, kind, ends in zip((axes.xaxis, axes.yaxis), scales, limits, strict=True):
-        _scaled(axis, kind, ends)
+    for axis, kind, band_limits in zip((axes.xaxis, axes.yaxis), scales, limits, strict=True):
+        _scaled(axis, kind, band_limits)
     if diagonal:
         low = max(axes.get_xlim()[0], axes.get_ylim()[0])
         high = min(axes.get_xlim()[1], axes.get_ylim()[1])
@@ -360,28 +362,28 @@ def _scale_ends(kind: CurveScale, values: Sequence[FloatArray]) -> tuple[float, 
     return (max(low, _LEAST_SHARE), min(max(high, low), 1 - _LEAST_SHARE)) if kind == "probit" else (low, high)
 
 
-def _placed(values: FloatArray, kind: CurveScale, ends: tuple[float, float]) -> FloatArray:
-    """Return numbers as they are drawn: normal deviates on `probit`, nothing for what has no place on `log`."""
+def _to_scale(values: FloatArray, kind: CurveScale, limits: tuple[float, float]) -> FloatArray:
+    """Transform numbers to the axis scale: normal deviates on `probit`, NaN for non-positive numbers on `log`."""
     if kind == "probit":
         from scipy.special import ndtri
 
-        low, high = ndtri(ends[0]) - _PROBIT_ROOM, ndtri(ends[1]) + _PROBIT_ROOM
+        low, high = ndtri(limits[0]) - _PROBIT_ROOM, ndtri(limits[1]) + _PROBIT_ROOM
         return np.clip(ndtri(np.clip(values, 0, 1)), low, high)
     return np.where(values > 0, values, np.nan) if kind == "log" else values
 
 
-def _scaled(axis: Axis, kind: CurveScale, ends: tuple[float, float]) -> None:
+def _scaled(axis: Axis, kind: CurveScale, limits: tuple[float, float]) -> None:
     """Give an axis its scale and ticks that people read."""
     if kind == "log":
         axis.set_major_formatter(lambda value, _: f"{value:g}")
-        if ends[1] < 30 * ends[0]:
+        if limits[1] < 30 * limits[0]:
             axis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in "25" else "")
         else:
             axis.set_minor_formatter(lambda value, _: "")
     if kind == "probit":
         from scipy.special import ndtri
 
-        low, high = float(ndtri(ends[0])) - _PROBIT_ROOM, float(ndtri(ends[1])) + _PROBIT_ROOM
+        low, high = float(ndtri(limits[0])) - _PROBIT_ROOM, float(ndtri(limits[1])) + _PROBIT_ROOM
         ticks = [share for share in _SHARES if low <= ndtri(share) <= high]
         # Their words would touch where the whole range is shown.
         while len(ticks) > _MOST_TICKS:
@@ -391,7 +393,7 @@ def _scaled(axis: Axis, kind: CurveScale, ends: tuple[float, float]) -> None:
 
 
 def _like(x: FloatArray, *values: npt.ArrayLike) -> list[npt.ArrayLike]:
-    if any(np.shape(one) != x.shape for one in values):
+    if any(np.shape(item) != x.shape for item in values):
         raise InputError(f"The interval of a learning curve must have {len(x)} lower and {len(x)} upper ends.")
     return list(values)
 

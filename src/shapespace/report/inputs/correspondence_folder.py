@@ -1,4 +1,4 @@
-"""A folder that `shapespace correspond` wrote, read for report, viewer and terminal: surfaces are read one by one."""
+"""Reader of the output folder of `shapespace correspond`, for report, viewer and terminal, one surface at a time."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from shapespace.report.inputs.saved_fits import Folder
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, read
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
 
-_FEWEST_VERTICES = 3
-_ONE_UNIT = 5.0
-_POSED_ALIKE = 0.8
-_OPEN_SHARE = 0.15
+_FEWEST_VERTICES = 3  # a triangle
+_ONE_UNIT = 5.0  # ratio of scales; mm, cm and m differ by 10 or more
+_POSED_ALIKE = 0.8  # strength of the mean rotation above which the scans share a pose
+_OPEN_SHARE = 0.15  # share of the area that faces one way in an open surface
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
-    """One surface as pictures need it.
+class PlacedSurface:
+    """One surface in the frame of the pictures.
 
     Args:
         vertices: (V, 3) in the frame of `Corresponded.mean`, size divided out; not-a-number where missing.
@@ -48,13 +48,13 @@ class Placed:
 
     @property
     def seen(self) -> BoolArray:
-        """(V,) which vertices the scan shows."""
-        return there_are(self.vertices)
+        """(V,) mask of observed vertices."""
+        return observed_mask(self.vertices)
 
 
 @dataclass(frozen=True, eq=False)
 class Population:
-    """What all surfaces tell together; scans whose surface cannot be read are not in it.
+    """Summary of all readable surfaces.
 
     Args:
         names: of the scans.
@@ -70,7 +70,7 @@ class Population:
 
 
 class Corresponded:
-    """A folder in correspondence.
+    """Output folder of a correspondence.
 
     Args:
         folder: that `shapespace correspond` wrote.
@@ -88,8 +88,8 @@ class Corresponded:
         if self._mean.faces is None or not np.isfinite(self._mean.vertices).all():
             raise FileFormatError(f"{CorrespondenceRecord.MEAN} is no whole surface; {CORRESPOND_AGAIN}.")
         self.unread: dict[str, str] = {}
-        found = [record for file in self._record_files() if (record := self._record(file)) is not None]
-        self.records = {record.name: record for record in found}
+        records = [record for file in self._record_files() if (record := self._record(file)) is not None]
+        self.records = {record.name: record for record in records}
         self.turn = np.eye(3)
         self._population: Population | None = None
 
@@ -100,13 +100,13 @@ class Corresponded:
 
     @property
     def mean(self) -> Mesh:
-        """The mean shape as pictures show it: upright, about the origin, of the size that it has in its file."""
-        at = self._mean.vertices
-        return self._mean.with_vertices((at - at.mean(axis=0)) @ self.turn.T)
+        """The mean shape, upright and centred at the origin, in the size of its file."""
+        vertices = self._mean.vertices
+        return self._mean.with_vertices((vertices - vertices.mean(axis=0)) @ self.turn.T)
 
     @property
     def holes(self) -> int:
-        """How many borders the mean shape has beside one, which an open surface may have."""
+        """Number of borders of the mean shape beyond the first, which an open surface may have."""
         from shapespace.geometry.topology import join, labels  # compiled
 
         edges = boundary_edges(faces_of(self._mean))
@@ -121,11 +121,11 @@ class Corresponded:
 
     @property
     def set_aside(self) -> list[CorrespondRecord]:
-        """The records of the others."""
+        """Records of excluded scans."""
         return [record for record in self.records.values() if record.status != "corresponding"]
 
     def surface(self, name: str) -> Mesh:
-        """Return the surface of the scan `name` in its own frame and unit, not-a-number where it is not observed.
+        """Return the surface of the scan `name` in its own frame and unit, NaN where it is not observed.
 
         Raises:
             FileError: it cannot be read.
@@ -136,31 +136,31 @@ class Corresponded:
             raise FileFormatError(
                 f"{name}{CorrespondRecord.SURFACE} is not on the template of this folder; {CORRESPOND_AGAIN}."
             )
-        if there_are(mesh.vertices).sum() < _FEWEST_VERTICES:
+        if observed_mask(mesh.vertices).sum() < _FEWEST_VERTICES:
             raise FileFormatError(
                 f"{name}{CorrespondRecord.SURFACE} has hardly a vertex that is not missing; {CORRESPOND_AGAIN}."
             )
         return mesh
 
-    def placed(self, name: str) -> Placed:
+    def placed(self, name: str) -> PlacedSurface:
         """Return the surface of the scan `name` moved onto the mean shape.
 
         Raises:
             FileError: it cannot be read.
             FileFormatError: it is damaged, or not on the template of this folder.
         """
-        own = self.surface(name).vertices
-        seen = there_are(own)
+        vertices = self.surface(name).vertices
+        is_observed = observed_mask(vertices)
         try:
-            T = fit_similarity(self.mean.vertices[seen], own[seen])
+            T = fit_similarity(self.mean.vertices[is_observed], vertices[is_observed])
         except ShapespaceError as error:
             raise FileFormatError(
                 f"{name}{CorrespondRecord.SURFACE} cannot be laid onto the mean shape; {CORRESPOND_AGAIN}."
             ) from error
-        return Placed(np.where(seen[:, None], T.inverse().apply(own), np.nan), T)
+        return PlacedSurface(np.where(is_observed[:, None], T.inverse().apply(vertices), np.nan), T)
 
     def raw_scan(self, record: CorrespondRecord) -> Mesh:
-        """Return the scan of a record, if it is still where it was, with the content it had.
+        """Return the scan of a record, if it is in the same place with the same content.
 
         Raises:
             FileFormatError: it is not, or cannot be read.
@@ -178,7 +178,7 @@ class Corresponded:
             raise FileFormatError("the scan cannot be read.") from error
 
     def population(self, on_scan: Callable[[str], None] | None = None) -> Population:
-        """Return what all surfaces tell together, and turn the mean shape upright; they are read once.
+        """Summarise all surfaces, and bring the mean shape upright; each surface is read once.
 
         Args:
             on_scan: told of each scan that was read.
@@ -209,13 +209,13 @@ class Corresponded:
 
     @property
     def settled(self) -> float:
-        """The share of the size by which vertices move at most in a round that is the last one."""
+        """Convergence threshold: the largest movement in the last round, as a share of the size."""
         value = self.run.settings.get("settled")
         return float(value) if isinstance(value, int | float) else 0.0
 
     @property
     def units_mixed(self) -> bool:
-        """Whether sizes differ so much that the scans cannot be in one unit."""
+        """Whether sizes differ so much that the scans must have different units."""
         scales = [record.scale for record in self.corresponding if record.scale]
         return bool(scales) and max(scales) > _ONE_UNIT * min(scales)
 
@@ -240,22 +240,22 @@ class Corresponded:
         return structs.replace(record, reason=without_folders(record.reason))
 
 
-def there_are(vertices: FloatArray) -> BoolArray:
-    """Return (V,) which of `vertices` (V, 3) are not missing."""
+def observed_mask(vertices: FloatArray) -> BoolArray:
+    """Return the mask (V,) of `vertices` (V, 3) that are not missing."""
     return np.isfinite(vertices.sum(axis=1))
 
 
 def drawable(mesh: Mesh, values: FloatArray | None = None) -> tuple[Mesh, FloatArray | None]:
-    """Return `mesh` without its missing vertices, and `values` (V,) of those that are left."""
-    there = there_are(mesh.vertices)
-    if there.all():
+    """Return `mesh` without missing vertices, and the `values` (V,) of the remaining ones."""
+    is_observed = observed_mask(mesh.vertices)
+    if is_observed.all():
         return mesh, values
-    vertices, faces = without_vertices(mesh.vertices, faces_of(mesh), there)
-    return Mesh(vertices, faces, name=mesh.name), None if values is None else values[there]
+    vertices, faces = without_vertices(mesh.vertices, faces_of(mesh), is_observed)
+    return Mesh(vertices, faces, name=mesh.name), None if values is None else values[is_observed]
 
 
 def upright(mean: Mesh, turns: Sequence[FloatArray] = ()) -> FloatArray:
-    """Return the rotation (3, 3) that brings the mean shape to how it is looked at: +y up, its front along +z.
+    """Return the rotation (3, 3) that brings the mean shape upright: +y up, its front along +z.
 
     Where the scans stand alike, it is how they stand, as everywhere else. Otherwise the longest axis stands upright
     with the narrower end below, and the front is where an open surface faces, or the shortest axis of a closed one.

@@ -1,4 +1,4 @@
-"""Labels of the fits in a folder: where their table is, and which fit has which."""
+"""Labels of the fits in a folder, and the location of their table."""
 
 from __future__ import annotations
 
@@ -11,36 +11,36 @@ from shapespace.report.blocks.wording import listed
 from shapespace.report.inputs.saved_fits import Folder, SavedFit
 
 
-def find_labels(folder: Folder, fits: Sequence[SavedFit], given: Path | None) -> tuple[dict[str, Label], str]:
-    """Return labels and a sentence that says where they come from, or why there are none.
+def find_labels(folder: Folder, fits: Sequence[SavedFit], labels_path: Path | None) -> tuple[dict[str, Label], str]:
+    """Return labels and a sentence on their source, or on the reason why there are none.
 
-    They are looked for in `given`, else in labels.csv in `folder`, else beside the scans.
+    They are looked for in `labels_path`, else in labels.csv in `folder`, else beside the scans.
 
     Raises:
-        FileError: `given` cannot be read.
+        FileError: `labels_path` cannot be read.
         FileFormatError: the table is damaged.
     """
-    if given is not None:
-        return read_labels(given, of_any=True), f"Labels are from {given.name}."
+    if labels_path is not None:
+        return read_labels(labels_path, of_any=True), f"Labels are from {labels_path.name}."
     places = [folder.root / LABELS_FILE]
     for fit in fits:
         path = fit.record.scan.path
         if path and "\0" not in path:
-            beside = (folder.root / path).parent / LABELS_FILE
-            if beside not in places:
-                places.append(beside)
+            label_file = (folder.root / path).parent / LABELS_FILE
+            if label_file not in places:
+                places.append(label_file)
     if places[0].is_file():
         return read_labels(places[0]), f"Labels are from {LABELS_FILE} in the folder."
-    found: dict[str, Label] = {}
-    used: list[str] = []
+    labels: dict[str, Label] = {}
+    used_names: list[str] = []
     for place in filter(Path.is_file, places[1:]):
-        found |= read_labels(place)
-        used.append(f"{place.parent.name}/{LABELS_FILE}")
-    return found, f"Labels are from {listed(used)}, beside the scans." if used else ""
+        labels |= read_labels(place)
+        used_names.append(f"{place.parent.name}/{LABELS_FILE}")
+    return labels, f"Labels are from {listed(used_names)}, beside the scans." if used_names else ""
 
 
-def labelled(fit: SavedFit, labels: Mapping[str, Label]) -> SavedFit:
-    """Return `fit` with its label, found by the scan's file name or the name of the fit; as it is without one."""
+def with_label(fit: SavedFit, labels: Mapping[str, Label]) -> SavedFit:
+    """Return `fit` with its label, matched by the scan's file name or the name of the fit; unchanged without one."""
     scan = fit.record.scan.name
     label = labels.get(stem_of(scan) if scan else fit.name) or labels.get(fit.name)
     if label is None or not label.text:

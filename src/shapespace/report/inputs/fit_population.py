@@ -1,4 +1,4 @@
-"""Very many fits at once: their numbers by column, what they were listed with, and who stands out; read in one stream.
+"""Large sets of fits as columns, with the metadata of their list and unusual fits, read in one stream.
 
 Of each fit some forty bytes and its coefficients are kept (float32), no record and no surface.
 """
@@ -30,21 +30,22 @@ MEASURES: Mapping[str, str] = {
 }
 """What is told of each fit, in words."""
 
-MOST_LEVELS, MOST_BINS = 24, 40
+MOST_LEVELS, MOST_BINS = 24, 40  # layout: rows of a table and bins of a figure
 FEWEST = 20
 """Fits of a level or a stretch of time below which nothing is said about it."""
 
-_MOST_VALUES = 500
-_FEWEST_NUMBERS = 12
+_MOST_VALUES = 500  # distinct texts of a column that counts as a category
+_FEWEST_NUMBERS = 12  # distinct values of a column that counts as numeric
+# a group stands out: standard errors, share of the typical value, and shift in sd of the coefficients
 _SIGNS, _LEAST_SHARE, _LEAST_SHIFT = 4.0, 0.1, 0.3
 _NUMBERS = re.compile(r"\d+(?:[.,]\d+)*")
 _NAMES = re.compile(r"\S*[\\/.]\S*[^\s.,;:]")
-_MOST_REASONS = 5000
+_MOST_REASONS = 5000  # limit on memory
 
 
 @dataclass(frozen=True, eq=False)
-class Listed:
-    """A column of the list that the scans came from.
+class ListedColumn:
+    """A metadata column of the list of scans.
 
     Args:
         name: its head.
@@ -61,20 +62,20 @@ class Listed:
     levels: tuple[str, ...] = ()
 
     def groups(self) -> list[tuple[str, npt.NDArray[np.bool_], float]]:
-        """Return levels, or stretches of equal length, each with its name, which fits are in it, and its middle.
+        """Return levels, or intervals of equal length, each with its name, its fits and its centre.
 
         Of very many levels, those with the most fits.
         """
         if self.kind == "level":
             counts = np.bincount(self.codes[self.codes >= 0], minlength=len(self.levels))
-            most = sorted(np.argsort(-counts, kind="stable")[:MOST_LEVELS].tolist())
-            return [(self.levels[k], self.codes == k, float(k)) for k in most if counts[k]]
+            most_frequent = sorted(np.argsort(-counts, kind="stable")[:MOST_LEVELS].tolist())
+            return [(self.levels[k], self.codes == k, float(k)) for k in most_frequent if counts[k]]
         edges = self.edges()
-        at = np.clip(np.searchsorted(edges, self.values, side="right") - 1, 0, len(edges) - 2)
-        at[~np.isfinite(self.values)] = -1
+        bin_index = np.clip(np.searchsorted(edges, self.values, side="right") - 1, 0, len(edges) - 2)
+        bin_index[~np.isfinite(self.values)] = -1
         middles = (edges[1:] + edges[:-1]) / 2
         return [
-            (f"{self.told(edges[k])} to {self.told(edges[k + 1])}", at == k, float(middles[k]))
+            (f"{self.told(edges[k])} to {self.told(edges[k + 1])}", bin_index == k, float(middles[k]))
             for k in range(len(middles))
         ]
 
@@ -82,14 +83,14 @@ class Listed:
         """Return where stretches of times or numbers begin, and where the last ends; of whole numbers at such."""
         known = self.values[np.isfinite(self.values)]
         low, high = float(known.min()), float(known.max())
-        most = min(MOST_BINS, max(2, len(known) // FEWEST))
+        max_bins = min(MOST_BINS, max(2, len(known) // FEWEST))
         if self.kind == "number" and bool((known == np.round(known)).all()):
-            step = max(1.0, float(np.ceil((high - low + 1) / most)))
+            step = max(1.0, float(np.ceil((high - low + 1) / max_bins)))
             return np.asarray(np.arange(low, high + step + 1, step), dtype=np.float64)
-        return np.asarray(np.linspace(low, np.nextafter(high, np.inf), most + 1), dtype=np.float64)
+        return np.asarray(np.linspace(low, np.nextafter(high, np.inf), max_bins + 1), dtype=np.float64)
 
     def told(self, value: float) -> str:
-        """Return a value in words."""
+        """Format a value as text."""
         if self.kind == "time":
             return datetime.fromtimestamp(value, UTC).strftime("%Y-%m-%d")
         return f"{value:.4g}"
@@ -97,7 +98,7 @@ class Listed:
 
 @dataclass(frozen=True)
 class Group:
-    """How the fits of one level, or one stretch, differ from all.
+    """Difference between the fits of one level, or one interval, and all fits.
 
     Args:
         name: of it.
@@ -142,9 +143,11 @@ class Population:
         codes_of_models: dict[str, int] = {}
         measures: dict[str, list[FloatArray]] = {key: [] for key in MEASURES}
         z: list[npt.NDArray[np.float32]] = []
-        kept: dict[str, tuple[dict[str, int], list[npt.NDArray[np.int32]]]] = {column: ({}, []) for column in metas}
-        wanted = ("scan", "status", "reason", "model_hash", *self.origins, *_READ, *metas)
-        for rows in results.iter_rows((*wanted, *(f"z{k}" for k in range(1, n_modes + 1)))):
+        coded_columns: dict[str, tuple[dict[str, int], list[npt.NDArray[np.int32]]]] = {
+            column: ({}, []) for column in metas
+        }
+        requested = ("scan", "status", "reason", "model_hash", *self.origins, *_READ, *metas)
+        for rows in results.iter_rows((*requested, *(f"z{k}" for k in range(1, n_modes + 1)))):
             self.names += rows["scan"]
             statuses += bytes(_code(status) for status in rows["status"])
             self._count_reasons(rows["status"], rows["reason"])
@@ -155,24 +158,26 @@ class Population:
             numbers = {key: np.array(rows[key], dtype=np.float64) for key in _READ}
             measures["expected_error_mm"].append(numbers["expected_error_mm"])
             for key, direction in (("to_scan_mm", "model_to_scan"), ("to_model_mm", "scan_to_model")):
-                shown = numbers[f"shown_{direction}_mean_mm"]
-                measures[key].append(np.where(np.isfinite(shown), shown, numbers[f"{direction}_mean_mm"]))
+                overlap_distance = numbers[f"shown_{direction}_mean_mm"]
+                measures[key].append(
+                    np.where(np.isfinite(overlap_distance), overlap_distance, numbers[f"{direction}_mean_mm"])
+                )
             measures["seen_percent"].append(100 * numbers["model_seen_share"])
             z.append(np.array([rows[f"z{k}"] for k in range(1, n_modes + 1)], dtype=np.float32).T.reshape(-1, n_modes))
-            for column, (codes, found) in kept.items():
-                found.append(_coded(rows[column], codes, _MOST_VALUES * 400))
+            for column, (codes, chunks) in coded_columns.items():
+                chunks.append(_coded(rows[column], codes, _MOST_VALUES * 400))
         if not self.names:
             raise InputError(f"{results.folder}: none of its fits can be read; {'; '.join(results.problems[:1])}")
         self.status = np.frombuffer(bytes(statuses), dtype=np.uint8)
         self.measures = {key: np.concatenate(parts) for key, parts in measures.items()}
         # Coefficients of other models mean something else.
-        most = codes_of_models.get(self.models.most_common(1)[0][0], 0) if self.models else 0
+        commonest_model = codes_of_models.get(self.models.most_common(1)[0][0], 0) if self.models else 0
         self.z = np.concatenate(z)
-        self.z[np.concatenate(models) != most] = np.nan
+        self.z[np.concatenate(models) != commonest_model] = np.nan
         self.left_out: list[str] = []
         self.listed = [
             column
-            for name, (codes, parts) in kept.items()
+            for name, (codes, parts) in coded_columns.items()
             if (column := self._column(name.removeprefix(META), list(codes), np.concatenate(parts))) is not None
         ]
 
@@ -181,41 +186,41 @@ class Population:
 
     @property
     def counts(self) -> Counter[str]:
-        """How many fits have which status."""
-        found = np.bincount(self.status, minlength=len(ORDER_OF_CONCERN))
-        return Counter({status: int(count) for status, count in zip(ORDER_OF_CONCERN, found, strict=True) if count})
+        """Number of fits per status."""
+        counts = np.bincount(self.status, minlength=len(ORDER_OF_CONCERN))
+        return Counter({status: int(count) for status, count in zip(ORDER_OF_CONCERN, counts, strict=True) if count})
 
     @property
     def trusted(self) -> npt.NDArray[np.bool_]:
-        """(n,) which fits converged with nothing found against them."""
+        """(n,) mask of fits that converged without problems."""
         return self.status == _code("converged")
 
     def median(self, measure: str) -> float:
-        """Return the median of a measure over the trusted fits; not-a-number where none tells it."""
+        """Return the median of a measure over the trusted fits; NaN without values."""
         values = self.measures[measure][self.trusted]
         values = values[np.isfinite(values)]
         return float(np.median(values)) if len(values) else np.nan
 
     def far(self) -> FloatArray:
-        """Return (n,) the root mean square of each fit's coefficients in standard deviations; not-a-number without."""
+        """Return the root mean square (n,) of each fit's coefficients in standard deviations; NaN without any."""
         out = np.full(len(self), np.nan)
-        has = np.isfinite(self.z).any(axis=1) if self.z.shape[1] else np.zeros(len(self), dtype=bool)
-        out[has] = np.sqrt(np.nanmean(np.square(self.z[has], dtype=np.float64), axis=1))
+        has_coefficients = np.isfinite(self.z).any(axis=1) if self.z.shape[1] else np.zeros(len(self), dtype=bool)
+        out[has_coefficients] = np.sqrt(np.nanmean(np.square(self.z[has_coefficients], dtype=np.float64), axis=1))
         return out
 
-    def worst(self, status: str, most: int) -> list[str]:
-        """Return names of fits of a status: those that expect the largest error of themselves first."""
-        at = np.flatnonzero(self.status == _code(status))
-        error = self.measures["expected_error_mm"][at]
-        error = np.where(np.isfinite(error), error, self.measures["to_model_mm"][at])
+    def worst(self, status: str, max_count: int) -> list[str]:
+        """Return names of fits of a status, sorted by expected error, largest first."""
+        rows = np.flatnonzero(self.status == _code(status))
+        error = self.measures["expected_error_mm"][rows]
+        error = np.where(np.isfinite(error), error, self.measures["to_model_mm"][rows])
         order = np.argsort(np.where(np.isfinite(error), -error, 0.0), kind="stable")
-        return [self.names[k] for k in at[order[:most]]]
+        return [self.names[k] for k in rows[order[:max_count]]]
 
-    def compared(self, column: Listed) -> list[Group]:
+    def compared(self, column: ListedColumn) -> list[Group]:
         """Return how the fits of each level, or stretch, of a column differ from all."""
         return list(self._compared(column))
 
-    def _compared(self, column: Listed) -> Iterator[Group]:
+    def _compared(self, column: ListedColumn) -> Iterator[Group]:
         trusted, errors = self.trusted, self.measures["expected_error_mm"]
         known = errors[trusted & np.isfinite(errors)]
         middle = float(np.median(known)) if len(known) else np.nan
@@ -225,13 +230,13 @@ class Population:
             count = int(inside.sum())
             if not count:
                 continue
-            mine = errors[inside & trusted]
-            mine = mine[np.isfinite(mine)]
-            error = float(np.median(mine)) if len(mine) else np.nan
+            group_errors = errors[inside & trusted]
+            group_errors = group_errors[np.isfinite(group_errors)]
+            error = float(np.median(group_errors)) if len(group_errors) else np.nan
             untrusted = 1 - float(trusted[inside].mean())
             out: list[str] = []
-            if len(mine) >= FEWEST:
-                spread = 1.2533 * float(mine.std()) / np.sqrt(len(mine))
+            if len(group_errors) >= FEWEST:
+                spread = 1.2533 * float(group_errors.std()) / np.sqrt(len(group_errors))
                 if abs(error - middle) > max(_SIGNS * spread, _LEAST_SHARE * middle):
                     way = "larger" if error > middle else "smaller"
                     out.append(f"the expected error is {way}: {error:.2f} mm at the median against {middle:.2f} of all")
@@ -241,10 +246,10 @@ class Population:
                 out.append(f"{way} fits are not trusted: {100 * untrusted:.1f} % against {100 * all_share:.1f} of all")
             shifts = _mean(self.z[inside & trusted]) - all_mean if all_mean.size else all_mean
             mode, shift = 0, 0.0
-            if len(mine) >= FEWEST and np.isfinite(shifts).any():
+            if len(group_errors) >= FEWEST and np.isfinite(shifts).any():
                 mode = int(np.nanargmax(np.abs(shifts))) + 1
                 shift = float(shifts[mode - 1])
-                if abs(shift) > max(_SIGNS / np.sqrt(len(mine)), _LEAST_SHIFT):
+                if abs(shift) > max(_SIGNS / np.sqrt(len(group_errors)), _LEAST_SHIFT):
                     out.append(f"z{mode} is {'higher' if shift > 0 else 'lower'} by {abs(shift):.2f} on average")
             yield Group(name, count, untrusted, error, error - middle, mode, shift, tuple(out))
 
@@ -258,15 +263,15 @@ class Population:
                 plain = "another reason"
             self.n_reasons[status, plain] += 1
 
-    def _column(self, name: str, texts: Sequence[str], codes: npt.NDArray[np.int32]) -> Listed | None:
-        """Return a column as times, numbers or levels; None of one whose values all differ, such as identifiers."""
+    def _column(self, name: str, texts: Sequence[str], codes: npt.NDArray[np.int32]) -> ListedColumn | None:
+        """Return a column as times, numbers or levels; None if all values differ, as for identifiers."""
         if not (codes >= 0).any():
             return None
         for kind, parse in (("number", _number), ("time", _seconds)):
             values = np.array([parse(text) for text in texts])
             if np.isfinite(values).mean() > 0.95 and len(np.unique(values)) > _FEWEST_NUMBERS:
-                own = np.where(codes >= 0, values[codes], np.nan)
-                return Listed(name, "number" if kind == "number" else "time", own, codes)
+                values_by_row = np.where(codes >= 0, values[codes], np.nan)
+                return ListedColumn(name, "number" if kind == "number" else "time", values_by_row, codes)
         if not 1 < len(texts) <= min(_MOST_VALUES, len(codes) // 2):
             if len(texts) > 1:
                 self.left_out.append(name)
@@ -274,18 +279,18 @@ class Population:
         order = sorted(range(len(texts)), key=lambda k: texts[k])
         rank = np.argsort(np.array(order))
         own_codes = np.where(codes >= 0, rank[codes], -1).astype(np.int32)
-        return Listed(name, "level", np.zeros(0), own_codes, tuple(texts[k] for k in order))
+        return ListedColumn(name, "level", np.zeros(0), own_codes, tuple(texts[k] for k in order))
 
 
-def neediest(results: Results, most: int) -> list[str]:
-    """Return the names of the fits that need a look most: by status, then by the error expected or seen."""
-    found: list[tuple[int, float, str]] = []
+def most_concerning(results: Results, max_count: int) -> list[str]:
+    """Return the names of fits to review first: by status, then by the expected or measured error."""
+    ranked: list[tuple[int, float, str]] = []
     columns = ("scan", "status", "expected_error_mm", "scan_to_model_mean_mm")
     for rows in results.iter_rows(columns):
-        for name, status, expected, seen in zip(*(rows[column] for column in columns), strict=True):
-            found.append((_code(status), -(seen or 0.0) if expected is None else -expected, name))
-        found = heapq.nsmallest(most, found)
-    return [name for _, _, name in found]
+        for name, status, expected, seen_share in zip(*(rows[column] for column in columns), strict=True):
+            ranked.append((_code(status), -(seen_share or 0.0) if expected is None else -expected, name))
+        ranked = heapq.nsmallest(max_count, ranked)
+    return [name for _, _, name in ranked]
 
 
 _READ = (
@@ -298,11 +303,13 @@ def _code(status: str) -> int:
     return ORDER_OF_CONCERN.index(status) if status in ORDER_OF_CONCERN else ORDER_OF_CONCERN.index("unreadable")
 
 
-def _coded(texts: Sequence[str | None], codes: dict[str, int], most: int) -> npt.NDArray[np.int32]:
-    """Return the number of each text in `codes`, which grows; -1 for none, and beyond `most` different ones."""
+def _coded(texts: Sequence[str | None], codes: dict[str, int], max_levels: int) -> npt.NDArray[np.int32]:
+    """Return the index of each text in `codes`, which grows; -1 for missing ones and beyond `max_levels` distinct
+    texts.
+    """
     out = np.full(len(texts), -1, dtype=np.int32)
     for k, text in enumerate(texts):
-        if text and (text in codes or len(codes) < most):
+        if text and (text in codes or len(codes) < max_levels):
             out[k] = codes.setdefault(text, len(codes))
     return out
 

@@ -1,4 +1,4 @@
-"""What fits and the demo saved, read back for pictures: JSON, arrays, meshes and models, checked, inside one folder."""
+"""Reader of saved fits and the demo for reports: JSON, arrays, meshes and models, checked, inside one folder."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from shapespace.store.results import ENDING, ENDINGS, Results, arrays_at, json_a
 from shapespace.types import FloatArray, Mesh
 
 _AGAIN = "make it again with shapespace fit --stages"
-_FEWEST_POINTS = 20
+_FEWEST_POINTS = 20  # fewer are not a scan
 
 Direction: TypeAlias = Literal["model_to_scan", "scan_to_model"]
 Measure: TypeAlias = Literal["mean", "median", "rms", "p95", "max", "fraction"]
@@ -69,7 +69,7 @@ class Folder:
         return path
 
     def json(self, name: object) -> dict[str, Any]:
-        """Return the object in a JSON file, its strings free of what cannot be printed.
+        """Return the object in a JSON file, without unprintable characters in its strings.
 
         Raises:
             FileError: it cannot be read.
@@ -108,22 +108,22 @@ class Folder:
         try:
             yield
         except ShapespaceError as error:
-            told = str(error)
+            message = str(error)
             for root in dict.fromkeys((str(self.root.resolve()), str(self.root))):
-                told = told.replace(f"{root}{os.sep}", "")
-            raise type(error)(told) from error
+                message = message.replace(f"{root}{os.sep}", "")
+            raise type(error)(message) from error
 
 
 @dataclass(frozen=True, eq=False)
 class SavedFit:
-    """One fit: its record, and what is known beside it, from demo.json or from the files of a folder."""
+    """One fit: its record, and metadata from demo.json or from the files of a folder."""
 
     entry: FitEntry
     record: FitRecord
 
     @property
     def name(self) -> str:
-        """What it is called."""
+        """Name of the fit."""
         return self.entry.name
 
     @property
@@ -157,40 +157,40 @@ class SavedFit:
 
     @property
     def pictured(self) -> bool:
-        """Whether there are surfaces to show."""
+        """Whether there are surfaces to draw."""
         return bool(self.entry.stages or self.entry.fitted) and self.fitted
 
     def summary_mm(self, stage: str, direction: Direction, measure: Measure) -> float:
-        """Return a distance over the whole model, or all of the scan, in mm; not-a-number where there is none."""
-        found = self.record.distances_mm.get(stage)
-        return _known(getattr(getattr(found, direction), measure)) if found else math.nan
+        """Return a distance over the whole model, or the whole scan, in mm; NaN if there is none."""
+        summary = self.record.distances_mm.get(stage)
+        return _known(getattr(getattr(summary, direction), measure)) if summary else math.nan
 
     def distance_mm(self, direction: Direction, measure: Measure = "mean") -> float:
-        """Return a distance of the final stage over what the scan shows, in mm; not-a-number where there is none.
+        """Return a distance of the final stage over the overlap, in mm; NaN if there is none.
 
         Records of earlier versions do not have it, see `shown`; of them it is that of `summary_mm`.
         """
-        found = self.record.shown
+        overlap = self.record.shown
         return (
-            _known(getattr(getattr(found, direction), measure))
-            if found
+            _known(getattr(getattr(overlap, direction), measure))
+            if overlap
             else self.summary_mm("final", direction, measure)
         )
 
     @property
     def shown(self) -> bool:
-        """Whether distances are over what the scan shows."""
+        """Whether distances are over the overlap."""
         return self.record.shown is not None
 
     @property
     def expected_error_mm(self) -> float:
-        """The vertex error that the fit expects of itself, mm; not-a-number where it does not say."""
+        """Expected vertex error of the fit, mm; NaN if unknown."""
         value = self.record.evidence.get("expected_error_mm")
         return float(value) if isinstance(value, int | float) else math.nan
 
-    def with_entry(self, **known: Any) -> SavedFit:
+    def with_entry(self, **values: Any) -> SavedFit:
         """Return the fit with more known beside its record, by the names of `FitEntry`."""
-        return SavedFit(structs.replace(self.entry, **known), self.record)
+        return SavedFit(structs.replace(self.entry, **values), self.record)
 
     def numbers(self, key: Literal["b", "z"]) -> FloatArray:
         """Return coefficients of the record, (K,).
@@ -247,7 +247,7 @@ def _results(folder: Folder) -> Results:
 
 
 def saved_fit(folder: Folder, results: Results, name: str) -> SavedFit:
-    """Return one fit of `results`, which are those of `folder`; `unreadable` where it cannot be read."""
+    """Return one fit of `results`, which belong to `folder`; `unreadable` if it cannot be read."""
     fitted, dense, stages = (
         f"{name}{ENDINGS[kind]}" if results.has(name, kind) else None for kind in ("fitted", "dense", "stages")
     )
@@ -281,10 +281,10 @@ def saved_surfaces(folder: Folder, fit: SavedFit) -> dict[str, Mesh]:
         FileFormatError: one is damaged, or the record has no pose.
     """
     files = {"final": fit.entry.fitted, "dense": fit.entry.dense}
-    found = {stage: folder.mesh(file) for stage, file in files.items() if file or stage == "final"}
-    if len({len(mesh.vertices) for mesh in found.values()}) > 1:
+    surfaces = {stage: folder.mesh(file) for stage, file in files.items() if file or stage == "final"}
+    if len({len(mesh.vertices) for mesh in surfaces.values()}) > 1:
         raise FileFormatError(f"{fit.name}: its fitted and its dense surface differ in their vertices; {_AGAIN}.")
-    return {stage: _in_model_frame(mesh, fit) for stage, mesh in found.items()}
+    return {stage: _in_model_frame(mesh, fit) for stage, mesh in surfaces.items()}
 
 
 def _in_model_frame(mesh: Mesh, fit: SavedFit) -> Mesh:
@@ -321,13 +321,13 @@ def raw_scan(folder: Folder, fit: SavedFit) -> Mesh:
     return mesh
 
 
-def model_of(folder: Folder, fits: Sequence[SavedFit], given: Path | None = None) -> ShapeModel:
-    """Return the model by which `fits` were made.
+def model_of(folder: Folder, fits: Sequence[SavedFit], model_path: Path | None = None) -> ShapeModel:
+    """Return the model that `fits` were made with.
 
     Args:
         folder: where the fits lie.
         fits: one or more; those without a readable record do not count.
-        given: the model's file; None goes by the path in the records.
+        model_path: the model's file; None goes by the path in the records.
 
     Raises:
         FileError: it cannot be read.
@@ -338,10 +338,10 @@ def model_of(folder: Folder, fits: Sequence[SavedFit], given: Path | None = None
     hashes = {source.hash for source in sources}
     if not sources:
         raise InputError(f"{folder.root}: no record names a model; give it with --model.")
-    if len(hashes) > 1 and given is None:
+    if len(hashes) > 1 and model_path is None:
         raise InputError(f"{folder.root}: its fits are by {len(hashes)} different models; give one with --model.")
-    path = given or folder.root / (sources[0].path or sources[0].name)
-    if given is None and not path.exists():
+    path = model_path or folder.root / (sources[0].path or sources[0].name)
+    if model_path is None and not path.exists():
         raise InputError(f"{folder.root}: the model {path.name} is no longer at {path}; give it with --model.")
     model = ShapeModel.load(path)
     if model.content_hash not in hashes:

@@ -1,4 +1,4 @@
-"""A fit as pictures need it: scan and model in the model's frame in mm, moment by moment, with signed distances."""
+"""A fit in the frame of the pictures: scan and model in mm, iteration by iteration, with signed distances."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Moment:
 
 @dataclass(frozen=True, eq=False)
 class StagedFit:
-    """A fit as pictures need it, with scan and model in the model's frame in mm.
+    """A fit in the frame of the pictures, with scan and model in the model's frame in mm.
 
     Args:
         name: of the fit.
@@ -90,7 +90,7 @@ class StagedFit:
 
     @staticmethod
     def of(model: ShapeModel, result: FitResult, label: str = "") -> StagedFit:
-        """Return what pictures need of `result`, which was fitted by `model`."""
+        """Return the staged fit of `result`, which was fitted by `model`."""
         arrays = stage_arrays(result, model)
         return StagedFit.from_arrays(arrays, result, name=result.scan_name, label=label or result.scan_name)
 
@@ -98,7 +98,7 @@ class StagedFit:
     def from_surfaces(
         surfaces: Mapping[str, Mesh], scan: Mesh, record: FitRecord, *, name: str, label: str
     ) -> StagedFit:
-        """Return a fit from its saved surfaces and its scan, with distances that are measured now.
+        """Return a fit from its saved surfaces and its scan, and measure its distances.
 
         A vertex counts as not shown by the scan where its closest point lies on the border of the scan, and more than
         1 % of the size of the model to the side; nowhere where the record says that the scan shows the whole model.
@@ -119,13 +119,13 @@ class StagedFit:
         if not all(values.shape == b.shape for values in (z, b_stddev, shrinkage)):
             raise FileFormatError(f"{name}: the coefficients of its record do not fit together; fit the scan again.")
         engine = build_engine(scan)
-        whole = record.shown is not None and record.shown.model_seen_share == 1.0
+        is_complete = record.shown is not None and record.shown.model_seen_share == 1.0
         forward: dict[str, FloatArray] = {}
         backward: dict[str, FloatArray] = {}
         for stage, surface in surfaces.items():
             distances = surface_distances(surface, scan, scan_engine=engine)
             unseen = np.zeros(len(surface.vertices), dtype=bool)
-            if scan.faces is not None and surface.faces is not None and not whole:
+            if scan.faces is not None and surface.faces is not None and not is_complete:
                 nearest = engine.query(surface.vertices)
                 along = np.einsum("ij,ij->i", nearest.points - surface.vertices, vertex_normals(surface))
                 sideways = np.sqrt(np.maximum(nearest.distance**2 - along**2, 0.0))
@@ -141,25 +141,25 @@ class StagedFit:
     @staticmethod
     @np.errstate(all="ignore")  # what overflows, or is divided by zero, is refused at the end
     def from_arrays(
-        arrays: Mapping[str, npt.NDArray[Any]], told: FitResult | FitRecord, *, name: str, label: str
+        arrays: Mapping[str, npt.NDArray[Any]], record: FitResult | FitRecord, *, name: str, label: str
     ) -> StagedFit:
         """Return a fit from the arrays of NAME.stages.npz.
 
         Args:
             arrays: of the file.
-            told: its result, or its record: status, reason and numbers.
+            record: its result, or its record: status, reason and numbers.
             name: of the fit.
             label: what pictures call it.
 
         Raises:
             FileFormatError: arrays are absent, of an earlier version, or do not fit together.
         """
-        again = "fit the scan again with --stages"
+        remedy = "fit the scan again with --stages"
         b, z, b_stddev, shrinkage = (
-            np.array(values, dtype=np.float64) for values in (told.b, told.z, told.b_stddev, told.shrinkage)
+            np.array(values, dtype=np.float64) for values in (record.b, record.z, record.b_stddev, record.shrinkage)
         )
         if not np.array_equal(arrays.get("format_version", 0), STAGES_VERSION):
-            raise FileFormatError(f"{name}: its stages were saved by another version of shapespace; {again}.")
+            raise FileFormatError(f"{name}: its stages were saved by another version of shapespace; {remedy}.")
         try:
             faces = arrays.get("faces")
             scan = Mesh(
@@ -182,27 +182,27 @@ class StagedFit:
                 )
             )
         except (KeyError, ValueError, TypeError, IndexError, OverflowError, ShapespaceError) as error:
-            raise FileFormatError(f"{name}: its saved stages are damaged ({error}); {again}.") from error
+            raise FileFormatError(f"{name}: its saved stages are damaged ({error}); {remedy}.") from error
         V, S = len(surfaces["final"].vertices), len(scan.vertices)
-        whole = all(np.isfinite(mesh.vertices).all() for mesh in (scan, *surfaces.values()))
-        whole &= all(len(surface.vertices) == V for surface in surfaces.values())
-        whole &= all(d.shape == (V,) and np.isfinite(d).all() for d in forward.values())
-        whole &= all(d.shape == (S,) and not np.isinf(d).any() for d in backward.values())
-        whole &= regions.shape == (V,) and int(regions.max(initial=0)) < len(REGIONS)
-        whole &= all(values.shape == b.shape for values in (z, b_stddev, shrinkage))
-        whole &= all(moment.b.shape == b.shape and np.isfinite(moment.b).all() for moment in history)
-        if not whole:
-            raise FileFormatError(f"{name}: its saved stages do not fit together; {again}.")
+        is_finite = all(np.isfinite(mesh.vertices).all() for mesh in (scan, *surfaces.values()))
+        is_finite &= all(len(surface.vertices) == V for surface in surfaces.values())
+        is_finite &= all(d.shape == (V,) and np.isfinite(d).all() for d in forward.values())
+        is_finite &= all(d.shape == (S,) and not np.isinf(d).any() for d in backward.values())
+        is_finite &= regions.shape == (V,) and int(regions.max(initial=0)) < len(REGIONS)
+        is_finite &= all(values.shape == b.shape for values in (z, b_stddev, shrinkage))
+        is_finite &= all(moment.b.shape == b.shape and np.isfinite(moment.b).all() for moment in history)
+        if not is_finite:
+            raise FileFormatError(f"{name}: its saved stages do not fit together; {remedy}.")
         unseen = regions == UNSEEN
-        shown = {stage: np.where(unseen, np.nan, d) for stage, d in forward.items()}
+        overlap_mm = {stage: np.where(unseen, np.nan, d) for stage, d in forward.items()}
         return StagedFit(
-            name, label, told.status, told.reason, scan, surfaces, shown, backward, regions, b, z, b_stddev, shrinkage,
-            history,
+            name, label, record.status, record.reason, scan, surfaces, overlap_mm, backward, regions, b, z, b_stddev,
+            shrinkage, history,
         )  # fmt: skip
 
 
 def measured_mm(distances_mm: FloatArray) -> FloatArray:
-    """Return the lengths of signed distances, those that were measured, (n,)."""
+    """Return the absolute values of the finite signed distances, (n,)."""
     return np.abs(distances_mm[np.isfinite(distances_mm)])
 
 
@@ -213,7 +213,7 @@ _MEDIANS = 5.0
 
 
 def scale_end(distances_mm: FloatArray) -> float:
-    """Return where a scale of signed distances (N,), mm, ends, whatever hair or one bad fit among them does."""
+    """Return the end of a colour scale for signed distances (N,), mm, robust against outliers."""
     known = measured_mm(distances_mm)
     if not len(known):
         return 1.0

@@ -1,4 +1,4 @@
-"""Which scans in correspondence to look at first, and why: what stands out beside the others, or is bad by itself."""
+"""Triage of scans in correspondence: scans to review first, with reasons."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from shapespace.schemas import CorrespondRecord
 
 _STANDS_OUT = 4.0
 """How many times the usual spread above the middle makes a scan one to look at."""
-_LEAST_SPREAD = 0.25
-_TO_STDDEV = 1.4826
+_LEAST_SPREAD = 0.25  # share of the median that counts as usual variation, where all scans are alike
+_TO_STDDEV = 1.4826  # MAD to standard deviation of a normal distribution: 1 / 0.6745
 
 
 @dataclass(frozen=True)
 class Concern:
-    """Why a scan in correspondence may need a look.
+    """Reasons to review a scan in correspondence.
 
     Args:
         weight: how much it stands out, 0 for not at all.
@@ -32,13 +32,13 @@ class Concern:
 
     @property
     def told(self) -> str:
-        """The reasons as a sentence."""
+        """Reasons as a sentence."""
         return sentence("; ".join(self.reasons)) if self.reasons else "Nothing about it stands out."
 
 
 @dataclass(frozen=True)
 class _Measure:
-    """What may stand out.
+    """A measure with its usual range.
 
     Args:
         of: the value of each scan, not-a-number where it is not known.
@@ -55,40 +55,40 @@ class _Measure:
     always: float = inf
 
 
-def concerns_of(at: Corresponded) -> dict[str, Concern]:
-    """Return for each scan in correspondence, by its name, what stands out about it."""
-    population = at.population()
-    records = [at.records[name] for name in population.names]
-    found: list[list[tuple[float, str]]] = [[] for _ in records]
-    for measure in _measures(records, population.sizes.tolist(), at.settled):
+def concerns_of(folder: Corresponded) -> dict[str, Concern]:
+    """Return the concerns about each scan in correspondence, by name."""
+    population = folder.population()
+    records = [folder.records[name] for name in population.names]
+    reasons_by_record: list[list[tuple[float, str]]] = [[] for _ in records]
+    for measure in _measures(records, population.sizes.tolist(), folder.settled):
         centre = median(measure.of)
         spread = _TO_STDDEV * median([abs(value - centre) for value in measure.of])
         spread = max(spread, measure.least_spread, 1e-12)
-        for reasons, value in zip(found, measure.of, strict=True):
+        for reasons, value in zip(reasons_by_record, measure.of, strict=True):
             over = (value - centre) / spread
             if value > measure.always:
                 over = max(over, _STANDS_OUT * value / measure.always)
             if over > _STANDS_OUT and value > measure.at_least:
                 reasons.append((over, measure.told(value)))
-    ordered = [sorted(reasons, reverse=True) for reasons in found]
+    ordered = [sorted(reasons, reverse=True) for reasons in reasons_by_record]
     return {
-        record.name: Concern(reasons[0][0] if reasons else 0.0, tuple(told for _, told in reasons))
+        record.name: Concern(reasons[0][0] if reasons else 0.0, tuple(reason for _, reason in reasons))
         for record, reasons in zip(records, ordered, strict=True)
     }
 
 
-def _measures(records: Sequence[CorrespondRecord], sizes: Sequence[float], settled: float) -> list[_Measure]:
-    far = [distance_share(record, "p99", size) for record, size in zip(records, sizes, strict=True)]
+def _measures(records: Sequence[CorrespondRecord], sizes: Sequence[float], settled_mm: float) -> list[_Measure]:
+    tail_shares = [distance_share(record, "p99", size) for record, size in zip(records, sizes, strict=True)]
     growth = [log(record.area_factor) if record.area_factor else nan for record in records]
-    moved = [record.moved_share[-1] if record.moved_share else nan for record in records]
+    last_movements = [record.moved_share[-1] if record.moved_share else nan for record in records]
     return [
         _Measure(
-            far,
+            tail_shares,
             lambda v: (
                 f"1 % of its points lie farther off than {percent_of(v)} of its size, where "
-                f"{percent_of(median(far))} is usual"
+                f"{percent_of(median(tail_shares))} is usual"
             ),
-            _LEAST_SPREAD * known(median(far)),
+            _LEAST_SPREAD * known(median(tail_shares)),
             always=0.1,
         ),
         _Measure(
@@ -119,26 +119,26 @@ def _measures(records: Sequence[CorrespondRecord], sizes: Sequence[float], settl
             _LEAST_SPREAD * known(median(growth)),
         ),
         _Measure(
-            moved,
+            last_movements,
             lambda v: f"its vertices still moved by {percent_of(v)} of its size in the last round",
-            _LEAST_SPREAD * known(median(moved)),
-            at_least=settled,
+            _LEAST_SPREAD * known(median(last_movements)),
+            at_least=settled_mm,
         ),
     ]
 
 
-def distance_share(record: CorrespondRecord, which: str, size: float) -> float:
+def distance_share(record: CorrespondRecord, statistic: str, size: float) -> float:
     """Return the distance `mean`, `p95`, `p99` or `max` of a record as a share of `size`, which is in its unit."""
-    return known(getattr(record, f"distance_{which}")) / size
+    return known(getattr(record, f"distance_{statistic}")) / size
 
 
 def known(value: float | None) -> float:
-    """Return a number that may be absent, not-a-number for none."""
+    """Return a number that may be absent, NaN for None."""
     return nan if value is None else value
 
 
 def median(values: Sequence[float]) -> float:
-    """Return the median of those that are numbers, not-a-number where none is."""
+    """Return the median of the finite numbers, NaN if there are none."""
     numbers = [value for value in values if isfinite(value)]
     return float(np.median(numbers)) if numbers else nan
 
@@ -154,7 +154,7 @@ def sentence(text: str) -> str:
 
 
 def scan_status(record: CorrespondRecord, concerns: Mapping[str, Concern]) -> str:
-    """Return `corresponding`, `look` for one that stands out, `set aside`, or `unreadable` where its surface is."""
+    """Return `corresponding`, `look` for an unusual scan, `set aside`, or `unreadable`."""
     if record.status != "corresponding":
         return "set aside"
     concern = concerns.get(record.name)

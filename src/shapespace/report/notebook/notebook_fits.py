@@ -1,4 +1,4 @@
-"""What a notebook shows of a model, a fit and a quality: a picture, the key numbers, the verdict; and their plots."""
+"""Notebook views of models, fits and model quality: a picture, key numbers, status; and their plots."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
 Drawn: TypeAlias = "tuple[Still, str]"
 """A picture, and what stands below it."""
-_SHARES = (0.9, 0.95, 0.98)
-_MODES_SHOWN = 2
-_PANEL = (220, 290)
-_MOST_COEFFICIENTS = 5
+_SHARES = (0.9, 0.95, 0.98)  # of the variance; usual choices for the number of modes
+_MODES_SHOWN = 2  # layout: rows
+_PANEL = (220, 290)  # layout: pixels
+_MOST_COEFFICIENTS = 5  # layout: entries
 _CURVES = (
     "compactness",
     "generalisation",
@@ -38,17 +38,17 @@ _CURVES = (
 )
 
 
-def plot_model(model: ShapeModel, what: str, **options: Any) -> Figure:
-    """Do what `ShapeModel.plot` says."""
+def plot_model(model: ShapeModel, kind: str, **options: Any) -> Figure:
+    """Draw a figure for `ShapeModel.plot`."""
     require_report_extra()
     from shapespace.report import figures
 
     draw = {"modes": figures.modes_figure, "mean": figures.mean_figure, "spectrum": figures.spectrum_figure}
-    return _choose(draw, what)(model, **options)
+    return _choose(draw, kind)(model, **options)
 
 
-def plot_fit(result: FitResult, what: str, **options: Any) -> Figure:
-    """Do what `FitResult.plot` says."""
+def plot_fit(result: FitResult, kind: str, **options: Any) -> Figure:
+    """Draw a figure for `FitResult.plot`."""
     require_report_extra()
     from shapespace.report import figures
 
@@ -61,19 +61,19 @@ def plot_fit(result: FitResult, what: str, **options: Any) -> Figure:
         "history": figures.history_figure,
         "regions": figures.regions_figure,
     }
-    return _choose(draw, what)(StagedFit.of(result.model, result), **options)
+    return _choose(draw, kind)(StagedFit.of(result.model, result), **options)
 
 
 def plot_quality(quality: ModelQuality, **options: Any) -> Figure:
-    """Do what `ModelQuality.plot` says."""
+    """Draw a figure for `ModelQuality.plot`."""
     require_report_extra()
     from shapespace.report import figures
 
-    told = {name: _numbers(curve) for name in _CURVES if (curve := getattr(quality, name)) is not None}
+    curves = {name: _numbers(curve) for name in _CURVES if (curve := getattr(quality, name)) is not None}
     if quality.by_shapes is not None:
         sizes = _numbers(quality.by_shapes)
-        told["generalisation_by_shapes"] = {"shapes": sizes.pop("modes"), **sizes}
-    return figures.quality_figure(told, **options)
+        curves["generalisation_by_shapes"] = {"shapes": sizes.pop("modes"), **sizes}
+    return figures.quality_figure(curves, **options)
 
 
 def _numbers(curve: Curve) -> dict[str, list[float]]:
@@ -81,20 +81,22 @@ def _numbers(curve: Curve) -> dict[str, list[float]]:
     return {name: values.tolist() for name, values in of.items()}
 
 
-def _choose(draw: Mapping[str, Callable[..., Figure]], what: str) -> Callable[..., Figure]:
-    if what not in draw:
-        raise InputError(f"There is no plot {what!r}; choose one of {', '.join(draw)}.")
-    return draw[what]
+def _choose(draw: Mapping[str, Callable[..., Figure]], kind: str) -> Callable[..., Figure]:
+    if kind not in draw:
+        raise InputError(f"There is no plot {kind!r}; choose one of {', '.join(draw)}.")
+    return draw[kind]
 
 
 def html_of_model(model: ShapeModel) -> str:
-    """Return a model for a notebook: its first modes, what it was made of, and what it may be used for."""
-    needed = [f"{percent(share)} in {n}" for share in _SHARES if (n := model.modes_for_variance(share)) is not None]
+    """Return a model for a notebook: its first modes, training data, and licence."""
+    modes_needed = [
+        f"{percent(share)} in {n}" for share in _SHARES if (n := model.modes_for_variance(share)) is not None
+    ]
     rows = [
         ("Made of", counted(model.n_training, "shape")),
         ("Surface", f"{model.n_vertices:,} vertices, {0 if model.faces is None else len(model.faces):,} triangles"),
         ("Modes", f"{model.n_modes}, with {100 * float(model.cumulative_variance[-1]):.1f} % of the variance"),
-        ("Variance", listed(needed) or "below 90 % in the modes kept"),
+        ("Variance", listed(modes_needed) or "below 90 % in the modes kept"),
         ("Size", "divided out (gauge shape)" if model.gauge == "shape" else "kept in the modes (gauge form)"),
         ("Landmarks", listed(list(model.landmarks)) or "none"),
         ("Provenance", model.provenance or "not stated"),
@@ -141,8 +143,10 @@ def html_of_quality(quality: ModelQuality) -> str:
         curve = getattr(quality, name)
         if curve is not None:
             value, low, high = curve.mean[-1], curve.low[-1], curve.high[-1]
-            told = percent(value) if name == "compactness" else f"{mm(value)} ({low:.3g} to {high:.3g})"
-            rows.append((name.replace("_vertices", " (vertices)").capitalize(), f"{told} with {curve.at[-1]} modes"))
+            value_text = percent(value) if name == "compactness" else f"{mm(value)} ({low:.3g} to {high:.3g})"
+            rows.append(
+                (name.replace("_vertices", " (vertices)").capitalize(), f"{value_text} with {curve.at[-1]} modes")
+            )
 
     def draw() -> Drawn:
         return _still(plot_quality(quality)), "Bands are 95 % intervals."

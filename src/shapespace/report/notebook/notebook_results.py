@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 MOST_TABLES, MOST_ROWS = 2, 12
 """Largest number of tables of an analysis, and of rows of a table, in a notebook; reports have all."""
 
-_MOST_NOTES = 6
-_MOST_COLUMNS = 8
+_MOST_NOTES = 6  # layout: lines
+_MOST_COLUMNS = 8  # layout: columns
 
 
 def html_of_analysis(result: AnalysisResult) -> str:
@@ -86,24 +86,24 @@ def html_of_results(results: Results) -> str:
     return notebook_html(results, "Results", [], rows, blocks=[*blocks, Notes(results.problems[:_MOST_NOTES])])
 
 
-def html_of_correspondence(found: Correspondence) -> str:
+def html_of_correspondence(correspondence: Correspondence) -> str:
     """Return the notebook view of scans in correspondence: the mean shape, and the coverage of each scan."""
-    kept = [scan for scan in found.scans if not scan.reason]
+    included = [scan for scan in correspondence.scans if not scan.reason]
     rows = [
-        ("Scans", f"{len(kept)} of {len(found.scans)} in correspondence"),
-        ("Surface", f"{len(found.template.vertices):,} vertices"),
-        ("Rounds", f"{len(found.moved)}; movement in the last {percent(found.moved[-1])} of the size")
-        if found.moved
+        ("Scans", f"{len(included)} of {len(correspondence.scans)} in correspondence"),
+        ("Surface", f"{len(correspondence.template.vertices):,} vertices"),
+        ("Rounds", f"{len(correspondence.moved)}; movement in the last {percent(correspondence.moved[-1])} of the size")
+        if correspondence.moved
         else ("Rounds", "none"),
     ]
     cells = [
         [scan.name, scan.reason or "in correspondence", percent(scan.seen), percent(scan.covered)]
-        for scan in sorted(found.scans, key=lambda scan: not scan.reason)[:MOST_ROWS]
+        for scan in sorted(correspondence.scans, key=lambda scan: not scan.reason)[:MOST_ROWS]
     ]
     heads = ["scan", "status", "share of the mean shape seen", "share of the scan covered"]
-    blocks = _table(heads, cells, "The scans, excluded ones first", len(found.scans))
-    draw = _surface(found.template, "The mean shape.")
-    return notebook_html(found, "Correspondence", [found.why], rows, draw, blocks=blocks)
+    blocks = _table(heads, cells, "The scans, excluded ones first", len(correspondence.scans))
+    draw = _surface(correspondence.template, "The mean shape.")
+    return notebook_html(correspondence, "Correspondence", [correspondence.why], rows, draw, blocks=blocks)
 
 
 def html_of_volume_surface(surface: VolumeSurface) -> str:
@@ -145,30 +145,35 @@ def html_of_predictor(predictor: Predictor) -> str:
     return notebook_html(predictor, f"Predictor of {predictor.target}", [], rows)
 
 
-def html_of_predictions(found: Predictions) -> str:
+def html_of_predictions(predictions: Predictions) -> str:
     """Return the notebook view of predictions: value and interval of the first shapes."""
     cells = [
-        [name, f"{found.value[k]:.4g}", f"{found.low[k]:.4g} to {found.high[k]:.4g}", found.outside[k]]
-        for k, name in enumerate(found.names[:MOST_ROWS])
+        [
+            name,
+            f"{predictions.value[k]:.4g}",
+            f"{predictions.low[k]:.4g} to {predictions.high[k]:.4g}",
+            predictions.outside[k],
+        ]
+        for k, name in enumerate(predictions.names[:MOST_ROWS])
     ]
     heads = ["shape", "value", "interval", "outside of the training data"]
-    blocks = _table(heads, cells, "The first shapes", len(found.names))
-    return notebook_html(found, "Predictions", [], [("Shapes", str(len(found.names)))], blocks=blocks)
+    blocks = _table(heads, cells, "The first shapes", len(predictions.names))
+    return notebook_html(predictions, "Predictions", [], [("Shapes", str(len(predictions.names)))], blocks=blocks)
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], caption: str, total: int) -> list[Block]:
     """Return a table of the first of `total` rows, and how many there are beyond them."""
-    shown: list[Block] = [
+    blocks: list[Block] = [
         Table([Column(head) for head in heads], [[Cell(text) for text in row] for row in rows], caption)
     ]
-    return shown if total <= len(rows) else [*shown, Text(f"{total - len(rows):,} more are left out.")]
+    return blocks if total <= len(rows) else [*blocks, Text(f"{total - len(rows):,} more are left out.")]
 
 
-def _shortened(table: Table) -> list[Block]:
-    """Return a table with at most `MOST_ROWS` rows, and how many there are beyond them."""
-    shown = Table(table.columns, table.rows[:MOST_ROWS], table.caption)
+def _shorten(table: Table) -> list[Block]:
+    """Return a table with at most `MOST_ROWS` rows, and the number of further rows."""
+    short_table = Table(table.columns, table.rows[:MOST_ROWS], table.caption)
     left = len(table.rows) - MOST_ROWS
-    return [shown] if left <= 0 else [shown, Text(f"{left:,} more rows are left out.")]
+    return [short_table] if left <= 0 else [short_table, Text(f"{left:,} more rows are left out.")]
 
 
 def _surface(mesh: Mesh, caption: str) -> Callable[[], Drawn]:

@@ -32,7 +32,7 @@ from shapespace.report.blocks.blocks import (
     text_table,
 )
 from shapespace.report.blocks.wording import DASH, counted, listed, percent, plain, setting, words
-from shapespace.report.inputs.correspondence_folder import Corresponded, Placed, drawable, upright
+from shapespace.report.inputs.correspondence_folder import Corresponded, PlacedSurface, drawable, upright
 from shapespace.report.inputs.saved_fits import Folder
 from shapespace.report.inputs.staged_fit import nice_ceiling
 from shapespace.report.inputs.triage import (
@@ -377,11 +377,11 @@ class CorrespondencePage:
         return self.page.image(still, f"{record.name}: {seen}"), note
 
     def _bounded(self, record: CorrespondRecord) -> Mesh:
-        from shapespace.report.render.decimate import thinned
+        from shapespace.report.render.decimate import decimate
 
-        return thinned(self.at.raw_scan(record), _TRIANGLES_DRAWN)[0]
+        return decimate(self.at.raw_scan(record), _TRIANGLES_DRAWN)[0]
 
-    def _beside(self, scan: Mesh, placed: Placed) -> tuple[Mesh, FloatArray]:
+    def _beside(self, scan: Mesh, placed: PlacedSurface) -> tuple[Mesh, FloatArray]:
         """Return the scan moved onto the mean shape, and how far off each vertex lies, percent of the size."""
         moved = scan.with_vertices(placed.T_scan_mean.inverse().apply(scan.vertices))
         far = np.full(len(placed.vertices), nan)

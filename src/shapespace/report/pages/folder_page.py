@@ -33,7 +33,7 @@ from shapespace.report.blocks.blocks import (
 )
 from shapespace.report.blocks.settings_text import settings_told
 from shapespace.report.blocks.wording import DASH, STATUS_WORDS, counted, isfinite, listed, mm, printable
-from shapespace.report.inputs.fit_labels import find_labels, labelled
+from shapespace.report.inputs.fit_labels import find_labels, with_label
 from shapespace.report.inputs.saved_fits import (
     Folder,
     SavedFit,
@@ -96,7 +96,7 @@ class FolderPage:
             if labels is not None:
                 raise
             self.label_note = f"There are no labels: {error}"
-        self.fits = sorted((labelled(fit, found) for fit in fits), key=sections.concern)
+        self.fits = sorted((with_label(fit, found) for fit in fits), key=sections.concern)
         self.main = _main_fits(self.fits)
         planned = sections.MODEL_PICTURES + min(len(fits), MOST_CARDS) + 4 + len(self.main) * sections.FIT_PICTURES
         self.page = Page(planned, on_step)

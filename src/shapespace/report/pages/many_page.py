@@ -35,7 +35,7 @@ from shapespace.report.blocks.wording import (
     printable,
     without_folders,
 )
-from shapespace.report.inputs.fit_population import FEWEST, MEASURES, Group, Listed, Population
+from shapespace.report.inputs.fit_population import FEWEST, MEASURES, Group, ListedColumn, Population
 from shapespace.report.inputs.saved_fits import Folder, SavedFit, saved_fit
 from shapespace.report.pages import recognition_page as recognition
 from shapespace.report.pages.folder_page import FolderPage
@@ -262,7 +262,7 @@ class ManyPage(FolderPage):
             parts.append(Text(f"Not shown: {listed(left)}.", "soft"))
         return parts
 
-    def by(self, column: Listed) -> list[Block]:
+    def by(self, column: ListedColumn) -> list[Block]:
         """Return how the fits go with one column."""
         from shapespace.report import figures
 
@@ -289,7 +289,7 @@ class ManyPage(FolderPage):
         table = self._compared(column)
         return [picture, table if column.kind == "level" else Folded(f"By {column.name}, in numbers", [table])]
 
-    def _compared(self, column: Listed) -> Table:
+    def _compared(self, column: ListedColumn) -> Table:
         def row(group: Group) -> list[Cell]:
             shift = f"z{group.mode} {group.shift:+.2f}".replace("-", "−") if group.mode else DASH
             return [

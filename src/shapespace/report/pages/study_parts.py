@@ -256,7 +256,7 @@ class StudyParts:
         if low.shape != high.shape:
             raise self.parts_file.damaged("the two shapes of a morph have different numbers of vertices")
         first, last = self._mesh(low, faces), self._mesh(high, faces)
-        turn, _ = figures.looked_at(first)
+        turn, _ = figures.upright_views(first)
         both = first.with_vertices(first.vertices @ turn.T), last.with_vertices(last.vertices @ turn.T)
         labels = part.low_label or "low", part.high_label or "high"
         still = figures.encode_webp(figures.morph_figure(*both, labels, title=None))

@@ -1,4 +1,4 @@
-"""Surfaces and point clouds with fewer points, so that they can be sent; no point of them is new."""
+"""Decimation of surfaces and point clouds for transfer, without new points."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from shapespace.errors import MeshError
 from shapespace.geometry.remesh import collapse
 from shapespace.types import IntArray, Mesh
 
-_MOST_COLLAPSED = 150_000
+_MOST_COLLAPSED = 150_000  # triangles; larger scans are clustered on a grid first, which is faster
 
 
-def thinned(scan: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
-    """Return `scan` with at most `largest` triangles (points, where it has none), and which vertices are left.
+def decimate(scan: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
+    """Return `scan` with at most `largest` triangles (or points), and the indices of the remaining vertices.
 
     No new point is made, so what was measured at a vertex stays true of it. Of surfaces, the shortest edges are
     collapsed. Points, surfaces that branch, and very large ones, which would take long, are thinned by a cubic grid
@@ -53,14 +53,14 @@ def thinned(scan: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
 
 
 def _collapsed(scan: Mesh, faces: IntArray, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]] | None:
-    """Return the surface with collapsed edges and its vertices that are left; None where it branches."""
+    """Return the surface after edge collapse and its remaining vertices; None for a non-manifold surface."""
     try:
-        _, triangles, kept = collapse(scan.vertices, faces, largest, scan.name)
+        _, triangles, source_rows = collapse(scan.vertices, faces, largest, scan.name)
     except MeshError:
         return None
     if len(triangles) > largest:
         return None
-    return Mesh(scan.vertices[kept], triangles.astype(np.int32), name=scan.name), kept
+    return Mesh(scan.vertices[source_rows], triangles.astype(np.int32), name=scan.name), source_rows
 
 
 def _count(mesh: Mesh) -> int:
@@ -69,19 +69,19 @@ def _count(mesh: Mesh) -> int:
 
 def _clustered(scan: Mesh, cell: float) -> tuple[Mesh, npt.NDArray[np.intp]]:
     points = scan.vertices
-    at = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
-    side = at.max(axis=0) + 1
-    _, group = np.unique((at[:, 0] * side[1] + at[:, 1]) * side[2] + at[:, 2], return_inverse=True)
+    cells = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
+    side = cells.max(axis=0) + 1
+    _, group = np.unique((cells[:, 0] * side[1] + cells[:, 1]) * side[2] + cells[:, 2], return_inverse=True)
     size = np.bincount(group)
     middle = np.stack([np.bincount(group, points[:, k]) / size for k in range(3)], axis=1)
-    far = ((points - middle[group]) ** 2).sum(axis=1)
-    order = np.lexsort((far, group))
+    squared_distance = ((points - middle[group]) ** 2).sum(axis=1)
+    order = np.lexsort((squared_distance, group))
     first = np.r_[0, np.cumsum(size)[:-1]]
-    kept = order[first]
+    representatives = order[first]
     if scan.faces is None:
-        return Mesh(points[kept], None, name=scan.name), kept
+        return Mesh(points[representatives], None, name=scan.name), representatives
     faces = group[scan.faces].astype(np.int32)
-    whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    faces = faces[whole]
-    _, once = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
-    return Mesh(points[kept], faces[np.sort(once)], name=scan.name), kept
+    is_whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    faces = faces[is_whole]
+    _, unique_rows = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    return Mesh(points[representatives], faces[np.sort(unique_rows)], name=scan.name), representatives

@@ -1,4 +1,4 @@
-"""Colours that report and viewer share, told apart with every common kind of colour blindness.
+"""Colours of report and viewer, distinguishable with every common kind of colour blindness.
 
 Both maps change evenly to the eye: they are drawn through a few colours in the space OKLab (Ottosson 2020) and stepped
 at equal lengths. The sequential one is pale where nothing is wrong, so that a surface looks like a surface there, and
@@ -22,12 +22,13 @@ Colour: TypeAlias = tuple[float, float, float]
 
 CLAY: Colour = (0.80, 0.755, 0.715)
 """A surface of which only the form is to be seen."""
+# orange; colours of this group are sRGB from 0 to 1, and differ in lightness too
 SCAN_COLOUR: Colour = (0.93, 0.66, 0.36)
-MODEL_COLOUR: Colour = (0.36, 0.58, 0.80)
-DENSE_COLOUR: Colour = (0.33, 0.66, 0.56)
+MODEL_COLOUR: Colour = (0.36, 0.58, 0.80)  # blue
+DENSE_COLOUR: Colour = (0.33, 0.66, 0.56)  # green
 UNKNOWN_COLOUR: Colour = (0.66, 0.66, 0.66)
 """Where a map has no value."""
-WITHIN_COLOUR: Colour = (0.22, 0.53, 0.74)
+WITHIN_COLOUR: Colour = (0.22, 0.53, 0.74)  # blue
 BEYOND_COLOUR: Colour = (0.95, 0.58, 0.20)
 """The two sides of a threshold."""
 
@@ -86,19 +87,19 @@ def _even(anchors: npt.ArrayLike, count: int) -> FloatArray:
     anchors = np.asarray(anchors, dtype=np.float64)
     curve = _between(np.linspace(0, len(anchors) - 1, 2001), np.arange(len(anchors)), anchors)
     # Corners in a map are seen as edges that the data do not have.
-    reach = 150
-    padded = np.concatenate([2 * curve[0] - curve[reach:0:-1], curve, 2 * curve[-1] - curve[-2 : -reach - 2 : -1]])
-    window = np.hanning(2 * reach + 1) / np.hanning(2 * reach + 1).sum()
+    n_steps = 150
+    padded = np.concatenate([2 * curve[0] - curve[n_steps:0:-1], curve, 2 * curve[-1] - curve[-2 : -n_steps - 2 : -1]])
+    window = np.hanning(2 * n_steps + 1) / np.hanning(2 * n_steps + 1).sum()
     for k in range(3):
         curve[:, k] = np.convolve(padded[:, k], window, mode="valid")
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
     return _srgb(_between(np.linspace(0, float(along[-1]), count), along, curve))
 
 
-def _between(at: npt.NDArray[Any], known: npt.NDArray[Any], colours: FloatArray) -> FloatArray:
-    out = np.empty((len(at), 3))
+def _between(positions: npt.NDArray[Any], known: npt.NDArray[Any], colours: FloatArray) -> FloatArray:
+    out = np.empty((len(positions), 3))
     for k in range(3):
-        out[:, k] = np.interp(at, known, colours[:, k])
+        out[:, k] = np.interp(positions, known, colours[:, k])
     return out
 
 
@@ -109,8 +110,8 @@ def _frozen(colours: FloatArray) -> FloatArray:
 
 
 def _sequential() -> FloatArray:
-    named = ("f6f1e4", "f3cf8e", "e98f53", "c24a5c", "7a2669", "2b1250")
-    return _frozen(_even(oklab([_hex(name) for name in named]), 256))
+    anchors = ("f6f1e4", "f3cf8e", "e98f53", "c24a5c", "7a2669", "2b1250")
+    return _frozen(_even(oklab([_hex(name) for name in anchors]), 256))
 
 
 def _diverging() -> FloatArray:

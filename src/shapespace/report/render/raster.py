@@ -1,4 +1,4 @@
-"""The compiled loops of the renderer: which triangle or ball a pixel shows, and what is interpolated there."""
+"""Compiled loops of the renderer: visibility of triangles and balls, and interpolation."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy.typing as npt
 from shapespace.compiled import compiled
 from shapespace.types import FloatArray, IntArray
 
-_TINY = 1e-9
+_TINY = 1e-9  # pixels; keeps triangles that share an edge without gaps
 
 
 @compiled
@@ -90,9 +90,9 @@ def nearest_triangles(
 
 
 @compiled
-def interpolated(
+def interpolate(
     pixel: npt.NDArray[np.int64],
-    shown: npt.NDArray[np.int32],
+    triangle_index: npt.NDArray[np.int32],
     screen: FloatArray,
     nearness: FloatArray,
     faces: IntArray,
@@ -102,13 +102,13 @@ def interpolated(
     width: int,
     normal: npt.NDArray[np.float32],
     scalar: npt.NDArray[np.float32],
-    back: npt.NDArray[np.bool_],
+    is_back: npt.NDArray[np.bool_],
 ) -> None:
     """Fill in the normal, the scalar and the side of each covered pixel.
 
     Args:
         pixel: (n,) covered pixels, row by row.
-        shown: (n,) the triangle of each.
+        triangle_index: (n,) the triangle of each.
         screen: (V, 2) pixels.
         nearness: (V,) one over the distance from the eye, or one where the picture is orthographic.
         faces: (F, 3).
@@ -118,19 +118,19 @@ def interpolated(
         width: of the picture in pixels.
         normal: (3, n), written: of unit length, towards the eye.
         scalar: (n,) or (0,), written.
-        back: (n,), written: whether the triangle is seen from behind.
+        is_back: (n,), written: whether the triangle is seen from behind.
     """
     for i in range(len(pixel)):
         x, y = pixel[i] % width + 0.5, pixel[i] // width + 0.5
-        a, b, c = faces[shown[i], 0], faces[shown[i], 1], faces[shown[i], 2]
+        a, b, c = faces[triangle_index[i], 0], faces[triangle_index[i], 1], faces[triangle_index[i], 2]
         ax, ay = screen[a, 0] - x, screen[a, 1] - y
         bx, by = screen[b, 0] - x, screen[b, 1] - y
         cx, cy = screen[c, 0] - x, screen[c, 1] - y
         wa, wb, wc = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
         area = wa + wb + wc
         # On the screen y points down, so a triangle that faces the eye turns the negative way.
-        behind = area > 0
-        back[i] = behind
+        is_back_facing = area > 0
+        is_back[i] = is_back_facing
         if area == 0:
             area = 1.0
         wa = min(max(wa / area, 0.0), 1.0) * nearness[a]
@@ -142,7 +142,7 @@ def interpolated(
         ny = wa * normals[a, 1] + wb * normals[b, 1] + wc * normals[c, 1]
         nz = wa * normals[a, 2] + wb * normals[b, 2] + wc * normals[c, 2]
         length = math.sqrt(max(nx * nx + ny * ny + nz * nz, 1e-24))
-        if behind:
+        if is_back_facing:
             length = -length
         normal[0, i], normal[1, i], normal[2, i] = nx / length, ny / length, nz / length
         if len(scalars):
@@ -189,9 +189,9 @@ def nearest_balls(
         left, right = max(int(x - radius), 0), min(int(min(x + radius, width)), width - 1)
         for row in range(top, bottom + 1):
             for column in range(left, right + 1):
-                off = (column + 0.5 - x) ** 2 + (row + 0.5 - y) ** 2
-                if off <= radius * radius:
-                    value = depth_mm[k] - math.sqrt(radius * radius - off) / radius * rise_mm
+                squared_distance = (column + 0.5 - x) ** 2 + (row + 0.5 - y) ** 2
+                if squared_distance <= radius * radius:
+                    value = depth_mm[k] - math.sqrt(radius * radius - squared_distance) / radius * rise_mm
                     pixel = row * width + column
                     if value < nearest[pixel]:
                         nearest[pixel] = value
@@ -199,7 +199,7 @@ def nearest_balls(
 
 
 @compiled
-def lit(
+def shade_pixels(
     normal: npt.NDArray[np.float32],
     scalar: npt.NDArray[np.float32],
     table: npt.NDArray[np.float32],
@@ -209,7 +209,7 @@ def lit(
     as_map: bool,
     lights: npt.NDArray[np.float32],
     occlusion: npt.NDArray[np.float32],
-    back: npt.NDArray[np.bool_],
+    is_back: npt.NDArray[np.bool_],
     out: npt.NDArray[np.float32],
 ) -> None:
     """Fill in linear colours: soft key, fill and rim light, a little gloss.
@@ -224,7 +224,7 @@ def lit(
         as_map: whether colours are read by a scale, and shading must leave them alone.
         lights: (5, 3): directions of key, fill and gloss, colours of key and fill.
         occlusion: (n,) in (0, 1].
-        back: (n,) whether a surface is seen from its inside.
+        is_back: (n,) whether a surface is seen from its inside.
         out: (n, 3), written.
     """
     mapped = len(scalar) > 0
@@ -236,28 +236,28 @@ def lit(
         gloss = min(max(lights[2, 0] * x + lights[2, 1] * y + lights[2, 2] * z, 0.0), 1.0)
         gloss = gloss**32 * occlusion[i]
         rim = min(max(1.0 - abs(z), 0.0), 1.0)
-        at, known = 0, True
+        position, is_known = 0, True
         if mapped:
-            known = math.isfinite(scalar[i])
-            if known:
+            is_known = math.isfinite(scalar[i])
+            if is_known:
                 share = min(max((scalar[i] - low) / (high - low), 0.0), 1.0)
-                at = min(int(share * len(table)), len(table) - 1)
+                position = min(int(share * len(table)), len(table) - 1)
         # A map is read by its colours: less shading there, and none of it coloured, so that they stay the scale's.
         plain = (0.50 + 0.48 * key + 0.08 * fill) * (1.0 - 0.45 * rim**4)
         for k in range(3):
-            base = table[at, k] if known else unknown[k]
+            base = table[position, k] if is_known else unknown[k]
             if as_map:
                 value = base * plain * occlusion[i] + 0.02 * gloss
             else:
                 light = key * lights[3, k] + (0.15 * fill + 0.13 * (0.5 + 0.5 * y)) * lights[4, k] + 0.035
                 value = base * light * occlusion[i] + 0.07 * gloss + 0.035 * rim**3
-            if back[i]:
+            if is_back[i]:
                 value = 0.4 * value + 0.02
             out[i, k] = min(max(value, 0.0), 1.0)
 
 
 @compiled
-def put_nearer(
+def merge_nearer(
     pixel: npt.NDArray[np.int64],
     colours: npt.NDArray[np.float32],
     depth: npt.NDArray[np.float32],
@@ -266,15 +266,15 @@ def put_nearer(
 ) -> None:
     """Put `colours` (n, 3) of covered pixels (n,) into `out` (m, 3) where `depth` (n,) is below `nearest` (m,)."""
     for i in range(len(pixel)):
-        at = pixel[i]
-        if depth[i] < nearest[at]:
-            nearest[at] = depth[i]
+        pixel_index = pixel[i]
+        if depth[i] < nearest[pixel_index]:
+            nearest[pixel_index] = depth[i]
             for k in range(3):
-                out[at, k] = colours[i, k]
+                out[pixel_index, k] = colours[i, k]
 
 
 @compiled
-def averaged(
+def average_pixels(
     samples: npt.NDArray[np.float32], supersample: int, srgb: npt.NDArray[np.uint8], out: npt.NDArray[np.uint8]
 ) -> None:
     """Fill in the mean of the samples of each pixel, as sRGB.

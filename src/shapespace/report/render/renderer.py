@@ -1,4 +1,4 @@
-"""Stills of meshes and point clouds by a z-buffer: no GPU, no window, the same bytes every time.
+"""Renderer of meshes and point clouds by a z-buffer: no GPU, no window, reproducible to the byte.
 
 The nearest triangle of each pixel is found first; normals and scalars are interpolated for what is seen only.
 """
@@ -18,7 +18,14 @@ from shapespace.errors import InputError
 from shapespace.geometry.normals import vertex_normals
 from shapespace.io.memory_cache import cached_with_owner
 from shapespace.report.render.palette import CLAY, DIVERGING, SEQUENTIAL, UNKNOWN_COLOUR, Colour
-from shapespace.report.render.raster import averaged, interpolated, lit, nearest_balls, nearest_triangles, put_nearer
+from shapespace.report.render.raster import (
+    average_pixels,
+    interpolate,
+    merge_nearer,
+    nearest_balls,
+    nearest_triangles,
+    shade_pixels,
+)
 from shapespace.types import FloatArray, IntArray, Mesh, read_only
 
 Image: TypeAlias = npt.NDArray[np.uint8]
@@ -28,16 +35,16 @@ _Single: TypeAlias = npt.NDArray[np.float32]
 SQUARE_COLOURS = 5
 """How many colours the squares of a checkerboard take in turn."""
 
-_LARGEST_SIDE = 8192
-_SUPERSAMPLE = 2
-_GAMMA = 2.2
+_LARGEST_SIDE = 8192  # pixels; limit on memory
+_SUPERSAMPLE = 2  # samples per pixel and axis
+_GAMMA = 2.2  # approximation of the sRGB transfer function
 # Powers of every pixel would take as long as finding what it shows.
 _SRGB = np.round(255.0 * ((np.arange(65536) + 0.5) / 65536) ** (1 / _GAMMA)).astype(np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Where a picture is taken from; share one in a row so that its panels can be compared.
+    """Viewpoint of a picture; share one in a row so that its panels can be compared.
 
     With yaw and pitch 0 it looks along -z with +y up: the front of a face that looks along +z.
 
@@ -86,8 +93,8 @@ class Camera:
         if not len(points) or not np.isfinite(points).all():
             raise InputError("A camera needs at least one point to look at, and all of them finite.")
         axes = _view_axes(yaw_deg, pitch_deg)
-        seen = points @ axes.T
-        low, high = seen.min(axis=0), seen.max(axis=0)
+        projected = points @ axes.T
+        low, high = projected.min(axis=0), projected.max(axis=0)
         extent = high - low
         height = float(max(extent[1], extent[0] / aspect, 1e-6)) * (1 + 2 * margin)
         centre = ((low + high) / 2) @ axes
@@ -95,9 +102,11 @@ class Camera:
             return Camera(centre, height, yaw_deg, pitch_deg)
         distance = 5.0 * height + float(extent[2])
         # Nearer parts grow in perspective, so the height is that of the point which reaches farthest out.
-        offset = np.abs(seen - (low + high) / 2) * (distance / (distance - (seen[:, 2:] - (low + high)[2] / 2)))
-        reach = max(float(offset[:, 1].max()), float(offset[:, 0].max()) / aspect, 1e-6)
-        grown = 2 * reach * (1 + 2 * margin)
+        offset = np.abs(projected - (low + high) / 2) * (
+            distance / (distance - (projected[:, 2:] - (low + high)[2] / 2))
+        )
+        half_height = max(float(offset[:, 1].max()), float(offset[:, 0].max()) / aspect, 1e-6)
+        grown = 2 * half_height * (1 + 2 * margin)
         return Camera(centre, grown, yaw_deg, pitch_deg, distance)
 
 
@@ -136,11 +145,11 @@ class Layer:
         if self.scalars is None:
             return
         name = self.mesh.name
-        for which, given in (("scalars", self.scalars), ("across", self.across)):
-            if given is None:
+        for field_name, field_values in (("scalars", self.scalars), ("across", self.across)):
+            if field_values is None:
                 continue
-            values = read_only(given)
-            object.__setattr__(self, which, values)
+            values = read_only(field_values)
+            object.__setattr__(self, field_name, values)
             if values.shape != (len(self.mesh.vertices),):
                 raise InputError(
                     f"{name} has {len(self.mesh.vertices)} vertices but the scalars have the shape {values.shape}."
@@ -167,7 +176,7 @@ def distance_layer(mesh: Mesh, distances_mm: FloatArray, limit_mm: float, *, sig
 
 @dataclass(frozen=True, eq=False)
 class _Surfels:
-    """What a layer leaves in the picture: for each covered pixel, where, how deep and what."""
+    """Rasterised layer: position, depth and colour of each covered pixel."""
 
     pixel: npt.NDArray[np.int64]
     depth_mm: _Single
@@ -180,7 +189,7 @@ class _Surfels:
 def render(
     *layers: Layer, camera: Camera, size: tuple[int, int] = (480, 560), supersample: int = _SUPERSAMPLE
 ) -> Image:
-    """Return a picture of layers on white, the nearest one in each pixel.
+    """Render layers on white, the nearest layer in each pixel.
 
     Args:
         layers: what to draw.
@@ -204,7 +213,7 @@ def render_series(
     size: tuple[int, int] = (480, 560),
     supersample: int = _SUPERSAMPLE,
 ) -> list[Image]:
-    """Return several pictures from one camera; what takes part in several is rasterised once, whatever its colours.
+    """Render several pictures from one camera; layers in several pictures are rasterised once.
 
     Arguments and errors as in `render`.
     """
@@ -214,16 +223,16 @@ def render_series(
             f"each side times the samples must be 1 to {_LARGEST_SIDE}."
         )
     fine = (size[0] * supersample, size[1] * supersample)
-    found: dict[tuple[object, ...], _Surfels] = {}
+    surfels_by_key: dict[tuple[object, ...], _Surfels] = {}
     pieces: dict[int, tuple[_Single, _Surfels]] = {}
     for layer in {id(layer): layer for layers in pictures for layer in layers}.values():
         # Layers hold views of their scalars: those of one array begin at one place.
         scalars = None if layer.scalars is None else layer.scalars.ctypes.data
         across = None if layer.across is None else layer.across.ctypes.data
-        seen = (id(layer.mesh), scalars, across, layer.point_radius_mm, layer.categories)
-        if seen not in found:
-            found[seen] = _surfels(layer, camera, fine, supersample)
-        pieces[id(layer)] = (_shaded(layer, found[seen]), found[seen])
+        cache_key = (id(layer.mesh), scalars, across, layer.point_radius_mm, layer.categories)
+        if cache_key not in surfels_by_key:
+            surfels_by_key[cache_key] = _surfels(layer, camera, fine, supersample)
+        pieces[id(layer)] = (_shaded(layer, surfels_by_key[cache_key]), surfels_by_key[cache_key])
     return [_composed([pieces[id(layer)] for layer in layers], size, supersample) for layers in pictures]
 
 
@@ -233,14 +242,14 @@ def _composed(pieces: Sequence[tuple[_Single, _Surfels]], size: tuple[int, int],
     count = width * height * supersample**2
     out, nearest = np.ones((count, 3), dtype=np.float32), np.full(count, np.inf, dtype=np.float32)
     for colours, surfels in pieces:
-        put_nearer(surfels.pixel, colours, surfels.depth_mm, out, nearest)
+        merge_nearer(surfels.pixel, colours, surfels.depth_mm, out, nearest)
     image = np.empty((height, width, 3), dtype=np.uint8)
-    averaged(out.reshape(height * supersample, width * supersample, 3), supersample, _SRGB, image)
+    average_pixels(out.reshape(height * supersample, width * supersample, 3), supersample, _SRGB, image)
     return image
 
 
-def covered(mesh: Mesh, *, camera: Camera, size: tuple[int, int]) -> tuple[IntArray, FloatArray]:
-    """Return which triangle each pixel shows, and how deep.
+def visible_triangles(mesh: Mesh, *, camera: Camera, size: tuple[int, int]) -> tuple[IntArray, FloatArray]:
+    """Return the triangle that each pixel shows, and its depth.
 
     Args:
         mesh: with faces.
@@ -270,16 +279,16 @@ def _view_axes(yaw_deg: float, pitch_deg: float) -> FloatArray:
 def _project(points: FloatArray, camera: Camera, size: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
     """Return pixel positions (N, 2), y down, and depths (N,) that are linear across a triangle on the screen."""
     width, height = size
-    seen = (points - camera.centre) @ _view_axes(camera.yaw_deg, camera.pitch_deg).T
+    camera_points = (points - camera.centre) @ _view_axes(camera.yaw_deg, camera.pitch_deg).T
     pixels_per_mm = height / camera.height_mm
     if camera.distance_mm is None:
-        scale, depth = np.full(len(seen), pixels_per_mm), -seen[:, 2]
+        scale, depth = np.full(len(camera_points), pixels_per_mm), -camera_points[:, 2]
     else:
-        away = camera.distance_mm - seen[:, 2]
+        away = camera.distance_mm - camera_points[:, 2]
         # Behind the eye there is no picture: NaN drops the triangle.
         away = np.where(away > 0.05 * camera.distance_mm, away, np.nan)
         scale, depth = pixels_per_mm * camera.distance_mm / away, -1.0 / away
-    screen = np.stack([width / 2 + seen[:, 0] * scale, height / 2 - seen[:, 1] * scale], axis=1)
+    screen = np.stack([width / 2 + camera_points[:, 0] * scale, height / 2 - camera_points[:, 1] * scale], axis=1)
     return screen, depth
 
 
@@ -306,28 +315,39 @@ def _surfels(layer: Layer, camera: Camera, size: tuple[int, int], supersample: i
     triangle, nearest = _rasterise(screen, depth, faces, size)
     pixel = np.flatnonzero(triangle >= 0)
     # Colours bear single precision.
-    normal, back = np.empty((3, len(pixel)), dtype=np.float32), np.empty(len(pixel), dtype=np.bool_)
+    normal, is_back = np.empty((3, len(pixel)), dtype=np.float32), np.empty(len(pixel), dtype=np.bool_)
     scalars = read_only(np.zeros(0)) if layer.scalars is None else layer.scalars
     scalar = np.empty(len(pixel) if len(scalars) else 0, dtype=np.float32)
     nearness = np.ones(len(vertices)) if camera.distance_mm is None else -depth
     normals = vertex_normals(layer.mesh) @ _view_axes(camera.yaw_deg, camera.pitch_deg).T
-    interpolated(
+    interpolate(
         pixel, triangle[pixel], screen, nearness, faces, normals, scalars, layer.categories, size[0],
-        normal, scalar, back,
+        normal, scalar, is_back,
     )  # fmt: skip
     if layer.across is not None:
-        other = np.empty_like(scalar)
-        interpolated(
-            pixel, triangle[pixel], screen, nearness, faces, normals, layer.across, False, size[0], normal, other, back
+        scratch = np.empty_like(scalar)
+        interpolate(
+            pixel,
+            triangle[pixel],
+            screen,
+            nearness,
+            faces,
+            normals,
+            layer.across,
+            False,
+            size[0],
+            normal,
+            scratch,
+            is_back,
         )
-        scalar = squares(scalar, other)
+        scalar = squares(scalar, scratch)
     depth_mm = _depth_mm(nearest[pixel], camera).astype(np.float32)
     occlusion = _occlusion(pixel, depth_mm, size, supersample, camera)
-    return _Surfels(pixel, depth_mm, normal, scalar, back, occlusion)
+    return _Surfels(pixel, depth_mm, normal, scalar, is_back, occlusion)
 
 
 def squares(along: npt.NDArray[np.floating[Any]], across: npt.NDArray[np.floating[Any]]) -> _Single:
-    """Return codes (n,) of the squares of a checkerboard: 0 for every other one, the others 1, 2, ... in turn.
+    """Return square codes (n,) of a checkerboard: 0 for every second square, the others 1, 2, ... in turn.
 
     Those nearest to each other differ, also two columns or rows apart, so that a square is told from the next ones.
 
@@ -341,7 +361,7 @@ def squares(along: npt.NDArray[np.floating[Any]], across: npt.NDArray[np.floatin
 
 
 def _unit(vectors: _Single) -> _Single:
-    """Return (d, n) vectors at length one."""
+    """Return (d, n) vectors normalised to length one."""
     squares = vectors[0] ** 2 + vectors[1] ** 2 + vectors[2] ** 2
     return vectors / np.sqrt(np.maximum(squares, 1e-24))
 
@@ -361,19 +381,19 @@ def _balls(layer: Layer, camera: Camera, size: tuple[int, int], supersample: int
     nearest_balls(screen, behind, radius, rise_mm, width, height, winner, nearest)
     pixel = np.flatnonzero(winner >= 0)
     owner = winner[pixel]
-    at = np.stack([pixel % width + 0.5, pixel // width + 0.5], axis=1)
-    flat = (at - screen[owner]) / radius * [1.0, -1.0]
+    pixel_centres = np.stack([pixel % width + 0.5, pixel // width + 0.5], axis=1)
+    flat = (pixel_centres - screen[owner]) / radius * [1.0, -1.0]
     up = np.sqrt(np.clip(1 - (flat**2).sum(axis=1), 0, 1))
     normal = np.concatenate([flat.T, up[None]]).astype(np.float32)
     if surface is not None:
-        seen = (surface @ _view_axes(camera.yaw_deg, camera.pitch_deg).T).astype(np.float32)
-        seen *= np.where(seen[:, 2:] < 0, np.float32(-1), np.float32(1))
+        view_directions = (surface @ _view_axes(camera.yaw_deg, camera.pitch_deg).T).astype(np.float32)
+        view_directions *= np.where(view_directions[:, 2:] < 0, np.float32(-1), np.float32(1))
         # A little of the ball is kept, by which a cloud is told from a closed surface.
-        normal = np.ascontiguousarray(_unit((seen[owner].T + 0.35 * normal).astype(np.float32)))
+        normal = np.ascontiguousarray(_unit((view_directions[owner].T + 0.35 * normal).astype(np.float32)))
     scalar = (np.zeros(0) if layer.scalars is None else layer.scalars[owner]).astype(np.float32)
     depth_mm = nearest[pixel].astype(np.float32)
-    back = np.zeros(len(pixel), dtype=np.bool_)
-    return _Surfels(pixel, depth_mm, normal, scalar, back, _occlusion(pixel, depth_mm, size, supersample, camera))
+    is_back = np.zeros(len(pixel), dtype=np.bool_)
+    return _Surfels(pixel, depth_mm, normal, scalar, is_back, _occlusion(pixel, depth_mm, size, supersample, camera))
 
 
 _CLOSING = 0.8
@@ -393,7 +413,7 @@ def _cloud_surface(mesh: Mesh) -> tuple[float, FloatArray | None]:
 
 
 def point_spacing(mesh: Mesh) -> float:
-    """Return about how far the points of a cloud lie from each other, mm."""
+    """Return the typical distance between neighbouring points of a cloud, mm."""
     return _cloud_surface(mesh)[0]
 
 
@@ -420,7 +440,7 @@ def _shaded(layer: Layer, surfels: _Surfels) -> _Single:
     """Return linear colours (n, 3)."""
     out = np.empty((len(surfels.pixel), 3), dtype=np.float32)
     table = _linear(layer.colour if layer.scalars is None or layer.colormap is None else layer.colormap)
-    lit(
+    shade_pixels(
         surfels.normal, surfels.scalar, table, _linear(UNKNOWN_COLOUR)[0], float(layer.vmin), float(layer.vmax),
         layer.scalars is not None and layer.across is None, _LIGHTS, surfels.occlusion, surfels.back, out,
     )  # fmt: skip
@@ -432,18 +452,18 @@ def _occlusion(
 ) -> _Single:
     """Return (n,) in (0, 1]: darker where a point lies behind its neighbours' mean depth (Luft et al. 2006)."""
     width, height = size
-    there = np.zeros((height, width), dtype=np.float32)
-    there.ravel()[pixel] = 1
+    is_surface = np.zeros((height, width), dtype=np.float32)
+    is_surface.ravel()[pixel] = 1
     depth = np.zeros((height, width), dtype=np.float32)
     depth.ravel()[pixel] = depth_mm
     coarse = (slice(None, None, supersample), slice(None, None, supersample))
     out = np.ones(len(pixel), dtype=np.float32)
     row, column = pixel // width // supersample, pixel % width // supersample
     # The wide one shades the eye sockets and below the chin, the narrow one draws lips, lids and folds.
-    for reach, most, strength in ((0.026, 0.035, 26.0), (0.007, 0.010, 42.0)):
-        sigma = reach * height / supersample
-        total = gaussian_filter(there[coarse], sigma, truncate=2.5)
+    for radius_share, max_depth, strength in ((0.026, 0.035, 26.0), (0.007, 0.010, 42.0)):
+        sigma = radius_share * height / supersample
+        total = gaussian_filter(is_surface[coarse], sigma, truncate=2.5)
         mean = gaussian_filter(depth[coarse], sigma, truncate=2.5) / np.maximum(total, 1e-6)
-        behind = np.clip(depth_mm - mean[row, column], 0, most * camera.height_mm)
-        out *= np.exp(np.float32(-strength / camera.height_mm) * behind)
+        depth_behind = np.clip(depth_mm - mean[row, column], 0, max_depth * camera.height_mm)
+        out *= np.exp(np.float32(-strength / camera.height_mm) * depth_behind)
     return out

@@ -1,4 +1,4 @@
-"""What turns in the browser: arrays packed for scene.js, and the scripts that draw them.
+"""Interactive 3-D views for the browser: arrays packed for scene.js, and the scripts that draw them.
 
 The bytes of `pack` are a uint32 (little-endian) with the length of a JSON header, the header, zeros up to a multiple of
 8, then the arrays, each at a multiple of 8. `Shapespace.unpack` of scene.js reads them back.
@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from shapespace.errors import InputError
 from shapespace.report.inputs.staged_fit import StagedFit, measured_mm
-from shapespace.report.render.decimate import thinned
+from shapespace.report.render.decimate import decimate
 from shapespace.schemas import FitRecord, to_json
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 
@@ -33,12 +33,12 @@ SCRIPTS = ("vendor/three.min.js", "scene.js", "widgets.js")
 """The scripts of `assets` that a page with scenes needs, in this order; the colours come before the last."""
 
 _DTYPES = ("float32", "int32", "uint32", "uint16", "int16", "uint8")
-_UNKNOWN = -32768
-_MOST_STEPS = 32767
+_UNKNOWN = -32768  # smallest int16
+_MOST_STEPS = 32767  # largest int16
 # What a report rounds to: an error of 0.02 mm is a hundredth of what a good fit leaves.
 _PLACE_STEP_MM = 0.04
-_DISTANCE_STEP_MM = 0.05
-_MODE_STEP_MM = 0.02
+_DISTANCE_STEP_MM = 0.05  # mm
+_MODE_STEP_MM = 0.02  # mm
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class Steps:
     follows: str | None = None
 
 
-def quantised(values: npt.ArrayLike, *, step: float = 0.0, by_row: bool = False, coded: bool = False) -> Steps:
+def quantise(values: npt.ArrayLike, *, step: float = 0.0, by_row: bool = False, coded: bool = False) -> Steps:
     """Return `values` as int16 steps; the error is at most half a step.
 
     Args:
@@ -74,8 +74,8 @@ def quantised(values: npt.ArrayLike, *, step: float = 0.0, by_row: bool = False,
     scale = np.maximum(np.asarray(largest) / _MOST_STEPS, step)
     scale = np.where(scale > 0, scale, 1.0)
     steps = np.rint(np.where(known, array, 0.0) / (scale.reshape(-1, *[1] * (array.ndim - 1)) if by_row else scale))
-    whole = np.where(known, steps, _UNKNOWN).astype(np.int16)
-    return Steps(whole, [float(value) for value in scale] if by_row else float(scale), coded)
+    whole_steps = np.where(known, steps, _UNKNOWN).astype(np.int16)
+    return Steps(whole_steps, [float(value) for value in scale] if by_row else float(scale), coded)
 
 
 def pack(arrays: Mapping[str, npt.NDArray[Any] | Steps], facts: Mapping[str, Any]) -> bytes:
@@ -92,17 +92,17 @@ def pack(arrays: Mapping[str, npt.NDArray[Any] | Steps], facts: Mapping[str, Any
     specs: dict[str, Any] = {}
     buffers: list[bytes] = []
     offset = 0
-    for name, given in arrays.items():
-        array = given.values if isinstance(given, Steps) else _portable(name, np.asarray(given))
+    for name, values in arrays.items():
+        array = values.values if isinstance(values, Steps) else _portable(name, np.asarray(values))
         spec: dict[str, Any] = {"dtype": array.dtype.name, "shape": list(array.shape), "offset": offset}
         data = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<")).tobytes()
-        if isinstance(given, Steps):
-            if given.scale is not None:
-                spec["scale"] = given.scale
-            if given.coded:
-                before = arrays[given.follows] if given.follows is not None else None
-                spec["coded"] = given.follows or True
-                data = _coded(array, before.values if isinstance(before, Steps) else None)
+        if isinstance(values, Steps):
+            if values.scale is not None:
+                spec["scale"] = values.scale
+            if values.coded:
+                reference = arrays[values.follows] if values.follows is not None else None
+                spec["coded"] = values.follows or True
+                data = _coded(array, reference.values if isinstance(reference, Steps) else None)
         specs[name] = spec
         buffers.append(data + bytes(-len(data) % 8))
         offset += len(buffers[-1])
@@ -113,19 +113,19 @@ def pack(arrays: Mapping[str, npt.NDArray[Any] | Steps], facts: Mapping[str, Any
     return struct.pack("<I", len(header)) + header + bytes(-(4 + len(header)) % 8) + b"".join(buffers)
 
 
-def _coded(array: npt.NDArray[Any], before: npt.NDArray[Any] | None) -> bytes:
+def _coded(array: npt.NDArray[Any], reference: npt.NDArray[Any] | None) -> bytes:
     """Return the differences from row to row modulo 2^16, small ones of both signs as small numbers, by byte planes."""
     columns = array.shape[-1] if array.ndim > 1 else 1
     values = array.reshape(-1, columns).view(np.uint16)
-    if before is not None:
-        values = values - before.reshape(-1, columns).view(np.uint16)
+    if reference is not None:
+        values = values - reference.reshape(-1, columns).view(np.uint16)
     steps = np.diff(values, axis=0, prepend=np.zeros((1, columns), np.uint16)).view(np.int16).astype(np.int32)
     zigzag = np.where(steps < 0, -2 * steps - 1, 2 * steps).astype("<u2")
     return np.ascontiguousarray(zigzag.T).view(np.uint8).reshape(columns, -1, 2).transpose(0, 2, 1).tobytes()
 
 
 def pack_model(model: ShapeModel, modes: int | None = None, *, small: bool = False) -> bytes:
-    """Return what `Shapespace.Model` and the widget of modes need.
+    """Return the data of `Shapespace.Model` and the modes widget.
 
     Arrays: `mean` (V, 3) mm; `faces` (F, 3), absent for point models; `modes` (K, V, 3) quantised, the displacement of
     one standard deviation of each mode, mm; `stddev` (K,) mm; `share` (K,) of the training variance.
@@ -144,17 +144,15 @@ def pack_model(model: ShapeModel, modes: int | None = None, *, small: bool = Fal
     order, faces = np.arange(model.n_vertices), model.faces
     if small and faces is not None:
         order, faces = _neighbours_together(faces, model.n_vertices)
-    one = np.zeros(K)
-    moved = np.empty((K, model.n_vertices, 3))
+    unit = np.zeros(K)
+    mode_shapes = np.empty((K, model.n_vertices, 3))
     for k in range(K):
-        one[k] = model.stddev[k]
-        moved[k] = model.reconstruct(one) - model.mean_vertices
-        one[k] = 0.0
+        unit[k] = model.stddev[k]
+        mode_shapes[k] = model.reconstruct(unit) - model.mean_vertices
+        unit[k] = 0.0
     arrays: dict[str, npt.NDArray[Any] | Steps] = {
-        "mean": quantised(model.mean_vertices[order], step=_PLACE_STEP_MM, coded=True)
-        if small
-        else model.mean_vertices,
-        "modes": quantised(moved[:, order], step=_MODE_STEP_MM if small else 0.0, by_row=True, coded=small),
+        "mean": quantise(model.mean_vertices[order], step=_PLACE_STEP_MM, coded=True) if small else model.mean_vertices,
+        "modes": quantise(mode_shapes[:, order], step=_MODE_STEP_MM if small else 0.0, by_row=True, coded=small),
         "stddev": model.stddev[:K],
         "share": model.stddev[:K] ** 2 / model.total_variance,
     }
@@ -180,7 +178,7 @@ def pack_model(model: ShapeModel, modes: int | None = None, *, small: bool = Fal
 
 
 def pack_morph(low: Mesh, high: Mesh, labels: tuple[str, str], *, largest: int = 20_000) -> bytes:
-    """Return what the widget of a morph needs: two shapes in correspondence as a mean and one mode, from -1 to 1.
+    """Return the data of the morph widget: two shapes in correspondence as a mean and one mode, from -1 to 1.
 
     Arrays: `mean` (V, 3) mm; `faces`, absent for points; `modes` (1, V, 3) mm, half of the difference.
 
@@ -191,11 +189,11 @@ def pack_morph(low: Mesh, high: Mesh, labels: tuple[str, str], *, largest: int =
         largest: how many triangles (or points) are kept.
     """
     middle, half = (low.vertices + high.vertices) / 2, (high.vertices - low.vertices) / 2
-    mesh, kept = _small(low.with_vertices(middle), largest)
+    mesh, source_rows = _decimate(low.with_vertices(middle), largest)
     extent = float(np.ptp(middle, axis=0).max())
     arrays: dict[str, npt.NDArray[Any] | Steps] = {
-        "mean": quantised(mesh.vertices, step=min(_PLACE_STEP_MM, extent / 4000), coded=True),
-        "modes": quantised(half[None, kept], step=min(_MODE_STEP_MM, extent / 8000), by_row=True, coded=True),
+        "mean": quantise(mesh.vertices, step=min(_PLACE_STEP_MM, extent / 4000), coded=True),
+        "modes": quantise(half[None, source_rows], step=min(_MODE_STEP_MM, extent / 8000), by_row=True, coded=True),
     }
     if mesh.faces is not None:
         arrays["faces"] = _indices(mesh.faces, len(mesh.vertices), coded=True)
@@ -203,7 +201,7 @@ def pack_morph(low: Mesh, high: Mesh, labels: tuple[str, str], *, largest: int =
 
 
 def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: int | None = None) -> bytes:
-    """Return what the widget of a fit needs: the scan, the model at each stage, distances, regions, iterations.
+    """Return the data of the fit widget: the scan, the model at each stage, distances, regions, iterations.
 
     Arrays: `scan` (S, 3) mm and `scan_faces`; `faces` of the model; by stage `surface_STAGE` (V, 3) mm,
     `model_to_scan_STAGE` (V,) and `scan_to_model_STAGE` (S,) mm, signed where the fact `signed` is true, lengths where
@@ -231,10 +229,10 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: i
     scan, model = staged.scan, last
     of_scan, of_model = np.arange(len(scan.vertices)), np.arange(len(model.vertices))
     if largest_scan is not None:
-        scan, of_scan = _small(scan, largest_scan)
-        model, of_model = _small(last, largest_scan)
+        scan, of_scan = _decimate(scan, largest_scan)
+        model, of_model = _decimate(last, largest_scan)
     elif most_sent is not None:
-        scan, of_scan = thinned(scan, most_sent)
+        scan, of_scan = decimate(scan, most_sent)
     arrays: dict[str, npt.NDArray[Any] | Steps] = {"scan": _places(scan.vertices, small)}
     if scan.faces is not None:
         arrays["scan_faces"] = _indices(scan.faces, len(scan.vertices), coded=small)
@@ -274,7 +272,7 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: i
 
 
 def pack_surfaces(
-    surfaces: Mapping[str, Mesh], record: FitRecord, *, name: str, label: str, why: str, largest: int | None = None
+    surfaces: Mapping[str, Mesh], record: FitRecord, *, name: str, label: str, reason: str, largest: int | None = None
 ) -> bytes:
     """Return the data for the widget of a fit without its scan: as `pack_fit`, without scan and distances.
 
@@ -283,17 +281,17 @@ def pack_surfaces(
         record: of the fit.
         name: of the fit.
         label: what pictures call it.
-        why: there is no scan to show, as the end of a sentence.
+        reason: there is no scan to show, as the end of a sentence.
         largest: for a report: how many triangles (or points) are kept; None packs all as it is.
     """
     last = list(surfaces.values())[-1]
-    model, kept = (last, np.arange(len(last.vertices))) if largest is None else _small(last, largest)
+    model, source_rows = (last, np.arange(len(last.vertices))) if largest is None else _decimate(last, largest)
     small = largest is not None
-    places = {f"surface_{stage}": surface.vertices[kept] for stage, surface in surfaces.items()}
+    places = {f"surface_{stage}": surface.vertices[source_rows] for stage, surface in surfaces.items()}
     arrays: dict[str, npt.NDArray[Any] | Steps] = {}
     if model.faces is not None:
         arrays["faces"] = _indices(model.faces, len(model.vertices), coded=small)
-    arrays |= _alike(places) if small else {key: _places(points, small) for key, points in places.items()}
+    arrays |= _shared_steps(places) if small else {key: _places(points, small) for key, points in places.items()}
     arrays |= {key: np.array(getattr(record, key), dtype=np.float64) for key in ("b", "z", "b_stddev")}
     facts = {
         "kind": "fit",
@@ -302,7 +300,7 @@ def pack_surfaces(
         "status": record.status,
         "reason": record.reason,
         "stages": list(surfaces),
-        "without_scan": f"The fitted surface is shown alone, since {why}",
+        "without_scan": f"The fitted surface is shown alone, since {reason}",
         "thinned": len(model.vertices) < len(last.vertices),
     }
     return pack(arrays, facts)
@@ -314,15 +312,15 @@ def _stage_arrays(
     """Return surface and distances at each stage, of these vertices and scan points; shares are of all of them."""
     surfaces = {f"surface_{stage}": surface.vertices[of_model] for stage, surface in staged.surfaces.items()}
     arrays: dict[str, npt.NDArray[Any] | Steps] = {}
-    arrays |= _alike(surfaces) if small else {name: _places(values, small) for name, values in surfaces.items()}
+    arrays |= _shared_steps(surfaces) if small else {name: _places(values, small) for name, values in surfaces.items()}
     step = _DISTANCE_STEP_MM if small else 0.0
     signed = staged.scan.faces is not None
     for stage in staged.surfaces:
         forward, backward = staged.model_to_scan_mm[stage][of_model], staged.scan_to_model_mm[stage][of_scan]
         if not signed:
             forward, backward = np.abs(forward), np.abs(backward)
-        arrays[f"model_to_scan_{stage}"] = quantised(forward, step=step, coded=small)
-        arrays[f"scan_to_model_{stage}"] = quantised(backward, step=step, coded=small)
+        arrays[f"model_to_scan_{stage}"] = quantise(forward, step=step, coded=small)
+        arrays[f"scan_to_model_{stage}"] = quantise(backward, step=step, coded=small)
         arrays[f"beyond_model_{stage}"] = _shares_beyond(staged.model_to_scan_mm[stage])
         arrays[f"beyond_scan_{stage}"] = _shares_beyond(staged.scan_to_model_mm[stage])
     return arrays
@@ -331,7 +329,7 @@ def _stage_arrays(
 def _colours(
     staged: StagedFit, of_model: npt.NDArray[np.intp], of_scan: npt.NDArray[np.intp]
 ) -> dict[str, npt.NDArray[Any] | Steps]:
-    """Return the colours of the scan, and those that the surfaces took from it, where there are any."""
+    """Return the colours of the scan, and the colours transferred from it to the surfaces, if there are any."""
     arrays: dict[str, npt.NDArray[Any] | Steps] = {}
     if staged.scan.colours is not None:
         arrays["scan_colours"] = staged.scan.colours[of_scan]
@@ -356,7 +354,7 @@ def _history(staged: StagedFit) -> dict[str, npt.NDArray[Any]]:
 def pack_scatter(
     points: FloatArray, labels: Sequence[str], names: Sequence[str], *, axes: Sequence[str], unit: str = "mm"
 ) -> bytes:
-    """Return what the widget of a scatter needs.
+    """Return the data of the scatter widget.
 
     Arrays: `points` (n, K) float32; `labels` (n,) int32 codes into the fact `labels`, by first appearance.
 
@@ -388,7 +386,7 @@ def pack_scatter(
 
 
 def scripts() -> str:
-    """Return the JavaScript of a page with scenes, for one inline `<script>`."""
+    """Return the JavaScript for the scenes of a page, for one inline `<script>`."""
     from shapespace.report.render import palette as colours
 
     folder = files("shapespace.report").joinpath("assets")
@@ -427,11 +425,11 @@ def payload_html(identifier: str, payload: bytes) -> str:
 
 
 def _portable(name: str, array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    wanted = {"float64": np.float32, "int64": np.int32, "bool": np.uint8}.get(array.dtype.name)
-    if wanted is not None:
+    target_dtype = {"float64": np.float32, "int64": np.int32, "bool": np.uint8}.get(array.dtype.name)
+    if target_dtype is not None:
         if array.dtype == np.int64 and array.size and np.abs(array).max() > np.iinfo(np.int32).max:
             raise InputError(f"The array {name!r} holds integers beyond 32 bits, which scenes do not have.")
-        array = array.astype(wanted)
+        array = array.astype(target_dtype)
     if array.dtype.name not in _DTYPES:
         raise InputError(f"The array {name!r} has the type {array.dtype}; scenes have {', '.join(_DTYPES)}.")
     return array
@@ -444,32 +442,32 @@ def _indices(faces: IntArray, vertices: int, *, coded: bool) -> npt.NDArray[Any]
 
 
 def _places(points: FloatArray, small: bool) -> npt.NDArray[Any] | Steps:
-    return quantised(points, step=_PLACE_STEP_MM, coded=True) if small else points.astype(np.float32)
+    return quantise(points, step=_PLACE_STEP_MM, coded=True) if small else points.astype(np.float32)
 
 
-def _alike(surfaces: Mapping[str, FloatArray]) -> dict[str, Steps]:
-    """Return surfaces of the same vertices in one step, each but the first as what differs from the one before."""
+def _shared_steps(surfaces: Mapping[str, FloatArray]) -> dict[str, Steps]:
+    """Quantise surfaces of the same vertices in one step, each after the first as the difference to the previous."""
     largest = max(float(np.abs(points).max(initial=0.0)) for points in surfaces.values())
     step = max(largest / _MOST_STEPS, _PLACE_STEP_MM)
     out: dict[str, Steps] = {}
-    before: str | None = None
+    previous: str | None = None
     for name, points in surfaces.items():
-        out[name] = Steps(np.rint(points / step).astype(np.int16), step, True, before)
-        before = name
+        out[name] = Steps(np.rint(points / step).astype(np.int16), step, True, previous)
+        previous = name
     return out
 
 
-def _small(mesh: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
-    """Return `mesh` thinned, with neighbours near each other in the order, and the indices of its vertices."""
-    few, kept = thinned(mesh, largest)
-    if few.faces is None:
-        return few, kept
-    order, faces = _neighbours_together(few.faces, len(few.vertices))
-    return Mesh(few.vertices[order], faces, name=mesh.name), kept[order]
+def _decimate(mesh: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
+    """Return `mesh` decimated, with neighbours close in the vertex order, and the indices of its vertices."""
+    small_mesh, source_rows = decimate(mesh, largest)
+    if small_mesh.faces is None:
+        return small_mesh, source_rows
+    order, faces = _neighbours_together(small_mesh.faces, len(small_mesh.vertices))
+    return Mesh(small_mesh.vertices[order], faces, name=mesh.name), source_rows[order]
 
 
 def _neighbours_together(faces: IntArray, vertices: int) -> tuple[npt.NDArray[np.intp], IntArray]:
-    """Return an order of the vertices, (V,), in which neighbours are near, and the sorted triangles in that order."""
+    """Return a vertex order, (V,), that keeps neighbours close, and the sorted triangles in that order."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import reverse_cuthill_mckee
 
@@ -478,10 +476,10 @@ def _neighbours_together(faces: IntArray, vertices: int) -> tuple[npt.NDArray[np
     order = np.asarray(reverse_cuthill_mckee(graph, symmetric_mode=True), dtype=np.intp)
     place = np.empty(vertices, dtype=np.int32)
     place[order] = np.arange(vertices, dtype=np.int32)
-    moved = place[faces]
-    first = moved.argmin(axis=1)[:, None]
-    moved = np.take_along_axis(moved, (first + np.arange(3)) % 3, axis=1)
-    return order, moved[np.lexsort((moved[:, 2], moved[:, 1], moved[:, 0]))]
+    new_faces = place[faces]
+    rotation = new_faces.argmin(axis=1)[:, None]
+    new_faces = np.take_along_axis(new_faces, (rotation + np.arange(3)) % 3, axis=1)
+    return order, new_faces[np.lexsort((new_faces[:, 2], new_faces[:, 1], new_faces[:, 0]))]
 
 
 def _region_shares(staged: StagedFit) -> list[float]:
@@ -492,14 +490,14 @@ def _region_shares(staged: StagedFit) -> list[float]:
 
 
 def _mean(signed_mm: FloatArray) -> float:
-    known = measured_mm(signed_mm)
-    return float(known.mean()) if len(known) else math.nan
+    known_mm = measured_mm(signed_mm)
+    return float(known_mm.mean()) if len(known_mm) else math.nan
 
 
 def _shares_beyond(signed_mm: FloatArray) -> npt.NDArray[Any]:
-    known = np.sort(measured_mm(signed_mm))
-    within = np.searchsorted(known, np.arange(101) / 10.0 + 1e-9, side="right")
-    return (1.0 - within / max(len(known), 1)).astype(np.float32)
+    sorted_mm = np.sort(measured_mm(signed_mm))
+    counts = np.searchsorted(sorted_mm, np.arange(101) / 10.0 + 1e-9, side="right")
+    return (1.0 - counts / max(len(sorted_mm), 1)).astype(np.float32)
 
 
 def _matrix(T: Similarity) -> FloatArray:

@@ -11,7 +11,7 @@ from PIL import Image as PillowImage
 
 from shapespace.geometry.distortion import Distortion
 from shapespace.geometry.normals import faces_of
-from shapespace.report.inputs.correspondence_folder import drawable, there_are
+from shapespace.report.inputs.correspondence_folder import drawable, observed_mask
 from shapespace.report.render.checkerboard import checker_layer, checker_places
 from shapespace.report.render.palette import DIVERGING, MODEL_COLOUR, SCAN_COLOUR, SEQUENTIAL, Colour
 from shapespace.report.render.renderer import Camera, Image, Layer, distance_layer, render, render_series
@@ -25,14 +25,14 @@ PANEL = (176, 232)
 
 AREA_LIMIT = 2.0
 """The factor of growth at which the maps of change of area end."""
-FOLD_COLOUR: Colour = (0.05, 0.05, 0.05)
+FOLD_COLOUR: Colour = (0.05, 0.05, 0.05)  # near black, sRGB from 0 to 1
 
 Still: TypeAlias = tuple[bytes, tuple[int, int]]
 """WebP, and its width and height in pixels."""
 
 
 def fit_strip(fit: StagedFit, limit_mm: float, panel: tuple[int, int] = PANEL) -> Still:
-    """Return three panels: the scan, scan and model over each other, distances from model to scan.
+    """Return three panels: the scan, scan and model superimposed, distances from model to scan.
 
     The distances are signed, on `colours.DIVERGING` from -limit_mm; those to a point cloud, which has no inside, are on
     `colours.SEQUENTIAL` from 0. Vertices that the scan does not show are grey.
@@ -45,10 +45,10 @@ def fit_strip(fit: StagedFit, limit_mm: float, panel: tuple[int, int] = PANEL) -
     surface = fit.surfaces["final"]
     camera = Camera.framing(surface.vertices, aspect=panel[0] / panel[1], margin=0.02)
     scan, model = Layer(fit.scan, SCAN_COLOUR), Layer(surface, MODEL_COLOUR)
-    plain, both = render_series([[scan], [scan, model]], camera=camera, size=panel)
+    plain, overlay = render_series([[scan], [scan, model]], camera=camera, size=panel)
     distances = distance_layer(surface, fit.model_to_scan_mm["final"], limit_mm, signed=fit.scan.faces is not None)
-    seen = render(distances, camera=camera, size=panel)
-    return encoded(np.concatenate([plain, both, seen], axis=1))
+    distance_image = render(distances, camera=camera, size=panel)
+    return encoded(np.concatenate([plain, overlay, distance_image], axis=1))
 
 
 def correspondence_strip(
@@ -69,29 +69,29 @@ def correspondence_strip(
         panel: width and height of each panel in pixels.
     """
     surface = mean.with_vertices(vertices)
-    there, far = drawable(surface, distance)
-    faces, changed = faces_of(surface), Distortion.of(surface, mean)
-    _, growth = drawable(surface, _at_vertices(changed.growth, faces, len(vertices)))
+    drawn_surface, drawn_distance = drawable(surface, distance)
+    faces, distortion = faces_of(surface), Distortion.of(surface, mean)
+    _, growth = drawable(surface, _at_vertices(distortion.growth, faces, len(vertices)))
     layers = [[checker_layer(surface, checker_places(mean))]]
     if scan is not None:
         layers = [
             [Layer(drawable(scan)[0], SCAN_COLOUR)], *layers,
-            [Layer(there, scalars=far, colormap=SEQUENTIAL, vmax=limit)],
+            [Layer(drawn_surface, scalars=drawn_distance, colormap=SEQUENTIAL, vmax=limit)],
         ]  # fmt: skip
     end = float(np.log(AREA_LIMIT))
-    area = [Layer(there, scalars=growth, colormap=DIVERGING, vmin=-end, vmax=end)]
-    if changed.folded.any():
-        around = np.isin(faces, faces[changed.folded]).any(axis=1) & there_are(vertices)[faces].all(axis=1)
+    area = [Layer(drawn_surface, scalars=growth, colormap=DIVERGING, vmin=-end, vmax=end)]
+    if distortion.folded.any():
+        around = np.isin(faces, faces[distortion.folded]).any(axis=1) & observed_mask(vertices)[faces].all(axis=1)
         # Of equally near surfaces the first stays.
         area.insert(0, Layer(Mesh(np.nan_to_num(vertices), faces[around]), FOLD_COLOUR))
-    framed = np.concatenate([mean.vertices, there.vertices])
+    framed = np.concatenate([mean.vertices, drawn_surface.vertices])
     camera = Camera.framing(framed, aspect=panel[0] / panel[1], margin=0.02)
-    pictures = [render(*one, camera=camera, size=panel) for one in (*layers, area)]
+    pictures = [render(*layer_group, camera=camera, size=panel) for layer_group in (*layers, area)]
     return encoded(np.concatenate(pictures, axis=1))
 
 
 def _at_vertices(values: FloatArray, faces: IntArray, vertices: int) -> FloatArray:
-    """Return the mean (V,) of what is known of the triangles around each vertex."""
+    """Return the mean (V,) of the known values of the triangles around each vertex."""
     known = np.isfinite(values)
     flat = faces[known].ravel()
     count = np.bincount(flat, minlength=vertices)
@@ -100,7 +100,7 @@ def _at_vertices(values: FloatArray, faces: IntArray, vertices: int) -> FloatArr
 
 
 def mesh_still(mesh: Mesh, panel: tuple[int, int] = PANEL) -> Still:
-    """Return one mesh from the front, as its axes stand."""
+    """Render one mesh from the front, without rotation."""
     camera = Camera.framing(mesh.vertices, aspect=panel[0] / panel[1], margin=0.06)
     # Points are drawn as balls, of a size that joins them whatever the unit of the file.
     radius = 0.004 * float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))

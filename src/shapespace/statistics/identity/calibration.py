@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from shapespace.lazy import other_package
+from shapespace.lazy import require_package
 from shapespace.statistics.identity.rates import Pairs
 from shapespace.types import BoolArray, FloatArray, IntArray
 
@@ -30,7 +30,7 @@ def cllr_min(score: FloatArray, same: BoolArray) -> float:
     Raises:
         ShapespaceError: scikit-learn is not installed.
     """
-    isotonic = other_package("sklearn.isotonic", _NEEDS, _INSTALL).IsotonicRegression
+    isotonic = require_package("sklearn.isotonic", _NEEDS, _INSTALL).IsotonicRegression
     genuine = int(same.sum())
     weights = np.where(same, 0.5 / genuine, 0.5 / (len(same) - genuine))
     rule = isotonic(y_min=0.0, y_max=1.0).fit(score, same.astype(np.float64), sample_weight=weights)
@@ -54,7 +54,7 @@ def calibrated(score: FloatArray, pairs: Pairs, group: IntArray) -> FloatArray |
     Raises:
         ShapespaceError: scikit-learn is not installed.
     """
-    make: Any = other_package("sklearn.linear_model", _NEEDS, _INSTALL).LogisticRegression
+    make: Any = require_package("sklearn.linear_model", _NEEDS, _INSTALL).LogisticRegression
     one, other = group[pairs.one], group[pairs.other]
     out = np.full(len(score), np.nan)
     for a, b in sorted({(min(p), max(p)) for p in zip(one.tolist(), other.tolist(), strict=True)}):

@@ -10,7 +10,7 @@ import numpy as np
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.proportions import widen_share
 from shapespace.errors import InputError
-from shapespace.reprs import listed_briefly, short_repr
+from shapespace.reprs import list_briefly, short_repr
 from shapespace.statistics.analysis_result import AnalysisResult
 from shapespace.statistics.identity.rates import RateEstimate, people_drawn, rate_estimate
 from shapespace.statistics.identity.scores import score_name
@@ -125,7 +125,7 @@ class IdentificationResult(AnalysisResult):
         return next(one for one in self.scores if one.name == name)
 
     def __repr__(self) -> str:
-        ranks = listed_briefly([f"{one.name}: rank 1 {one.rank_1.briefly()}" for one in self.scores])
+        ranks = list_briefly([f"{one.name}: rank 1 {one.rank_1.briefly()}" for one in self.scores])
         return f"<IdentificationResult of {self.probes} probes among {self.enrolled} subjects; {ranks}>"
 
 

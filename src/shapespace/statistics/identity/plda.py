@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from shapespace.errors import InputError
-from shapespace.lazy import other_package
+from shapespace.lazy import require_package
 from shapespace.statistics.identity.samples import Samples
 from shapespace.types import FloatArray, read_only
 
@@ -56,7 +56,7 @@ class TwoCovariance:
             InputError: fewer than three people, or nobody of them has two scans.
             ShapespaceError: scikit-learn is not installed.
         """
-        shrunk = other_package("sklearn.covariance", "The PLDA score", "'shapespace[statistics]'").ledoit_wolf
+        shrunk = require_package("sklearn.covariance", "The PLDA score", "'shapespace[statistics]'").ledoit_wolf
         names, whose = np.unique(np.asarray(training.subjects), return_inverse=True)
         counts = np.bincount(whose, minlength=len(names)).astype(np.float64)
         if len(names) < 3 or counts.max(initial=0.0) < 2:

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from shapespace.cohort.cohort import Cohort
-from shapespace.cohort.table import Table, named
+from shapespace.cohort.table import Table, list_names
 from shapespace.errors import InputError
 from shapespace.reprs import short_repr
 from shapespace.statistics.identity.rates import Pairs
@@ -135,7 +135,7 @@ def rows_of(table: Table, expression: str) -> list[int]:
     cells = table.texts(column)
     rows = [row for row, cell in enumerate(cells) if (cell in values) == (sign == "=")]
     if not rows:
-        there = named(sorted(set(cells) - {""}))
+        there = list_names(sorted(set(cells) - {""}))
         raise InputError(f"{table.where}: no scan has {expression}; {column} is {there or 'empty'}.")
     return rows
 
@@ -168,8 +168,8 @@ def trial_of(cohort: Cohort, config: IdentityConfig, *, enrol: bool = False) -> 
     both = sorted({subjects[row] for row in tested} & {subjects[row] for row in training})
     if both:
         raise InputError(
-            f"{table.where}: {named(both)} {'is' if len(both) == 1 else 'are'} both tested and learned from; put all "
-            "scans of a subject on one side."
+            f"{table.where}: {list_names(both)} {'is' if len(both) == 1 else 'are'} both tested and learned from; put "
+            "all scans of a subject on one side."
         )
     if enrol and not gallery:
         first = {int(person[row]): row for row in reversed(probes)}
@@ -218,7 +218,7 @@ def _roles(table: Table, role: str | None, config: IdentityConfig) -> tuple[list
         cells = [cell.lower() for cell in table.texts(role)]
         odd = sorted({cell for cell in cells if cell not in ROLES})
         if odd:
-            raise InputError(f"{table.where}: {role!r} is {named(odd)}; it may be gallery, probe or train.")
+            raise InputError(f"{table.where}: {role!r} is {list_names(odd)}; it may be gallery, probe or train.")
         gallery, probes, training = ([row for row, cell in enumerate(cells) if cell == what] for what in ROLES)
         if gallery and not probes:
             raise InputError(f"{table.where}: {role!r} names a gallery and no probe.")

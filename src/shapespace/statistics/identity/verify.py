@@ -10,7 +10,7 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.proportions import widen_share
-from shapespace.reprs import listed_briefly, short_repr
+from shapespace.reprs import list_briefly, short_repr
 from shapespace.statistics.analysis_result import AnalysisResult
 from shapespace.statistics.identity.calibration import calibrated, cllr, cllr_min
 from shapespace.statistics.identity.rates import Pairs, RateEstimate, Roc, Sweep, people_drawn, rate_estimate, resampled
@@ -103,7 +103,7 @@ class VerificationResult(AnalysisResult):
         return next(one for one in self.scores if one.name == name)
 
     def __repr__(self) -> str:
-        rates = listed_briefly([f"{one.name}: EER {one.eer.briefly()}" for one in self.scores])
+        rates = list_briefly([f"{one.name}: EER {one.eer.briefly()}" for one in self.scores])
         return f"<VerificationResult of {len(self.people)} subjects; {rates}>"
 
 
