@@ -80,8 +80,10 @@ def completed_shapes(
     completion = complete(masked, names, gauge, align=align)
     # Poses of the original shapes, which determine size and other vertices, do not depend on estimates.
     poses = [
-        fit_similarity(own[there], aligned[there], with_scale=align and gauge == "shape") if align else None
-        for own, aligned, there in zip(masked, found.shapes, found.observed, strict=True)
+        fit_similarity(masked_shape[is_observed], aligned[is_observed], with_scale=align and gauge == "shape")
+        if align
+        else None
+        for masked_shape, aligned, is_observed in zip(masked, completion.shapes, completion.observed, strict=True)
     ]
     scales = np.array([1.0 if T is None else T.scale for T in poses])
     sizes = np.array([centroid_size(shape) for shape in completion.shapes]) / scales

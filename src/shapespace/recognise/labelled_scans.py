@@ -70,7 +70,7 @@ def from_record(name: str, record: FitRecord) -> ScanCoefficients:
         raise FileFormatError(f"The record of {name} is damaged or not whole; fit the scan again.")
     z = None if record.status == "failed" else read_only(np.asarray(record.z, dtype=np.float64))
     scan = ScanCoefficients(name, record.status, record.reason, z, record.model.hash, file=record.scan.name)
-    return _checked(scan, f"The record of {name}")
+    return _check(scan, f"The record of {name}")
 
 
 def from_results(results: Results) -> list[ScanCoefficients]:

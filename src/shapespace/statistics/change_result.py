@@ -285,7 +285,7 @@ class ChangeResult(AnalysisResult):
             p_values.append(f"{groups} differ: p {self.group_difference.surface.omnibus_p:.3g}")
         return (
             f"<{type(self).__name__} of {len(self.subjects)} subjects, {len(self.cohort)} scans; uncertainty from "
-            f"{self.uncertainty}{f'; {listed_briefly(p_values)}' if p_values else ''}>"
+            f"{self.uncertainty}{f'; {list_briefly(p_values)}' if p_values else ''}>"
         )
 
     def surfaces(self, name: str) -> tuple[Mesh, Mesh]:

@@ -81,7 +81,7 @@ def visits_of(table: Table, subject: str, time: str | None, order: Sequence[str]
                 if len(plain) > 1:
                     raise InputError(
                         f"{table.where}: {name} has {len(plain)} scans at {labels[plain[0]]} "
-                        f"({named([table.rows[row] for row in plain])}) that the column {RESCAN} does not mark as "
+                        f"({list_names([table.rows[row] for row in plain])}) that the column {RESCAN} does not mark as "
                         "rescans; mark all but one, or correct their times."
                     )
     visits = {

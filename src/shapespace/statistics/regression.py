@@ -14,7 +14,7 @@ from shapespace.cohort.proportions import widen_share
 from shapespace.cohort.table import list_names
 from shapespace.errors import InputError
 from shapespace.geometry.normals import vertex_normals
-from shapespace.reprs import list_briefly, describe_briefly
+from shapespace.reprs import describe_briefly, list_briefly
 from shapespace.schemas import Methods, TestScheme
 from shapespace.statistics.analysis_result import AnalysisResult
 from shapespace.statistics.linear_regressors import (

@@ -178,7 +178,9 @@ class ModelView:
                 return pack_staged(staged_fit(self.folder, fit))
             except ScanNotFoundError as error:
                 surfaces = saved_surfaces(self.folder, fit)
-                return pack_surfaces(surfaces, fit.record, name=fit.name, label=fit.label, why=self.public(str(error)))
+                return pack_surfaces(
+                    surfaces, fit.record, name=fit.name, label=fit.label, reason=self.public(str(error))
+                )
 
     def _is_of_this_model(self, fit: SavedFit) -> bool:
         return fit.record.model.hash == self.model.content_hash

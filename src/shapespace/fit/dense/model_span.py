@@ -48,7 +48,7 @@ def in_span(
     normal = (pose.T @ pose - (inside.T * kept_share) @ inside) * np.outer(unit, unit)
     normal[np.diag_indices(free)] += noise / residual_energy
     delta = np.zeros(POSE)
-    delta[:free] = unit * np.linalg.solve(normal, unit * (pose.T @ y - inside.T @ (kept * b)))  # R18
+    delta[:free] = unit * np.linalg.solve(normal, unit * (pose.T @ y - inside.T @ (kept_share * b)))  # R18
     small = small_similarity(delta)
     y = (small.inverse().apply(vertices) - prepared.model.mean_vertices).ravel()
-    return Estimate(at.T_scan_model @ small, kept * (P.T @ y))  # R19
+    return Estimate(estimate.T_scan_model @ small, kept_share * (P.T @ y))  # R19

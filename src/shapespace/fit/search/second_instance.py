@@ -97,8 +97,8 @@ def find_second_instance(
         )
     except (FitError, InputError):
         return None
-    own, others = fitted.match_evidence, other.match_evidence
-    if failure_score(others) > 0.0 or others.spread_mm > _AS_GOOD * own.spread_mm:
+    own, second_evidence = fitted.match_evidence, second_fit.match_evidence
+    if failure_score(second_evidence) > 0.0 or second_evidence.spread_mm > _AS_GOOD * own.spread_mm:
         return None
     first, second = fitted.vertices_scan_mm, second_fit.vertices_scan_mm
     offset = second.mean(axis=0) - first.mean(axis=0)
@@ -150,15 +150,16 @@ def find_displaced(model: ShapeModel, target: ScanTarget, fitted: RobustFitted) 
     height = np.einsum("ij,ij->i", points - nearest.points, vertex_normals(surface)[nearest.vertex])
     around = height[np.asarray(cKDTree(points).query(points, _NEIGHBOURS)[1], dtype=np.int32)[:, 1:]]
     alike = np.median(np.abs(around - height[:, None]), axis=1) < _ALIKE * np.abs(height)
-    inside = ~boundary_vertices(surface)[at.vertex]
-    far = max(_DISPLACED[0] * size, _SPREADS * spread)
-    moved = (np.abs(height) > far) & (at.distance < _DISPLACED[1] * size) & alike & inside
-    moved &= np.abs(height) > _ALONG_NORMAL * at.distance
+    inside = ~boundary_vertices(surface)[nearest.vertex]
+    limit = max(_DISPLACED[0] * size, _SPREADS * spread)
+    is_displaced = (np.abs(height) > limit) & (nearest.distance < _DISPLACED[1] * size) & alike & inside
+    is_displaced &= np.abs(height) > _ALONG_NORMAL * nearest.distance
+    far_share = max(float((nearest.distance > limit).mean()), 1.0 / len(points))
     return Displaced(
-        displaced_share=float(moved.mean()),
-        displaced_inward_share=float((moved & (height < 0.0)).mean()),
-        displaced_purity=float(moved.mean() / max(float((at.distance > far).mean()), 1.0 / len(points))),
-        scattered_share=float(((at.distance > _DISPLACED[0] * size) & inside & ~alike).mean()),
+        displaced_share=float(is_displaced.mean()),
+        displaced_inward_share=float((is_displaced & (height < 0.0)).mean()),
+        displaced_purity=float(is_displaced.mean() / far_share),
+        scattered_share=float(((nearest.distance > _DISPLACED[0] * size) & inside & ~alike).mean()),
     )
 
 
@@ -179,13 +180,13 @@ def find_layers(model: ShapeModel, target: ScanTarget, fitted: RobustFitted) -> 
         return Layers()
     points = target.mesh.vertices[target.draw(_POINTS, np.random.default_rng(0))]
     surface = Mesh(fitted.vertices_scan_mm, model.faces)
-    at = build_engine(surface).query(points)
-    near = at.distance < 2 * _NEAR * size_mm * scale
-    if near.sum() < _FEWEST:
+    nearest = build_engine(surface).query(points)
+    is_near = nearest.distance < 2 * _NEAR * size_mm * scale
+    if is_near.sum() < _FEWEST:
         return Layers()
-    normals = vertex_normals(surface)[at.vertex[near]]
-    height = np.einsum("ij,ij->i", (points - at.points)[near], normals)
-    feet = at.points[near]
+    normals = vertex_normals(surface)[nearest.vertex[is_near]]
+    height = np.einsum("ij,ij->i", (points - nearest.points)[is_near], normals)
+    feet = nearest.points[is_near]
     heights = np.sort(height[cKDTree(feet).query(feet, _NEIGHBOURS)[1]], axis=1)
     gaps = np.diff(heights, axis=1)[:, _LEAST_SIDE - 1 : _NEIGHBOURS - _LEAST_SIDE]
     split = gaps.argmax(axis=1) + _LEAST_SIDE
@@ -198,8 +199,8 @@ def find_layers(model: ShapeModel, target: ScanTarget, fitted: RobustFitted) -> 
     return Layers(float(layered.mean()), float(np.median(gap[layered])) / scale)
 
 
-def _same_moved(fitted: RobustFitted, rest: FloatArray, size_mm: float) -> Similarity | None:
-    """Return the pose at which the shape that was fitted, turned much as it is, lies on `rest` (R, 3); None for none.
+def _fit_pose_again(fitted: RobustFitted, remaining_points: FloatArray, size_mm: float) -> Similarity | None:
+    """Return the pose, of similar rotation, at which the fitted shape lies on `remaining_points` (R, 3), or None.
 
     It is far cheaper than a search, which a head or a collar around a face would otherwise cost.
     """

@@ -52,7 +52,7 @@ def shape_search(
     scan: FloatArray,
     tree: KdArrays,
     counts: IntArray,
-    reaches: FloatArray,
+    radii: FloatArray,
     prior_weight: float,
     scale_precision: float,
     slack: FloatArray,
@@ -62,7 +62,7 @@ def shape_search(
     """Run symmetric Gauss-Newton over pose and leading modes from one pose, in place, and return the final scale.
 
     All is solved in the model's frame, where the modes need no turning; a mean point x and a scan point q brought
-    there differ by e = x - q, and the cost is sum w e^T (n n^T + eta I) e + prior_weight reach^2 (sum b_k^2 / lam_k + c
+    there differ by e = x - q, and the cost is sum w e^T (n n^T + eta I) e + prior_weight radius^2 (sum b_k^2 / lam_k + c
     log(scale)^2), w Geman and McClure's.
 
     Args:
@@ -74,7 +74,7 @@ def shape_search(
         scan: (N, 3) points of the scan, in any order.
         tree: of the scan's points.
         counts: (2,) how many of the first points of the model and of the scan look for the other.
-        reaches: (I,) of the weights, for each iteration, mm.
+        radii: (I,) of the weights, for each iteration, mm.
         prior_weight: weight of the prior.
         scale_precision: c; infinity holds the scale.
         slack: (2,) how far a match may lie sideways, model to scan and back, mm.
@@ -182,7 +182,7 @@ def shape_search(
         for m in range(n_modes):
             A[7 + m, 7 + m] += prior_weight * nu * shape.precision[m]
             g[7 + m] += prior_weight * nu * shape.precision[m] * b[m]
-        if held:
+        if is_scale_fixed:
             A[6, :7], A[7:, 6], A[6, 6], g[6] = 0.0, 0.0, 1.0, 0.0
         else:
             A[6, 6] += prior_weight * nu * scale_precision

@@ -581,11 +581,11 @@ def _notes(change: ChangeResult) -> list[str]:
     if change.single_visit_subjects:
         alone, every = len(change.single_visit_subjects), len(change.subjects) + len(change.single_visit_subjects)
         notes.append(
-            f"{alone} of {every} subjects are left out, who have one visit ({named(change.single_visit_subjects)})."
+            f"{alone} of {every} subjects are left out, who have one visit ({list_names(change.single_visit_subjects)})."
         )
     ends = {(one.visits[0].label, one.visits[-1].label) for one in change.subjects}
     if not change.time_unit and len(ends) > 1:
-        pairs_of_visits = named([f"{first} to {last}" for first, last in sorted(ends)])
+        pairs_of_visits = list_names([f"{first} to {last}" for first, last in sorted(ends)])
         notes.append(f"Not all subjects have the same first and last visit ({pairs_of_visits}).")
     if change.is_model_only:
         notes.append(

@@ -164,7 +164,7 @@ def calibration_figure(
     if ece is not None:
         headline = f"Stated probabilities are off by {100 * ece:.1f} points on average"
     note = "" if brier is None else f"Brier score {brier:.3f} (0 is best)."
-    figure, (above, below) = charts(title or headline, [2.9, 1.25], note=note)
+    figure, (curve_axes, count_axes) = charts(title or headline, [2.9, 1.25], note=note)
     floor = min(float(start.min()), 100 - 1e-3)
     curve_axes.plot([0, 100], [0, 100], color=GREY, ls=(0, (4, 3)), lw=1.4, label="right as often as stated")
     size = 26 + 190 * counts / counts.max()
@@ -297,7 +297,7 @@ def curve_figure(
     )
     for k, curve in enumerate(curves):
         x_values, y_values, *ends = (
-            _placed(values, scales[axis], limits[axis])
+            _to_scale(values, scales[axis], limits[axis])
             for axis, values in ((0, curve.x), (1, curve.y), *((1, end) for end in curve.ends))
         )
         colour, label = CATEGORIES[k % len(CATEGORIES)], escaped(short(curve.name, 34)) or None

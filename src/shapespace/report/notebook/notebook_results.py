@@ -46,7 +46,7 @@ def html_of_analysis(result: AnalysisResult) -> str:
     blocks: list[Block] = []
     for part in tables[:MOST_TABLES]:
         for block in parts.blocks(part, part.title or TITLES["table"]):
-            blocks += _shortened(block) if isinstance(block, Table) else [block]
+            blocks += _shorten(block) if isinstance(block, Table) else [block]
     blocks.append(Notes([*report.notes[:_MOST_NOTES], "result.save(folder) writes tables, maps and report."]))
     return notebook_html(result, report.title, report.summary, [], blocks=blocks)
 
