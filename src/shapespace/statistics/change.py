@@ -82,8 +82,8 @@ def change(
     single = tuple(name for name, own in visits.by_subject.items() if len(own) < 2)
     if len(single) == len(visits.by_subject):
         raise InputError(
-            f"{cohort.table.where}: none of its {len(single)} subjects has two visits ({list_names(single)}); give the same "
-            f"subject in {config.subject} and another time in {visits.column}."
+            f"{cohort.table.where}: none of its {len(single)} subjects has two visits ({list_names(single)}); give the "
+            f"same subject in {config.subject} and another time in {visits.column}."
         )
     groups = _groups(cohort, config, visits, single)
     stable = stable_vertices(cohort, config.stable)
