@@ -42,6 +42,7 @@ PAGES = {
     "score": ["score.md", "statistics.md"],
     "export": ["stores.md", "interop.md"],
     "convert": ["model-formats.md"],
+    "cache": ["fit-results.md"],
     "demo": ["data.md", "report.md"],
 }
 """Command -> pages that explain its topic."""

@@ -580,9 +580,8 @@ def _notes(change: ChangeResult) -> list[str]:
     notes: list[str] = []
     if change.single_visit_subjects:
         alone, every = len(change.single_visit_subjects), len(change.subjects) + len(change.single_visit_subjects)
-        notes.append(
-            f"{alone} of {every} subjects are left out, who have one visit ({list_names(change.single_visit_subjects)})."
-        )
+        names = list_names(change.single_visit_subjects)
+        notes.append(f"{alone} of {every} subjects are left out, who have one visit ({names}).")
     ends = {(one.visits[0].label, one.visits[-1].label) for one in change.subjects}
     if not change.time_unit and len(ends) > 1:
         pairs_of_visits = list_names([f"{first} to {last}" for first, last in sorted(ends)])
