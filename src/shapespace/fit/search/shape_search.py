@@ -62,8 +62,8 @@ def shape_search(
     """Run symmetric Gauss-Newton over pose and leading modes from one pose, in place, and return the final scale.
 
     All is solved in the model's frame, where the modes need no turning; a mean point x and a scan point q brought
-    there differ by e = x - q, and the cost is sum w e^T (n n^T + eta I) e + prior_weight radius^2 (sum b_k^2 / lam_k + c
-    log(scale)^2), w Geman and McClure's.
+    there differ by e = x - q, and the cost is sum w e^T (n n^T + eta I) e + prior_weight radius^2 (sum b_k^2 / lam_k
+    + c log(scale)^2), w Geman and McClure's.
 
     Args:
         R: (3, 3) rotation from the model's frame to the scan's, replaced.
