@@ -19,6 +19,7 @@ from sklearn.pipeline import Pipeline
 
 import shapespace as ss
 from shapespace import cli
+from shapespace.fit.diagnostics.reasons import Reason
 from shapespace.lazy import require_package
 from synthetic_shapes import blob_model, raw_scan, training_meshes
 
@@ -285,7 +286,8 @@ def test_notebooks_show_a_picture_the_numbers_and_the_verdict(result: ss.FitResu
 
 def test_nothing_that_a_file_holds_gets_into_a_page_unescaped(result: ss.FitResult) -> None:
     evil = "<img src=x onerror=alert(1)>"
-    for shown in (replace(result, scan_name=evil, reason=evil, notes=[evil]), replace(blob_model(200), licence=evil)):
+    fit = replace(result, scan_name=evil, reasons=(Reason.other(evil),), notes=[evil])
+    for shown in (fit, replace(blob_model(200), licence=evil)):
         page = shown._repr_html_()
         assert "<img src=x" not in page and "&lt;img src=x" in page
 

@@ -11,7 +11,7 @@ from shapespace.fit.diagnostics.reasons import Reason, ReasonCode
 DOUBTFUL = "Do not trust this fit: "
 """Beginning of the sentence on a doubtful fit."""
 
-_TEXTS: Mapping[str, Callable[[Mapping[str, Any]], str]] = MappingProxyType(
+_TEXTS: Mapping[ReasonCode, Callable[[Mapping[str, Any]], str]] = MappingProxyType(
     {
         ReasonCode.CONVERGED: lambda d: (
             f"Converged; robust residual SD {d['spread_mm']:.2f} mm over {100 * d['model_matched_share']:.0f} % of the "
@@ -121,10 +121,10 @@ def text_of(code: str, data: Mapping[str, Any]) -> str:
     """Return the text of one reason.
 
     Raises:
-        KeyError, TypeError, ValueError: the code is unknown, or its data are incomplete, as those of a saved file of
+        ValueError, KeyError, TypeError: the code is unknown, or its data are incomplete, as those of a saved file of
             another version can be.
     """
-    return _TEXTS[code](data)
+    return _TEXTS[ReasonCode(code)](data)
 
 
 def sentence_of(status: str, reasons: Sequence[Reason]) -> str:
