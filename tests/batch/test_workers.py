@@ -96,7 +96,7 @@ def test_a_small_fit_meets_every_loop_of_a_real_one() -> None:
     code = """
 import numpy as np
 from shapespace.batch.warm import warm_up, _hill
-from shapespace.compiled import on_compiling
+from shapespace.compiled import notify_compilation
 from numba.core.dispatcher import Dispatcher
 warm_up(tell=False)
 from shapespace.fit.fit_scan import FitConfig, fit_scan

@@ -128,5 +128,5 @@ def test_the_standard_deviation_is_told_and_infinity_holds_nothing(run: Run, wor
     assert record["config"]["landmark_stddev_mm"] == record["evidence"]["marks_stddev_mm"] == 1.5
     assert run(*command, "--landmark-std", "inf").code == 0
     assert "marks_stddev_mm" not in record_of(tmp_path / "o", "scan_0")["evidence"]
-    assert "which is kept" in run(*command, "--landmark-std", "inf").err
+    assert "which is reused" in run(*command, "--landmark-std", "inf").err
     assert run(*command, "--landmark-std", "0").code == 2

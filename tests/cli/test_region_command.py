@@ -32,7 +32,7 @@ def test_a_region_is_kept_by_name_and_fits_are_held_to_it_or_to_the_same_file(
         assert run(*command).code == 0
         record = json.loads((out / "scan_0.fit.json").read_text())
         assert record["distances_mm"]["final"]["model_to_scan"]["count"] == len(vertices)
-        assert "which is kept" in run(*command).err
+        assert "which is reused" in run(*command).err
         with (out / "coefficients.csv").open(newline="") as stream:
             rows += [{key: cell for key, cell in row.items() if key[0] in "bz"} for row in csv.DictReader(stream)]
     assert rows[0] == rows[1]

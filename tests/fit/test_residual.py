@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from shapespace.fit.dense import residual_modes as residual
 from shapespace.fit.dense.residual_modes import ResidualModes, residual_modes
 from shapespace.fit.robust.robust_settings import ResidualSettings
+from shapespace.model import local_modes
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh
 from synthetic_shapes import blob_model, sphere
@@ -99,7 +100,7 @@ def test_a_lopsided_mean_has_no_mirror_image() -> None:
 def test_blocks_change_nothing_but_the_rounding(monkeypatch: pytest.MonkeyPatch) -> None:
     model = symmetric_model()
     before = residual._make(model, SETTINGS)
-    monkeypatch.setattr(residual, "_BLOCK", 37)
+    monkeypatch.setattr(local_modes, "_BLOCK", 37)
     after = residual._make(model, SETTINGS)
     np.testing.assert_allclose(after.stddev, before.stddev, rtol=1e-4)
     # The same span, whatever the signs.

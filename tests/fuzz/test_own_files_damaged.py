@@ -420,7 +420,6 @@ KINDS: dict[str, tuple[dict[str, Any], Callable[[object], object]]] = {
              {"kind": "table", "columns": [{"name": "a", "kind": "interval"}], "rows": [[[0.1, 0.2]], [None]]},
              {"kind": "confusion", "classes": ["a", "b"], "counts": [[1, 2], [3, 4]]},
              {"kind": "calibration", "bins": [{"low": 0.4, "high": 0.6, "count": 3}], "ece": 0.1},
-             {"kind": "lines", "points": [{"b": [1.0, 2.0], "z": [0.1, 0.2], "intensity": 0.5}]},
              {"kind": "curve", "series": [{"x": [1, 2], "y": [0.5, 0.7]}]}]},
         lambda content: Recognition.from_json(content),
     ),

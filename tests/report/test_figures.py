@@ -108,8 +108,8 @@ def test_labels_that_are_long_or_hold_what_cannot_be_printed_stay_within_the_fig
     def blank(count: int, size: tuple[int, int]) -> list[np.ndarray]:
         return [np.full((size[1], size[0], 3), 255, dtype=np.uint8)] * count
 
-    monkeypatch.setattr(figures.fit, "render", lambda *_, size, **__: blank(1, size)[0])
-    monkeypatch.setattr(figures.fit, "render_series", lambda pictures, size, **_: blank(len(pictures), size))
+    monkeypatch.setattr(figures.fit_figures, "render", lambda *_, size, **__: blank(1, size)[0])
+    monkeypatch.setattr(figures.fit_figures, "render_series", lambda pictures, size, **_: blank(len(pictures), size))
     picture = decoded(draw_it(make_fit(head(6), label=NASTY)))
     assert (picture[:, -2:] == 255).all() and (picture[:, :2] == 255).all() and (picture < 128).any()
 
@@ -228,7 +228,7 @@ def test_a_fit_without_iterations_says_so(head: MakeHead) -> None:
 def test_the_interval_of_a_coefficient_is_in_the_units_of_its_bar(head: MakeHead) -> None:
     z, stddev = np.array([1.0, -2.0, 0.0]), np.array([30.0, 10.0, 5.0])
     fit = make_fit(head(6), modes=3, z=z, b=z * stddev, b_stddev=0.1 * stddev)
-    np.testing.assert_allclose(figures.fit.z_stddev(fit)[:2], 0.1)
+    np.testing.assert_allclose(figures.fit_figures.z_stddev(fit)[:2], 0.1)
     figure = figures.coefficients_figure(fit)
     (bars,) = figure.axes[0].collections[-1:]
     ends = np.array([segment[:, 1] for segment in bars.get_segments()])
@@ -257,7 +257,7 @@ def test_every_figure_of_a_model_is_drawn(model: ShapeModel, modes: int) -> None
 
 
 def test_a_mode_moves_the_mean_by_its_standard_deviations_to_both_sides(model: ShapeModel) -> None:
-    move = figures.model.mode_displacement(model, 1, 3.0)
+    move = figures.model_figures.mode_displacement(model, 1, 3.0)
     np.testing.assert_allclose(np.linalg.norm(move), 3 * model.stddev[1])
     assert draw.mm(float(np.linalg.norm(move, axis=1).max())) in words(figures.modes_figure(model))
     low, middle, high, _ = pictures(figures.modes_figure(model, modes=1))[:4]

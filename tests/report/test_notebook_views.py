@@ -11,6 +11,7 @@ import shapespace as ss
 from identity_people import cohort as people_cohort
 from shapespace.cohort.cohort import Cohort
 from shapespace.errors import InputError
+from shapespace.fit.diagnostics.reasons import Reason
 from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.report.analyses.result_tables import analysis_report
 from shapespace.report.figures import spectrum_figure
@@ -102,7 +103,7 @@ def test_the_page_of_an_analysis_says_what_its_report_says_first(results: dict[s
 def test_scans_in_correspondence_and_results_in_a_folder_are_shown(tmp_path: Path) -> None:
     meshes = list(training_meshes(vertices=150)[:3])
     result = ss.fit_scan(blob_model(150), meshes[0], ss.FitConfig(method="paper", max_iterations=2))
-    dataclasses.replace(result, reason=EVIL).save(tmp_path, "one")
+    dataclasses.replace(result, reasons=(Reason.other(EVIL),)).save(tmp_path, "one")
     results = ss.Results(tmp_path)
     assert len(repr(results)) < LONGEST_REPR
     assert "<img src=x" not in results._repr_html_() and "&lt;img src=x" in results._repr_html_()

@@ -68,7 +68,9 @@ def test_a_dropped_scan_is_fitted_as_the_command_line_does(
     record = user.get(f"/api/scans/{key}/record").json()
     for one in (record, expected):
         del one["seconds"]
-        del one["scan"]["path"], one["scan"]["size_bytes"], one["scan"]["modified_ns"], one["model"]["path"]
+        del one["scan"]["size_bytes"], one["scan"]["modified_ns"]
+        # The viewer leaves out the paths of its own folders.
+        one["scan"].pop("path", None), one["model"].pop("path", None)
     assert record == expected
     assert verdict["b"] == record["b"] == events[-3]["b"]
 
