@@ -36,7 +36,7 @@ def holed(meshes: tuple[Mesh, ...], shown: BoolArray) -> list[Mesh]:
     ]
 
 
-def noisy(count: int = 40, vertices: int = 300, seed: int = 1, noise_mm: float = 0.1) -> tuple[Mesh, ...]:
+def noisy(count: int = 24, vertices: int = 200, seed: int = 1, noise_mm: float = 0.1) -> tuple[Mesh, ...]:
     rng = np.random.default_rng(seed)
     return tuple(
         m.with_vertices(m.vertices + noise_mm * rng.standard_normal(m.vertices.shape))
@@ -104,7 +104,7 @@ def test_variances_and_mean_of_holed_shapes_are_nearer_those_of_whole_ones_than_
 
 
 def test_missing_vertices_of_shapes_of_few_modes_are_found_again() -> None:
-    meshes = noisy()
+    meshes = noisy(count=40, vertices=300)
     shapes, shown = np.stack([m.vertices for m in meshes]), patches(meshes)
     found = ppca(filled_by_the_mean(shapes, shown), shown, 20)
     off = [np.linalg.norm(found.estimate(i) - shapes[i][~shown[i]], axis=1) for i in range(len(shapes))]
@@ -127,7 +127,7 @@ def test_where_nothing_is_missing_the_model_is_the_same_to_the_bit() -> None:
 
 
 def test_with_hardly_anything_missing_the_model_is_nearly_that_of_the_whole() -> None:
-    meshes = noisy()
+    meshes = noisy(count=40, vertices=300)
     shown = np.ones((40, 300), dtype=bool)
     shown[7, 11] = False
     model, whole = ShapeModel.fit(holed(meshes, shown)), ShapeModel.fit(meshes)
@@ -136,7 +136,7 @@ def test_with_hardly_anything_missing_the_model_is_nearly_that_of_the_whole() ->
 
 
 def test_poses_do_not_matter_and_the_same_meshes_give_the_same_model() -> None:
-    meshes = noisy(count=20)
+    meshes = noisy(count=20, vertices=300)
     given = holed(meshes, patches(meshes))
     moved = [
         m.with_vertices(similarity(i, 0 if i == 0 else 60.0, 1.0, 200.0).apply(m.vertices)) for i, m in enumerate(given)
@@ -188,7 +188,7 @@ def test_a_vertex_that_is_not_observed_is_treated_as_missing(out_of_core: bool) 
     one, other = (ShapeModel.fit(given, modes=4) for given in (masked, estimated(masked)))
     np.testing.assert_array_equal(one.mean, other.mean)
     np.testing.assert_array_equal(one.basis, other.basis)
-    settings = QualitySettings(modes=3, samples=20)
+    settings = QualitySettings(modes=3, samples=6, folds=2)
     first, second = (measure_quality(given, settings) for given in (masked, estimated(masked)))
     np.testing.assert_array_equal(first.generalisation.mean, second.generalisation.mean)
 
