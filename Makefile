@@ -6,6 +6,8 @@ READY = $(VENV)/.ready
 READY_FOR_DEMO = $(VENV)/.ready-for-demo
 READY_TO_LINT = $(VENV)/.ready-to-lint
 READY_FOR_DOCS = $(VENV)/.ready-for-docs
+# Tests start many processes; where Python may not keep what it compiled, each compiles all that it imports: 3 s instead of 1.
+RUN_TESTS = env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n auto --max-worker-restart 0
 # What shows in a minute or two whether other versions of the dependencies do.
 QUICK = tests/api tests/contracts tests/formats tests/geometry tests/io/test_meshes.py tests/model/test_pca.py \
   tests/model/test_shape_model.py tests/recognise/test_saved_classifier.py tests/schemas tests/store tests/fit/test_robust.py
@@ -16,10 +18,10 @@ demo: $(READY_FOR_DEMO)
 	$(BIN)/shapespace demo --out demo-out $(DEMO)
 
 test: $(READY)
-	$(BIN)/python -m pytest -n auto --max-worker-restart 0 -m "not long" $(PYTEST)
+	$(RUN_TESTS) -m "not long" $(PYTEST)
 
 test-all: $(READY)
-	$(BIN)/python -m pytest -n auto --max-worker-restart 0 $(PYTEST)
+	$(RUN_TESTS) $(PYTEST)
 
 # Each has an environment of its own, beside the usual one; old packages warn of one another.
 test-oldest: WHICH = oldest
