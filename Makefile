@@ -6,9 +6,9 @@ READY = $(VENV)/.ready
 READY_FOR_DEMO = $(VENV)/.ready-for-demo
 READY_TO_LINT = $(VENV)/.ready-to-lint
 READY_FOR_DOCS = $(VENV)/.ready-for-docs
-# Tests start many processes; where Python may not keep what it compiled, each compiles all that it imports: 3 s instead of 1.
+# Tests start many processes. Where Python may not write bytecode, each compiles its imports: 3 s instead of 1.
 RUN_TESTS = env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n auto --max-worker-restart 0
-# What shows in a minute or two whether other versions of the dependencies do.
+# Tests that show within two minutes whether other versions of the dependencies work.
 QUICK = tests/api tests/contracts tests/formats tests/geometry tests/io/test_meshes.py tests/model/test_pca.py \
   tests/model/test_shape_model.py tests/recognise/test_saved_classifier.py tests/schemas tests/store tests/fit/test_robust.py
 
@@ -23,7 +23,7 @@ test: $(READY)
 test-all: $(READY)
 	$(RUN_TESTS) $(PYTEST)
 
-# Each has an environment of its own, beside the usual one; old packages warn of one another.
+# Each uses its own environment; old packages issue deprecation warnings for one another.
 test-oldest: WHICH = oldest
 test-newest: WHICH = newest
 test-oldest test-newest:
@@ -48,7 +48,7 @@ check: lint types contracts test
 bench: $(READY)
 	set -e; for name in pca accuracy speed memory throughput; do $(BIN)/python benchmarks/$$name.py; done
 
-# Strict: a link that leads nowhere fails the build. Everything is read anew, or the second build would pass.
+# Strict: a broken link fails the build. All files are read again, or the second build would pass.
 docs: $(READY_FOR_DOCS)
 	rm -rf build/site
 	$(BIN)/python -m sphinx -q -W --keep-going --fresh-env -c docs/site -d build/site-trees . build/site
@@ -65,7 +65,7 @@ $(READY): $(READY_FOR_DEMO)
 	$(BIN)/python -m pip install --quiet --editable '.[all]' --group test
 	touch $@
 
-# Apart, since pyright brings Node, which nothing else needs.
+# Separate, because pyright installs Node, which nothing else needs.
 $(READY_TO_LINT): $(READY)
 	$(BIN)/python -m pip install --quiet --group lint
 	touch $@

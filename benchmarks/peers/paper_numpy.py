@@ -1,6 +1,6 @@
 """The paper's method in plain NumPy and SciPy, as a reader of the paper would write it: the yardstick for its speed.
 
-Equation numbers are the paper's, misprints corrected as in `docs/errata.md`. The results are those of
+Equation numbers are the paper's, misprints corrected as in `docs/paper-map.md`. The results are those of
 `shapespace.fit.fit_scan.paper_method`; `tests/fit/test_paper_numpy.py` holds both to that.
 """
 

@@ -155,10 +155,10 @@ PLOTS = (
         _cases, ((BENCHMARKS, "Accuracy"),),
     ),
     Plot(
-        "peers", BENCHMARKS, "Beside the peers",
+        "peers", BENCHMARKS, "Comparison with other tools",
         "Two dots for each method, a complete scan and one with a cut, a hole and extra neck: of shapespace both lie "
         "at the same place, of most others the second lies far off",
-        _errors, ((BENCHMARKS, "Beside the peers"), ("docs/other-tools", "Measured comparisons")),
+        _errors, ((BENCHMARKS, "Comparison with other tools"), ("docs/other-tools", "Measured comparisons")),
     ),
     Plot(
         "speed", BENCHMARKS, "Speed",
@@ -166,10 +166,10 @@ PLOTS = (
         _times, ((BENCHMARKS, "Speed"),),
     ),
     Plot(
-        "organs", BENCHMARKS, "Correspondence of real organs beside the peers",
+        "organs", BENCHMARKS, "Correspondence of real organs, with other tools",
         "Generalisation and specificity of spleens put into correspondence by shapespace, meshmonk and rustcpd, with "
         "their intervals: those of shapespace and meshmonk overlap, those of rustcpd are larger",
-        _organs, ((BENCHMARKS, "Correspondence of real organs beside the peers"),),
+        _organs, ((BENCHMARKS, "Correspondence of real organs, with other tools"),),
     ),
 )  # fmt: skip
 

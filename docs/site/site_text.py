@@ -20,7 +20,6 @@ FIRST, REFERENCE, COMMANDS = "docs/index", "docs/api", "docs/cli"
 LONGEST = 600
 """Characters of a signature that is shown."""
 NAVIGATION = {
-    "Start": ["docs/start"],
     "Tutorials": [
         "docs/tutorial-faces",
         "docs/tutorial-spleens",
@@ -37,16 +36,12 @@ NAVIGATION = {
         "docs/volumes",
         "docs/missing",
         "docs/quality",
-        "docs/build-at-scale",
     ],
     "How-to: fits": [
-        "docs/howto-hair",
-        "docs/howto-partial",
+        "docs/howto-difficult-scans",
         "docs/landmarks",
         "docs/dense",
-        "docs/colours",
         "docs/scale",
-        "docs/stores",
         "docs/interop",
         "docs/report",
         "docs/viewer",
@@ -54,7 +49,6 @@ NAVIGATION = {
     ],
     "How-to: questions": [
         "docs/recognise",
-        "docs/real-sets",
         "docs/statistics",
         "docs/identity",
         "docs/compare",
@@ -70,7 +64,6 @@ NAVIGATION = {
         "docs/glossary",
         "docs/symbols",
         "docs/mesh-formats",
-        "docs/model-formats",
         "docs/model-file",
         "docs/data",
         "docs/benchmarks",
@@ -80,7 +73,6 @@ NAVIGATION = {
         "docs/how-it-works",
         "docs/robust",
         "docs/paper-map",
-        "docs/errata",
         "docs/uncertainty",
         "docs/what-can-go-wrong",
         "docs/bspline",

@@ -1,4 +1,4 @@
-"""The invariants of the paper's two phases, in the form that `docs/errata.md` corrects them to."""
+"""The invariants of the paper's two phases, in the form that `docs/paper-map.md` corrects them to."""
 
 from itertools import pairwise
 

@@ -1,6 +1,6 @@
 """Least-squares similarity between two matched point sets: equations 8 to 18 of the paper, misprints corrected.
 
-Sources: Arun, Huang and Blostein, PAMI 9(5), 1987; Umeyama, PAMI 13(4), 1991. `docs/errata.md` lists what the
+Sources: Arun, Huang and Blostein, PAMI 9(5), 1987; Umeyama, PAMI 13(4), 1991. `docs/paper-map.md` lists what the
 paper prints and what is right.
 """
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from shapespace.errors import FileFormatError, InputError
 from shapespace.io.containers.json_files import check_file
@@ -18,7 +19,7 @@ from shapespace.io.tables.table_io import table_rows
 from shapespace.reprs import short_repr
 from shapespace.schemas import FitRecord
 from shapespace.store.results import Results, modes_of
-from shapespace.types import FloatArray, read_only
+from shapespace.types import BoolArray, FloatArray, read_only
 
 NEUTRAL = "neutral"
 """The label of neutral faces, unless another is given."""
@@ -213,8 +214,15 @@ def relative_to_neutral(z: FloatArray, subjects: Sequence[str], is_neutral: Sequ
             f"There is no usable neutral face of {subject_names}{others_note}; add it with its label, or "
             "recognise without neutral faces."
         )
-    relative = np.empty_like(z)
-    for name in cast(list[str], np.unique(people).tolist()):
+    return relative_where_known(z, people, neutral)
+
+
+def relative_where_known(z: FloatArray, people: npt.NDArray[np.str_], is_neutral: BoolArray) -> FloatArray:
+    """Return coefficients as `relative_to_neutral` does, with NaN for people without a finite neutral face."""
+    relative = np.full_like(z, np.nan)
+    neutral = is_neutral & np.isfinite(z).all(axis=1)
+    for name in np.unique(people):
         is_subject = people == name
-        relative[is_subject] = z[is_subject] - z[is_subject & neutral].mean(axis=0)
+        if (is_subject & neutral).any():
+            relative[is_subject] = z[is_subject] - z[is_subject & neutral].mean(axis=0)
     return relative

@@ -25,12 +25,12 @@ from shapespace.model.additive import AdditiveModel, load_model
 from shapespace.model.shape_model import ShapeModel
 from shapespace.recognise import evaluate
 from shapespace.recognise.classifiers import CLASSIFIERS
+from shapespace.recognise.labelled_scans import NEUTRAL, relative_where_known
 from shapespace.report.pages.write_html import require_report_extra, write_report
 from shapespace.schemas import FitRecord, Part, TextPart
 from shapespace.study import parts
 from shapespace.types import BoolArray, FloatArray
 
-NEUTRAL = "neutral"
 TextArray = npt.NDArray[np.str_]
 _FEWEST_SUBJECTS = 4
 _FEWEST_PER_CLASS = 2
@@ -55,7 +55,7 @@ def run_own_study(
         model_file: the shape model, which should know none of these people; where it parts identity and expression,
             expression alone is a feature as well.
         folds: by subject, at most; fewer where there are fewer people.
-        where: the scans are fitted.
+        execution: where the scans are fitted.
         seed: of the folds.
         quiet: no progress bar.
 
@@ -83,7 +83,7 @@ def run_own_study(
         fit_many(jobs, BatchConfig(model, model_file, reuse=True), executor, sink, on_done=fitted)
     records = [sink.records[job.name] for job in jobs]
     fits = OwnFits.of(labelled.scans, records, model, additive)
-    settings = {"model": model_file.name, "folds": fits.most_folds(folds), "seed": seed}
+    settings = {"model": model_file.name, "folds": min(folds, fits.people), "seed": seed}
     content = _document(fits, labelled.summary(), settings)
     write_text(folder / "recognition.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
     return write_report(folder), labelled.summary()
@@ -154,17 +154,13 @@ class OwnFits:
 
     @property
     def people(self) -> int:
-        """How many people are tested."""
+        """Number of people that are tested."""
         return len(np.unique(self.subjects))
 
     @property
     def neutral_known(self) -> bool:
         """Whether there is a neutral scan of everybody who is tested."""
         return set(self.subjects.tolist()) <= set(self.subject[~self.tested].tolist())
-
-    def most_folds(self, wanted: int) -> int:
-        """Return how many folds there can be."""
-        return min(wanted, self.people)
 
     def folds(self, code: FloatArray, settings: Mapping[str, Any]) -> list[evaluate.Fold]:
         """Return the folds by person of one feature."""
@@ -248,7 +244,8 @@ def _compared(
     last: tuple[list[evaluate.Fold], evaluate.Predictions] | None = None
     for word in ("unknown", "known") if fits.neutral_known else ("unknown",):
         for name, code in fits.codes.items():
-            folds = fits.folds(_relative(code, fits.subject, fits.expression) if word == "known" else code, settings)
+            known = relative_where_known(code, fits.subject, ~fits.tested) if word == "known" else code
+            folds = fits.folds(known, settings)
             nested = evaluate.nested_predictions(
                 folds, inner_folds=parts.inner_folds(folds), seed=settings["seed"], modes=(10, None)
             )
@@ -281,14 +278,3 @@ def _by_intensity(fits: OwnFits, predictions: evaluate.Predictions) -> list[Part
             ],
         )
     ]
-
-
-def _relative(code: FloatArray, subject: Any, expression: Any) -> FloatArray:
-    """Return codes less the mean of the same person's neutral scans, NaN where none could be fitted."""
-    out = np.full(code.shape, np.nan)
-    for name in np.unique(subject):
-        at_rest = code[(subject == name) & (expression == NEUTRAL)]
-        at_rest = at_rest[np.isfinite(at_rest).all(axis=1)]
-        if len(at_rest):
-            out[subject == name] = code[subject == name] - at_rest.mean(axis=0)
-    return out
