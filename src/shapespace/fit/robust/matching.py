@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shapespace.fit.robust.kernels import gather_into
+from shapespace.fit.robust.kernels import compare_into, gather_into, on_scan_into
 from shapespace.fit.robust.prepared_model import ModelSurface
 from shapespace.fit.robust.weights import match_weights
 from shapespace.fit.scan_target import ScanTarget
-from shapespace.geometry.closest import ClosestPointEngine, ClosestPoints, on_boundary
+from shapespace.geometry.closest import ClosestPointEngine, ClosestPoints
 from shapespace.geometry.kdtree import KdTree
 from shapespace.types import BoolArray, FloatArray, IntArray, Similarity
 
@@ -252,12 +252,12 @@ def match_vertices(
     T, x, n = T_scan_model, surface.vertices[vertex], surface.normals[vertex]
     near = engine.query(T.apply(x), near)
     to_scan = x - ((near.points - T.translation) @ T.rotation) / T.scale
-    allowed = ~on_boundary(near, target.mesh, target.rim)
-    if target.mesh.faces is not None:
-        n_scan = target.normals_at(near) @ T.rotation
-        cosine = winding * np.einsum("md,md->m", n, n_scan)
-        allowed &= cosine > normal_cosine * np.linalg.norm(n_scan, axis=1)
-    return VertexMatches(vertex, np.einsum("md,md->m", to_scan, n), near.distance / T.scale, allowed, near)
+    corners, weights = target.carriers(near)
+    n_scan, allowed, residual = np.empty_like(x), np.empty(len(x), dtype=np.bool_), np.empty(len(x))
+    on_scan_into(corners, weights, target.normals, target.rim, n_scan, allowed)
+    n_scan = n_scan @ T.rotation if target.mesh.faces is not None else n_scan[:0]
+    compare_into(to_scan, n, n_scan, winding, normal_cosine, residual, allowed)
+    return VertexMatches(vertex, residual, near.distance / T.scale, allowed, near)
 
 
 def _winding_of(cosine: FloatArray, covered: BoolArray) -> float:
