@@ -406,7 +406,8 @@ def _landmark_stddev_mm(
     landmarks = model.landmarks if held is None else held.landmarks(model)
     if not dense:
         # The surface was told in the model's modes, and what that moved a landmark by is an error of it.
-        in_modes = landmarks.interpolate(fitted.T_scan_model.apply(model.reconstruct(fitted.b)))
+        modes = landmarks.interpolate(model.vertex_basis.reshape(model.n_vertices, 3, -1))[:, :, : len(fitted.b)]
+        in_modes = fitted.T_scan_model.apply(landmarks.interpolate(model.mean_vertices) + modes @ fitted.b)
         variance += (in_modes - landmarks.interpolate(fitted.vertices_scan_mm)) ** 2
     return dict(zip(landmarks, np.sqrt(variance), strict=True))
 

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from shapespace.geometry.closest import ClosestPointEngine, ClosestPoints, build_engine, finest_engine
+from shapespace.geometry.closest import ClosestPointEngine, ClosestPoints, VertexEngine, build_engine, finest_engine
 from shapespace.geometry.normals import boundary_vertices
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
 
@@ -37,9 +37,9 @@ class ScanTarget:
         return build_engine(self.mesh)
 
     @cached_property
-    def vertex_engine(self) -> ClosestPointEngine:
+    def vertex_engine(self) -> VertexEngine:
         """Search structure of the vertices."""
-        return build_engine(self.mesh, "vertices")
+        return VertexEngine(self.mesh)
 
     def search(self, name: str) -> ClosestPointEngine:
         """Return the engine called `name` in `ENGINES`."""

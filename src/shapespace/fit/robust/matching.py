@@ -176,6 +176,8 @@ class Matcher:
         target: the scan.
         points_mm: (M, 3) sample of its points, mm of the scan's frame.
         point_normals: (M, 3) their normals.
+        order: (M,) of searches for the sample, in which neighbours follow each other. It changes only their time, as
+            what a search needs is then in the processor's cache.
         vertex: (N,) sample of the model's vertices.
         engine: the scan's search structure.
         normal_cosine: matches whose normals disagree more than this are not allowed.
@@ -185,6 +187,7 @@ class Matcher:
     target: ScanTarget
     points_mm: FloatArray
     point_normals: FloatArray
+    order: IntArray
     vertex: IntArray
     engine: ClosestPointEngine
     normal_cosine: float
@@ -196,9 +199,13 @@ class Matcher:
         *, bulging: bool = False,
     ) -> Matcher:  # fmt: skip
         """Return the matcher of the scan points `points` (M,) and the model vertices `vertex` (N,)."""
+        place = np.full(len(target.mesh.vertices), -1, dtype=np.int32)
+        place[points] = np.arange(len(points), dtype=np.int32)
+        order = place[target.vertex_engine.order]
         return Matcher(
-            target, target.mesh.vertices[points], target.normals[points], vertex, engine, normal_cosine, bulging
-        )
+            target, target.mesh.vertices[points], target.normals[points], order[order >= 0], vertex, engine,
+            normal_cosine, bulging,
+        )  # fmt: skip
 
     def first_hint(
         self, surface: ModelSurface, T_scan_model: Similarity, tree: KdTree | None = None, winding: float | None = None
@@ -212,7 +219,9 @@ class Matcher:
             winding: of the scan where it is known.
         """
         tree = tree or surface.vertex_tree()
-        vertex: IntArray = surface.topology.used[tree.nearest(self._in_model(T_scan_model))[0]]
+        vertex = np.empty(len(self.points_mm), dtype=np.int32)
+        nearest = tree.nearest(self._in_model(T_scan_model)[self.order])[0]
+        vertex[self.order] = surface.topology.used[nearest]
         return MatchHint(vertex, np.full_like(vertex, -1), None, winding)
 
     def _in_model(self, T: Similarity) -> FloatArray:
