@@ -10,6 +10,7 @@ import dataclasses
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from math import isfinite
 from numbers import Integral
 from os import PathLike
 from types import MappingProxyType
@@ -408,11 +409,13 @@ class Similarity:
                 f"A similarity needs a (3, 3) rotation and a (3,) translation, not {rotation.shape} and "
                 f"{translation.shape}."
             )
-        if not (np.isfinite(self.scale) and self.scale > 0):
+        if not (isfinite(self.scale) and self.scale > 0):
             raise InputError(f"The scale of a similarity must be positive and finite, not {self.scale!r}.")
-        if not np.isfinite(translation).all():
+        if not all(isfinite(t) for t in translation.tolist()):
             raise InputError("The translation of a similarity must be finite.")
-        if not (np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-5 and np.linalg.det(rotation) > 0):
+        (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()  # plain numbers: a fit makes 40 of these
+        determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+        if not (np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-5 and determinant > 0):
             raise InputError("The rotation of a similarity must be orthonormal with determinant +1.")
         object.__setattr__(self, "scale", float(self.scale))
         object.__setattr__(self, "rotation", rotation)

@@ -30,6 +30,12 @@ def test_the_spread_is_the_standard_deviation_of_noise_whatever_a_third_of_outli
     assert spread(noise) < 0.45
 
 
+@pytest.mark.parametrize("count", [1, 2, 30, 31, 36, 1001])
+def test_tails_are_the_quantile_of_numpy_to_the_last_bit(count: int) -> None:
+    residual = np.random.default_rng(count).standard_normal(count)
+    assert tails(residual, 1.0) == np.quantile(np.abs(residual), 0.9) / 1.645
+
+
 def test_tails_are_one_for_noise_and_more_with_outliers() -> None:
     rng = np.random.default_rng(1)
     noise = 0.3 * rng.standard_normal(20_000)

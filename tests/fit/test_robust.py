@@ -4,19 +4,20 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from robust_reference import gauss_newton_step
 from shapespace.errors import FitError, InputError
 from shapespace.fit.dense.model_span import in_span
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.method_choices import method_named
-from shapespace.fit.robust.matching import Matcher, MatchHint
-from shapespace.fit.robust.normal_equations import Estimate
+from shapespace.fit.robust.matching import Matcher, MatchHint, match_vertices
+from shapespace.fit.robust.normal_equations import Estimate, small_similarity
 from shapespace.fit.robust.prepared_model import LinearShape, ModelSurface, prepare
 from shapespace.fit.robust.robust_icp import Iterate, Problem
 from shapespace.fit.robust.robust_settings import Level, RobustSettings
 from shapespace.fit.scan_target import ScanTarget
-from shapespace.geometry.closest import build_engine
+from shapespace.geometry.closest import build_engine, on_boundary
 from shapespace.geometry.normals import vertex_normals
 from shapespace.geometry.similarity import POSE
 from shapespace.model.shape_model import ShapeModel
@@ -90,6 +91,44 @@ def test_walks_end_where_brute_force_does_near_the_surface() -> None:
     found = (weights[:, :, None] * mesh.vertices[mesh.faces[triangle]]).sum(axis=1)
     exact = build_engine(mesh).query(points).distance
     assert np.mean(np.linalg.norm(found - points, axis=1) < exact + 0.05) > 0.98
+
+
+@pytest.mark.parametrize("triangles", [False, True])
+@pytest.mark.parametrize("winding", [1.0, -1.0])
+def test_compiled_comparison_of_vertices_is_that_of_plain_numpy(triangles: bool, winding: float) -> None:
+    target, vertex = ScanTarget(raw_scan(Z, NEAR, keep=-0.5).scan), np.arange(0, 600, 3, dtype=np.int32)
+    surface, rotation = surface_at(0.5 * Z * blob_model().stddev), NEAR.rotation
+    engine = target.engine if triangles else target.vertex_engine
+    found = match_vertices(target, engine, NEAR, surface, vertex, None, winding=winding, normal_cosine=0.4)
+    near = engine.query(NEAR.apply(surface.vertices[vertex]))
+    n = surface.normals[vertex]
+    to_scan = surface.vertices[vertex] - NEAR.inverse().apply(near.points)
+    np.testing.assert_allclose(found.residual, (to_scan * n).sum(axis=1), atol=1e-9)
+    if near.triangle is None or near.barycentric is None:
+        n_scan = target.normals[near.vertex]
+    else:
+        corners = target.normals[target.mesh.faces[near.triangle]]
+        n_scan = (near.barycentric[:, :, None] * corners).sum(axis=1)
+    n_scan = n_scan @ rotation
+    agree = winding * (n * n_scan).sum(axis=1) > 0.4 * np.linalg.norm(n_scan, axis=1)
+    expected = agree & ~on_boundary(near, target.mesh, target.rim)
+    np.testing.assert_array_equal(found.allowed, expected)
+    assert 0 < expected.sum() < len(expected) or winding < 0
+
+
+def test_the_order_of_searches_changes_no_hint() -> None:
+    _, matcher, iterate, hint = problem_at(raw_scan(Z, NEAR).scan, Level(0, 400, 200, False, 1, 0.0), np.zeros(5))
+    assert sorted(matcher.order) == list(range(len(matcher.points_mm)))
+    asked, used = NEAR.inverse().apply(matcher.points_mm), iterate.surface.topology.used
+    distance = np.linalg.norm(iterate.surface.vertices[used] - asked[:, None], axis=2)
+    np.testing.assert_array_equal(hint.vertex, used[distance.argmin(axis=1)])
+
+
+def test_a_small_rotation_is_that_of_scipy() -> None:
+    for size in (0.0, 1e-6, 9e-4, 0.01, 1.0):
+        delta = size * np.array([0.3, -0.8, 0.5, 0.0, 0.0, 0.0, 0.0])
+        expected = Rotation.from_rotvec(delta[:3]).as_matrix()
+        np.testing.assert_allclose(small_similarity(delta).rotation, expected, atol=1e-15)
 
 
 def test_what_lies_in_the_span_is_found_again_with_its_pose() -> None:

@@ -7,12 +7,12 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
 
 import numpy as np
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 from shapespace.errors import FitError, InputError
 from shapespace.fit.crop import Crop
@@ -188,7 +188,7 @@ def fit_scan(
         landmarks = read_landmarks(files["landmarks"])
     landmarks = cast("Mapping[str, FloatArray] | None", landmarks)
     # Products this small go slower by several threads, and many fits at a time share the cores anyway.
-    with threadpool_limits(limits=1, user_api="blas"):
+    with _thread_controller().limit(limits=1, user_api="blas"):
         clock = [time.perf_counter()]
         held = None if config.region is None else RegionFit.of(model, config.region)
         own = model if held is None else held.part.model
@@ -269,6 +269,14 @@ def fit_scan(
         landmark_stddev_mm=_landmark_stddev_mm(model, fitted, held, dense=config.dense),
         files=files,
     )
+
+
+@cache
+def _thread_controller() -> ThreadpoolController:
+    """Return the controller of the BLAS libraries; finding them takes 2 ms, so it is done once in a process."""
+    import scipy.linalg  # pyright: ignore[reportUnusedImport]  # noqa: F401  # its library must be loaded to be found
+
+    return ThreadpoolController()
 
 
 def _as_model(model: ShapeModel | AdditiveModel | PathTo) -> ShapeModel:
@@ -398,7 +406,8 @@ def _landmark_stddev_mm(
     landmarks = model.landmarks if held is None else held.landmarks(model)
     if not dense:
         # The surface was told in the model's modes, and what that moved a landmark by is an error of it.
-        in_modes = landmarks.interpolate(fitted.T_scan_model.apply(model.reconstruct(fitted.b)))
+        modes = landmarks.interpolate(model.vertex_basis.reshape(model.n_vertices, 3, -1))[:, :, : len(fitted.b)]
+        in_modes = fitted.T_scan_model.apply(landmarks.interpolate(model.mean_vertices) + modes @ fitted.b)
         variance += (in_modes - landmarks.interpolate(fitted.vertices_scan_mm)) ** 2
     return dict(zip(landmarks, np.sqrt(variance), strict=True))
 

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from shapespace.geometry.closest import ClosestPointEngine, ClosestPoints, build_engine, finest_engine
+from shapespace.geometry.closest import ClosestPointEngine, ClosestPoints, VertexEngine, build_engine, finest_engine
 from shapespace.geometry.normals import boundary_vertices
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
 
@@ -37,9 +37,9 @@ class ScanTarget:
         return build_engine(self.mesh)
 
     @cached_property
-    def vertex_engine(self) -> ClosestPointEngine:
+    def vertex_engine(self) -> VertexEngine:
         """Search structure of the vertices."""
-        return build_engine(self.mesh, "vertices")
+        return VertexEngine(self.mesh)
 
     def search(self, name: str) -> ClosestPointEngine:
         """Return the engine called `name` in `ENGINES`."""
@@ -84,8 +84,8 @@ class ScanTarget:
         reached = np.cumsum(np.minimum(1.0, share)) + rng.random()
         return np.flatnonzero(np.diff(np.floor(reached), prepend=0.0) > 0).astype(np.int32)
 
-    def normals_at(self, matches: ClosestPoints) -> FloatArray:
-        """Return the normals (M, 3) at `matches`, interpolated and so not quite of unit length between vertices."""
+    def carriers(self, matches: ClosestPoints) -> tuple[IntArray, FloatArray]:
+        """Return the vertices (M, c) that carry `matches`, three or one, and their barycentric weights (M, c)."""
         if matches.triangle is None or matches.barycentric is None or self.mesh.faces is None:
-            return self.normals[matches.vertex]
-        return np.einsum("mc,mcd->md", matches.barycentric, self.normals[self.mesh.faces[matches.triangle]])
+            return matches.vertex[:, None], np.ones((len(matches.vertex), 1))
+        return self.mesh.faces[matches.triangle], matches.barycentric

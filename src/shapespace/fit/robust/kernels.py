@@ -156,6 +156,66 @@ def meet_into(
 
 
 @compiled
+def on_scan_into(
+    corners: IntArray,
+    weights: FloatArray,
+    scan_normals: FloatArray,
+    rim: BoolArray,
+    normals: FloatArray,
+    inside: BoolArray,
+) -> None:
+    """Write the normal of the scan at each match, and whether the match is off the border of the scan.
+
+    Args:
+        corners: (N, c) vertices of the scan that carry each match: three of a triangle, or one.
+        weights: (N, c) barycentric.
+        scan_normals: (S, 3).
+        rim: (S,) True on the border of the scan.
+        normals: (N, 3) to be written, not quite of unit length between vertices.
+        inside: (N,) to be written.
+    """
+    for i in range(len(corners)):
+        x, y, z, off_rim = 0.0, 0.0, 0.0, False
+        for c in range(corners.shape[1]):
+            v, w = corners[i, c], weights[i, c]
+            x += w * scan_normals[v, 0]
+            y += w * scan_normals[v, 1]
+            z += w * scan_normals[v, 2]
+            off_rim = off_rim or (w > 1e-9 and not rim[v])
+        normals[i, 0], normals[i, 1], normals[i, 2], inside[i] = x, y, z, off_rim
+
+
+@compiled
+def compare_into(
+    to_scan: FloatArray,
+    model_normals: FloatArray,
+    scan_normals: FloatArray,
+    winding: float,
+    normal_cosine: float,
+    residual: FloatArray,
+    allowed: BoolArray,
+) -> None:
+    """Compare each vertex of the model with its match on the scan (R5, R6).
+
+    Args:
+        to_scan: (N, 3) from the match to the vertex, in the model's frame.
+        model_normals: (N, 3) unit normals of the vertices,
+        scan_normals: (N, 3) of the matches; (0, 3) of a scan without triangles, whose normals are not tested.
+        winding: -1 where the scan's normals are reversed, else 1.
+        normal_cosine: matches whose normals disagree more than this are not allowed.
+        residual: (N,) to be written.
+        allowed: (N,) False where it is already; to be set to False where the normals disagree.
+    """
+    for i in range(len(to_scan)):
+        nx, ny, nz = model_normals[i, 0], model_normals[i, 1], model_normals[i, 2]
+        residual[i] = to_scan[i, 0] * nx + to_scan[i, 2] * nz + to_scan[i, 1] * ny  # R5
+        if len(scan_normals) > 0:
+            x, y, z = scan_normals[i, 0], scan_normals[i, 1], scan_normals[i, 2]
+            cosine = winding * (nx * x + nz * z + ny * y)
+            allowed[i] = allowed[i] and cosine > normal_cosine * np.sqrt(x * x + y * y + z * z)  # R6
+
+
+@compiled
 def less_sag(
     triangle: IntArray,
     barycentric: FloatArray,

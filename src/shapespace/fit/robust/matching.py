@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shapespace.fit.robust.kernels import gather_into
+from shapespace.fit.robust.kernels import compare_into, gather_into, on_scan_into
 from shapespace.fit.robust.prepared_model import ModelSurface
 from shapespace.fit.robust.weights import match_weights
 from shapespace.fit.scan_target import ScanTarget
-from shapespace.geometry.closest import ClosestPointEngine, ClosestPoints, on_boundary
+from shapespace.geometry.closest import ClosestPointEngine, ClosestPoints
 from shapespace.geometry.kdtree import KdTree
 from shapespace.types import BoolArray, FloatArray, IntArray, Similarity
 
@@ -176,6 +176,8 @@ class Matcher:
         target: the scan.
         points_mm: (M, 3) sample of its points, mm of the scan's frame.
         point_normals: (M, 3) their normals.
+        order: (M,) of searches for the sample, in which neighbours follow each other. It changes only their time, as
+            what a search needs is then in the processor's cache.
         vertex: (N,) sample of the model's vertices.
         engine: the scan's search structure.
         normal_cosine: matches whose normals disagree more than this are not allowed.
@@ -185,6 +187,7 @@ class Matcher:
     target: ScanTarget
     points_mm: FloatArray
     point_normals: FloatArray
+    order: IntArray
     vertex: IntArray
     engine: ClosestPointEngine
     normal_cosine: float
@@ -196,9 +199,13 @@ class Matcher:
         *, bulging: bool = False,
     ) -> Matcher:  # fmt: skip
         """Return the matcher of the scan points `points` (M,) and the model vertices `vertex` (N,)."""
+        place = np.full(len(target.mesh.vertices), -1, dtype=np.int32)
+        place[points] = np.arange(len(points), dtype=np.int32)
+        order = place[target.vertex_engine.order]
         return Matcher(
-            target, target.mesh.vertices[points], target.normals[points], vertex, engine, normal_cosine, bulging
-        )
+            target, target.mesh.vertices[points], target.normals[points], order[order >= 0], vertex, engine,
+            normal_cosine, bulging,
+        )  # fmt: skip
 
     def first_hint(
         self, surface: ModelSurface, T_scan_model: Similarity, tree: KdTree | None = None, winding: float | None = None
@@ -212,7 +219,9 @@ class Matcher:
             winding: of the scan where it is known.
         """
         tree = tree or surface.vertex_tree()
-        vertex: IntArray = surface.topology.used[tree.nearest(self._in_model(T_scan_model))[0]]
+        vertex = np.empty(len(self.points_mm), dtype=np.int32)
+        nearest = tree.nearest(self._in_model(T_scan_model)[self.order])[0]
+        vertex[self.order] = surface.topology.used[nearest]
         return MatchHint(vertex, np.full_like(vertex, -1), None, winding)
 
     def _in_model(self, T: Similarity) -> FloatArray:
@@ -252,12 +261,12 @@ def match_vertices(
     T, x, n = T_scan_model, surface.vertices[vertex], surface.normals[vertex]
     near = engine.query(T.apply(x), near)
     to_scan = x - ((near.points - T.translation) @ T.rotation) / T.scale
-    allowed = ~on_boundary(near, target.mesh, target.rim)
-    if target.mesh.faces is not None:
-        n_scan = target.normals_at(near) @ T.rotation
-        cosine = winding * np.einsum("md,md->m", n, n_scan)
-        allowed &= cosine > normal_cosine * np.linalg.norm(n_scan, axis=1)
-    return VertexMatches(vertex, np.einsum("md,md->m", to_scan, n), near.distance / T.scale, allowed, near)
+    corners, weights = target.carriers(near)
+    n_scan, allowed, residual = np.empty_like(x), np.empty(len(x), dtype=np.bool_), np.empty(len(x))
+    on_scan_into(corners, weights, target.normals, target.rim, n_scan, allowed)
+    n_scan = n_scan @ T.rotation if target.mesh.faces is not None else n_scan[:0]
+    compare_into(to_scan, n, n_scan, winding, normal_cosine, residual, allowed)
+    return VertexMatches(vertex, residual, near.distance / T.scale, allowed, near)
 
 
 def _winding_of(cosine: FloatArray, covered: BoolArray) -> float:

@@ -6,10 +6,11 @@ Equation numbers and symbols are those of docs/robust.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import cos, sin, sqrt
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
-from scipy.spatial.transform import Rotation
+from scipy.linalg import LinAlgError
+from scipy.linalg.lapack import dpotrf, dpotrs
 
 from shapespace.fit.robust.kernels import rows_into
 from shapespace.fit.robust.matching import Gathered
@@ -90,20 +91,23 @@ class NormalEquations:
         Raises:
             LinAlgError: the equations have no solution.
         """
-        free = np.delete(np.arange(len(self.gradient)), [SCALE] if self.holds_scale else [])
-        hessian = self.H[np.ix_(free, free)] if self.holds_scale else self.H.copy()
+        free = np.delete(np.arange(len(self.gradient)), SCALE) if self.holds_scale else slice(None)
+        hessian = np.array(self.H[free][:, free], order="F")
         if self.H_landmarks is not None:
-            hessian += self.H_landmarks[np.ix_(free, free)]
-        hessian[np.diag_indices_from(hessian)] += self.D[free]
-        unit = 1.0 / np.sqrt(np.maximum(hessian.diagonal(), 1e-30))  # R15a
-        hessian *= np.outer(unit, unit)
-        hessian[np.diag_indices_from(hessian)] += _DAMPING
+            hessian += self.H_landmarks[free][:, free]
+        diagonal = np.einsum("ii->i", hessian)  # a view
+        diagonal += self.D[free]
+        unit = 1.0 / np.sqrt(np.maximum(diagonal, 1e-30))  # R15a
+        hessian *= unit[:, None] * unit
+        diagonal += _DAMPING
+        # LAPACK itself: the checks of `cho_factor` take as long as its work.
+        factor, not_definite = dpotrf(hessian, lower=1, overwrite_a=1, clean=0)
+        if not_definite:
+            raise LinAlgError("The normal equations are not positive definite.")
         delta = np.zeros(len(self.gradient))
-        try:
-            factor = cho_factor(hessian, lower=True, overwrite_a=True)
-            delta[free] = -unit * np.asarray(cho_solve(factor, unit * self.gradient[free]))  # R15
-        except ValueError as error:
-            raise LinAlgError(str(error)) from error
+        delta[free] = -unit * dpotrs(factor, unit * self.gradient[free], lower=1)[0]  # R15
+        if not np.isfinite(delta).all():
+            raise LinAlgError("The normal equations have no finite solution.")
         return delta
 
 
@@ -138,5 +142,17 @@ def normal_equations(
 
 def small_similarity(delta: FloatArray) -> Similarity:
     """Return S of R3 from `delta` (7,): omega (radians), tau (mm) and ds, about the origin."""
-    turn = np.asarray(Rotation.from_rotvec(delta[:3]).as_matrix())
-    return Similarity(float(np.exp(delta[SCALE])), turn, delta[3:6])
+    x, y, z = delta[:3].tolist()
+    angle = sqrt(x * x + y * y + z * z)
+    # The unit quaternion of the rotation, by a series where the quotient loses its digits.
+    squared = angle * angle
+    half = 0.5 - squared / 48 + squared * squared / 3840 if angle <= 1e-3 else sin(angle / 2) / angle
+    x, y, z, w = x * half, y * half, z * half, cos(angle / 2)
+    rotation = np.array(
+        [
+            [x * x - y * y - z * z + w * w, 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), -x * x + y * y - z * z + w * w, 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), -x * x - y * y + z * z + w * w],
+        ]
+    )
+    return Similarity(float(np.exp(delta[SCALE])), rotation, delta[3:6])

@@ -344,7 +344,7 @@ def _coarse_to_fine(
 ) -> Generator[IcpState, None, tuple[Course, KdTree]]:
     """Fit on all levels with the model's modes; return where that led, and a tree of the vertices for hints."""
     prepared, levels, winding = problem.prepared, problem.settings.levels, course.hint.winding
-    tree, tree_fits = prepared.tree, False
+    tree, tree_fits, sample = prepared.tree, False, levels[0].sample
     for level in levels:
         begins = level.modes != 0 and course.state.phase == 1
         if begins:
@@ -354,8 +354,10 @@ def _coarse_to_fine(
         # The surface changes little from level to level; the walks make up for it.
         if level.modes is None and not tree_fits:
             tree, tree_fits = tree.moved(iterate.surface.vertices[prepared.topology.used]), True
-        matcher = problem.matcher(level)
+        same = level.sample == sample
+        matcher, sample = course.matcher if same else problem.matcher(level), level.sample
         hint = matcher.first_hint(iterate.surface, iterate.T_scan_model, tree, winding)
+        hint = replace(hint, near=course.hint.near) if same else hint
         steps = problem.descent(matcher, iterate, hint, level)
         course = yield from _states(steps, replace(course, matcher=matcher, hint=hint), level, max_iterations)
         if begins and len(start.b) and course.state.iteration < max_iterations:
@@ -372,7 +374,7 @@ def _preferred(problem: Problem, course: Course, start: Start, level: Level, tre
     limit_mm = _CLEARLY_BETTER * mismatch_mm(course.iterate, course.matcher, course.hint)
     free, b = level.free(len(course.iterate.b)), np.zeros(len(course.iterate.b))
     b[: min(len(start.b), free)] = start.b[:free]
-    other, matcher = problem.iterate(Estimate(start.T_scan_model, b)), problem.matcher(level)
+    other, matcher = problem.iterate(Estimate(start.T_scan_model, b)), course.matcher
     hint = matcher.first_hint(other.surface, other.T_scan_model, tree)
     for step in problem.descent(matcher, other, hint, level):
         other, hint = step.iterate, step.weighted.matches.hint

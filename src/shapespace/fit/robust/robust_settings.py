@@ -42,6 +42,11 @@ class Level:
     iterations: int
     stop_motion_mm: float
 
+    @property
+    def sample(self) -> tuple[int | None, int | None, bool]:
+        """What is matched, and to what; levels with the same one share a matcher."""
+        return self.scan_points, self.vertices, self.triangles
+
     def free(self, modes: int) -> int:
         """Return how many of `modes` are free."""
         return modes if self.modes is None else min(self.modes, modes)
