@@ -8,9 +8,9 @@ from shapespace.version import __version__
 
 if TYPE_CHECKING:
     from shapespace.cohort.cohort import Cohort
-    from shapespace.cohort.read import CohortOptions, read_cohort
+    from shapespace.cohort.read import CohortConfig, read_cohort
     from shapespace.correspondence.groupwise import correspond
-    from shapespace.correspondence.settings import CorrespondSettings
+    from shapespace.correspondence.settings import CorrespondConfig
     from shapespace.datasets.faces import load_faces
     from shapespace.datasets.simulated_scan import simulate_scan
     from shapespace.errors import ShapespaceError
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
     from shapespace.io.volumes.volume_io import read_volume
     from shapespace.model.additive import AdditiveModel
-    from shapespace.model.model_quality import ModelQuality, QualitySettings, measure_quality
+    from shapespace.model.model_quality import ModelQuality, QualityConfig, measure_quality
     from shapespace.model.shape_model import ShapeModel
     from shapespace.recognise.classifiers import CLASSIFIERS
     from shapespace.recognise.predict import train_classifier
@@ -51,10 +51,10 @@ __all__ = [
     "ChangeConfig",
     "ChangeResult",
     "Cohort",
-    "CohortOptions",
+    "CohortConfig",
     "CompareConfig",
     "CompareResult",
-    "CorrespondSettings",
+    "CorrespondConfig",
     "FitConfig",
     "FitResult",
     "IdentityConfig",
@@ -63,7 +63,7 @@ __all__ = [
     "ModelQuality",
     "Paper",
     "Predictor",
-    "QualitySettings",
+    "QualityConfig",
     "RegressionResult",
     "Results",
     "Robust",
@@ -113,8 +113,8 @@ _HOMES = {
     "AdditiveModel": "model.additive",
     "CLASSIFIERS": "recognise.classifiers",
     "Cohort": "cohort.cohort",
-    "CohortOptions": "cohort.read",
-    "CorrespondSettings": "correspondence.settings",
+    "CohortConfig": "cohort.read",
+    "CorrespondConfig": "correspondence.settings",
     "FitConfig": "fit.fit_scan",
     "FitResult": "fit.result",
     "LabelVolume": "types",
@@ -122,7 +122,7 @@ _HOMES = {
     "ModelQuality": "model.model_quality",
     "Paper": "fit.paper.paper_method",
     "Predictor": "statistics.predictor",
-    "QualitySettings": "model.model_quality",
+    "QualityConfig": "model.model_quality",
     "Results": "store.results",
     "Robust": "fit.robust.robust_method",
     "ShapeModel": "model.shape_model",
@@ -158,8 +158,11 @@ _HOMES = {
 
 _FORMER_NAMES = {
     "ChangeSettings": "ChangeConfig",
+    "CohortOptions": "CohortConfig",
     "CompareOptions": "CompareConfig",
+    "CorrespondSettings": "CorrespondConfig",
     "IdentityOptions": "IdentityConfig",
+    "QualitySettings": "QualityConfig",
     "ScoreOptions": "ScoreConfig",
 }
 """Former name -> current name, of classes in published examples."""

@@ -42,7 +42,7 @@ def test_tab_completion_shows_every_public_name_before_any_is_loaded() -> None:
 
 def test_reprs_stay_short_whatever_the_arrays(result: ss.FitResult, tmp_path: Path) -> None:
     faces = ss.load_faces()
-    quality = ss.measure_quality(list(training_meshes()[:6]), settings=ss.QualitySettings(folds=2, samples=2))
+    quality = ss.measure_quality(list(training_meshes()[:6]), config=ss.QualityConfig(folds=2, samples=2))
     held: list[Any] = [
         result, result.model, result.scan, result.T_scan_model, result.stages["final"], result.history[-1],
         result.distances, quality, quality.compactness, faces, ss.LabelVolume(np.ones((9, 9, 9), np.uint8), np.eye(4)),

@@ -280,7 +280,7 @@ def test_notebooks_show_a_picture_the_numbers_and_the_verdict(result: ss.FitResu
         and "Scan to model" in page
     )
     assert len(page) < 120_000
-    quality = ss.measure_quality(list(training_meshes()[:6]), settings=ss.QualitySettings(folds=2, samples=2))
+    quality = ss.measure_quality(list(training_meshes()[:6]), config=ss.QualityConfig(folds=2, samples=2))
     assert "Generalisation" in quality._repr_html_() and quality.sentences()[0] in quality._repr_html_()
 
 

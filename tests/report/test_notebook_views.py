@@ -107,8 +107,8 @@ def test_scans_in_correspondence_and_results_in_a_folder_are_shown(tmp_path: Pat
     results = ss.Results(tmp_path)
     assert len(repr(results)) < LONGEST_REPR
     assert "<img src=x" not in results._repr_html_() and "&lt;img src=x" in results._repr_html_()
-    settings = ss.CorrespondSettings(vertices=120, rounds=1)
-    found = ss.correspond(meshes, settings)
+    config = ss.CorrespondConfig(vertices=120, rounds=1)
+    found = ss.correspond(meshes, config)
     assert len(repr(found)) < LONGEST_REPR and "in correspondence" in found._repr_html_()
 
 
@@ -126,7 +126,7 @@ def test_paths_may_be_text_and_shapes_may_be_arrays_or_files(tmp_path: Path) -> 
     for k, mesh in enumerate(meshes):
         write_mesh(tmp_path / f"m{k}.ply", mesh)
     (tmp_path / "table.csv").write_text("file,group\n" + "".join(f"m{k}.ply,a\n" for k in range(4)))
-    cohort = ss.read_cohort(str(tmp_path / "table.csv"), ss.CohortOptions(shapes=str(tmp_path)))
+    cohort = ss.read_cohort(str(tmp_path / "table.csv"), ss.CohortConfig(shapes=str(tmp_path)))
     assert len(cohort) == 4
     of_files = ss.ShapeModel.fit([str(tmp_path / f"m{k}.ply") for k in range(4)])
     of_arrays = ss.ShapeModel.fit(np.stack([mesh.vertices for mesh in meshes]))
@@ -138,9 +138,9 @@ def test_paths_may_be_text_and_shapes_may_be_arrays_or_files(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     "call",
     [
-        lambda: ss.CohortOptions(shapes=3),  # type: ignore[arg-type]
-        lambda: ss.CohortOptions(gauge="size"),  # type: ignore[arg-type]
-        lambda: ss.CohortOptions(surfaces="raw"),  # type: ignore[arg-type]
+        lambda: ss.CohortConfig(shapes=3),  # type: ignore[arg-type]
+        lambda: ss.CohortConfig(gauge="size"),  # type: ignore[arg-type]
+        lambda: ss.CohortConfig(surfaces="raw"),  # type: ignore[arg-type]
         lambda: ss.ShapeModel.fit("meshes"),  # type: ignore[arg-type]
         lambda: ss.ShapeModel.fit([None, None]),
         lambda: ss.ShapeModel.fit(np.zeros((10, 3))),

@@ -16,11 +16,11 @@ from shapespace.cli.answers import asymmetry, change, compare, identity, regress
 from shapespace.cli.options import Option, Source, advanced, basic
 
 # The classes and functions that options are read from.
-COHORT = Source("cohort.read", "CohortOptions")
+COHORT = Source("cohort.read", "CohortConfig")
 EXECUTION = Source("batch.execution", "ExecutionConfig")
-CORRESPOND = Source("correspondence.settings", "CorrespondSettings")
-BUILD = Source("commands.build", "BuildSettings")
-QUALITY = Source("model.model_quality", "QualitySettings")
+CORRESPOND = Source("correspondence.settings", "CorrespondConfig")
+BUILD = Source("commands.build", "BuildConfig")
+QUALITY = Source("model.model_quality", "QualityConfig")
 QUALITY_TARGETS = Source("commands.quality", "QualityOptions")
 FIT = Source("fit.fit_scan", "FitConfig")
 PAPER = Source("fit.paper.paper_method", "Paper")
@@ -163,7 +163,7 @@ def _identity() -> tuple[Option, ...]:
         advanced("--train", "EXPR", source=IDENTITY),
         advanced("--role", "COLUMN", source=IDENTITY),
         advanced("--folds", "N", source=IDENTITY),
-        advanced("--scores", "LIST", source=IDENTITY, default=None),
+        advanced("--scores", "LIST", source=IDENTITY),
         advanced("--modes", "K", source=IDENTITY),
         advanced("--no-uncertainty", help="ignore the uncertainty of the fits", source=IDENTITY),
         advanced("--draws", "N", source=IDENTITY),
@@ -560,7 +560,6 @@ COMMANDS: tuple[Command, ...] = (
             "Computes ranks (CMC), and the rate of misses if subjects who are not enrolled are searched for too.",
             _IDENTITY_RULES,
         ),
-        defaults={"curve": (), "by": None},
     ),
     Command(
         "compare", "test effects of groups and covariates on shape by linear models",

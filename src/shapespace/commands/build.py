@@ -45,8 +45,8 @@ _LEAST_MM, _MOST_MM = 1.0, 3000.0
 """Beyond this the largest extent of an object is likelier told in another unit."""
 
 
-@dataclass(frozen=True)
-class BuildSettings:
+@dataclass(frozen=True, kw_only=True)
+class BuildConfig:
     """What to make of which meshes.
 
     Args:
@@ -82,7 +82,7 @@ class BuildSettings:
         with_doubtful: include surfaces of doubtful fits (default: excluded, and counted).
 
     Raises:
-        InputError: settings that do not go together.
+        InputError: options that do not go together.
     """
 
     modes: int | float | Literal["auto"] | None = "auto"
@@ -146,9 +146,7 @@ class BuildSettings:
         return self.labels is None and self.representation == "vertices"
 
 
-def build(
-    meshes: Sequence[Path], output: Path, settings: BuildSettings, *, quiet: bool
-) -> tuple[ShapeModel, list[str]]:
+def build(meshes: Sequence[Path], output: Path, config: BuildConfig, *, quiet: bool) -> tuple[ShapeModel, list[str]]:
     """Build a model from mesh files and save it; return it and what the user should know.
 
     Surfaces of fits lead to their records: those of doubtful fits are left out unless asked for, and the landmarks of
@@ -163,72 +161,72 @@ def build(
     """
     if output.suffix.lower() not in (".h5", ".hdf5"):
         raise InputError(f"{output}: a model file is HDF5, so give it a name that ends in .h5.")
-    found = surface_files(meshes, recursive=settings.recursive)
+    found = surface_files(meshes, recursive=config.recursive)
     notes = list(found.notes)
-    parent = None if settings.add is None else _parent(settings.add, output)
-    gauge = parent.gauge if parent is not None else settings.gauge or "shape"
-    if gauge == "form" or not settings.align:
+    parent = None if config.add is None else _parent(config.add, output)
+    gauge = parent.gauge if parent is not None else config.gauge or "shape"
+    if gauge == "form" or not config.align:
         found.refuse_mixed_units()
-    files, records = _trusted(found.files, notes, with_doubtful=settings.with_doubtful)
+    files, records = _trusted(found.files, notes, with_doubtful=config.with_doubtful)
     make_folder(output.absolute().parent)
-    on_disk = _OnDisk(files, settings.unit, found.unit_ratios)
-    streamed = settings.streams or (settings.of_vertices and _too_large(on_disk, settings, notes))
+    on_disk = _OnDisk(files, config.unit, found.unit_ratios)
+    streamed = config.streams or (config.of_vertices and _too_large(on_disk, config, notes))
     loaded = on_disk if streamed else _read(on_disk, quiet=quiet)
     first = on_disk[0] if streamed else loaded[0]
     if found.unit_ratios:
-        notes.append(found.told_units(settings.unit))
-    marks = SurfaceLandmarks() if parent is not None else _landmarks(files, records, first, settings, notes)
+        notes.append(found.told_units(config.unit))
+    marks = SurfaceLandmarks() if parent is not None else _landmarks(files, records, first, config, notes)
     regions = {
-        name: region_vertices(read_region(file), len(first.vertices), name) for name, file in settings.regions.items()
+        name: region_vertices(read_region(file), len(first.vertices), name) for name, file in config.regions.items()
     }
-    settings = _with_origin(files, settings, notes)
+    config = _with_origin(files, config, notes)
     count = len(files) + (0 if parent is None else parent.n_training)
-    if settings.modes == "auto" and count < 4:
-        settings = replace(settings, modes=None)
+    if config.modes == "auto" and count < 4:
+        config = replace(config, modes=None)
         notes.append(f"With {count} meshes the number of modes cannot be cross-validated, so all modes are kept.")
-    if settings.modes == "auto" and count > MOST_SHAPES:
+    if config.modes == "auto" and count > MOST_SHAPES:
         notes.append(f"The number of modes is chosen by {MOST_SHAPES} of the {count} shapes, drawn by --seed.")
     if not isinstance(loaded, list):
-        model = _streamed(on_disk, output, settings, gauge, marks, parent, notes, quiet=quiet)
+        model = _streamed(on_disk, output, config, gauge, marks, parent, notes, quiet=quiet)
         if regions:
             model = replace(model, regions=regions)
             model.save(output)
-        return model, notes + _told(model, settings)
-    notes += _missing(loaded, marks, settings)
+        return model, notes + _told(model, config)
+    notes += _missing(loaded, marks, config)
     with waiting(f"aligning {len(files)} meshes and finding their modes", quiet=quiet):
-        if settings.labels is not None:
-            additive = _additive(files, loaded, settings.labels, settings, gauge, marks)
+        if config.labels is not None:
+            additive = _additive(files, loaded, config.labels, config, gauge, marks)
             additive = replace(additive, shape=replace(additive.shape, regions=regions))
             additive.save(output)
             notes.append(
                 f"It parts {additive.n_identity} modes of identity and {additive.n_expression} of expression, by "
-                f"{settings.labels}."
+                f"{config.labels}."
             )
             return additive.shape, notes
         model = ShapeModel.fit(
             loaded,
-            modes=settings.modes,
+            modes=config.modes,
             gauge=gauge,
-            align=settings.align,
+            align=config.align,
             out_of_core=False,
             landmarks=marks,
-            representation=settings.representation,
-            control_points=settings.control_points,
-            min_seen=_min_seen(settings),
-            provenance=settings.provenance,
-            licence=settings.licence,
-            seed=settings.seed,
+            representation=config.representation,
+            control_points=config.control_points,
+            min_seen=_min_seen(config),
+            provenance=config.provenance,
+            licence=config.licence,
+            seed=config.seed,
         )
         if regions:
-            kept = ObservedMeshes.of(loaded, _min_seen(settings)) if settings.representation == "vertices" else None
+            kept = ObservedMeshes.of(loaded, _min_seen(config)) if config.representation == "vertices" else None
             model = replace(model, regions=regions if kept is None else kept.regions(regions))
         model.save(output)
-    return model, notes + _told(model, settings)
+    return model, notes + _told(model, config)
 
 
-def _told(model: ShapeModel, settings: BuildSettings) -> list[str]:
+def _told(model: ShapeModel, config: BuildConfig) -> list[str]:
     """Return what the user should know of the model itself."""
-    notes = _odd_size(model, settings.unit)
+    notes = _odd_size(model, config.unit)
     if model.left_out:
         what = "1 mode is" if model.left_out == 1 else f"{model.left_out} modes are"
         notes.append(f"{what} left out, since alignment or rounding made them and no shape did.")
@@ -255,10 +253,10 @@ def _parent(path: Path, output: Path) -> ShapeModel:
     return model
 
 
-def _too_large(meshes: _OnDisk, settings: BuildSettings, notes: list[str]) -> bool:
+def _too_large(meshes: _OnDisk, config: BuildConfig, notes: list[str]) -> bool:
     """Return whether the meshes do not fit into memory, and say so."""
-    needed = bytes_in_memory(len(meshes), meshes[0], choose=settings.modes == "auto")
-    if settings.out_of_core is not None or not too_large(needed):
+    needed = bytes_in_memory(len(meshes), meshes[0], choose=config.modes == "auto")
+    if config.out_of_core is not None or not too_large(needed):
         return False
     notes.append(
         f"{len(meshes)} meshes would take {needed / 1e9:.1f} GB of memory, which is more than four fifths of what is "
@@ -270,7 +268,7 @@ def _too_large(meshes: _OnDisk, settings: BuildSettings, notes: list[str]) -> bo
 def _streamed(
     meshes: _OnDisk,
     output: Path,
-    settings: BuildSettings,
+    config: BuildConfig,
     gauge: Gauge,
     landmarks: SurfaceLandmarks,
     parent: ShapeModel | None,
@@ -280,17 +278,17 @@ def _streamed(
 ) -> ShapeModel:
     """Build a model of meshes that are not held in memory, and save it."""
     folder = output.with_name(f"{output.name}.build")
-    scratch = Scratch(folder, _identity(meshes, settings, parent))
-    kept = shapes_folder(output) if settings.keep_shapes else None
+    scratch = Scratch(folder, _identity(meshes, config, parent))
+    kept = shapes_folder(output) if config.keep_shapes else None
     with progress(None, "streaming", "mesh", quiet=quiet) as bar:
-        if parent is not None and settings.add is not None:
+        if parent is not None and config.add is not None:
             model = parent.with_more(
                 meshes,
-                shapes_folder(settings.add),
-                modes=settings.modes,
-                provenance=_joined(parent.provenance, settings.provenance),
-                licence=_joined(parent.licence, settings.licence),
-                seed=settings.seed,
+                shapes_folder(config.add),
+                modes=config.modes,
+                provenance=_joined(parent.provenance, config.provenance),
+                licence=_joined(parent.licence, config.licence),
+                seed=config.seed,
                 scratch=scratch,
                 keep_shapes=kept,
                 tell=bar.set_description_str,
@@ -298,13 +296,13 @@ def _streamed(
         else:
             model = ShapeModel.fit(
                 meshes,
-                modes=settings.modes,
+                modes=config.modes,
                 gauge=gauge,
-                align=settings.align,
+                align=config.align,
                 landmarks=landmarks,
-                provenance=settings.provenance,
-                licence=settings.licence,
-                seed=settings.seed,
+                provenance=config.provenance,
+                licence=config.licence,
+                seed=config.seed,
                 out_of_core=True,
                 scratch=scratch,
                 keep_shapes=kept,
@@ -321,9 +319,9 @@ def _joined(old: str, new: str) -> str:
     return old if new in ("", old) else f"{old}; {new}" if old else new
 
 
-def _identity(meshes: _OnDisk, settings: BuildSettings, parent: ShapeModel | None) -> str:
+def _identity(meshes: _OnDisk, config: BuildConfig, parent: ShapeModel | None) -> str:
     """Return a hash of all that decides what a streamed build comes to."""
-    digest = hashlib.sha256(repr((__version__, replace(settings, provenance="", licence=""))).encode())
+    digest = hashlib.sha256(repr((__version__, replace(config, provenance="", licence=""))).encode())
     digest.update(repr(None if parent is None else parent.content_hash).encode())
     for file in meshes.files:
         try:
@@ -412,11 +410,11 @@ def _training_mesh(path: Path) -> Mesh:
     return mesh
 
 
-def _min_seen(settings: BuildSettings) -> float:
-    return MIN_SEEN if settings.min_seen is None else settings.min_seen
+def _min_seen(config: BuildConfig) -> float:
+    return MIN_SEEN if config.min_seen is None else config.min_seen
 
 
-def _missing(meshes: Sequence[Mesh], landmarks: SurfaceLandmarks, settings: BuildSettings) -> list[str]:
+def _missing(meshes: Sequence[Mesh], landmarks: SurfaceLandmarks, config: BuildConfig) -> list[str]:
     """Return how many vertices are missing, and which of them and of the landmarks are not in the model for it.
 
     Raises:
@@ -427,7 +425,7 @@ def _missing(meshes: Sequence[Mesh], landmarks: SurfaceLandmarks, settings: Buil
     holed = [int(np.isnan(mesh.vertices).any(axis=1).sum()) for mesh in meshes]
     if not any(holed):
         return []
-    if settings.labels is not None:
+    if config.labels is not None:
         raise InputError(
             f"{meshes[int(np.argmax(holed))].name}: vertices are missing, and a model that parts identity and "
             "expression needs whole meshes; leave --additive out, or the meshes with holes."
@@ -435,13 +433,13 @@ def _missing(meshes: Sequence[Mesh], landmarks: SurfaceLandmarks, settings: Buil
     missing, every = sum(holed), len(meshes) * len(meshes[0].vertices)
     where, share = sum(count > 0 for count in holed), 100 * missing / every
     told = [f"{missing} of {every} vertices are missing ({share:.1f} %), in {where} of {len(meshes)} meshes."]
-    if settings.representation != "vertices":
+    if config.representation != "vertices":
         return told
-    kept = ObservedMeshes.of(meshes, _min_seen(settings))
+    kept = ObservedMeshes.of(meshes, _min_seen(config))
     if out := int((~kept.vertices).sum()):
         what = "1 vertex is" if out == 1 else f"{out} vertices are"
         told.append(
-            f"{what} taken out of the model, since fewer than {100 * _min_seen(settings):g} % of the meshes show them; "
+            f"{what} taken out of the model, since fewer than {100 * _min_seen(config):g} % of the meshes show them; "
             "--min-seen says how many must."
         )
     if lost := sorted(set(landmarks) - set(kept.landmarks(landmarks))):
@@ -456,13 +454,13 @@ def _landmarks(
     files: Sequence[Path],
     records: Mapping[Path, FitRecord],
     first: Mesh,
-    settings: BuildSettings,
+    config: BuildConfig,
     notes: list[str],
 ) -> SurfaceLandmarks:
     """Return the landmarks: the given ones, those next to the first mesh, or those of the model of the fits."""
-    mm = MM_PER_UNIT[settings.unit]
-    if settings.landmarks is not None:
-        return _read_landmarks(settings.landmarks, first, mm, notes)
+    mm = MM_PER_UNIT[config.unit]
+    if config.landmarks is not None:
+        return _read_landmarks(config.landmarks, first, mm, notes)
     beside = files[0].parent / "landmarks.csv"
     if beside.is_file():
         try:
@@ -530,24 +528,24 @@ def _placing_notes(landmarks: SurfaceLandmarks, surface: Mesh) -> list[str]:
     return notes
 
 
-def _with_origin(files: Sequence[Path], settings: BuildSettings, notes: list[str]) -> BuildSettings:
-    """Return the settings with provenance and licence, from beside the meshes where none was given."""
+def _with_origin(files: Sequence[Path], config: BuildConfig, notes: list[str]) -> BuildConfig:
+    """Return the configuration with provenance and licence, from beside the meshes where none was given."""
     abouts = {folder: read_about(folder) for folder in dict.fromkeys(file.parent for file in files)}
     about = abouts[files[0].parent]
-    if about and not (settings.provenance or settings.licence):
+    if about and not (config.provenance or config.licence):
         if len(set(abouts.values())) == 1:
             notes.append(f"Provenance and licence are taken from {files[0].parent / ABOUT}.")
-            return replace(settings, provenance=f"{len(files)} meshes of: {about[0]}", licence=about[1])
+            return replace(config, provenance=f"{len(files)} meshes of: {about[0]}", licence=about[1])
         notes.append("The meshes come from folders of different origin, so give --provenance and --licence.")
-    said = settings.provenance or f"{len(files)} meshes, {files[0].name} to {files[-1].name}"
-    return replace(settings, provenance=said)
+    said = config.provenance or f"{len(files)} meshes, {files[0].name} to {files[-1].name}"
+    return replace(config, provenance=said)
 
 
 def _additive(
     files: Sequence[Path],
     meshes: Sequence[Mesh],
     labels: Path,
-    settings: BuildSettings,
+    config: BuildConfig,
     gauge: Gauge,
     landmarks: SurfaceLandmarks,
 ) -> AdditiveModel:
@@ -561,15 +559,15 @@ def _additive(
         raise InputError(
             f"{labels} has no subject for {', '.join(lacking[:3])}; each mesh needs a label and a subject."
         )
-    expression_modes = settings.expression_variance
+    expression_modes = config.expression_variance
     return AdditiveModel.fit(
         meshes,
         [label.subject for label in own],
         [label.text == NEUTRAL for label in own],
-        identity_modes=_IDENTITY_VARIANCE if settings.modes == "auto" else settings.modes,
+        identity_modes=_IDENTITY_VARIANCE if config.modes == "auto" else config.modes,
         expression_modes=_EXPRESSION_VARIANCE if expression_modes is None else expression_modes,
         gauge=gauge,
         landmarks=landmarks,
-        provenance=settings.provenance,
-        licence=settings.licence,
+        provenance=config.provenance,
+        licence=config.licence,
     )

@@ -48,7 +48,7 @@ MOST_LEVELS = 6
 """Largest number of classes of a variable whose pairs are compared."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CompareConfig:
     """How groups are compared.
 

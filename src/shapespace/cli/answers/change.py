@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shapespace.cli.answers.common import cohort_of, finish
+from shapespace.cli.options import given
 
 if TYPE_CHECKING:
     from shapespace.types import SurfaceLandmarks
@@ -24,18 +25,8 @@ def run(arguments: argparse.Namespace) -> int:
     cohort = cohort_of(arguments, "form")
     if arguments.landmarks is not None:
         cohort = replace(cohort, landmarks=_landmarks(arguments.landmarks, cohort.n_vertices))
-    config = ChangeConfig(
-        subject=arguments.subject,
-        time=arguments.time,
-        order=arguments.order,
-        stable=arguments.stable,
-        regions={name: read_region(path) for name, path in arguments.region} or None,
-        group=arguments.group,
-        rate=arguments.rate,
-        permutations=arguments.permutations,
-        seed=arguments.seed,
-        unequal_variances=arguments.unequal_variances,
-    )
+    regions = {name: read_region(path) for name, path in arguments.region} or None
+    config = ChangeConfig(**given(arguments, ChangeConfig, regions=regions))
     columns = [column for column in (arguments.subject, arguments.group) if column]
     if arguments.drop_missing:
         from shapespace.statistics.change_visits import time_column

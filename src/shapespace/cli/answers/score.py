@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from shapespace.cli.answers.common import cohort_of, finish
+from shapespace.cli.options import given
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -13,13 +14,7 @@ def run(arguments: argparse.Namespace) -> int:
     from shapespace.report.analyses.score_report import score_report
     from shapespace.statistics.score import ScoreConfig, score
 
-    config = ScoreConfig(
-        modes=arguments.modes,
-        subject=arguments.subject,
-        nearest=arguments.nearest,
-        seed=arguments.seed,
-        drop_missing=arguments.drop_missing,
-    )
+    config = ScoreConfig(**given(arguments, ScoreConfig))
     known = {"data": arguments.reference, "shapes": arguments.reference_shapes, "doubtful": False}
     reference = cohort_of(argparse.Namespace(**{**vars(arguments), **known}))
     subjects = cohort_of(arguments, onto=reference)
