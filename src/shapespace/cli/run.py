@@ -215,18 +215,16 @@ def correspond(arguments: argparse.Namespace) -> int:
 
 def build(arguments: argparse.Namespace) -> int:
     """Build a shape model."""
-    from shapespace.commands.build import BuildConfig, build
+    from shapespace.commands.build import BuildFilesConfig, build
     from shapespace.commands.look import model_facts
+    from shapespace.model.build_model import BuildConfig
 
-    modes = arguments.variance if arguments.variance is not None else arguments.modes
-    chosen = given(
-        arguments,
-        BuildConfig,
-        modes=None if modes == "all" else modes,
-        out_of_core=arguments.out_of_core or None,
-        regions=dict(arguments.region),
-    )
-    config = BuildConfig(**chosen)
+    modes = None if arguments.modes == "all" else arguments.modes
+    if arguments.variance is not None:
+        modes = arguments.variance
+    model_options = given(arguments, BuildConfig, modes=modes, out_of_core=arguments.out_of_core or None)
+    file_options = given(arguments, BuildFilesConfig, regions=dict(arguments.region))
+    config = BuildFilesConfig(model=BuildConfig(**model_options), **file_options)
     if config.streams:
         arguments.goes_on = "; the same command goes on from there"
     model, notes = build(arguments.meshes, arguments.output, config, quiet=arguments.quiet)
