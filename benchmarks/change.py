@@ -42,9 +42,9 @@ from shapespace.datasets.simulated_scan import Hole, random_similarity, simulate
 from shapespace.geometry.normals import vertex_normals
 from shapespace.io.landmarks.landmark_io import write_landmark_indices
 from shapespace.io.meshes.mesh_io import write_mesh
-from shapespace.statistics.change import ChangeResult, change
 from shapespace.statistics.change_maps import volume_mm3
 from shapespace.statistics.change_result import ChangeConfig
+from shapespace.statistics.measure_change import ChangeResult, change
 from shapespace.types import FloatArray, Mesh
 
 PEAKS_MM, SHARES, WIDTH_MM, NEAR = (1.0, 2.0, 3.0), (0.02, 0.05, 0.10), 10.0, 0.05

@@ -18,7 +18,7 @@ from shapespace.io.files import write_text
 from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.report.analyses.result_tables import analysis_report
 from shapespace.schemas import Analysis
-from shapespace.statistics.score import ScoreConfig, ScoreResult, score
+from shapespace.statistics.score_subjects import ScoreConfig, ScoreResult, score
 from shapespace.types import FloatArray, Mesh
 from stored_fits import MODES, VERTICES, model, write_fit
 from synthetic_shapes import similarity, training_meshes

@@ -217,7 +217,7 @@ def build(arguments: argparse.Namespace) -> int:
     """Build a shape model."""
     from shapespace.commands.build import BuildFilesConfig, build
     from shapespace.commands.look import model_facts
-    from shapespace.model.build_model import BuildConfig
+    from shapespace.model.build_config import BuildConfig
 
     modes = None if arguments.modes == "all" else arguments.modes
     if arguments.variance is not None:

@@ -23,7 +23,8 @@ from shapespace.io.files import make_folder, read_error
 from shapespace.io.landmarks.landmark_io import is_of_vertices, read_landmarks, read_surface_landmarks
 from shapespace.io.meshes.region_files import read_region
 from shapespace.io.tables.label_table import label_of, read_labels
-from shapespace.model.build_model import BuildConfig, build_model, extend_model
+from shapespace.model.build_config import BuildConfig
+from shapespace.model.build_model import build_model, extend_model
 from shapespace.model.choose_modes import MOST_SHAPES
 from shapespace.model.missing import MIN_SEEN, ObservedMeshes
 from shapespace.model.representation import representation_named

@@ -20,6 +20,7 @@ from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.interop import MeshLike
 from shapespace.lazy import OpenViewer, lazy_import
 from shapespace.model import model_file
+from shapespace.model.build_config import BuildConfig
 from shapespace.model.foreign import Foreign, as_linear, is_foreign, load_foreign
 from shapespace.model.missing import MIN_SEEN
 from shapespace.model.representation import REPRESENTATIONS, Representation
@@ -171,8 +172,6 @@ class ShapeModel:
 
         The arguments are those of `build_model` and the fields of `BuildConfig`.
         """
-        from shapespace.model.build_model import BuildConfig, build_model
-
         config = BuildConfig(
             modes=modes,
             gauge=gauge,
@@ -187,7 +186,7 @@ class ShapeModel:
             seed=seed,
             out_of_core=out_of_core,
         )
-        return build_model(meshes, config, scratch=scratch, keep_shapes=keep_shapes, log=tell)
+        return lazy_import("build_model")(meshes, config, scratch=scratch, keep_shapes=keep_shapes, log=tell)
 
     def with_more(
         self,
@@ -203,10 +202,10 @@ class ShapeModel:
         tell: Tell | None = None,
     ) -> ShapeModel:
         """Return the model of the shapes that this one was made of and of `meshes`; see `build_model.extend_model`."""
-        from shapespace.model.build_model import BuildConfig, extend_model
-
         config = BuildConfig(modes=modes, provenance=provenance, licence=licence, seed=seed)
-        return extend_model(self, meshes, shapes, config, scratch=scratch, keep_shapes=keep_shapes, log=tell)
+        return lazy_import("extend_model")(
+            self, meshes, shapes, config, scratch=scratch, keep_shapes=keep_shapes, log=tell
+        )
 
     @cached_property
     def _coder(self) -> Representation:

@@ -19,8 +19,8 @@ def run(arguments: argparse.Namespace) -> int:
     from shapespace.batch.progress import steps
     from shapespace.io.meshes.region_files import read_region
     from shapespace.report.analyses.change_report import change_report
-    from shapespace.statistics.change import change
     from shapespace.statistics.change_result import ChangeConfig
+    from shapespace.statistics.measure_change import change
 
     cohort = cohort_of(arguments, "form")
     if arguments.landmarks is not None:

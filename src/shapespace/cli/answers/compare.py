@@ -12,7 +12,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Compare the shapes of a cohort."""
     from shapespace.batch.progress import steps
     from shapespace.report.analyses.compare_report import compare_report
-    from shapespace.statistics.compare import CompareConfig, compare
+    from shapespace.statistics.compare_shapes import CompareConfig, compare
 
     config = CompareConfig(**given(arguments, CompareConfig))
     cohort = cohort_of(arguments)

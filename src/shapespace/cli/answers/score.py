@@ -12,7 +12,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Score subjects against a reference."""
     from shapespace.batch.progress import steps
     from shapespace.report.analyses.score_report import score_report
-    from shapespace.statistics.score import ScoreConfig, score
+    from shapespace.statistics.score_subjects import ScoreConfig, score
 
     config = ScoreConfig(**given(arguments, ScoreConfig))
     known = {"data": arguments.reference, "shapes": arguments.reference_shapes, "doubtful": False}
