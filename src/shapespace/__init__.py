@@ -1,7 +1,6 @@
 """Statistical shape models from raw 3-D scans: correspondence, model building, robust fitting and shape statistics.
 
-The names of the main path are here, and the packages in `_PACKAGES` have the others. A name is imported when it is first
-used.
+The names of the main path are here; the packages in `_PACKAGES` have the others. A name is imported on first use.
 """
 
 from importlib import import_module

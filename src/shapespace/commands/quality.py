@@ -221,7 +221,7 @@ def _measure(target: _Target, options: QualityOptions, run: Runner, *, quiet: bo
     unseen = [] if options.unseen is None else _meshes(options.unseen, [], "shape", quiet=quiet)[0]
     scans = _scans(target, options.scans, quiet=quiet)
     with steps(None, f"measuring {target.name}, in", "step", quiet=quiet) as step:
-        return measure_quality(target.what, target.config, scans=scans, unseen=unseen, on_step=step, run=run)
+        return measure_quality(target.what, target.config, scans=scans, unseen=unseen, progress=step, run=run)
 
 
 def _missing(target: _Target, found: ModelQuality) -> str:

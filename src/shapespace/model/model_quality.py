@@ -12,7 +12,7 @@ second does not see it at all.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
 
@@ -29,6 +29,7 @@ from shapespace.model.missing import MIN_SEEN, ObservedMeshes
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import short_repr
+from shapespace.step_counter import StepCounter
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity, common_faces, require_whole
 
 if TYPE_CHECKING:
@@ -425,27 +426,13 @@ def run_here(shapes: Shapes, parts: Sequence[Part]) -> Iterable[tuple[Part, Floa
     return ((part, shapes.do(part)) for part in parts)
 
 
-@dataclass
-class _Steps:
-    """Counts what is done for whoever waits."""
-
-    total: int
-    on_step: OnStep | None
-    done: int = field(default=0)
-
-    def step(self, count: int = 1) -> None:
-        self.done += count
-        if self.on_step is not None:
-            self.on_step(self.done, self.total)
-
-
 def measure_quality(
     target: Sequence[MeshLike] | ShapeModel,
     config: QualityConfig | None = None,
     *,
     scans: Sequence[MeshLike] | None = None,
     unseen: Sequence[MeshLike] = (),
-    on_step: OnStep | None = None,
+    progress: OnStep | None = None,
     run: Runner = run_here,
 ) -> ModelQuality:
     """Measure the shape space of meshes in correspondence, or as much of a model as it tells by itself.
@@ -456,7 +443,7 @@ def measure_quality(
         config: folds, modes, samples, seed, and what model to make; None for the usual ones.
         scans: one a mesh, in its pose and unit, to judge surfaces against; None for the meshes themselves.
         unseen: meshes in correspondence that no model saw.
-        on_step: called with what is done and what there is to do.
+        progress: called with (steps done, in all).
         run: does folds and random shapes, here or elsewhere.
 
     Raises:
@@ -475,20 +462,22 @@ def measure_quality(
     for mesh in new:
         _refuse_other(mesh, vertices)
     if isinstance(target, ShapeModel):
-        return _of_model(target, new, config, on_step)
+        return _of_model(target, new, config, progress)
     whole = representation_named(config.representation, config.control_points).takes_holes
     kept = np.ones(vertices, dtype=np.bool_) if whole else ObservedMeshes.of(meshes, MIN_SEEN).vertices
     if not kept.all():
         meshes, new = [part_of(mesh, kept) for mesh in meshes], [part_of(mesh, kept) for mesh in new]
     shapes = Shapes(meshes, scans, config)
-    return _of_meshes(shapes, new, on_step, run, left_out=int((~kept).sum()))
+    return _of_meshes(shapes, new, progress, run, left_out=int((~kept).sum()))
 
 
-def _of_model(model: ShapeModel, unseen: Sequence[Mesh], config: QualityConfig, on_step: OnStep | None) -> ModelQuality:
+def _of_model(
+    model: ShapeModel, unseen: Sequence[Mesh], config: QualityConfig, progress: OnStep | None
+) -> ModelQuality:
     counts = _counts(min(config.modes or model.n_modes, model.n_modes))
     share = model.cumulative_variance[counts - 1]
     space = _Space(model, np.ones(model.n_vertices, dtype=np.bool_))
-    of_unseen = _unseen(space, unseen, counts, config, _Steps(len(unseen), on_step))
+    of_unseen = _unseen(space, unseen, counts, config, StepCounter(len(unseen), progress))
     return ModelQuality(
         Curve(counts, share, share, share),
         reconstruction=of_unseen[0],
@@ -499,15 +488,15 @@ def _of_model(model: ShapeModel, unseen: Sequence[Mesh], config: QualityConfig, 
 
 
 def _of_meshes(
-    shapes: Shapes, unseen: Sequence[Mesh], on_step: OnStep | None, run: Runner, *, left_out: int
+    shapes: Shapes, unseen: Sequence[Mesh], progress: OnStep | None, run: Runner, *, left_out: int
 ) -> ModelQuality:
     meshes, config, counts, few = shapes.meshes, shapes.config, shapes.counts, shapes.few_counts
-    steps = _Steps(len(meshes) + len(unseen) + config.samples, on_step)
+    steps = StepCounter(len(meshes) + len(unseen) + config.samples, progress)
     errors = np.zeros((len(meshes), len(counts) + len(shapes.sizes), 2))
     drawn = np.zeros((config.samples, len(few), 2))
     for part, part_result in run(shapes, shapes.parts()):
         (errors if part.held else drawn)[list(part.held or part.drawn)] = part_result
-        steps.step(len(part_result))
+        steps.add(len(part_result))
     general = _curves(errors[:, : len(counts)], counts, config.seed)
     specific = _curves(drawn, few, config.seed)
     space = shapes.space
@@ -558,7 +547,7 @@ def _curves(errors: FloatArray, counts: IntArray, seed: int) -> tuple[Curve, Cur
 
 
 def _unseen(
-    space: _Space, unseen: Sequence[Mesh], counts: IntArray, config: QualityConfig, steps: _Steps
+    space: _Space, unseen: Sequence[Mesh], counts: IntArray, config: QualityConfig, steps: StepCounter
 ) -> tuple[Curve, Curve] | tuple[None, None]:
     if not unseen:
         return None, None
@@ -586,11 +575,11 @@ def _spread(vertices: int) -> IntArray:
     return np.unique(np.linspace(0, vertices - 1, _points(vertices)).round().astype(np.int32))
 
 
-def _over_shapes(space: _Space, targets: Sequence[_Target], counts: IntArray, steps: _Steps) -> FloatArray:
+def _over_shapes(space: _Space, targets: Sequence[_Target], counts: IntArray, steps: StepCounter) -> FloatArray:
     out = np.zeros((len(targets), len(counts), 2))
     for row, target in enumerate(targets):
         out[row] = _told(space.model, target.cut_to(space.kept), counts)
-        steps.step()
+        steps.add()
     return out
 
 
