@@ -35,16 +35,16 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from shapespace import cli
-from shapespace.cohort.read import CohortOptions, read_cohort
+from shapespace.cohort.read import CohortConfig, read_cohort
 from shapespace.datasets.faces import load_faces
 from shapespace.datasets.organs import Organ, raw_surface
 from shapespace.datasets.simulated_scan import Hole, random_similarity, simulate_scan
 from shapespace.geometry.normals import vertex_normals
 from shapespace.io.landmarks.landmark_io import write_landmark_indices
 from shapespace.io.meshes.mesh_io import write_mesh
-from shapespace.statistics.change import ChangeResult, change
 from shapespace.statistics.change_maps import volume_mm3
 from shapespace.statistics.change_result import ChangeConfig
+from shapespace.statistics.measure_change import ChangeResult, change
 from shapespace.types import FloatArray, Mesh
 
 PEAKS_MM, SHARES, WIDTH_MM, NEAR = (1.0, 2.0, 3.0), (0.02, 0.05, 0.10), 10.0, 0.05
@@ -90,11 +90,13 @@ def asked(
     plan: Plan, after: int, surfaces: Any, stable: str, *, rescans: bool, bumps: dict[str, FloatArray] | None = None
 ) -> ChangeResult:
     """Return what `change` says of it, with the volume of the place of each subject's bump."""
-    options = CohortOptions(plan.folder / "fits", plan.folder / "model.h5", surfaces, "form", doubtful=True)
-    cohort = read_cohort(write_table(plan, after, rescans=rescans), options)
+    config = CohortConfig(
+        shapes=plan.folder / "fits", model=plan.folder / "model.h5", surfaces=surfaces, gauge="form", doubtful=True
+    )
+    cohort = read_cohort(write_table(plan, after, rescans=rescans), config)
     regions = {name: np.flatnonzero(bump > NEAR).tolist() for name, bump in (bumps or {}).items()}
-    settings = ChangeConfig(order=("before", "after"), stable=stable, regions=regions, permutations=1)
-    return change(cohort, settings)
+    config = ChangeConfig(order=("before", "after"), stable=stable, regions=regions, permutations=1)
+    return change(cohort, config)
 
 
 # Faces

@@ -27,7 +27,7 @@ from shapespace.datasets.simulated_scan import Cut
 from shapespace.errors import FitError
 from shapespace.fit.fit_scan import FitConfig
 from shapespace.geometry.normals import vertex_normals
-from shapespace.statistics.compare import CompareConfig, CompareResult, compare
+from shapespace.statistics.compare_shapes import CompareConfig, CompareResult, compare
 from shapespace.types import BoolArray, FloatArray, Mesh
 
 GROUP = 40

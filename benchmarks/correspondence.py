@@ -31,7 +31,7 @@ from shapespace.batch.execution import ExecutionConfig
 from shapespace.batch.parallel_rounds import RoundRunner
 from shapespace.correspondence.correspondence_result import Correspondence
 from shapespace.correspondence.groupwise import correspond, run_here
-from shapespace.correspondence.settings import CorrespondSettings
+from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.datasets.faces import load_faces
 from shapespace.datasets.ict import EXPRESSIONS, LANDMARK_VERTICES, load_ict
 from shapespace.datasets.simulated_scan import Cut, Hole, random_similarity, simulate_scan
@@ -265,18 +265,18 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=5)
     parser.add_argument("--people", choices=["ict", "bundled"], default="ict")
     parser.add_argument("--given", action="store_true", help="the template is the first one's true mesh")
-    parser.add_argument("--vertices", type=int, default=CorrespondSettings.vertices)
-    parser.add_argument("--rounds", type=int, default=CorrespondSettings.rounds)
+    parser.add_argument("--vertices", type=int, default=CorrespondConfig.vertices)
+    parser.add_argument("--rounds", type=int, default=CorrespondConfig.rounds)
     parser.add_argument("--jobs", type=int, default=1)
     arguments = parser.parse_args()
-    settings = CorrespondSettings(vertices=arguments.vertices, rounds=arguments.rounds)
+    config = CorrespondConfig(vertices=arguments.vertices, rounds=arguments.rounds)
 
     def run(scans: list[Mesh], template: Mesh | None) -> Correspondence:
         if arguments.jobs < 2:
-            return correspond(scans, settings, template=template, run=run_here)
+            return correspond(scans, config, template=template, run=run_here)
         with tempfile.TemporaryDirectory() as folder:
             kept = RoundRunner(Path(folder), ExecutionConfig(jobs=arguments.jobs), quiet=True, on_done=lambda: None)
-            return correspond(scans, settings, template=template, run=kept)
+            return correspond(scans, config, template=template, run=kept)
 
     for name in arguments.cases or [*SETS, *OTHERS]:
         begun = time.process_time()

@@ -29,7 +29,7 @@ import peers
 from shapespace.batch.execution import ExecutionConfig
 from shapespace.commands.correspond import CorrespondFiles, correspond_files
 from shapespace.commands.surface import write_surfaces
-from shapespace.correspondence.settings import CorrespondSettings
+from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.correspondence.template import choose_template, clean_scan, resample
 from shapespace.datasets.simulated_scan import random_similarity
 from shapespace.geometry.closest import build_engine
@@ -37,7 +37,7 @@ from shapespace.geometry.distortion import Distortion
 from shapespace.geometry.doctor import repair
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
-from shapespace.model.model_quality import Curve, ModelQuality, QualitySettings, measure_quality
+from shapespace.model.model_quality import Curve, ModelQuality, QualityConfig, measure_quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh, Similarity
 
@@ -82,7 +82,7 @@ def scans_of(case: str, count: int | None, seed: int, folder: Path) -> dict[str,
 
 
 def by_shapespace(
-    scans: dict[str, Mesh], turns: dict[str, Similarity], folder: Path, settings: CorrespondSettings, jobs: int
+    scans: dict[str, Mesh], turns: dict[str, Similarity], folder: Path, config: CorrespondConfig, jobs: int
 ) -> Way:
     """Return what the command makes of turned scans, turned back."""
     turned = folder / "turned"
@@ -92,7 +92,7 @@ def by_shapespace(
     _, records = correspond_files(
         CorrespondFiles([turned], execution=ExecutionConfig(jobs=jobs)),
         folder / "same",
-        settings,
+        config,
         quiet=False,
         say=print,
     )
@@ -234,8 +234,8 @@ def main() -> None:
     parser.add_argument("case", choices=list(FOLDERS))
     parser.add_argument("--scans", type=int, help="as many, drawn (default: all)")
     parser.add_argument("--seed", type=int, default=0, help="of the scans drawn, how they are turned, folds, samples")
-    parser.add_argument("--vertices", type=int, default=CorrespondSettings.vertices)
-    parser.add_argument("--rounds", type=int, default=CorrespondSettings.rounds)
+    parser.add_argument("--vertices", type=int, default=CorrespondConfig.vertices)
+    parser.add_argument("--rounds", type=int, default=CorrespondConfig.rounds)
     parser.add_argument("--jobs", type=int, default=1, help="of shapespace")
     parser.add_argument("--folds", type=int, default=10, help="of the generalisation")
     parser.add_argument("--methods", default=",".join([OURS, *PEERS]))
@@ -245,12 +245,12 @@ def main() -> None:
     scans = scans_of(arguments.case, arguments.scans, arguments.seed, arguments.out / "hippocampi")
     rng = np.random.default_rng(arguments.seed)
     turns = {name: random_similarity(rng, 180.0, (1.0, 1.0)) for name in scans}
-    settings = CorrespondSettings(vertices=arguments.vertices, rounds=arguments.rounds)
+    config = CorrespondConfig(vertices=arguments.vertices, rounds=arguments.rounds)
 
     def template() -> Mesh:
         # The one that shapespace chooses, of the same turned scans by the same seed, in the pose it was given in.
         turned = [repair(scan.with_vertices(turns[name].apply(scan.vertices)))[0] for name, scan in scans.items()]
-        chosen = list(scans.values())[choose_template(turned, settings.seed).index]
+        chosen = list(scans.values())[choose_template(turned, config.seed).index]
         return resample(clean_scan(chosen), arguments.vertices)
 
     ways: dict[str, Way] = {}
@@ -258,7 +258,7 @@ def main() -> None:
     for name in arguments.methods.split(","):
         way: Way | str | None = read_again(out / name.replace(" ", "-"))
         if way is None and name == OURS:
-            way = by_shapespace(scans, turns, out, settings, arguments.jobs)
+            way = by_shapespace(scans, turns, out, config, arguments.jobs)
         elif way is None:
             even = even or template()
             way = by_peer(name, even, scans)
@@ -276,7 +276,7 @@ def main() -> None:
     common = [scans[name] for name in names]
     for name, way in ways.items():
         meshes = [way.surfaces[one] for one in names]
-        measure = QualitySettings(folds=arguments.folds, modes=MODES, samples=SAMPLES, seed=arguments.seed)
+        measure = QualityConfig(folds=arguments.folds, modes=MODES, samples=SAMPLES, seed=arguments.seed)
         quality = measure_quality(meshes, measure, scans=common)
         specific = specificity(meshes, common, [1, 3, MODES], arguments.seed)
         found[name] = (nearness(way, scans, names), quality, specific)

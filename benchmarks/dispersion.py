@@ -18,9 +18,9 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.statistics import compare as compare_module
-from shapespace.statistics.compare import CompareConfig, compare
 from shapespace.statistics.compare_formula import Design as FormulaDesign
 from shapespace.statistics.compare_formula import design_of
+from shapespace.statistics.compare_shapes import CompareConfig, compare
 from shapespace.statistics.dispersion import dispersion_test
 from shapespace.statistics.map_tests import difference_test
 from shapespace.types import FloatArray

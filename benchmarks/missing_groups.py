@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from shapespace.cohort.cohort import Cohort
-from shapespace.statistics.compare import CompareConfig, compare
+from shapespace.statistics.compare_shapes import CompareConfig, compare
 from shapespace.types import BoolArray, FloatArray
 
 VERTICES, MODES = 60, 6

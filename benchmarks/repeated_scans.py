@@ -21,8 +21,8 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.table import Table
-from shapespace.statistics.compare import CompareConfig, TermTest, compare, term_tests
 from shapespace.statistics.compare_formula import Design, design_of
+from shapespace.statistics.compare_shapes import CompareConfig, TermTest, compare, term_tests
 from shapespace.statistics.compare_within import strata_of
 from shapespace.types import FloatArray
 

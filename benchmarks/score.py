@@ -18,7 +18,7 @@ from shapespace.cohort.cohort import Cohort, Fitted
 from shapespace.cohort.table import Table
 from shapespace.fit.robust.posterior import new_shapes
 from shapespace.model.shape_model import ShapeModel
-from shapespace.statistics.score import ScoreConfig, ScoreResult, score
+from shapespace.statistics.score_subjects import ScoreConfig, ScoreResult, score
 from shapespace.types import FloatArray
 
 LEVELS = (0.05, 0.1, 0.2, 0.5)

@@ -59,9 +59,15 @@ def _called_with(of: Any) -> str:
     return re.sub(r" at 0x[0-9a-f]+", "", str(inspect.signature(of)))
 
 
+def names() -> dict[str, Any]:
+    """Return the public names, of shapespace and of its packages, with what they are."""
+    packages = [ss, *(getattr(ss, name) for name in ss._PACKAGES)]  # pyright: ignore[reportPrivateUsage]
+    return {name: getattr(package, name) for package in packages for name in package.__all__}
+
+
 def lines() -> list[str]:
     """Return the lines of all public names."""
-    return [line for name in sorted(ss.__all__) for line in lines_of(name, getattr(ss, name))]
+    return [line for name, of in sorted(names().items()) for line in lines_of(name, of)]
 
 
 def name_in(line: str) -> str:

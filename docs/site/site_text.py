@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,15 @@ if TYPE_CHECKING:
     from sphinx.environment import BuildEnvironment
 
 FIRST, REFERENCE, COMMANDS = "docs/index", "docs/api", "docs/cli"
+HOMES = {
+    name: package.__name__
+    for package in (*(getattr(shapespace, name) for name in shapespace._PACKAGES), shapespace)
+    for name in package.__all__
+    if name != "__version__"
+}
+"""Public name -> its package; the top level for those that both have."""
+DATA = {"CLASSIFIERS": "shapespace.recognise.classifiers"}
+"""Public data -> the module that has their text."""
 LONGEST = 600
 """Characters of a signature that is shown."""
 NAVIGATION = {
@@ -127,7 +137,7 @@ def reference(text: str) -> str:
     Public names that the text does not have come at its end.
     """
     listed = re.findall(r"^- `(\w+)`:", text, flags=re.MULTILINE)
-    rest = [name for name in shapespace.__all__ if name not in listed and name != "__version__"]
+    rest = [name for name in HOMES if name not in listed]
     if rest:
         text += "\n## Others\n\n" + "".join(f"- `{name}`:\n" for name in rest)
     return re.sub(r"^- `(\w+)`:.*\n", lambda match: directive(match[1]), text, flags=re.MULTILINE)
@@ -135,7 +145,10 @@ def reference(text: str) -> str:
 
 def directive(name: str) -> str:
     """Return what has Sphinx show the docstring of a public name."""
-    thing, home, shown, options = getattr(shapespace, name), "shapespace", name, ""
+    if name not in HOMES:
+        raise AttributeError(f"shapespace has no public name {name!r}")
+    home, shown, options = HOMES[name], name, ""
+    thing = getattr(import_module(home), name)
     if isinstance(thing, type):
         kind, options = "autoclass", "   :members:\n"
         # Settings and results have dozens of arguments, which the list below tells one by one.
@@ -144,8 +157,7 @@ def directive(name: str) -> str:
     elif callable(thing):
         kind = "autofunction"
     else:
-        # The text of data stands in the module that has it.
-        kind, home, options = "autodata", f"shapespace.{shapespace._HOMES[name]}", "   :no-value:\n"
+        kind, home, options = "autodata", DATA[name], "   :no-value:\n"
     return f"\n```{{eval-rst}}\n.. {kind}:: {home}.{shown}\n{options}```\n"
 
 
@@ -168,6 +180,6 @@ def markup(app: Sphinx, what: str, name: str, thing: object, options: object, li
 def public_name(app: Sphinx, env: BuildEnvironment, node: pending_xref, shown: TextElement) -> Element | None:
     """Lead from a class as its module has it to where the reference has it."""
     name: Any = node.get("reftarget", "").rpartition(".")[2]
-    if node.get("refdomain") != "py" or name not in shapespace.__all__:
+    if node.get("refdomain") != "py" or name not in HOMES:
         return None
-    return env.domains["py"].resolve_xref(env, node["refdoc"], app.builder, "obj", f"shapespace.{name}", node, shown)
+    return env.domains["py"].resolve_xref(env, node["refdoc"], app.builder, "obj", f"{HOMES[name]}.{name}", node, shown)

@@ -6,6 +6,7 @@ does it: this list is all there is of that.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from pathlib import Path
@@ -17,6 +18,8 @@ from shapespace.errors import ShapespaceError
 LAZY_FUNCTIONS: Mapping[str, str] = MappingProxyType(
     {
         "analysis_report": "report.analyses.result_tables",
+        "build_model": "model.build_model",
+        "extend_model": "model.build_model",
         "html_of_additive_model": "report.notebook.notebook_results",
         "html_of_analysis": "report.notebook.notebook_results",
         "html_of_cohort": "report.notebook.notebook_results",
@@ -84,6 +87,27 @@ def lazy_import(name: str) -> Callable[..., Any]: ...
 def lazy_import(name: str) -> Callable[..., Any]:
     """Return the function `name` of `LAZY_FUNCTIONS`."""
     return getattr(import_module(f"shapespace.{LAZY_FUNCTIONS[name]}"), name)
+
+
+def lazy_names(
+    package: str, modules: Mapping[str, tuple[str, ...]]
+) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """Return `__getattr__` and `__dir__` of a package whose names are imported when they are first used.
+
+    SciPy takes most of a second to import, and `shapespace --help` needs none of it.
+
+    Args:
+        package: its name.
+        modules: module, without `shapespace.` -> the names that the package has from it.
+    """
+    homes = {name: module for module, names in modules.items() for name in names}
+
+    def find(name: str) -> Any:
+        if name not in homes:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        return getattr(import_module(f"shapespace.{homes[name]}"), name)
+
+    return find, lambda: sorted({*vars(sys.modules[package]), *homes})
 
 
 def require_package(module: str, purpose: str, install: str = "") -> Any:

@@ -42,11 +42,12 @@ def test_tab_completion_shows_every_public_name_before_any_is_loaded() -> None:
 
 def test_reprs_stay_short_whatever_the_arrays(result: ss.FitResult, tmp_path: Path) -> None:
     faces = ss.load_faces()
-    quality = ss.measure_quality(list(training_meshes()[:6]), settings=ss.QualitySettings(folds=2, samples=2))
+    quality = ss.model.measure_quality(list(training_meshes()[:6]), config=ss.model.QualityConfig(folds=2, samples=2))
     held: list[Any] = [
         result, result.model, result.scan, result.T_scan_model, result.stages["final"], result.history[-1],
-        result.distances, quality, quality.compactness, faces, ss.LabelVolume(np.ones((9, 9, 9), np.uint8), np.eye(4)),
-        ss.AdditiveModel(result.model, np.eye(5), 2), ss.FitConfig(),
+        result.distances, quality, quality.compactness, faces,
+        ss.io.LabelVolume(np.ones((9, 9, 9), np.uint8), np.eye(4)), ss.model.AdditiveModel(result.model, np.eye(5), 2),
+        ss.FitConfig(),
     ]  # fmt: skip
     for each in held:
         told = repr(each)
@@ -58,7 +59,7 @@ def test_reprs_stay_short_whatever_the_arrays(result: ss.FitResult, tmp_path: Pa
 def test_a_fit_takes_paths_and_meshes_alike(result: ss.FitResult, files: Path) -> None:
     same = ss.fit_scan(ss.ShapeModel.load(files / "model.h5"), ss.read_mesh(files / "scan.ply"))
     np.testing.assert_array_equal(same.b, result.b)
-    additive = ss.AdditiveModel(result.model, np.eye(5), 2)
+    additive = ss.model.AdditiveModel(result.model, np.eye(5), 2)
     np.testing.assert_array_equal(ss.fit_scan(additive, files / "scan.ply").b, result.b)
 
 

@@ -186,7 +186,7 @@ def test_a_scan_of_another_tool_is_fitted_as_ours(result: ss.FitResult) -> None:
 
 def test_a_data_frame_has_the_rows_and_columns_of_the_table(folder: Path, result: ss.FitResult) -> None:
     pytest.importorskip("pandas")
-    results = ss.Results(folder)
+    results = ss.store.Results(folder)
     frame = results.to_dataframe()
     assert list(frame.index) == ["anna", "bad", "zoë smile"]
     np.testing.assert_array_equal(frame.loc["anna", [f"z{k}" for k in range(1, 6)]].to_numpy(float), result.z)
@@ -200,7 +200,7 @@ def test_a_data_frame_has_the_rows_and_columns_of_the_table(folder: Path, result
 
 def test_xarray_has_coefficients_by_scan_and_mode(folder: Path, result: ss.FitResult) -> None:
     pytest.importorskip("xarray")
-    data = ss.Results(folder).to_xarray()
+    data = ss.store.Results(folder).to_xarray()
     np.testing.assert_array_equal(data["z"].sel(scan="anna"), result.z)
     assert data["b_stddev"].shape == (3, 5) and "z1" not in data
 
@@ -280,7 +280,7 @@ def test_notebooks_show_a_picture_the_numbers_and_the_verdict(result: ss.FitResu
         and "Scan to model" in page
     )
     assert len(page) < 120_000
-    quality = ss.measure_quality(list(training_meshes()[:6]), settings=ss.QualitySettings(folds=2, samples=2))
+    quality = ss.model.measure_quality(list(training_meshes()[:6]), config=ss.model.QualityConfig(folds=2, samples=2))
     assert "Generalisation" in quality._repr_html_() and quality.sentences()[0] in quality._repr_html_()
 
 

@@ -3,11 +3,15 @@
 import re
 import runpy
 from pathlib import Path
+from types import ModuleType
+
+import pytest
 
 import shapespace as ss
 
 ROOT = Path(__file__).resolve().parents[2]
 API = runpy.run_path(str(ROOT / "tools" / "public_api.py"))
+PACKAGES = [ss, *(getattr(ss, name) for name in ss._PACKAGES)]  # pyright: ignore[reportPrivateUsage]
 CHANGELOG = (ROOT / "CHANGELOG.md").read_text("utf-8")
 
 
@@ -43,7 +47,28 @@ def test_the_snapshot_sees_constructors_methods_properties_and_tables() -> None:
 def test_every_public_name_has_a_docstring_and_a_line_in_the_architecture() -> None:
     text = (ROOT / "docs" / "architecture.md").read_text("utf-8")
     named = set(re.findall(r"`(\w+)`", text.partition("## Public names")[2].partition("\n## ")[0]))
-    assert set(ss.__all__) <= named
-    for name in ss.__all__:
-        of = getattr(ss, name)
+    assert set(API["names"]()) <= named
+    for name, of in API["names"]().items():
         assert not (callable(of) and not (of.__doc__ or "").strip()), name
+
+
+@pytest.mark.parametrize("package", PACKAGES, ids=lambda package: package.__name__)
+def test_every_name_of_a_package_is_there_and_listed_once(package: ModuleType) -> None:
+    assert len(package.__all__) == len(set(package.__all__))
+    assert set(package.__all__) <= set(dir(package))
+    for name in package.__all__:
+        assert not isinstance(getattr(package, name), ModuleType), name
+    with pytest.raises(AttributeError, match="nonsense"):
+        _ = package.nonsense
+
+
+@pytest.mark.parametrize("former", ss._MOVED)  # pyright: ignore[reportPrivateUsage]
+def test_a_former_name_works_with_a_warning_that_states_the_present_one(former: str) -> None:
+    present = ss._MOVED[former]  # pyright: ignore[reportPrivateUsage]
+    with pytest.warns(DeprecationWarning, match=rf"shapespace\.{former} is now shapespace\.{present}\."):
+        of = getattr(ss, former)
+    assert of is API["names"]()[present.rpartition(".")[2]]
+
+
+def test_the_top_level_has_the_main_path_alone() -> None:
+    assert len(ss.__all__) <= 25

@@ -14,13 +14,13 @@ from shapespace.correspondence.groupwise import correspond
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.place import RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.register import ElasticSettings
-from shapespace.correspondence.settings import CorrespondSettings
+from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.correspondence.template import PoseModel, resample
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model
 
 QUICK = ElasticSettings(harmonics=60, points=500, iterations=10)
-SETTINGS = CorrespondSettings(vertices=400, rounds=2, first=QUICK, next=QUICK)
+SETTINGS = CorrespondConfig(vertices=400, rounds=2, first=QUICK, next=QUICK)
 FIRST = replace(SETTINGS, rounds=1)
 
 
@@ -77,11 +77,11 @@ def test_a_damaged_file_is_made_again(scans: list[Mesh], placed: list[int], tmp_
 
 
 def test_other_settings_find_nothing(scans: list[Mesh], placed: list[int], tmp_path: Path) -> None:
-    one = CorrespondSettings(vertices=400, rounds=1, first=QUICK)
+    one = CorrespondConfig(vertices=400, rounds=1, first=QUICK)
     correspond(scans, one, run=kept(tmp_path))
     placed.clear()
     other = ElasticSettings(harmonics=60, points=500, iterations=11)
-    correspond(scans, CorrespondSettings(vertices=400, rounds=1, first=other), run=kept(tmp_path))
+    correspond(scans, CorrespondConfig(vertices=400, rounds=1, first=other), run=kept(tmp_path))
     assert placed == [0, 1, 2]
 
 

@@ -12,11 +12,11 @@ from shapespace.batch.execution import EXECUTORS, ExecutionConfig
 from shapespace.batch.executors import Serial
 from shapespace.batch.quality_work import QualityRunner, QualityWork
 from shapespace.errors import FitError
-from shapespace.model.model_quality import Curve, ModelQuality, Part, QualitySettings, Shapes, measure_quality
+from shapespace.model.model_quality import Curve, ModelQuality, Part, QualityConfig, Shapes, measure_quality
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model
 
-SETTINGS = QualitySettings(folds=3, samples=7, seed=2)
+SETTINGS = QualityConfig(folds=3, samples=7, seed=2)
 
 
 @pytest.fixture(scope="module")
@@ -49,15 +49,15 @@ def test_what_workers_read_is_what_was_to_be_measured(judged_by: str, meshes: li
     scans = None
     if judged_by == "scans":
         scans = [Mesh(mesh.vertices[:150], None, name=f"scan of {mesh.name}") for mesh in meshes]
-    settings = QualitySettings(folds=None, samples=4, representation="vertices", gauge="form", align=False, modes=3)
-    shapes = Shapes(meshes, scans, settings)
+    config = QualityConfig(folds=None, samples=4, representation="vertices", gauge="form", align=False, modes=3)
+    shapes = Shapes(meshes, scans, config)
     work = QualityWork(tmp_path / "shapes.npz")
     work.save(shapes)
     first, last = shapes.parts()[0], shapes.parts()[-1]
     for part in (first, last):
         assert np.array_equal(np.asarray(work.do(part)[0]), shapes.do(part))
     read = work._load()  # pyright: ignore[reportPrivateUsage]
-    assert read.settings == settings
+    assert read.config == config
     assert [mesh.name for mesh in read.meshes] == [mesh.name for mesh in meshes]
 
 

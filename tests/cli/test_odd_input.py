@@ -172,7 +172,7 @@ def test_too_little_memory_to_build_ends_in_one_sentence(
     def exhausted(*_: object, **__: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr("shapespace.commands.build.ShapeModel.fit", exhausted)
+    monkeypatch.setattr("shapespace.commands.build.build_model", exhausted)
     outcome = run("build", world.meshes, "-o", tmp_path / "m.h5")
     assert outcome.code == 2 and "not enough memory" in outcome.err
     assert not list(tmp_path.iterdir())

@@ -10,7 +10,7 @@ import pytest
 
 from shapespace.batch.fit_records import coefficient_row, read_record, write_coefficients
 from shapespace.cohort.cohort import Cohort, Fitted, ShapeSource, with_columns
-from shapespace.cohort.read import CohortOptions, read_cohort
+from shapespace.cohort.read import CohortConfig, read_cohort
 from shapespace.cohort.table import Table
 from shapespace.errors import CorrespondenceError, FileError, FileFormatError, InputError
 from shapespace.geometry.procrustes import Gauge, centroid_size
@@ -230,31 +230,31 @@ def test_a_folder_of_fits_is_a_cohort_without_doubtful_and_failed_ones(fits: Pat
     told = " ".join(cohort.notes)
     assert "2 of 10 fits are left out, which are doubtful (scan3, scan4)" in told and "1 of 10" in told
     assert cohort.fitted is not None and set(cohort.fitted.status) == {"converged"}
-    with_doubtful = read_cohort(fits, CohortOptions(doubtful=True))
+    with_doubtful = read_cohort(fits, CohortConfig(doubtful=True))
     assert len(with_doubtful) == 9 and "doubtful" not in " ".join(with_doubtful.notes)
     for k, name in enumerate(cohort.names):
         b = np.array(read_record(fits / f"{name}.fit.json").b)
         assert np.abs(cohort.vertices(k) - model().reconstruct(b)).max() < 1e-10
         assert cohort.sizes_mm[k] == read_record(fits / f"{name}.fit.json").centroid_size_mm
-    form = read_cohort(fits, CohortOptions(gauge="form"))
+    form = read_cohort(fits, CohortConfig(gauge="form"))
     assert np.abs([centroid_size(form.vertices(k)) for k in range(7)] - cohort.sizes_mm).max() < 1e-9
 
 
 def test_surfaces_of_fits_are_the_same_shapes_in_another_frame(fits: Path) -> None:
     steps: list[tuple[int, int]] = []
-    fitted = read_cohort(fits, CohortOptions(surfaces="fitted"), on_shape=lambda *step: steps.append(step))
+    fitted = read_cohort(fits, CohortConfig(surfaces="fitted"), on_shape=lambda *step: steps.append(step))
     plain = read_cohort(fits)
     # The surfaces are in float32, and aligned anew.
     assert np.abs(pairwise(fitted.coefficients) - pairwise(plain.coefficients)).max() < 0.3
     assert steps[-1] == (7, 7) and fitted.fitted is not None and fitted.landmarks == dict(model().landmarks)
     with pytest.raises(InputError, match=r"holds no dense surface of scan0.*with --dense"):
-        read_cohort(fits, CohortOptions(surfaces="dense"))
+        read_cohort(fits, CohortConfig(surfaces="dense"))
 
 
 def test_dense_surfaces_are_the_default_where_all_fits_have_one(fits: Path) -> None:
     share = read_cohort(fits).source.explained_variance_ratio
     assert read_cohort(fits).source == ShapeSource("coefficients", MODES, share)
-    assert read_cohort(fits, CohortOptions(surfaces="fitted")).source == ShapeSource("fitted", MODES, share)
+    assert read_cohort(fits, CohortConfig(surfaces="fitted")).source == ShapeSource("fitted", MODES, share)
     rng = np.random.default_rng(0)
     for k in (0, 1, 2, 3, 4, 5, 6, 8):  # the fit of scan7 failed
         mesh = read_mesh(fits / f"scan{k}.fitted.ply")
@@ -264,23 +264,23 @@ def test_dense_surfaces_are_the_default_where_all_fits_have_one(fits: Path) -> N
     write_mesh(fits / "scan9.dense.ply", read_mesh(fits / "scan9.fitted.ply"))
     dense = read_cohort(fits)
     assert dense.source == ShapeSource("dense") and dense.fitted is not None
-    assert read_cohort(fits, CohortOptions(surfaces="coefficients")).source.kind == "coefficients"
+    assert read_cohort(fits, CohortConfig(surfaces="coefficients")).source.kind == "coefficients"
 
 
 def test_surfaces_of_an_unknown_unit_have_no_size_to_compare(fits: Path) -> None:
     for k in range(10):
         write_fit(fits, f"scan{k}", k, mm_per_scan_unit=None)
-    assert np.isnan(read_cohort(fits, CohortOptions(surfaces="fitted")).sizes_mm).all()
+    assert np.isnan(read_cohort(fits, CohortConfig(surfaces="fitted")).sizes_mm).all()
     for surfaces in ("fitted", "coefficients"):
         with pytest.raises(InputError, match="not known in mm"):
-            read_cohort(fits, CohortOptions(surfaces=surfaces, gauge="form"))  # type: ignore[arg-type]
+            read_cohort(fits, CohortConfig(surfaces=surfaces, gauge="form"))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("column", ["file", "scan", "id"])
 def test_a_table_names_fits_by_their_scans_and_tells_whom_it_lacks(fits: Path, tmp_path: Path, column: str) -> None:
     rows = "".join(f"../scans/scan{k}.ply,{k}\n" for k in (9, 0, 3)) + "stranger.ply,7\n"
     write_text(tmp_path / "data.csv", f"{column},age\n{rows}")
-    cohort = read_cohort(tmp_path / "data.csv", CohortOptions(shapes=fits))
+    cohort = read_cohort(tmp_path / "data.csv", CohortConfig(shapes=fits))
     assert cohort.names == ("scan9", "scan0") and list(cohort.table.numbers("age")) == [9, 0]
     told = " ".join(cohort.notes)
     assert "1 of 4 rows" in told and "(stranger)" in told
@@ -323,10 +323,10 @@ def test_a_model_that_moved_or_is_another_is_told(fits: Path) -> None:
     kept = (fits.parent / "model.h5").rename(fits.parent / "moved.h5")
     with pytest.raises(InputError, match=r"no longer at.*give it with --model"):
         read_cohort(fits)
-    assert len(read_cohort(fits, CohortOptions(model=kept))) == 7
+    assert len(read_cohort(fits, CohortConfig(model=kept))) == 7
     blob_model(VERTICES, 3).save(fits.parent / "other.h5")
     with pytest.raises(InputError, match="is not the model of the fits"):
-        read_cohort(fits, CohortOptions(model=fits.parent / "other.h5"))
+        read_cohort(fits, CohortConfig(model=fits.parent / "other.h5"))
 
 
 def test_two_fits_of_one_scan_are_refused(fits: Path) -> None:
@@ -338,10 +338,10 @@ def test_two_fits_of_one_scan_are_refused(fits: Path) -> None:
 def test_too_few_fits_say_why(fits: Path, tmp_path: Path) -> None:
     write_text(tmp_path / "data.csv", "file\nscan0\nscan3\nscan4\n")
     with pytest.raises(InputError, match=r"1 of its fits can be used.*doubtful \(scan3, scan4\)"):
-        read_cohort(tmp_path / "data.csv", CohortOptions(shapes=fits))
+        read_cohort(tmp_path / "data.csv", CohortConfig(shapes=fits))
     write_text(tmp_path / "data.csv", "file\nx\ny\n")
     with pytest.raises(InputError, match=r"holds no shape of .*such as x, y; there is scan0, scan1"):
-        read_cohort(tmp_path / "data.csv", CohortOptions(shapes=fits))
+        read_cohort(tmp_path / "data.csv", CohortConfig(shapes=fits))
 
 
 def test_what_is_no_folder_or_holds_nothing_is_refused(fits: Path, tmp_path: Path) -> None:
@@ -350,7 +350,7 @@ def test_what_is_no_folder_or_holds_nothing_is_refused(fits: Path, tmp_path: Pat
         read_cohort(tmp_path / "empty")
     write_text(tmp_path / "data.csv", "file\na\n")
     with pytest.raises(InputError, match="is no folder"):
-        read_cohort(tmp_path / "data.csv", CohortOptions(shapes=tmp_path / "gone"))
+        read_cohort(tmp_path / "data.csv", CohortConfig(shapes=tmp_path / "gone"))
     with pytest.raises((FileError, InputError)):
         read_cohort(tmp_path / "gone.csv")
 
@@ -376,7 +376,7 @@ def meshes(tmp_path: Path) -> Callable[..., Path]:
 
 def test_meshes_in_correspondence_are_a_cohort(meshes: Callable[..., Path], tmp_path: Path) -> None:
     table = meshes()
-    cohort = read_cohort(table, CohortOptions(shapes=tmp_path / "meshes"))
+    cohort = read_cohort(table, CohortConfig(shapes=tmp_path / "meshes"))
     shapes = np.stack([mesh.vertices for mesh in training_meshes(5, vertices=80)])
     known = Cohort.of_shapes(shapes.astype(np.float32), {})
     assert cohort.names == ("m0", "m1", "m2", "m3", "m4") and cohort.fitted is None and cohort.faces is not None
@@ -388,7 +388,7 @@ def test_meshes_in_correspondence_are_a_cohort(meshes: Callable[..., Path], tmp_
 def test_meshes_that_are_not_in_correspondence_are_refused(meshes: Callable[..., Path], tmp_path: Path) -> None:
     table = meshes(change=lambda k, mesh: Mesh(mesh.vertices, mesh.faces[::-1]) if k == 3 else mesh)  # type: ignore[index]
     with pytest.raises(CorrespondenceError, match="m3 has other vertices or triangles than m0"):
-        read_cohort(table, CohortOptions(shapes=tmp_path / "meshes"))
+        read_cohort(table, CohortConfig(shapes=tmp_path / "meshes"))
 
 
 def cut(meshes: Sequence[Mesh], seed: int = 0, share: float = 0.15) -> list[Mesh]:
@@ -483,14 +483,14 @@ def test_a_mesh_that_was_copied_is_refused(meshes: Callable[..., Path], tmp_path
     elsewhere = similarity(3, degrees=70.0, scale=1.0)
     table = meshes(change=lambda k, mesh: first.with_vertices(elsewhere.apply(first.vertices)) if k == 4 else mesh)
     with pytest.raises(InputError, match="m0 and m4 are the same shape but for rounding"):
-        read_cohort(table, CohortOptions(shapes=tmp_path / "meshes"))
+        read_cohort(table, CohortConfig(shapes=tmp_path / "meshes"))
 
 
 def test_a_table_with_one_mesh_is_too_few(meshes: Callable[..., Path], tmp_path: Path) -> None:
     meshes()
     write_text(tmp_path / "one.csv", "name\nm0\n")
     with pytest.raises(InputError, match=r"1 of its meshes are in .*two are the least"):
-        read_cohort(tmp_path / "one.csv", CohortOptions(shapes=tmp_path / "meshes"))
+        read_cohort(tmp_path / "one.csv", CohortConfig(shapes=tmp_path / "meshes"))
     with pytest.raises(InputError, match="give a CSV table of its meshes"):
         read_cohort(tmp_path / "meshes")
 

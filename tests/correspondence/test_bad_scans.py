@@ -14,7 +14,7 @@ from shapespace.cli import main
 from shapespace.correspondence.correspondence_result import Correspondence
 from shapespace.correspondence.register import ElasticSettings
 from shapespace.correspondence.scan_set import copies, unit_ratios
-from shapespace.correspondence.settings import CorrespondSettings
+from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.correspondence.template import clean_scan, resample
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.closest import build_engine
@@ -24,7 +24,7 @@ from shapespace.types import FloatArray, Mesh
 from synthetic_shapes import sphere
 
 QUICK = ElasticSettings(harmonics=150, points=1000)
-ONE_ROUND = CorrespondSettings(vertices=500, rounds=1, first=QUICK, next=QUICK)
+ONE_ROUND = CorrespondConfig(vertices=500, rounds=1, first=QUICK, next=QUICK)
 BLOBS = [raw_blob(k, points=1200) for k in range(4)]
 SCANS = [one.scan for one in BLOBS]
 

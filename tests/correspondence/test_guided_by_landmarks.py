@@ -16,7 +16,7 @@ from shapespace.correspondence.landmark_guide import ScanLandmarks, consensus_la
 from shapespace.correspondence.mirror_image import MirrorMap
 from shapespace.correspondence.place import RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.register import ElasticSettings
-from shapespace.correspondence.settings import CorrespondSettings
+from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.correspondence.template import PoseModel, choose_template
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.closest import build_engine
@@ -26,7 +26,7 @@ from shapespace.types import FloatArray, Mesh, Similarity, SurfaceLandmarks
 from synthetic_shapes import blob, sphere, training_meshes
 
 QUICK = ElasticSettings(harmonics=150, points=1000)
-SETTINGS = CorrespondSettings(vertices=900, rounds=1, first=QUICK, next=QUICK)
+SETTINGS = CorrespondConfig(vertices=900, rounds=1, first=QUICK, next=QUICK)
 SHORT = replace(QUICK, iterations=2)
 """Too short for landmarks to turn a surface round by their pull."""
 FLIP = np.array([-1.0, 1.0, 1.0])

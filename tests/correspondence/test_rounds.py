@@ -7,14 +7,14 @@ import shapespace as ss
 from raw_blobs import RawBlob, dispersion_mm, raw_blob, without_ball
 from shapespace.correspondence.correspondence_result import Correspondence
 from shapespace.correspondence.register import ElasticSettings
-from shapespace.correspondence.settings import CorrespondSettings
+from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.closest import build_engine
 from shapespace.types import Mesh
 from synthetic_shapes import sphere
 
 QUICK = ElasticSettings(harmonics=150, points=1000)
-SETTINGS = CorrespondSettings(vertices=900, rounds=2, first=QUICK, next=QUICK)
+SETTINGS = CorrespondConfig(vertices=900, rounds=2, first=QUICK, next=QUICK)
 HOLED, METRES, OTHER = 2, 3, 8
 
 

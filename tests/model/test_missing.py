@@ -12,7 +12,7 @@ from shapespace.geometry.procrustes import align_in_place
 from shapespace.io.landmarks.landmark_io import write_landmark_indices
 from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.model.missing import ObservedMeshes, with_estimates
-from shapespace.model.model_quality import QualitySettings, measure_quality
+from shapespace.model.model_quality import QualityConfig, measure_quality
 from shapespace.model.pca import principal_components
 from shapespace.model.ppca import ppca
 from shapespace.model.shape_model import ShapeModel
@@ -188,8 +188,8 @@ def test_a_vertex_that_is_not_observed_is_treated_as_missing(out_of_core: bool) 
     one, other = (ShapeModel.fit(given, modes=4) for given in (masked, estimated(masked)))
     np.testing.assert_array_equal(one.mean, other.mean)
     np.testing.assert_array_equal(one.basis, other.basis)
-    settings = QualitySettings(modes=3, samples=6, folds=2)
-    first, second = (measure_quality(given, settings) for given in (masked, estimated(masked)))
+    config = QualityConfig(modes=3, samples=6, folds=2)
+    first, second = (measure_quality(given, config) for given in (masked, estimated(masked)))
     np.testing.assert_array_equal(first.generalisation.mean, second.generalisation.mean)
 
 

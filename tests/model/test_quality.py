@@ -9,13 +9,13 @@ import pytest
 from shapespace import cli
 from shapespace.errors import CorrespondenceError, InputError
 from shapespace.io.meshes.mesh_io import write_mesh
-from shapespace.model.model_quality import Curve, ModelQuality, QualitySettings, measure_quality
+from shapespace.model.model_quality import Curve, ModelQuality, QualityConfig, measure_quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import Quality
 from shapespace.types import Mesh
 from synthetic_shapes import blob, sphere, training_meshes
 
-FEW = QualitySettings(folds=4, samples=6)
+FEW = QualityConfig(folds=4, samples=6)
 
 
 def blobs(count: int = 12, noise_mm: float = 0.0, vertices: int = 200, turn: float = 0.0) -> list[Mesh]:
@@ -82,7 +82,7 @@ def test_compactness_of_a_normal_model_approaches_that_of_the_model() -> None:
     stddev = np.array([30.0, 20.0, 10.0])
     base = 50 * rng.standard_normal((200, 3))
     meshes = [Mesh(base + (basis @ (stddev * rng.standard_normal(3))).reshape(-1, 3)) for _ in range(120)]
-    found = measure_quality(meshes, QualitySettings(folds=2, samples=40, align=False, modes=3))
+    found = measure_quality(meshes, QualityConfig(folds=2, samples=40, align=False, modes=3))
     assert np.allclose(curve(found.compactness).mean, np.cumsum(stddev**2) / (stddev**2).sum(), atol=0.06)
     assert (curve(found.compactness).low < np.cumsum(stddev**2) / (stddev**2).sum() + 1e-9).all()
     assert curve(found.generalisation_vertices).mean[-1] < 1e-5
@@ -109,9 +109,9 @@ def test_two_equal_folders_have_differences_of_zero_and_noise_is_found_out() -> 
 
 
 def test_more_shapes_help_where_they_do_and_not_where_all_is_known() -> None:
-    few = measure_quality(blobs(6), QualitySettings(folds=3, samples=2))
+    few = measure_quality(blobs(6), QualityConfig(folds=3, samples=2))
     assert few.sentences()[-1].endswith("so more shapes would help.")
-    many = measure_quality(blobs(40, noise_mm=0.1), QualitySettings(folds=2, samples=2, modes=1))
+    many = measure_quality(blobs(40, noise_mm=0.1), QualityConfig(folds=2, samples=2, modes=1))
     assert "would help little" in many.sentences()[-1]
 
 
@@ -146,7 +146,7 @@ def test_too_few_meshes_are_refused(count: int) -> None:
 
 
 def test_three_meshes_are_enough_and_other_input_is_refused() -> None:
-    assert measure_quality(blobs(3), QualitySettings(folds=None, samples=2)).supported_modes is None
+    assert measure_quality(blobs(3), QualityConfig(folds=None, samples=2)).supported_modes is None
     same = [blobs(1)[0]] * 5
     with pytest.raises(InputError, match="all equal"):
         measure_quality(same, FEW)
@@ -158,7 +158,7 @@ def test_three_meshes_are_enough_and_other_input_is_refused() -> None:
         measure_quality([*blobs(4)[1:], blobs(1)[0].with_vertices(torn)], FEW)
     for wrong in ({"folds": 1}, {"samples": 1}, {"modes": 0}):
         with pytest.raises(InputError):
-            QualitySettings(**wrong)
+            QualityConfig(**wrong)
 
 
 def holed(mesh: Mesh, share: float, seed: int) -> Mesh:

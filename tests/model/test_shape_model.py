@@ -13,7 +13,7 @@ from shapespace.errors import CorrespondenceError, FileError, InputError, ModelF
 from shapespace.geometry.procrustes import centroid_size
 from shapespace.io.containers.hdf5 import write_hdf5
 from shapespace.model.choose_modes import choose_modes
-from shapespace.model.model_quality import QualitySettings
+from shapespace.model.model_quality import QualityConfig
 from shapespace.model.pca import principal_components
 from shapespace.model.shape_model import ShapeModel
 from shapespace.store.results import Results
@@ -528,7 +528,7 @@ def test_coefficients_in_mm_and_in_standard_deviations_are_each_others_inverse()
 
 def test_arguments_of_another_type_are_refused_in_a_sentence() -> None:
     calls: list[Callable[[], object]] = [
-        lambda: QualitySettings(folds="a"),  # type: ignore[arg-type]
+        lambda: QualityConfig(folds="a"),  # type: ignore[arg-type]
         lambda: ShapeModel.load(3),  # type: ignore[arg-type]
         lambda: Results(3),  # type: ignore[arg-type]
     ]

@@ -41,19 +41,23 @@ def shapes(n: int = 24, gauge: Literal["shape", "form"] = "shape") -> Cohort:
 def results() -> dict[str, object]:
     pytest.importorskip("formulaic", reason="the extra `statistics` is not installed")
     cohort, people, thing = shapes(), people_cohort(10, 3), symmetric_object()
-    identity = ss.IdentityConfig(folds=2, draws=20)
-    regression = ss.regress(cohort, "age", subject="subject", folds=3, permutations=3, draws=20)
+    identity = ss.statistics.IdentityConfig(folds=2, draws=20)
+    regression = ss.statistics.regress(cohort, "age", subject="subject", folds=3, permutations=3, draws=20)
     return {
         "cohort": cohort,
-        "comparison": ss.compare(cohort, "age + sex", ss.CompareConfig(permutations=20, maps=False)),
-        "change": ss.change(shapes(gauge="form"), ss.ChangeConfig(time="visit", order=("one", "two"), permutations=20)),
-        "asymmetry": ss.measure_asymmetry(cohort, subject="subject", pairs=thing.pairs, permutations=19),
+        "comparison": ss.statistics.compare(
+            cohort, "age + sex", ss.statistics.CompareConfig(permutations=20, maps=False)
+        ),
+        "change": ss.statistics.change(
+            shapes(gauge="form"), ss.statistics.ChangeConfig(time="visit", order=("one", "two"), permutations=20)
+        ),
+        "asymmetry": ss.statistics.measure_asymmetry(cohort, subject="subject", pairs=thing.pairs, permutations=19),
         "regression": regression,
         "predictor": regression.predictor,
         "predictions": Predictions((EVIL,), np.ones(1), np.zeros(1), np.ones(1), ("",)),
-        "scores": ss.score(cohort, shapes(4), ss.ScoreConfig(modes=3, draws=2)),
-        "verification": ss.verify(people, identity),
-        "identification": ss.identify(people, identity),
+        "scores": ss.statistics.score(cohort, shapes(4), ss.statistics.ScoreConfig(modes=3, draws=2)),
+        "verification": ss.statistics.verify(people, identity),
+        "identification": ss.statistics.identify(people, identity),
         "model": blob_model(60),
     }
 
@@ -104,11 +108,11 @@ def test_scans_in_correspondence_and_results_in_a_folder_are_shown(tmp_path: Pat
     meshes = list(training_meshes(vertices=150)[:3])
     result = ss.fit_scan(blob_model(150), meshes[0], ss.FitConfig(method="paper", max_iterations=2))
     dataclasses.replace(result, reasons=(Reason.other(EVIL),)).save(tmp_path, "one")
-    results = ss.Results(tmp_path)
+    results = ss.store.Results(tmp_path)
     assert len(repr(results)) < LONGEST_REPR
     assert "<img src=x" not in results._repr_html_() and "&lt;img src=x" in results._repr_html_()
-    settings = ss.CorrespondSettings(vertices=120, rounds=1)
-    found = ss.correspond(meshes, settings)
+    config = ss.CorrespondConfig(vertices=120, rounds=1)
+    found = ss.correspond(meshes, config)
     assert len(repr(found)) < LONGEST_REPR and "in correspondence" in found._repr_html_()
 
 
@@ -126,7 +130,7 @@ def test_paths_may_be_text_and_shapes_may_be_arrays_or_files(tmp_path: Path) -> 
     for k, mesh in enumerate(meshes):
         write_mesh(tmp_path / f"m{k}.ply", mesh)
     (tmp_path / "table.csv").write_text("file,group\n" + "".join(f"m{k}.ply,a\n" for k in range(4)))
-    cohort = ss.read_cohort(str(tmp_path / "table.csv"), ss.CohortOptions(shapes=str(tmp_path)))
+    cohort = ss.read_cohort(str(tmp_path / "table.csv"), ss.CohortConfig(shapes=str(tmp_path)))
     assert len(cohort) == 4
     of_files = ss.ShapeModel.fit([str(tmp_path / f"m{k}.ply") for k in range(4)])
     of_arrays = ss.ShapeModel.fit(np.stack([mesh.vertices for mesh in meshes]))
@@ -138,25 +142,25 @@ def test_paths_may_be_text_and_shapes_may_be_arrays_or_files(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     "call",
     [
-        lambda: ss.CohortOptions(shapes=3),  # type: ignore[arg-type]
-        lambda: ss.CohortOptions(gauge="size"),  # type: ignore[arg-type]
-        lambda: ss.CohortOptions(surfaces="raw"),  # type: ignore[arg-type]
+        lambda: ss.CohortConfig(shapes=3),  # type: ignore[arg-type]
+        lambda: ss.CohortConfig(gauge="size"),  # type: ignore[arg-type]
+        lambda: ss.CohortConfig(surfaces="raw"),  # type: ignore[arg-type]
         lambda: ss.ShapeModel.fit("meshes"),  # type: ignore[arg-type]
         lambda: ss.ShapeModel.fit([None, None]),
         lambda: ss.ShapeModel.fit(np.zeros((10, 3))),
-        lambda: ss.measure_quality("meshes"),  # type: ignore[arg-type]
+        lambda: ss.model.measure_quality("meshes"),  # type: ignore[arg-type]
         lambda: ss.correspond("scans"),  # type: ignore[arg-type]
         lambda: ss.surface_distances(np.zeros((9, 3)), np.zeros((9, 3))),  # type: ignore[arg-type]
         lambda: ss.write_mesh("out.ply", np.zeros((9, 3))),  # type: ignore[arg-type]
         lambda: ss.simulate_scan(np.zeros((9, 3)), np.random.default_rng(0)),  # type: ignore[arg-type]
-        lambda: ss.surface_of_volume(np.zeros((3, 3, 3))),  # type: ignore[arg-type]
-        lambda: ss.compare("out", "age"),  # type: ignore[arg-type]
-        lambda: ss.change("out"),  # type: ignore[arg-type]
-        lambda: ss.measure_asymmetry("out"),  # type: ignore[arg-type]
-        lambda: ss.regress("out", "age"),  # type: ignore[arg-type]
-        lambda: ss.score("out", "out"),  # type: ignore[arg-type]
-        lambda: ss.verify("out"),  # type: ignore[arg-type]
-        lambda: ss.identify("out"),  # type: ignore[arg-type]
+        lambda: ss.geometry.surface_of_volume(np.zeros((3, 3, 3))),  # type: ignore[arg-type]
+        lambda: ss.statistics.compare("out", "age"),  # type: ignore[arg-type]
+        lambda: ss.statistics.change("out"),  # type: ignore[arg-type]
+        lambda: ss.statistics.measure_asymmetry("out"),  # type: ignore[arg-type]
+        lambda: ss.statistics.regress("out", "age"),  # type: ignore[arg-type]
+        lambda: ss.statistics.score("out", "out"),  # type: ignore[arg-type]
+        lambda: ss.statistics.verify("out"),  # type: ignore[arg-type]
+        lambda: ss.statistics.identify("out"),  # type: ignore[arg-type]
         lambda: ss.train_classifier("out"),  # type: ignore[arg-type]
     ],
 )

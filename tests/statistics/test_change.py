@@ -18,12 +18,12 @@ from shapespace.geometry.normals import face_vectors, vertex_areas, vertex_norma
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.report.analyses.result_tables import analysis_report
 from shapespace.schemas import Analysis, MorphPart, SurfaceMapPart, TablePart, read, read_part
-from shapespace.statistics.change import ChangeResult, change
 from shapespace.statistics.change_align import align_by, align_robustly
 from shapespace.statistics.change_maps import align_visits, swept_mm3, volume_mm3
 from shapespace.statistics.change_result import ChangeConfig
 from shapespace.statistics.change_visits import visits_of
 from shapespace.statistics.map_tests import difference_test, mean_test
+from shapespace.statistics.measure_change import ChangeResult, change
 from shapespace.types import FloatArray, Mesh, SurfaceLandmarks
 from synthetic_shapes import blob, blob_model, sphere
 

@@ -19,8 +19,8 @@ from shapespace.report.analyses.compare_report import compare_warnings
 from shapespace.report.analyses.result_tables import analysis_report
 from shapespace.schemas import PARTS, Analysis, TextPart, json_text
 from shapespace.statistics import compare_maps
-from shapespace.statistics.compare import CompareConfig, SquaresType, compare
 from shapespace.statistics.compare_formula import FUNCTIONS, design_of, random_effects_of
+from shapespace.statistics.compare_shapes import CompareConfig, SquaresType, compare
 from shapespace.statistics.compare_within import strata_of
 from shapespace.statistics.effect_size import EFFECT_SIZES, effect_size
 from shapespace.types import FloatArray, IntArray, Mesh

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from shapespace.cohort.cohort import Cohort
-from shapespace.statistics.compare import CompareConfig, SquaresType, compare
+from shapespace.statistics.compare_shapes import CompareConfig, SquaresType, compare
 from shapespace.statistics.effect_size import box_cox_exponent, effect_size
 
 MONTE_CARLO = 0.35

@@ -7,11 +7,11 @@ from shapespace.cohort.cohort import Cohort
 from shapespace.report.analyses.result_tables import analysis_report
 from shapespace.report.analyses.shape_data import shape_notes, shape_settings
 from shapespace.statistics.asymmetry import measure_asymmetry
-from shapespace.statistics.change import change
-from shapespace.statistics.compare import CompareConfig, compare
+from shapespace.statistics.compare_shapes import CompareConfig, compare
+from shapespace.statistics.measure_change import change
 from shapespace.statistics.observation_weights import information
 from shapespace.statistics.regression import regress
-from shapespace.statistics.score import score
+from shapespace.statistics.score_subjects import score
 from shapespace.types import BoolArray, FloatArray
 from symmetric_object import posed, symmetric_object
 from synthetic_shapes import training_meshes

@@ -9,7 +9,7 @@ import pytest
 
 from shapespace.cli import main
 from shapespace.cohort.cohort import Cohort, Fitted
-from shapespace.cohort.read import CohortOptions, read_cohort
+from shapespace.cohort.read import CohortConfig, read_cohort
 from shapespace.cohort.table import Table
 from shapespace.errors import CorrespondenceError, InputError
 from shapespace.fit.robust.posterior import variance_of_new_shapes
@@ -18,7 +18,7 @@ from shapespace.io.files import write_text
 from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.report.analyses.result_tables import analysis_report
 from shapespace.schemas import Analysis
-from shapespace.statistics.score import ScoreConfig, ScoreResult, score
+from shapespace.statistics.score_subjects import ScoreConfig, ScoreResult, score
 from shapespace.types import FloatArray, Mesh
 from stored_fits import MODES, VERTICES, model, write_fit
 from synthetic_shapes import similarity, training_meshes
@@ -303,8 +303,8 @@ def test_one_subject_is_read_beside_a_reference_and_not_alone(fits: Path) -> Non
     assert len(read_cohort(fits.parent / "new", onto=reference)) == 1
     with pytest.raises(InputError, match="two are the least"):
         read_cohort(fits.parent / "new")
-    fitted = read_cohort(fits, CohortOptions(surfaces="fitted"))
-    one = read_cohort(fits.parent / "new", CohortOptions(surfaces="fitted"), onto=fitted)
+    fitted = read_cohort(fits, CohortConfig(surfaces="fitted"))
+    one = read_cohort(fits.parent / "new", CohortConfig(surfaces="fitted"), onto=fitted)
     found, plain = score(fitted, one), score(reference, read_cohort(fits.parent / "new", onto=reference))
     assert "uncertain each fit is was not taken into account" in " ".join(found.notes)
     assert found.distance[0] == pytest.approx(plain.distance[0], rel=0.1)

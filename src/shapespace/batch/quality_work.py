@@ -18,7 +18,7 @@ from shapespace.io.containers.archives import read_arrays
 from shapespace.io.containers.arrays import write_arrays
 from shapespace.io.files import make_folder, temporary_folder
 from shapespace.io.memory_cache import LatestValue
-from shapespace.model.model_quality import Part, QualitySettings, Shapes
+from shapespace.model.model_quality import Part, QualityConfig, Shapes
 from shapespace.types import FloatArray, Mesh
 
 _AGAIN = "run the command again"
@@ -92,7 +92,7 @@ class QualityWork:
         Raises:
             FileError: they cannot be written.
         """
-        settings = asdict(shapes.settings)
+        settings = asdict(shapes.config)
         arrays = {f"setting.{key}": np.array(value) for key, value in settings.items() if value is not None}
         for kind, meshes in (("mesh", shapes.meshes), ("scan", shapes.scans or ())):
             for number, mesh in enumerate(meshes):
@@ -108,7 +108,7 @@ class QualityWork:
         settings = {key: _value(key, array) for key, array in stored.items()}
         absent = {key: None for key in ("folds", "modes", "control_points") if key not in settings}
         meshes, scans = _meshes(arrays, "mesh"), _meshes(arrays, "scan")
-        return Shapes(meshes, scans or None, QualitySettings(**cast(Any, {**settings, **absent})))
+        return Shapes(meshes, scans or None, QualityConfig(**cast(Any, {**settings, **absent})))
 
 
 _shapes = LatestValue[Shapes]()

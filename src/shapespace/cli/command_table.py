@@ -16,20 +16,21 @@ from shapespace.cli.answers import asymmetry, change, compare, identity, regress
 from shapespace.cli.options import Option, Source, advanced, basic
 
 # The classes and functions that options are read from.
-COHORT = Source("cohort.read", "CohortOptions")
+COHORT = Source("cohort.read", "CohortConfig")
 EXECUTION = Source("batch.execution", "ExecutionConfig")
-CORRESPOND = Source("correspondence.settings", "CorrespondSettings")
-BUILD = Source("commands.build", "BuildSettings")
-QUALITY = Source("model.model_quality", "QualitySettings")
+CORRESPOND = Source("correspondence.settings", "CorrespondConfig")
+BUILD = Source("model.build_config", "BuildConfig")
+BUILD_FILES = Source("commands.build", "BuildFilesConfig")
+QUALITY = Source("model.model_quality", "QualityConfig")
 QUALITY_TARGETS = Source("commands.quality", "QualityOptions")
 FIT = Source("fit.fit_scan", "FitConfig")
 PAPER = Source("fit.paper.paper_method", "Paper")
 IDENTITY = Source("statistics.identity.trial", "IdentityConfig")
-COMPARE = Source("statistics.compare", "CompareConfig")
+COMPARE = Source("statistics.compare_shapes", "CompareConfig")
 CHANGE = Source("statistics.change_result", "ChangeConfig")
 ASYMMETRY = Source("statistics.asymmetry", "measure_asymmetry")
 REGRESS = Source("statistics.regression", "regress")
-SCORE = Source("statistics.score", "ScoreConfig")
+SCORE = Source("statistics.score_subjects", "ScoreConfig")
 DEMO = Source("demo", "run_demo")
 FACES = Source("commands.data", "write_simulated_faces")
 ORGANS = Source("commands.data", "write_simulated_organs")
@@ -42,6 +43,7 @@ EXPORT = Source("commands.export", "export")
 CONVERT = Source("commands.convert", "convert")
 
 _UNITS = ("um", "mm", "cm", "inch", "m")
+_ABOUT_MESHES = "kept in the model file (default: from about.json next to the meshes)"
 _REPRESENTATIONS = ("vertices", "bspline", "bspline-detail")
 _GOES_ON: Mapping[str, Any] = {"goes_on": "; the same command goes on from there"}
 
@@ -163,7 +165,7 @@ def _identity() -> tuple[Option, ...]:
         advanced("--train", "EXPR", source=IDENTITY),
         advanced("--role", "COLUMN", source=IDENTITY),
         advanced("--folds", "N", source=IDENTITY),
-        advanced("--scores", "LIST", source=IDENTITY, default=None),
+        advanced("--scores", "LIST", source=IDENTITY),
         advanced("--modes", "K", source=IDENTITY),
         advanced("--no-uncertainty", help="ignore the uncertainty of the fits", source=IDENTITY),
         advanced("--draws", "N", source=IDENTITY),
@@ -315,27 +317,30 @@ COMMANDS: tuple[Command, ...] = (
         (
             basic("meshes", "MESH", "mesh files, or folders of them", nargs="+", parse=Path),
             basic("-o --output", "MODEL.h5", "the model", parse=Path, required=True),
-            basic("--modes", "K|auto|all", source=BUILD, parse=values.modes, either=_MODES),
+            basic("--modes", "K|auto|all", source=BUILD, parse=values.modes, default="auto", either=_MODES),
             basic("--variance", "SHARE", "as many modes as explain this share of the variance, such as 0.98",
                   parse=values.share, either=_MODES),
-            basic("--gauge", source=BUILD),
-            basic("--landmarks", "FILE", source=BUILD),
-            basic("--unit", source=BUILD, choices=_UNITS),
-            basic("--provenance", "TEXT", source=BUILD),
-            basic("--licence", "TEXT", source=BUILD),
-            advanced("--recursive", source=BUILD),
-            advanced("--with-doubtful", source=BUILD),
+            basic("--gauge", source=BUILD_FILES),
+            basic("--landmarks", "FILE", source=BUILD_FILES),
+            basic("--unit", source=BUILD_FILES, choices=_UNITS),
+            basic("--provenance", "TEXT", f"description of the meshes, {_ABOUT_MESHES}", BUILD),
+            basic("--licence", "TEXT", f"licence of the meshes, {_ABOUT_MESHES}", BUILD),
+            advanced("--recursive", source=BUILD_FILES),
+            advanced("--with-doubtful", source=BUILD_FILES),
             advanced("--no-align", help="use the meshes in their pose, without alignment", source=BUILD),
             advanced("--region", "NAME=FILE", "region of the surface for fit --region: a CSV file of vertices; can be "
                      "repeated", parse=values.named_file, repeat=True),
-            advanced("--min-seen", "SHARE", source=BUILD, parse=values.share),
+            advanced("--min-seen", "SHARE", source=BUILD_FILES, parse=values.share),
             advanced("--representation", source=BUILD, choices=_REPRESENTATIONS),
             advanced("--control-points", "MxN", source=BUILD, parse=values.control_points),
-            advanced("--additive", "LABELS.csv", source=BUILD, field="labels"),
-            advanced("--expression-variance", "SHARE", source=BUILD, parse=values.share),
-            advanced("--out-of-core", source=BUILD),
-            advanced("--keep-shapes", source=BUILD),
-            advanced("--add", "OLD.h5", source=BUILD),
+            advanced("--additive", "LABELS.csv", source=BUILD_FILES, field="labels"),
+            advanced("--expression-variance", "SHARE", source=BUILD_FILES, parse=values.share),
+            advanced("--out-of-core", source=BUILD,
+                     help="stream the meshes through a file next to the model, which is automatic if they would take "
+                     "more than four fifths of the free memory; a build that was stopped is continued by the same "
+                     "command"),
+            advanced("--keep-shapes", source=BUILD_FILES),
+            advanced("--add", "OLD.h5", source=BUILD_FILES),
             advanced("--seed", "S", source=BUILD),
         ),
         (
@@ -560,7 +565,6 @@ COMMANDS: tuple[Command, ...] = (
             "Computes ranks (CMC), and the rate of misses if subjects who are not enrolled are searched for too.",
             _IDENTITY_RULES,
         ),
-        defaults={"curve": (), "by": None},
     ),
     Command(
         "compare", "test effects of groups and covariates on shape by linear models",

@@ -192,10 +192,10 @@ def correspond(arguments: argparse.Namespace) -> int:
 
         start_loading(tell=not arguments.quiet)
     from shapespace.commands.correspond import CorrespondFiles, correspond_files
-    from shapespace.correspondence.settings import CorrespondSettings
+    from shapespace.correspondence.settings import CorrespondConfig
     from shapespace.schemas import to_json
 
-    settings = CorrespondSettings(**given(arguments, CorrespondSettings))
+    config = CorrespondConfig(**given(arguments, CorrespondConfig))
     files = CorrespondFiles(
         arguments.scans,
         arguments.template,
@@ -205,7 +205,7 @@ def correspond(arguments: argparse.Namespace) -> int:
         arguments.recursive,
         arguments.strict,
     )
-    summary, records = correspond_files(files, arguments.output, settings, quiet=arguments.quiet, say=warn)
+    summary, records = correspond_files(files, arguments.output, config, quiet=arguments.quiet, say=warn)
     if arguments.json:
         show_json({"folder": str(arguments.output), **to_json(summary), "records": to_json(records)})
     else:
@@ -215,21 +215,19 @@ def correspond(arguments: argparse.Namespace) -> int:
 
 def build(arguments: argparse.Namespace) -> int:
     """Build a shape model."""
-    from shapespace.commands.build import BuildSettings, build
+    from shapespace.commands.build import BuildFilesConfig, build
     from shapespace.commands.look import model_facts
+    from shapespace.model.build_config import BuildConfig
 
-    modes = arguments.variance if arguments.variance is not None else arguments.modes
-    chosen = given(
-        arguments,
-        BuildSettings,
-        modes=None if modes == "all" else modes,
-        out_of_core=arguments.out_of_core or None,
-        regions=dict(arguments.region),
-    )
-    settings = BuildSettings(**chosen)
-    if settings.streams:
+    modes = None if arguments.modes == "all" else arguments.modes
+    if arguments.variance is not None:
+        modes = arguments.variance
+    model_options = given(arguments, BuildConfig, modes=modes, out_of_core=arguments.out_of_core or None)
+    file_options = given(arguments, BuildFilesConfig, regions=dict(arguments.region))
+    config = BuildFilesConfig(model=BuildConfig(**model_options), **file_options)
+    if config.streams:
         arguments.goes_on = "; the same command goes on from there"
-    model, notes = build(arguments.meshes, arguments.output, settings, quiet=arguments.quiet)
+    model, notes = build(arguments.meshes, arguments.output, config, quiet=arguments.quiet)
     for note in notes:
         say(note)
     facts = model_facts(model)
@@ -248,11 +246,11 @@ def build(arguments: argparse.Namespace) -> int:
 def quality(arguments: argparse.Namespace) -> int:
     """How good a shape space is."""
     from shapespace.commands.quality import QualityOptions, quality
-    from shapespace.model.model_quality import QualitySettings
+    from shapespace.model.model_quality import QualityConfig
     from shapespace.schemas import to_json
 
-    settings = QualitySettings(**given(arguments, QualitySettings))
-    options = QualityOptions(settings, **given(arguments, QualityOptions))
+    config = QualityConfig(**given(arguments, QualityConfig))
+    options = QualityOptions(config, **given(arguments, QualityOptions))
     found, notes = quality(
         arguments.targets, arguments.output, options, _execution_config(arguments), quiet=arguments.quiet
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 
@@ -57,34 +58,26 @@ def share(text: str) -> float:
 
 def seconds(text: str) -> float:
     """Return a time in seconds above 0."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"must be seconds above 0, not {text!r}")
-    return value
+    return _number(text, lambda value: 0 < value < float("inf"), "seconds above 0")
 
 
 def std_mm(text: str) -> float:
     """Return a standard deviation in mm; infinity is accepted."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not value > 0:
-        raise argparse.ArgumentTypeError(f"must be a number of millimetres above 0, or inf, not {text!r}")
-    return value
+    return _number(text, lambda value: value > 0, "a number of millimetres above 0, or inf")
 
 
 def smoothing(text: str) -> float:
     """Return a standard deviation in voxels, from 0 to 10."""
+    return _number(text, lambda value: 0 <= value <= 10, "a number from 0 to 10")
+
+
+def _number(text: str, accepts: Callable[[float], bool], accepted: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        value = -1.0
-    if not 0 <= value <= 10:
-        raise argparse.ArgumentTypeError(f"must be a number from 0 to 10, not {text!r}")
+        value = float("nan")  # which no comparison accepts
+    if not accepts(value):
+        raise argparse.ArgumentTypeError(f"must be {accepted}, not {text!r}")
     return value
 
 

@@ -30,8 +30,8 @@ SURFACES: tuple[Surfaces, ...] = ("auto", "coefficients", "fitted", "dense")
 _USED = ("converged", "max_iterations")
 
 
-@dataclass(frozen=True)
-class CohortOptions:
+@dataclass(frozen=True, kw_only=True)
+class CohortConfig:
     """Options for the selection and comparison of shapes.
 
     Args:
@@ -54,15 +54,15 @@ class CohortOptions:
     def __post_init__(self) -> None:
         for name, path in (("shapes", self.shapes), ("model", self.model)):
             if path is not None and not isinstance(path, str | PathLike):  # pyright: ignore[reportUnnecessaryIsInstance]
-                raise InputError(f"CohortOptions: {name} is a path, not {type(path).__name__}; give a str or a Path.")
+                raise InputError(f"CohortConfig: {name} is a path, not {type(path).__name__}; give a str or a Path.")
         for name, value, choices in (("surfaces", self.surfaces, SURFACES), ("gauge", self.gauge, get_args(Gauge))):
             if value not in choices:
-                raise InputError(f"CohortOptions: there is no {name} {value!r}; choose one of {', '.join(choices)}.")
+                raise InputError(f"CohortConfig: there is no {name} {value!r}; choose one of {', '.join(choices)}.")
 
 
 def read_cohort(
     data: Path | str,
-    options: CohortOptions | None = None,
+    config: CohortConfig | None = None,
     *,
     onto: Cohort | None = None,
     on_shape: Callable[[int, int], None] | None = None,
@@ -75,7 +75,7 @@ def read_cohort(
     Args:
         data: a table whose column `file`, `scan`, `specimen`, `name` or `id` names a shape in each row
             (coefficients.csv is one), or a folder of results of fits, whose metadata are the table.
-        options: which shapes; None for the defaults.
+        config: which shapes; None for the defaults.
         onto: a cohort that these shapes, of which there may be one alone, are to be compared with.
         on_shape: called with (done, total) as surfaces are read.
 
@@ -85,21 +85,21 @@ def read_cohort(
         InputError: no row has a shape, fits of different models, the same scan twice, or fewer than two shapes.
         CorrespondenceError: meshes that are not in correspondence.
     """
-    data, options = Path(data), options or CohortOptions()
+    data, config = Path(data), config or CohortConfig()
     table, keys = (None, ()) if data.is_dir() else read_table(data)
-    folder = Path(options.shapes) if options.shapes else (data if table is None else data.parent)
+    folder = Path(config.shapes) if config.shapes else (data if table is None else data.parent)
     if not folder.is_dir():
         raise InputError(
             f"{folder} is no folder; give the results of fits, or meshes in correspondence, with --shapes."
         )
     results = Results(folder)
     if len(results):
-        return _of_results(results, table, keys, options, onto, on_shape)
+        return _of_results(results, table, keys, config, onto, on_shape)
     if table is None:
         raise InputError(
             f"{folder} holds no results of fits; give a CSV table of its meshes, and the folder as --shapes."
         )
-    return _of_surfaces(folder, table, keys, options, onto, on_shape)
+    return _of_surfaces(folder, table, keys, config, onto, on_shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,13 +150,13 @@ def _of_results(
     results: Results,
     table: Table | None,
     keys: Sequence[str],
-    options: CohortOptions,
+    config: CohortConfig,
     onto: Cohort | None,
     on_shape: Callable[[int, int], None] | None,
 ) -> Cohort:
     rows = _rows(results)
     notes = list(results.problems)
-    used = (*_USED, "doubtful") if options.doubtful else _USED
+    used = (*_USED, "doubtful") if config.doubtful else _USED
     if table is None:
         heads = dict.fromkeys(head for row in rows for head in row.known)
         cells = {head: tuple(row.known.get(head, "") for row in rows) for head in heads}
@@ -172,7 +172,7 @@ def _of_results(
     for status, count in Counter(row.status for row, _ in pairs if row.status not in used).items():
         excluded_names = list_names([row.name for row, _ in pairs if row.status == status])
         notes.append(f"{count} of {len(pairs)} fits are left out, which are {status} ({excluded_names}).")
-    least = options.least if onto is None else 1
+    least = config.least if onto is None else 1
     if len(accepted) < least:
         raise InputError(
             f"{results.folder}: {len(accepted)} of its fits can be used, and {_count_words(least)} the least; "
@@ -180,7 +180,7 @@ def _of_results(
         )
     fits = [row for row, _ in accepted]
     _refuse_mixed(fits, results.folder)
-    model, additive = _model_of(results, fits[0], None if options.model is None else Path(options.model))
+    model, additive = _model_of(results, fits[0], None if config.model is None else Path(config.model))
     stated = table.take([index for _, index in accepted])
     names = tuple(row.name for row in fits)
     sizes = read_only([row.size_mm for row in fits])
@@ -194,9 +194,9 @@ def _of_results(
         read_only([row.beyond_mm for row in fits]),
         additive,
     )
-    kind = _kind(options.surfaces, results, names, options.gauge, fits, onto)
+    kind = _kind(config.surfaces, results, names, config.gauge, fits, onto)
     if kind == "coefficients":
-        cohort = Cohort.of_fits(fitted, names, stated, sizes, options.gauge)
+        cohort = Cohort.of_fits(fitted, names, stated, sizes, config.gauge)
     else:
         without_surface = [name for name in names if not results.has(name, kind)]
         if without_surface:
@@ -205,7 +205,7 @@ def _of_results(
                 f"{results.folder} holds no {kind} surface of {list_names(without_surface)}; fit them again{dense}."
             )
         unknown = [row.name for row in fits if not np.isfinite(row.mm_per_unit)]
-        if unknown and options.gauge == "form":
+        if unknown and config.gauge == "form":
             raise InputError(
                 f"The size of {list_names(unknown)} is not known in mm, so forms cannot be compared; fit with --unit, "
                 "or compare shapes with --gauge shape."
@@ -218,7 +218,7 @@ def _of_results(
             if on_shape is not None:
                 on_shape(index + 1, len(fits))
         cohort = replace(
-            Cohort.of_meshes(meshes, stated, options.gauge, onto, options.least),
+            Cohort.of_meshes(meshes, stated, config.gauge, onto, config.least),
             fitted=fitted,
             landmarks=model.landmarks,
             sizes_mm=sizes,
@@ -243,18 +243,18 @@ def _of_surfaces(
     folder: Path,
     table: Table,
     keys: Sequence[str],
-    options: CohortOptions,
+    config: CohortConfig,
     onto: Cohort | None,
     on_shape: Callable[[int, int], None] | None,
 ) -> Cohort:
     listing = surface_files([folder])
     notes = list(listing.notes)
-    if options.gauge == "form":
+    if config.gauge == "form":
         listing.refuse_mixed_units()
     files = {surface_stem(file): file for file in listing.files if file.suffix.lower() != ".csv"}
     matched = [(files[key], row_index) for row_index, key in enumerate(keys) if key in files]
     _note_unmatched(notes, table, keys, files, [surface_stem(file) for file, _ in matched], list(files), folder)
-    least = options.least if onto is None else 1
+    least = config.least if onto is None else 1
     if len(matched) < least:
         raise InputError(
             f"{folder}: {len(matched)} of its meshes are in {table.where}, and {_count_words(least)} the least."
@@ -267,7 +267,7 @@ def _of_surfaces(
         if on_shape is not None:
             on_shape(n_read, len(matched))
     cohort = Cohort.of_meshes(
-        meshes, table.take([row_index for _, row_index in matched]), options.gauge, onto, options.least
+        meshes, table.take([row_index for _, row_index in matched]), config.gauge, onto, config.least
     )
     corresponding = all(file.name.endswith(SURFACE) for file, _ in matched)
     source = ShapeSource("corresponding" if corresponding else "surfaces")

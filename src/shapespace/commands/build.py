@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,6 +23,8 @@ from shapespace.io.files import make_folder, read_error
 from shapespace.io.landmarks.landmark_io import is_of_vertices, read_landmarks, read_surface_landmarks
 from shapespace.io.meshes.region_files import read_region
 from shapespace.io.tables.label_table import label_of, read_labels
+from shapespace.model.build_config import BuildConfig
+from shapespace.model.build_model import build_model, extend_model
 from shapespace.model.choose_modes import MOST_SHAPES
 from shapespace.model.missing import MIN_SEEN, ObservedMeshes
 from shapespace.model.representation import representation_named
@@ -45,20 +47,15 @@ _LEAST_MM, _MOST_MM = 1.0, 3000.0
 """Beyond this the largest extent of an object is likelier told in another unit."""
 
 
-@dataclass(frozen=True)
-class BuildSettings:
-    """What to make of which meshes.
+@dataclass(frozen=True, kw_only=True)
+class BuildFilesConfig:
+    """Options of a model that is built from files.
 
     Args:
-        modes: number of modes; `auto`: cross-validation on held-out vertices, of a random sample of 2,000 meshes if
-            there are more; `all` (in Python None). With labels, they are modes of identity.
+        model: options of the model; its gauge, landmarks and share of observed vertices are those below.
         gauge: `form`: size is part of the modes, and fits are rigid; `shape`: size is divided out, and fits have a free
             scale (default: shape, or that of the model added to).
-        align: whether to align the meshes.
         unit: unit of the meshes.
-        representation: what the modes move: `vertices`; `bspline`, control points of a smooth surface;
-            `bspline-detail`, the same with the detail of the mean that the B-spline cannot represent.
-        control_points: control points of a B-spline along each side, 4 to 64 (default 24x24).
         min_seen: remove vertices that fewer than this share of the meshes show, with their triangles and landmarks;
             missing vertices are nan in the files (default: 0.5).
         landmarks: landmarks of the model: points on the first mesh in any landmark format, a CSV of name,vertex, or
@@ -69,36 +66,24 @@ class BuildSettings:
             the number of modes then counts modes of identity (default 0.995 of the variance).
         expression_variance: for a model of identity and expression: share of the expression variance that its
             expression modes explain (default 0.99).
-        provenance: description of the meshes, kept in the model file (default: from about.json next to the meshes).
-        licence: licence of the meshes, kept in the model file (default: from about.json next to the meshes).
-        seed: seed of the cross-validation, and of the first directions of streamed modes.
-        out_of_core: stream the meshes through a file next to the model, which is automatic if they would take more than
-            four fifths of the free memory; a build that was stopped is continued by the same command.
-        keep_shapes: keep that file as MODEL.h5.shapes, so that meshes can be added later (4 bytes per coordinate of a
-            mesh).
+        keep_shapes: keep the aligned shapes as MODEL.h5.shapes, so that meshes can be added later (4 bytes per
+            coordinate of a mesh).
         add: add the meshes to this model, which was built with its shapes kept; gauge, alignment and landmarks are
             those of that model.
         recursive: also search subfolders of the given folders.
         with_doubtful: include surfaces of doubtful fits (default: excluded, and counted).
 
     Raises:
-        InputError: settings that do not go together.
+        InputError: options that do not go together.
     """
 
-    modes: int | float | Literal["auto"] | None = "auto"
+    model: BuildConfig = field(default_factory=BuildConfig)
     gauge: Gauge | None = None
-    align: bool = True
     unit: str = "mm"
-    representation: str = "vertices"
-    control_points: tuple[int, int] | None = None
     min_seen: float | None = None
     landmarks: Path | None = None
     labels: Path | None = None
     expression_variance: float | None = None
-    provenance: str = ""
-    licence: str = ""
-    seed: int = 0
-    out_of_core: bool | None = None
     keep_shapes: bool = False
     add: Path | None = None
     recursive: bool = False
@@ -106,30 +91,29 @@ class BuildSettings:
     regions: Mapping[str, Path] = field(default_factory=dict[str, Path])
 
     def __post_init__(self) -> None:
-        representation_named(self.representation, self.control_points)
+        representation_named(self.model.representation, self.model.control_points)
         if self.labels is None and self.expression_variance is not None:
             raise InputError("--expression-variance belongs to --additive LABELS.csv; give both, or neither.")
-        if self.labels is not None and self.representation != "vertices":
+        if self.labels is not None and self.model.representation != "vertices":
             raise InputError("A model that parts identity and expression holds vertices; leave --representation out.")
-        if self.min_seen is not None and (self.labels is not None or self.representation != "vertices"):
+        if self.min_seen is not None and (self.labels is not None or self.model.representation != "vertices"):
             raise InputError("--min-seen is for models of vertices without --additive; leave it out.")
-        if self.labels is not None and not self.align:
+        if self.labels is not None and not self.model.align:
             raise InputError(
                 "A model that parts identity and expression aligns its faces itself; leave --no-align out."
             )
-        if self.streams and (self.labels is not None or self.representation != "vertices"):
+        if self.streams and (self.labels is not None or self.model.representation != "vertices"):
             raise InputError(
                 "--out-of-core, --keep-shapes and --add are for models of vertices without --additive; leave them out, "
                 "or --representation and --additive."
             )
         if self.streams and self.min_seen is not None:
             raise InputError("Streamed meshes must be whole, so leave --min-seen out.")
-        if self.add is not None and (self.gauge is not None or not self.align or self.landmarks is not None):
+        if self.add is not None and (self.gauge is not None or not self.model.align or self.landmarks is not None):
             raise InputError(
                 "--add takes gauge, alignment and landmarks from the model; leave --gauge, --no-align and --landmarks "
                 "out."
             )
-
         if self.regions and (self.keep_shapes or self.add is not None):
             raise InputError(
                 "--region cannot go with --keep-shapes or --add; leave it out, and give fit a file instead."
@@ -138,16 +122,16 @@ class BuildSettings:
     @property
     def streams(self) -> bool:
         """Whether the meshes are streamed even where they would fit."""
-        return bool(self.out_of_core) or self.keep_shapes or self.add is not None
+        return bool(self.model.out_of_core) or self.keep_shapes or self.add is not None
 
     @property
     def of_vertices(self) -> bool:
         """Whether it is a plain model of vertices, whose meshes can be streamed."""
-        return self.labels is None and self.representation == "vertices"
+        return self.labels is None and self.model.representation == "vertices"
 
 
 def build(
-    meshes: Sequence[Path], output: Path, settings: BuildSettings, *, quiet: bool
+    meshes: Sequence[Path], output: Path, config: BuildFilesConfig, *, quiet: bool
 ) -> tuple[ShapeModel, list[str]]:
     """Build a model from mesh files and save it; return it and what the user should know.
 
@@ -163,72 +147,60 @@ def build(
     """
     if output.suffix.lower() not in (".h5", ".hdf5"):
         raise InputError(f"{output}: a model file is HDF5, so give it a name that ends in .h5.")
-    found = surface_files(meshes, recursive=settings.recursive)
+    found = surface_files(meshes, recursive=config.recursive)
     notes = list(found.notes)
-    parent = None if settings.add is None else _parent(settings.add, output)
-    gauge = parent.gauge if parent is not None else settings.gauge or "shape"
-    if gauge == "form" or not settings.align:
+    parent = None if config.add is None else _parent(config.add, output)
+    gauge = parent.gauge if parent is not None else config.gauge or "shape"
+    if gauge == "form" or not config.model.align:
         found.refuse_mixed_units()
-    files, records = _trusted(found.files, notes, with_doubtful=settings.with_doubtful)
+    files, records = _trusted(found.files, notes, with_doubtful=config.with_doubtful)
     make_folder(output.absolute().parent)
-    on_disk = _OnDisk(files, settings.unit, found.unit_ratios)
-    streamed = settings.streams or (settings.of_vertices and _too_large(on_disk, settings, notes))
+    on_disk = _OnDisk(files, config.unit, found.unit_ratios)
+    streamed = config.streams or (config.of_vertices and _too_large(on_disk, config, notes))
     loaded = on_disk if streamed else _read(on_disk, quiet=quiet)
     first = on_disk[0] if streamed else loaded[0]
     if found.unit_ratios:
-        notes.append(found.told_units(settings.unit))
-    marks = SurfaceLandmarks() if parent is not None else _landmarks(files, records, first, settings, notes)
+        notes.append(found.told_units(config.unit))
+    marks = SurfaceLandmarks() if parent is not None else _landmarks(files, records, first, config, notes)
     regions = {
-        name: region_vertices(read_region(file), len(first.vertices), name) for name, file in settings.regions.items()
+        name: region_vertices(read_region(file), len(first.vertices), name) for name, file in config.regions.items()
     }
-    settings = _with_origin(files, settings, notes)
+    config = _with_origin(files, config, notes)
     count = len(files) + (0 if parent is None else parent.n_training)
-    if settings.modes == "auto" and count < 4:
-        settings = replace(settings, modes=None)
+    if config.model.modes == "auto" and count < 4:
+        config = replace(config, model=replace(config.model, modes=None))
         notes.append(f"With {count} meshes the number of modes cannot be cross-validated, so all modes are kept.")
-    if settings.modes == "auto" and count > MOST_SHAPES:
+    if config.model.modes == "auto" and count > MOST_SHAPES:
         notes.append(f"The number of modes is chosen by {MOST_SHAPES} of the {count} shapes, drawn by --seed.")
     if not isinstance(loaded, list):
-        model = _streamed(on_disk, output, settings, gauge, marks, parent, notes, quiet=quiet)
+        model = _streamed(on_disk, output, config, gauge, marks, parent, notes, quiet=quiet)
         if regions:
             model = replace(model, regions=regions)
             model.save(output)
-        return model, notes + _told(model, settings)
-    notes += _missing(loaded, marks, settings)
+        return model, notes + _told(model, config)
+    notes += _missing(loaded, marks, config)
     with waiting(f"aligning {len(files)} meshes and finding their modes", quiet=quiet):
-        if settings.labels is not None:
-            additive = _additive(files, loaded, settings.labels, settings, gauge, marks)
+        if config.labels is not None:
+            additive = _additive(files, loaded, config.labels, config, gauge, marks)
             additive = replace(additive, shape=replace(additive.shape, regions=regions))
             additive.save(output)
             notes.append(
                 f"It parts {additive.n_identity} modes of identity and {additive.n_expression} of expression, by "
-                f"{settings.labels}."
+                f"{config.labels}."
             )
             return additive.shape, notes
-        model = ShapeModel.fit(
-            loaded,
-            modes=settings.modes,
-            gauge=gauge,
-            align=settings.align,
-            out_of_core=False,
-            landmarks=marks,
-            representation=settings.representation,
-            control_points=settings.control_points,
-            min_seen=_min_seen(settings),
-            provenance=settings.provenance,
-            licence=settings.licence,
-            seed=settings.seed,
-        )
+        chosen = replace(config.model, gauge=gauge, landmarks=marks, min_seen=_min_seen(config), out_of_core=False)
+        model = build_model(loaded, chosen)
         if regions:
-            kept = ObservedMeshes.of(loaded, _min_seen(settings)) if settings.representation == "vertices" else None
+            kept = ObservedMeshes.of(loaded, _min_seen(config)) if config.model.representation == "vertices" else None
             model = replace(model, regions=regions if kept is None else kept.regions(regions))
         model.save(output)
-    return model, notes + _told(model, settings)
+    return model, notes + _told(model, config)
 
 
-def _told(model: ShapeModel, settings: BuildSettings) -> list[str]:
+def _told(model: ShapeModel, config: BuildFilesConfig) -> list[str]:
     """Return what the user should know of the model itself."""
-    notes = _odd_size(model, settings.unit)
+    notes = _odd_size(model, config.unit)
     if model.left_out:
         what = "1 mode is" if model.left_out == 1 else f"{model.left_out} modes are"
         notes.append(f"{what} left out, since alignment or rounding made them and no shape did.")
@@ -255,10 +227,10 @@ def _parent(path: Path, output: Path) -> ShapeModel:
     return model
 
 
-def _too_large(meshes: _OnDisk, settings: BuildSettings, notes: list[str]) -> bool:
+def _too_large(meshes: _OnDisk, config: BuildFilesConfig, notes: list[str]) -> bool:
     """Return whether the meshes do not fit into memory, and say so."""
-    needed = bytes_in_memory(len(meshes), meshes[0], choose=settings.modes == "auto")
-    if settings.out_of_core is not None or not too_large(needed):
+    needed = bytes_in_memory(len(meshes), meshes[0], choose=config.model.modes == "auto")
+    if config.model.out_of_core is not None or not too_large(needed):
         return False
     notes.append(
         f"{len(meshes)} meshes would take {needed / 1e9:.1f} GB of memory, which is more than four fifths of what is "
@@ -270,7 +242,7 @@ def _too_large(meshes: _OnDisk, settings: BuildSettings, notes: list[str]) -> bo
 def _streamed(
     meshes: _OnDisk,
     output: Path,
-    settings: BuildSettings,
+    config: BuildFilesConfig,
     gauge: Gauge,
     landmarks: SurfaceLandmarks,
     parent: ShapeModel | None,
@@ -280,36 +252,22 @@ def _streamed(
 ) -> ShapeModel:
     """Build a model of meshes that are not held in memory, and save it."""
     folder = output.with_name(f"{output.name}.build")
-    scratch = Scratch(folder, _identity(meshes, settings, parent))
-    kept = shapes_folder(output) if settings.keep_shapes else None
+    scratch = Scratch(folder, _identity(meshes, config, parent))
+    kept = shapes_folder(output) if config.keep_shapes else None
     with progress(None, "streaming", "mesh", quiet=quiet) as bar:
-        if parent is not None and settings.add is not None:
-            model = parent.with_more(
-                meshes,
-                shapes_folder(settings.add),
-                modes=settings.modes,
-                provenance=_joined(parent.provenance, settings.provenance),
-                licence=_joined(parent.licence, settings.licence),
-                seed=settings.seed,
-                scratch=scratch,
-                keep_shapes=kept,
-                tell=bar.set_description_str,
+        if parent is not None and config.add is not None:
+            chosen = replace(
+                config.model,
+                provenance=_joined(parent.provenance, config.model.provenance),
+                licence=_joined(parent.licence, config.model.licence),
+            )
+            shapes = shapes_folder(config.add)
+            model = extend_model(
+                parent, meshes, shapes, chosen, scratch=scratch, keep_shapes=kept, log=bar.set_description_str
             )
         else:
-            model = ShapeModel.fit(
-                meshes,
-                modes=settings.modes,
-                gauge=gauge,
-                align=settings.align,
-                landmarks=landmarks,
-                provenance=settings.provenance,
-                licence=settings.licence,
-                seed=settings.seed,
-                out_of_core=True,
-                scratch=scratch,
-                keep_shapes=kept,
-                tell=bar.set_description_str,
-            )
+            chosen = replace(config.model, gauge=gauge, landmarks=landmarks, out_of_core=True)
+            model = build_model(meshes, chosen, scratch=scratch, keep_shapes=kept, log=bar.set_description_str)
         model.save(output)
     if kept is not None:
         size = sum(file.stat().st_size for file in kept.iterdir())
@@ -321,9 +279,11 @@ def _joined(old: str, new: str) -> str:
     return old if new in ("", old) else f"{old}; {new}" if old else new
 
 
-def _identity(meshes: _OnDisk, settings: BuildSettings, parent: ShapeModel | None) -> str:
+def _identity(meshes: _OnDisk, config: BuildFilesConfig, parent: ShapeModel | None) -> str:
     """Return a hash of all that decides what a streamed build comes to."""
-    digest = hashlib.sha256(repr((__version__, replace(settings, provenance="", licence=""))).encode())
+    digest = hashlib.sha256(
+        repr((__version__, replace(config, model=replace(config.model, provenance="", licence="")))).encode()
+    )
     digest.update(repr(None if parent is None else parent.content_hash).encode())
     for file in meshes.files:
         try:
@@ -412,11 +372,11 @@ def _training_mesh(path: Path) -> Mesh:
     return mesh
 
 
-def _min_seen(settings: BuildSettings) -> float:
-    return MIN_SEEN if settings.min_seen is None else settings.min_seen
+def _min_seen(config: BuildFilesConfig) -> float:
+    return MIN_SEEN if config.min_seen is None else config.min_seen
 
 
-def _missing(meshes: Sequence[Mesh], landmarks: SurfaceLandmarks, settings: BuildSettings) -> list[str]:
+def _missing(meshes: Sequence[Mesh], landmarks: SurfaceLandmarks, config: BuildFilesConfig) -> list[str]:
     """Return how many vertices are missing, and which of them and of the landmarks are not in the model for it.
 
     Raises:
@@ -427,7 +387,7 @@ def _missing(meshes: Sequence[Mesh], landmarks: SurfaceLandmarks, settings: Buil
     holed = [int(np.isnan(mesh.vertices).any(axis=1).sum()) for mesh in meshes]
     if not any(holed):
         return []
-    if settings.labels is not None:
+    if config.labels is not None:
         raise InputError(
             f"{meshes[int(np.argmax(holed))].name}: vertices are missing, and a model that parts identity and "
             "expression needs whole meshes; leave --additive out, or the meshes with holes."
@@ -435,13 +395,13 @@ def _missing(meshes: Sequence[Mesh], landmarks: SurfaceLandmarks, settings: Buil
     missing, every = sum(holed), len(meshes) * len(meshes[0].vertices)
     where, share = sum(count > 0 for count in holed), 100 * missing / every
     told = [f"{missing} of {every} vertices are missing ({share:.1f} %), in {where} of {len(meshes)} meshes."]
-    if settings.representation != "vertices":
+    if config.model.representation != "vertices":
         return told
-    kept = ObservedMeshes.of(meshes, _min_seen(settings))
+    kept = ObservedMeshes.of(meshes, _min_seen(config))
     if out := int((~kept.vertices).sum()):
         what = "1 vertex is" if out == 1 else f"{out} vertices are"
         told.append(
-            f"{what} taken out of the model, since fewer than {100 * _min_seen(settings):g} % of the meshes show them; "
+            f"{what} taken out of the model, since fewer than {100 * _min_seen(config):g} % of the meshes show them; "
             "--min-seen says how many must."
         )
     if lost := sorted(set(landmarks) - set(kept.landmarks(landmarks))):
@@ -456,13 +416,13 @@ def _landmarks(
     files: Sequence[Path],
     records: Mapping[Path, FitRecord],
     first: Mesh,
-    settings: BuildSettings,
+    config: BuildFilesConfig,
     notes: list[str],
 ) -> SurfaceLandmarks:
     """Return the landmarks: the given ones, those next to the first mesh, or those of the model of the fits."""
-    mm = MM_PER_UNIT[settings.unit]
-    if settings.landmarks is not None:
-        return _read_landmarks(settings.landmarks, first, mm, notes)
+    mm = MM_PER_UNIT[config.unit]
+    if config.landmarks is not None:
+        return _read_landmarks(config.landmarks, first, mm, notes)
     beside = files[0].parent / "landmarks.csv"
     if beside.is_file():
         try:
@@ -530,24 +490,28 @@ def _placing_notes(landmarks: SurfaceLandmarks, surface: Mesh) -> list[str]:
     return notes
 
 
-def _with_origin(files: Sequence[Path], settings: BuildSettings, notes: list[str]) -> BuildSettings:
-    """Return the settings with provenance and licence, from beside the meshes where none was given."""
+def _with_origin(files: Sequence[Path], config: BuildFilesConfig, notes: list[str]) -> BuildFilesConfig:
+    """Return the configuration with provenance and licence, from beside the meshes where none was given."""
     abouts = {folder: read_about(folder) for folder in dict.fromkeys(file.parent for file in files)}
     about = abouts[files[0].parent]
-    if about and not (settings.provenance or settings.licence):
+    if about and not (config.model.provenance or config.model.licence):
         if len(set(abouts.values())) == 1:
             notes.append(f"Provenance and licence are taken from {files[0].parent / ABOUT}.")
-            return replace(settings, provenance=f"{len(files)} meshes of: {about[0]}", licence=about[1])
+            return _with_words(config, f"{len(files)} meshes of: {about[0]}", about[1])
         notes.append("The meshes come from folders of different origin, so give --provenance and --licence.")
-    said = settings.provenance or f"{len(files)} meshes, {files[0].name} to {files[-1].name}"
-    return replace(settings, provenance=said)
+    said = config.model.provenance or f"{len(files)} meshes, {files[0].name} to {files[-1].name}"
+    return _with_words(config, said, config.model.licence)
+
+
+def _with_words(config: BuildFilesConfig, provenance: str, licence: str) -> BuildFilesConfig:
+    return replace(config, model=replace(config.model, provenance=provenance, licence=licence))
 
 
 def _additive(
     files: Sequence[Path],
     meshes: Sequence[Mesh],
     labels: Path,
-    settings: BuildSettings,
+    config: BuildFilesConfig,
     gauge: Gauge,
     landmarks: SurfaceLandmarks,
 ) -> AdditiveModel:
@@ -561,15 +525,15 @@ def _additive(
         raise InputError(
             f"{labels} has no subject for {', '.join(lacking[:3])}; each mesh needs a label and a subject."
         )
-    expression_modes = settings.expression_variance
+    expression_modes = config.expression_variance
     return AdditiveModel.fit(
         meshes,
         [label.subject for label in own],
         [label.text == NEUTRAL for label in own],
-        identity_modes=_IDENTITY_VARIANCE if settings.modes == "auto" else settings.modes,
+        identity_modes=_IDENTITY_VARIANCE if config.model.modes == "auto" else config.model.modes,
         expression_modes=_EXPRESSION_VARIANCE if expression_modes is None else expression_modes,
         gauge=gauge,
         landmarks=landmarks,
-        provenance=settings.provenance,
-        licence=settings.licence,
+        provenance=config.model.provenance,
+        licence=config.model.licence,
     )

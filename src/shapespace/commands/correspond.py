@@ -28,7 +28,7 @@ from shapespace.correspondence.groupwise import ENOUGH_TO_JUDGE, correspond
 from shapespace.correspondence.landmark_guide import stray_landmarks, without_stray_landmarks
 from shapespace.correspondence.place import RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.scan_set import copies, unit_ratios
-from shapespace.correspondence.settings import CorrespondSettings
+from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.errors import ShapespaceError
 from shapespace.geometry.distortion import Distortion
 from shapespace.geometry.doctor import NON_FINITE, repair
@@ -85,7 +85,7 @@ class CorrespondFiles:
 def correspond_files(
     files: CorrespondFiles,
     folder: Path,
-    settings: CorrespondSettings,
+    config: CorrespondConfig,
     *,
     quiet: bool,
     say: _Say,
@@ -105,7 +105,7 @@ def correspond_files(
         say(f"{len(found) - len(scans)} surfaces of an earlier correspondence are not taken for scans.")
     make_folder(folder)
     with only_writer(folder):
-        return _corresponding(_jobs(scans), files, folder, settings, quiet=quiet, say=say)
+        return _corresponding(_jobs(scans), files, folder, config, quiet=quiet, say=say)
 
 
 def _jobs(given: Sequence[Given]) -> list[Job]:
@@ -117,11 +117,11 @@ def _jobs(given: Sequence[Given]) -> list[Job]:
 
 
 def _corresponding(
-    jobs: Sequence[Job], files: CorrespondFiles, folder: Path, settings: CorrespondSettings, *, quiet: bool, say: _Say
+    jobs: Sequence[Job], files: CorrespondFiles, folder: Path, config: CorrespondConfig, *, quiet: bool, say: _Say
 ) -> tuple[CorrespondenceRecord, list[CorrespondRecord]]:
     marks = LandmarkFiles.of(files.landmarks)
     marks.refuse_shared([job.scan for job in jobs if job.landmarks is None])
-    inputs_hash = _inputs_hash(jobs, marks, files, settings)
+    inputs_hash = _inputs_hash(jobs, marks, files, config)
     if (finished := _finished(jobs, folder, inputs_hash)) is not None:
         say(f"{folder} already contains the results of these scans and settings; nothing is computed.")
         return finished
@@ -136,8 +136,8 @@ def _corresponding(
             say(f"{template.name}: {sentence}")
     rounds = _Rounds(folder / _KEPT, files.execution, quiet=quiet)
     with telling_of_compiling(quiet=quiet), waiting("choosing the template", quiet=quiet):
-        first = first_template(list(scans.values()), template, settings, model)
-    made = correspond(list(scans.values()), settings, first=first, run=rounds)
+        first = first_template(list(scans.values()), template, config, model)
+    made = correspond(list(scans.values()), config, first=first, run=rounds)
     _note_copies(scans, notes)
     given = template.name if template is not None else "" if model is None else "The model's mean"
     if not given or made.moved[0] < _ANOTHER_SHAPE:
@@ -155,7 +155,7 @@ def _corresponding(
         rounds=list(made.moved),
         corresponding=[record.name for record in records if not record.reason],
         set_aside={record.name: record.reason for record in records if record.reason},
-        settings=asdict(settings),
+        settings=asdict(config),
         version=__version__,
         other_units={record.name: record.unit_ratio for record in records if record.unit_ratio != 1.0},
         inputs_hash=inputs_hash,
@@ -166,9 +166,7 @@ def _corresponding(
     return summary, records
 
 
-def _inputs_hash(
-    jobs: Sequence[Job], marks: LandmarkFiles, files: CorrespondFiles, settings: CorrespondSettings
-) -> str:
+def _inputs_hash(jobs: Sequence[Job], marks: LandmarkFiles, files: CorrespondFiles, config: CorrespondConfig) -> str:
     """Return the SHA-256 of all inputs of a run, without parsing the scans; it does not depend on the executor."""
 
     def landmarks_hash(scan: Path, own: Path | None) -> str:
@@ -185,7 +183,7 @@ def _inputs_hash(
         scans.append([job.name, content, landmarks_hash(job.scan, job.landmarks), dict(job.metadata)])
     template = None if files.template is None else [_hash_of(files.template), landmarks_hash(files.template, None)]
     model = None if files.model is None else _hash_of(files.model)
-    inputs = [scans, template, model, asdict(settings), files.strict, __version__]
+    inputs = [scans, template, model, asdict(config), files.strict, __version__]
     content = json.dumps(inputs, sort_keys=True, default=str)
     return hashlib.sha256(content.encode()).hexdigest()
 

@@ -19,7 +19,7 @@ from shapespace.io.files import make_folder, write_text
 from shapespace.io.meshes.mesh_folders import mesh_files
 from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.model.foreign import looks_like_model
-from shapespace.model.model_quality import Curve, ModelQuality, QualitySettings, Runner, measure_quality
+from shapespace.model.model_quality import Curve, ModelQuality, QualityConfig, Runner, measure_quality
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import BySize, Measured, Quality, json_text
@@ -36,7 +36,7 @@ class QualityOptions:
     """What to measure, and against what.
 
     Args:
-        settings: folds, modes, samples, seed and gauge.
+        config: folds, modes, samples, seed and gauge.
         representations: what the modes move, for all targets or one for each; two for one target compare it with
             itself.
         scans: folder of the scans that the surfaces were made from, with the same names, pose and unit: distances are
@@ -47,7 +47,7 @@ class QualityOptions:
         InputError: representations that there are not.
     """
 
-    settings: QualitySettings = field(default_factory=QualitySettings)
+    config: QualityConfig = field(default_factory=QualityConfig)
     representations: Sequence[str] = ("vertices",)
     scans: Path | None = None
     unseen: Path | None = None
@@ -63,7 +63,7 @@ class _Target:
 
     name: str
     what: ShapeModel | Sequence[Mesh]
-    settings: QualitySettings
+    config: QualityConfig
     unit_ratios: Mapping[str, float] = field(default_factory=dict[str, float])
     """Of meshes by their names without endings, as of `CorrespondRecord`."""
 
@@ -128,7 +128,7 @@ def _targets(paths: Sequence[Path], options: QualityOptions, notes: list[str], *
     names = list(options.representations)
     if len(paths) > _MOST_TARGETS or len(names) > _MOST_TARGETS:
         raise InputError("At most two targets or representations are compared; give one or two.")
-    gauge = options.settings.gauge if options.settings.align else "form"
+    gauge = options.config.gauge if options.config.align else "form"
     loaded: list[tuple[ShapeModel | list[Mesh], dict[str, float]]] = [
         (ShapeModel.load(p), {}) if not p.is_dir() and looks_like_model(p) else _meshes(p, notes, gauge, quiet=quiet)
         for p in paths
@@ -140,16 +140,16 @@ def _targets(paths: Sequence[Path], options: QualityOptions, notes: list[str], *
     out: list[_Target] = []
     for k, name in pairs:
         called = f"{paths[k]}, {name}" if several else str(paths[k])
-        out.append(_Target(called, loaded[k][0], _of_representation(options.settings, name, names), loaded[k][1]))
+        out.append(_Target(called, loaded[k][0], _of_representation(options.config, name, names), loaded[k][1]))
     if len(out) == _MOST_TARGETS and not any(isinstance(target.what, ShapeModel) for target in out):
         _refuse_unlike(out)
     return out
 
 
-def _of_representation(settings: QualitySettings, name: str, names: Sequence[str]) -> QualitySettings:
-    """Return the settings of one representation; control points belong to B-splines, where one is among them."""
+def _of_representation(config: QualityConfig, name: str, names: Sequence[str]) -> QualityConfig:
+    """Return the configuration of one representation; control points belong to B-splines, where one is among them."""
     splines = name != "vertices" or set(names) == {"vertices"}
-    return replace(settings, representation=name, control_points=settings.control_points if splines else None)
+    return replace(config, representation=name, control_points=config.control_points if splines else None)
 
 
 def _refuse_unlike(targets: Sequence[_Target]) -> None:
@@ -221,7 +221,7 @@ def _measure(target: _Target, options: QualityOptions, run: Runner, *, quiet: bo
     unseen = [] if options.unseen is None else _meshes(options.unseen, [], "shape", quiet=quiet)[0]
     scans = _scans(target, options.scans, quiet=quiet)
     with steps(None, f"measuring {target.name}, in", "step", quiet=quiet) as step:
-        return measure_quality(target.what, target.settings, scans=scans, unseen=unseen, on_step=step, run=run)
+        return measure_quality(target.what, target.config, scans=scans, unseen=unseen, progress=step, run=run)
 
 
 def _missing(target: _Target, found: ModelQuality) -> str:
@@ -262,7 +262,7 @@ def _as_quality(target: _Target, found: ModelQuality, options: QualityOptions) -
         supported_modes=found.supported_modes,
         sentences=found.sentences(),
         settings={
-            **asdict(target.settings),
+            **asdict(target.config),
             "folds": found.folds,
             "shapes": found.shapes,
             "points": found.points,

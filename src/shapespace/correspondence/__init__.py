@@ -2,3 +2,27 @@
 
 Entry point: `groupwise.correspond`. Imported by `batch`, `report` and above.
 """
+
+from typing import TYPE_CHECKING
+
+from shapespace.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
+    from shapespace.correspondence.groupwise import correspond
+    from shapespace.correspondence.settings import CorrespondConfig
+
+__all__ = [
+    "CorrespondConfig",
+    "Correspondence",
+    "Corresponding",
+    "correspond",
+]
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "correspondence.correspondence_result": ("Correspondence", "Corresponding"),
+        "correspondence.groupwise": ("correspond",),
+        "correspondence.settings": ("CorrespondConfig",),
+    },
+)

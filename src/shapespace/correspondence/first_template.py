@@ -9,7 +9,7 @@ import numpy as np
 
 from shapespace.correspondence.landmark_guide import contradicts_most, without_stray_landmarks
 from shapespace.correspondence.scan_set import copies
-from shapespace.correspondence.settings import FEWEST, SIZE, CorrespondSettings
+from shapespace.correspondence.settings import FEWEST, SIZE, CorrespondConfig
 from shapespace.correspondence.template import check_template, choose_template, clean_scan, resample
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.doctor import repair
@@ -40,7 +40,7 @@ class FirstTemplate:
 def first_template(
     scans: Sequence[Mesh],
     template: Mesh | None,
-    settings: CorrespondSettings,
+    config: CorrespondConfig,
     model: ShapeModel | None = None,
 ) -> FirstTemplate:
     """Return the input of the first round: `template` as it is, the mean of `model`, or the scan nearest to the others.
@@ -51,8 +51,8 @@ def first_template(
     """
     if len(scans) < FEWEST:
         raise InputError(f"A correspondence needs at least {FEWEST} scans, not {len(scans)}; give more.")
-    if not 0 < settings.landmark_uncertainty < np.inf:
-        raise InputError(f"Landmarks have an uncertainty above 0, not {settings.landmark_uncertainty}; give another.")
+    if not 0 < config.landmark_uncertainty < np.inf:
+        raise InputError(f"Landmarks have an uncertainty above 0, not {config.landmark_uncertainty}; give another.")
     if template is not None and model is not None:
         raise InputError("Both a template and a model are given, and the model's mean is a template; leave one out.")
     repaired, broken = _repaired(scans)
@@ -66,11 +66,11 @@ def first_template(
         mesh = without_stray_landmarks(check_template(template))
         origin = f"{template.name} was given as the template."
     else:
-        mesh, origin = _chosen_scan(repaired, settings)
+        mesh, origin = _chosen_scan(repaired, config)
     scale = SIZE / rms_size(mesh.vertices)
     T = Similarity(scale, np.eye(3), -scale * mesh.vertices.mean(axis=0))
     mesh = mesh.with_vertices(T.apply(mesh.vertices), {name: T.apply(point) for name, point in mesh.landmarks.items()})
-    if contradicts_most(mesh, repaired.values(), settings.landmark_uncertainty):
+    if contradicts_most(mesh, repaired.values(), config.landmark_uncertainty):
         mesh = mesh.with_vertices(mesh.vertices, {})
         origin += " Its landmarks contradict those of most scans, so the first round goes without them."
     return FirstTemplate(mesh, origin, repaired, broken, None if model is None else _transformed(model, T))
@@ -93,11 +93,11 @@ def _mean_of(model: ShapeModel) -> Mesh:
     return Mesh(model.mean_vertices, model.faces, model.landmarks.positions(model.mean_vertices), "mean")
 
 
-def _chosen_scan(scans: Mapping[int, Mesh], settings: CorrespondSettings) -> tuple[Mesh, str]:
+def _chosen_scan(scans: Mapping[int, Mesh], config: CorrespondConfig) -> tuple[Mesh, str]:
     """Return the scan nearest to the others, meshed evenly, and why it is that one."""
-    choice = choose_template(list(scans.values()), settings.seed)
+    choice = choose_template(list(scans.values()), config.seed)
     chosen = scans[list(scans)[choice.index]]
-    mesh = resample(clean_scan(chosen), settings.vertices)
+    mesh = resample(clean_scan(chosen), config.vertices)
     origin = (
         f"{chosen.name} is the first template: of {np.isfinite(choice.nearness).sum()} candidates it lies nearest "
         f"to the others, {100 * choice.nearness[choice.index]:.1f} % of its size off after a smooth change."

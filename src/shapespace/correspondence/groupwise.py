@@ -24,7 +24,7 @@ from shapespace.correspondence.landmark_guide import ScanLandmarks, consensus_la
 from shapespace.correspondence.mirror_image import MirrorMap
 from shapespace.correspondence.place import RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.scan_set import unit_ratios
-from shapespace.correspondence.settings import FEWEST, SIZE, CorrespondSettings
+from shapespace.correspondence.settings import FEWEST, SIZE, CorrespondConfig
 from shapespace.correspondence.template import PoseModel
 from shapespace.errors import InputError
 from shapespace.geometry.landmark_placement import place_landmarks
@@ -61,7 +61,7 @@ def run_here(context: RoundContext, tasks: Sequence[RegistrationTask]) -> Iterab
 
 def correspond(
     scans: Sequence[Mesh],
-    settings: CorrespondSettings | None = None,
+    config: CorrespondConfig | None = None,
     *,
     template: Mesh | None = None,
     model: ShapeModel | None = None,
@@ -72,7 +72,7 @@ def correspond(
 
     Args:
         scans: of one kind of object; landmarks that they have are soft constraints, but for those far off the scan.
-        settings: how.
+        config: how.
         template: the surface of the first round, used as it is; None chooses a scan and meshes it evenly.
         model: of such objects; its mean is the template, and the first round begins at its fit to each scan.
         first: the result of `first_template` for these scans, where it was called already.
@@ -83,14 +83,14 @@ def correspond(
         MeshError: no scan can be a template, or the template is none.
     """
     scans = list(as_meshes(scans, "correspond"))
-    settings = settings or CorrespondSettings()
-    first = first or first_template(scans, template, settings, model)
-    problem = _Problem.of([scan.name for scan in scans], first, settings)
+    config = config or CorrespondConfig()
+    first = first or first_template(scans, template, config, model)
+    problem = _Problem.of([scan.name for scan in scans], first, config)
     state = _initial_state(problem)
-    for _ in range(settings.rounds):
+    for _ in range(config.rounds):
         registrations = run(_context(problem, state), [_task(problem, state, i) for i in problem.first.repaired])
         state = _next_state(problem, state, registrations)
-        if state.rounds[-1].moved < settings.settled:  # C17
+        if state.rounds[-1].moved < config.settled:  # C17
             break
     return _result(problem, state)
 
@@ -102,26 +102,26 @@ class _Problem:
     Args:
         names: of all scans, also of those that cannot be used.
         first: the first template, and the scans that can be used.
-        settings: of the correspondence.
+        config: of the correspondence.
         harmonics: of the first template, used on every later one.
         mirror: of the first template; None if the object is not symmetric.
     """
 
     names: Sequence[str]
     first: FirstTemplate
-    settings: CorrespondSettings
+    config: CorrespondConfig
     harmonics: Harmonics
     mirror: MirrorMap | None
 
     @staticmethod
-    def of(names: Sequence[str], first: FirstTemplate, settings: CorrespondSettings) -> _Problem:
-        harmonics = Harmonics.of(first.mesh, settings.first.harmonics)
-        mirror = MirrorMap.of(first.mesh, harmonics, settings.first, settings.seed) if settings.symmetric else None
-        return _Problem(names, first, settings, harmonics, mirror)
+    def of(names: Sequence[str], first: FirstTemplate, config: CorrespondConfig) -> _Problem:
+        harmonics = Harmonics.of(first.mesh, config.first.harmonics)
+        mirror = MirrorMap.of(first.mesh, harmonics, config.first, config.seed) if config.symmetric else None
+        return _Problem(names, first, config, harmonics, mirror)
 
     def landmarks(self, places: SurfaceLandmarks, i: int) -> ScanLandmarks | None:
         """Return the landmarks of scan `i` that the template has at `places`."""
-        return ScanLandmarks.shared(places, self.first.repaired[i], self.settings.landmark_uncertainty)
+        return ScanLandmarks.shared(places, self.first.repaired[i], self.config.landmark_uncertainty)
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ def _initial_state(problem: _Problem) -> RegistrationState:
 
 def _context(problem: _Problem, state: RegistrationState) -> RoundContext:
     """Return what the tasks of the next round share."""
-    order, seed = sorted(state.registrations), problem.settings.seed
+    order, seed = sorted(state.registrations), problem.config.seed
     if len(order) < ENOUGH_TO_JUDGE:
         guide = None if state.registrations else problem.first.guide
         pose_model = PoseModel.of(state.template) if guide is None else PoseModel(guide)
@@ -192,13 +192,13 @@ def _part(i: int) -> int:
 
 def _task(problem: _Problem, state: RegistrationState, i: int) -> RegistrationTask:
     """Return the task of scan `i` in the next round; an excluded scan is searched for in all poses."""
-    known, settings = i in state.registrations, problem.settings
+    known, config = i in state.registrations, problem.config
     return RegistrationTask(
         index=i,
         scan=problem.first.repaired[i],
         T_scan_template=_pose_with_usual_size(state, i) if known else None,
         expected=state.predictions.get(i) if known else None,
-        settings=settings.next if known else settings.first,
+        settings=config.next if known else config.first,
         pose_model=_part(i) if len(state.registrations) >= ENOUGH_TO_JUDGE else 0,
         landmarks=problem.landmarks(state.landmarks, i),
     )
@@ -255,28 +255,28 @@ def _accept(problem: _Problem, previous: RegistrationState, ended: Sequence[Scan
     excluded = dict(problem.first.broken)
     for registration in ended:
         i = registration.index
-        if reason := _exclusion_reason(problem.settings, registration, first=i not in previous.registrations):
+        if reason := _exclusion_reason(problem.config, registration, first=i not in previous.registrations):
             excluded[i] = reason
         else:
             registrations[i] = registration
     return replace(previous, registrations=registrations, excluded=excluded)
 
 
-def _exclusion_reason(settings: CorrespondSettings, registration: ScanRegistration, *, first: bool) -> str:
+def _exclusion_reason(config: CorrespondConfig, registration: ScanRegistration, *, first: bool) -> str:
     """Return why a registration is not used; empty if it is. `first`: its pose was searched for in this round."""
     if registration.reason:
         return registration.reason
-    if first and not settings.symmetric and registration.mirror_ratio < _MIRRORED:
+    if first and not config.symmetric and registration.mirror_ratio < _MIRRORED:
         return (
             f"mirrored: its mirror image lies {registration.mirror_ratio:.2f} times as far from the template as "
             "itself; turn it over, or do such scans on their own"
         )
-    if registration.covered < settings.fewest_covered:
+    if registration.covered < config.fewest_covered:
         return (
             f"surface not reached: the template covers {100 * registration.covered:.0f} % of it; another object, or "
             f"one with much beside it{_wrong_names(registration)}"
         )
-    if registration.observed.mean() < settings.fewest_seen:
+    if registration.observed.mean() < config.fewest_seen:
         return f"half missing: it shows {100 * registration.observed.mean():.0f} % of the template"
     return ""
 
@@ -290,10 +290,10 @@ def _exclude_outliers(problem: _Problem, state: RegistrationState, order: Sequen
     """Exclude the scans in `order` that are far from their leave-one-out prediction."""
     if len(order) < ENOUGH_TO_JUDGE:
         return state
-    settings = problem.settings
+    config = problem.config
     shapes, observed = state.shapes(order)
     shapes, _ = align_to_weighted_mean(shapes, observed, state.template.vertices)
-    predicted = predict_leave_one_out(shapes, observed, settings.noise_share)
+    predicted = predict_leave_one_out(shapes, observed, config.noise_share)
     squares = ((shapes - predicted) ** 2).sum(axis=2)
     rms = np.sqrt((observed * squares).sum(axis=1) / np.maximum(observed.sum(axis=1), 1))  # C14
     median = float(np.median(rms))
@@ -301,7 +301,7 @@ def _exclude_outliers(problem: _Problem, state: RegistrationState, order: Sequen
         i: f"another object, or wrongly placed: {distance / median:.1f} times as far as usual from its leave-one-out "
         f"prediction{_wrong_names(state.registrations[i])}"
         for i, distance in zip(order, rms, strict=True)
-        if distance > settings.outlier_threshold * median  # C14
+        if distance > config.outlier_threshold * median  # C14
     }
     registrations = {i: one for i, one in state.registrations.items() if i not in outliers}
     return replace(state, registrations=registrations, excluded={**state.excluded, **outliers})
@@ -314,7 +314,7 @@ def _resolve_alternatives(problem: _Problem, state: RegistrationState) -> Regist
         return state
     shapes, observed = state.shapes(sure)
     shapes, _ = align_to_weighted_mean(shapes, observed, state.template.vertices)
-    predictor = ShapePredictor.of(shapes, problem.settings.noise_share)
+    predictor = ShapePredictor.of(shapes, problem.config.noise_share)
 
     def best(registration: ScanRegistration) -> ScanRegistration:
         if not registration.alternatives:
@@ -346,8 +346,8 @@ def _update_template(
         before = previous.registrations[i].vertices if known else previous.template.vertices
         squares[i] = float(((fit_similarity(before, shape).apply(before) - shape) ** 2).sum(axis=1).mean())
     predictions = state.predictions
-    if problem.settings.guided and len(order) >= _ENOUGH_TO_PREDICT:
-        predicted = predict_leave_one_out(shapes, observed, problem.settings.noise_share, images)
+    if problem.config.guided and len(order) >= _ENOUGH_TO_PREDICT:
+        predicted = predict_leave_one_out(shapes, observed, problem.config.noise_share, images)
         predictions = dict(zip(order, predicted, strict=True))
     template = Mesh(mean, state.template.faces, name=state.template.name)
     record = RoundRecord(

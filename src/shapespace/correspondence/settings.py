@@ -12,8 +12,8 @@ FEWEST = 2
 """Scans in a correspondence, and scans that must observe a vertex for it to be estimated where it is missing."""
 
 
-@dataclass(frozen=True)
-class CorrespondSettings:
+@dataclass(frozen=True, kw_only=True)
+class CorrespondConfig:
     """How scans are brought into correspondence; lengths are shares of the object's size (RMS from its centroid).
 
     Args:

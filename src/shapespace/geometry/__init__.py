@@ -2,3 +2,32 @@
 
 Entry points: `closest`, `procrustes`, `doctor`, `distance`. Imported by every layer above, never by `io`.
 """
+
+from typing import TYPE_CHECKING
+
+from shapespace.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from shapespace.geometry.distance import SurfaceDistances, surface_distances
+    from shapespace.geometry.landmark_placement import place_landmarks
+    from shapespace.geometry.volume_surface import VolumeSurface, surface_of_volume
+    from shapespace.types import Similarity, SurfaceLandmarks
+
+__all__ = [
+    "Similarity",
+    "SurfaceDistances",
+    "SurfaceLandmarks",
+    "VolumeSurface",
+    "place_landmarks",
+    "surface_distances",
+    "surface_of_volume",
+]
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "geometry.distance": ("SurfaceDistances", "surface_distances"),
+        "geometry.landmark_placement": ("place_landmarks",),
+        "geometry.volume_surface": ("VolumeSurface", "surface_of_volume"),
+        "types": ("Similarity", "SurfaceLandmarks"),
+    },
+)

@@ -112,7 +112,7 @@ def surface_of_volume(
             `smooth`.
         ShapespaceError: the extra `volumes` is not installed.
     """
-    require(volume, LabelVolume, "surface_of_volume", "read one with shapespace.read_volume")
+    require(volume, LabelVolume, "surface_of_volume", "read one with shapespace.io.read_volume")
     if not 0 <= smooth <= MOST_SMOOTH:
         raise InputError(f"The smoothing must be from 0 to {MOST_SMOOTH:g} voxels, not {smooth}.")
     chosen = _chosen(volume, labels)

@@ -3,3 +3,34 @@
 Entry points: `meshes.mesh_io`, `landmarks.landmark_io`, `volumes.volume_io`, `tables.table_io`, `interop`. Imported by
 every layer above; knows no model.
 """
+
+from typing import TYPE_CHECKING
+
+from shapespace.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from shapespace.io.interop import as_mesh
+    from shapespace.io.landmarks.landmark_io import read_landmarks, write_landmarks
+    from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
+    from shapespace.io.volumes.volume_io import read_volume
+    from shapespace.types import LabelVolume
+
+__all__ = [
+    "LabelVolume",
+    "as_mesh",
+    "read_landmarks",
+    "read_mesh",
+    "read_volume",
+    "write_landmarks",
+    "write_mesh",
+]
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "io.interop": ("as_mesh",),
+        "io.landmarks.landmark_io": ("read_landmarks", "write_landmarks"),
+        "io.meshes.mesh_io": ("read_mesh", "write_mesh"),
+        "io.volumes.volume_io": ("read_volume",),
+        "types": ("LabelVolume",),
+    },
+)

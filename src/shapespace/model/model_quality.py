@@ -12,7 +12,7 @@ second does not see it at all.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
 
@@ -29,6 +29,7 @@ from shapespace.model.missing import MIN_SEEN, ObservedMeshes
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import short_repr
+from shapespace.step_counter import StepCounter
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity, common_faces, require_whole
 
 if TYPE_CHECKING:
@@ -181,8 +182,8 @@ class ModelQuality:
         return out
 
 
-@dataclass(frozen=True)
-class QualitySettings:
+@dataclass(frozen=True, kw_only=True)
+class QualityConfig:
     """How quality is measured.
 
     Args:
@@ -312,23 +313,23 @@ class Shapes:
     Args:
         meshes: at least three, in correspondence.
         scans: one a mesh, or None for the meshes themselves.
-        settings: of the measurement.
+        config: of the measurement.
     """
 
     meshes: Sequence[Mesh]
     scans: Sequence[Mesh] | None
-    settings: QualitySettings
+    config: QualityConfig
 
     @cached_property
     def folds(self) -> list[IntArray]:
         """Numbers of the shapes in each fold."""
-        return _folds(len(self.meshes), self.settings)
+        return _folds(len(self.meshes), self.config)
 
     @cached_property
     def counts(self) -> IntArray:
         """Numbers of modes that are tried."""
         most = len(self.meshes) - max(len(fold) for fold in self.folds) - 1
-        return _counts(min(self.settings.modes or most, most))
+        return _counts(min(self.config.modes or most, most))
 
     @cached_property
     def few_counts(self) -> IntArray:
@@ -346,7 +347,7 @@ class Shapes:
     @cached_property
     def space(self) -> _Space:
         """The shape space of all."""
-        return self.settings.space(self.meshes)
+        return self.config.space(self.meshes)
 
     @cached_property
     def targets(self) -> list[_Target]:
@@ -361,21 +362,21 @@ class Shapes:
     @cached_property
     def drawn(self) -> FloatArray:
         """(S, K) coefficients of the random shapes."""
-        return self.space.model.sample(self.settings.samples, np.random.default_rng(self.settings.seed + 2))
+        return self.space.model.sample(self.config.samples, np.random.default_rng(self.config.seed + 2))
 
     @cached_property
     def nearest(self) -> _Nearest:
         """The training shapes in the pose of the model."""
-        return _Nearest.of(_posed(self.space.model, self.trained, self.settings), self.space.model.n_vertices)
+        return _Nearest.of(_posed(self.space.model, self.trained, self.config), self.space.model.n_vertices)
 
     def parts(self) -> list[Part]:
         """Return all parts of the work, in the order in which they are told."""
-        n, rng = len(self.meshes), np.random.default_rng(self.settings.seed + 1)
+        n, rng = len(self.meshes), np.random.default_rng(self.config.seed + 1)
         folds: list[Part] = []
         for fold in self.folds:
             order = tuple(int(i) for i in rng.permutation(n) if i not in fold)
             folds.append(Part(tuple(fold.tolist()), order))
-        samples = range(self.settings.samples)
+        samples = range(self.config.samples)
         return folds + [
             Part(drawn=tuple(samples[start : start + _DRAWN_AT_ONCE])) for start in samples[::_DRAWN_AT_ONCE]
         ]
@@ -390,13 +391,13 @@ class Shapes:
 
     def _left_out(self, part: Part) -> FloatArray:
         held = [self.targets[i] for i in part.held]
-        space = self.settings.space([self.meshes[i] for i in sorted(part.order)])
+        space = self.config.space([self.meshes[i] for i in sorted(part.order)])
         out = np.zeros((len(held), len(self.counts) + len(self.sizes), 2))
         for row, target in enumerate(held):
             out[row, : len(self.counts)] = _told(space.model, target.cut_to(space.kept), self.counts)
         for column, size in enumerate(self.sizes, len(self.counts)):
-            fewer = self.settings.space([self.meshes[i] for i in sorted(part.order[:size])])
-            only = np.array([min(self.settings.modes or size - 1, size - 1)], dtype=np.int32)
+            fewer = self.config.space([self.meshes[i] for i in sorted(part.order[:size])])
+            only = np.array([min(self.config.modes or size - 1, size - 1)], dtype=np.int32)
             for row, target in enumerate(held):
                 out[row, column] = _told(fewer.model, target.cut_to(fewer.kept), only, surface=False)[0]
         return out
@@ -425,27 +426,13 @@ def run_here(shapes: Shapes, parts: Sequence[Part]) -> Iterable[tuple[Part, Floa
     return ((part, shapes.do(part)) for part in parts)
 
 
-@dataclass
-class _Steps:
-    """Counts what is done for whoever waits."""
-
-    total: int
-    on_step: OnStep | None
-    done: int = field(default=0)
-
-    def step(self, count: int = 1) -> None:
-        self.done += count
-        if self.on_step is not None:
-            self.on_step(self.done, self.total)
-
-
 def measure_quality(
     target: Sequence[MeshLike] | ShapeModel,
-    settings: QualitySettings | None = None,
+    config: QualityConfig | None = None,
     *,
     scans: Sequence[MeshLike] | None = None,
     unseen: Sequence[MeshLike] = (),
-    on_step: OnStep | None = None,
+    progress: OnStep | None = None,
     run: Runner = run_here,
 ) -> ModelQuality:
     """Measure the shape space of meshes in correspondence, or as much of a model as it tells by itself.
@@ -453,17 +440,17 @@ def measure_quality(
     Args:
         target: at least three meshes, mm, or whatever else `as_mesh` takes; or a model, of which only compactness and
             the measures on `unseen` are available, since a model does not keep its training shapes.
-        settings: folds, modes, samples, seed, and what model to make; None for the usual ones.
+        config: folds, modes, samples, seed, and what model to make; None for the usual ones.
         scans: one a mesh, in its pose and unit, to judge surfaces against; None for the meshes themselves.
         unseen: meshes in correspondence that no model saw.
-        on_step: called with what is done and what there is to do.
+        progress: called with (steps done, in all).
         run: does folds and random shapes, here or elsewhere.
 
     Raises:
         CorrespondenceError: meshes differ in vertices or triangles.
         InputError: too few meshes, all equal, coordinates that are infinite, or scans that are not theirs.
     """
-    settings = settings or QualitySettings()
+    config = config or QualityConfig()
     meshes: Sequence[Mesh] = []
     if not isinstance(target, ShapeModel):
         meshes = _checked([without_estimates(mesh) for mesh in as_meshes(target, "measure_quality")])
@@ -475,60 +462,60 @@ def measure_quality(
     for mesh in new:
         _refuse_other(mesh, vertices)
     if isinstance(target, ShapeModel):
-        return _of_model(target, new, settings, on_step)
-    whole = representation_named(settings.representation, settings.control_points).takes_holes
+        return _of_model(target, new, config, progress)
+    whole = representation_named(config.representation, config.control_points).takes_holes
     kept = np.ones(vertices, dtype=np.bool_) if whole else ObservedMeshes.of(meshes, MIN_SEEN).vertices
     if not kept.all():
         meshes, new = [part_of(mesh, kept) for mesh in meshes], [part_of(mesh, kept) for mesh in new]
-    shapes = Shapes(meshes, scans, settings)
-    return _of_meshes(shapes, new, on_step, run, left_out=int((~kept).sum()))
+    shapes = Shapes(meshes, scans, config)
+    return _of_meshes(shapes, new, progress, run, left_out=int((~kept).sum()))
 
 
 def _of_model(
-    model: ShapeModel, unseen: Sequence[Mesh], settings: QualitySettings, on_step: OnStep | None
+    model: ShapeModel, unseen: Sequence[Mesh], config: QualityConfig, progress: OnStep | None
 ) -> ModelQuality:
-    counts = _counts(min(settings.modes or model.n_modes, model.n_modes))
+    counts = _counts(min(config.modes or model.n_modes, model.n_modes))
     share = model.cumulative_variance[counts - 1]
     space = _Space(model, np.ones(model.n_vertices, dtype=np.bool_))
-    of_unseen = _unseen(space, unseen, counts, settings, _Steps(len(unseen), on_step))
+    of_unseen = _unseen(space, unseen, counts, config, StepCounter(len(unseen), progress))
     return ModelQuality(
         Curve(counts, share, share, share),
         reconstruction=of_unseen[0],
         reconstruction_vertices=of_unseen[1],
         points=_points(model.n_vertices),
-        seed=settings.seed,
+        seed=config.seed,
     )
 
 
 def _of_meshes(
-    shapes: Shapes, unseen: Sequence[Mesh], on_step: OnStep | None, run: Runner, *, left_out: int
+    shapes: Shapes, unseen: Sequence[Mesh], progress: OnStep | None, run: Runner, *, left_out: int
 ) -> ModelQuality:
-    meshes, settings, counts, few = shapes.meshes, shapes.settings, shapes.counts, shapes.few_counts
-    steps = _Steps(len(meshes) + len(unseen) + settings.samples, on_step)
+    meshes, config, counts, few = shapes.meshes, shapes.config, shapes.counts, shapes.few_counts
+    steps = StepCounter(len(meshes) + len(unseen) + config.samples, progress)
     errors = np.zeros((len(meshes), len(counts) + len(shapes.sizes), 2))
-    drawn = np.zeros((settings.samples, len(few), 2))
+    drawn = np.zeros((config.samples, len(few), 2))
     for part, part_result in run(shapes, shapes.parts()):
         (errors if part.held else drawn)[list(part.held or part.drawn)] = part_result
-        steps.step(len(part_result))
-    general = _curves(errors[:, : len(counts)], counts, settings.seed)
-    specific = _curves(drawn, few, settings.seed)
+        steps.add(len(part_result))
+    general = _curves(errors[:, : len(counts)], counts, config.seed)
+    specific = _curves(drawn, few, config.seed)
     space = shapes.space
-    of_unseen = _unseen(space, unseen, counts, settings, steps)
+    of_unseen = _unseen(space, unseen, counts, config, steps)
     there = np.mean([len(target.seen) for target in shapes.targets]) / len(meshes[0].vertices)
     return ModelQuality(
-        _compactness(space.model, shapes.trained, counts, settings),
+        _compactness(space.model, shapes.trained, counts, config),
         generalisation=general[0],
         generalisation_vertices=general[1],
         specificity=specific[0],
         specificity_vertices=specific[1],
         reconstruction=of_unseen[0],
         reconstruction_vertices=of_unseen[1],
-        by_shapes=Curve.over(errors[:, len(counts) :, 0], shapes.sizes, settings.seed),
-        supported_modes=settings.space(meshes, "auto").model.n_modes if len(meshes) >= _FEWEST_TO_CHOOSE else None,
+        by_shapes=Curve.over(errors[:, len(counts) :, 0], shapes.sizes, config.seed),
+        supported_modes=config.space(meshes, "auto").model.n_modes if len(meshes) >= _FEWEST_TO_CHOOSE else None,
         shapes=len(meshes),
         folds=len(shapes.folds),
         points=_points(space.model.n_vertices),
-        seed=settings.seed,
+        seed=config.seed,
         missing_share=1.0 - float(there),
         left_out_vertices=left_out,
     )
@@ -560,12 +547,12 @@ def _curves(errors: FloatArray, counts: IntArray, seed: int) -> tuple[Curve, Cur
 
 
 def _unseen(
-    space: _Space, unseen: Sequence[Mesh], counts: IntArray, settings: QualitySettings, steps: _Steps
+    space: _Space, unseen: Sequence[Mesh], counts: IntArray, config: QualityConfig, steps: StepCounter
 ) -> tuple[Curve, Curve] | tuple[None, None]:
     if not unseen:
         return None, None
     errors = _over_shapes(space, [_Target.of(m, None) for m in unseen], counts, steps)
-    return _curves(errors, counts, settings.seed)
+    return _curves(errors, counts, config.seed)
 
 
 def _counts(most: int) -> IntArray:
@@ -574,9 +561,9 @@ def _counts(most: int) -> IntArray:
     return np.array(sorted(spaced), dtype=np.int32)
 
 
-def _folds(n: int, settings: QualitySettings) -> list[IntArray]:
-    folds = n if settings.folds is None else min(settings.folds, n)
-    order = np.random.default_rng(settings.seed).permutation(n).astype(np.int32)
+def _folds(n: int, config: QualityConfig) -> list[IntArray]:
+    folds = n if config.folds is None else min(config.folds, n)
+    order = np.random.default_rng(config.seed).permutation(n).astype(np.int32)
     return [np.asarray(part, dtype=np.int32) for part in np.array_split(order, folds)]
 
 
@@ -588,11 +575,11 @@ def _spread(vertices: int) -> IntArray:
     return np.unique(np.linspace(0, vertices - 1, _points(vertices)).round().astype(np.int32))
 
 
-def _over_shapes(space: _Space, targets: Sequence[_Target], counts: IntArray, steps: _Steps) -> FloatArray:
+def _over_shapes(space: _Space, targets: Sequence[_Target], counts: IntArray, steps: StepCounter) -> FloatArray:
     out = np.zeros((len(targets), len(counts), 2))
     for row, target in enumerate(targets):
         out[row] = _told(space.model, target.cut_to(space.kept), counts)
-        steps.step()
+        steps.add()
     return out
 
 
@@ -679,20 +666,20 @@ class _Nearest:
         return float(off.min()), min(_apart(drawn, self.targets[int(i)]) for i in nearest)
 
 
-def _posed(model: ShapeModel, targets: Sequence[_Target], settings: QualitySettings) -> list[Mesh]:
+def _posed(model: ShapeModel, targets: Sequence[_Target], config: QualityConfig) -> list[Mesh]:
     """Return the shapes in the pose and size of the model, by what is seen of them."""
     out: list[Mesh] = []
     for target in targets:
         shape = target.shape
-        if settings.align:
+        if config.align:
             shape = shape.with_vertices(_onto_mean(model, target).apply(shape.vertices))
         out.append(shape)
     return out
 
 
-def _compactness(model: ShapeModel, targets: Sequence[_Target], counts: IntArray, settings: QualitySettings) -> Curve:
+def _compactness(model: ShapeModel, targets: Sequence[_Target], counts: IntArray, config: QualityConfig) -> Curve:
     """Return the share of the variance that the first modes hold, its interval by jackknife over shapes."""
-    posed = [mesh.vertices for mesh in _posed(model, targets, settings)]
+    posed = [mesh.vertices for mesh in _posed(model, targets, config)]
     for i, target in enumerate(targets):
         if len(target.seen) < model.n_vertices:
             reconstructed = _in_best_pose(model, target, model.n_modes, _onto_mean(model, target))[0]

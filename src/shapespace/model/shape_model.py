@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -16,35 +15,22 @@ import numpy.typing as npt
 
 from shapespace.errors import CorrespondenceError, InputError, ModelFileError
 from shapespace.formats.model_parts import LinearModel
-from shapespace.geometry.normals import without_estimates
-from shapespace.geometry.procrustes import Gauge, align_in_place, scale_to_tangent
+from shapespace.geometry.procrustes import Gauge
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.io.interop import MeshLike, as_meshes
+from shapespace.io.interop import MeshLike
 from shapespace.lazy import OpenViewer, lazy_import
 from shapespace.model import model_file
-from shapespace.model.choose_modes import choose_modes
+from shapespace.model.build_config import BuildConfig
 from shapespace.model.foreign import Foreign, as_linear, is_foreign, load_foreign
-from shapespace.model.holes import fill_holes
-from shapespace.model.missing import MIN_SEEN, CompletedShapes, ObservedMeshes, complete
-from shapespace.model.pca import PrincipalComponents, principal_components
-from shapespace.model.representation import REPRESENTATIONS, Representation, Vertices, representation_named
-from shapespace.model.spurious import below_precision, made_by_alignment, rounding_mm
-from shapespace.model.streamed import (
-    Aligned,
-    KeptShapes,
-    Meshes,
-    Scratch,
-    Tell,
-    aligned_on_disk,
-    bytes_in_memory,
-    refuse_without_extent,
-    too_large,
-)
+from shapespace.model.missing import MIN_SEEN
+from shapespace.model.representation import REPRESENTATIONS, Representation
 from shapespace.reprs import short_repr
-from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks, common_faces, read_only, require_path
+from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks, read_only, require_path
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from shapespace.model.streamed import Meshes, Scratch, Tell
 
 _PROJECTION_ITERATIONS = 200
 _PROJECTION_TOLERANCE = 1e-10
@@ -180,94 +166,27 @@ class ShapeModel:
         out_of_core: bool | None = None,
         scratch: Scratch | None = None,
         keep_shapes: Path | None = None,
-        tell: Tell = lambda _: None,
+        tell: Tell | None = None,
     ) -> ShapeModel:
-        """Build the shape space of corresponding `meshes` (P1-P5), in mm.
+        """Build a model of meshes in correspondence, mm (P1-P5); short for `build_model`.
 
-        Args:
-            meshes: at least two, same vertices in the same order, same triangles: a list, or anything with a length
-                and items that loads a mesh when it is accessed. Items are anything that `as_mesh` takes: meshes, paths,
-                arrays (V, 3) of points, or objects of other tools. Vertices that are not-a-number or not
-                observed are missing: a model of vertices learns from the others, one of B-splines from filled ones.
-            modes: a number; a float below 1 for a share of the variance; "auto" for cross-validation on held-out
-                vertices; None for every mode that varies.
-            gauge: `form` aligns rigidly and leaves size in the modes; `shape` divides size out.
-            align: False takes the meshes as they stand.
-            alignment_vertices: indices that carry the alignment, such as forehead and nose when expressions vary.
-            landmarks: of the model: named points on the surface (`place_landmarks`), or name -> vertex.
-            representation: `vertices`; `bspline`, control points of a smooth surface; `bspline-detail`, the same
-                with what the spline cannot hold of the mean added to every shape.
-            control_points: along u and v of a B-spline; None for 24 each.
-            min_seen: share of the meshes that must show a vertex; others are taken out of a model of vertices, with
-                their triangles and landmarks. Where nothing is missing it does nothing.
-            provenance: what the meshes are, in words.
-            licence: of the meshes.
-            seed: of the cross-validation, and of the first directions where modes are found by passes.
-            out_of_core: whether to stream the meshes, each loaded once and not held, through a file of single
-                precision as large as they are: the same model but for that rounding, with `residuals`. None does so
-                where a model of vertices would need more than four fifths of the memory that is free.
-            scratch: for the file, and for what a build that is killed goes on with; None takes the system's folder
-                for temporary files and does not go on.
-            keep_shapes: a folder to keep that file in, for `with_more`; the meshes are then streamed.
-            tell: told what is being done while meshes are streamed.
-
-        Raises:
-            CorrespondenceError: the meshes differ in vertices or triangles.
-            MeshError: for B-splines: the surface cannot be spread out on a square.
-            InputError: too few meshes, values that are not finite, no variation, too many modes asked for, an unknown
-                representation, control points that cannot be; streamed meshes with missing vertices, or for B-splines.
-            FileError: the disk has no room for the file.
+        The arguments are those of `build_model` and the fields of `BuildConfig`.
         """
-        meshes = as_meshes(meshes, "ShapeModel.fit")
-        kind = representation_named(representation, control_points)
-        if kind is not Vertices and (out_of_core or keep_shapes is not None):
-            raise InputError("Only models of vertices can be made of streamed meshes; leave --representation out.")
-        if out_of_core is None and kind is Vertices and len(meshes) > 1:
-            out_of_core = too_large(bytes_in_memory(len(meshes), meshes[0], choose=modes == "auto"))
-        if out_of_core or keep_shapes is not None:
-            stream = aligned_on_disk(
-                meshes,
-                gauge,
-                align=align,
-                alignment_vertices=alignment_vertices,
-                scratch=scratch,
-                onto=None,
-                modes=modes,
-                tell=tell,
-            )
-            if len(meshes):
-                SurfaceLandmarks.of(landmarks or {}).check(len(meshes[0].vertices))
-            about = {"landmarks": landmarks or {}, "provenance": provenance, "licence": licence}
-            return cls._of_streamed(stream, modes, seed, keep_shapes, tell, about)
-        meshes = [without_estimates(meshes[index]) for index in range(len(meshes))]
-        faces = common_faces(meshes)
-        if not kind.takes_holes and len(meshes) > 1:
-            observed = ObservedMeshes.of(meshes, min_seen)
-            meshes, landmarks = observed.meshes, observed.landmarks(landmarks or {})
-            faces, alignment_vertices = meshes[0].faces, observed.indices(alignment_vertices)
-        shapes, names = _training_shapes(meshes, faces, fill=kind.takes_holes), [mesh.name for mesh in meshes]
-        rounding = rounding_mm(np.nan_to_num(meshes[0].vertices, posinf=0.0, neginf=0.0))
-        shapes, completed = _aligned(shapes, names, gauge, align=align, alignment_vertices=alignment_vertices)
-        coder = kind.of(Mesh(shapes.mean(axis=0), faces, name="The mean of the meshes"), control_points)
-        if completed is not None:
-            pc = completed.components(modes, seed)
-        elif isinstance(coder, Vertices):
-            pc = _components(coder.encode(shapes), modes, seed)
-        else:
-            pc = _components_of_codes(coder, shapes, modes, seed)
-        return cls._of_components(
-            pc,
-            coder,
-            rounding=rounding,
+        config = BuildConfig(
+            modes=modes,
+            gauge=gauge,
             align=align,
             alignment_vertices=alignment_vertices,
-            faces=faces,
-            gauge=gauge,
-            landmarks=landmarks or {},
+            landmarks=landmarks,
             representation=representation,
+            control_points=control_points,
+            min_seen=min_seen,
             provenance=provenance,
             licence=licence,
+            seed=seed,
+            out_of_core=out_of_core,
         )
+        return lazy_import("build_model")(meshes, config, scratch=scratch, keep_shapes=keep_shapes, log=tell)
 
     def with_more(
         self,
@@ -280,113 +199,12 @@ class ShapeModel:
         seed: int = 0,
         scratch: Scratch | None = None,
         keep_shapes: Path | None = None,
-        tell: Tell = lambda _: None,
+        tell: Tell | None = None,
     ) -> ShapeModel:
-        """Return the model of the shapes that this one was made of and of `meshes`, without the first ones' meshes.
-
-        It is the model that `fit` makes of all of them, but for rounding to single precision: all shapes are aligned
-        anew, beginning from the poses that are known.
-
-        Args:
-            meshes: at least one, corresponding to the model.
-            shapes: the folder that `fit` was given as `keep_shapes`.
-            modes: as of `fit`.
-            provenance: of the new model; empty for that of this one.
-            licence: the same.
-            seed: as of `fit`.
-            scratch: as of `fit`.
-            keep_shapes: a folder to keep all shapes in, other than `shapes`.
-            tell: as of `fit`.
-
-        Raises:
-            CorrespondenceError: a mesh differs from the model in vertices or triangles.
-            InputError: shapes of another model, or what `fit` refuses.
-            FileError: there are no shapes, or the disk is full.
-        """
-        training = KeptShapes.load(shapes)
-        if training.model_hash != self.content_hash:
-            raise InputError(
-                f"The shapes in {shapes} are those of another model; give the model that was built with them."
-            )
-        if not len(meshes):
-            raise InputError("There are no meshes to be added; give at least one.")
-        training.check()
-        stream = aligned_on_disk(
-            meshes,
-            training.gauge,
-            align=training.align,
-            alignment_vertices=training.alignment_vertices,
-            scratch=scratch,
-            onto=training,
-            modes=modes,
-            tell=tell,
-        )
-        about = {
-            "landmarks": self.landmarks,
-            "provenance": provenance or self.provenance,
-            "licence": licence or self.licence,
-        }
-        return self._of_streamed(stream, modes, seed, keep_shapes, tell, about)
-
-    @classmethod
-    def _of_streamed(
-        cls,
-        stream: AbstractContextManager[Aligned],
-        modes: int | float | Literal["auto"] | None,
-        seed: int,
-        keep_shapes: Path | None,
-        tell: Tell,
-        about: Mapping[str, Any],
-    ) -> ShapeModel:
-        with stream as aligned:
-            training = aligned.kept
-            model = cls._of_components(
-                aligned.components(modes, seed, tell),
-                Vertices(),
-                rounding=training.rounding,
-                align=training.align,
-                alignment_vertices=training.alignment_vertices,
-                faces=training.faces,
-                gauge=training.gauge,
-                **about,
-            )
-            if keep_shapes is not None:
-                aligned.keep(keep_shapes, model.content_hash)
-        return model
-
-    @classmethod
-    def _of_components(
-        cls,
-        pc: PrincipalComponents,
-        coder: Representation,
-        *,
-        rounding: float,
-        align: bool,
-        alignment_vertices: IntArray | None,
-        gauge: Gauge,
-        **about: Any,
-    ) -> ShapeModel:
-        """Return the model of these components, without modes that no shape made."""
-        mean = coder.decode(pc.mean)
-        spurious = below_precision(pc.variance, pc.n_samples, mean.size, rounding)
-        if align:
-            spurious |= made_by_alignment(mean, coder.directions(pc.basis), gauge, alignment_vertices)
-        if spurious.all():
-            raise InputError(
-                "The training meshes differ by no more than their alignment and their rounding make of them, so there "
-                "is no variation to model; give different ones."
-            )
-        return cls(
-            mean=pc.mean,
-            basis=pc.basis[:, ~spurious],
-            stddev=np.sqrt(pc.variance[~spurious]),
-            residuals=None if pc.residuals is None else pc.residuals[~spurious],
-            left_out=int(spurious.sum()),
-            total_variance=pc.total_variance,
-            n_training=pc.n_samples,
-            gauge=gauge,
-            coding=coder.arrays(),
-            **about,
+        """Return the model of the shapes that this one was made of and of `meshes`; see `build_model.extend_model`."""
+        config = BuildConfig(modes=modes, provenance=provenance, licence=licence, seed=seed)
+        return lazy_import("extend_model")(
+            self, meshes, shapes, config, scratch=scratch, keep_shapes=keep_shapes, log=tell
         )
 
     @cached_property
@@ -638,52 +456,6 @@ class ShapeModel:
         return array
 
 
-def _aligned(
-    shapes: FloatArray, names: Sequence[str], gauge: Gauge, *, align: bool, alignment_vertices: IntArray | None
-) -> tuple[FloatArray, CompletedShapes | None]:
-    """Return the training shapes (N, V, 3) aligned and complete, and how they were completed; `shapes` is overwritten.
-
-    Raises:
-        InputError: a shape has no extent, or too little of it is observed.
-    """
-    if align:
-        for shape, name in zip(shapes, names, strict=True):
-            refuse_without_extent(shape, name)
-    if np.isnan(shapes).any():
-        completed = complete(shapes, names, gauge, align=align, alignment_vertices=alignment_vertices)
-        return completed.shapes, completed
-    if align:
-        align_in_place(shapes, gauge, alignment_vertices=alignment_vertices)
-        # Where only some vertices carried the alignment, the size of the others is shape.
-        if gauge == "shape" and alignment_vertices is None:
-            scale_to_tangent(shapes)
-    return shapes, None
-
-
-def _components(data: FloatArray, modes: int | float | Literal["auto"] | None, seed: int) -> PrincipalComponents:
-    return principal_components(data, choose_modes(data, seed=seed).modes if modes == "auto" else modes)
-
-
-def _components_of_codes(
-    coder: Representation, shapes: FloatArray, modes: int | float | Literal["auto"] | None, seed: int
-) -> PrincipalComponents:
-    """Return mean and basis in codes, orthonormal in the vertices that they decode to; `shapes` is overwritten.
-
-    What coding loses counts as variance that the modes leave over.
-    """
-    centre = shapes.mean(axis=0)
-    total = sum(float(((shape - centre) ** 2).sum()) for shape in shapes) / (len(shapes) - 1)
-    codes = coder.encode(shapes)
-    for shape, code in zip(shapes, codes, strict=True):
-        shape[:] = coder.decode(code)
-    data = shapes.reshape(len(shapes), -1)
-    pc = _components(data, modes, seed)
-    # Modes are sums of the training shapes, and the same sums of their codes decode to them.
-    shares = (data @ pc.basis - pc.mean @ pc.basis) / (pc.variance * (len(data) - 1))
-    mean = codes.mean(axis=0)
-    return PrincipalComponents(mean, (codes - mean).T @ shares, pc.variance, total, pc.n_samples)
-
-
 def region_vertices(vertices: npt.ArrayLike, n_vertices: int, name: str) -> IntArray:
     """Return the vertices of a region, (n,) int32, each once, in order; `name` is what errors call it.
 
@@ -716,35 +488,3 @@ def _refuse_impossible(stddev: FloatArray, mean_vertices: FloatArray) -> None:
                 f"Mode {mode + 1} of the model has a standard deviation of {value:.1e} mm, which no shape of its size "
                 "can have; check its unit."
             )
-
-
-def _training_shapes(meshes: Sequence[Mesh], faces: IntArray | None, *, fill: bool) -> FloatArray:
-    """Return the vertices of training meshes, (N, V, 3), checked; `fill` says whether what is missing is filled."""
-    if len(meshes) < 2:
-        raise InputError(
-            f"A shape model needs at least two meshes, not {len(meshes)}; with one there is nothing that varies."
-        )
-    shapes = np.stack([mesh.vertices for mesh in meshes])
-    names = [mesh.name for mesh in meshes]
-    if fill and np.isnan(shapes).any():
-        _refuse_not_finite(np.where(np.isnan(shapes), 0.0, shapes), names)
-        fill_holes(shapes, faces, names)
-    _refuse_not_finite(np.nan_to_num(shapes, nan=0.0, posinf=np.inf, neginf=-np.inf) if not fill else shapes, names)
-    _refuse_equal(shapes)
-    return shapes
-
-
-def _refuse_not_finite(values: FloatArray, names: Sequence[str]) -> None:
-    finite = np.isfinite(values).all(axis=(1, 2))
-    if not finite.all():
-        raise InputError(
-            f"{names[int(np.argmin(finite))]} holds vertices that are not finite; see shapespace check, and repair it "
-            "or leave it out."
-        )
-
-
-def _refuse_equal(shapes: FloatArray) -> None:
-    """Refuse training shapes without extent or variation before alignment turns rounding into modes."""
-    spread = float((np.nanmax(shapes, axis=0) - np.nanmin(shapes, axis=0)).max())
-    if spread <= 64 * np.finfo(float).eps * float(np.nanmax(np.abs(shapes))):
-        raise InputError("The training meshes are all equal, so there is no variation to model; give different ones.")

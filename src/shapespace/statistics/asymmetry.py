@@ -29,6 +29,7 @@ from shapespace.statistics.analysis_result import AnalysisResult
 from shapespace.statistics.methods import methods_of
 from shapespace.statistics.observation_weights import weights_of
 from shapespace.statistics.sides import Sides, find_sides, given_sides
+from shapespace.step_counter import StepCounter
 from shapespace.types import BoolArray, FloatArray, Mesh, read_only, require
 
 ERROR_ASYMMETRIC, ERROR_SYMMETRIC = "measurement error, asymmetric", "measurement error, symmetric"
@@ -245,7 +246,7 @@ def measure_asymmetry(
     scores = _scores(along, who, _shared(cohort, sides, mean, told, who))
     vertex_scores = _scores(difference, who, _shared(cohort, sides, mean, own_difference, who))
     z, z_low, z_high = _standardised(scores, in_reference)
-    steps = _Steps(permutations, progress)
+    steps = _Steps(4 * permutations, progress)
     parts = symmetric, difference
     if normals is not None and not sides.paired:
         # Places nearest on the mean leave its sides no difference along the surface, which single shapes have.
@@ -283,19 +284,17 @@ def measure_asymmetry(
     )
 
 
-class _Steps:
-    """Counts permutations for whoever shows progress."""
+class _Steps(StepCounter):
+    """Permutations of the four tests."""
 
-    def __init__(self, permutations: int, progress: Callable[[int, int], None] | None) -> None:
-        self.each, self.done, self.progress = permutations, 0, progress
+    @property
+    def each(self) -> int:
+        """The number of permutations of one test."""
+        return self.total // 4
 
     def blocks(self) -> list[int]:
+        """Return the sizes of the blocks of permutations that are in memory at once."""
         return [min(_BLOCK, self.each - start) for start in range(0, self.each, _BLOCK)]
-
-    def add(self, count: int) -> None:
-        self.done += count
-        if self.progress is not None:
-            self.progress(self.done, 4 * self.each)
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,6 +29,7 @@ from shapespace.statistics.linear_regressors import (
 )
 from shapespace.statistics.methods import SCAN_OF_SUBJECT, methods_of
 from shapespace.statistics.predictor import Predictions, Predictor, cv_plus, model_hash_of
+from shapespace.step_counter import StepCounter
 from shapespace.types import FloatArray, Mesh, read_only, require
 
 FEWEST, SMALL = 10, 100
@@ -204,8 +205,8 @@ def regress(
     rng = np.random.default_rng(seed)
     outer = folds_of(codes, folds, rng)
     inner = [folds_of(codes[outer != fold], min(5, len(names) // 2), rng) for fold in range(folds)]
-    steps = _Steps(1 + -(-permutations // _BLOCK), folds, progress)
-    done = nested(X, y[:, None], share, outer, inner, on_fold=steps.fold)
+    steps = StepCounter((1 + -(-permutations // _BLOCK)) * folds, progress)
+    done = nested(X, y[:, None], share, outer, inner, on_fold=lambda _done, _folds: steps.add())
     predicted, baseline = done.predicted[:, 0], done.baseline[:, 0]
     low, high = _intervals(
         X=X, y=y, share=share, outer=outer, inner=inner, chosen=done.chosen[:, 0], confidence=confidence
@@ -301,18 +302,6 @@ def share_of(subjects: Sequence[str]) -> FloatArray:
     """Return (N,) the weight of each scan: 1 / the number of scans of its subject."""
     counts = Counter(subjects)
     return np.array([1.0 / counts[name] for name in subjects])
-
-
-class _Steps:
-    """Counts outer folds over all blocks of permutations."""
-
-    def __init__(self, blocks: int, folds: int, progress: Callable[[int, int], None] | None) -> None:
-        self.total, self.done, self.progress = blocks * folds, 0, progress
-
-    def fold(self, _done: int, _folds: int) -> None:
-        self.done += 1
-        if self.progress is not None:
-            self.progress(self.done, self.total)
 
 
 def _check_options(folds: int, permutations: int, draws: int, confidence: float, seed: int) -> None:
@@ -461,7 +450,7 @@ def _p_of(
     observed: float,
     permutations: int,
     rng: np.random.Generator,
-    steps: _Steps,
+    steps: StepCounter,
 ) -> float | None:
     """Return the share of permutations, that observed among them, whose R2 is at least as high, each with its own
     choice."""
@@ -470,7 +459,7 @@ def _p_of(
     beyond = 1
     for start in range(0, permutations, _BLOCK):
         targets = np.stack([_permuted(codes, y, rng) for _ in range(min(_BLOCK, permutations - start))], axis=1)
-        done = nested(X, targets, share, outer, inner, on_fold=steps.fold)
+        done = nested(X, targets, share, outer, inner, on_fold=lambda _done, _folds: steps.add())
         # S43
         r2 = 1.0 - (share @ (targets - done.predicted) ** 2) / (share @ (targets - done.baseline) ** 2)
         beyond += int((r2 >= observed - 1e-12).sum())

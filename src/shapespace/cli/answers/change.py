@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shapespace.cli.answers.common import cohort_of, finish
+from shapespace.cli.options import given
 
 if TYPE_CHECKING:
     from shapespace.types import SurfaceLandmarks
@@ -18,24 +19,14 @@ def run(arguments: argparse.Namespace) -> int:
     from shapespace.batch.progress import steps
     from shapespace.io.meshes.region_files import read_region
     from shapespace.report.analyses.change_report import change_report
-    from shapespace.statistics.change import change
     from shapespace.statistics.change_result import ChangeConfig
+    from shapespace.statistics.measure_change import change
 
     cohort = cohort_of(arguments, "form")
     if arguments.landmarks is not None:
         cohort = replace(cohort, landmarks=_landmarks(arguments.landmarks, cohort.n_vertices))
-    config = ChangeConfig(
-        subject=arguments.subject,
-        time=arguments.time,
-        order=arguments.order,
-        stable=arguments.stable,
-        regions={name: read_region(path) for name, path in arguments.region} or None,
-        group=arguments.group,
-        rate=arguments.rate,
-        permutations=arguments.permutations,
-        seed=arguments.seed,
-        unequal_variances=arguments.unequal_variances,
-    )
+    regions = {name: read_region(path) for name, path in arguments.region} or None
+    config = ChangeConfig(**given(arguments, ChangeConfig, regions=regions))
     columns = [column for column in (arguments.subject, arguments.group) if column]
     if arguments.drop_missing:
         from shapespace.statistics.change_visits import time_column

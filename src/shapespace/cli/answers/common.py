@@ -1,4 +1,4 @@
-"""What the commands about cohorts share: arguments, reading the cohort, and printing of the results."""
+"""What the commands about cohorts share: reading the cohort, and printing of the results."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import argparse
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from shapespace.cli.options import given
 from shapespace.cli.printing import say, show, show_json
 
 if TYPE_CHECKING:
@@ -17,22 +18,21 @@ if TYPE_CHECKING:
 def cohort_of(
     arguments: argparse.Namespace, gauge: Gauge | None = None, onto: Cohort | None = None, *, least: int = 2
 ) -> Cohort:
-    """Return the cohort that the arguments of `add_cohort` name.
+    """Return the cohort that the arguments name.
 
     Args:
-        arguments: parsed arguments, with those of `add_cohort`.
-        gauge: of a command without the argument of `add_gauge`.
+        arguments: parsed arguments of a command that reads a cohort.
+        gauge: gauge of a command that has no option for it; None for the value of the option.
         onto: a cohort that this one is compared with.
         least: the smallest number of shapes, if `onto` is None.
     """
     from shapespace.batch.progress import steps
-    from shapespace.cohort.read import CohortOptions, read_cohort
+    from shapespace.cohort.read import CohortConfig, read_cohort
 
-    options = CohortOptions(
-        arguments.shapes, arguments.model, arguments.surfaces, gauge or arguments.gauge, arguments.doubtful, least
-    )
+    fixed = {} if gauge is None else {"gauge": gauge}
+    config = CohortConfig(**given(arguments, CohortConfig, least=least, **fixed))
     with steps(None, "reading", "shape", quiet=arguments.quiet) as step:
-        cohort = read_cohort(arguments.data, options, onto=onto, on_shape=step)
+        cohort = read_cohort(arguments.data, config, onto=onto, on_shape=step)
     return replace(cohort, unit="") if getattr(arguments, "no_unit", False) else cohort
 
 

@@ -5,27 +5,16 @@ from __future__ import annotations
 import argparse
 
 from shapespace.cli.answers.common import cohort_of, finish
+from shapespace.cli.options import given
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Compare the shapes of a cohort."""
     from shapespace.batch.progress import steps
     from shapespace.report.analyses.compare_report import compare_report
-    from shapespace.statistics.compare import CompareConfig, compare
+    from shapespace.statistics.compare_shapes import CompareConfig, compare
 
-    config = CompareConfig(
-        anova_type=arguments.anova_type,
-        blocks=arguments.blocks,
-        random=arguments.random,
-        permutations=arguments.permutations,
-        seed=arguments.seed,
-        maps=not arguments.no_maps,
-        bump_width_mm=arguments.bumps,
-        alpha=arguments.level,
-        drop_missing=arguments.drop_missing,
-        unequal_variances=arguments.unequal_variances,
-        effect_size=arguments.effect_size,
-    )
+    config = CompareConfig(**given(arguments, CompareConfig))
     cohort = cohort_of(arguments)
     with steps(None, "permuting", "step", quiet=arguments.quiet) as step:
         result = compare(cohort, arguments.formula, config, progress=step)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from shapespace.cli.answers.common import cohort_of, finish
+from shapespace.cli.options import given
 
 if TYPE_CHECKING:
     from shapespace.cohort.cohort import Cohort
@@ -43,21 +44,4 @@ def _cohort_and_config(arguments: argparse.Namespace) -> tuple[Cohort, IdentityC
     cohort = cohort_of(arguments, "shape")
     if arguments.surfaces != "coefficients":
         cohort = replace(cohort, fitted=None)
-    chosen: dict[str, Any] = {} if arguments.scores is None else {"scores": arguments.scores}
-    config = IdentityConfig(
-        subject=arguments.subject,
-        gallery=arguments.gallery,
-        probe=arguments.probe,
-        train=arguments.train,
-        role=arguments.role,
-        folds=arguments.folds,
-        modes=arguments.modes,
-        curve=arguments.curve,
-        by=arguments.by,
-        uncertainty=not arguments.no_uncertainty,
-        draws=arguments.draws,
-        seed=arguments.seed,
-        drop_missing=arguments.drop_missing,
-        **chosen,
-    )
-    return cohort, config
+    return cohort, IdentityConfig(**given(arguments, IdentityConfig))

@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 
 from shapespace.cli.answers.common import cohort_of, finish
+from shapespace.cli.options import given
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Fit a regression on shape, predict with it, and write the report."""
     from shapespace.batch.progress import steps
     from shapespace.cohort.cohort import SUBJECT
-    from shapespace.cohort.read import CohortOptions, read_cohort
+    from shapespace.cohort.read import CohortConfig, read_cohort
     from shapespace.io.files import make_folder
     from shapespace.report.analyses.regression_report import prediction_report, regression_report
     from shapespace.statistics.predictor import Predictor, refuse_known
@@ -40,11 +41,9 @@ def run(arguments: argparse.Namespace) -> int:
         )
     new = None
     if arguments.predict is not None:
-        options = CohortOptions(
-            arguments.new_shapes, arguments.model, arguments.surfaces, arguments.gauge, arguments.doubtful, least=1
-        )
+        config = CohortConfig(**given(arguments, CohortConfig, shapes=arguments.new_shapes, least=1))
         with steps(None, "reading", "shape", quiet=arguments.quiet) as step:
-            fresh = read_cohort(arguments.predict, options, onto=cohort, on_shape=step)
+            fresh = read_cohort(arguments.predict, config, onto=cohort, on_shape=step)
         there = subject is not None and subject in fresh.table.columns
         refuse_known(
             result.subjects, fresh.table.texts(subject) if there and subject else fresh.names, fresh.table.where

@@ -5,21 +5,16 @@ from __future__ import annotations
 import argparse
 
 from shapespace.cli.answers.common import cohort_of, finish
+from shapespace.cli.options import given
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Score subjects against a reference."""
     from shapespace.batch.progress import steps
     from shapespace.report.analyses.score_report import score_report
-    from shapespace.statistics.score import ScoreConfig, score
+    from shapespace.statistics.score_subjects import ScoreConfig, score
 
-    config = ScoreConfig(
-        modes=arguments.modes,
-        subject=arguments.subject,
-        nearest=arguments.nearest,
-        seed=arguments.seed,
-        drop_missing=arguments.drop_missing,
-    )
+    config = ScoreConfig(**given(arguments, ScoreConfig))
     known = {"data": arguments.reference, "shapes": arguments.reference_shapes, "doubtful": False}
     reference = cohort_of(argparse.Namespace(**{**vars(arguments), **known}))
     subjects = cohort_of(arguments, onto=reference)

@@ -46,7 +46,6 @@ MOST_MAPS = 6
 """Subjects whose maps the report draws."""
 MOST_ROWS, MOST_CURVES = 50, 12
 _LEVEL = LEVEL
-_MM3_PER_ML = 1000.0
 _LEAST_ML_MM3 = 100.0
 """Volumes below this limit (mm³) are written in mm³, others in ml; 0.1 ml needs more than two decimals."""
 _FEW = 10

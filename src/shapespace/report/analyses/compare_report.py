@@ -32,8 +32,8 @@ from shapespace.schemas import (
     TablePart,
     TextPart,
 )
-from shapespace.statistics.compare import MOST_LEVELS, CompareResult, ShapeEffect
 from shapespace.statistics.compare_maps import EffectMap, Tested
+from shapespace.statistics.compare_shapes import MOST_LEVELS, CompareResult, ShapeEffect
 from shapespace.statistics.observation_weights import blank_where
 from shapespace.types import BoolArray, FloatArray, Mesh
 

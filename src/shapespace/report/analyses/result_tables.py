@@ -15,11 +15,11 @@ from shapespace.report.analyses.verify_report import verify_report
 from shapespace.statistics.analysis_result import AnalysisResult
 from shapespace.statistics.asymmetry import AsymmetryResult
 from shapespace.statistics.change_result import ChangeResult
-from shapespace.statistics.compare import CompareResult
+from shapespace.statistics.compare_shapes import CompareResult
 from shapespace.statistics.identity.identify import IdentificationResult
 from shapespace.statistics.identity.verify import VerificationResult
 from shapespace.statistics.regression import RegressionResult
-from shapespace.statistics.score import ScoreResult
+from shapespace.statistics.score_subjects import ScoreResult
 
 
 def analysis_report(result: AnalysisResult) -> AnalysisReport:

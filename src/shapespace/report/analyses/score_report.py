@@ -12,7 +12,7 @@ from shapespace.report.analyses.analysis_report import AnalysisReport, LengthFor
 from shapespace.report.analyses.methods_section import methods_parts
 from shapespace.report.analyses.shape_data import add_shape_data, model_hashes
 from shapespace.schemas import Counts, HistogramPart, MorphPart, Part, SurfaceMapPart, TableColumn, TablePart, TextPart
-from shapespace.statistics.score import SMALL, ScoreResult
+from shapespace.statistics.score_subjects import SMALL, ScoreResult
 
 _MOST_MAPS, _MOST_MORPHS, _MOST_SENTENCES, _BINS = 12, 3, 12, 24
 _LIMIT_SD = 4.0

@@ -22,7 +22,7 @@ ROLES = ("gallery", "probe", "train")
 _FOLDS, _GROUPS = 4, 5
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class IdentityConfig:
     """Who is compared with whom, and how.
 

@@ -36,6 +36,7 @@ from shapespace.statistics.dispersion import DispersionTest
 from shapespace.statistics.effect_size import EFFECT_SIZES, EffectSize, effect_size
 from shapespace.statistics.methods import dispersion_record, methods_of, sample_sizes
 from shapespace.statistics.observation_weights import information, weights_of
+from shapespace.step_counter import StepCounter
 from shapespace.types import FloatArray, read_only, require
 
 SquaresType: TypeAlias = Literal["I", "II", "III"]
@@ -48,7 +49,7 @@ MOST_LEVELS = 6
 """Largest number of classes of a variable whose pairs are compared."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CompareConfig:
     """How groups are compared.
 
@@ -305,7 +306,7 @@ def compare(
     strata = made.every
     families = [_weighted(cohort, design, family) for family in _families(design, made)]
     total = len(design.terms) + len(families) * (1 + config.maps)
-    step = _Steps(total, progress)
+    step = StepCounter(total, progress).add
     owners = subjects if repeated else None
     tests = tuple(
         test
@@ -349,16 +350,6 @@ def _random(config: CompareConfig, cohort: Cohort) -> tuple[tuple[frozenset[str]
     if config.blocks not in (None, column):
         raise InputError(f"Blocks of {config.blocks!r} and random terms of {column!r} differ; give one of the two.")
     return effects, replace(config, blocks=column)
-
-
-class _Steps:
-    def __init__(self, total: int, tell: Callable[[int, int], None] | None) -> None:
-        self.done, self.total, self.tell = 0, total, tell
-
-    def __call__(self) -> None:
-        self.done += 1
-        if self.tell is not None:
-            self.tell(self.done, self.total)
 
 
 def _with_sizes(cohort: Cohort) -> Cohort:

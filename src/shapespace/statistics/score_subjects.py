@@ -37,7 +37,7 @@ _SAME = 1e-6
 _OUTSIDE = 0.01
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ScoreConfig:
     """How subjects are measured by a reference.
 

@@ -1,0 +1,51 @@
+"""Options of a shape model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from shapespace.geometry.procrustes import Gauge
+from shapespace.model.missing import MIN_SEEN
+from shapespace.types import IntArray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BuildConfig:
+    """Options of a shape model.
+
+    Args:
+        modes: number of modes (in Python also a float below 1, a share of the variance); `auto`: cross-validation on
+            held-out vertices, of a random sample of 2,000 meshes if there are more; `all` (in Python None).
+        gauge: `form`: size is part of the modes, and fits are rigid; `shape`: size is divided out, and fits have a free
+            scale.
+        align: whether to align the meshes.
+        alignment_vertices: indices of the vertices that determine the alignment, such as forehead and nose where
+            expressions vary; None for all.
+        landmarks: landmarks of the model: named points on the surface (`place_landmarks`), or name -> vertex.
+        representation: what the modes move: `vertices`; `bspline`, control points of a smooth surface;
+            `bspline-detail`, the same with the detail of the mean that the B-spline cannot represent.
+        control_points: control points of a B-spline along each side, 4 to 64 (default 24x24).
+        min_seen: remove vertices that fewer than this share of the meshes show, with their triangles and landmarks,
+            from a model of vertices.
+        provenance: description of the meshes, kept in the model file.
+        licence: licence of the meshes, kept in the model file.
+        seed: seed of the cross-validation, and of the first directions of streamed modes.
+        out_of_core: stream the meshes, each loaded once and not held, through a file of single precision as large as
+            they are: the same model but for that rounding, with `ShapeModel.residuals`. None does so where a model of
+            vertices would need more than four fifths of the free memory.
+    """
+
+    modes: int | float | Literal["auto"] | None = None
+    gauge: Gauge = "shape"
+    align: bool = True
+    alignment_vertices: IntArray | None = None
+    landmarks: Mapping[str, int] | None = None
+    representation: str = "vertices"
+    control_points: tuple[int, int] | None = None
+    min_seen: float = MIN_SEEN
+    provenance: str = ""
+    licence: str = ""
+    seed: int = 0
+    out_of_core: bool | None = None

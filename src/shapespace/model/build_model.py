@@ -1,0 +1,313 @@
+"""A shape model of meshes in correspondence: alignment, principal components, and the modes among them (P1-P5)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from shapespace.errors import InputError
+from shapespace.geometry.normals import without_estimates
+from shapespace.geometry.procrustes import Gauge, align_in_place, scale_to_tangent
+from shapespace.io.interop import MeshLike, as_meshes
+from shapespace.model.build_config import BuildConfig
+from shapespace.model.choose_modes import choose_modes
+from shapespace.model.holes import fill_holes
+from shapespace.model.missing import CompletedShapes, ObservedMeshes, complete
+from shapespace.model.pca import PrincipalComponents, principal_components
+from shapespace.model.representation import Representation, Vertices, representation_named
+from shapespace.model.shape_model import ShapeModel
+from shapespace.model.spurious import below_precision, made_by_alignment, rounding_mm
+from shapespace.model.streamed import (
+    Aligned,
+    KeptShapes,
+    Meshes,
+    Scratch,
+    Tell,
+    aligned_on_disk,
+    bytes_in_memory,
+    refuse_without_extent,
+    too_large,
+)
+from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks, common_faces, require
+
+
+def build_model(
+    meshes: Meshes | Sequence[MeshLike],
+    config: BuildConfig | None = None,
+    *,
+    scratch: Scratch | None = None,
+    keep_shapes: Path | None = None,
+    log: Tell | None = None,
+) -> ShapeModel:
+    """Build a shape model of meshes in correspondence, in mm (P1-P5).
+
+    Args:
+        meshes: at least two, same vertices in the same order, same triangles: a list, or anything with a length
+            and items that loads a mesh when it is accessed. Items are anything that `as_mesh` takes: meshes, paths,
+            arrays (V, 3) of points, or objects of other tools. Vertices that are not-a-number or not observed are
+            missing: a model of vertices learns from the others, one of B-splines from filled ones.
+        config: options; None for the defaults.
+        scratch: for the file of streamed meshes, and for what a build that is killed goes on with; None takes the
+            system's folder for temporary files and does not go on.
+        keep_shapes: a folder to keep that file in, for `extend_model`; the meshes are then streamed.
+        log: called with the name of each step while meshes are streamed.
+
+    Raises:
+        CorrespondenceError: the meshes differ in vertices or triangles.
+        MeshError: for B-splines: the surface cannot be spread out on a square.
+        InputError: too few meshes, values that are not finite, no variation, too many modes asked for, an unknown
+            representation, control points that cannot be; streamed meshes with missing vertices, or for B-splines.
+        FileError: the disk has no room for the file.
+    """
+    config, log = config or BuildConfig(), log or _silent
+    require(config, BuildConfig, "build_model", "give the options as BuildConfig(...)")
+    align, alignment_vertices = config.align, config.alignment_vertices
+    landmarks: Mapping[str, int] = config.landmarks or {}
+    meshes = as_meshes(meshes, "build_model")
+    kind = representation_named(config.representation, config.control_points)
+    if kind is not Vertices and (config.out_of_core or keep_shapes is not None):
+        raise InputError("Only models of vertices can be made of streamed meshes; leave --representation out.")
+    out_of_core = config.out_of_core
+    if out_of_core is None and kind is Vertices and len(meshes) > 1:
+        out_of_core = too_large(bytes_in_memory(len(meshes), meshes[0], choose=config.modes == "auto"))
+    if out_of_core or keep_shapes is not None:
+        stream = aligned_on_disk(
+            meshes,
+            config.gauge,
+            align=align,
+            alignment_vertices=alignment_vertices,
+            scratch=scratch,
+            onto=None,
+            modes=config.modes,
+            tell=log,
+        )
+        if len(meshes):
+            SurfaceLandmarks.of(landmarks).check(len(meshes[0].vertices))
+        return _of_streamed(stream, config, landmarks, keep_shapes, log)
+    meshes = [without_estimates(meshes[index]) for index in range(len(meshes))]
+    faces = common_faces(meshes)
+    if not kind.takes_holes and len(meshes) > 1:
+        observed = ObservedMeshes.of(meshes, config.min_seen)
+        meshes, landmarks = observed.meshes, observed.landmarks(landmarks)
+        faces, alignment_vertices = meshes[0].faces, observed.indices(alignment_vertices)
+    shapes, names = _training_shapes(meshes, faces, fill=kind.takes_holes), [mesh.name for mesh in meshes]
+    rounding = rounding_mm(np.nan_to_num(meshes[0].vertices, posinf=0.0, neginf=0.0))
+    shapes, completed = _aligned(shapes, names, config.gauge, align=align, alignment_vertices=alignment_vertices)
+    coder = kind.of(Mesh(shapes.mean(axis=0), faces, name="The mean of the meshes"), config.control_points)
+    if completed is not None:
+        pc = completed.components(config.modes, config.seed)
+    elif isinstance(coder, Vertices):
+        pc = _components(coder.encode(shapes), config.modes, config.seed)
+    else:
+        pc = _components_of_codes(coder, shapes, config.modes, config.seed)
+    return _of_components(
+        pc,
+        coder,
+        rounding=rounding,
+        align=align,
+        alignment_vertices=alignment_vertices,
+        faces=faces,
+        gauge=config.gauge,
+        landmarks=landmarks,
+        representation=config.representation,
+        provenance=config.provenance,
+        licence=config.licence,
+    )
+
+
+def extend_model(
+    model: ShapeModel,
+    meshes: Meshes,
+    shapes: Path,
+    config: BuildConfig | None = None,
+    *,
+    scratch: Scratch | None = None,
+    keep_shapes: Path | None = None,
+    log: Tell | None = None,
+) -> ShapeModel:
+    """Return the model of the shapes that `model` was made of and of `meshes`, without the first ones' meshes.
+
+    It is the model that `build_model` makes of all of them, but for rounding to single precision: all shapes are
+    aligned anew, beginning from the poses that are known.
+
+    Args:
+        model: a model that was built with its shapes kept.
+        meshes: at least one, corresponding to the model.
+        shapes: the folder that `build_model` was given as `keep_shapes`.
+        config: modes and seed; provenance and licence of the new model, empty for those of `model`. Everything else
+            is that of `model`.
+        scratch: as of `build_model`.
+        keep_shapes: a folder to keep all shapes in, other than `shapes`.
+        log: as of `build_model`.
+
+    Raises:
+        CorrespondenceError: a mesh differs from the model in vertices or triangles.
+        InputError: shapes of another model, or what `build_model` refuses.
+        FileError: there are no shapes, or the disk is full.
+    """
+    config, log = config or BuildConfig(), log or _silent
+    training = KeptShapes.load(shapes)
+    if training.model_hash != model.content_hash:
+        raise InputError(f"The shapes in {shapes} are those of another model; give the model that was built with them.")
+    if not len(meshes):
+        raise InputError("There are no meshes to be added; give at least one.")
+    training.check()
+    stream = aligned_on_disk(
+        meshes,
+        training.gauge,
+        align=training.align,
+        alignment_vertices=training.alignment_vertices,
+        scratch=scratch,
+        onto=training,
+        modes=config.modes,
+        tell=log,
+    )
+    config = replace(config, provenance=config.provenance or model.provenance, licence=config.licence or model.licence)
+    return _of_streamed(stream, config, model.landmarks, keep_shapes, log)
+
+
+def _silent(_: str) -> None:
+    pass
+
+
+def _of_streamed(
+    stream: AbstractContextManager[Aligned],
+    config: BuildConfig,
+    landmarks: Mapping[str, int],
+    keep_shapes: Path | None,
+    log: Tell,
+) -> ShapeModel:
+    with stream as aligned:
+        training = aligned.kept
+        model = _of_components(
+            aligned.components(config.modes, config.seed, log),
+            Vertices(),
+            rounding=training.rounding,
+            align=training.align,
+            alignment_vertices=training.alignment_vertices,
+            faces=training.faces,
+            gauge=training.gauge,
+            landmarks=landmarks,
+            provenance=config.provenance,
+            licence=config.licence,
+        )
+        if keep_shapes is not None:
+            aligned.keep(keep_shapes, model.content_hash)
+    return model
+
+
+def _of_components(
+    pc: PrincipalComponents,
+    coder: Representation,
+    *,
+    rounding: float,
+    align: bool,
+    alignment_vertices: IntArray | None,
+    gauge: Gauge,
+    **about: Any,
+) -> ShapeModel:
+    """Return the model of these components, without modes that no shape made."""
+    mean = coder.decode(pc.mean)
+    spurious = below_precision(pc.variance, pc.n_samples, mean.size, rounding)
+    if align:
+        spurious |= made_by_alignment(mean, coder.directions(pc.basis), gauge, alignment_vertices)
+    if spurious.all():
+        raise InputError(
+            "The training meshes differ by no more than their alignment and their rounding make of them, so there "
+            "is no variation to model; give different ones."
+        )
+    return ShapeModel(
+        mean=pc.mean,
+        basis=pc.basis[:, ~spurious],
+        stddev=np.sqrt(pc.variance[~spurious]),
+        residuals=None if pc.residuals is None else pc.residuals[~spurious],
+        left_out=int(spurious.sum()),
+        total_variance=pc.total_variance,
+        n_training=pc.n_samples,
+        gauge=gauge,
+        coding=coder.arrays(),
+        **about,
+    )
+
+
+def _aligned(
+    shapes: FloatArray, names: Sequence[str], gauge: Gauge, *, align: bool, alignment_vertices: IntArray | None
+) -> tuple[FloatArray, CompletedShapes | None]:
+    """Return the training shapes (N, V, 3) aligned and complete, and how they were completed; `shapes` is overwritten.
+
+    Raises:
+        InputError: a shape has no extent, or too little of it is observed.
+    """
+    if align:
+        for shape, name in zip(shapes, names, strict=True):
+            refuse_without_extent(shape, name)
+    if np.isnan(shapes).any():
+        completed = complete(shapes, names, gauge, align=align, alignment_vertices=alignment_vertices)
+        return completed.shapes, completed
+    if align:
+        align_in_place(shapes, gauge, alignment_vertices=alignment_vertices)
+        # Where only some vertices carried the alignment, the size of the others is shape.
+        if gauge == "shape" and alignment_vertices is None:
+            scale_to_tangent(shapes)
+    return shapes, None
+
+
+def _components(data: FloatArray, modes: int | float | Literal["auto"] | None, seed: int) -> PrincipalComponents:
+    return principal_components(data, choose_modes(data, seed=seed).modes if modes == "auto" else modes)
+
+
+def _components_of_codes(
+    coder: Representation, shapes: FloatArray, modes: int | float | Literal["auto"] | None, seed: int
+) -> PrincipalComponents:
+    """Return mean and basis in codes, orthonormal in the vertices that they decode to; `shapes` is overwritten.
+
+    What coding loses counts as variance that the modes leave over.
+    """
+    centre = shapes.mean(axis=0)
+    total = sum(float(((shape - centre) ** 2).sum()) for shape in shapes) / (len(shapes) - 1)
+    codes = coder.encode(shapes)
+    for shape, code in zip(shapes, codes, strict=True):
+        shape[:] = coder.decode(code)
+    data = shapes.reshape(len(shapes), -1)
+    pc = _components(data, modes, seed)
+    # Modes are sums of the training shapes, and the same sums of their codes decode to them.
+    shares = (data @ pc.basis - pc.mean @ pc.basis) / (pc.variance * (len(data) - 1))
+    mean = codes.mean(axis=0)
+    return PrincipalComponents(mean, (codes - mean).T @ shares, pc.variance, total, pc.n_samples)
+
+
+def _training_shapes(meshes: Sequence[Mesh], faces: IntArray | None, *, fill: bool) -> FloatArray:
+    """Return the vertices of training meshes, (N, V, 3), checked; `fill` says whether what is missing is filled."""
+    if len(meshes) < 2:
+        raise InputError(
+            f"A shape model needs at least two meshes, not {len(meshes)}; with one there is nothing that varies."
+        )
+    shapes = np.stack([mesh.vertices for mesh in meshes])
+    names = [mesh.name for mesh in meshes]
+    if fill and np.isnan(shapes).any():
+        _refuse_not_finite(np.where(np.isnan(shapes), 0.0, shapes), names)
+        fill_holes(shapes, faces, names)
+    _refuse_not_finite(np.nan_to_num(shapes, nan=0.0, posinf=np.inf, neginf=-np.inf) if not fill else shapes, names)
+    _refuse_equal(shapes)
+    return shapes
+
+
+def _refuse_not_finite(values: FloatArray, names: Sequence[str]) -> None:
+    finite = np.isfinite(values).all(axis=(1, 2))
+    if not finite.all():
+        raise InputError(
+            f"{names[int(np.argmin(finite))]} holds vertices that are not finite; see shapespace check, and repair it "
+            "or leave it out."
+        )
+
+
+def _refuse_equal(shapes: FloatArray) -> None:
+    """Refuse training shapes without extent or variation before alignment turns rounding into modes."""
+    spread = float((np.nanmax(shapes, axis=0) - np.nanmin(shapes, axis=0)).max())
+    if spread <= 64 * np.finfo(float).eps * float(np.nanmax(np.abs(shapes))):
+        raise InputError("The training meshes are all equal, so there is no variation to model; give different ones.")

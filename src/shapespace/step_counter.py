@@ -1,0 +1,27 @@
+"""Progress of long computations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+
+@dataclass
+class StepCounter:
+    """Counts the steps of a computation and reports them.
+
+    Args:
+        total: number of steps in all.
+        progress: called with (steps done, in all); None for nothing.
+        done: number of steps done.
+    """
+
+    total: int
+    progress: Callable[[int, int], None] | None
+    done: int = 0
+
+    def add(self, count: int = 1) -> None:
+        """Count steps that are done."""
+        self.done += count
+        if self.progress is not None:
+            self.progress(self.done, self.total)
