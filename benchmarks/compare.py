@@ -161,7 +161,7 @@ class Found:
         assert made is not None
         self.studies += 1
         self.omnibus += study.test(term).p <= study.config.alpha
-        self.somewhere += bool((made.shown.p_family <= study.config.alpha).any())
+        self.somewhere += bool((made.test.p_family <= study.config.alpha).any())
 
     def told(self) -> str:
         return f"{100 * self.omnibus / self.studies:5.1f} %   {100 * self.somewhere / self.studies:5.1f} %"
@@ -233,7 +233,7 @@ def power(pool: Pool, surfaces: str, studies: int, permutations: int) -> str:
         rows.append(
             (
                 float(study.test("group").p <= options.alpha),
-                float((made.shown.p_family <= options.alpha).any()),
+                float((made.test.p_family <= options.alpha).any()),
                 float(found.any()),
                 float(truth[int(made.bump.f.argmax())]),
                 2 * both / (some + float(truth.sum())) if some else np.nan,

@@ -159,14 +159,14 @@ class _Files:
         return [*left, self.stages] if stages else left
 
 
-def naming(place: Path | str, sentence: str) -> str:
+def naming(source: Path | str, sentence: str) -> str:
     """Return `sentence` about a mesh with its path or address in it, not just its file's name."""
-    if str(place) in sentence:
+    if str(source) in sentence:
         return sentence
-    name = name_of(place) if isinstance(place, str) and is_address(place) else Path(place).name
+    name = name_of(source) if isinstance(source, str) and is_address(source) else Path(source).name
     if sentence.startswith(f"{name}: "):
-        return f"{place}{sentence.removeprefix(name)}"
-    return f"{place}: {sentence[:1].lower()}{sentence[1:]}"
+        return f"{source}{sentence.removeprefix(name)}"
+    return f"{source}: {sentence[:1].lower()}{sentence[1:]}"
 
 
 @dataclass(frozen=True)
@@ -285,10 +285,10 @@ def resumed(task: FitTask, model_hash: str, folder: Path, run: str = "") -> tupl
         dense = bool(record.config["dense"]) and is_surface_of(files.dense, record)
         staged = files.stages.is_file()
         enough = is_surface_of(files.fitted, record) and dense >= task.config.dense and staged >= task.stages
-        whole = len(record.b) == len(record.z) == len(record.b_stddev)
+        complete = len(record.b) == len(record.z) == len(record.b_stddev)
     except (ShapespaceError, KeyError, TypeError, AttributeError, ValueError):
         return task, None
-    if enough and whole and record.is_fitted:
+    if enough and complete and record.is_fitted:
         return task, record
     also = replace(task.config, dense=task.config.dense or dense)
     return replace(task, config=also, stages=task.stages or staged), None

@@ -163,20 +163,20 @@ def build(
     """
     if output.suffix.lower() not in (".h5", ".hdf5"):
         raise InputError(f"{output}: a model file is HDF5, so give it a name that ends in .h5.")
-    found = surface_files(meshes, recursive=settings.recursive)
-    notes = list(found.notes)
+    listed = surface_files(meshes, recursive=settings.recursive)
+    notes = list(listed.notes)
     parent = None if settings.add is None else _parent(settings.add, output)
     gauge = parent.gauge if parent is not None else settings.gauge or "shape"
     if gauge == "form" or not settings.align:
-        found.refuse_mixed_units()
-    files, records = _trusted(found.files, notes, with_doubtful=settings.with_doubtful)
+        listed.refuse_mixed_units()
+    files, records = _trusted(listed.files, notes, with_doubtful=settings.with_doubtful)
     make_folder(output.absolute().parent)
-    on_disk = _OnDisk(files, settings.unit, found.unit_ratios)
+    on_disk = _OnDisk(files, settings.unit, listed.unit_ratios)
     streamed = settings.streams or (settings.of_vertices and _too_large(on_disk, settings, notes))
     loaded = on_disk if streamed else _read(on_disk, quiet=quiet)
     first = on_disk[0] if streamed else loaded[0]
-    if found.unit_ratios:
-        notes.append(found.told_units(settings.unit))
+    if listed.unit_ratios:
+        notes.append(listed.told_units(settings.unit))
     marks = SurfaceLandmarks() if parent is not None else _landmarks(files, records, first, settings, notes)
     regions = {
         name: region_vertices(read_region(file), len(first.vertices), name) for name, file in settings.regions.items()
@@ -193,7 +193,7 @@ def build(
         if regions:
             model = replace(model, regions=regions)
             model.save(output)
-        return model, notes + _told(model, settings)
+        return model, notes + _model_notes(model, settings)
     notes += _missing(loaded, marks, settings)
     with waiting(f"aligning {len(files)} meshes and finding their modes", quiet=quiet):
         if settings.labels is not None:
@@ -223,15 +223,15 @@ def build(
             kept = ObservedMeshes.of(loaded, _min_seen(settings)) if settings.representation == "vertices" else None
             model = replace(model, regions=regions if kept is None else kept.regions(regions))
         model.save(output)
-    return model, notes + _told(model, settings)
+    return model, notes + _model_notes(model, settings)
 
 
-def _told(model: ShapeModel, settings: BuildSettings) -> list[str]:
+def _model_notes(model: ShapeModel, settings: BuildSettings) -> list[str]:
     """Return what the user should know of the model itself."""
     notes = _odd_size(model, settings.unit)
     if model.left_out:
-        what = "1 mode is" if model.left_out == 1 else f"{model.left_out} modes are"
-        notes.append(f"{what} left out, since alignment or rounding made them and no shape did.")
+        count_text = "1 mode is" if model.left_out == 1 else f"{model.left_out} modes are"
+        notes.append(f"{count_text} left out, since alignment or rounding made them and no shape did.")
     return notes
 
 
@@ -250,8 +250,8 @@ def _parent(path: Path, output: Path) -> ShapeModel:
         raise InputError(f"{output} is the model that meshes are added to; give another name for the new one.")
     model = ShapeModel.load(path)
     if model.held_out or model.representation != "vertices":
-        what = "parts identity and expression" if model.held_out else "is of B-spline surfaces"
-        raise InputError(f"{path} {what}, and meshes can be added only to plain models of vertices; build it again.")
+        reason = "parts identity and expression" if model.held_out else "is of B-spline surfaces"
+        raise InputError(f"{path} {reason}, and meshes can be added only to plain models of vertices; build it again.")
     return model
 
 
@@ -364,23 +364,25 @@ def _trusted(
     records: dict[Path, FitRecord] = {}
     for file in files:
         name = next((file.name.removesuffix(ending) for ending in _SURFACES if file.name.endswith(ending)), None)
-        if name is not None and is_result(beside := file.with_name(f"{name}{RECORD}")):
-            record = read_record(beside)
+        if name is not None and is_result(record_file := file.with_name(f"{name}{RECORD}")):
+            record = read_record(record_file)
             records[file] = FitRecord(status=record.status, model=record.model)  # all of each would be large
     doubtful = [file for file in files if file in records and records[file].status == "doubtful"]
     if not doubtful:
         return list(files), records
     named = ", ".join(file.name for file in doubtful[:_NAMED]) + (", ..." if len(doubtful) > _NAMED else "")
-    what = "1 surface of a doubtful fit is" if len(doubtful) == 1 else f"{len(doubtful)} surfaces of doubtful fits are"
+    count_text = (
+        "1 surface of a doubtful fit is" if len(doubtful) == 1 else f"{len(doubtful)} surfaces of doubtful fits are"
+    )
     if with_doubtful:
-        notes.append(f"{what} taken too ({named}).")
+        notes.append(f"{count_text} taken too ({named}).")
         return list(files), records
     left = [file for file in files if file not in set(doubtful)]
     if not left:
         raise InputError(
             f"All meshes are surfaces of doubtful fits ({named}); --with-doubtful takes them all the same."
         )
-    notes.append(f"{what} left out ({named}); --with-doubtful takes them too.")
+    notes.append(f"{count_text} left out ({named}); --with-doubtful takes them too.")
     return left, {file: records[file] for file in left if file in records}
 
 
@@ -434,22 +436,23 @@ def _missing(meshes: Sequence[Mesh], landmarks: SurfaceLandmarks, settings: Buil
         )
     missing, every = sum(holed), len(meshes) * len(meshes[0].vertices)
     where, share = sum(count > 0 for count in holed), 100 * missing / every
-    told = [f"{missing} of {every} vertices are missing ({share:.1f} %), in {where} of {len(meshes)} meshes."]
+    sentences = [f"{missing} of {every} vertices are missing ({share:.1f} %), in {where} of {len(meshes)} meshes."]
     if settings.representation != "vertices":
-        return told
+        return sentences
     kept = ObservedMeshes.of(meshes, _min_seen(settings))
     if out := int((~kept.vertices).sum()):
-        what = "1 vertex is" if out == 1 else f"{out} vertices are"
-        told.append(
-            f"{what} taken out of the model, since fewer than {100 * _min_seen(settings):g} % of the meshes show them; "
+        number = "1 vertex is" if out == 1 else f"{out} vertices are"
+        sentences.append(
+            f"{number} taken out of the model, since fewer than {100 * _min_seen(settings):g} % of the meshes show "
+            "them; "
             "--min-seen says how many must."
         )
     if lost := sorted(set(landmarks) - set(kept.landmarks(landmarks))):
-        told.append(
+        sentences.append(
             f"The model has no {', '.join(lost)}, since these landmarks lie in triangles with vertices that are taken "
             "out."
         )
-    return told
+    return sentences
 
 
 def _landmarks(
@@ -463,14 +466,14 @@ def _landmarks(
     mm = MM_PER_UNIT[settings.unit]
     if settings.landmarks is not None:
         return _read_landmarks(settings.landmarks, first, mm, notes)
-    beside = files[0].parent / "landmarks.csv"
-    if beside.is_file():
+    landmark_file = files[0].parent / "landmarks.csv"
+    if landmark_file.is_file():
         try:
-            marks = _read_landmarks(beside, first, mm, placed := list[str]())
+            marks = _read_landmarks(landmark_file, first, mm, placed := list[str]())
         except ShapespaceError as error:
-            notes.append(f"The model has no landmarks, since {beside} cannot be used: {error}")
+            notes.append(f"The model has no landmarks, since {landmark_file} cannot be used: {error}")
             return SurfaceLandmarks()
-        notes += [f"Landmarks are taken from {beside}.", *placed]
+        notes += [f"Landmarks are taken from {landmark_file}.", *placed]
         return marks
     return _landmarks_of_parent(files, records, first, notes)
 
@@ -539,8 +542,8 @@ def _with_origin(files: Sequence[Path], settings: BuildSettings, notes: list[str
             notes.append(f"Provenance and licence are taken from {files[0].parent / ABOUT}.")
             return replace(settings, provenance=f"{len(files)} meshes of: {about[0]}", licence=about[1])
         notes.append("The meshes come from folders of different origin, so give --provenance and --licence.")
-    said = settings.provenance or f"{len(files)} meshes, {files[0].name} to {files[-1].name}"
-    return replace(settings, provenance=said)
+    provenance = settings.provenance or f"{len(files)} meshes, {files[0].name} to {files[-1].name}"
+    return replace(settings, provenance=provenance)
 
 
 def _additive(
@@ -554,10 +557,12 @@ def _additive(
     from shapespace.model.additive import AdditiveModel
 
     known = read_labels(labels)
-    found = [label_of(known, file) for file in files]
-    own = [label for label in found if label is not None and label.subject]
+    mesh_labels = [label_of(known, file) for file in files]
+    own = [label for label in mesh_labels if label is not None and label.subject]
     if len(own) < len(files):
-        lacking = [file.name for file, label in zip(files, found, strict=True) if label is None or not label.subject]
+        lacking = [
+            file.name for file, label in zip(files, mesh_labels, strict=True) if label is None or not label.subject
+        ]
         raise InputError(
             f"{labels} has no subject for {', '.join(lacking[:3])}; each mesh needs a label and a subject."
         )

@@ -99,10 +99,10 @@ def correspond_files(
         InputError: fewer than two scans, or too few that can be reached.
     """
     given = given_scans(files.scans, folder, recursive=files.recursive, say=say)
-    found = list({one.place: one for one in given}.values())
-    scans = [one for one in found if not one.path.name.endswith(SURFACE)]
-    if len(scans) < len(found):
-        say(f"{len(found) - len(scans)} surfaces of an earlier correspondence are not taken for scans.")
+    distinct = list({one.place: one for one in given}.values())
+    scans = [one for one in distinct if not one.path.name.endswith(SURFACE)]
+    if len(scans) < len(distinct):
+        say(f"{len(distinct) - len(scans)} surfaces of an earlier correspondence are not taken for scans.")
     make_folder(folder)
     with only_writer(folder):
         return _corresponding(_jobs(scans), files, folder, settings, quiet=quiet, say=say)
@@ -379,9 +379,9 @@ def _tell(records: Sequence[CorrespondRecord], made: Correspondence, given: str,
         say(f"Notes on {len(noted) - _LISTED} more scans are in their records.")
     if others := [record for record in records if record.unit_ratio != 1.0]:
         named = ", ".join(record.name for record in others[:_LISTED]) + (", ..." if len(others) > _LISTED else "")
-        what = "scans is" if len(others) == 1 else "scans are"
+        noun = "scans is" if len(others) == 1 else "scans are"
         say(
-            f"{len(others)} of {len(records)} {what} in another unit than the majority, judging by size ({named}); "
+            f"{len(others)} of {len(records)} {noun} in another unit than the majority, judging by size ({named}); "
             "so are the surfaces, and build converts them to the unit of the majority."
         )
 
@@ -418,7 +418,7 @@ def _with_far_ones(records: Sequence[CorrespondRecord]) -> list[CorrespondRecord
     far = np.array([(r.distance_p95 or np.nan) / ((r.scale or np.nan) * r.unit_ratio) for r in records])
     if np.isfinite(far).sum() < _ENOUGH_TO_COMPARE:
         return list(records)
-    beside = far / np.nanmedian(far)
+    ratios = far / np.nanmedian(far)
     return [
         record
         if not times > _FAR
@@ -426,7 +426,7 @@ def _with_far_ones(records: Sequence[CorrespondRecord]) -> list[CorrespondRecord
             record,
             notes=[*record.notes, f"Its surface lies {times:.2g} times as far from it as is usual; look at it."],
         )
-        for record, times in zip(records, beside, strict=True)
+        for record, times in zip(records, ratios, strict=True)
     ]
 
 

@@ -72,7 +72,7 @@ def given_scans(
         InputError: there is nothing, or a list is not one.
         FileError: a folder, a list or an address cannot be read.
     """
-    found: list[Given] = []
+    rows: list[Given] = []
     for one in scans:
         text = str(one)
         if not is_address(text) and text.lower().endswith(_LISTS) and Path(text).is_file():
@@ -82,11 +82,11 @@ def given_scans(
                     raise InputError(f"{text}: {row.called} stands for {len(there)} scans; give a row for each.")
                 if row.landmarks is not None and len(there) > 1:
                     raise InputError(f"{text}: the landmarks {row.landmarks} cannot be those of {len(there)} scans.")
-                found += [replace(row, place=place) for place in there]
+                rows += [replace(row, place=source) for source in there]
         else:
-            found += [Given(place) for place in _expanded(text, folder, recursive=recursive, say=say)]
-    _refuse_doubles(found)
-    return found
+            rows += [Given(source) for source in _expanded(text, folder, recursive=recursive, say=say)]
+    _refuse_doubles(rows)
+    return rows
 
 
 def with_ids(jobs: Sequence[Job], given: Sequence[Given]) -> list[Job]:
@@ -133,7 +133,7 @@ def _rows(file: Path) -> list[Given]:
         content = read_bytes(file)
         if file.suffix.lower() == ".txt":
             lines = [line.strip() for line in decoded_text(content).splitlines()]
-            rows = [Given(_beside(file, line)) for line in lines if line and not line.startswith("#")]
+            rows = [Given(_relative_to(file, line)) for line in lines if line and not line.startswith("#")]
         else:
             rows = _table(file, content)
     except ValueError as error:
@@ -161,36 +161,36 @@ def _table(file: Path, content: bytes) -> list[Given]:
         cells = [cell.strip() for cell in line]
         if any("\0" in cell for cell in cells):
             raise ValueError("is not a table but binary")
-        place, marks = cells[column], "" if marks_by is None else cells[marks_by]
+        source, marks = cells[column], "" if marks_by is None else cells[marks_by]
         called = "" if called_by is None or called_by == column else cells[called_by]
-        if not place:
+        if not source:
             raise InputError(f"{file}: row {number} names no scan in the column {header[column]}.")
         if called and (called.startswith(".") or len(called.encode()) > _LONGEST or set(called) & set('/\\:*?"<>|\0')):
             raise InputError(f"{file}: row {number} has an id that no file can have, {called[:40]!r}; change it.")
-        known = {head: cells[at] for at, head in enumerate(header) if head and at not in own}
-        rows.append(Given(_scan_at(file, place), called, known, file.parent / marks if marks else None))
+        known = {head: cells[index] for index, head in enumerate(header) if head and index not in own}
+        rows.append(Given(_scan_source(file, source), called, known, file.parent / marks if marks else None))
     return rows
 
 
-def _scan_at(file: Path, place: str) -> Path | str:
+def _scan_source(file: Path, text: str) -> Path | str:
     """Return the place of a scan, which may be named without its ending where one mesh file has that name."""
-    found = _beside(file, place)
-    if isinstance(found, str) or found.name.lower().endswith(MESH_FILE_ENDINGS) or glob.has_magic(place):
-        return found
+    source = _relative_to(file, text)
+    if isinstance(source, str) or source.name.lower().endswith(MESH_FILE_ENDINGS) or glob.has_magic(text):
+        return source
     try:
-        there = [one for one in sorted(found.parent.glob(f"{found.name}.*")) if stem_of(one) == found.name]
+        there = [one for one in sorted(source.parent.glob(f"{source.name}.*")) if stem_of(one) == source.name]
         meshes = [one for one in there if one.name.lower().endswith(MESH_FILE_ENDINGS)]
-        return meshes[0] if len(meshes) == 1 and not found.exists() else found
+        return meshes[0] if len(meshes) == 1 and not source.exists() else source
     except (OSError, ValueError):
-        return found  # the reader of the scans reports such a name
+        return source  # the reader of the scans reports such a name
 
 
-def _beside(file: Path, text: str) -> Path | str:
+def _relative_to(file: Path, text: str) -> Path | str:
     return text if is_address(text) else file.parent / text
 
 
-def _refuse_doubles(found: Sequence[Given]) -> None:
+def _refuse_doubles(scans: Sequence[Given]) -> None:
     named: dict[str, Given] = {}
-    for one in found:
+    for one in scans:
         if one.called and named.setdefault(one.called.casefold(), one).place != one.place:
             raise InputError(f"Two scans have the id {one.called}; give each one of its own.")

@@ -61,11 +61,11 @@ def write_surfaces(
         InputError: a folder without volumes.
     """
     require_volumes_extra()
-    found = mesh_files(paths, recursive=recursive, apart_from=folder, endings=VOLUME_ENDINGS, kind_name="volumes")
-    for sentence in found.left_out:
+    listed = mesh_files(paths, recursive=recursive, apart_from=folder, endings=VOLUME_ENDINGS, kind_name="volumes")
+    for sentence in listed.left_out:
         say(sentence)
     make_folder(folder)
-    files = list({path.resolve(): path for path in found.files}.values())
+    files = list({path.resolve(): path for path in listed.files}.values())
     records: list[dict[str, Any]] = []
     limit = _default_limit() if max_memory_bytes is None else max_memory_bytes
     with progress(len(files), "making", "surface", quiet=quiet) as bar:
@@ -143,10 +143,10 @@ def _name_the_odd(records: Sequence[dict[str, Any]]) -> None:
     middle = float(np.median([record["volume_mm3"] for record in records]))
     usual = np.median(np.array([record["voxel_mm"] for record in records]), axis=0)
     others = [bool((np.abs(np.array(record["voxel_mm"]) / usual - 1) > _OTHER_SIZE).any()) for record in records]
-    told = " x ".join(f"{mm:.3g}" for mm in usual)
+    voxel_text = " x ".join(f"{mm:.3g}" for mm in usual)
     for record, other in zip(records, others, strict=True):
         if other and sum(others) < len(others) / 2:
-            _add(record, f"Most of the others have voxels of {told} mm.")
+            _add(record, f"Most of the others have voxels of {voxel_text} mm.")
         ratio = float(record["volume_mm3"]) / middle
         if not 1 / _OTHER_VOLUME < ratio < _OTHER_VOLUME:
             _add(record, f"Its volume is {ratio:.2g} times that in the middle of all.")

@@ -81,8 +81,8 @@ class Crop:
                 f"{scan.name}: the crop {self.text} leaves {inside.sum()} of its {len(inside)} vertices, which lie "
                 f"between {low} and {high}; give a crop in the scan's own frame and unit."
             )
-        said = f"Cropped to {inside.sum():,} of {len(inside):,} vertices ({self.text})."
-        return part_of(scan, inside), said
+        note = f"Cropped to {inside.sum():,} of {len(inside):,} vertices ({self.text})."
+        return part_of(scan, inside), note
 
     def _inside(
         self, scan: Mesh, model: ShapeModel, landmarks: Mapping[str, FloatArray] | None, unit: str

@@ -337,7 +337,7 @@ class _Recorder:
 
 
 def _place(
-    whole: ShapeModel,
+    full_model: ShapeModel,
     model: ShapeModel,
     scan: Mesh,
     config: FitConfig,
@@ -345,10 +345,10 @@ def _place(
     T_scan_model: Similarity | None,
 ) -> _Placed:
     """Crop and repair the scan, find its unit, and find where to begin; landmarks are those of the `whole` model."""
-    said: list[str] = []
+    notes: list[str] = []
     if config.crop:
-        scan, cropped = Crop.of(config.crop).cut(scan, whole, landmarks, config.unit)
-        said.append(cropped)
+        scan, cropped = Crop.of(config.crop).cut(scan, full_model, landmarks, config.unit)
+        notes.append(cropped)
     scan, findings = repair(scan, strict=config.strict)
     mm = MM_PER_UNIT[find_unit(model, scan) if config.unit == "auto" else config.unit]
     T_mm_scan = mm_frame(scan, mm)
@@ -358,14 +358,14 @@ def _place(
     if T_scan_model is not None:
         start = Start(T_mm_scan @ T_scan_model, "given", float("nan"))
     elif landmarks:
-        start = start_from_landmarks(whole, marks_mm, scan.name, with_scale=with_scale)
+        start = start_from_landmarks(full_model, marks_mm, scan.name, with_scale=with_scale)
     else:
         start = start_from_any_pose(model, scan_mm.vertices, seed=config.seed, with_scale=with_scale)
     if landmarks:
-        stddev_mm = config.landmark_stddev_mm or SHARE * rms_size(whole.mean_vertices) * start.T_scan_model.scale
+        stddev_mm = config.landmark_stddev_mm or SHARE * rms_size(full_model.mean_vertices) * start.T_scan_model.scale
         start = replace(start, marks=LandmarkConstraint.of(model, marks_mm, stddev_mm))
-    said += [*scan.notes, *(f"{finding.what} {finding.action}".strip() for finding in findings)]
-    return _Placed(scan, mm, T_mm_scan.inverse(), ScanTarget(scan_mm), start, said)
+    notes += [*scan.notes, *(f"{finding.what} {finding.action}".strip() for finding in findings)]
+    return _Placed(scan, mm, T_mm_scan.inverse(), ScanTarget(scan_mm), start, notes)
 
 
 def _measure(

@@ -88,14 +88,14 @@ def _landmarks(vertices: Mapping[str, Any], places: Mapping[str, Any], n: int, m
     """Return the landmarks of facts: in their triangles where these are given, else at their vertices."""
     landmarks: list[SurfaceLandmarks] = []
     for name, value in vertices.items():
-        vertex, place = _count(value), json_object(places.get(name))
+        vertex, entry = _count(value), json_object(places.get(name))
         if vertex is None or vertex >= n:
             continue
         landmark = SurfaceLandmarks.of({name: vertex})
         try:
-            corners = np.array([place["vertices"]], dtype=np.int32)
-            weights = np.array([place["barycentric"]], dtype=np.float64)
-            distance = np.array([place["distance_mm"]], dtype=np.float64) / mm
+            corners = np.array([entry["vertices"]], dtype=np.int32)
+            weights = np.array([entry["barycentric"]], dtype=np.float64)
+            distance = np.array([entry["distance_mm"]], dtype=np.float64) / mm
             exact = SurfaceLandmarks((name,), corners, weights, distance)
             landmark = exact if dict(exact) == dict(landmark) and corners.max() < n else landmark
         except (KeyError, ValueError, TypeError, OverflowError):

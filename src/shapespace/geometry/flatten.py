@@ -52,12 +52,12 @@ def disc_map(mesh: Mesh, *, most_rounds: int = 40) -> FloatArray:
         if (_turning(uv, filled) <= 0).any():
             break  # so much stretch that rounding folds it
         squared = wanted * _squared_stretch(vertices, uv, filled)
-        whole = float(np.sqrt((area * squared).sum() / area.sum()))
-        if whole > best[0] * (1 - _LEAST_GAIN):
-            if whole < best[0]:
-                best = (whole, uv)
+        mean_stretch = float(np.sqrt((area * squared).sum() / area.sum()))
+        if mean_stretch > best[0] * (1 - _LEAST_GAIN):
+            if mean_stretch < best[0]:
+                best = (mean_stretch, uv)
             break
-        best = (whole, uv)
+        best = (mean_stretch, uv)
         share = np.repeat(area * squared, 3), np.repeat(area, 3)
         flat = filled.ravel()
         stretch = np.sqrt(

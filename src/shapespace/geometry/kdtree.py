@@ -268,10 +268,10 @@ def start_at(
     leaf = (((row + 1) << depth) - 1) // count + (1 << depth) - 1
     top = 0
     for level in range(1, depth + 1):
-        beside = (((leaf + 1) >> (depth - level)) ^ 1) - 1
-        d = box_distance(boxes, beside, x, y, z)
+        sibling = (((leaf + 1) >> (depth - level)) ^ 1) - 1
+        d = box_distance(boxes, sibling, x, y, z)
         if d <= squared:
-            stack[top], stack[top + 1] = beside, d
+            stack[top], stack[top + 1] = sibling, d
             top += 2
     return leaf, top
 

@@ -318,18 +318,18 @@ class _Solid:
 
     @staticmethod
     def of(mask: BoolArray, *, keep_pieces: bool) -> _Solid:
-        whole = _without_edge_contacts(mask)
-        label, pieces = _components(whole)
+        separated = _without_edge_contacts(mask)
+        label, pieces = _components(separated)
         sizes = np.bincount(label[mask], minlength=pieces + 1)
         if keep_pieces:
             return _Solid(
-                mask=whole,
+                mask=separated,
                 voxels=int(sizes.sum()),
                 pieces=pieces,
                 left_out=0,
                 filled=0,
-                added=int(whole.sum() - mask.sum()),
-                topology=(pieces, _components(~whole)[1] - 1),
+                added=int(separated.sum() - mask.sum()),
+                topology=(pieces, _components(~separated)[1] - 1),
             )
         largest = 1 + int(np.argmax(sizes[1:]))
         piece = label == largest

@@ -111,7 +111,7 @@ def time_column(table: Table, time: str | None) -> str:
 def _places(table: Table, column: str, order: Sequence[str] | None) -> tuple[list[float], str]:
     cells = table.texts(column)
     if order is not None:
-        known = {word: float(place) for place, word in enumerate(order)}
+        known = {word: float(time) for time, word in enumerate(order)}
         if len(known) < max(len(order), 2):
             raise InputError(f"The order {','.join(order)} needs two or more words, each once.")
         odd = next((row for row, cell in enumerate(cells) if cell not in known), None)

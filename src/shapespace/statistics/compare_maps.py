@@ -93,10 +93,10 @@ class EffectMap:
 
     def interval_mm(self, vertex: int) -> tuple[float, float]:
         """Return the interval of `shown_mm` at a vertex, which holds for all vertices at once."""
-        f, shown = float(self.shown.f[vertex]), float(self.shown_mm[vertex])
-        half = float("inf") if f <= 0 else abs(shown) * float(np.sqrt(self.shown.critical / f))  # S9
+        f, change = float(self.test.f[vertex]), float(self.shown_mm[vertex])
+        half = float("inf") if f <= 0 else abs(change) * float(np.sqrt(self.test.critical / f))  # S9
         # A length is not negative.
-        return (shown - half if self.normal_mm is not None else max(shown - half, 0.0)), shown + half
+        return (change - half if self.normal_mm is not None else max(change - half, 0.0)), change + half
 
     @property
     def shown_mm(self) -> FloatArray:
@@ -105,7 +105,7 @@ class EffectMap:
         return mm if self.blank is None else np.where(self.blank, 0.0, mm)
 
     @property
-    def shown(self) -> Tested:
+    def test(self) -> Tested:
         """The test of `shown_mm`."""
         return self.any_way if self.along is None else self.along
 
@@ -249,8 +249,8 @@ def _precision(cohort: Cohort, residual: FloatArray) -> FloatArray:
         known = cohort.basis @ model.vertex_basis[:, :modes]
         variance = model.stddev[:modes] ** 2 + (cohort.fitted.b_stddev**2).mean(axis=0)
         # What no mode of the model makes is taken to vary alike in all directions.
-        beside = max(float((residual**2).sum() - ((residual @ known) ** 2).sum()), 0.0) / residual.size
-        prior = (known * variance) @ known.T + max(beside, _FLOOR * float(variance.mean())) * prior
+        error_variance = max(float((residual**2).sum() - ((residual @ known) ** 2).sum()), 0.0) / residual.size
+        prior = (known * variance) @ known.T + max(error_variance, _FLOOR * float(variance.mean())) * prior
     factor = np.linalg.cholesky(prior)
     white = np.linalg.solve(factor, residual.T).T
     shrunk: FloatArray = sklearn.LedoitWolf(assume_centered=True).fit(white).covariance_

@@ -368,8 +368,8 @@ def welch_flips(
             variance += within / (count - 1.0) / count
         difference = means[1] - means[0]
         t = np.divide(difference, np.sqrt(variance), out=np.zeros_like(difference), where=variance > 0)
-        whole = (difference**2 @ area) / np.maximum(variance @ area, 1e-300)
+        statistic = (difference**2 @ area) / np.maximum(variance @ area, 1e-300)
         if not arrangements:
             observed = t[0]
-        arrangements += zip(np.abs(t).max(axis=1).tolist(), whole.tolist(), strict=True)
+        arrangements += zip(np.abs(t).max(axis=1).tolist(), statistic.tolist(), strict=True)
     return observed, np.array(arrangements).T, every

@@ -74,8 +74,8 @@ class TrainingDecomposition:
         """Return the decomposition of coefficients (n, K) whose rows have weights (n,)."""
         middle = weighted_mean(X, weight)
         left, singular, right = np.linalg.svd(np.sqrt(weight)[:, None] * (X - middle), full_matrices=False)
-        kept = singular > _NOTHING * max(float(singular[0]), 1e-300)
-        return TrainingDecomposition(middle, left[:, kept], singular[kept], right[kept], weight)
+        significant = singular > _NOTHING * max(float(singular[0]), 1e-300)
+        return TrainingDecomposition(middle, left[:, significant], singular[significant], right[significant], weight)
 
     def predict(self, X: FloatArray, targets: FloatArray, choices: Sequence[Regularisation]) -> FloatArray:
         """Return the predictions (C, m, P) of each choice for coefficients (m, K), from targets (n, P) of the training
@@ -124,8 +124,8 @@ def errors_of(
     total = np.zeros((len(choices), targets.shape[1]))
     for fold in np.unique(folds):
         test = folds == fold
-        found = TrainingDecomposition.of(X[~test], weight[~test]).predict(X[test], targets[~test], choices)
-        total += np.einsum("m,cmp->cp", weight[test], (found - targets[test]) ** 2)
+        predicted = TrainingDecomposition.of(X[~test], weight[~test]).predict(X[test], targets[~test], choices)
+        total += np.einsum("m,cmp->cp", weight[test], (predicted - targets[test]) ** 2)
     return total
 
 

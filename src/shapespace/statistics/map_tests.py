@@ -123,9 +123,9 @@ def difference_test(
     """
     if unequal_variances:
         t, arrangements, every = welch_flips(maps, second, area, permutations, seed)
-        largest, whole = arrangements
+        largest, total = arrangements
         p = (len(largest) - np.searchsorted(np.sort(largest), np.abs(t) * (1 - _TIE))) / len(largest)
-        omnibus = float((whole >= whole[0] * (1 - _TIE)).mean())
+        omnibus = float((total >= total[0] * (1 - _TIE)).mean())
         counts = (int((~second).sum()), int(second.sum()))
         effect = maps[second].mean(axis=0) - maps[~second].mean(axis=0)
         return MapTest(

@@ -115,7 +115,7 @@ class Predictor:
             InputError: another gauge.
         """
         self._check(cohort)
-        off = np.stack([self._placed(cohort.vertices(at)) for at in range(len(cohort))]) - self.mean
+        off = np.stack([self._placed(cohort.vertices(k)) for k in range(len(cohort))]) - self.mean
         all_ways = off.reshape(len(off), -1) @ self.weights.T + self.intercepts
         low, high = cv_plus(all_ways[:, 1:], self.residuals, self.fold - 1, self.share, self.confidence)
         away = np.sqrt((off**2).sum(axis=2).mean(axis=1))

@@ -389,10 +389,10 @@ class Results:
         try:
             return store_row(name, self.fit(name)) | {kind: kind in self.singles[name] for kind in FLAGS}
         except ShapespaceError as error:
-            told = str(error)
+            message = str(error)
         except (ValueError, OverflowError):
-            told = f"{self.folder / f'{name}{ENDING}'} is damaged; fit the scan again."
-        self._tell(told)
+            message = f"{self.folder / f'{name}{ENDING}'} is damaged; fit the scan again."
+        self._tell(message)
         return None
 
     def _tell(self, problem: str) -> None:

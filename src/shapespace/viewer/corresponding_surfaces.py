@@ -97,7 +97,7 @@ class Surfaces:
         ]
         for name, record in self._corresponded.records.items():
             status = scan_status(record, concerns)
-            reason = record.reason or population.unread.get(name) or concerns.get(name, Concern()).told
+            reason = record.reason or population.unread.get(name) or concerns.get(name, Concern()).text
             share = distance_share(record, "mean", sizes[name]) if name in sizes else math.nan
             rows.append(
                 {

@@ -98,11 +98,11 @@ def _summary(result: AsymmetryResult, order: Any) -> tuple[str, ...]:
             "in one shape, and is subtracted."
         )
     if result.permutations:
-        shown = int((result.directional_p <= _ALPHA).sum())
+        n_significant = int((result.directional_p <= _ALPHA).sum())
         sentences.append(
-            f"Directional asymmetry is shown at {shown} of {len(result.mean)} vertices (family-wise p at most "
+            f"Directional asymmetry is shown at {n_significant} of {len(result.mean)} vertices (family-wise p at most "
             f"{_ALPHA})."
-            if shown
+            if n_significant
             else f"No vertex shows directional asymmetry (family-wise p above {_ALPHA} everywhere)."
         )
     first = int(order[0])
@@ -249,7 +249,7 @@ def _finite_or_none(value: float) -> float | None:
 
 
 def _maps_and_morphs(result: AsymmetryResult, order: Any) -> tuple[Mapping[str, Any], list[Part]]:
-    shown = [int(k) for k in order[:_MOST_MAPS]]
+    subjects = [int(k) for k in order[:_MOST_MAPS]]
     half_difference = result.difference.mean(axis=0) / 2.0
     arrays: dict[str, Any] = {
         "vertices": result.mean,
@@ -328,7 +328,7 @@ def _maps_and_morphs(result: AsymmetryResult, order: Any) -> tuple[Mapping[str, 
             low="two one way",
             high="two the other",
         )
-    for rank, k in enumerate(shown, 1):
+    for rank, k in enumerate(subjects, 1):
         name = result.subjects[k]
         hidden = _unobserved(result)
         arrays[f"subject_{rank}_mm"] = blank_where(result.maps[k], None if hidden is None else hidden[k])
@@ -341,7 +341,7 @@ def _maps_and_morphs(result: AsymmetryResult, order: Any) -> tuple[Mapping[str, 
                 note=f"{_score_text(result, k)}.",
             )
         )
-    k = shown[0]
+    k = subjects[0]
     morph(
         title=f"{result.subjects[k]} and its mirror image",
         key="subject",

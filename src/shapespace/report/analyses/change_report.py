@@ -375,7 +375,7 @@ def _subject_parts(change: ChangeResult, arrays: dict[str, npt.NDArray[Any]]) ->
     columns = [
         TableColumn(name="subject"), TableColumn(name="first"), TableColumn(name="last"),
         TableColumn(name="RMS", kind="mm"), TableColumn(name="beyond its uncertainty", kind="percent"),
-        *(TableColumn(name=f"{what}, {unit.name}", kind="number") for what in ("volume", "stddev")),
+        *(TableColumn(name=f"{quantity}, {unit.name}", kind="number") for quantity in ("volume", "stddev")),
     ]  # fmt: skip
     if change.is_closed:
         columns.append(TableColumn(name="of the volume before", kind="percent"))

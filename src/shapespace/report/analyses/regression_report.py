@@ -42,8 +42,8 @@ def regression_report(result: RegressionResult, new: tuple[Cohort, Predictions] 
         tables["new.csv"] = _prediction_rows(*new)
     faces = result.cohort.faces
     meshes = {
-        f"{name}.ply": Mesh(result.shape_at(at), faces, name=f"{result.target} {at:g}")
-        for name, at in (("low", result.low_at), ("high", result.high_at))
+        f"{name}.ply": Mesh(result.shape_at(value), faces, name=f"{result.target} {value:g}")
+        for name, value in (("low", result.low_at), ("high", result.high_at))
     }
     report = AnalysisReport(
         question="regress",

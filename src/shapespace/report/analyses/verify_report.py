@@ -197,14 +197,14 @@ def _roc_curve(result: VerificationResult) -> CurvePart:
     least = max(1.0 / int((~result.pairs.same).sum()), _LEAST_RATE)
     series: list[Series] = []
     for one in result.scores:
-        shown = np.unique(np.concatenate([[least], GRID[least <= GRID]]))
-        grid_points = np.searchsorted(GRID, shown)
+        far = np.unique(np.concatenate([[least], GRID[least <= GRID]]))
+        grid_points = np.searchsorted(GRID, far)
         band = [tuple(side[np.minimum(grid_points, len(GRID) - 1)].tolist()) for side in one.band]
         has_band = bool(np.isfinite(one.band).all())
         series.append(
             Series(
-                x=tuple(shown.tolist()),
-                y=tuple(one.roc.tar_at(shown).tolist()),
+                x=tuple(far.tolist()),
+                y=tuple(one.roc.tar_at(far).tolist()),
                 label=score_label(one.name),
                 low=band[0] if has_band else None,
                 high=band[1] if has_band else None,

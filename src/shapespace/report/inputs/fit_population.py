@@ -75,7 +75,7 @@ class ListedColumn:
         bin_index[~np.isfinite(self.values)] = -1
         middles = (edges[1:] + edges[:-1]) / 2
         return [
-            (f"{self.told(edges[k])} to {self.told(edges[k + 1])}", bin_index == k, float(middles[k]))
+            (f"{self.value_text(edges[k])} to {self.value_text(edges[k + 1])}", bin_index == k, float(middles[k]))
             for k in range(len(middles))
         ]
 
@@ -89,7 +89,7 @@ class ListedColumn:
             return np.asarray(np.arange(low, high + step + 1, step), dtype=np.float64)
         return np.asarray(np.linspace(low, np.nextafter(high, np.inf), max_bins + 1), dtype=np.float64)
 
-    def told(self, value: float) -> str:
+    def value_text(self, value: float) -> str:
         """Format a value as text."""
         if self.kind == "time":
             return datetime.fromtimestamp(value, UTC).strftime("%Y-%m-%d")

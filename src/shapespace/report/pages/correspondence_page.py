@@ -99,9 +99,9 @@ class CorrespondencePage:
 
     def status(self, record: CorrespondRecord) -> Cell:
         """Return what came of a scan, sorted from bad to good."""
-        found = scan_status(record, self.concerns)
-        words, colour = _STATUS[found]
-        return Cell(words, float(list(_STATUS).index(found)), colour)
+        cell = scan_status(record, self.concerns)
+        words, colour = _STATUS[cell]
+        return Cell(words, float(list(_STATUS).index(cell)), colour)
 
     @property
     def looked_at(self) -> list[CorrespondRecord]:
@@ -168,17 +168,17 @@ class CorrespondencePage:
     def verdict(self) -> str:
         """Return in a few sentences whether to go on, and what to look at first."""
         n, aside = len(self.records), len(self.out) + len(self.at.unread)
-        told = f"{n} of {counted(self.total, 'scan')} {'is' if n == 1 else 'are'} in correspondence"
+        text = f"{n} of {counted(self.total, 'scan')} {'is' if n == 1 else 'are'} in correspondence"
         some = self.looked_at
-        told += f"; {counted(len(some), 'of them stands', 'of them stand')} out and should be looked at" if some else (
+        text += f"; {counted(len(some), 'of them stands', 'of them stand')} out and should be looked at" if some else (
             " and none of them stands out"
         )  # fmt: skip
-        told += f"; {aside} {'is' if aside == 1 else 'are'} excluded." if aside else "."
+        text += f"; {aside} {'is' if aside == 1 else 'are'} excluded." if aside else "."
         folded = [record.folded_share for record in self.records if record.folded_share]
-        told += " No triangle is folded over." if not folded else (
+        text += " No triangle is folded over." if not folded else (
             f" {counted(len(folded), 'scan has', 'scans have')} folded triangles, {percent_of(max(folded))} at most."
         )  # fmt: skip
-        return f"{told} {self._settling()}"
+        return f"{text} {self._settling()}"
 
     def _settling(self) -> str:
         moved = self.at.run.rounds
@@ -200,7 +200,7 @@ class CorrespondencePage:
     def _to_look_at(self) -> Notice:
         some = self.looked_at
         items = [
-            Item(self.concerns[record.name].told, Cell(record.name, place=self._cards.get(record.name)))
+            Item(self.concerns[record.name].text, Cell(record.name, place=self._cards.get(record.name)))
             for record in some[:_MOST_NAMED]
         ]
         if len(some) > _MOST_NAMED:
@@ -216,14 +216,15 @@ class CorrespondencePage:
         """Return a checkerboard on the mean shape, carried to the worst scans and to some of the others."""
         from shapespace.report import figures
 
-        shown = self._boards()
-        if not shown:
+        pictured = self._boards()
+        if not pictured:
             return [Text("There is no surface to show.", "broken")]
-        placed = {record.name: self.at.placed(record.name) for record in shown}
-        which = "All scans." if len(shown) == len(self.records) else (
-            f"{len(shown)} of {counted(len(self.records), 'scan')}: those that stand out most, then some of the others."
+        placed = {record.name: self.at.placed(record.name) for record in pictured}
+        which = "All scans." if len(pictured) == len(self.records) else (
+            f"{len(pictured)} of {counted(len(self.records), 'scan')}: those that stand out most, then some of the "
+            "others."
         )  # fmt: skip
-        surfaces, labels = [placed[r.name].vertices for r in shown], [record.name for record in shown]
+        surfaces, labels = [placed[r.name].vertices for r in pictured], [record.name for record in pictured]
         pictures: list[Block] = []
         for yaw, side in ((0.0, "from the front"), (figures.SIDE_DEG, "from one side")):
             title = f"The same squares on every scan, {side}"
@@ -259,27 +260,27 @@ class CorrespondencePage:
         shares = np.array([[self.share(r, w) for w in ("mean", "p95", "p99", "max")] for r in self.records])
         share = 1 - self.all.seen_count / len(self.records)
         hardly = float((share > 1 - _HARDLY_SEEN).mean())
-        told = "Every scan shows every vertex."
+        text = "Every scan shows every vertex."
         if share.any():
             most = (
                 f"{percent(hardly)} on more than half, which build leaves out" if hardly else "none on more than half"
             )
-            told = f"{percent(float((share > 0).mean()))} of the vertices are missing on at least one scan, and {most}."
+            text = f"{percent(float((share > 0).mean()))} of the vertices are missing on at least one scan, and {most}."
         there = median([known(record.area_share) for record in self.records])
         lacking: list[Block] = []
         if there < _WHOLE_SHARE:
-            what = (
+            caption = (
                 f"The mean shape lacks parts that the scans show: its surface is {percent(there)} of the median "
                 "scan's, mostly because the first template lacked them. Give a whole one with --template."
             )
-            lacking.append(Text(what, "notice"))
+            lacking.append(Text(caption, "notice"))
         if self.at.holes:
-            what = (
+            caption = (
                 f"The mean shape has {counted(self.at.holes, 'hole')} beside its border. Where the object has no "
                 "opening, the first template had a hole, and no scan can show anything there; give a whole one with "
                 "--template."
             )
-            lacking.append(Text(what, "notice"))
+            lacking.append(Text(caption, "notice"))
         return [
             Text(
                 "Distances are measured both ways: from the vertices that a scan shows to the scan, and from its "
@@ -295,7 +296,7 @@ class CorrespondencePage:
                 ),
                 self.page.figure(
                     figures.missing_figure(self.mean, share),
-                    f"{told} The mean shape from four sides.",
+                    f"{text} The mean shape from four sides.",
                     alt="Share of scans that do not show each vertex, on the mean shape from four sides",
                 ),
             ),
@@ -351,9 +352,9 @@ class CorrespondencePage:
         status = self.status(record)
         if record in self.out:
             return Card(self._cards[record.name], record.name, status, "", self._reason(record), image, note)
-        told = f"Mean distance {percent_of(self.share(record, 'mean'))} of its size. {self.concerns[record.name].told}"
-        told += f" {note}" if note else ""
-        return Card(self._cards[record.name], record.name, status, "", told, image)
+        text = f"Mean distance {percent_of(self.share(record, 'mean'))} of its size. {self.concerns[record.name].text}"
+        text += f" {note}" if note else ""
+        return Card(self._cards[record.name], record.name, status, "", text, image)
 
     def _still(self, record: CorrespondRecord, limit: float) -> tuple[Image, str]:
         """Return the picture of a scan, and what it lacks."""
@@ -369,7 +370,7 @@ class CorrespondencePage:
         far = np.full(len(placed.vertices), nan)
         try:
             own = drawable(self._bounded(record))[0]
-            scan, far = self._beside(own, placed)
+            scan, far = self._scan_on_mean(own, placed)
         except FileFormatError as error:
             note = f"Without the scan beside it: {error}"
         still = thumbnails.correspondence_strip(self.mean, placed.vertices, scan, far, limit)
@@ -381,7 +382,7 @@ class CorrespondencePage:
 
         return decimate(self.at.raw_scan(record), _TRIANGLES_DRAWN)[0]
 
-    def _beside(self, scan: Mesh, placed: PlacedSurface) -> tuple[Mesh, FloatArray]:
+    def _scan_on_mean(self, scan: Mesh, placed: PlacedSurface) -> tuple[Mesh, FloatArray]:
         """Return the scan moved onto the mean shape, and how far off each vertex lies, percent of the size."""
         moved = scan.with_vertices(placed.T_scan_mean.inverse().apply(scan.vertices))
         far = np.full(len(placed.vertices), nan)
@@ -417,12 +418,12 @@ class CorrespondencePage:
         if len(records) > MOST_ROWS:
             out.append(Text(f"The first {MOST_ROWS:,} of {len(records):,} scans; their records have all."))
         table = Table([column for column, _ in columns], rows, "All scans", sortable=len(rows) > 1)
-        what = (
+        caption = (
             "Distances are both ways; those without % are in the unit of the scan's file. Area covered: that of the "
             "surface beside that of the scan. Folded: triangles that turn back over their neighbours. Area change: "
             "95 % of the triangles grow or shrink by less than so many times beside the mean shape, size divided out."
         )
-        notes: list[Block] = [Text(what, "soft")]
+        notes: list[Block] = [Text(caption, "soft")]
         why = [[record.name, self._reason(record)] for record in records if self._reason(record)]
         if why:
             heading = f"The reasons of {counted(len(why), 'scan')}"
@@ -432,7 +433,7 @@ class CorrespondencePage:
     def _reason(self, record: CorrespondRecord) -> str:
         if record in self.out:
             return sentence(record.reason or self.all.unread.get(record.name, ""))
-        return self.concerns[record.name].told if self.concerns[record.name].reasons else ""
+        return self.concerns[record.name].text if self.concerns[record.name].reasons else ""
 
     # The rest
 

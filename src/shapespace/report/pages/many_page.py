@@ -123,7 +123,9 @@ class ManyPage(FolderPage):
             Tiles(tiles),
             *self.other_models(),
             Notice(
-                "Cannot be read", [without_folders(printable(told)) for told in self.problems[:_MOST_NOTED]], "broken"
+                "Cannot be read",
+                [without_folders(printable(text)) for text in self.problems[:_MOST_NOTED]],
+                "broken",
             ),
             *([] if len(self.population.models) < 2 else [Text(self._of_models())]),
             *self.page.tried(self.stands_out),
@@ -143,8 +145,8 @@ class ManyPage(FolderPage):
         for column in self.population.listed:
             for group in self.population.compared(column):
                 if group.stands_out:
-                    told = "; ".join(group.stands_out)
-                    items.append(Item(f"{told[:1].upper()}{told[1:]}.", Cell(f"{column.name} {printable(group.name)}")))
+                    text = "; ".join(group.stands_out)
+                    items.append(Item(f"{text[:1].upper()}{text[1:]}.", Cell(f"{column.name} {printable(group.name)}")))
         if len(items) > _MOST_NOTED:
             items = [*items[:_MOST_NOTED], f"{len(items) - _MOST_NOTED} more, in the tables of Time and site."]
         return Notice("Differ from all the others", items)
@@ -316,12 +318,12 @@ class ManyPage(FolderPage):
     def numbers(self) -> list[Block]:
         """Return the table of the fits that are looked at."""
         wanted = listed([f"{most} {STATUS_WORDS[kind]}" for kind, most in WORST.items()])
-        told = (
+        text = (
             f"Of {counted(len(self.population), 'fit')} these {len(self.fits)}: the worst of each status ({wanted}), "
             f"and the {_FARTHEST} farthest from the mean. shapespace export gives the table of all, and fits as files."
         )
         table = tables.fits_table(self.fits, self.places, caption="Fits to look at: distances and errors in mm")
-        return [Text(told), table, *([Text(self.label_note, "soft")] if self.label_note else [])]
+        return [Text(text), table, *([Text(self.label_note, "soft")] if self.label_note else [])]
 
     def together(self) -> list[Block]:
         """Return the first coefficients of the fits that are looked at, to be turned."""

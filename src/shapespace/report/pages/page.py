@@ -65,10 +65,10 @@ class Page:
         """Count bytes that are embedded by other means than this page's."""
         self._spent += n_bytes
 
-    def step(self, what: str) -> None:
+    def step(self, name: str) -> None:
         """Tell the progress bar what was just made."""
         if self._on_step is not None:
-            self._on_step(what, self._planned)
+            self._on_step(name, self._planned)
 
     def place(self, text: str) -> str:
         """Return a name for a place in the page, made of `text` and taken only once."""

@@ -77,17 +77,17 @@ def write_report(
         if model is not None or labels is not None:
             raise InputError(f"{folder} is a correspondence without fits; leave out --model and --labels.")
         page = CorrespondencePage(results, on_step).html()
-    elif (kept := standalone_file(results)) is not None:
+    elif (standalone := standalone_file(results)) is not None:
         if model is not None or labels is not None:
-            raise InputError(f"{folder} holds {kept.article} without fits; leave out --model and --labels.")
-        page = study_page(results, kept, on_step)
+            raise InputError(f"{folder} holds {standalone.article} without fits; leave out --model and --labels.")
+        page = study_page(results, standalone, on_step)
     else:
         from shapespace.report.pages.folder_page import FolderPage
         from shapespace.report.pages.many_page import ManyPage, is_many
 
-        kept = Results(folder)
-        if is_many(kept):
-            write_text(path, ManyPage(results, kept, model=model, labels=labels, on_step=on_step).html())
+        standalone = Results(folder)
+        if is_many(standalone):
+            write_text(path, ManyPage(results, standalone, model=model, labels=labels, on_step=on_step).html())
             return path
         fits = find_fits(results)
         if all(fit.status == "unreadable" for fit in fits):

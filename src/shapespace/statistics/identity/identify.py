@@ -55,8 +55,8 @@ class Searches:
     def cmc(self, most: int, weights: FloatArray | None = None) -> FloatArray:
         """Return (most,) the share of enrolled probes found within the first 1, 2, ... people."""
         w = (np.ones(len(self.rank)) if weights is None else weights)[self.enrolled]
-        at = np.minimum(self.rank[self.enrolled] - 1, most)
-        return np.cumsum(np.bincount(at, weights=w, minlength=most + 1))[:most] / w.sum()
+        rank = np.minimum(self.rank[self.enrolled] - 1, most)
+        return np.cumsum(np.bincount(rank, weights=w, minlength=most + 1))[:most] / w.sum()
 
     def fnir(self, fpir: FloatArray, weights: FloatArray | None = None) -> FloatArray:
         """Return the share of enrolled probes missed at thresholds that let at most `fpir` of others in.
@@ -173,15 +173,15 @@ def identify(
     trial = trial_of(cohort, config, enrol=True)
     parts: dict[str, list[Searches]] = {name: [] for name in config.scores}
     sizes: list[int] = []
-    for round_, found in scores_of(trial, config, config.modes):
+    for round_, matrices in scores_of(trial, config, config.modes):
         gallery, probes = (trial.person[list(rows)] for rows in (round_.gallery, round_.probes))
         sizes.append(len(np.unique(gallery)))
-        for name, scores in found.items():
+        for name, scores in matrices.items():
             parts[name].append(search(scores, gallery, probes))
     people = people_drawn(trial.tested, config.draws, config.seed)
     rates: list[IdentificationRates] = []
-    for number, (name, told) in enumerate(parts.items()):
-        rates.append(identification_rates(name, joined(told), min(sizes), people))
+    for number, (name, searches) in enumerate(parts.items()):
+        rates.append(identification_rates(name, joined(searches), min(sizes), people))
         if progress is not None:
             progress(number + 1, len(parts))
     return IdentificationResult(
@@ -200,13 +200,13 @@ def joined(parts: Sequence[Searches]) -> Searches:
     return Searches(*(np.concatenate([getattr(part, field) for part in parts]) for field in fields))
 
 
-def identification_rates(name: str, searches: Searches, most: int, people: FloatArray) -> IdentificationRates:
+def identification_rates(name: str, searches: Searches, n_ranks: int, people: FloatArray) -> IdentificationRates:
     """Return the figures of one score.
 
     Args:
         name: of it.
         searches: of all probes.
-        most: ranks that are told.
+        n_ranks: ranks that are told.
         people: (draws, P) from `people_drawn`.
     """
     rates = np.array(FPIR)
@@ -215,14 +215,14 @@ def identification_rates(name: str, searches: Searches, most: int, people: Float
         weights = times[searches.person]
         strangers = ~searches.enrolled if not searches.enrolled.all() else searches.enrolled
         if weights[searches.enrolled].sum() > 0 and weights[strangers].sum() > 0:
-            rows.append(np.concatenate([searches.cmc(most, weights), searches.fnir(rates, weights)]))
-    drawn = np.array(rows).reshape(len(rows), most + len(rates))
-    cmc, fnir = searches.cmc(most), searches.fnir(rates)
+            rows.append(np.concatenate([searches.cmc(n_ranks, weights), searches.fnir(rates, weights)]))
+    drawn = np.array(rows).reshape(len(rows), n_ranks + len(rates))
+    cmc, fnir = searches.cmc(n_ranks), searches.fnir(rates)
     searched = len(searches.rank) if searches.enrolled.all() else int((~searches.enrolled).sum())
-    band = np.percentile(drawn[:, :most], [2.5, 97.5], axis=0) if len(drawn) else np.full((2, most), np.nan)
+    band = np.percentile(drawn[:, :n_ranks], [2.5, 97.5], axis=0) if len(drawn) else np.full((2, n_ranks), np.nan)
     band = np.stack(widen_share(band[0], band[1], searches.people))
     missed = {
-        rate: rate_estimate(float(fnir[k]), drawn[:, most + k], searches.people)
+        rate: rate_estimate(float(fnir[k]), drawn[:, n_ranks + k], searches.people)
         if searched * rate >= 1
         else RateEstimate(None)
         for k, rate in enumerate(FPIR)

@@ -111,8 +111,8 @@ class TwoCovariance:
         return 1.0 - self.noise + self.noise_scale * (samples.variance @ self.basis**2)
 
 
-def _less(whole: FloatArray, part: FloatArray, least: float) -> FloatArray:
+def _less(total: FloatArray, part: FloatArray, least: float) -> FloatArray:
     """Return `whole` less `part`, of which in no direction less than the share `least` of `whole` is left."""
-    shares, vectors = eigh(part, whole)
+    shares, vectors = eigh(part, total)
     back = np.linalg.inv(vectors)
     return (back.T * np.maximum(1.0 - shares, least)) @ back

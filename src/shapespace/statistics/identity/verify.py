@@ -139,27 +139,27 @@ def verify(
     curves: dict[int, Mapping[str, FloatArray]] = {
         modes: _pairs_and_scores(trial, config, modes)[1] for modes in config.curve
     }
-    found = tuple(
+    rates = tuple(
         verification_rates(name, score, pairs, trial.group, people, chosen=chosen, on_draw=step,
                  curve={modes: Sweep(curves[modes][name], pairs.same).roc().eer for modes in curves})
         for name, score in scores.items()
     )  # fmt: skip
     n_training = min(len({trial.subjects[row] for row in one.training}) for one in trial.rounds)
     return VerificationResult(
-        scores=found, pairs=pairs, people=trial.people, trained_on=n_training, trial=trial, config=config
+        scores=rates, pairs=pairs, people=trial.people, trained_on=n_training, trial=trial, config=config
     )
 
 
 def _pairs_and_scores(trial: Trial, config: IdentityConfig, modes: int | None) -> tuple[Pairs, dict[str, FloatArray]]:
     parts: list[Pairs] = []
     scores: dict[str, list[FloatArray]] = {name: [] for name in config.scores}
-    for round_, found in scores_of(trial, config, modes):
-        pairs, at = trial.pairs(round_)
+    for round_, matrices in scores_of(trial, config, modes):
+        pairs, indices = trial.pairs(round_)
         parts.append(pairs)
-        for name, matrix in found.items():
-            scores[name].append(matrix[at[:, 0], at[:, 1]])
+        for name, matrix in matrices.items():
+            scores[name].append(matrix[indices[:, 0], indices[:, 1]])
     one, other, rows = (np.concatenate([getattr(part, field) for part in parts]) for field in ("one", "other", "rows"))
-    return Pairs(one, other, rows), {name: np.concatenate(told) for name, told in scores.items()}
+    return Pairs(one, other, rows), {name: np.concatenate(parts_of_score) for name, parts_of_score in scores.items()}
 
 
 def verification_rates(
@@ -200,7 +200,7 @@ def verification_rates(
         return np.concatenate([[own], _figures(rates), rates.tar_at(GRID)])
 
     drawn = resampled(pairs, people, of, 2 + len(FAR) + len(GRID), on_draw)
-    eer, tar = _told(roc, pairs, drawn[:, 1:])
+    eer, tar = _rate_estimates(roc, pairs, drawn[:, 1:])
     usable = drawn[np.isfinite(drawn[:, 1]), 2 + len(FAR) :]
     band = np.percentile(usable, _ENDS, axis=0) if len(usable) else np.full((2, len(GRID)), np.nan)
     band = np.stack(widen_share(band[0], band[1], pairs.genuine_people))
@@ -212,7 +212,7 @@ def verification_rates(
             continue
         own_sweep = Sweep(score[own], part.same)
         spread = resampled(part, people[:_BY_DRAWS], lambda w, s=own_sweep: _figures(s.roc(w)), 1 + len(FAR))
-        by[value] = SubgroupRates(genuine, len(part) - genuine, *_told(own_sweep.roc(), part, spread))
+        by[value] = SubgroupRates(genuine, len(part) - genuine, *_rate_estimates(own_sweep.roc(), part, spread))
     least = cllr_min(score, pairs.same)
     return VerificationRates(
         name=name,
@@ -233,7 +233,7 @@ def _figures(rates: Roc) -> FloatArray:
     return np.concatenate([[rates.eer], rates.tar_at(np.array(FAR))])
 
 
-def _told(roc: Roc, pairs: Pairs, drawn: FloatArray) -> tuple[RateEstimate, dict[float, RateEstimate]]:
+def _rate_estimates(roc: Roc, pairs: Pairs, drawn: FloatArray) -> tuple[RateEstimate, dict[float, RateEstimate]]:
     """Return EER and TAR at each FAR with their intervals; no value where no impostor pair may be accepted."""
     impostors = int((~pairs.same).sum())
     tar = {
