@@ -192,7 +192,7 @@ def specificity(meshes: Sequence[Mesh], scans: Sequence[Mesh], counts: Sequence[
 def at_modes(curve: Curve | None, modes: int) -> tuple[float, float, float]:
     """Return a measure with its 95 % interval at so many modes, or at the most there are."""
     assert curve is not None
-    k = int(np.searchsorted(curve.at, min(modes, curve.at[-1])))
+    k = int(np.searchsorted(curve.counts, min(modes, curve.counts[-1])))
     return float(curve.mean[k]), float(curve.low[k]), float(curve.high[k])
 
 

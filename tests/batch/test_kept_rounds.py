@@ -12,8 +12,8 @@ from shapespace.batch.execution import ExecutionConfig
 from shapespace.batch.parallel_rounds import RoundRunner
 from shapespace.correspondence.groupwise import correspond
 from shapespace.correspondence.harmonics import Harmonics
-from shapespace.correspondence.place import RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.register import ElasticSettings
+from shapespace.correspondence.registration import RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.settings import CorrespondSettings
 from shapespace.correspondence.template import PoseModel, resample
 from shapespace.types import Mesh

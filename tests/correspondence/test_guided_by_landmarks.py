@@ -14,8 +14,8 @@ from shapespace.correspondence.groupwise import correspond
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.landmark_guide import ScanLandmarks, consensus_landmarks, stray_landmarks
 from shapespace.correspondence.mirror_image import MirrorMap
-from shapespace.correspondence.place import RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.register import ElasticSettings
+from shapespace.correspondence.registration import RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.settings import CorrespondSettings
 from shapespace.correspondence.template import PoseModel, choose_template
 from shapespace.errors import InputError, MeshError

@@ -73,7 +73,7 @@ class Source:
     remote_version: str = ""
 
     @staticmethod
-    def at(file: Path, content_hash: str, folder: Path) -> Source:
+    def of_file(file: Path, content_hash: str, folder: Path) -> Source:
         """Return the source `file` as results in `folder` refer to it."""
         try:
             path = os.path.relpath(_resolved(file), _resolved_folder(folder.absolute()))
@@ -90,7 +90,7 @@ class Source:
         """
         content_hash = sha256_of_file(file)
         stat = file.stat()
-        source = Source.at(file, content_hash, folder)
+        source = Source.of_file(file, content_hash, folder)
         return replace(source, size_bytes=stat.st_size, modified_ns=stat.st_mtime_ns)
 
     def to_file(self) -> File:

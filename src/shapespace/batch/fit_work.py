@@ -80,7 +80,7 @@ class Job:
 
     def source(self, folder: Path) -> Source:
         """Return what results in `folder` say of where the scan is, without reading it."""
-        return Source(self.scan.name, "", self.address) if self.address else Source.at(self.scan, "", folder)
+        return Source(self.scan.name, "", self.address) if self.address else Source.of_file(self.scan, "", folder)
 
     def read_source(self, file: Path, folder: Path) -> Source:
         """Return the same, with what the scan is known again by; `file` is that of `readable`.
@@ -212,7 +212,7 @@ class FitWork:
             if earlier is not None:
                 return earlier
         job, model = task.job, _model.get(self.model_hash, self._load)
-        model_source = Source.at(self.model_file, self.model_hash, self.folder)
+        model_source = Source.of_file(self.model_file, self.model_hash, self.folder)
         scan_source, marks_source = job.source(self.folder), None
         try:
             with job.readable() as file:
@@ -234,7 +234,7 @@ class FitWork:
 
     def give_up(self, task: FitTask, reason: str) -> FitRecord:
         """Write and return the record of a scan whose workers were lost."""
-        model = Source.at(self.model_file, self.model_hash, self.folder)
+        model = Source.of_file(self.model_file, self.model_hash, self.folder)
         scan = task.job.source(self.folder)
         if not task.job.address:
             with contextlib.suppress(ShapespaceError):
@@ -331,7 +331,7 @@ def is_same_scan(recorded: File, job: Job, folder: Path) -> bool:
         return recorded.path == job.address and recorded.remote_version == version_of(job.address)
     with contextlib.suppress(OSError):
         there = job.scan.stat()
-        now = (there.st_size, there.st_mtime_ns, Source.at(job.scan, "", folder).path)
+        now = (there.st_size, there.st_mtime_ns, Source.of_file(job.scan, "", folder).path)
         if (recorded.size_bytes, recorded.modified_ns, recorded.path) == now:
             return True
     return recorded.hash == sha256_of_file(job.scan)

@@ -121,7 +121,7 @@ def _key(scan: Path, folder: Path | None, address: str) -> _Scan:
         return _Scan(scan.name, address)
     if folder is None:
         return _Scan(scan.name, str(scan.parent.resolve()))
-    return _Scan(scan.name, Source.at(scan, "", folder).path)
+    return _Scan(scan.name, Source.of_file(scan, "", folder).path)
 
 
 def _stem(scan: Path) -> str:

@@ -54,7 +54,7 @@ def _hash_of(mesh: Mesh) -> str:
 
 def _model(result: FitResult, folder: Path) -> Source:
     file = result.files.get("model") or result.model.file
-    return Source.at(file, result.model_hash, folder) if file else Source("", result.model_hash)
+    return Source.of_file(file, result.model_hash, folder) if file else Source("", result.model_hash)
 
 
 def _landmarks(result: FitResult) -> Source | None:

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 
-def whole(text: str) -> int:
+def integer(text: str) -> int:
     """Return a whole number of any sign."""
     try:
         return int(text)
@@ -17,7 +17,7 @@ def whole(text: str) -> int:
 
 def natural(text: str) -> int:
     """Return a whole number of 0 or more."""
-    value = whole(text)
+    value = integer(text)
     if value < 0:
         raise argparse.ArgumentTypeError("must not be negative")
     return value

@@ -220,8 +220,8 @@ def build(
             seed=settings.seed,
         )
         if regions:
-            kept = ObservedMeshes.of(loaded, _min_seen(settings)) if settings.representation == "vertices" else None
-            model = replace(model, regions=regions if kept is None else kept.regions(regions))
+            observed = ObservedMeshes.of(loaded, _min_seen(settings)) if settings.representation == "vertices" else None
+            model = replace(model, regions=regions if observed is None else observed.regions(regions))
         model.save(output)
     return model, notes + _model_notes(model, settings)
 
@@ -281,7 +281,7 @@ def _streamed(
     """Build a model of meshes that are not held in memory, and save it."""
     folder = output.with_name(f"{output.name}.build")
     scratch = Scratch(folder, _identity(meshes, settings, parent))
-    kept = shapes_folder(output) if settings.keep_shapes else None
+    shapes_kept_in = shapes_folder(output) if settings.keep_shapes else None
     with progress(None, "streaming", "mesh", quiet=quiet) as bar:
         if parent is not None and settings.add is not None:
             model = parent.with_more(
@@ -292,7 +292,7 @@ def _streamed(
                 licence=_joined(parent.licence, settings.licence),
                 seed=settings.seed,
                 scratch=scratch,
-                keep_shapes=kept,
+                keep_shapes=shapes_kept_in,
                 tell=bar.set_description_str,
             )
         else:
@@ -307,13 +307,13 @@ def _streamed(
                 seed=settings.seed,
                 out_of_core=True,
                 scratch=scratch,
-                keep_shapes=kept,
+                keep_shapes=shapes_kept_in,
                 tell=bar.set_description_str,
             )
         model.save(output)
-    if kept is not None:
-        size = sum(file.stat().st_size for file in kept.iterdir())
-        notes.append(f"The shapes are kept in {kept} ({size / 1e6:.1f} MB), for --add.")
+    if shapes_kept_in is not None:
+        size = sum(file.stat().st_size for file in shapes_kept_in.iterdir())
+        notes.append(f"The shapes are kept in {shapes_kept_in} ({size / 1e6:.1f} MB), for --add.")
     return model
 
 
@@ -439,15 +439,15 @@ def _missing(meshes: Sequence[Mesh], landmarks: SurfaceLandmarks, settings: Buil
     sentences = [f"{missing} of {every} vertices are missing ({share:.1f} %), in {where} of {len(meshes)} meshes."]
     if settings.representation != "vertices":
         return sentences
-    kept = ObservedMeshes.of(meshes, _min_seen(settings))
-    if out := int((~kept.vertices).sum()):
+    observed = ObservedMeshes.of(meshes, _min_seen(settings))
+    if out := int((~observed.vertices).sum()):
         number = "1 vertex is" if out == 1 else f"{out} vertices are"
         sentences.append(
             f"{number} taken out of the model, since fewer than {100 * _min_seen(settings):g} % of the meshes show "
             "them; "
             "--min-seen says how many must."
         )
-    if lost := sorted(set(landmarks) - set(kept.landmarks(landmarks))):
+    if lost := sorted(set(landmarks) - set(observed.landmarks(landmarks))):
         sentences.append(
             f"The model has no {', '.join(lost)}, since these landmarks lie in triangles with vertices that are taken "
             "out."

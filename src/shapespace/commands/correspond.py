@@ -26,7 +26,7 @@ from shapespace.correspondence.correspondence_result import Correspondence, Corr
 from shapespace.correspondence.first_template import first_template
 from shapespace.correspondence.groupwise import ENOUGH_TO_JUDGE, correspond
 from shapespace.correspondence.landmark_guide import stray_landmarks, without_stray_landmarks
-from shapespace.correspondence.place import RegistrationTask, RoundContext, ScanRegistration
+from shapespace.correspondence.registration import RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.scan_set import copies, unit_ratios
 from shapespace.correspondence.settings import CorrespondSettings
 from shapespace.errors import ShapespaceError
@@ -99,7 +99,7 @@ def correspond_files(
         InputError: fewer than two scans, or too few that can be reached.
     """
     given = given_scans(files.scans, folder, recursive=files.recursive, say=say)
-    distinct = list({one.place: one for one in given}.values())
+    distinct = list({one.source: one for one in given}.values())
     scans = [one for one in distinct if not one.path.name.endswith(SURFACE)]
     if len(scans) < len(distinct):
         say(f"{len(distinct) - len(scans)} surfaces of an earlier correspondence are not taken for scans.")
@@ -293,7 +293,7 @@ def _looked_at(scan: Mesh, *, strict: bool) -> tuple[Mesh, list[str]]:
         MeshError: it cannot be used.
     """
     mesh, findings = repair(scan, strict=strict)
-    notes = [f"{one.what} {one.action}" for one in findings if one.level == "note" or NON_FINITE in one.what]
+    notes = [f"{one.problem} {one.action}" for one in findings if one.level == "note" or NON_FINITE in one.problem]
     return without_stray_landmarks(mesh), [*notes, *_told_astray(mesh)]
 
 

@@ -234,7 +234,7 @@ def _scans(scans: Sequence[str | Path], folder: Path, *, recursive: bool, say: C
             return False
         return scan.parent.resolve() == here or not {scan.resolve(), scan.parent.resolve()} & given
 
-    left = [one for one in scans_found if not is_result(one.place)]
+    left = [one for one in scans_found if not is_result(one.source)]
     if not left:
         raise InputError(f"{folder} holds only results of earlier fits; give the scans, or another folder for results.")
     if len(left) < len(scans_found):

@@ -30,13 +30,13 @@ class Given:
     """A scan as it was given.
 
     Args:
-        place: path of the scan, or its address.
+        source: path of the scan, or its address.
         called: by the column `id` of a list, or empty.
         metadata: the other columns of the list.
         landmarks: of the scan, by the column `landmarks` of the list; None where it names none.
     """
 
-    place: Path | str
+    source: Path | str
     called: str = ""
     metadata: dict[str, str] = field(default_factory=dict[str, str])
     landmarks: Path | None = None
@@ -44,14 +44,14 @@ class Given:
     @property
     def address(self) -> str:
         """Of a scan that lies elsewhere; else empty."""
-        return self.place if isinstance(self.place, str) else ""
+        return self.source if isinstance(self.source, str) else ""
 
     @property
     def path(self) -> Path:
         """Of the scan; of one that lies elsewhere, what it would be, for its name."""
-        if isinstance(self.place, Path):
-            return self.place
-        head = self.place.split("::", 1)[0].partition("?")[0]
+        if isinstance(self.source, Path):
+            return self.source
+        head = self.source.split("::", 1)[0].partition("?")[0]
         return Path("/", *(part for part in head.replace("://", "/").split("/") if part not in ("", ".", "..")))
 
 
@@ -77,12 +77,12 @@ def given_scans(
         text = str(one)
         if not is_address(text) and text.lower().endswith(_LISTS) and Path(text).is_file():
             for row in _rows(Path(text)):
-                there = _expanded(row.place, folder, recursive=recursive, say=say)
+                there = _expanded(row.source, folder, recursive=recursive, say=say)
                 if row.called and len(there) > 1:
                     raise InputError(f"{text}: {row.called} stands for {len(there)} scans; give a row for each.")
                 if row.landmarks is not None and len(there) > 1:
                     raise InputError(f"{text}: the landmarks {row.landmarks} cannot be those of {len(there)} scans.")
-                rows += [replace(row, place=source) for source in there]
+                rows += [replace(row, source=source) for source in there]
         else:
             rows += [Given(source) for source in _expanded(text, folder, recursive=recursive, say=say)]
     _refuse_doubles(rows)
@@ -192,5 +192,5 @@ def _relative_to(file: Path, text: str) -> Path | str:
 def _refuse_doubles(scans: Sequence[Given]) -> None:
     named: dict[str, Given] = {}
     for one in scans:
-        if one.called and named.setdefault(one.called.casefold(), one).place != one.place:
+        if one.called and named.setdefault(one.called.casefold(), one).source != one.source:
             raise InputError(f"Two scans have the id {one.called}; give each one of its own.")

@@ -51,9 +51,9 @@ def check(
             short = f"{path}: not enough memory to read it; thin the scan first, as by MeshLab."
             reports.append({"file": str(path), "usable": False, "error": short})
             continue
-        facts = asdict(report)
-        usable = not any(finding["level"] == "refused" for finding in facts["findings"])
-        reports.append({"file": str(path), "usable": usable, **facts})
+        usable = not any(finding.level == "refused" for finding in report.findings)
+        findings = [{"level": one.level, "what": one.problem, "action": one.action} for one in report.findings]
+        reports.append({"file": str(path), "usable": usable, **asdict(report), "findings": findings})
     return reports
 
 

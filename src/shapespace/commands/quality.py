@@ -62,7 +62,7 @@ class _Target:
     """A model or meshes in correspondence, by a name that tells it from the other."""
 
     name: str
-    what: ShapeModel | Sequence[Mesh]
+    data: ShapeModel | Sequence[Mesh]
     settings: QualitySettings
     unit_ratios: Mapping[str, float] = field(default_factory=dict[str, float])
     """Of meshes by their names without endings, as of `CorrespondRecord`."""
@@ -70,7 +70,7 @@ class _Target:
     @property
     def names(self) -> list[str]:
         """Names of its meshes, without endings."""
-        return [] if isinstance(self.what, ShapeModel) else [surface_stem(Path(mesh.name)) for mesh in self.what]
+        return [] if isinstance(self.data, ShapeModel) else [surface_stem(Path(mesh.name)) for mesh in self.data]
 
 
 def quality(
@@ -105,7 +105,7 @@ def quality(
             result, others=(parts[1],), differences=differences, sentences=(*result.sentences, *comparison)
         )
     for target in loaded:
-        if isinstance(target.what, ShapeModel):
+        if isinstance(target.data, ShapeModel):
             notes.append(
                 f"{target.name} is a model file, which does not keep its training shapes: only compactness is "
                 "computed; generalisation and specificity need a folder"
@@ -141,7 +141,7 @@ def _targets(paths: Sequence[Path], options: QualityOptions, notes: list[str], *
     for k, name in pairs:
         called = f"{paths[k]}, {name}" if several else str(paths[k])
         out.append(_Target(called, loaded[k][0], _of_representation(options.settings, name, names), loaded[k][1]))
-    if len(out) == _MOST_TARGETS and not any(isinstance(target.what, ShapeModel) for target in out):
+    if len(out) == _MOST_TARGETS and not any(isinstance(target.data, ShapeModel) for target in out):
         _refuse_unlike(out)
     return out
 
@@ -199,7 +199,7 @@ def _scaled(mesh: Mesh, ratio: float) -> Mesh:
 
 def _scans(target: _Target, folder: Path | None, *, quiet: bool) -> list[Mesh] | None:
     """Return the scans of the meshes of a target, in their order; None where none are given, or none are needed."""
-    if folder is None or isinstance(target.what, ShapeModel):
+    if folder is None or isinstance(target.data, ShapeModel):
         return None
     by_name = {surface_stem(file): file for file in mesh_files([folder]).files}
     lacking = [name for name in target.names if name not in by_name]
@@ -221,7 +221,7 @@ def _measure(target: _Target, options: QualityOptions, run: Runner, *, quiet: bo
     unseen = [] if options.unseen is None else _meshes(options.unseen, [], "shape", quiet=quiet)[0]
     scans = _scans(target, options.scans, quiet=quiet)
     with steps(None, f"measuring {target.name}, in", "step", quiet=quiet) as step:
-        return measure_quality(target.what, target.settings, scans=scans, unseen=unseen, on_step=step, run=run)
+        return measure_quality(target.data, target.settings, scans=scans, unseen=unseen, on_step=step, run=run)
 
 
 def _missing(target: _Target, result: ModelQuality) -> str:
@@ -236,7 +236,7 @@ def _missing(target: _Target, result: ModelQuality) -> str:
 
 def _measured(curve: Curve) -> Measured:
     low, high = tuple(curve.low.tolist()), tuple(curve.high.tolist())
-    return Measured(mean=tuple(curve.mean.tolist()), modes=tuple(curve.at.tolist()), low=low, high=high)
+    return Measured(mean=tuple(curve.mean.tolist()), modes=tuple(curve.counts.tolist()), low=low, high=high)
 
 
 def _as_quality(target: _Target, result: ModelQuality, options: QualityOptions) -> Quality:
@@ -248,7 +248,7 @@ def _as_quality(target: _Target, result: ModelQuality, options: QualityOptions) 
     if size is not None:
         lists = (tuple(values.tolist()) for values in (size.mean, size.low, size.high))
         mean, low, high = lists
-        by_shapes = BySize(shapes=tuple(size.at.tolist()), mean=mean, low=low, high=high)
+        by_shapes = BySize(shapes=tuple(size.counts.tolist()), mean=mean, low=low, high=high)
     return Quality(
         name=target.name,
         compactness=measured(result.compactness),
@@ -285,7 +285,7 @@ def _comparison_sentences(targets: Sequence[_Target], differences: dict[str, Cur
     )
     difference += f"{targets[0].name}"
     verdict = "no difference shows" if low <= 0 <= high else f"{targets[0 if off > 0 else 1].name} is better"
-    return [f"On unseen shapes with {curve.at[-1]} modes {difference}: {verdict}."]
+    return [f"On unseen shapes with {curve.counts[-1]} modes {difference}: {verdict}."]
 
 
 def _draw(result: Quality, output: Path, notes: list[str]) -> None:

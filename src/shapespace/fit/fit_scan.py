@@ -97,12 +97,12 @@ class FitConfig:
     strict: bool = False
 
     def __post_init__(self) -> None:
-        for value, choices, what in (
+        for value, choices, name in (
             (self.unit, ["auto", *MM_PER_UNIT], "unit"),
             (self.scale, ("auto", "free", "fixed"), "scale"),
         ):
             if value not in choices:
-                raise InputError(f"There is no {what} {value!r}; choose one of {', '.join(choices)}.")
+                raise InputError(f"There is no {name} {value!r}; choose one of {', '.join(choices)}.")
         fitting = self.fitting
         if self.dense and not fitting.goes_on_densely:
             raise InputError(
@@ -181,7 +181,7 @@ def fit_scan(
     config = config or FitConfig()
     given = {"model": model, "scan": scan, "landmarks": landmarks}
     files = {
-        what: Path(cast(PathTo, path)).absolute() for what, path in given.items() if isinstance(path, str | os.PathLike)
+        name: Path(cast(PathTo, path)).absolute() for name, path in given.items() if isinstance(path, str | os.PathLike)
     }
     model, scan = _as_model(model), as_mesh(scan)
     if "landmarks" in files:
@@ -364,7 +364,7 @@ def _place(
     if landmarks:
         stddev_mm = config.landmark_stddev_mm or SHARE * rms_size(full_model.mean_vertices) * start.T_scan_model.scale
         start = replace(start, marks=LandmarkConstraint.of(model, marks_mm, stddev_mm))
-    notes += [*scan.notes, *(f"{finding.what} {finding.action}".strip() for finding in findings)]
+    notes += [*scan.notes, *(f"{finding.problem} {finding.action}".strip() for finding in findings)]
     return _Placed(scan, mm, T_mm_scan.inverse(), ScanTarget(scan_mm), start, notes)
 
 

@@ -57,8 +57,8 @@ class LandmarkConstraint:
 
     def off_mm(self, surface: ModelSurface, T_scan_model: Similarity) -> FloatArray:
         """Return (L,) the distance of each landmark of the surface from that of the scan, mm of the scan."""
-        at = self.landmarks.interpolate(surface.vertices)
-        return np.linalg.norm(T_scan_model.apply(at) - self.points_mm, axis=1)
+        positions = self.landmarks.interpolate(surface.vertices)
+        return np.linalg.norm(T_scan_model.apply(positions) - self.points_mm, axis=1)
 
     def equations(self, surface: ModelSurface, T_scan_model: Similarity, modes: int) -> tuple[FloatArray, FloatArray]:
         """Return Hessian (7 + k, 7 + k) and gradient (7 + k,) of half the squares over the variance, robustly weighed.

@@ -37,12 +37,12 @@ class Finding:
 
     Args:
         level: "fixed" (repaired), "note" (left as it is) or "refused" (cannot be fitted).
-        what: a sentence on what is there.
+        problem: a sentence on what is there.
         action: a sentence on what fitting does about it, or for "refused", what the user can do.
     """
 
     level: FindingLevel
-    what: str
+    problem: str
     action: str
 
 
@@ -131,7 +131,7 @@ def repair(mesh: Mesh, *, strict: bool = False) -> tuple[Mesh, tuple[Finding, ..
     state = _examine_and_repair(mesh, strict=strict)
     for finding in state.report.findings:
         if finding.level == "refused":
-            raise MeshError(f"{mesh.name}: {finding.what[0].lower()}{finding.what[1:-1]}; {finding.action}")
+            raise MeshError(f"{mesh.name}: {finding.problem[0].lower()}{finding.problem[1:-1]}; {finding.action}")
     return state.repaired(mesh), state.report.findings
 
 

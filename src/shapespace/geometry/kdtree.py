@@ -29,14 +29,14 @@ class KdArrays(NamedTuple):
     Args:
         points: (N, 3) float64, in leaf order.
         original: (N,) int32, the number each of `points` had when it was given.
-        place: (N,) int32, the row of `points` where each number is.
+        row_of: (N,) int32, the row of `points` where each number is.
         boxes: (2^(depth + 1) - 1, 6) float64, lowest and highest coordinates below each node.
         depth: number of splits from the root to a leaf.
     """
 
     points: FloatArray
     original: IntArray
-    place: IntArray
+    row_of: IntArray
     boxes: FloatArray
     depth: int
 
@@ -81,9 +81,9 @@ class KdTree:
         index = np.arange(len(points), dtype=np.int32)
         boxes = np.empty((2 ** (depth + 1) - 1, 6))
         order_into_leaves(ordered, index, boxes, depth)
-        place = np.empty_like(index)
-        place[index] = np.arange(len(points), dtype=np.int32)
-        self.arrays = KdArrays(ordered, index, place, boxes, depth)
+        row_of = np.empty_like(index)
+        row_of[index] = np.arange(len(points), dtype=np.int32)
+        self.arrays = KdArrays(ordered, index, row_of, boxes, depth)
         """The tree as compiled loops take it."""
 
     def moved(self, points: FloatArray) -> KdTree:
@@ -96,7 +96,7 @@ class KdTree:
         boxes = np.empty_like(old.boxes)
         ordered = np.ascontiguousarray(points[old.original], dtype=np.float64)
         _boxes_of_leaves(ordered, boxes, old.depth)
-        tree.arrays = KdArrays(ordered, old.original, old.place, boxes, old.depth)
+        tree.arrays = KdArrays(ordered, old.original, old.row_of, boxes, old.depth)
         return tree
 
     def nearest(self, queries: FloatArray, guess: IntArray | None = None) -> tuple[IntArray, FloatArray]:
@@ -293,7 +293,7 @@ def nearest_one(tree: KdArrays, x: float, y: float, z: float, guess: int, stack:
     best, squared = -1, np.inf
     node, top = 0, 0
     if guess >= 0:
-        row = tree.place[guess]
+        row = tree.row_of[guess]
         dx, dy, dz = points[row, 0] - x, points[row, 1] - y, points[row, 2] - z
         best, squared = guess, dx * dx + dy * dy + dz * dz
         node, top = start_at(boxes, row, count, depth, x, y, z, squared, stack)

@@ -339,7 +339,7 @@ class ShapeModel:
         about: Mapping[str, Any],
     ) -> ShapeModel:
         with stream as aligned:
-            training = aligned.kept
+            training = aligned.training
             model = cls._of_components(
                 aligned.components(modes, seed, tell),
                 Vertices(),

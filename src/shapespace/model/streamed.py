@@ -181,13 +181,13 @@ class Aligned:
     """Aligned shapes on the disk, and what is known of them.
 
     Args:
-        shapes: N rows of 3V numbers about `kept.template`.
-        kept: all the rest; its folder and model are not told yet.
+        shapes: N rows of 3V numbers about `training.template`.
+        training: the other data of the shapes; its folder and model are not yet set.
         passes: where those of the PCA are kept; None keeps nothing.
     """
 
     shapes: Spill
-    kept: KeptShapes
+    training: KeptShapes
     passes: KeptPasses | None
 
     def components(self, modes: int | float | Literal["auto"] | None, seed: int, tell: Tell) -> PrincipalComponents:
@@ -203,10 +203,10 @@ class Aligned:
             self.shapes,
             modes,
             seed=seed,
-            kept=self.passes,
+            passes=self.passes,
             on_pass=lambda n, share: tell(f"finding the modes, pass {n} (residual {share:.0e} of the first)"),
         )
-        mean = pc.mean + self.kept.template.reshape(-1)
+        mean = pc.mean + self.training.template.reshape(-1)
         return PrincipalComponents(mean, pc.basis, pc.variance, pc.total_variance, pc.n_samples, pc.residuals)
 
     def keep(self, folder: Path, model_hash: str) -> None:
@@ -223,7 +223,7 @@ class Aligned:
         except OSError as error:
             raise write_error(folder / _SHAPES, error) from error
         digest = sha256_of_file(folder / _SHAPES)
-        replace(self.kept, folder=folder, model_hash=model_hash, digest=digest).save()
+        replace(self.training, folder=folder, model_hash=model_hash, digest=digest).save()
 
 
 def bytes_in_memory(count: int, mesh: Mesh, *, choose: bool) -> int:
@@ -282,7 +282,7 @@ def aligned_on_disk(
         try:
             with work.aligned() as shapes:
                 passes = None if scratch is None else KeptPasses(folder)
-                yield Aligned(shapes, work.told(), passes)
+                yield Aligned(shapes, work.kept_shapes(), passes)
         finally:
             path.unlink(missing_ok=True)
 
@@ -372,7 +372,7 @@ class _Work:
         self.template: FloatArray = np.empty((0, 3))
         self.sizes: FloatArray = np.empty(0)
 
-    def told(self) -> KeptShapes:
+    def kept_shapes(self) -> KeptShapes:
         if self.onto is not None:
             reference, rounding = self.onto.reference, self.onto.rounding
         else:
@@ -396,9 +396,9 @@ class _Work:
         """Yield the file of aligned shapes: as a build that was killed left it, or made anew."""
         path, start, done = (self.folder / name for name in (_SHAPES, _START, _ALIGNED))
         poses = read_arrays(self.folder / _POSES)
-        whole = path.is_file() and path.stat().st_size == 4 * self.count * self.first.vertices.size
-        near = read_arrays(start) if whole else None
-        if whole and done.is_file() and poses is not None:
+        complete = path.is_file() and path.stat().st_size == 4 * self.count * self.first.vertices.size
+        near = read_arrays(start) if complete else None
+        if complete and done.is_file() and poses is not None:
             self.template, self.sizes = poses["template"], poses["sizes"]
             with Spill(path, self.count, self.template.size, new=False) as shapes:
                 yield shapes

@@ -72,8 +72,8 @@ def visits_of(table: Table, subject: str, time: str | None, order: Sequence[str]
     subjects, labels = table.texts(subject), table.texts(column)
     marks = table.columns.get(RESCAN)
     rows: dict[str, dict[float, list[int]]] = {}
-    for row, (name, place) in enumerate(zip(subjects, places, strict=True)):
-        rows.setdefault(name, {}).setdefault(place, []).append(row)
+    for row, (name, when) in enumerate(zip(subjects, places, strict=True)):
+        rows.setdefault(name, {}).setdefault(when, []).append(row)
     if marks is not None:
         for name, times in rows.items():
             for scans in times.values():
@@ -85,7 +85,7 @@ def visits_of(table: Table, subject: str, time: str | None, order: Sequence[str]
                         "rescans; mark all but one, or correct their times."
                     )
     visits = {
-        name: tuple(Visit(place, labels[scans[0]], tuple(scans)) for place, scans in sorted(times.items()))
+        name: tuple(Visit(when, labels[scans[0]], tuple(scans)) for when, scans in sorted(times.items()))
         for name, times in rows.items()
     }
     return Visits(visits, unit, column)

@@ -168,19 +168,19 @@ def effect_maps(
                 if start == 0:
                     observed[name][:, part] = f[:, 0]
                 as_large[name][:, part] += (f >= observed[name][:, None, part] * (1 - _TIE)).sum(axis=1)
-                for at in range(E):
-                    counted = f[at] if weights is None else f[at][:, weights[at, part] > 0]
-                    pooled[name][at] += np.bincount(_bin(counted).ravel(), minlength=_BINS)
+                for e in range(E):
+                    counted = f[e] if weights is None else f[e][:, weights[e, part] > 0]
+                    pooled[name][e] += np.bincount(_bin(counted).ravel(), minlength=_BINS)
                 so_far = largest[name][:, start : start + chunk]
                 np.maximum(so_far, f.max(axis=2), out=so_far)
     made: list[EffectMap] = []
-    for at in range(E):
+    for e in range(E):
         tests = {
-            name: _tested(observed[name][at], as_large[name][at] / P, largest[name][at], pooled[name][at], alpha)
+            name: _tested(observed[name][e], as_large[name][e] / P, largest[name][e], pooled[name][e], alpha)
             for name in lenses
         }
-        own = {name: read_only(values[at, :, 0]) for name, values in seen.items()}
-        change = seen["any_way"][at]
+        own = {name: read_only(values[e, :, 0]) for name, values in seen.items()}
+        change = seen["any_way"][e]
         made.append(
             EffectMap(
                 change_mm=read_only(change),
@@ -190,7 +190,7 @@ def effect_maps(
                 any_way=tests["any_way"],
                 bump_mm=own.get("bump"),
                 bump=tests.get("bump"),
-                weight=None if weights is None else read_only(weights[at]),
+                weight=None if weights is None else read_only(weights[e]),
             )
         )
     return made

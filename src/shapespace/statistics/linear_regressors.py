@@ -171,8 +171,8 @@ def nested(
         train = ~test
         errors = errors_of(X[train], targets[train], weight[train], own, choices)
         best = errors.argmin(axis=0)
-        found = TrainingDecomposition.of(X[train], weight[train]).predict(X[test], targets[train], choices)
-        predicted[test] = np.take_along_axis(found, best[None, None, :], axis=0)[0]
+        estimates = TrainingDecomposition.of(X[train], weight[train]).predict(X[test], targets[train], choices)
+        predicted[test] = np.take_along_axis(estimates, best[None, None, :], axis=0)[0]
         baseline[test] = weighted_mean(targets[train], weight[train])
         chosen.append(best)
         if on_fold is not None:

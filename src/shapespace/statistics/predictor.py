@@ -208,10 +208,10 @@ class Predictor:
 
 
 def _facts(arrays: Mapping[str, npt.NDArray[Any]]) -> dict[str, Any]:
-    found: object = plain_json(str(arrays["facts"]))
-    if not isinstance(found, dict):
+    content: object = plain_json(str(arrays["facts"]))
+    if not isinstance(content, dict):
         raise ValueError("no facts")
-    facts = cast(dict[str, Any], found)
+    facts = cast(dict[str, Any], content)
     if facts.get("format") != FORMAT or facts.get("format_version") != VERSION:
         raise ValueError("another format")
     texts = {name: facts[name] for name in ("target", "gauge", "model_hash", "method")}

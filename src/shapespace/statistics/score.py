@@ -462,9 +462,9 @@ class _FitUncertainty:
         return coefficients + moved @ self.into
 
 
-def _draws(seen: _FitUncertainty | None, config: ScoreConfig) -> FloatArray:
+def _draws(uncertainty: _FitUncertainty | None, config: ScoreConfig) -> FloatArray:
     """Return standard normal numbers (R, N, K)."""
-    shape = (0, 0) if seen is None else seen.shrinkage.shape
+    shape = (0, 0) if uncertainty is None else uncertainty.shrinkage.shape
     return np.random.default_rng(config.seed).standard_normal((config.draws, *shape))
 
 
@@ -485,7 +485,7 @@ def _nearest(
 
 
 def _maps(
-    reference: Cohort, subjects: Cohort, people: IntArray, seen: _FitUncertainty | None
+    reference: Cohort, subjects: Cohort, people: IntArray, uncertainty: _FitUncertainty | None
 ) -> tuple[FloatArray, float]:
     """Return standard deviations (M, V) along the mean's normals, and the limit that 95 % of the people stay within."""
     mean = reference.vertices(reference.coefficients.mean(axis=0))
@@ -499,7 +499,7 @@ def _maps(
     n, count = len(reference), int(people.max()) + 1
     z = np.empty((len(subjects), len(mean)))
     largest = np.zeros(n)
-    rows = None if seen is None else seen.into @ reference.basis
+    rows = None if uncertainty is None else uncertainty.into @ reference.basis
     groups = np.zeros((count, n))
     groups[people, np.arange(n)] = 1
     size = groups.sum(axis=1, keepdims=True)
@@ -513,9 +513,9 @@ def _maps(
         moved = np.einsum("nmi,mi->nm", subjects.displacements(part), own)
         moved += np.einsum("mi,mi->m", (subjects.reference - mean)[part], own)
         uncertain = 0.0
-        if seen is not None and rows is not None:
+        if uncertainty is not None and rows is not None:
             along = np.einsum("kmi,mi->km", rows.reshape(len(rows), -1, 3)[:, part], own)
-            uncertain = seen.variance @ along**2
+            uncertain = uncertainty.variance @ along**2
         z[:, part] = moved / np.sqrt(variance * (1 + 1 / count) + uncertain)  # S54
         rest = n - size
         others = (total - groups @ x) / rest

@@ -109,7 +109,7 @@ class _Endpoints:
                 "has_fits": self._view.folder is not None,
                 "upload_bytes": limits.upload_bytes,
                 "unfinished": limits.unfinished,
-                "kept": limits.kept,
+                "kept": limits.max_fits,
                 "formats": list(MESH_ENDINGS),
                 "exports": [kind for kind in EXPORTS if model.faces is not None or kind != "stl"],
                 "sequential": colours.as_list(colours.SEQUENTIAL),

@@ -416,11 +416,11 @@ def _summary(
             "landmarks (--landmarks)."
         ) from error
     # Modes that are not reported are no reason to doubt the fit, so the verdict is on all of them.
-    whole = reported = problem.in_model(iterate, known.surface_mm, model.n_modes)
+    all_regions = reported = problem.in_model(iterate, known.surface_mm, model.n_modes)
     wanted = model.n_modes if modes is None else min(modes, model.n_modes)
     if wanted < model.n_modes:
         reported = problem.in_model(iterate, known.surface_mm, wanted)
-    in_model = (T.inverse() @ whole.T_scan_model).apply(model.reconstruct(whole.b))
+    in_model = (T.inverse() @ all_regions.T_scan_model).apply(model.reconstruct(all_regions.b))
     left_out_mm2 = float(((surface.vertices - in_model) ** 2).sum(axis=1).mean())  # R22, second term
     return RobustFitted(
         T_scan_model=reported.T_scan_model,

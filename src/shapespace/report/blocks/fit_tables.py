@@ -25,7 +25,7 @@ def fits_table(fits: Sequence[SavedFit], places: Mapping[str, str], *, caption: 
         caption: of the table.
     """
     texts: list[tuple[str, _Make]] = [
-        ("Scan", lambda fit: Cell(fit.name, place=places.get(fit.name))),
+        ("Scan", lambda fit: Cell(fit.name, anchor=places.get(fit.name))),
         ("Label", lambda fit: Cell(fit.label if fit.label != fit.name else "")),
         ("Status", lambda fit: status(fit.status)),
     ]

@@ -105,9 +105,9 @@ class FolderPage:
         if model is not None:
             self.model()
         self._staged: dict[str, StagedFit] = {}
-        self._details = {fit.name: self.page.place(f"pictures-of-{fit.name}") for fit in self.main}
+        self._details = {fit.name: self.page.anchor(f"pictures-of-{fit.name}") for fit in self.main}
         carded = _carded(self.fits) if len(fits) > 1 or not self.main else []
-        self._cards = {fit.name: self.page.place(f"fit-{fit.name}") for fit in carded}
+        self._cards = {fit.name: self.page.anchor(f"fit-{fit.name}") for fit in carded}
         self.carded = carded
 
     # What is read, once
@@ -228,7 +228,7 @@ class FolderPage:
         items: list[str | Item] = [
             Item(
                 f"{STATUS_WORDS[fit.status]}. {_all_reasons(fit)}",
-                Cell(fit.name, place=places.get(fit.name)),
+                Cell(fit.name, anchor=places.get(fit.name)),
             )
             for fit in bad[:_MOST_NAMED]
         ]
@@ -315,7 +315,7 @@ class FolderPage:
         several = len(self.fits) > 1
         for fit in self.main:
             made = page.section(
-                f"{fit.name} in detail", lambda fit=fit: self.detail(fit), place=self._details[fit.name],
+                f"{fit.name} in detail", lambda fit=fit: self.detail(fit), anchor=self._details[fit.name],
                 folded=several, status=status(fit.status) if several else None,
             )  # fmt: skip
             # Of a single fit, its pictures matter more than its numbers.

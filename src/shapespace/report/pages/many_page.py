@@ -227,7 +227,7 @@ class ManyPage(FolderPage):
             ]
             name = self.population.names[k]
             rows.append([
-                Cell(printable(name), place=self.place_of(name)),
+                Cell(printable(name), anchor=self.place_of(name)),
                 status(sections.ORDER_OF_CONCERN[int(self.population.status[k])]),
                 number(float(self._far[k]), 2),
                 Cell(f"z{most + 1} = {float(z[most]):+.1f}".replace("-", "−"), float(np.abs(z[most]))),

@@ -70,7 +70,7 @@ class Page:
         if self._on_step is not None:
             self._on_step(name, self._planned)
 
-    def place(self, text: str) -> str:
+    def anchor(self, text: str) -> str:
         """Return a name for a place in the page, made of `text` and taken only once."""
         name = base = anchor(text)
         count = 1
@@ -81,12 +81,12 @@ class Page:
         return name
 
     def section(
-        self, heading: str, make: Make, level: int = 3, place: str | None = None, link: str = "", *,
+        self, heading: str, make: Make, level: int = 3, anchor: str | None = None, link: str = "", *,
         folded: bool = False, status: Cell | None = None,
     ) -> Section:  # fmt: skip
         """Return a section, or its heading and why it could not be made."""
-        place = place or self.place(heading)
-        return Section(heading, place, self.tried(make), level, link or heading, folded, status)
+        anchor = anchor or self.anchor(heading)
+        return Section(heading, anchor, self.tried(make), level, link or heading, folded, status)
 
     def tried(self, make: Make) -> Sequence[Block]:
         """Return what `make` gives, or why it could not."""
@@ -155,10 +155,10 @@ class Page:
         from markupsafe import Markup
 
         # Their places come first, so that no part inside takes the name of a chapter.
-        places = [self.place(chapter.heading) for chapter in chapters]
+        places = [self.anchor(chapter.heading) for chapter in chapters]
         sections = [
-            self.section(chapter.heading, chapter.make, 2, place, chapter.link)
-            for chapter, place in zip(chapters, places, strict=True)
+            self.section(chapter.heading, chapter.make, 2, anchor, chapter.link)
+            for chapter, anchor in zip(chapters, places, strict=True)
         ]
         style, early, scripts = _asset("report.css"), _script(_asset("theme.js")), [_script(_asset("report.js"))]
         if self._payloads:

@@ -219,7 +219,7 @@ def _roles(table: Table, role: str | None, config: IdentityConfig) -> tuple[list
         odd = sorted({cell for cell in cells if cell not in ROLES})
         if odd:
             raise InputError(f"{table.where}: {role!r} is {list_names(odd)}; it may be gallery, probe or train.")
-        gallery, probes, training = ([row for row, cell in enumerate(cells) if cell == what] for what in ROLES)
+        gallery, probes, training = ([row for row, cell in enumerate(cells) if cell == wanted] for wanted in ROLES)
         if gallery and not probes:
             raise InputError(f"{table.where}: {role!r} names a gallery and no probe.")
         return gallery, probes, training
