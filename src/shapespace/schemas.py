@@ -20,7 +20,7 @@ from shapespace.errors import FileFormatError
 Status = Literal["converged", "max_iterations", "doubtful", "failed"]
 FIT_AGAIN, STUDY_AGAIN, DEMO_AGAIN = "fit the scan again", "run shapespace recognise study again", "run the demo again"
 CORRESPOND_AGAIN, ANALYSIS_AGAIN = "run shapespace correspond again", "run the analysis again"
-_TOLD = 200
+_TOLD = 200  # characters of a library's error that a message repeats
 _T = TypeVar("_T")
 
 

@@ -39,7 +39,7 @@ from shapespace.store.rows import META, coefficient_columns
 from shapespace.store.rows import coefficient_row as coefficient_row
 from shapespace.version import __version__
 
-_LARGEST_RECORD = 2**24
+_LARGEST_RECORD = 2**24  # bytes; a fit record has some tens of kB, more is damage or an attack
 
 
 @lru_cache(maxsize=1024)

@@ -23,7 +23,7 @@ from shapespace.store.results import results_at
 
 COEFFICIENTS = "coefficients.csv"
 RECORD = ".fit.json"
-_LONGEST_NAME = 200
+_LONGEST_NAME = 200  # bytes; file systems allow 255, and endings such as .fit.json follow the name
 _SCAN_COLUMNS = ("scan", "scan_name", "path", "scan_hash")
 
 

@@ -18,7 +18,7 @@ from shapespace.types import Mesh
 
 _FORBIDDEN = re.compile(r'[<>:"/\\|?*\x00-\x1f]')
 """Characters that file names cannot contain on some systems."""
-_HASH_CHARACTERS = 12
+_HASH_CHARACTERS = 12  # hexadecimal digits, 48 bits: no two of a million scans share them by chance
 
 
 def save_fit(result: FitResult, folder: Path, name: str, *, stages: bool) -> Path:

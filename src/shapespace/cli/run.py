@@ -197,13 +197,13 @@ def correspond(arguments: argparse.Namespace) -> int:
 
     settings = CorrespondSettings(**given(arguments, CorrespondSettings))
     files = CorrespondFiles(
-        arguments.scans,
-        arguments.template,
-        arguments.model,
-        arguments.landmarks,
-        _execution_config(arguments),
-        arguments.recursive,
-        arguments.strict,
+        scans=arguments.scans,
+        template=arguments.template,
+        model=arguments.model,
+        landmarks=arguments.landmarks,
+        execution=_execution_config(arguments),
+        recursive=arguments.recursive,
+        strict=arguments.strict,
     )
     summary, records = correspond_files(files, arguments.output, settings, quiet=arguments.quiet, say=warn)
     if arguments.json:

@@ -38,9 +38,10 @@ from shapespace.version import __version__
 if TYPE_CHECKING:
     from shapespace.model.additive import AdditiveModel
 
+# shares of variance of identity and of expression in an additive model when the number of modes is automatic
 _IDENTITY_VARIANCE, _EXPRESSION_VARIANCE = 0.995, 0.99
 _SURFACES = (".dense.ply", ".fitted.ply")
-_NAMED = 3
+_NAMED = 3  # names in a message, so that it stays short
 _LEAST_MM, _MOST_MM = 1.0, 3000.0
 """Beyond this the largest extent of an object is likelier told in another unit."""
 
@@ -189,7 +190,16 @@ def build(
     if settings.modes == "auto" and count > MOST_SHAPES:
         notes.append(f"The number of modes is chosen by {MOST_SHAPES} of the {count} shapes, drawn by --seed.")
     if not isinstance(loaded, list):
-        model = _streamed(on_disk, output, settings, gauge, marks, parent, notes, quiet=quiet)
+        model = _streamed(
+            meshes=on_disk,
+            output=output,
+            settings=settings,
+            gauge=gauge,
+            landmarks=marks,
+            parent=parent,
+            notes=notes,
+            quiet=quiet,
+        )
         if regions:
             model = replace(model, regions=regions)
             model.save(output)

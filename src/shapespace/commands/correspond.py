@@ -50,10 +50,10 @@ _BROKEN = "broken: "
 _UNREADABLE = "unreadable"
 _WITH_OTHER_FILES = (".gltf",)
 """Endings of mesh formats that can store vertices in other files."""
-_LISTED = 10
+_LISTED = 10  # names in a message, so that it stays readable
 _ANOTHER_SHAPE = 0.25
 """The mean change of another object, as a share of its size."""
-_OTHER_SIZE = 2.0
+_OTHER_SIZE = 2.0  # ratio of sizes: beyond twice the median a scan is probably of another object or unit
 _ENOUGH_TO_COMPARE, _FAR = 4, 3.0
 """Times the usual distance (95 % of both directions), sizes divided out."""
 _Say: TypeAlias = Callable[[str], None]

@@ -22,7 +22,7 @@ from shapespace.store.results import ENDING, ENDINGS, Results, modes_of
 from shapespace.store.rows import META, coefficient_columns, kind_of
 
 _MAT_HEADER, _MAT_HEADER_BYTES = b"MATLAB 5.0 MAT-file, written by shapespace", 116
-_LONGEST_IN_MATLAB = 63
+_LONGEST_IN_MATLAB = 63  # characters; MATLAB's namelengthmax
 
 
 def export(

@@ -34,7 +34,7 @@ from shapespace.store.manifest import read_manifest
 
 FULL_CHECK_BYTES = 2**28
 """Scans of so many bytes together are read whole before the first fit (256 MiB: 0.4 s of binary PLY, 14 s of OBJ)."""
-_LISTED = 10
+_LISTED = 10  # names in a message, so that it stays readable
 _STATUSES = ("converged", "max_iterations", "doubtful", "failed")
 _SURFACES = (".fitted.ply", ".dense.ply")
 

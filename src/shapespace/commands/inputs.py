@@ -22,7 +22,7 @@ _PLACES = ("scan", "file", "path", "specimen", "name", "id")
 _LANDMARKS, _ID = "landmarks", "id"
 _LARGEST_BYTES = 2**26
 """Largest size of a list of scans in bytes; a million rows need less."""
-_LONGEST = 200
+_LONGEST = 200  # bytes of an id; file systems allow 255, and endings follow it
 
 
 @dataclass(frozen=True)

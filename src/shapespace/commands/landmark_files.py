@@ -12,7 +12,7 @@ from shapespace.io.landmarks.landmark_io import LANDMARK_FORMATS, READ_ONLY_LAND
 from shapespace.io.meshes.mesh_io import stem_of
 from shapespace.types import Mesh
 
-_LISTED = 5
+_LISTED = 5  # names in a message, so that it stays short
 
 
 def _is_result(file: Path) -> bool:

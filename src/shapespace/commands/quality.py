@@ -28,7 +28,7 @@ from shapespace.store.results import mesh_at
 from shapespace.types import Mesh
 
 _SURFACES = (".dense.ply", ".fitted.ply", SURFACE)
-_MOST_TARGETS = 2
+_MOST_TARGETS = 2  # differences are computed between two targets
 
 
 @dataclass(frozen=True)

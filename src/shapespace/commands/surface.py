@@ -21,10 +21,10 @@ from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.io.volumes.volume_io import VOLUME_ENDINGS, read_volume, require_volumes_extra, volume_name
 from shapespace.types import MAX_MEMORY_BYTES
 
-_MANY = 4
-_MOST_OF_MEMORY = 0.8
-_OTHER_SIZE = 0.02
-_OTHER_VOLUME = 4.0
+_MANY = 4  # surfaces; a median of fewer does not show what is usual
+_MOST_OF_MEMORY = 0.8  # share of the free memory; the rest is for other processes
+_OTHER_SIZE = 0.02  # relative difference of voxel sizes beyond rounding in image headers
+_OTHER_VOLUME = 4.0  # ratio to the median volume; beyond it probably another object
 
 
 def write_surfaces(

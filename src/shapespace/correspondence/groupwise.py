@@ -37,7 +37,7 @@ from shapespace.types import FloatArray, Mesh, Similarity, SurfaceLandmarks
 
 ENOUGH_TO_JUDGE, _ENOUGH_TO_PREDICT = 6, 4
 """Scans: fewer do not determine the normal range of shapes; fewer do not predict another one."""
-_PARTS = 4
+_PARTS = 4  # folds of the shapes: the pose model of a scan is built without it
 _WHOLE, _LEAST_SPREAD, _SIZE_UNSEEN = 0.9, 0.01, 0.3
 """Scans that observe more than this share of the template determine the usual size; the least standard deviation of
 log sizes; and that of a scan's own log size for each share that is missing."""

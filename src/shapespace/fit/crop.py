@@ -14,7 +14,7 @@ from shapespace.types import MM_PER_UNIT, BoolArray, FloatArray, Mesh
 
 KINDS = {"sphere": 4, "box": 6, "landmarks": 1}
 """How many numbers each kind of crop needs."""
-_FEWEST = 30
+_FEWEST = 30  # vertices; with fewer no fit has enough matches (`_FEWEST_MATCHES` of the robust method)
 
 
 @dataclass(frozen=True)

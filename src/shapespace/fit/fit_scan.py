@@ -39,9 +39,9 @@ from shapespace.version import __version__
 if TYPE_CHECKING:
     from shapespace.model.additive import AdditiveModel
 
-_FAR_OUT = 3.0
-_FAR_OUT_BY_CHANCE = 0.01
-_ALL_BUT_THE_RIM = 0.95
+_FAR_OUT = 3.0  # standard deviations; a normal coefficient exceeds them once in 370
+_FAR_OUT_BY_CHANCE = 0.01  # share of coefficients beyond it that raises no note; chance alone gives 0.3 %
+_ALL_BUT_THE_RIM = 0.95  # share of vertices; a complete scan still leaves out vertices at its border
 _VANISHED = 0.05
 """Share of the start's scale below which nothing is left to fit."""
 

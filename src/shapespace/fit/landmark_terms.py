@@ -22,7 +22,8 @@ from shapespace.types import FloatArray, Similarity, SurfaceLandmarks
 
 SHARE = 0.03
 """Standard deviation of a landmark as a share of the model's size (RMS distance from its centre), if none is given."""
-_PATCHES = 300.0
+_PATCHES = 300.0  # independent patches that the matches of a surface count as, since neighbours share their errors
+# width and outlier limit of landmark residuals in SD (R16b), and the factor from MAD to SD of a normal distribution
 _WIDTH, _MAD, _FAR = 3.0, 1.48, 4.0
 
 

@@ -25,7 +25,7 @@ from shapespace.geometry.kdtree import (
 )
 from shapespace.types import FloatArray, IntArray
 
-_LEAF_TRIANGLES = 4
+_LEAF_TRIANGLES = 4  # triangles in a leaf, at most: all of them are compared, instead of another level of boxes
 # Squared sine of the angle between two edges below which a triangle has no area.
 _FLAT = 1e-14
 

@@ -16,7 +16,7 @@ from shapespace.compiled import compiled
 from shapespace.errors import InputError
 from shapespace.types import FloatArray, IntArray
 
-_LEAF_POINTS = 12
+_LEAF_POINTS = 12  # points in a leaf, at most: all of them are compared, instead of another level of boxes
 NOTED = 2
 """How many nearest points `follow_into` chooses from before it searches again."""
 STACK_SIZE = 128

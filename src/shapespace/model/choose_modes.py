@@ -15,7 +15,7 @@ from shapespace.types import BoolArray, FloatArray, IntArray
 
 MOST_SHAPES = 2000
 """Of more, so many are drawn: the choice takes the cube of their number, and its standard error is small by then."""
-_LEAST_NOISE = 1e-6
+_LEAST_NOISE = 1e-6  # share of the first variance per dimension, so that the likelihood of noise-free shapes is finite
 _NO_VARIANCE = 1e-10
 """Of the first mode's, as in `pca`."""
 _ALL_EQUAL = 1e-24

@@ -33,9 +33,11 @@ EXACT = 15_000
 """Shapes of which the Gram matrix is made: 1.8 GB."""
 _WHOLE = 1000
 """Shapes of which all eigenvectors are found at once, which is then as quick as to find the first."""
-_BASIS_BYTES = 768 << 20
+_BASIS_BYTES = 768 << 20  # bytes of the Krylov basis in memory
+# vectors in a block: products of a few columns are slow, many cost memory
 _LEAST_BLOCK, _MOST_BLOCK = 32, 128
 _TO_ROUNDING = Stop(radians=1e-8, least_gap=1e-5, enough=1e-12)
+# 1/8 of the shapes: more modes are computed by the full decomposition; and a relative variance that is rounding
 _FEW, _NO_VARIATION = 8, 1e-12
 
 

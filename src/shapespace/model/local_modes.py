@@ -12,12 +12,12 @@ from scipy.linalg import eigh
 from shapespace.geometry.normals import rms_size
 from shapespace.types import FloatArray, IntArray
 
-_CENTRES = 40
-_FIELD_SHARE = 0.999
-MOST_PRODUCTS = 600
+_CENTRES = 40  # centres of the smooth fields, spread evenly over the mean
+_FIELD_SHARE = 0.999  # share of the variance of the smooth fields that their leading ones must have
+MOST_PRODUCTS = 600  # products of modes and fields, the columns of the decomposition; time grows with the square
 _BLOCK = 250
 """Vertices: the products of all at once are many times as large as the model."""
-_RANGE_SHARE = 0.6
+_RANGE_SHARE = 0.6  # share of the model's size; range of the smooth fields
 _FAINT = 1e-7
 """Of the variance of the modes; local modes with less are not worth their time."""
 _ROOM = 4

@@ -27,12 +27,13 @@ from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity, 
 
 MIN_SEEN = 0.5
 """Share of the shapes that must observe a vertex for it to be in a model, by default."""
-_FEWEST = 2
+_FEWEST = 2  # shapes that must observe a vertex: fewer have no variance
 _POSES_BY = (8, 60)
 """Modes of the completions that poses are taken from, one after the other: with few only, variation that they lack
 becomes pose, and alignment then removes real modes."""
 _MODES_A_SHAPE, _MOST_MODES = 0.7, 60
 """Modes that probabilistic PCA begins with; those without evidence lose their width."""
+# limit of the iterations of the mean, and the change as a share of the size that ends them
 _MEAN_ROUNDS, _STILL = 50, 1e-8
 
 

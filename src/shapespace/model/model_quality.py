@@ -34,17 +34,17 @@ from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity, 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_FEWEST = 3
-_FEWEST_TO_CHOOSE = 4
+_FEWEST = 3  # shapes; without one of them two are left, and fewer have no mode
+_FEWEST_TO_CHOOSE = 4  # shapes; fewer leave no folds in which modes can be chosen
 _MOST_COUNTS, _MOST_SPECIFIC = 12, 6
 """Numbers of modes that are tried; specificity takes longest."""
 _POINTS = 1000
 """Vertices that distances between surfaces are measured at, spread evenly over their numbers."""
-_POSE_ROUNDS = 3
+_POSE_ROUNDS = 3  # alternations of pose and coefficients
 _NEAREST = 2
 """Training shapes nearest by vertices, of which the nearest by surface is taken."""
-_RESAMPLES = 2000
-_PARTS = (0.25, 0.5, 0.75, 1.0)
+_RESAMPLES = 2000  # bootstrap samples, enough for percentiles 2.5 and 97.5
+_PARTS = (0.25, 0.5, 0.75, 1.0)  # shares of the training shapes at which the learning curve is measured
 _ANY = 1e-9
 """Share of the shapes that show a vertex: two of them are enough for a model that is measured."""
 _LEAST_NOISE = 1e-6

@@ -30,8 +30,8 @@ _FIRST_NOISE = 1e-3
 """Of the variance, at least: without noise nothing would move."""
 _CONVERGED = 1e-5
 """Nats a coordinate that is observed."""
-_MOST_ROUNDS = 60
-_BLOCK = 512
+_MOST_ROUNDS = 60  # limit of EM iterations
+_BLOCK = 512  # vertices at a time; bounds the memory of their (k + 1)^2 moments
 
 
 @dataclass(frozen=True, eq=False)

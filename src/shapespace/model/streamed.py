@@ -46,9 +46,10 @@ Tell: TypeAlias = Callable[[str], None]
 _SHAPES, _START, _POSES, _ALIGNED = "shapes.f32", "start.npz", "poses.npz", "aligned"
 _IDENTITY, _LOCK = "identity.txt", "lock"
 _KEPT = "shapes.npz"
+# copies of the meshes in memory during a build, the same when modes are chosen; share of the free memory to use
 _COPIES, _COPIES_TO_CHOOSE, _MOST_OF_MEMORY = 2.0, 4.5, 0.8
-_SAMPLE_BYTES = 256 << 20
-_TOLD_EVERY = 200
+_SAMPLE_BYTES = 256 << 20  # bytes of the rows that are read to estimate the variance
+_TOLD_EVERY = 200  # meshes between two progress messages
 _ROUNDING = 64 * float(np.finfo(float).eps)
 
 

@@ -32,11 +32,11 @@ from shapespace.statistics.sides import Sides, find_sides, given_sides
 from shapespace.types import BoolArray, FloatArray, Mesh, read_only, require
 
 ERROR_ASYMMETRIC, ERROR_SYMMETRIC = "measurement error, asymmetric", "measurement error, symmetric"
-LEVEL = 0.95
-_BLOCK = 100
+LEVEL = 0.95  # of confidence intervals, the usual one
+_BLOCK = 100  # permutations at a time; bounds memory and spaces the progress messages
 _HEIGHT_OFF = 2.0
 """Error of the height of the surface above a triangle, as a share of the height: curvature differs at its corners."""
-_FEWEST = 3
+_FEWEST = 3  # subjects; two leave one degree of freedom
 _MOSTLY = 0.5
 """Share of the shapes of a subject that must observe a vertex, so that it counts as observed."""
 

@@ -14,7 +14,7 @@ TIMES = ("time", "visit", "date")
 """The columns that may tell the time; the first that is there does."""
 RESCAN = "rescan"
 _NOT_MARKED = frozenset({"", "0", "0.0", "no", "false"})
-_DAYS_IN_A_YEAR = 365.25
+_DAYS_IN_A_YEAR = 365.25  # days; mean of the Julian calendar
 
 
 @dataclass(frozen=True)

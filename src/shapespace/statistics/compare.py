@@ -42,8 +42,8 @@ SquaresType: TypeAlias = Literal["I", "II", "III"]
 TYPES: tuple[SquaresType, ...] = ("I", "II", "III")
 """Of sums of squares: of a term after those before it, after all that do not contain it, or after all others."""
 
-_RANK = 1e-9
-_TIE = 1e-9
+_RANK = 1e-9  # ratio of singular values; below is float64 rounding
+_TIE = 1e-9  # relative; statistics nearer than float64 sums are accurate count as equal
 MOST_LEVELS = 6
 """Largest number of classes of a variable whose pairs are compared."""
 

@@ -35,8 +35,9 @@ FUNCTIONS: Mapping[str, str] = {
 }
 """What a formula may call, and what it is."""
 
+# characters, stars, names and constants that bound the time a formula takes to expand
 _LONGEST, _MOST_STARS, _MOST_NAMES, _LARGEST_CONSTANT = 1000, 5, 64, 20
-_MOST_CELLS = 100_000
+_MOST_CELLS = 100_000  # combinations of levels, which are enumerated
 _MOST_COLUMNS = 5000
 """Limit before repeated or implied columns are removed; more take seconds to expand, and need as many shapes."""
 _DEEPEST = 30

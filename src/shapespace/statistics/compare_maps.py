@@ -24,15 +24,15 @@ from shapespace.statistics.compare_strata import Stratum
 from shapespace.statistics.dispersion import Estimate
 from shapespace.types import BoolArray, FloatArray, Mesh, read_only
 
-_VERTICES = 512
-_BYTES = 48 * 2**20
-_TIE = 1e-9
-_NONE = 1e-12
+_VERTICES = 512  # vertices at a time; with _BYTES it bounds the memory of permuted values
+_BYTES = 48 * 2**20  # bytes of permuted values at a time
+_TIE = 1e-9  # relative; statistics nearer than float64 sums are accurate count as equal
+_NONE = 1e-12  # share of the squares; a residual below is rounding
 _BINS = 6000
 """Of the logarithm of F, from a millionth to a million."""
 _REACH = 2.5
 """Standard deviations after which a bump ends."""
-_FLOOR = 1e-6
+_FLOOR = 1e-6  # share of the mean variance that the error variance is at least, so that the matrix is invertible
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,8 +27,8 @@ Rows: TypeAlias = npt.NDArray[np.intp]
 Scheme: TypeAlias = Literal["permute", "flip", "subjects"]
 """How rows are arranged: permuted, or with flipped signs; subjects either way, depending on the reduced model."""
 
-_ALIASED = 1e-8
-_CONSTANT = 1e-9
+_ALIASED = 1e-8  # relative length of a residual column; below it follows from the others
+_CONSTANT = 1e-9  # scale of a column of zeros, whose length would be zero
 _BATCH = 50
 """Arrangements that are drawn from one seed."""
 

@@ -21,7 +21,7 @@ PENALTIES = tuple(10.0 ** (0.5 * k) for k in range(-10, 1))
 """Of ridge regression on coefficients in mm, times the largest squared singular value."""
 MODES = (1, 2, 3, 5, 8, 12, 20, 30, 50)
 """Leading principal components that a regression on whitened coefficients keeps."""
-_NOTHING = 1e-10
+_NOTHING = 1e-10  # share of the first singular value; below is rounding
 
 
 @dataclass(frozen=True)

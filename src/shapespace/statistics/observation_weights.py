@@ -13,8 +13,8 @@ from shapespace.types import BoolArray, FloatArray
 
 LEAST_INFORMATION = 0.5
 """Share of the information below which a map is blank; the share of shapes that a model needs (`MIN_SEEN`)."""
-_ESTIMABLE = 1e-6
-_BLOCK = 4096
+_ESTIMABLE = 1e-6  # relative; a contrast off by less is estimable within rounding
+_BLOCK = 4096  # rows at a time; bounds memory
 
 
 def information(cohort: Cohort, matrix: FloatArray, contrasts: FloatArray) -> FloatArray | None:

@@ -30,7 +30,7 @@ from shapespace.statistics.linear_regressors import IndexArray
 from shapespace.types import FloatArray, read_only
 
 FORMAT, VERSION = "shapespace predictor", 1
-_ROUNDING = 1e-9
+_ROUNDING = 1e-9  # relative slack, so that training shapes never count as outside their own range
 _AGAIN = "make it again with shapespace regress"
 _FLOATS = ("mean", "weights", "intercepts", "residuals", "share")
 _FACTS = ("target", "gauge", "model_hash", "lowest", "highest", "farthest_mm", "subjects", "confidence", "method")

@@ -34,8 +34,8 @@ from shapespace.types import FloatArray, Mesh, read_only, require
 FEWEST, SMALL = 10, 100
 """Subjects below which nothing is learned, and below which a sample is said to be small."""
 MEASURES = ("r2", "rmse", "mae", "slope", "intercept", "coverage", "width")
-_BLOCK = 500
-_EDGES = (5.0, 95.0)
+_BLOCK = 500  # permutations at a time; bounds memory
+_EDGES = (5.0, 95.0)  # percentiles of the target that the two predicted shapes stand for
 
 
 @dataclass(frozen=True)

@@ -29,12 +29,14 @@ from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, read_only, r
 FEWEST_PEOPLE, SMALL = 5, 30
 """The least reference, and one below which the answer says that it is small."""
 
-LEVEL = 0.05
+LEVEL = 0.05  # share of people of the reference beyond the limit of the maps
+# share of variance of the modes, people per mode that estimate its variance, and folds (each costs a decomposition)
 _SHARE, _PEOPLE_PER_MODE, _MOST_FOLDS = 0.95, 5, 100
+# least shrinkage, which is divided by; and the ratio of shrinkages above which fits count as equally precise
 _LEAST_SHRINKAGE, _EQUALLY_PRECISE = 1e-4, 0.95
-_VERTICES_AT_ONCE = 2000
-_SAME = 1e-6
-_OUTSIDE = 0.01
+_VERTICES_AT_ONCE = 2000  # vertices at a time; bounds memory
+_SAME = 1e-6  # share of the size; two different scans never agree to rounding
+_OUTSIDE = 0.01  # share of the reference beyond a subject from which it is reported as outside
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,8 @@ LARGEST_OFF = 0.02
 """A mean that lies further (RMS, share of its size) from its mirror image about any plane is not symmetric."""
 LARGEST_PAIRED_OFF = 0.1
 """The same where pairs are given, from vertex to vertex."""
-_LARGEST_BYTES = 2**26
-_FEWEST = 4
+_LARGEST_BYTES = 2**26  # bytes; a table of pairs of millions of vertices is smaller
+_FEWEST = 4  # vertices, two pairs: one pair leaves the plane of symmetry to chance
 _NUMBER = re.compile(r"[0-9]{1,12}")
 
 

@@ -34,7 +34,7 @@ from shapespace.viewer.responses import PAGES, application, asset, binary, json_
 from shapespace.viewer.uploaded_scans import MIN_LANDMARKS, Scans, UploadedScan
 
 EXPORTS = ("ply", "obj", "stl")
-_MAX_NAME = 120
+_MAX_NAME = 120  # characters of a file's name on the page, so that it fits one line
 _NO_SCAN = "There is no such scan; it was removed."
 _QUEUE_FULL = "{} scans are being fitted or wait; wait for one, or stop one."
 

@@ -16,7 +16,7 @@ from shapespace.viewer.fitting import NAME, PICTURE, PREVIEW, STOPPED, Message, 
 
 FOLDER_PREFIX = "shapespace-view-"
 """Of the temporary folder of a viewer."""
-MIN_LANDMARKS = 3
+MIN_LANDMARKS = 3  # landmarks that determine a pose
 _RESULT_FILES = (
     PREVIEW,
     PICTURE,

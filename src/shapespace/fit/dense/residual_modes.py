@@ -33,7 +33,7 @@ from shapespace.types import FloatArray
 
 _ALGORITHM_VERSION = 1
 """Part of the key of the disk cache: raise it whenever `_make`, `local_modes` or `mirror` compute other modes."""
-_LEAST_VALUE = 1e-8
+_LEAST_VALUE = 1e-8  # share of the largest eigenvalue; below are float32 rounding and linear dependence
 _SYMMETRIC_SHARE = 0.01
 """A mean whose mirror image lies within this share of its size is taken for symmetric."""
 

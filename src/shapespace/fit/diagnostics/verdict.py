@@ -10,7 +10,7 @@ from shapespace.fit.result import Status
 
 _FARTHEST_Z = 10.0
 """Standard deviations of new shapes; the plain method goes to 8 on real scans, where faint modes chase details."""
-_OTHER_SCALE = 0.05
+_OTHER_SCALE = 0.05  # logarithm, 5 %: scale that projection onto the modes may change
 _MOVED_AWAY, _LEAST_MOVED_SHARE = 1.5, 0.005
 """The nearest shape in the span lies as far from a surface as that leaves the span, and hardly farther."""
 _DENSE_MOVED_SHARE = 0.009

@@ -25,14 +25,14 @@ from shapespace.types import FloatArray
 
 # Set on simulated scans: clean ones stay far from each bound, cut ones cross at least one.
 _SHRUNK_BY_SHAPE = 0.85
-_SHRUNK_IN_ALL = 0.7
-_LEADING_SHARE = 0.9
-_IMPLAUSIBLE = 1e-5
-_CLOSE_SHARE = 0.01
-_FAR_SHARE = 0.05
-_GAP_RATIO = 4.0
-_GAP_SHARE = 0.02
-_SEEN_SHARE = 0.05
+_SHRUNK_IN_ALL = 0.7  # ratio of the final scale to that of the start
+_LEADING_SHARE = 0.9  # share of variance of the main coefficients
+_IMPLAUSIBLE = 1e-5  # probability that a new shape exceeds the bound on its coefficients
+_CLOSE_SHARE = 0.01  # share of the size; a surface nearer than this is right however unusual its coefficients
+_FAR_SHARE = 0.05  # share of the size that the model may lie from the scan (RMS)
+_GAP_RATIO = 4.0  # ratio of the median distances scan to model and model to scan
+_GAP_SHARE = 0.02  # share of the size; smaller medians are good whatever their ratio
+_SEEN_SHARE = 0.05  # share of the scan that the model must cover
 
 
 @dataclass(frozen=True)

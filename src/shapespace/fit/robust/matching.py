@@ -197,7 +197,13 @@ class Matcher:
     ) -> Matcher:  # fmt: skip
         """Return the matcher of the scan points `points` (M,) and the model vertices `vertex` (N,)."""
         return Matcher(
-            target, target.mesh.vertices[points], target.normals[points], vertex, engine, normal_cosine, bulging
+            target=target,
+            points_mm=target.mesh.vertices[points],
+            point_normals=target.normals[points],
+            vertex=vertex,
+            engine=engine,
+            normal_cosine=normal_cosine,
+            bulging=bulging,
         )
 
     def first_hint(
@@ -227,15 +233,21 @@ class Matcher:
         agree = winding * cosine > self.normal_cosine
         points = PointMatches(triangle, barycentric, nearest, residual, distance, covered & agree)
         vertices = match_vertices(
-            self.target, self.engine, T_scan_model, surface, self.vertex, hint.near,
-            winding=winding, normal_cosine=self.normal_cosine,
-        )  # fmt: skip
+            target=self.target,
+            engine=self.engine,
+            T_scan_model=T_scan_model,
+            surface=surface,
+            vertex=self.vertex,
+            near=hint.near,
+            winding=winding,
+            normal_cosine=self.normal_cosine,
+        )
         return Matches(points, vertices, winding)
 
 
 def match_vertices(
-    target: ScanTarget, engine: ClosestPointEngine, T_scan_model: Similarity, surface: ModelSurface, vertex: IntArray,
-    near: ClosestPoints | None, *, winding: float, normal_cosine: float,
+    *, target: ScanTarget, engine: ClosestPointEngine, T_scan_model: Similarity, surface: ModelSurface,
+    vertex: IntArray, near: ClosestPoints | None, winding: float, normal_cosine: float,
 ) -> VertexMatches:  # fmt: skip
     """Match some of the surface's vertices to the scan (R5, R6).
 

@@ -234,9 +234,15 @@ class _Sides:
         R, t = np.concatenate([T.rotation[None], R]), np.concatenate([T.translation[None], t])
         for step in (COARSE, RIGID):
             R, t, score = rigid_search(
-                R, t, self.model.points[: step.points], self.scan[: step.points], self.model.grid, grid,
-                step.reaches(size), _RIGID_CAP * size,
-            )  # fmt: skip
+                R=R,
+                t=t,
+                model=self.model.points[: step.points],
+                scan=self.scan[: step.points],
+                model_grid=self.model.grid,
+                scan_grid=grid,
+                radii=step.reaches(size),
+                cap=_RIGID_CAP * size,
+            )
             order = np.argsort(score)
             kept_rows = order[_distinct_rows(R[order], t[order], step.n_poses, _SAME_TURN, _SAME_PLACE * size)]
             R, t = R[kept_rows], t[kept_rows]

@@ -397,7 +397,15 @@ def read_vtp(data: bytes, path: Path) -> Mesh:
     base = block is not None and block.get("encoding", "base64") == "base64"
     order = ">" if root.get("byte_order") == "BigEndian" else "<"
     header = order + ("u8" if root.get("header_type") == "UInt64" else "u4")
-    xml = _Xml(path, order, header, compressor != "", appended, base, Allowance(len(data), path))
+    xml = _Xml(
+        path=path,
+        order=order,
+        header=header,
+        compressed=compressor != "",
+        appended=appended,
+        appended_base64=base,
+        allowance=Allowance(len(data), path),
+    )
     points: list[FloatArray] = []
     colours: list[ByteArray | None] = []
     faces: list[IndexArray] = []

@@ -27,14 +27,12 @@ from shapespace.statistics.asymmetry import AnovaRow, AsymmetryResult, first_pat
 from shapespace.statistics.observation_weights import blank_where
 from shapespace.types import BoolArray, FloatArray, Mesh, SurfaceLandmarks
 
-_ALPHA = 0.05
-_MOST_MAPS = 2
-_MOST_ROWS = 10
-_BINS = 20
+_ALPHA = 0.05  # significance level of the summary, the usual one
+_MOST_MAPS, _MOST_ROWS, _BINS = 2, 10, 20  # maps, rows and bins of the report: what fits one screen each
 _MORPH_SHARE = 0.05
 """Largest displacement in an exaggerated morph, as a share of the size (RMS distance from the centroid)."""
 _FILE = "asymmetry.npz"
-_FEWEST_REPEATS = 10
+_FEWEST_REPEATS = 10  # repeated scans; with fewer the measurement error is known to no better than 22 %
 
 
 def asymmetry_report(result: AsymmetryResult) -> AnalysisReport:

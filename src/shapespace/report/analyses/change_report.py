@@ -44,12 +44,13 @@ from shapespace.types import FloatArray, Mesh
 ARRAYS, MAPS = "change.npz", "subjects.npz"
 MOST_MAPS = 6
 """Subjects whose maps the report draws."""
+# rows and curves of the report: what can be read without scrolling far, and curves that stay distinguishable
 MOST_ROWS, MOST_CURVES = 50, 12
 _LEVEL = LEVEL
-_MM3_PER_ML = 1000.0
+_MM3_PER_ML = 1000.0  # unit conversion
 _LEAST_ML_MM3 = 100.0
 """Volumes below this limit (mm³) are written in mm³, others in ml; 0.1 ml needs more than two decimals."""
-_FEW = 10
+_FEW = 10  # degrees of freedom; with fewer a standard deviation is known to no better than 22 %
 _SOURCES = {
     "rescans": "Standard deviations are those of rescans.",
     "fits": "Standard deviations are those that the fits state of their coefficients, carried through modes and "

@@ -39,8 +39,8 @@ from shapespace.types import BoolArray, FloatArray, Mesh
 
 _LARGEST_SHARE = 0.05
 """A morph shows changes exaggerated to about this share of the size."""
-_EXAGGERATIONS = (1, 2, 3, 5, 10, 20, 50)
-_BINS = 40
+_EXAGGERATIONS = (1, 2, 3, 5, 10, 20, 50)  # factors of a displacement; the largest that stays plausible is taken
+_BINS = 40  # bins of a histogram of thousands of permutations
 _FEWEST_ARRANGEMENTS = 20
 """Number of different arrangements below which no p value can be small."""
 _PALE = "Vertices that are not found to differ are pale."

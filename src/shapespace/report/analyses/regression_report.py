@@ -24,7 +24,7 @@ from shapespace.statistics.regression import (
 from shapespace.types import Mesh
 
 _FILE = "regression.npz"
-_MOST_ROWS = 20
+_MOST_ROWS = 20  # rows that fit one screen; files have all
 _MEASURE_NAMES = {
     "r2": "R²", "rmse": "RMSE", "mae": "mean absolute error", "slope": "calibration slope",
     "intercept": "calibration intercept", "coverage": "coverage of intervals", "width": "width of intervals",

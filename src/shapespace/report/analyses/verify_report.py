@@ -24,9 +24,9 @@ from shapespace.report.analyses.shape_data import add_shape_data, model_hashes
 from shapespace.schemas import Counts, CurvePart, HistogramPart, Part, Series, TableColumn, TablePart, TextPart
 from shapespace.statistics.identity.verify import FAR, GRID, VerificationRates, VerificationResult
 
-_LEAST_RATE = 1e-4
-_BINS = 40
-_ERRORS = 30
+_LEAST_RATE = 1e-4  # lowest false accept rate of the plot, the end of `GRID`
+_BINS = 40  # bins of a histogram of thousands of pairs
+_ERRORS = 30  # expected errors; a rate from fewer is uncertain by more than 30 % ("rule of 30")
 
 
 def verify_report(result: VerificationResult) -> AnalysisReport:

@@ -39,7 +39,7 @@ ORDER_OF_CONCERN = ("failed", "unreadable", "doubtful", "max_iterations", "conve
 MODEL_PICTURES, FIT_PICTURES = 4, 9
 """How many pictures `model_part` and `fit_in_full` make."""
 
-MODES_IN_WIDGET = 8
+MODES_IN_WIDGET = 8  # sliders that fit beside the picture; their displacements are most of the payload
 SCAN_TRIANGLES = 8_000
 """How many triangles of a scan turn in the page; the file of the scan has them all."""
 
@@ -47,8 +47,8 @@ _From = TypeVar("_From")
 _To = TypeVar("_To")
 _CAPTION_HEIGHT = 0.14
 """Of a figure, beside its width."""
-_DETAIL_BYTES = 1_300_000
-_VARIANCE_SHARES = (0.90, 0.95, 0.98, 0.99)
+_DETAIL_BYTES = 1_300_000  # bytes of the page that all pictures of one fit take
+_VARIANCE_SHARES = (0.90, 0.95, 0.98, 0.99)  # shares of the variance that are usual in publications
 
 
 def concern(fit: SavedFit) -> tuple[int, float]:

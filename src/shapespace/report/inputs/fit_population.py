@@ -251,7 +251,16 @@ class Population:
                 shift = float(shifts[mode - 1])
                 if abs(shift) > max(_SIGNS / np.sqrt(len(group_errors)), _LEAST_SHIFT):
                     out.append(f"z{mode} is {'higher' if shift > 0 else 'lower'} by {abs(shift):.2f} on average")
-            yield Group(name, count, untrusted, error, error - middle, mode, shift, tuple(out))
+            yield Group(
+                name=name,
+                count=count,
+                untrusted=untrusted,
+                error_mm=error,
+                error_off_mm=error - middle,
+                mode=mode,
+                shift=shift,
+                stands_out=tuple(out),
+            )
 
     def _count_reasons(self, statuses: Sequence[str], reasons: Sequence[str | None]) -> None:
         for status, reason in zip(statuses, reasons, strict=True):

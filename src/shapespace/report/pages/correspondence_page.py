@@ -50,8 +50,10 @@ from shapespace.schemas import CORRESPOND_AGAIN, CorrespondRecord, Quality, read
 from shapespace.types import FloatArray, Mesh
 from shapespace.version import __version__
 
+# Items on a page: what can be looked through without paging, and a page that stays within its bytes.
 MOST_CARDS, MOST_EMPTY_CARDS, MOST_BOARDS, MOST_ROWS = 24, 6, 11, 2000
-_MOST_NAMED = 12
+_MOST_NAMED = 12  # items of a list; the table has all
+# share of the scans that observe a hardly seen vertex, and of vertices for a complete surface
 _HARDLY_SEEN, _WHOLE_SHARE = 0.5, 0.9
 _STATUS = {
     "unreadable": ("unreadable", "failed"),
@@ -59,7 +61,7 @@ _STATUS = {
     "look": ("to be looked at", "doubtful"),
     "corresponding": ("in correspondence", "converged"),
 }
-_TRIANGLES_DRAWN = 400_000
+_TRIANGLES_DRAWN = 400_000  # triangles; more are smaller than a pixel of the pictures
 
 _Make: TypeAlias = Callable[[CorrespondRecord], Cell]
 
@@ -351,7 +353,15 @@ class CorrespondencePage:
         self.page.step(record.name)
         status = self.status(record)
         if record in self.out:
-            return Card(self._cards[record.name], record.name, status, "", self._reason(record), image, note)
+            return Card(
+                anchor=self._cards[record.name],
+                name=record.name,
+                status=status,
+                label="",
+                text=self._reason(record),
+                image=image,
+                why_none=note,
+            )
         text = f"Mean distance {percent_of(self.share(record, 'mean'))} of its size. {self.concerns[record.name].text}"
         text += f" {note}" if note else ""
         return Card(self._cards[record.name], record.name, status, "", text, image)

@@ -22,9 +22,9 @@ from shapespace.schemas import DEMO_AGAIN, Case, Demo, DemoModel, ExpressionsOfO
 if TYPE_CHECKING:
     from shapespace.report.inputs.staged_fit import StagedFit
 
-_RESERVE_BYTES = 1_200_000
-_PICTURES = 30
-_MODES_OF_A_CASE = 4
+_RESERVE_BYTES = 1_200_000  # bytes that stay free for the parts after the fits
+_PICTURES = 30  # planned pictures, for the progress bar alone
+_MODES_OF_A_CASE = 4  # leading modes that are drawn for each case, one row of pictures
 _NOTHING = Text("No fit kept its surfaces.", "broken")
 
 

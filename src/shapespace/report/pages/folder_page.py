@@ -53,15 +53,17 @@ if TYPE_CHECKING:
     from shapespace.model.shape_model import ShapeModel
     from shapespace.report.inputs.staged_fit import StagedFit
 
+# Items on a page: what can be looked through without paging, and a page that stays within its bytes.
 MOST_CARDS = 24
-MOST_EMPTY_CARDS = 6
-MOST_OPEN_CARDS = 6
-MOST_DETAILS = 3
-MOST_ROWS = 2000
-MOST_CURVES = 100
-_MOST_NAMED = 12
-_MOST_WORST = 3
-_FEWEST_LEVELS = 2
+MOST_EMPTY_CARDS = 6  # cards of fits without a surface
+MOST_OPEN_CARDS = 6  # cards that are not folded away
+MOST_DETAILS = 3  # fits with all pictures, about 1.3 MB each
+MOST_ROWS = 2000  # rows of the table of all fits
+MOST_CURVES = 100  # curves of iterations; more cover each other
+_MOST_NAMED = 12  # items of a list; the table has all
+_MOST_WORST = 3  # fits named in one sentence
+_FEWEST_LEVELS = 2  # scans of a subject; one shows no progression
+# bytes that stay free for tables, and sections of analyses that room is reserved for
 _RESERVE_BYTES, _MOST_RESERVED = 400_000, 2
 
 
@@ -363,14 +365,14 @@ class FolderPage:
         # The summary has the whole reason of these.
         named = [bad.name for bad in self.fits if bad.status != "converged"][:_MOST_NAMED]
         return Card(
-            self._cards[fit.name],
-            fit.name,
-            status(fit.status),
-            fit.label if fit.label != fit.name else "",
-            text + (_first_reason(fit) if fit.name in named else fit.reason),
-            image,
-            why,
-            self._details.get(fit.name),
+            anchor=self._cards[fit.name],
+            name=fit.name,
+            status=status(fit.status),
+            label=fit.label if fit.label != fit.name else "",
+            text=text + (_first_reason(fit) if fit.name in named else fit.reason),
+            image=image,
+            why_none=why,
+            detail=self._details.get(fit.name),
         )
 
     def still(self, fit: SavedFit, limit_mm: float) -> Image:

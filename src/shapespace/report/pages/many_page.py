@@ -50,8 +50,9 @@ WORST = {"failed": 12, "doubtful": 60, "max_iterations": 20, "converged": 60}
 MOST_SINGLE, MOST_STORED = 10_000, 2_000
 """Fits of which a folder of single files, and a store, are reported with one row for each."""
 
+# Items on a page, and points in a picture: what can be looked through without paging.
 _FARTHEST, _MOST_REASONS, _MOST_NOTED, _MOST_LINES, _IN_PICTURE = 20, 20, 24, 6, 400
-_MOST_COLUMNS = 12
+_MOST_COLUMNS = 12  # columns of metadata; each has a figure
 
 
 def is_many(results: Results) -> bool:

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 LARGEST_REPORT_BYTES = 8_000_000
 """A report stays below this size, so that it can be mailed."""
 
-_SHELL_BYTES = 250_000
-_RESERVE_BYTES = 700_000
+_SHELL_BYTES = 250_000  # bytes of scripts and styles of a page
+_RESERVE_BYTES = 700_000  # bytes that stay free for tables and text after the last picture
 
 Step = Callable[[str, int], None]
 """Told what was just made, and about how many such things there will be, for a progress bar."""
@@ -86,7 +86,15 @@ class Page:
     ) -> Section:  # fmt: skip
         """Return a section, or its heading and why it could not be made."""
         anchor = anchor or self.anchor(heading)
-        return Section(heading, anchor, self.tried(make), level, link or heading, folded, status)
+        return Section(
+            heading=heading,
+            anchor=anchor,
+            body=self.tried(make),
+            level=level,
+            link=link or heading,
+            folded=folded,
+            status=status,
+        )
 
     def tried(self, make: Make) -> Sequence[Block]:
         """Return what `make` gives, or why it could not."""

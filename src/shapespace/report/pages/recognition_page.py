@@ -47,12 +47,13 @@ SECTION_BYTES = 1_500_000
 MOST_ANALYSES = 12
 """How many analyses a report of fits shows."""
 
+# parts of a study, and characters of a damaged value, that a page shows: bounds its length
 _MOST_PARTS, _MOST_TEXT = 120, 400
-_PART_BYTES = 700_000
-_MOST_NOTES = 40
+_PART_BYTES = 700_000  # bytes that one part of a study takes with its figures
+_MOST_NOTES = 40  # notes on the page; the file has all
 _BESIDE = ("confusion", "calibration", "learning_curve", "curve", "histogram")
 """Kinds of parts that share the page's width with their neighbour; the views of a surface map need all of it."""
-_CHAPTER = 2
+_CHAPTER = 2  # level of parts that begin a chapter (`Part` in schemas)
 _T = TypeVar("_T")
 
 

@@ -20,7 +20,7 @@ from shapespace.types import BoolArray, FloatArray, IntArray, require
 FPIR = (1e-1, 1e-2)
 """Shares of searches for people who are not enrolled that find somebody, at which the misses are told."""
 
-_JUST = 1e-12
+_JUST = 1e-12  # relative slack for rates that rounding puts just below a step
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,6 +19,7 @@ from shapespace.lazy import require_package
 from shapespace.statistics.identity.samples import Samples
 from shapespace.types import FloatArray, read_only
 
+# bounds as shares of the variance within and between people, so that both stay positive
 _MOST_NOISE, _LEAST_BETWEEN = 0.9, 1e-3
 
 

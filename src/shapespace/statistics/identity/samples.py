@@ -12,7 +12,7 @@ from shapespace.errors import InputError
 from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, read_only
 
-_NO_VARIANCE = 1e-9
+_NO_VARIANCE = 1e-9  # share of the largest; below is rounding
 
 
 @dataclass(frozen=True, eq=False)

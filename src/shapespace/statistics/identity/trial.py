@@ -19,7 +19,7 @@ from shapespace.statistics.identity.scores import SCORES, refuse_unknown_scores,
 from shapespace.types import BoolArray, FloatArray, IntArray
 
 ROLES = ("gallery", "probe", "train")
-_FOLDS, _GROUPS = 4, 5
+_FOLDS, _GROUPS = 4, 5  # folds of people, and groups for the calibration
 
 
 @dataclass(frozen=True)

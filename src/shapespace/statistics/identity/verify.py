@@ -22,8 +22,8 @@ FAR = (1e-1, 1e-2, 1e-3)
 """Shares of impostor pairs accepted, at which the genuine pairs accepted are told."""
 
 GRID = np.geomspace(1e-4, 1.0, 61)
-_BY_DRAWS = 200
-_ENDS = (2.5, 97.5)
+_BY_DRAWS = 200  # bootstrap draws of a subgroup; fewer than for all, since there are many subgroups
+_ENDS = (2.5, 97.5)  # percentiles of a 95 % interval
 
 
 @dataclass(frozen=True, eq=False)
