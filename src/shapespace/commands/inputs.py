@@ -66,7 +66,7 @@ def given_scans(
             `id`, perhaps `id` and `landmarks` as well, and others that are kept.
         folder: of the results, not looked into.
         recursive: whether to take what lies in folders below too.
-        say: told what was not taken.
+        say: called with each message on skipped files.
 
     Raises:
         InputError: there is nothing, or a list is not one.

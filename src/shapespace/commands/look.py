@@ -35,7 +35,7 @@ def check(
         paths: files and folders.
         recursive: whether to take what lies in folders below these too.
         strict: whether a mesh with triangles that use vertices with non-finite coordinates is not usable.
-        say: told what was not taken.
+        say: called with each message on skipped files.
     """
     reports: list[dict[str, Any]] = []
     listed = mesh_files(paths, recursive=recursive)

@@ -39,21 +39,22 @@ def write_surfaces(
     quiet: bool = False,
     say: Callable[[str], None],
 ) -> list[dict[str, Any]]:
-    """Write the surface of each volume as NAME.ply into `folder`, RAS in mm, and return the facts of each, in order.
+    """Write the surface of each volume as NAME.ply into `folder`, in RAS coordinates and mm.
 
-    A volume that cannot be used has an `error`, and the others go on.
+    Returns:
+        A record of each volume, in order; that of an unusable volume has an `error`.
 
     Args:
         paths: label volumes, and folders of them.
-        folder: where surfaces go.
+        folder: output folder.
         labels: labels that form one object, or `all` (default: the only label of the volume).
         smooth: standard deviation of the smoothing in voxels, 0 to 10; 0 for none (default 1.3).
         keep_pieces: keep all pieces and cavities (default: the largest piece, cavities filled, with a message).
         recursive: also search subfolders of the given folders.
         max_memory_bytes: memory limit for a volume and its surface; a volume that needs more is refused before it is
             read (default: `MAX_MEMORY_BYTES`, 4G, or 80 % of the free memory if that is less).
-        quiet: no progress.
-        say: told what was not taken, and which volumes cannot be used.
+        quiet: show no progress.
+        say: called with each message on skipped files and unusable volumes.
 
     Raises:
         ShapespaceError: the extra `volumes` is not installed.

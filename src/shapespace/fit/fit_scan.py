@@ -127,7 +127,7 @@ class FitConfig:
         return method_named(self.method) if isinstance(self.method, str) else self.method
 
     def limits(self, model: ShapeModel) -> Limits:
-        """Return what the method is told; a scale that goes by the gauge is free where size was divided out."""
+        """Return the settings of the method; a scale that goes by the gauge is free where size was divided out."""
         with_scale = model.gauge == "shape" if self.scale == "auto" else self.scale == "free"
         return Limits(with_scale, self.modes, self.max_iterations)
 
@@ -397,7 +397,7 @@ def _landmark_stddev_mm(
     variance = np.einsum("lii->li", fitted.landmark_covariance).copy()
     landmarks = model.landmarks if held is None else held.landmarks(model)
     if not dense:
-        # The surface was told in the model's modes, and what that moved a landmark by is an error of it.
+        # The surface was projected onto the model's modes; the motion of a landmark by it is an error of the landmark.
         in_modes = landmarks.interpolate(fitted.T_scan_model.apply(model.reconstruct(fitted.b)))
         variance += (in_modes - landmarks.interpolate(fitted.vertices_scan_mm)) ** 2
     return dict(zip(landmarks, np.sqrt(variance), strict=True))

@@ -1,4 +1,4 @@
-"""A fit that is held to a region: made with the model of that part, and told in the coefficients of the whole."""
+"""Region fit: computed with the model of the region, reported in the coefficients of the full model."""
 
 from __future__ import annotations
 

@@ -105,7 +105,7 @@ def _landmarks(vertices: Mapping[str, Any], places: Mapping[str, Any], n: int, m
 
 
 def total_variance(model: LinearModel) -> float | None:
-    """Return the variance of all modes, in the unit of the model squared; None where it is not told."""
+    """Return the variance of all modes, in the unit of the model squared; None if the file does not state it."""
     variances = [block.total_variance for block in (model.shape, model.expression) if block is not None]
     known = [variance for variance in variances if variance is not None]
     return sum(known) if known else None

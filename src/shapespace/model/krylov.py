@@ -70,7 +70,7 @@ class Stop:
 
     Args:
         radians: that a mode may be turned by.
-        least_gap: eigenvalues nearer than this share of the first are not told apart.
+        least_gap: eigenvalues nearer than this share of the first are not separated.
         enough: residual, as a share of the first eigenvalue, that will do where the basis may not grow any more.
     """
 

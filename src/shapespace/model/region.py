@@ -2,7 +2,7 @@
 
 The region's vertices vary as the whole model has them vary: the modes of the part are the principal components of the
 model's own modes there, and each coefficient vector of one stands for one of the other. So nothing beyond the region
-has a say in the fit, and what comes of it is told in the coefficients of the whole.
+affects the fit, and its result is given in the coefficients of the full model.
 """
 
 from __future__ import annotations

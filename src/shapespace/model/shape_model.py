@@ -209,7 +209,7 @@ class ShapeModel:
             scratch: for the file, and for what a build that is killed goes on with; None takes the system's folder
                 for temporary files and does not go on.
             keep_shapes: a folder to keep that file in, for `with_more`; the meshes are then streamed.
-            tell: told what is being done while meshes are streamed.
+            tell: called with the current step while meshes are streamed.
 
         Raises:
             CorrespondenceError: the meshes differ in vertices or triangles.

@@ -268,7 +268,7 @@ def aligned_on_disk(
         scratch: for what a build that is killed goes on with; None takes a temporary folder and keeps nothing.
         onto: shapes to which these are added.
         modes: that will be asked for; what cannot be had is refused before anything is read.
-        tell: told what is being done.
+        tell: called with the current step.
 
     Raises:
         CorrespondenceError: the meshes differ in vertices or triangles.

@@ -340,7 +340,7 @@ def _refuse_known(
 
 @dataclass(frozen=True, eq=False)
 class _ShapeDistribution:
-    """Mean (K,), components (q, K) and variances (q,) of some people; the last count that the mean is uncertain."""
+    """Mean (K,), components (q, K) and variances (q,) of some people; the variances include that of the mean."""
 
     mean: FloatArray
     components: FloatArray
@@ -368,7 +368,7 @@ class _ShapeDistribution:
 
 
 class _Population:
-    """The reference as it measures: all of it, and without some of its people in turn."""
+    """Distribution of the reference: of all people, and with each fold of people left out."""
 
     def __init__(self, reference: Cohort, people: IntArray, modes: int) -> None:
         self.people, self.modes = int(people.max()) + 1, modes
@@ -414,14 +414,14 @@ class _Population:
 
 @dataclass(frozen=True, eq=False)
 class _FitUncertainty:
-    """How well fits were seen.
+    """Uncertainty of the coefficients of fits.
 
     Args:
         b: (N, K) coefficients, mm.
-        shrinkage: (N, K) 1 where the scan told a coefficient, near 0 where only the model did.
-        variance: (N, K) of the coefficients, mm^2.
-        prior: (K,) of a new shape, mm^2.
-        into: (K, K') from the model's coefficients to those of the cohort.
+        shrinkage: (N, K) share of the prior variance that each scan removes.
+        variance: (N, K) variance of the coefficients, mm^2.
+        prior: (K,) variance of the coefficients of a new shape, mm^2.
+        into: (K, K') matrix from the model's coefficients to those of the cohort.
     """
 
     b: FloatArray
@@ -432,7 +432,7 @@ class _FitUncertainty:
 
     @staticmethod
     def of(cohort: Cohort) -> _FitUncertainty | None:
-        """Return how well the fits of a cohort were seen; None for other surfaces than the model's own."""
+        """Return the uncertainty of the fits of a cohort; None for other surfaces than the model's own."""
         fitted = cohort.fitted
         if fitted is None or not np.isfinite(fitted.b_stddev).all():
             return None
@@ -455,11 +455,11 @@ class _FitUncertainty:
         return (self.into.T * np.median(self.variance, axis=0)) @ self.into
 
     def degraded(self, coefficients: FloatArray, shrinkage: FloatArray, draws: FloatArray) -> FloatArray:
-        """Return (R, N, K') coefficients as they would be if scans had told only `told` (K,) of each mode."""
+        """Return (R, N, K') coefficients as fits with less shrinkage (K,) would estimate them."""
         ratio = np.minimum(shrinkage / self.shrinkage, 1.0)
         if ratio.min() > _EQUALLY_PRECISE:
             return coefficients[None]
-        # What a scan does not tell goes to the model's mean, with what is left of the spread of such estimates.
+        # What a scan does not show is estimated by the model's mean, with the remaining scatter of such estimates.
         moved = (ratio - 1) * self.b + np.sqrt(self.prior * shrinkage * (1 - ratio)) * draws
         return coefficients + moved @ self.into
 

@@ -209,13 +209,13 @@ class Matcher:
     def first_hint(
         self, surface: ModelSurface, T_scan_model: Similarity, tree: KdTree | None = None, winding: float | None = None
     ) -> MatchHint:
-        """Return a hint for the first search.
+        """Return the start of the first search: the closest vertices, and no matches yet.
 
         Args:
-            surface: of the model.
-            T_scan_model: its pose.
-            tree: of the vertices of a similar surface; None to build one.
-            winding: of the scan where it is known.
+            surface: surface of the model.
+            T_scan_model: pose of the model.
+            tree: search tree of the vertices of a similar surface; None to build one.
+            winding: -1 where the normals of the scan are reversed, else 1; None if unknown.
         """
         tree = tree or surface.vertex_tree()
         vertex: IntArray = surface.topology.used[tree.nearest(self._in_model(T_scan_model))[0]]

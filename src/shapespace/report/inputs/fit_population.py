@@ -28,11 +28,11 @@ MEASURES: Mapping[str, str] = {
     "to_model_mm": "mean, scan to model (mm)",
     "seen_percent": "model that the scan shows (%)",
 }
-"""What is told of each fit, in words."""
+"""Measures of each fit, with their labels."""
 
 MOST_LEVELS, MOST_BINS = 24, 40  # layout: rows of a table and bins of a figure
 FEWEST = 20
-"""Fits of a level or a stretch of time below which nothing is said about it."""
+"""Fits of a level or a stretch of time below which it is not reported."""
 
 _MOST_VALUES = 500  # distinct texts of a column that counts as a category
 _FEWEST_NUMBERS = 12  # distinct values of a column that counts as numeric

@@ -41,11 +41,11 @@ class _Measure:
     """A measure with its usual range.
 
     Args:
-        of: the value of each scan, not-a-number where it is not known.
-        describe: a value in words.
+        of: value of each scan, not-a-number where it is not known.
+        describe: formats a value as a clause.
         least_spread: the spread of values is at least this.
-        at_least: below this nothing is said.
-        always: above this it is said however many others are alike.
+        at_least: smaller values are not reported.
+        always: larger values are reported however many scans have them.
     """
 
     of: Sequence[float]

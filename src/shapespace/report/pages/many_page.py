@@ -56,7 +56,7 @@ _MOST_COLUMNS = 12  # columns of metadata; each has a figure
 
 
 def is_many(results: Results) -> bool:
-    """Return whether a folder has so many fits that not each of them is told of."""
+    """Return whether a folder has too many fits to report each one."""
     return len(results) > (MOST_SINGLE if results.store is None else MOST_STORED)
 
 

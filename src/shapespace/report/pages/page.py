@@ -46,7 +46,7 @@ class Page:
 
     Args:
         planned: about how many pictures there will be.
-        on_step: told of each picture.
+        on_step: called after each picture.
     """
 
     def __init__(self, planned: int, on_step: Step | None = None) -> None:

@@ -50,7 +50,7 @@ def write_report(
         output: the file; None writes `folder`/report.html.
         model: file of the model of the fits; None goes by their records. The demo names its own, a study has none.
         labels: table of labels of the scans; None looks for labels.csv in `folder`, then beside the scans.
-        on_step: told of each picture as it is made.
+        on_step: called after each picture.
 
     Raises:
         FileError: the folder, demo.json, `model` or `labels` cannot be read, or the report cannot be written.

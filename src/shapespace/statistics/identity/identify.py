@@ -1,4 +1,4 @@
-"""Which of the people enrolled does a scan show: ranks, and what is missed where nobody need be enrolled."""
+"""Identification of the enrolled person that a scan shows: ranks, and miss rates of open-set searches."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from shapespace.statistics.identity.trial import IdentityConfig, Trial, scores_o
 from shapespace.types import BoolArray, FloatArray, IntArray, require
 
 FPIR = (1e-1, 1e-2)
-"""Shares of searches for people who are not enrolled that find somebody, at which the misses are told."""
+"""False positive identification rates at which the miss rate is reported."""
 
 _JUST = 1e-12  # relative slack for rates that rounding puts just below a step
 
 
 @dataclass(frozen=True, eq=False)
 class Searches:
-    """What each probe found in a gallery.
+    """Results of searching a gallery for each probe.
 
     Args:
-        person: (S,) number of whom each probe shows.
+        person: (S,) number of the person of each probe.
         rank: (S,) place of that person among all enrolled, 1 for the first, ties counted against it; 0 where they are
             not enrolled.
         own: (S,) score of that person; minus infinity where they are not enrolled.
-        best_other: (S,) the highest score of anybody else.
+        best_other: (S,) highest score of another person.
     """
 
     person: IntArray
@@ -79,11 +79,11 @@ class Searches:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class IdentificationRates:
-    """How well one score finds people.
+    """Error rates of identification by one score.
 
     Args:
-        name: of the score.
-        searches: of all probes.
+        name: name of the score.
+        searches: results of all probes.
         rank_1: share of enrolled probes whose person is first.
         cmc: (R,) share found within the first 1 to R people.
         band: (2, R) ends of its interval.
@@ -102,14 +102,14 @@ class IdentificationRates:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class IdentificationResult(AnalysisResult):
-    """What identification in a cohort found.
+    """Result of the identification in a cohort.
 
     Args:
-        scores: one for each score that was asked for, in that order.
-        enrolled: people in the gallery; the least of all rounds.
-        probes: how many searches there were.
-        trained_on: how many people were learned from; the least of all rounds.
-        trial: who was who.
+        scores: rates of each requested score, in that order.
+        enrolled: number of people in the gallery; the smallest of all rounds.
+        probes: number of searches.
+        trained_on: number of training people; the smallest of all rounds.
+        trial: roles of the scans.
         config: options of the analysis.
     """
 
@@ -130,12 +130,12 @@ class IdentificationResult(AnalysisResult):
 
 
 def search(scores: FloatArray, gallery: IntArray, probes: IntArray) -> Searches:
-    """Return what probes find: a person's score is that of the scan of them that is most like the probe.
+    """Search the gallery for each probe; the score of a person is that of the most similar scan.
 
     Args:
         scores: (G, P).
-        gallery: (G,) number of whom each scan shows.
-        probes: (P,) the same.
+        gallery: (G,) number of the person of each scan.
+        probes: (P,) number of the person of each probe.
 
     Raises:
         InputError: fewer than two people are enrolled.
@@ -156,11 +156,11 @@ def search(scores: FloatArray, gallery: IntArray, probes: IntArray) -> Searches:
 def identify(
     cohort: Cohort, config: IdentityConfig | None = None, *, progress: Callable[[int, int], None] | None = None
 ) -> IdentificationResult:
-    """Return how well people are found among those enrolled.
+    """Estimate the error rates of identification: which enrolled person does a scan show?
 
     Args:
-        cohort: scans of which the table says whom they show.
-        config: who is enrolled; None enrols the first scan of each person. With folds, people are searched for among
+        cohort: scans with a column that identifies the person.
+        config: roles of the scans; None enrols the first scan of each person. With folds, people are searched for among
             those of their own fold.
         progress: called with (done, total).
 
@@ -201,12 +201,12 @@ def joined(parts: Sequence[Searches]) -> Searches:
 
 
 def identification_rates(name: str, searches: Searches, n_ranks: int, people: FloatArray) -> IdentificationRates:
-    """Return the figures of one score.
+    """Return the error rates of one score.
 
     Args:
-        name: of it.
-        searches: of all probes.
-        n_ranks: ranks that are told.
+        name: name of the score.
+        searches: results of all probes.
+        n_ranks: number of ranks of the CMC curve.
         people: (draws, P) from `people_drawn`.
     """
     rates = np.array(FPIR)

@@ -19,20 +19,21 @@ from shapespace.statistics.identity.trial import IdentityConfig, Trial, scores_o
 from shapespace.types import BoolArray, FloatArray, IntArray, require
 
 FAR = (1e-1, 1e-2, 1e-3)
-"""Shares of impostor pairs accepted, at which the genuine pairs accepted are told."""
+"""False accept rates at which the true accept rate is reported."""
 
 GRID = np.geomspace(1e-4, 1.0, 61)
+"""False accept rates of the ROC curve: 15 in each decade."""
 _BY_DRAWS = 200  # bootstrap draws of a subgroup; fewer than for all, since there are many subgroups
 _ENDS = (2.5, 97.5)  # percentiles of a 95 % interval
 
 
 @dataclass(frozen=True, eq=False)
 class SubgroupRates:
-    """The figures of some pairs.
+    """Error rates of a subgroup of pairs.
 
     Args:
-        genuine: pairs of one person.
-        impostor: pairs of two.
+        genuine: number of pairs of the same person.
+        impostor: number of pairs of two people.
         eer: equal error rate.
         tar: FAR -> TAR.
     """
@@ -47,19 +48,19 @@ class SubgroupRates:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class VerificationRates:
-    """How well one score tells pairs of one person from pairs of two.
+    """Error rates of verification by one score.
 
     Args:
-        name: of the score.
-        score: (M,) of all pairs.
+        name: name of the score.
+        score: (M,) score of each pair.
         llr: (M,) calibrated log likelihood ratios, natural; None where there are too few people to calibrate.
-        roc: the rates.
+        roc: ROC curve.
         eer: equal error rate.
         tar: FAR -> TAR; without a value where there are too few impostor pairs to say.
         cllr: cost of the calibrated ratios, in bits.
-        cllr_min: of the best monotone calibration.
+        cllr_min: cost after the best monotone calibration.
         band: (2, 61) ends of the interval of TAR at the FAR of `GRID`.
-        by: value of the column `by` -> its figures.
+        by: value of the column `by` -> rates of its pairs.
         curve: number of modes -> EER.
     """
 
@@ -80,14 +81,14 @@ class VerificationRates:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class VerificationResult(AnalysisResult):
-    """What verification of a cohort found.
+    """Result of the verification of a cohort.
 
     Args:
-        scores: one for each score that was asked for, in that order.
-        pairs: that were compared.
-        people: names.
-        trained_on: how many people were learned from; the least of all rounds.
-        trial: who was who.
+        scores: rates of each requested score, in that order.
+        pairs: compared pairs of scans.
+        people: names of the people.
+        trained_on: number of training people; the smallest of all rounds.
+        trial: roles of the scans.
         config: options of the analysis.
     """
 
@@ -110,11 +111,11 @@ class VerificationResult(AnalysisResult):
 def verify(
     cohort: Cohort, config: IdentityConfig | None = None, *, progress: Callable[[int, int], None] | None = None
 ) -> VerificationResult:
-    """Return how well scans of one person are told from scans of two.
+    """Estimate the error rates of verification: do two scans show the same person?
 
     Args:
-        cohort: scans of which the table says whom they show.
-        config: who is compared with whom; None for all against all, by folds of the people.
+        cohort: scans with a column that identifies the person.
+        config: roles of the scans; None compares all with all, by folds of the people.
         progress: called with (done, total).
 
     Raises:
@@ -173,15 +174,15 @@ def verification_rates(
     curve: Mapping[int, float] | None = None,
     on_draw: Callable[[], None] | None = None,
 ) -> VerificationRates:
-    """Return the figures of one score.
+    """Return the error rates of one score.
 
     Args:
-        name: of it.
-        score: (M,) of all pairs.
-        pairs: of whom.
-        group: (P,) of each person, for calibration on people of other groups.
+        name: name of the score.
+        score: (M,) score of each pair.
+        pairs: the pairs.
+        group: (P,) group of each person, for calibration on people of other groups.
         people: (draws, P) from `people_drawn`.
-        chosen: value -> (M,) pairs that have figures of their own.
+        chosen: value -> (M,) pairs of a subgroup.
         curve: number of modes -> EER.
         on_draw: called after each draw.
 
