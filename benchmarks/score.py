@@ -16,7 +16,7 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort, Fitted
 from shapespace.cohort.table import Table
-from shapespace.fit.robust.posterior import new_shapes
+from shapespace.fit.robust.posterior import variance_of_new_shapes
 from shapespace.model.shape_model import ShapeModel
 from shapespace.statistics.score import ScoreConfig, ScoreResult, score
 from shapespace.types import FloatArray
@@ -58,7 +58,7 @@ def rates_text(collected: Kept) -> str:
 def simulated(model: ShapeModel, people: int, seen: float, runs: int, seed: int) -> Kept:
     """Return scores of ten new people by each of `runs` references; half of their modes are told to `seen` alone."""
     rng = np.random.default_rng((seed, people, round(100 * seen)))
-    prior = new_shapes(model)
+    prior = variance_of_new_shapes(model)
 
     def fits(count: int, shares: FloatArray, name: str) -> Cohort:
         b = rng.standard_normal((count, len(prior))) * np.sqrt(prior)
