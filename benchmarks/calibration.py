@@ -95,7 +95,7 @@ def measure(bench: Bench, condition: Condition, scans: int) -> list[Coverage]:
         z.append(error / result.b_stddev)
         off.append(error)
         shrinkage.append(result.shrinkage)
-    ratio, told, wrong = np.array(z), np.array(shrinkage), np.array(off)
+    ratio, shrinkages, wrong = np.array(z), np.array(shrinkage), np.array(off)
     K = model.n_modes
     new = variance_of_new_shapes(model)
 
@@ -106,7 +106,7 @@ def measure(bench: Bench, condition: Condition, scans: int) -> list[Coverage]:
             (first + 1, last),
             {name: float((part < width).mean()) for name, width in _WIDTHS.items()},
             float(np.sqrt((part**2).mean())),
-            float(told[:, first:last].mean()),
+            float(shrinkages[:, first:last].mean()),
             float(np.sqrt((wrong[:, first:last] ** 2 / new[first:last]).mean())),
         )
 

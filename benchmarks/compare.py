@@ -130,10 +130,10 @@ def people_of(folders: list[Path]) -> tuple[Cohort, list[str]]:
     b, stddev, who = list[FloatArray](), list[FloatArray](), list[str]()
     for folder in folders:
         for file in sorted((folder / "fits").glob("person_*.npz")):
-            kept = np.load(file)
-            fold = int((kept["status"] >= 0).all(axis=1).argmax())
-            for row in np.flatnonzero(kept["status"][fold] <= 1):
-                pair = [kept[name][fold, row][:K] for name in ("z", "z_stddev")]
+            stored = np.load(file)
+            fold = int((stored["status"] >= 0).all(axis=1).argmax())
+            for row in np.flatnonzero(stored["status"][fold] <= 1):
+                pair = [stored[name][fold, row][:K] for name in ("z", "z_stddev")]
                 own, spread = (np.pad(one.astype(np.float64), (0, K - len(one))) * model.stddev for one in pair)
                 b.append(own)
                 stddev.append(spread)
@@ -161,9 +161,9 @@ class Found:
         assert made is not None
         self.studies += 1
         self.omnibus += study.test(term).p <= study.config.alpha
-        self.somewhere += bool((made.shown.p_family <= study.config.alpha).any())
+        self.somewhere += bool((made.test.p_family <= study.config.alpha).any())
 
-    def told(self) -> str:
+    def rates_text(self) -> str:
         return f"{100 * self.omnibus / self.studies:5.1f} %   {100 * self.somewhere / self.studies:5.1f} %"
 
 
@@ -233,7 +233,7 @@ def power(pool: Pool, surfaces: str, studies: int, permutations: int) -> str:
         rows.append(
             (
                 float(study.test("group").p <= options.alpha),
-                float((made.shown.p_family <= options.alpha).any()),
+                float((made.test.p_family <= options.alpha).any()),
                 float(found.any()),
                 float(truth[int(made.bump.f.argmax())]),
                 2 * both / (some + float(truth.sum())) if some else np.nan,
@@ -284,14 +284,14 @@ def main() -> None:
     if asked.only in (None, "null") and asked.fits:
         print("false positives at 5 %: term, map (family-wise)")
         for name, found in null_studies(asked.fits, 20 if asked.quick else 1000, 40 if asked.quick else 100).items():
-            print(f"  {name:20} {found.told()}", flush=True)
+            print(f"  {name:20} {found.rates_text()}", flush=True)
     if asked.only in (None, "power"):
         print("power: term, map, bump found, its peak in the nose, Dice, share of what is found that is true")
         for missing in MISSING:
             pool = make_pool(asked.pool, missing, 50 if asked.quick else POOL)
             for surfaces in ("coefficients", "dense"):
-                told = power(pool, surfaces, 3 if asked.quick else 40, 100)
-                print(f"  {100 * missing:.0f} % missing, {surfaces:12} {told}", flush=True)
+                rows = power(pool, surfaces, 3 if asked.quick else 40, 100)
+                print(f"  {100 * missing:.0f} % missing, {surfaces:12} {rows}", flush=True)
 
 
 if __name__ == "__main__":

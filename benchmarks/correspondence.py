@@ -120,8 +120,8 @@ def dispersion(made: Correspondence, of: Set) -> dict[str, float]:
         places.append(place)
         gaps.append(gap)
     place, gap = np.array(places), np.array(gaps)
-    shown = np.isfinite(place[:, :, 0]).any(axis=0)
-    place, gap = place[:, shown], gap[:, shown]
+    observed = np.isfinite(place[:, :, 0]).any(axis=0)
+    place, gap = place[:, observed], gap[:, observed]
     middle = np.nanmedian(place, axis=0)
     inside = of.counted[build_engine(of.mean).query(middle).vertex]
     apart = np.linalg.norm(place - middle, axis=2)[:, inside]
@@ -214,7 +214,7 @@ def spleens(scans: int, seed: int, run: Callable[[list[Mesh], Mesh | None], Corr
     ]
     mean, p95, p99, largest = np.mean(shares, axis=0)
     told = {"mean_share": mean, "p95_share": p95, "p99_share": p99, "largest_share": largest}
-    return told | said(made)
+    return told | summary(made)
 
 
 def templates(of: Set, run: Callable[[list[Mesh], Mesh | None], Correspondence], vertices: int) -> dict[str, object]:
@@ -244,11 +244,11 @@ def templates(of: Set, run: Callable[[list[Mesh], Mesh | None], Correspondence],
     whole = np.concatenate(apart)
     return {
         "apart_mean_mm": float(whole.mean()), "apart_median_mm": float(np.median(whole)),
-        "apart_p95_mm": float(np.quantile(whole, 0.95)), "set_aside": [said(one)["set_aside"] for one in made],
+        "apart_p95_mm": float(np.quantile(whole, 0.95)), "set_aside": [summary(one)["set_aside"] for one in made],
     }  # fmt: skip
 
 
-def said(made: Correspondence) -> dict[str, object]:
+def summary(made: Correspondence) -> dict[str, object]:
     """Return what a correspondence says of itself."""
     return {
         "cpu_s_a_scan_and_round": float(np.mean([second for one in made.scans for second in one.seconds])),
@@ -280,21 +280,21 @@ def main() -> None:
 
     for name in arguments.cases or [*SETS, *OTHERS]:
         begun = time.process_time()
-        told: dict[str, object]
+        report: dict[str, object]
         if name == "spleens":
-            told = spleens(arguments.scans or 40, arguments.seed, run)
+            report = spleens(arguments.scans or 40, arguments.seed, run)
         elif name == "templates":
-            told = templates(faces(arguments.scans or 24, arguments.seed, arguments.people), run, arguments.vertices)
+            report = templates(faces(arguments.scans or 24, arguments.seed, arguments.people), run, arguments.vertices)
         else:
             make, options, usual = SETS[name]
             drawn = make(arguments.scans or usual, arguments.seed, arguments.people, **options)
             first = drawn.known[0]
             true = drawn.mean.with_vertices(first.T_scan_model.inverse().apply(first.truth))
             made = run([one.scan for one in drawn.known], true if arguments.given else None)
-            told = {**dispersion(made, drawn), **said(made)}
-        told |= {"cpu_s": time.process_time() - begun}
+            report = {**dispersion(made, drawn), **summary(made)}
+        report |= {"cpu_s": time.process_time() - begun}
         asked = {"case": name, **vars(arguments), "cases": None}
-        print(json.dumps({**asked, **told}, indent=1), flush=True)
+        print(json.dumps({**asked, **report}, indent=1), flush=True)
 
 
 if __name__ == "__main__":

@@ -132,9 +132,9 @@ def read_again(folder: Path) -> Way | None:
     """Return what `kept` wrote; None where there is nothing."""
     if not (folder / "told.json").exists():
         return None
-    told = json.loads((folder / "told.json").read_text())
+    stored = json.loads((folder / "told.json").read_text())
     surfaces = {file.stem: read_mesh(file) for file in sorted(folder.glob("*.ply"))}
-    return Way(surfaces, told["seconds"], told["aside"])
+    return Way(surfaces, stored["seconds"], stored["aside"])
 
 
 def both_ways(surface: Mesh, scan: Mesh, points: int | None = None) -> tuple[FloatArray, FloatArray]:
@@ -144,8 +144,8 @@ def both_ways(surface: Mesh, scan: Mesh, points: int | None = None) -> tuple[Flo
     own, others = surface.vertices[there], scan.vertices
     if points is not None:
         own, others = (x[np.unique(np.linspace(0, len(x) - 1, points).round().astype(int))] for x in (own, others))
-    shown = Mesh(np.nan_to_num(surface.vertices), faces)
-    return build_engine(scan).query(own).distance, build_engine(shown).query(others).distance
+    filled = Mesh(np.nan_to_num(surface.vertices), faces)
+    return build_engine(scan).query(own).distance, build_engine(filled).query(others).distance
 
 
 def nearness(way: Way, scans: dict[str, Mesh], names: Sequence[str]) -> dict[str, float]:
@@ -192,7 +192,7 @@ def specificity(meshes: Sequence[Mesh], scans: Sequence[Mesh], counts: Sequence[
 def at_modes(curve: Curve | None, modes: int) -> tuple[float, float, float]:
     """Return a measure with its 95 % interval at so many modes, or at the most there are."""
     assert curve is not None
-    k = int(np.searchsorted(curve.at, min(modes, curve.at[-1])))
+    k = int(np.searchsorted(curve.counts, min(modes, curve.counts[-1])))
     return float(curve.mean[k]), float(curve.low[k]), float(curve.high[k])
 
 
@@ -281,12 +281,12 @@ def main() -> None:
         specific = specificity(meshes, common, [1, 3, MODES], arguments.seed)
         found[name] = (nearness(way, scans, names), quality, specific)
         print(f"{name}: measured, {quality.supported_modes} modes supported", flush=True)
-    told = table(ways, found, names)
+    rows = table(ways, found, names)
     title = (
         f"{arguments.case}: {len(names)} of {len(scans)} scans, {arguments.vertices} vertices, seed {arguments.seed}"
     )
-    (out / "table.md").write_text(f"{title}\n\n{told}\n")
-    print(f"\n{title}\n\n{told}")
+    (out / "table.md").write_text(f"{title}\n\n{rows}\n")
+    print(f"\n{title}\n\n{rows}")
 
 
 if __name__ == "__main__":

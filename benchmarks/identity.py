@@ -84,16 +84,16 @@ def folds_of(
         gallery = np.flatnonzero(own & usable & (fits.shown == 0))
         probes = np.flatnonzero(own & usable & (fits.shown > 0))
         training = of(np.flatnonzero(~own & usable & taught), z, stddev, fits.person, model)
-        told = fits.status[fold][own]
+        statuses = fits.status[fold][own]
         if hard is None:
             pair = (of(gallery, z, stddev, fits.person, model), of(probes, z, stddev, fits.person, model))
         else:
             mine, fine = fold_of[hard.person] == fold, np.isin(hard.status, good)
             rows = [np.flatnonzero(mine & fine & (hard.shown == 0)), np.flatnonzero(mine & fine & (hard.shown > 0))]
             found = [of(row, hard.z, hard.z_stddev, hard.person, model) for row in rows if len(row)]
-            told = hard.status[mine]
+            statuses = hard.status[mine]
             pair = (found[0] if len(found) == 2 else of(gallery, z, stddev, fits.person, model), found[-1])
-        for status in told:
+        for status in statuses:
             counts[STATUSES[int(status)]] += 1
         out.append(Fold(training, *pair, group=number * 100 + fold))
     return out, counts
@@ -134,34 +134,36 @@ def measured(folds: Sequence[Fold], names: Sequence[str], modes: Sequence[int], 
             for k in modes:
                 flat = np.concatenate([m.ravel() for m in score_matrices(folds, name, k)])
                 curve[k] = Sweep(flat, pairs.same).roc().eer
-        told = verification_rates(name, np.concatenate([m.ravel() for m in matrices]), pairs, group, drawn, curve=curve)
+        rates = verification_rates(
+            name, np.concatenate([m.ravel() for m in matrices]), pairs, group, drawn, curve=curve
+        )
         found: list[Searches] = [search(m, *row) for m, row in zip(matrices, rows, strict=True)]
         ranks = identification_rates(name, joined(found), min(len(np.unique(g)) for g, _ in rows), drawn)
-        out[name] = row_of(told) | {"rank_1": shown(ranks.rank_1)}
-        out[name] |= {f"fnir_at_fpir_{rate:g}": shown(ranks.fnir[rate]) for rate in ranks.fnir}
-        least = float(told.score[pairs.same].min() - told.score[~pairs.same].max()) / float(
-            told.score[~pairs.same].std()
+        out[name] = row_of(rates) | {"rank_1": estimate_values(ranks.rank_1)}
+        out[name] |= {f"fnir_at_fpir_{rate:g}": estimate_values(ranks.fnir[rate]) for rate in ranks.fnir}
+        least = float(rates.score[pairs.same].min() - rates.score[~pairs.same].max()) / float(
+            rates.score[~pairs.same].std()
         )
         out[name]["margin"] = least
         if name.startswith("plda"):
             # The score is a difference of log likelihoods, so its cost as it stands can be compared.
-            out[name]["cllr_of_the_score"] = cllr(told.score, pairs.same)
+            out[name]["cllr_of_the_score"] = cllr(rates.score, pairs.same)
     out["pairs"] = {"people": len(people), "genuine": int(pairs.same.sum()), "impostor": int((~pairs.same).sum())}
     return out
 
 
-def row_of(told: VerificationRates) -> dict[str, Any]:
+def row_of(rates: VerificationRates) -> dict[str, Any]:
     """Return the figures of a score as JSON has them."""
     return {
-        "eer": shown(told.eer),
-        **{f"tar_at_far_{far:g}": shown(one) for far, one in told.tar.items()},
-        "cllr": shown(told.cllr),
-        "cllr_min": told.cllr_min,
-        "eer_by_modes": {str(k): value for k, value in told.curve.items()},
+        "eer": estimate_values(rates.eer),
+        **{f"tar_at_far_{far:g}": estimate_values(one) for far, one in rates.tar.items()},
+        "cllr": estimate_values(rates.cllr),
+        "cllr_min": rates.cllr_min,
+        "eer_by_modes": {str(k): value for k, value in rates.curve.items()},
     }
 
 
-def shown(one: RateEstimate) -> list[float | None]:
+def estimate_values(one: RateEstimate) -> list[float | None]:
     return [one.value, one.low, one.high]
 
 
@@ -182,8 +184,8 @@ def table(found: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def percent(told: Sequence[float | None]) -> str:
-    value, low, high = told
+def percent(values: Sequence[float | None]) -> str:
+    value, low, high = values
     if value is None:
         return "too few pairs"
     return f"{100 * value:.2f}" + (
@@ -196,7 +198,7 @@ def quick_study(folder: Path) -> Path:
     people = StudyPeople(people=8, expressions=("smile", "surprise"), levels=(1.0,), triangles=4_000)
     config = StudyConfig(people, folds=2, taught_levels=1, strangers=0)
     prepare_folder(folder, config)
-    run_fits(folder, config, workers=1, on_progress=told)
+    run_fits(folder, config, workers=1, on_progress=print_progress)
     return folder
 
 
@@ -204,12 +206,12 @@ def full_study(folder: Path, seed: int, workers: int) -> Path:
     """Make a study of 100 people and return its folder."""
     config = StudyConfig(StudyPeople(seed=seed), strangers=0)
     prepare_folder(folder, config)
-    run_fits(folder, config, workers=workers, on_progress=told)
+    run_fits(folder, config, workers=workers, on_progress=print_progress)
     return folder
 
 
-def told(what: str, done: int, total: int) -> None:
-    print(f"{what}: {done} of {total}", file=sys.stderr, flush=True)
+def print_progress(name: str, done: int, total: int) -> None:
+    print(f"{name}: {done} of {total}", file=sys.stderr, flush=True)
 
 
 def main() -> int:
@@ -252,7 +254,7 @@ def main() -> int:
             names = [*list(SCORES)[:1], AS_EXACT, *list(SCORES)[1:]]
             scores = measured(used, names, [k for k in MODES if k in curve], chosen.draws)
             found[condition] = {"fits": counts, "scores": scores}
-            told(condition, len(found), 1 + len(chosen.conditions))
+            print_progress(condition, len(found), 1 + len(chosen.conditions))
     print(table(found))
     print(f"{time.process_time() - since:.0f} CPU seconds for the figures", file=sys.stderr)
     if chosen.json:

@@ -42,9 +42,9 @@ def random_points(mesh: Mesh, rng: np.random.Generator) -> dict[str, FloatArray]
     return {f"mark {k}": point for k, point in enumerate(points)}
 
 
-def row(what: str, exact: FloatArray, snapped: FloatArray, unit: str) -> None:
-    told = [f"{off.mean():.2g} / {off.max():.2g}" for off in (exact, snapped)]
-    print(f"| {what} | {unit} | {told[0]} | {told[1]} |", flush=True)
+def row(name: str, exact: FloatArray, snapped: FloatArray, unit: str) -> None:
+    cells = [f"{off.mean():.2g} / {off.max():.2g}" for off in (exact, snapped)]
+    print(f"| {name} | {unit} | {cells[0]} | {cells[1]} |", flush=True)
 
 
 def off(landmarks: SurfaceLandmarks, vertices: FloatArray, truth: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -65,19 +65,21 @@ def simulated(count: int, scans: int, seed: int, *, ict: bool) -> None:
     kind = "ICT" if ict else "bundled"
     row(f"{kind} faces: first mesh after `build`", *off(model.landmarks, trained[0].vertices, given), "mm")
     found = [np.empty(0), np.empty(0)]
-    told = np.empty((0, 3))
+    ratios = np.empty((0, 3))
     at_vertices = replace(model, landmarks=SurfaceLandmarks.of(dict(model.landmarks)))
     for person in people(scans, rng, ict=ict):
         scan = simulate_scan(person, rng, triangles=20_000, noise_mm=0.2, T_scan_model=random_similarity(rng, 20.0))
         truth = model.landmarks.interpolate(scan.truth_vertices)
         for k, one in enumerate((model, at_vertices)):
             result = fit_scan(one, scan.scan, FitConfig(dense=True))
-            at = np.stack(list(result.landmarks.values()))
-            found[k] = np.concatenate([found[k], np.linalg.norm(at - truth, axis=1)])
+            positions = np.stack(list(result.landmarks.values()))
+            found[k] = np.concatenate([found[k], np.linalg.norm(positions - truth, axis=1)])
             if k == 0 and result.landmark_stddev_mm is not None:
-                told = np.concatenate([told, (at - truth) / np.stack(list(result.landmark_stddev_mm.values()))])
+                ratios = np.concatenate(
+                    [ratios, (positions - truth) / np.stack(list(result.landmark_stddev_mm.values()))]
+                )
     row(f"{kind} faces: {scans} new people, dense fits of raw scans", found[0], found[1], "mm")
-    share = ", ".join(f"{100 * (np.abs(told) < s).mean():.0f} % within {s:g}" for s in (1.0, 1.96))
+    share = ", ".join(f"{100 * (np.abs(ratios) < s).mean():.0f} % within {s:g}" for s in (1.0, 1.96))
     print(f"\nCoordinates of landmarks in triangles within their standard deviations: {share}.")
 
 

@@ -99,7 +99,7 @@ def false_positives(design: Design, studies: int, seed: int) -> tuple[float, flo
         assert shown is not None
         found[k] = (
             result.tests[0].p <= LEVEL,
-            bool((shown.shown.p_family <= LEVEL).any()),
+            bool((shown.test.p_family <= LEVEL).any()),
             float(cohort.estimated_share.mean()),
         )
     return tuple(found.mean(axis=0).tolist())

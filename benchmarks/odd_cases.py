@@ -250,9 +250,9 @@ def draw(family_named: Callable[[str], Family], kind: Kind, seed: int, index: in
         return _torn(raw.scan, missing, rng)
 
     if case == "object":
-        wrong, thing = True, str(rng.choice(OBJECTS, p=(0.25, 0.1, 0.1, 0.1, 0.1, 0.1, 0.25)))
-        mesh = _object(thing, family, family_named, size, rng, scanned)
-        details.append(thing)
+        wrong, object_name = True, str(rng.choice(OBJECTS, p=(0.25, 0.1, 0.1, 0.1, 0.1, 0.1, 0.25)))
+        mesh = _object(object_name, family, family_named, size, rng, scanned)
+        details.append(object_name)
     elif case == "far":
         # Half of them are far out for a larger model of the family, and may leave the span of the one that is fitted.
         source = model if rng.random() < 0.5 else family.largest
@@ -363,7 +363,7 @@ def _torn(mesh: Mesh, missing: float, rng: np.random.Generator) -> Mesh:
 
 
 def _object(
-    thing: str,
+    object_name: str,
     family: Family,
     family_named: Callable[[str], Family],
     size: float,
@@ -372,29 +372,29 @@ def _object(
 ) -> Mesh:
     """Return a scan of another object with about the size of the family's shapes."""
     grown = float(np.exp(0.15 * rng.standard_normal()))
-    if thing == "other organ":
+    if object_name == "other organ":
         other = family_named(str(rng.choice([name for name in FAMILIES if name != family.name]))).draw(rng)
         x = other.vertices - other.vertices.mean(axis=0)
         return scanned(Mesh(x * (grown * size / rms_size(x)), other.faces))
     n = 50
     u, v = (axis.ravel() for axis in np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n), indexing="ij"))
     polar, azimuth = np.pi * (0.01 + 0.98 * u), 2 * np.pi * v
-    if thing == "plane":
+    if object_name == "plane":
         x = np.column_stack([u - 0.5, v - 0.5, 0 * u])
-    elif thing == "cylinder":
+    elif object_name == "cylinder":
         x = np.column_stack([np.cos(azimuth), 4 * (u - 0.5), np.sin(azimuth)])
     else:
         x = np.column_stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
-        if thing == "box":
+        if object_name == "box":
             x = x / np.abs(x).max(axis=1, keepdims=True)
-        elif thing == "lump":
+        elif object_name == "lump":
             waves = rng.standard_normal((6, 3)) * 3.0
             x = x * (1 + 0.12 * np.sin(x @ waves.T + rng.uniform(0, 6, 6)).sum(axis=1, keepdims=True) / 2)
-    if thing != "sphere":
+    if object_name != "sphere":
         # As long, wide and deep as the family's shapes, which makes it the harder to reject.
         extent = np.std(family.model(VARIANTS[family.name][0]).mean_vertices @ np.eye(3), axis=0)
         x = x / np.maximum(x.std(axis=0), 1e-9) * extent * np.exp(0.1 * rng.standard_normal(3))
-        if thing == "plane":
+        if object_name == "plane":
             x[:, 2] = 0.0
     corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
     faces = np.concatenate(
@@ -415,9 +415,9 @@ def judge(case: Case) -> dict[str, Any]:
         cpu_s = time.process_time() - begun
         return {**record, "status": "failed", "reason": str(error), "wrong": True, "cpu_s": cpu_s}
     cpu_s = time.process_time() - begun
-    at = result.surface().vertices
+    vertices = result.surface().vertices
     size = rms_size(case.model.mean_vertices) * case.T_scan_model.scale
-    errors = [float(np.linalg.norm(at - true, axis=1).mean()) / size for true in case.truths]
+    errors = [float(np.linalg.norm(vertices - true, axis=1).mean()) / size for true in case.truths]
     error = min(errors, default=None)
     return {
         **record,

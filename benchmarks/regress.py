@@ -79,13 +79,13 @@ def simulate_cohort(counts: IntArray, rng: np.random.Generator, *, varies: bool,
     shown = (between + within) / total
     own = rng.standard_normal(len(counts))[codes]
     if varies:
-        told, noise = shown, (own + WITHIN * rng.standard_normal(len(codes))) / total
+        observed, noise = shown, (own + WITHIN * rng.standard_normal(len(codes))) / total
     else:
-        told, noise = between, own
+        observed, noise = between, own
     if not signal:
         fresh = rng.standard_normal((len(counts), MODES))[codes]
-        told = (fresh + WITHIN * rng.standard_normal((len(codes), MODES))) / total if varies else fresh
-    age = 50 + told @ SLOPES + NOISE * noise
+        observed = (fresh + WITHIN * rng.standard_normal((len(codes), MODES))) / total if varies else fresh
+    age = 50 + observed @ SLOPES + NOISE * noise
     names = tuple(f"{name} {k}" for k in range(len(codes)))
     table = Table({"age": numbers_as_text(age), "subject": tuple(f"{name} {k}" for k in codes)}, names)
     basis = np.linalg.qr(np.random.default_rng(0).standard_normal((3 * VERTICES, MODES)))[0].T
@@ -103,16 +103,16 @@ def run_study(study: Study) -> FloatArray:
     found = regress(cohort, "age", permutations=99, draws=200, seed=study.seed)
     new = simulate_cohort(np.ones(NEW, dtype=np.int32), rng, varies=study.varies, signal=study.signal, name="n")
     r2, _, coverage = compare_with(found.predictor.predict(new), new.table.numbers("age"))
-    told = found.measures
+    measures = found.measures
     p = np.nan if found.p is None else found.p
     return np.array(
         [
             p,
-            told["r2"].value,
-            told["r2"].low,
-            told["r2"].high,
-            told["coverage"].value,
-            told["slope"].value,
+            measures["r2"].value,
+            measures["r2"].low,
+            measures["r2"].high,
+            measures["coverage"].value,
+            measures["slope"].value,
             r2,
             coverage,
         ]

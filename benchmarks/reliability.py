@@ -202,9 +202,11 @@ def draw(families: Callable[[str], Family], split: Split, index: int) -> Drawn:
         other = str(rng.choice([name for name in KINDS if name != kind]))
         if {kind, other} == {"face", "head"}:
             other = "femur"
-        thing = families(other).draw(rng)
-        grown = rms_size(model.mean_vertices) / rms_size(thing.vertices) * float(np.exp(0.2 * rng.standard_normal()))
-        shapes = [thing.with_vertices(grown * thing.vertices)]
+        other_mesh = families(other).draw(rng)
+        grown = (
+            rms_size(model.mean_vertices) / rms_size(other_mesh.vertices) * float(np.exp(0.2 * rng.standard_normal()))
+        )
+        shapes = [other_mesh.with_vertices(grown * other_mesh.vertices)]
     else:
         shapes = [shape() for _ in range(2 if condition in ("overlaid", "beside") else 1)]
     if condition == "overlaid":
@@ -220,13 +222,13 @@ def draw(families: Callable[[str], Family], split: Split, index: int) -> Drawn:
         start = T @ Similarity(
             float(np.exp(0.04 * rng.standard_normal())), _turn(rng, 12.0), unit * rng.normal(0, 4, 3)
         )
-    said = (
+    description = (
         f"{triangles} triangles, {noise_mm / unit:.1f} mm noise, {100 * outliers:.0f} % outliers, "
         f"{100 * missing:.0f} % missing{', points' * points}{', given start' * (start is not None)}"
     )
     truths = () if condition == "other" else tuple(T.apply(each.vertices) for each in shapes)
     placed = Mesh(T.apply(scan.vertices), scan.faces, name=f"{split} {index}")
-    return Drawn(kind, condition, variant, in_span, said, model, placed, truths, start)
+    return Drawn(kind, condition, variant, in_span, description, model, placed, truths, start)
 
 
 def _turn(rng: np.random.Generator, most_deg: float) -> FloatArray:
@@ -272,8 +274,8 @@ def judge(drawn: Drawn) -> dict[str, Any]:
     except ShapespaceError as error:
         return {**record, "status": "failed", "reason": str(error)}
     seconds = time.process_time() - begun
-    at = result.surface().vertices
-    errors = [float(np.linalg.norm(at - truth, axis=1).mean()) for truth in drawn.truths]
+    vertices = result.surface().vertices
+    errors = [float(np.linalg.norm(vertices - truth, axis=1).mean()) for truth in drawn.truths]
     return {
         **record,
         "status": result.status,
@@ -310,7 +312,7 @@ def measure(path: Path, fits: int) -> None:
                     out.flush()
 
 
-def told(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def summary_rows(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return the fits that gave evidence and whose truth is known."""
     return [record for record in found if record.get("evidence") and record["error_mm"] is not None]
 
@@ -333,7 +335,7 @@ def tune(found: list[dict[str, Any]]) -> str:
     inputs and no weight below zero. Offset and interval: quantiles of what that leaves on "calibration". The
     probability of failure: a logistic regression on both.
     """
-    dev, held = (told([r for r in found if r["split"] == split]) for split in ("dev", "calibration"))
+    dev, held = (summary_rows([r for r in found if r["split"] == split]) for split in ("dev", "calibration"))
     terms = failure_model.ERROR_TERMS
     raw = np.array([[term.value(FitEvidence(**r["evidence"])) for term in terms.values()] for r in dev])
     truth = np.array([log_share(r) for r in dev])
@@ -459,7 +461,7 @@ def picture(found: list[dict[str, Any]], judged: list[dict[str, Any]], path: Pat
 
     figure, axes = plt.subplots(1, 3, figsize=(11.0, 3.7), dpi=90)
     true = np.array([100 * r["error_mm"] / r["evidence"]["size_mm"] for r in found])
-    for ax, key, said in zip(
+    for ax, key, label in zip(
         axes, ("posterior_error_mm", "expected_error_mm"), ("the posterior alone", "calibrated"), strict=False
     ):
         expected = np.array([100 * r["evidence"][key] / r["evidence"]["size_mm"] for r in found])
@@ -475,7 +477,7 @@ def picture(found: list[dict[str, Any]], judged: list[dict[str, Any]], path: Pat
             low, high = failure_model.INTERVAL
             ax.fill_between(ends, low * ends, high * ends, color="0.9", zorder=0)
         ax.set(
-            xscale="log", yscale="log", xlim=ends, ylim=ends, title=said,
+            xscale="log", yscale="log", xlim=ends, ylim=ends, title=label,
             xlabel="expected error, % of size", ylabel="true mean vertex error, % of size",
         )  # fmt: skip
     axes[0].legend(fontsize=8)
@@ -502,8 +504,8 @@ def main() -> None:
         print(tune(found))
     elif options.report:
         judged = [again(r) for r in found if r["split"] == "test" and r.get("evidence")]
-        print(table(told(judged)), of_failure(judged), sep="\n\n")
-        picture(told(judged), judged, options.report / "reliability.png")
+        print(table(summary_rows(judged)), of_failure(judged), sep="\n\n")
+        picture(summary_rows(judged), judged, options.report / "reliability.png")
     else:
         threadpool_limits(1)
         measure(options.kept, options.fits)

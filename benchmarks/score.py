@@ -16,7 +16,7 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort, Fitted
 from shapespace.cohort.table import Table
-from shapespace.fit.robust.posterior import new_shapes
+from shapespace.fit.robust.posterior import variance_of_new_shapes
 from shapespace.model.shape_model import ShapeModel
 from shapespace.statistics.score_subjects import ScoreConfig, ScoreResult, score
 from shapespace.types import FloatArray
@@ -36,29 +36,29 @@ Kept = dict[str, list[FloatArray]]
 """By name of a column: p values of subjects, and whether their maps pass the limit."""
 
 
-def add(kept: Kept, scores: ScoreResult, rows: Sequence[int]) -> None:
+def add(collected: Kept, scores: ScoreResult, rows: Sequence[int]) -> None:
     """Add those of some subjects."""
-    at = list(rows)
+    indices = list(rows)
     for which in ("farther", "p_value", "rest_farther"):
-        kept.setdefault(which, []).append(getattr(scores, which)[at])
+        collected.setdefault(which, []).append(getattr(scores, which)[indices])
     if np.isfinite(scores.z_limit):
-        kept.setdefault("map", []).append((np.abs(scores.z[at]) > scores.z_limit).any(axis=1).astype(float))
+        collected.setdefault("map", []).append((np.abs(scores.z[indices]) > scores.z_limit).any(axis=1).astype(float))
 
 
-def told(kept: Kept) -> str:
+def rates_text(collected: Kept) -> str:
     """Return cells: share of subjects whose p values lie below each level, and of those whose map passes its limit."""
     cells = []
     for which in ("farther", "p_value", "rest_farther"):
-        p = np.concatenate(kept[which])
+        p = np.concatenate(collected[which])
         cells.append(" / ".join(f"{100 * (p <= level).mean():.0f}" for level in LEVELS))
-    cells.append(f"{100 * np.concatenate(kept['map']).mean():.0f}" if "map" in kept else "-")
+    cells.append(f"{100 * np.concatenate(collected['map']).mean():.0f}" if "map" in collected else "-")
     return " | ".join(cells)
 
 
 def simulated(model: ShapeModel, people: int, seen: float, runs: int, seed: int) -> Kept:
     """Return scores of ten new people by each of `runs` references; half of their modes are told to `seen` alone."""
     rng = np.random.default_rng((seed, people, round(100 * seen)))
-    prior = new_shapes(model)
+    prior = variance_of_new_shapes(model)
 
     def fits(count: int, shares: FloatArray, name: str) -> Cohort:
         b = rng.standard_normal((count, len(prior))) * np.sqrt(prior)
@@ -126,14 +126,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
         model = ShapeModel.load(options.model)
         for people in options.people:
             for seen in (0.97, 0.4):
-                print(f"| {people}, told {seen:g} | {told(simulated(model, people, seen, runs, 0))} |", flush=True)
+                print(
+                    f"| {people}, told {seen:g} | {rates_text(simulated(model, people, seen, runs, 0))} |", flush=True
+                )
     for folder in options.study:
         found: dict[float, Kept] = {}
         for fold in range(4):
             of_study(folder, fold, 2 if options.quick else options.most, found)
         for strength, kept in found.items():
             count = sum(map(len, kept["farther"]))
-            print(f"| expressions at {strength:g}, {count} scans | {told(kept)} |", flush=True)
+            print(f"| expressions at {strength:g}, {count} scans | {rates_text(kept)} |", flush=True)
     print(f"{time.process_time() - start:.0f} CPU s")
 
 

@@ -75,11 +75,11 @@ def draw(bench: Bench, index: int) -> Drawn:
     triangles = round(float(np.exp(rng.uniform(*np.log(_TRIANGLES)))))
     noise = float(np.exp(rng.uniform(*np.log(_NOISE_MM))))
     person = int(rng.integers(40))
-    said = [f"{triangles} triangles", f"noise {noise:.2f} mm"]
+    labels = [f"{triangles} triangles", f"noise {noise:.2f} mm"]
     if kind == "no face":
-        thing = THINGS[rng.integers(len(THINGS))]
-        mesh, truth = _thing(bench, thing, person, triangles, noise, rng), None
-        said.insert(0, thing)
+        kind_name = THINGS[rng.integers(len(THINGS))]
+        mesh, truth = _object(bench, kind_name, person, triangles, noise, rng), None
+        labels.insert(0, kind_name)
     else:
         expression = None
         if kind == "expression":
@@ -87,7 +87,7 @@ def draw(bench: Bench, index: int) -> Drawn:
             share = float(rng.uniform(0.2, 1.0))
             whole = EXPRESSIONS.get(name, {"jawOpen": 1.0})
             expression = {key: share * value for key, value in whole.items()}
-            said.append(f"{name} by {share:.2f}")
+            labels.append(f"{name} by {share:.2f}")
         face = bench.faces.mesh(bench.person(person), expression)
         outliers = float(rng.uniform(0, _MOST_OUTLIERS)) if rng.random() < 0.5 else 0.0
         hairy = rng.random() < 0.3
@@ -105,12 +105,12 @@ def draw(bench: Bench, index: int) -> Drawn:
         )
         missing = float(rng.uniform(0, _MOST_MISSING)) if rng.random() < 0.7 else 0.0
         mesh = _torn(simulated.scan, missing, rng)
-        said += [f"{100 * missing:.0f} % missing", f"{100 * outliers:.0f} % outliers"] + ["hair, collar"] * hairy
+        labels += [f"{100 * missing:.0f} % missing", f"{100 * outliers:.0f} % outliers"] + ["hair, collar"] * hairy
         truth = face.vertices
         if rng.random() < 0.15:
             points = rng.choice(len(mesh.vertices), min(len(mesh.vertices), 20_000), replace=False)
             mesh = Mesh(mesh.vertices[points])
-            said.append("points")
+            labels.append("points")
     pose = str(rng.choice(list(POSES), p=list(POSES.values())))
     turn = _turn(rng, 20.0) if pose == "upright" else np.asarray(Rotation.from_quat(rng.standard_normal(4)).as_matrix())
     mm = 1.0 if pose == "upright" else float(rng.choice(sorted(MM_PER_UNIT.values())))
@@ -122,11 +122,11 @@ def draw(bench: Bench, index: int) -> Drawn:
     if kind == "bad start":
         off = np.asarray(Rotation.from_rotvec(np.radians(rng.uniform(30, 180)) * _direction(rng)).as_matrix())
         start = T @ Similarity(float(np.exp(0.15 * rng.standard_normal())), off, rng.uniform(0, 40) * _direction(rng))
-        said.append("start far off")
-    said.append(f"{pose} in units of {mm:g} mm")
+        labels.append("start far off")
+    labels.append(f"{pose} in units of {mm:g} mm")
     name = f"trust {index}"
     placed = Scan(Mesh(T.apply(mesh.vertices), faces, name=name), None if truth is None else T.apply(truth), T, start)
-    return Drawn(kind, ", ".join(said), model, modes, placed)
+    return Drawn(kind, ", ".join(labels), model, modes, placed)
 
 
 def _direction(rng: np.random.Generator) -> FloatArray:
@@ -159,12 +159,12 @@ def _only(mesh: Mesh, kept: FloatArray) -> Mesh:
     return Mesh(mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32), name=mesh.name)
 
 
-def _thing(bench: Bench, thing: str, person: int, triangles: int, noise: float, rng: np.random.Generator) -> Mesh:
+def _object(bench: Bench, kind_name: str, person: int, triangles: int, noise: float, rng: np.random.Generator) -> Mesh:
     """Return a surface of about a face's size that is no face."""
-    if thing in ("back of a head", "ear"):
+    if kind_name in ("back of a head", "ear"):
         head = bench.faces.mesh(bench.person(person), area="face_and_head")
         middle = head.vertices[head.faces].mean(axis=1)
-        if thing == "ear":
+        if kind_name == "ear":
             tip = head.vertices[np.abs(head.vertices[:, 0]).argmax()]
             there = np.linalg.norm(middle - tip, axis=1) < rng.uniform(35, 60)
         else:
@@ -174,27 +174,27 @@ def _thing(bench: Bench, thing: str, person: int, triangles: int, noise: float, 
     size = rng.uniform(60.0, 120.0)
     n = max(12, round(np.sqrt(triangles / 2)))
     u, v = np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n), indexing="ij")
-    if thing in ("ball", "half a ball", "lump"):
-        most = np.pi if thing != "half a ball" else np.pi / 2
+    if kind_name in ("ball", "half a ball", "lump"):
+        most = np.pi if kind_name != "half a ball" else np.pi / 2
         polar, azimuth = most * (0.01 + 0.98 * u), 2 * np.pi * v
-        at = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1)
-        if thing == "lump":
-            at = at * (1 + 0.1 * _waves(at.reshape(-1, 3), rng, 1.5).reshape(n, n, 1))
-    elif thing == "cylinder":
-        at = np.stack([np.cos(2 * np.pi * v), 3 * (u - 0.5), np.sin(2 * np.pi * v)], axis=-1)
-    elif thing == "waves":
+        points = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1)
+        if kind_name == "lump":
+            points = points * (1 + 0.1 * _waves(points.reshape(-1, 3), rng, 1.5).reshape(n, n, 1))
+    elif kind_name == "cylinder":
+        points = np.stack([np.cos(2 * np.pi * v), 3 * (u - 0.5), np.sin(2 * np.pi * v)], axis=-1)
+    elif kind_name == "waves":
         flat = np.stack([2 * u - 1, 2 * v - 1, 0 * u], axis=-1)
-        at = flat + np.array([0, 0, 0.15]) * _waves(flat.reshape(-1, 3), rng, 1.0).reshape(n, n, 1)
+        points = flat + np.array([0, 0, 0.15]) * _waves(flat.reshape(-1, 3), rng, 1.0).reshape(n, n, 1)
     else:
-        at = np.stack([2 * u - 1, 2 * v - 1, 0 * u], axis=-1)
-        at = np.concatenate([at, at[..., [2, 0, 1]] + [-1, 0, -1], at[..., [1, 2, 0]] + [0, -1, -1]])
+        points = np.stack([2 * u - 1, 2 * v - 1, 0 * u], axis=-1)
+        points = np.concatenate([points, points[..., [2, 0, 1]] + [-1, 0, -1], points[..., [1, 2, 0]] + [0, -1, -1]])
     corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
     grid = np.concatenate(
         [np.stack([corner, corner + n, corner + 1], 1), np.stack([corner + 1, corner + n, corner + n + 1], 1)]
     )
-    grid = np.concatenate([grid + k * n * n for k in range(at.size // (3 * n * n))])
+    grid = np.concatenate([grid + k * n * n for k in range(points.size // (3 * n * n))])
     stretch = size * np.exp(0.2 * rng.standard_normal(3))
-    return _noisy(Mesh(at.reshape(-1, 3) * stretch, grid.astype(np.int32)), noise, rng)
+    return _noisy(Mesh(points.reshape(-1, 3) * stretch, grid.astype(np.int32)), noise, rng)
 
 
 def _resampled(mesh: Mesh, rng: np.random.Generator, triangles: int) -> tuple[FloatArray, Any]:
@@ -255,15 +255,15 @@ def judge(index: int) -> Outcome:
     assert _bench is not None
     drawn = draw(_bench, index)
     model, scan = _bench.model(drawn.model, drawn.modes), drawn.scan
-    said = (index, drawn.kind, drawn.what, drawn.model, drawn.modes)
+    fields = (index, drawn.kind, drawn.what, drawn.model, drawn.modes)
     begun = time.process_time()
     try:
         result = fit_scan(model, scan.mesh, FitConfig(), T_scan_model=scan.start)
     except ShapespaceError as error:
-        return Outcome(*said, "failed", str(error), None, {}, time.process_time() - begun)
+        return Outcome(*fields, "failed", str(error), None, {}, time.process_time() - begun)
     seconds = time.process_time() - begun
     off = None if scan.truth is None else float(error_mm(result.surface(model).vertices, scan).mean())
-    return Outcome(*said, result.status, result.reason, off, result.evidence.to_dict(), seconds)
+    return Outcome(*fields, result.status, result.reason, off, result.evidence.to_dict(), seconds)
 
 
 def table(outcomes: Sequence[Outcome]) -> str:

@@ -14,7 +14,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 if TYPE_CHECKING:
     from xdist.scheduler import LoadScopeScheduling
 
-FIRST = (
+RUN_FIRST = (
     "tests/browser/test_report_in_browser.py",
     "tests/io/",
     "tests/datasets/",
@@ -26,21 +26,21 @@ FIRST = (
     "tests/study/",
     "tests/report/",
 )
-"""What begins first: what takes longest, so that no worker ends alone with it; but beside the first, which compiles a
-fit, what needs none, so that it is not compiled twice."""
-APART = ("tests/docs/test_docs.py",)
-"""Files whose tests share nothing."""
+"""Files that start first, as they take longest. The first one compiles the fit; those after it need no fit, so that it
+is not compiled twice."""
+INDEPENDENT_TESTS = ("tests/docs/test_docs.py",)
+"""Files whose tests share no fixtures, so that any worker may run each test."""
 
 
-def begins(nodeid: str) -> int:
-    """Return the place of a test in `FIRST`, or one after all of them."""
-    return next((place for place, start in enumerate(FIRST) if nodeid.startswith(start)), len(FIRST))
+def start_order(nodeid: str) -> int:
+    """Return the index of a test in `RUN_FIRST`, or the number of entries."""
+    return next((place for place, start in enumerate(RUN_FIRST) if nodeid.startswith(start)), len(RUN_FIRST))
 
 
-def unit(nodeid: str) -> str:
-    """Return what the test is given to a worker with: its file, mostly."""
+def scheduling_unit(nodeid: str) -> str:
+    """Return the group of tests that one worker runs: the file, or the test alone."""
     file = nodeid.partition("::")[0]
-    return nodeid if file in APART else file
+    return nodeid if file in INDEPENDENT_TESTS else file
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -55,14 +55,14 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> "LoadScopeSc
 
     class Units(LoadScopeScheduling):
         def _split_scope(self, nodeid: str) -> str:
-            return unit(nodeid)
+            return scheduling_unit(nodeid)
 
     config.option.loadscopereorder = False
     return Units(config, log)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    items.sort(key=lambda item: begins(item.nodeid))
+    items.sort(key=lambda item: start_order(item.nodeid))
 
 
 @pytest.hookimpl(wrapper=True)

@@ -52,10 +52,10 @@ class Place:
         """Run Python with `arguments`, and return all that was printed."""
         clean = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "SHAPESPACE"))}
         done = subprocess.run([self.python, *arguments], cwd=at, env=clean, capture_output=True, text=True, timeout=900)
-        told = done.stdout + done.stderr
-        if (done.returncode == 0) != well or "Traceback" in told:
-            sys.exit(f"{shlex.join(map(str, arguments))}: code {done.returncode}\n{told[-3000:]}")
-        return told
+        output = done.stdout + done.stderr
+        if (done.returncode == 0) != well or "Traceback" in output:
+            sys.exit(f"{shlex.join(map(str, arguments))}: code {done.returncode}\n{output[-3000:]}")
+        return output
 
     def megabytes(self) -> float:
         """Return what the packages take on disk, without pip and what it compiled."""
@@ -82,17 +82,17 @@ def main(dist: Path) -> None:
         (work / "labels.csv").write_text("\n".join(["file,label", *rows]) + "\n", encoding="utf-8")
         shutil.make_archive(str(work / "scans"), "zip", work / "scans")
         for extra, commands in TRIES.items():
-            told = core.run("-m", "shapespace", *shlex.split(commands[0]), at=work, well=False)
-            if not re.search(rf"pip install \S*shapespace\[{extra}\]", told):
-                sys.exit(f"without {extra} {commands[0]!r} says no command to install it: {told}")
+            output = core.run("-m", "shapespace", *shlex.split(commands[0]), at=work, well=False)
+            if not re.search(rf"pip install \S*shapespace\[{extra}\]", output):
+                sys.exit(f"without {extra} {commands[0]!r} says no command to install it: {output}")
             one = Place(Path(temporary) / extra)
             _copy(core.folder, one.folder)
             one.run("-m", "pip", "install", "--quiet", f"{wheel}[{extra}]", at=work)
             for command in commands:
                 otherwise = ENDS_OTHERWISE.get(extra, "")
-                said = one.run("-m", "shapespace", *shlex.split(command), at=work, well=not otherwise)
-                if otherwise not in said:
-                    sys.exit(f"{command}: {said}")
+                printed = one.run("-m", "shapespace", *shlex.split(command), at=work, well=not otherwise)
+                if otherwise not in printed:
+                    sys.exit(f"{command}: {printed}")
             print(f"extra {extra}: {one.megabytes() - size:+.0f} MB, works alone", flush=True)
             shutil.rmtree(one.folder)
         core.run("-m", "pip", "install", "--quiet", f"{wheel}[all]", at=work)

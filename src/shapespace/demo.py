@@ -53,9 +53,9 @@ from shapespace.types import FloatArray, Mesh, Similarity
 from shapespace.version import __version__
 
 PAPER_EXPRESSIONS = ("anger", "disgust", "fear", "smile")
-_SEED = 2007
-_PAPER_VARIANCE = 0.985
-_MAIN_MODES_SHARE = 0.9
+_SEED = 2007  # the year of the paper
+_PAPER_VARIANCE = 0.985  # share of the variance that the modes of the paper have (98.5 %)
+_MAIN_MODES_SHARE = 0.9  # share of the variance of the modes that the fit with few modes uses
 
 
 @dataclass(frozen=True)
@@ -307,7 +307,15 @@ def _case(home: Path, story: _Story, scale: DemoScale, clock: _Clock) -> Case:
     name = f"{Path(mesh.name).stem}_{story.model_name}"
     paper = _paper(scale)
     fit, robust = (
-        _fit_all(home, model, {name: story.scan}, {name: ("neutral", 0.0)}, config, clock, file)[0]
+        _fit_all(
+            home=home,
+            model=model,
+            scans={name: story.scan},
+            labels={name: ("neutral", 0.0)},
+            config=config,
+            clock=clock,
+            model_name=file,
+        )[0]
         for name, config in ((name, paper), (f"{name}_robust", FitConfig(Robust())))
     )
     return Case(

@@ -20,7 +20,7 @@ from shapespace.errors import FileFormatError
 Status = Literal["converged", "max_iterations", "doubtful", "failed"]
 FIT_AGAIN, STUDY_AGAIN, DEMO_AGAIN = "fit the scan again", "run shapespace recognise study again", "run the demo again"
 CORRESPOND_AGAIN, ANALYSIS_AGAIN = "run shapespace correspond again", "run the analysis again"
-_TOLD = 200
+_TOLD = 200  # characters of a library's error that a message repeats
 _T = TypeVar("_T")
 
 
@@ -39,8 +39,8 @@ def read(kind: type[_T], content: object, where: str, again: str) -> _T:
     try:
         return msgspec.convert(content, kind)
     except (msgspec.ValidationError, UnicodeEncodeError, OverflowError, RecursionError) as error:
-        said = str(error)[:_TOLD].replace("`", "").replace("$.", "").replace("Object missing", "missing")
-        raise FileFormatError(f"{where} is damaged: {said[:1].lower()}{said[1:]}; {again}.") from error
+        message = str(error)[:_TOLD].replace("`", "").replace("$.", "").replace("Object missing", "missing")
+        raise FileFormatError(f"{where} is damaged: {message[:1].lower()}{message[1:]}; {again}.") from error
 
 
 def to_json(content: object) -> Any:
@@ -77,10 +77,10 @@ def check_format(
     known: Mapping[str, Any] = cast(dict[str, Any], content) if isinstance(content, dict) else {}
     if known.get("format") != kind.FORMAT:
         raise FileFormatError(f"{where} is not {kind.CALLED} ({kind.FORMAT!r}); {again}.")
-    found = known.get("format_version", 1)
-    if found != kind.VERSION:
+    version = known.get("format_version", 1)
+    if version != kind.VERSION:
         raise FileFormatError(
-            f"{where} has the format version {str(found)[:40]}, of which this version of shapespace knows only "
+            f"{where} has the format version {str(version)[:40]}, of which this version of shapespace knows only "
             f"{kind.VERSION}; update shapespace, or {again}."
         )
 

@@ -166,7 +166,15 @@ class Mesh:
     def with_vertices(self, vertices: npt.ArrayLike, landmarks: Mapping[str, FloatArray] | None = None) -> Mesh:
         """Return the same mesh with other `vertices` (V, 3); landmarks are dropped unless given."""
         positions = np.asarray(vertices, dtype=np.float64)
-        return Mesh(positions, self.faces, landmarks or {}, self.name, self.colours, self.notes, self.observed)
+        return Mesh(
+            vertices=positions,
+            faces=self.faces,
+            landmarks=landmarks or {},
+            name=self.name,
+            colours=self.colours,
+            notes=self.notes,
+            observed=self.observed,
+        )
 
     def to_trimesh(self) -> Any:
         """Return a `trimesh.Trimesh` with the same vertices, or a `trimesh.PointCloud` where there are no triangles.

@@ -140,7 +140,7 @@ def test_what_scan_and_model_both_show_is_told_in_both_millimetres(tmp_path: Pat
 
 
 def test_the_table_tells_pose_size_and_where_the_scan_was(result: FitResult, tmp_path: Path) -> None:
-    record = fit_record(result, Source.at(tmp_path / "scans" / "raw.ply", "a", tmp_path / "out"), MODEL)
+    record = fit_record(result, Source.of_file(tmp_path / "scans" / "raw.ply", "a", tmp_path / "out"), MODEL)
     row = coefficient_row("one", record)
     turn = np.radians([row[f"rotation_{axis}_deg"] for axis in "xyz"])
     assert np.allclose(Rotation.from_rotvec(turn).as_matrix(), result.T_scan_model.rotation)
@@ -189,7 +189,7 @@ def test_the_iterations_kept_end_in_the_final_surface(tmp_path: Path, result: Fi
 
 
 def test_sources_are_told_relative_to_the_results(tmp_path: Path) -> None:
-    source = Source.at(tmp_path / "models" / "m.h5", "h", tmp_path / "out")
+    source = Source.of_file(tmp_path / "models" / "m.h5", "h", tmp_path / "out")
     assert source.to_file() == File(name="m.h5", hash="h", path="../models/m.h5")
 
 

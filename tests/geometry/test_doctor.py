@@ -146,7 +146,7 @@ def test_vertices_that_are_not_finite_go_with_their_triangles_or_are_refused(val
     mesh = Mesh(vertices, ball.faces, {"tip": vertices[0]}, "ball.ply", np.tile(number[:, None], 3))
     repaired, findings = repair(mesh)
     (said,) = [finding for finding in findings if finding.level == "fixed"]
-    assert f"2 vertices with coordinates that are NaN or infinite, used by {used.sum()} triangles" in said.what
+    assert f"2 vertices with coordinates that are NaN or infinite, used by {used.sum()} triangles" in said.problem
     assert np.array_equal(repaired.vertices, np.delete(ball.vertices, [7, 9], axis=0))
     assert np.array_equal(repaired.vertices[repaired.faces], ball.vertices[ball.faces[~used]])
     assert np.array_equal(repaired.colours[:, 0], np.delete(number, [7, 9]))
@@ -169,7 +169,7 @@ def test_a_surface_of_which_nothing_finite_is_left_is_refused():
 def test_a_closed_surface_that_is_inside_out_is_turned():
     fixed, findings = repair(turned(sphere()))
     assert volume(fixed) == pytest.approx(volume(sphere()))
-    assert "inside out" in findings[0].what
+    assert "inside out" in findings[0].problem
 
 
 def test_the_wall_of_a_cavity_keeps_looking_inward():
@@ -191,7 +191,7 @@ def test_reversed_winding_of_an_open_surface_is_found(lowest: float):
     assert repair(scan)[0] is scan
     fixed, findings = repair(turned(scan))
     assert same_triangles(fixed, scan)
-    assert "looks reversed" in findings[0].what
+    assert "looks reversed" in findings[0].problem
     assert examine(turned(scan)).reversed_triangles == len(scan.faces)
 
 
@@ -226,7 +226,7 @@ def test_pieces_that_touch_do_not_turn_each_other():
     fixed, findings = repair(joined(*parts))
     assert examine(joined(*parts)).inconsistent_edges > 10
     assert same_triangles(fixed, joined(*parts))
-    assert any("touch" in f.what and f.level == "note" for f in findings)
+    assert any("touch" in f.problem and f.level == "note" for f in findings)
 
 
 def test_a_moebius_strip_is_kept_and_said():
@@ -242,7 +242,7 @@ def test_a_moebius_strip_is_kept_and_said():
         faces += [[a, c, b], [c, d, b]]
     fixed, findings = repair(Mesh(np.concatenate(edge), np.array(faces), name="strip"))
     assert len(fixed.faces) == 80
-    assert any("Moebius" in f.what and f.level == "note" for f in findings)
+    assert any("Moebius" in f.problem and f.level == "note" for f in findings)
 
 
 def test_non_manifold_edges_are_kept_and_said():
@@ -252,7 +252,7 @@ def test_non_manifold_edges_are_kept_and_said():
     fixed, findings = repair(bad)
     assert len(fixed.faces) == len(bad.faces)
     assert examine(bad).non_manifold_edges == 1
-    assert any("1 edge has more than two triangles" in f.what for f in findings)
+    assert any("1 edge has more than two triangles" in f.problem for f in findings)
 
 
 def test_several_components_are_kept_and_the_largest_share_said():
@@ -260,7 +260,7 @@ def test_several_components_are_kept_and_the_largest_share_said():
     report = examine(far)
     assert report.components == 2
     assert report.largest_component_share == pytest.approx(0.8)
-    assert any("80.0 %" in f.what for f in report.findings)
+    assert any("80.0 %" in f.problem for f in report.findings)
     assert repair(far)[0] is far
 
 
@@ -272,7 +272,7 @@ def test_a_far_origin_is_noted_and_changes_nothing(dtype: type):
     assert report.usable
     assert report.origin_distance > 5000
     assert [f.level for f in report.findings] == ["note"]
-    assert ("grid" in report.findings[0].what) == (dtype == np.float32)
+    assert ("grid" in report.findings[0].problem) == (dtype == np.float32)
     assert repair(far)[0] is far
     fixed, _ = repair(turned(far))
     assert same_triangles(fixed, far)

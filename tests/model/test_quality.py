@@ -48,7 +48,7 @@ def measured() -> ModelQuality:
 
 def test_five_modes_are_told_apart_from_noise(measured: ModelQuality) -> None:
     held, whole = curve(measured.generalisation_vertices), curve(measured.compactness)
-    at_five = int(np.searchsorted(held.at, 5))
+    at_five = int(np.searchsorted(held.counts, 5))
     # The noise of three coordinates is 0.1 * sqrt(8 / pi) mm long in the mean.
     assert held.mean[at_five] == pytest.approx(0.16, abs=0.05)
     assert held.mean[0] > 1.0
@@ -172,7 +172,7 @@ def test_missing_vertices_leave_the_measures_what_they_are(measured: ModelQualit
     found = measure_quality([holed(m, 0.15, k) for k, m in enumerate(blobs(30, noise_mm=0.1))], FEW)
     assert found.missing_share == pytest.approx(0.15, abs=0.01) and found.left_out_vertices == 0
     whole, held = curve(measured.generalisation_vertices), curve(found.generalisation_vertices)
-    at_five = int(np.searchsorted(held.at, 5))
+    at_five = int(np.searchsorted(held.counts, 5))
     np.testing.assert_allclose(held.mean[: at_five + 1], whole.mean[: at_five + 1], rtol=0.3)
     specific = curve(found.specificity).mean / curve(measured.specificity).mean
     assert ((specific > 0.8) & (specific < 1.2)).all()

@@ -69,19 +69,19 @@ def test_the_first_sentences_say_whether_to_go_on(page: str) -> None:
 def test_what_stands_out_has_its_reason_and_comes_first(page: str, template: Path) -> None:
     concerns = concerns_of(Corresponded(template))
     assert {name for name, concern in concerns.items() if concern.reasons} == {FAR, FOLDED, HIDDEN}
-    assert concerns[FAR].told.startswith("1 % of its points lie farther off than")
-    assert "of its triangles are folded over" in concerns[FOLDED].told
-    assert "It shows only 76 % of the mean shape" in concerns[HIDDEN].told
+    assert concerns[FAR].text.startswith("1 % of its points lie farther off than")
+    assert "of its triangles are folded over" in concerns[FOLDED].text
+    assert "It shows only 76 % of the mean shape" in concerns[HIDDEN].text
     cards = re.findall(r'<li class="card" id="scan-([^"]+)"', page)
     assert cards[0] == ASIDE and set(cards[1:4]) == {FAR, FOLDED, HIDDEN} and len(cards) == 7
-    assert all(concern.told in Page(page).words for concern in concerns.values())
+    assert all(concern.text in Page(page).words for concern in concerns.values())
 
 
 def test_scans_that_are_all_alike_bad_are_told_too(same: Path) -> None:
     for name in NAMES:
         edit(same, lambda record: record.update(folded_share=0.05, covered_share=0.6), f"{name}.correspond.json")
     concerns = concerns_of(Corresponded(same))
-    assert all("folded over" in c.told and "only 60 % of its points are reached" in c.told for c in concerns.values())
+    assert all("folded over" in c.text and "only 60 % of its points are reached" in c.text for c in concerns.values())
 
 
 def test_nothing_stands_out_where_nothing_does(tmp_path: Path) -> None:

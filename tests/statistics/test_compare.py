@@ -181,7 +181,7 @@ def test_a_seed_gives_the_same_numbers_and_another_one_others() -> None:
     assert json_text(analysis_report(one).analysis().parts) == json_text(analysis_report(same).analysis().parts)
     for a, b in zip(one.effects, same.effects, strict=True):
         assert a.map is not None and b.map is not None
-        np.testing.assert_array_equal(a.map.shown.p_family, b.map.shown.p_family)
+        np.testing.assert_array_equal(a.map.test.p_family, b.map.test.p_family)
     assert (one.tests[0].arrangements[1:] != other.tests[0].arrangements[1:]).any()
     assert one.tests[0].arrangements[0] == other.tests[0].arrangements[0]
 
@@ -779,7 +779,7 @@ def test_a_map_is_exploratory_unless_its_term_is_significant_and_has_an_interval
     assert effect.map is not None
     for vertex in range(SIDE * SIDE):
         low, high = effect.map.interval_mm(vertex)
-        assert (low > 0 or high < 0) == (effect.map.shown.p_family[vertex] <= 0.05)
+        assert (low > 0 or high < 0) == (effect.map.test.p_family[vertex] <= 0.05)
 
 
 def test_z_by_logarithms_is_an_option() -> None:

@@ -79,8 +79,8 @@ def test_a_difference_that_only_estimates_show_is_not_on_the_map() -> None:
     shown = found.effects[0].map
     assert shown is not None and shown.weight is not None and shown.blank is not None
     np.testing.assert_array_equal(np.flatnonzero(shown.blank), np.arange(6))
-    assert (shown.shown.p_family[:6] == 1).all() and (shown.shown_mm[:6] == 0).all()
-    assert (shown.shown.p_family[6:] <= 0.05).any()
+    assert (shown.test.p_family[:6] == 1).all() and (shown.shown_mm[:6] == 0).all()
+    assert (shown.test.p_family[6:] <= 0.05).any()
     answer = analysis_report(found)
     assert any("6 of 80 vertices are grey" in sentence for sentence in answer.summary)
     assert np.isnan(answer.arrays["effect_1.npz"]["normal_mm"][:6]).all()

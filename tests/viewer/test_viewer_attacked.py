@@ -148,7 +148,7 @@ def test_the_documentation_states_the_limits() -> None:
     text = (Path(__file__).parents[2] / "docs" / "viewer.md").read_text(encoding="utf-8")
     rows = [line for line in text.partition("## Limits")[2].split("\n## ")[0].splitlines() if line[:1] == "|"]
     numbers = [int(number) for row in rows[2:] for number in re.findall(r"\d+", row.split("|")[2])]
-    assert numbers == [limits.upload_bytes // 2**20, limits.unfinished, limits.kept, limits.fit_s]
+    assert numbers == [limits.upload_bytes // 2**20, limits.unfinished, limits.max_fits, limits.fit_s]
 
 
 def test_the_browser_is_started_with_a_ticket_and_the_token_is_only_printed(

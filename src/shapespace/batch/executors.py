@@ -28,7 +28,7 @@ ATTEMPTS = 2
 """Number of workers that a task may cost before it is given up."""
 GRACE_S = 5.0
 """Time for running tasks to end when a run is stopped; a second Ctrl-C ends them at once."""
-_STARTS = 3
+_STARTS = 3  # worker pools in a row that may fail to start: one failure can be chance, three are the machine
 _FOREVER = float("inf")
 _NO_START = (
     "Worker processes end as they start; use --jobs 1, free some memory, or, in a script of your own, put what it does "

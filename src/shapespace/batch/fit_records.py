@@ -39,7 +39,7 @@ from shapespace.store.rows import META, coefficient_columns
 from shapespace.store.rows import coefficient_row as coefficient_row
 from shapespace.version import __version__
 
-_LARGEST_RECORD = 2**24
+_LARGEST_RECORD = 2**24  # bytes; a fit record has some tens of kB, more is damage or an attack
 
 
 @lru_cache(maxsize=1024)
@@ -73,7 +73,7 @@ class Source:
     remote_version: str = ""
 
     @staticmethod
-    def at(file: Path, content_hash: str, folder: Path) -> Source:
+    def of_file(file: Path, content_hash: str, folder: Path) -> Source:
         """Return the source `file` as results in `folder` refer to it."""
         try:
             path = os.path.relpath(_resolved(file), _resolved_folder(folder.absolute()))
@@ -90,7 +90,7 @@ class Source:
         """
         content_hash = sha256_of_file(file)
         stat = file.stat()
-        source = Source.at(file, content_hash, folder)
+        source = Source.of_file(file, content_hash, folder)
         return replace(source, size_bytes=stat.st_size, modified_ns=stat.st_mtime_ns)
 
     def to_file(self) -> File:

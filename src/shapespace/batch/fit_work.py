@@ -80,7 +80,7 @@ class Job:
 
     def source(self, folder: Path) -> Source:
         """Return what results in `folder` say of where the scan is, without reading it."""
-        return Source(self.scan.name, "", self.address) if self.address else Source.at(self.scan, "", folder)
+        return Source(self.scan.name, "", self.address) if self.address else Source.of_file(self.scan, "", folder)
 
     def read_source(self, file: Path, folder: Path) -> Source:
         """Return the same, with what the scan is known again by; `file` is that of `readable`.
@@ -159,14 +159,14 @@ class _Files:
         return [*left, self.stages] if stages else left
 
 
-def naming(place: Path | str, sentence: str) -> str:
+def naming(source: Path | str, sentence: str) -> str:
     """Return `sentence` about a mesh with its path or address in it, not just its file's name."""
-    if str(place) in sentence:
+    if str(source) in sentence:
         return sentence
-    name = name_of(place) if isinstance(place, str) and is_address(place) else Path(place).name
+    name = name_of(source) if isinstance(source, str) and is_address(source) else Path(source).name
     if sentence.startswith(f"{name}: "):
-        return f"{place}{sentence.removeprefix(name)}"
-    return f"{place}: {sentence[:1].lower()}{sentence[1:]}"
+        return f"{source}{sentence.removeprefix(name)}"
+    return f"{source}: {sentence[:1].lower()}{sentence[1:]}"
 
 
 @dataclass(frozen=True)
@@ -212,7 +212,7 @@ class FitWork:
             if earlier is not None:
                 return earlier
         job, model = task.job, _model.get(self.model_hash, self._load)
-        model_source = Source.at(self.model_file, self.model_hash, self.folder)
+        model_source = Source.of_file(self.model_file, self.model_hash, self.folder)
         scan_source, marks_source = job.source(self.folder), None
         try:
             with job.readable() as file:
@@ -234,7 +234,7 @@ class FitWork:
 
     def give_up(self, task: FitTask, reason: str) -> FitRecord:
         """Write and return the record of a scan whose workers were lost."""
-        model = Source.at(self.model_file, self.model_hash, self.folder)
+        model = Source.of_file(self.model_file, self.model_hash, self.folder)
         scan = task.job.source(self.folder)
         if not task.job.address:
             with contextlib.suppress(ShapespaceError):
@@ -285,10 +285,10 @@ def resumed(task: FitTask, model_hash: str, folder: Path, run: str = "") -> tupl
         dense = bool(record.config["dense"]) and is_surface_of(files.dense, record)
         staged = files.stages.is_file()
         enough = is_surface_of(files.fitted, record) and dense >= task.config.dense and staged >= task.stages
-        whole = len(record.b) == len(record.z) == len(record.b_stddev)
+        complete = len(record.b) == len(record.z) == len(record.b_stddev)
     except (ShapespaceError, KeyError, TypeError, AttributeError, ValueError):
         return task, None
-    if enough and whole and record.is_fitted:
+    if enough and complete and record.is_fitted:
         return task, record
     also = replace(task.config, dense=task.config.dense or dense)
     return replace(task, config=also, stages=task.stages or staged), None
@@ -331,7 +331,7 @@ def is_same_scan(recorded: File, job: Job, folder: Path) -> bool:
         return recorded.path == job.address and recorded.remote_version == version_of(job.address)
     with contextlib.suppress(OSError):
         there = job.scan.stat()
-        now = (there.st_size, there.st_mtime_ns, Source.at(job.scan, "", folder).path)
+        now = (there.st_size, there.st_mtime_ns, Source.of_file(job.scan, "", folder).path)
         if (recorded.size_bytes, recorded.modified_ns, recorded.path) == now:
             return True
     return recorded.hash == sha256_of_file(job.scan)

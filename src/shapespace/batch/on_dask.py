@@ -33,7 +33,7 @@ WORKERS_S = 600.0
 """Time for a queue to start the first worker."""
 REPORT_S = 10.0
 """Seconds without a worker after which a line on standard error says what the command waits for."""
-_MOST_NAMED = 5
+_MOST_NAMED = 5  # workers listed in a message, so that it stays one line
 _LOST = "its workers ended again and again, most likely for lack of memory; thin it"
 
 

@@ -14,8 +14,8 @@ from shapespace.batch.execution import ExecutionConfig
 from shapespace.batch.executors import Serial
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.landmark_guide import ScanLandmarks
-from shapespace.correspondence.place import RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.register import ElasticSettings
+from shapespace.correspondence.registration import RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.template import PoseModel
 from shapespace.errors import FileError
 from shapespace.io.containers.archives import read_arrays
@@ -271,7 +271,14 @@ def _read_one(stored: Mapping[str, npt.NDArray[Any]], number: int, index: int) -
     T = Similarity(float(of("scale")), of("rotation"), of("translation"))
     mean, p95, p99, largest = (float(length) for length in of("distance"))
     return ScanRegistration(
-        index, np.asarray(of("vertices"), dtype=np.float64), T, np.asarray(of("observed"), dtype=np.bool_),
-        float(of("covered")), (mean, p95, p99, largest), float(of("cpu_s")), str(of("reason")),
-        mirror_ratio=float(of("mirror_ratio")), posed_by_landmarks=bool(of("posed_by_landmarks")),
-    )  # fmt: skip
+        index=index,
+        vertices=np.asarray(of("vertices"), dtype=np.float64),
+        T_scan_template=T,
+        observed=np.asarray(of("observed"), dtype=np.bool_),
+        covered=float(of("covered")),
+        distance=(mean, p95, p99, largest),
+        cpu_s=float(of("cpu_s")),
+        reason=str(of("reason")),
+        mirror_ratio=float(of("mirror_ratio")),
+        posed_by_landmarks=bool(of("posed_by_landmarks")),
+    )

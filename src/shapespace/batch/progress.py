@@ -54,7 +54,7 @@ def progress(total: int | None, doing: str, unit: str, *, quiet: bool) -> Genera
         quiet: whether to be silent.
     """
     several = unit + ("es" if unit.endswith("sh") else "s")
-    what = f"{doing} {several}" if total is None else f"{doing} {total} {unit if total == 1 else several}"
+    label = f"{doing} {several}" if total is None else f"{doing} {total} {unit if total == 1 else several}"
     # disable=None is tqdm's way to ask whether there is a terminal.
     with Bar(total=total, desc=doing, unit=unit, leave=False, disable=True if quiet else None) as bar:
 
@@ -62,7 +62,7 @@ def progress(total: int | None, doing: str, unit: str, *, quiet: bool) -> Genera
             text = f", {bar.shown_description}" if bar.shown_description else ""
             return f"{text}: {bar.counted:g} of {bar.total:g} done" if bar.counted and bar.total else text
 
-        with _logging_progress(what, state, quiet=quiet):
+        with _logging_progress(label, state, quiet=quiet):
             yield bar
 
 
@@ -79,11 +79,11 @@ def steps(total: int | None, doing: str, unit: str, *, quiet: bool) -> Generator
 
 
 @contextmanager
-def waiting(what: str, *, quiet: bool) -> Generator[None]:
+def waiting(label: str, *, quiet: bool) -> Generator[None]:
     """Say on standard error what the user waits for while it cannot be counted, such as "finding the modes"."""
     with (
-        _logging_progress(what, lambda: "", quiet=quiet),
-        tqdm(total=0, desc=f"{what} ...", bar_format="{desc}", leave=False, disable=True if quiet else None),
+        _logging_progress(label, lambda: "", quiet=quiet),
+        tqdm(total=0, desc=f"{label} ...", bar_format="{desc}", leave=False, disable=True if quiet else None),
     ):
         yield
 
@@ -99,11 +99,11 @@ def telling_of_compiling(*, quiet: bool) -> AbstractContextManager[None]:
 
 
 @contextmanager
-def _logging_progress(what: str, state: Callable[[], str], *, quiet: bool) -> Generator[None]:
+def _logging_progress(label: str, state: Callable[[], str], *, quiet: bool) -> Generator[None]:
     """Print lines on standard error while the block runs, first after `FIRST_LOG_LINE_S`, then at growing intervals.
 
     Args:
-        what: the step.
+        label: the step.
         state: returns the progress, which is printed after `what`; empty if it is unknown.
         quiet: whether to be silent.
     """
@@ -115,7 +115,7 @@ def _logging_progress(what: str, state: Callable[[], str], *, quiet: bool) -> Ge
     def print_lines() -> None:
         pause, after = FIRST_LOG_LINE_S, ""
         while not ended.wait(pause):
-            print(f"shapespace: {what}{state()} ...{after}", file=sys.stderr, flush=True)
+            print(f"shapespace: {label}{state()} ...{after}", file=sys.stderr, flush=True)
             pause = min(max(2 * pause, 1.0), LONGEST_PAUSE_S)
             after = f" ({time.monotonic() - began + pause:.0f} s)"
 

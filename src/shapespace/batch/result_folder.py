@@ -23,7 +23,7 @@ from shapespace.store.results import results_at
 
 COEFFICIENTS = "coefficients.csv"
 RECORD = ".fit.json"
-_LONGEST_NAME = 200
+_LONGEST_NAME = 200  # bytes; file systems allow 255, and endings such as .fit.json follow the name
 _SCAN_COLUMNS = ("scan", "scan_name", "path", "scan_hash")
 
 
@@ -121,7 +121,7 @@ def _key(scan: Path, folder: Path | None, address: str) -> _Scan:
         return _Scan(scan.name, address)
     if folder is None:
         return _Scan(scan.name, str(scan.parent.resolve()))
-    return _Scan(scan.name, Source.at(scan, "", folder).path)
+    return _Scan(scan.name, Source.of_file(scan, "", folder).path)
 
 
 def _stem(scan: Path) -> str:

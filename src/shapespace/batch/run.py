@@ -52,12 +52,12 @@ class Plan:
         """Yield what a user should know of it."""
         total = self.valid + self.repeated + self.new
         if self.valid:
-            what = "scan has a valid result, which is" if self.valid == 1 else "scans have valid results, which are"
-            yield f"{self.valid} of {total} {what} reused; --again fits again."
+            noun = "scan has a valid result, which is" if self.valid == 1 else "scans have valid results, which are"
+            yield f"{self.valid} of {total} {noun} reused; --again fits again."
         if self.repeated:
-            what = "scan is" if self.repeated == 1 else "scans are"
+            noun = "scan is" if self.repeated == 1 else "scans are"
             yield (
-                f"{self.repeated} of {total} {what} fitted again: the scan, model, settings, version or result files "
+                f"{self.repeated} of {total} {noun} fitted again: the scan, model, settings, version or result files "
                 "have changed since the last fit."
             )
 

@@ -18,7 +18,7 @@ from shapespace.types import Mesh
 
 _FORBIDDEN = re.compile(r'[<>:"/\\|?*\x00-\x1f]')
 """Characters that file names cannot contain on some systems."""
-_HASH_CHARACTERS = 12
+_HASH_CHARACTERS = 12  # hexadecimal digits, 48 bits: no two of a million scans share them by chance
 
 
 def save_fit(result: FitResult, folder: Path, name: str, *, stages: bool) -> Path:
@@ -54,7 +54,7 @@ def _hash_of(mesh: Mesh) -> str:
 
 def _model(result: FitResult, folder: Path) -> Source:
     file = result.files.get("model") or result.model.file
-    return Source.at(file, result.model_hash, folder) if file else Source("", result.model_hash)
+    return Source.of_file(file, result.model_hash, folder) if file else Source("", result.model_hash)
 
 
 def _landmarks(result: FitResult) -> Source | None:

@@ -28,7 +28,7 @@ STORE_FROM = 10_000
 """Number of scans from which on a store is the default."""
 ROWS = 1000
 """Number of fits that are moved into a store at a time."""
-_SAVE_INTERVAL_S = 5.0
+_SAVE_INTERVAL_S = 5.0  # seconds; least time between two saves of the tables
 _SAVE_COST_RATIO = 20.0
 """The next save of the table is at least this many times as far away as the last one took."""
 _SCAN = {

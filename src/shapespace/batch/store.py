@@ -42,7 +42,7 @@ from shapespace.types import Mesh
 ROWS = 1000
 """Fits in a shard, if not said otherwise."""
 
-_ROW_GROUP = 250
+_ROW_GROUP = 250  # rows; readers load whole groups, and 250 wide rows take a few MB
 
 
 @dataclass(frozen=True)
@@ -173,9 +173,9 @@ class Store:
             # Fits without a surface go with those that have one.
             if len(groups) > 1 and (bare := groups.pop("", None)):
                 next(iter(groups.values())).extend(bare)
-            place = {name: k for k, name in enumerate(wanted)}
+            rank = {name: k for k, name in enumerate(wanted)}
             for group in groups.values():
-                self._move(sorted(group, key=lambda result: place[result.name]), stored)
+                self._move(sorted(group, key=lambda result: rank[result.name]), stored)
                 out.moved.extend(result.name for result in group)
         return out
 
@@ -245,8 +245,8 @@ class Store:
             columns = shard.columns(sorted(shard.column_names()))
         except ShapespaceError:
             return entry
-        kept = [k for k, name in enumerate(columns["scan"]) if name not in names]
-        rows = [{column: values[k] for column, values in columns.items() if values[k] is not None} for k in kept]
+        remaining = [k for k, name in enumerate(columns["scan"]) if name not in names]
+        rows = [{column: values[k] for column, values in columns.items() if values[k] is not None} for k in remaining]
         if not rows:
             return None
         mark = hashlib.sha256("\n".join(row["scan"] for row in rows).encode()).hexdigest()[:12]

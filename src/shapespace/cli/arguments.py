@@ -47,19 +47,19 @@ class CommandParser(argparse.ArgumentParser):
         self, args: Any = None, namespace: Any = None
     ) -> Any:
         """Parse arguments after adding the options."""
-        self._add_options(shown="basic")
+        self._add_options(help_level="basic")
         return super().parse_known_args(args, namespace)
 
     def format_help(self, *, everything: bool = False) -> str:
         """Return the help: basic options, or all."""
         if everything and self._command:
             full = CommandParser(prog=self.prog, command=self._command)
-            full._add_options(shown="all")
+            full._add_options(help_level="all")
             return full.format_help()
-        self._add_options(shown="basic")
+        self._add_options(help_level="basic")
         return super().format_help()
 
-    def _add_options(self, shown: str) -> None:
+    def _add_options(self, help_level: str) -> None:
         command = self._command
         if command is None or self.description is not None:
             return
@@ -67,14 +67,14 @@ class CommandParser(argparse.ArgumentParser):
         more = sum(not option.basic and not option.hidden for option in command.options)
         self.usage, self.description = command.usage, _sentence(command.summary)
         self.epilog = "example: " + "\n         ".join(command.examples)
-        if shown == "all":
+        if help_level == "all":
             self.description += "".join(f"\n\n{textwrap.fill(text, 78)}" for text in command.details)
         elif more:
             self.epilog += f"\n\n{more} more options: {self.prog} --help-all"
         self.add_argument("--help-all", action=_HelpAll, help="show all options and exit")
-        self._add(command.options, shown)
+        self._add(command.options, help_level)
 
-    def _add(self, options: Sequence[Option], shown: str) -> None:
+    def _add(self, options: Sequence[Option], help_level: str) -> None:
         advanced = self.add_argument_group("advanced options")
         exclusive: dict[str, Container] = {}
         for option in options:
@@ -83,7 +83,7 @@ class CommandParser(argparse.ArgumentParser):
                 if option.either not in exclusive:
                     exclusive[option.either] = group.add_mutually_exclusive_group(required=option.required)
                 group = exclusive[option.either]
-            option.add_to(group, shown=not option.hidden and (option.basic or shown == "all"))
+            option.add_to(group, in_help=not option.hidden and (option.basic or help_level == "all"))
 
 
 class _HelpAll(argparse.Action):

@@ -157,14 +157,14 @@ class Option:
         initial = self.initial
         if self.is_flag or initial in (NO_DEFAULT, None, "", (), []) or "(default" in text or self.required:
             return text
-        shown = " ".join(map(str, cast(Sequence[Any], initial))) if isinstance(initial, tuple) else initial
-        return f"{text} (default: {shown})"
+        default_text = " ".join(map(str, cast(Sequence[Any], initial))) if isinstance(initial, tuple) else initial
+        return f"{text} (default: {default_text})"
 
     @property
     def _field(self) -> Field | None:
         return self.source.field(self.field_name) if self.source else None
 
-    def add_to(self, group: Container, *, shown: bool) -> None:
+    def add_to(self, group: Container, *, in_help: bool) -> None:
         """Add it to a parser or a group of one; `shown` is whether its help is."""
         if self.formerly:
             group.add_argument(
@@ -172,7 +172,7 @@ class Option:
                 default=NO_DEFAULT, help=argparse.SUPPRESS,
             )  # fmt: skip
         text = self.text.replace("%", "%%").replace("`", "")
-        keywords: dict[str, Any] = {"help": text if shown else argparse.SUPPRESS}
+        keywords: dict[str, Any] = {"help": text if in_help else argparse.SUPPRESS}
         if self.is_flag:
             group.add_argument(*self.spellings, action="store_true", dest=self.attribute, **keywords)
             return
@@ -246,18 +246,20 @@ def _fields(source: Source) -> Mapping[str, Field]:
         if isinstance(node, ast.ClassDef | ast.FunctionDef) and node.name == source.name
     ]
     texts = _texts(ast.get_docstring(node) or "")
-    found: dict[str, tuple[ast.expr | None, ast.expr | None]] = {}
+    definitions: dict[str, tuple[ast.expr | None, ast.expr | None]] = {}
     if isinstance(node, ast.ClassDef):
         for part in node.body:
             if isinstance(part, ast.AnnAssign) and isinstance(part.target, ast.Name):
-                found[part.target.id] = part.annotation, part.value
+                definitions[part.target.id] = part.annotation, part.value
     else:
         plain, keyword = node.args.args, node.args.kwonlyargs
         defaults = [*[None] * (len(plain) - len(node.args.defaults)), *node.args.defaults, *node.args.kw_defaults]
-        found = {one.arg: (one.annotation, default) for one, default in zip([*plain, *keyword], defaults, strict=True)}
+        definitions = {
+            one.arg: (one.annotation, default) for one, default in zip([*plain, *keyword], defaults, strict=True)
+        }
     return {
         name: Field(texts.get(name, ""), *_kinds(source.module, annotation), _literal(default))
-        for name, (annotation, default) in found.items()
+        for name, (annotation, default) in definitions.items()
     }
 
 

@@ -49,8 +49,8 @@ def short(value: Any) -> str:
     plain = _plain(value)
     if isinstance(plain, list):
         items = cast(list[Any], plain)
-        shown = ", ".join(short(item) for item in items[:8])
-        return f"[{shown}{', ...' if len(items) > 8 else ''}]" + (f" ({len(items)})" if len(items) > 8 else "")
+        items_text = ", ".join(short(item) for item in items[:8])
+        return f"[{items_text}{', ...' if len(items) > 8 else ''}]" + (f" ({len(items)})" if len(items) > 8 else "")
     if isinstance(plain, dict):
         return ", ".join(f"{key} {short(item)}" for key, item in cast(dict[str, Any], plain).items())
     return f"{plain:.6g}" if isinstance(plain, float) else str(plain)

@@ -106,12 +106,12 @@ def data_bones(arguments: argparse.Namespace) -> int:
     return _show_written(arguments, "bone", arguments.count)
 
 
-def _show_written(arguments: argparse.Namespace, what: str, count: int) -> int:
+def _show_written(arguments: argparse.Namespace, noun: str, count: int) -> int:
     """Print how many simulated shapes were written, and where."""
     if arguments.json:
-        show_json({"folder": str(arguments.output), f"{what}s": count})
+        show_json({"folder": str(arguments.output), f"{noun}s": count})
     else:
-        show(f"{count} {what}{'' if count == 1 else 's'} in {arguments.output}")
+        show(f"{count} {noun}{'' if count == 1 else 's'} in {arguments.output}")
     return 0
 
 
@@ -134,10 +134,10 @@ def surface(arguments: argparse.Namespace) -> int:
 def _print_surfaces(made: Sequence[Mapping[str, Any]], volumes: int, folder: Path) -> None:
     for record in made[:_LISTED]:
         size = " x ".join(f"{mm:.3g}" for mm in record["voxel_mm"])
-        what = f"label{'s' if len(record['labels']) > 1 else ''} {', '.join(map(str, record['labels']))}"
+        labels = f"label{'s' if len(record['labels']) > 1 else ''} {', '.join(map(str, record['labels']))}"
         show(
-            f"{record['name']}.ply: {record['triangles']:,} triangles around {record['volume_mm3']:.4g} mm3 of {what}, "
-            f"voxels of {size} mm"
+            f"{record['name']}.ply: {record['triangles']:,} triangles around {record['volume_mm3']:.4g} mm3 of "
+            f"{labels}, voxels of {size} mm"
         )
         for note in record["notes"]:
             show(f"  {note}")
@@ -177,10 +177,10 @@ def _print_check(report: Mapping[str, Any]) -> None:
         if key not in ("file", "usable", "findings", "name"):
             show(f"  {key}: {short(value)}")
     for finding in report["findings"]:
-        what, action = finding["what"], finding["action"]
+        problem, action = finding["what"], finding["action"]
         show(
             f"  {finding['level']}: "
-            + (f"{what[:-1]}; {action}" if finding["level"] == "refused" else f"{what} {action}")
+            + (f"{problem[:-1]}; {action}" if finding["level"] == "refused" else f"{problem} {action}")
         )
     print("  usable" if report["usable"] else "  not usable for fitting")
 
@@ -197,13 +197,13 @@ def correspond(arguments: argparse.Namespace) -> int:
 
     config = CorrespondConfig(**given(arguments, CorrespondConfig))
     files = CorrespondFiles(
-        arguments.scans,
-        arguments.template,
-        arguments.model,
-        arguments.landmarks,
-        _execution_config(arguments),
-        arguments.recursive,
-        arguments.strict,
+        scans=arguments.scans,
+        template=arguments.template,
+        model=arguments.model,
+        landmarks=arguments.landmarks,
+        execution=_execution_config(arguments),
+        recursive=arguments.recursive,
+        strict=arguments.strict,
     )
     summary, records = correspond_files(files, arguments.output, config, quiet=arguments.quiet, say=warn)
     if arguments.json:
@@ -251,18 +251,18 @@ def quality(arguments: argparse.Namespace) -> int:
 
     config = QualityConfig(**given(arguments, QualityConfig))
     options = QualityOptions(config, **given(arguments, QualityOptions))
-    found, notes = quality(
+    result, notes = quality(
         arguments.targets, arguments.output, options, _execution_config(arguments), quiet=arguments.quiet
     )
     for note in notes:
         say(note)
     if arguments.json:
-        show_json({"folder": str(arguments.output), **to_json(found)})
+        show_json({"folder": str(arguments.output), **to_json(result)})
         return 0
-    for one in (found, *found.others):
+    for one in (result, *result.others):
         for line in quality_lines(one):
             show(line)
-    for sentence in found.sentences:
+    for sentence in result.sentences:
         show(sentence)
     show(f"All numbers are in {arguments.output / 'quality.json'}")
     return 0
@@ -280,10 +280,10 @@ def quality_lines(quality: Quality) -> list[str]:
         ("reconstruction", "mm, surface to surface, on unseen shapes"),
         ("reconstruction_vertices", "mm, vertex to vertex, on unseen shapes"),
     ):
-        told = getattr(quality, key)
-        if told is not None:
-            band = f" (95 %: {told.low[-1]:.3f} to {told.high[-1]:.3f})" if told.low != told.mean else ""
-            out.append(f"  {key.split('_')[0]}, {told.modes[-1]:g} modes: {told.mean[-1]:.3f}{band} {unit}")
+        measure = getattr(quality, key)
+        if measure is not None:
+            band = f" (95 %: {measure.low[-1]:.3f} to {measure.high[-1]:.3f})" if measure.low != measure.mean else ""
+            out.append(f"  {key.split('_')[0]}, {measure.modes[-1]:g} modes: {measure.mean[-1]:.3f}{band} {unit}")
     return out
 
 
@@ -298,8 +298,8 @@ def info(arguments: argparse.Namespace) -> int:
         for key, value in facts.items():
             if key in _BY_SCAN:
                 show(f"{key}: {len(value)}")
-                for name, told in value.items():
-                    show(f"  {name}: {told}")
+                for name, text in value.items():
+                    show(f"  {name}: {text}")
             else:
                 show(f"{key}: {short(value)}")
     return 0
@@ -404,8 +404,8 @@ def recognise_predict(arguments: argparse.Namespace) -> int:
             )
         if len(rows) > _LISTED:
             show(f"and {len(rows) - _LISTED} more; all are in {arguments.output}")
-        told = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
-        show(f"{len(rows)} {'scan' if len(rows) == 1 else 'scans'}: {told}; answers in {arguments.output}")
+        counts_text = ", ".join(f"{count} {outcome}" for outcome, count in counts.items() if count)
+        show(f"{len(rows)} {'scan' if len(rows) == 1 else 'scans'}: {counts_text}; answers in {arguments.output}")
     asked = len(rows) - counts["neutral"]
     if counts["failed"] == asked:
         say("shapespace: no scan could be answered for; the reasons stand in the table.")

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 
-def whole(text: str) -> int:
+def integer(text: str) -> int:
     """Return a whole number of any sign."""
     try:
         return int(text)
@@ -18,7 +18,7 @@ def whole(text: str) -> int:
 
 def natural(text: str) -> int:
     """Return a whole number of 0 or more."""
-    value = whole(text)
+    value = integer(text)
     if value < 0:
         raise argparse.ArgumentTypeError("must not be negative")
     return value
@@ -83,8 +83,8 @@ def _number(text: str, accepts: Callable[[float], bool], accepted: str) -> float
 
 def memory_bytes(text: str) -> int:
     """Return a size such as 8G as bytes."""
-    found = re.fullmatch(r"(\d{1,9}(?:\.\d{1,6})?)([KMGT])(?:i?B)?", text, re.IGNORECASE | re.ASCII)
-    value = float(found[1]) * 1024 ** (1 + "KMGT".index(found[2].upper())) if found else 0.0
+    match = re.fullmatch(r"(\d{1,9}(?:\.\d{1,6})?)([KMGT])(?:i?B)?", text, re.IGNORECASE | re.ASCII)
+    value = float(match[1]) * 1024 ** (1 + "KMGT".index(match[2].upper())) if match else 0.0
     if not value:
         raise argparse.ArgumentTypeError(f"must be a size such as 8G or 500M, not {text!r}")
     return int(value)
@@ -136,12 +136,12 @@ def labels(text: str) -> str | tuple[int, ...]:
     if text == "all":
         return text
     try:
-        found = tuple(int(part) for part in text.split(","))
+        numbers = tuple(int(part) for part in text.split(","))
     except ValueError:
-        found = (0,)
-    if 0 in found:
+        numbers = (0,)
+    if 0 in numbers:
         raise argparse.ArgumentTypeError(f"must be all, or whole numbers other than 0 such as 1 or 1,2, not {text!r}")
-    return found
+    return numbers
 
 
 def named_file(text: str) -> tuple[str, Path]:

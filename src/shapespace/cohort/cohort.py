@@ -349,10 +349,19 @@ class Cohort:
         reference = shapes.mean(axis=0)
         basis, coefficients = _orthonormal((shapes - reference).reshape(len(shapes), -1))
         cohort = Cohort(
-            shape_names, read_only(reference), basis, coefficients, sizes, Table(cells, shape_names), gauge, faces,
-            None if landmarks is None else SurfaceLandmarks.of(landmarks), observed=mask, analysed=analysed,
+            names=shape_names,
+            reference=read_only(reference),
+            basis=basis,
+            coefficients=coefficients,
+            sizes_mm=sizes,
+            table=Table(cells, shape_names),
+            gauge=gauge,
+            faces=faces,
+            landmarks=None if landmarks is None else SurfaceLandmarks.of(landmarks),
+            observed=mask,
+            analysed=analysed,
             unit=unit if unit is not None else "" if np.abs(sizes - 1.0).max() < _UNIT_SIZE else "mm",
-        )  # fmt: skip
+        )
         refuse_twice(cohort)
         return cohort
 
@@ -430,9 +439,18 @@ class Cohort:
             reference = centre + mean * (reference - centre)
         basis, coefficients = _in_basis(rows, b)
         cohort = Cohort(
-            tuple(names), read_only(reference), basis, coefficients, read_only(sizes_mm), table, gauge, model.faces,
-            model.landmarks, fitted, source=fitted.source("coefficients"),
-        )  # fmt: skip
+            names=tuple(names),
+            reference=read_only(reference),
+            basis=basis,
+            coefficients=coefficients,
+            sizes_mm=read_only(sizes_mm),
+            table=table,
+            gauge=gauge,
+            faces=model.faces,
+            landmarks=model.landmarks,
+            fitted=fitted,
+            source=fitted.source("coefficients"),
+        )
         refuse_twice(cohort)
         return cohort
 

@@ -130,17 +130,17 @@ def _rows(results: Results) -> list[_Row]:
             n_modes = int(part["modes"][index] or 0)
             rows.append(
                 _Row(
-                    str(part["scan"][index] or ""),
-                    str(part["status"][index] or ""),
-                    str(part["scan_name"][index] or ""),
-                    str(part["scan_hash"][index] or ""),
-                    str(part["model_hash"][index] or ""),
-                    values[0, :n_modes, index],
-                    values[1, :n_modes, index],
-                    _number(part["centroid_size_mm"][index]),
-                    _number(part["mm_per_scan_unit"][index]),
-                    _number(part["beyond_model_mm"][index]),
-                    {column.removeprefix(META): str(part[column][index] or "").strip() for column in known},
+                    name=str(part["scan"][index] or ""),
+                    status=str(part["status"][index] or ""),
+                    scan_name=str(part["scan_name"][index] or ""),
+                    scan_hash=str(part["scan_hash"][index] or ""),
+                    model_hash=str(part["model_hash"][index] or ""),
+                    b=values[0, :n_modes, index],
+                    b_stddev=values[1, :n_modes, index],
+                    size_mm=_number(part["centroid_size_mm"][index]),
+                    mm_per_unit=_number(part["mm_per_scan_unit"][index]),
+                    beyond_mm=_number(part["beyond_model_mm"][index]),
+                    known={column.removeprefix(META): str(part[column][index] or "").strip() for column in known},
                 )
             )
     return sorted(rows, key=lambda row: row.name)
@@ -166,7 +166,13 @@ def _of_results(
         by_key = _by_key(rows)
         pairs = [(by_key[key], index) for index, key in enumerate(keys) if key in by_key]
         _note_unmatched(
-            notes, table, keys, by_key, [row.name for row, _ in pairs], [row.name for row in rows], results.folder
+            notes=notes,
+            table=table,
+            keys=keys,
+            available=by_key,
+            used=[row.name for row, _ in pairs],
+            names=[row.name for row in rows],
+            folder=results.folder,
         )
     accepted = [(row, index) for row, index in pairs if row.status in used]
     for status, count in Counter(row.status for row, _ in pairs if row.status not in used).items():
@@ -186,13 +192,13 @@ def _of_results(
     sizes = read_only([row.size_mm for row in fits])
     width = max(len(row.b) for row in fits)
     fitted = Fitted(
-        model,
-        read_only([np.pad(row.b, (0, width - len(row.b))) for row in fits]),
-        read_only([np.pad(row.b_stddev, (0, width - len(row.b_stddev))) for row in fits]),
-        tuple(row.status for row in fits),
-        str(results.folder),
-        read_only([row.beyond_mm for row in fits]),
-        additive,
+        model=model,
+        b=read_only([np.pad(row.b, (0, width - len(row.b))) for row in fits]),
+        b_stddev=read_only([np.pad(row.b_stddev, (0, width - len(row.b_stddev))) for row in fits]),
+        status=tuple(row.status for row in fits),
+        folder=str(results.folder),
+        beyond_mm=read_only([row.beyond_mm for row in fits]),
+        additive=additive,
     )
     kind = _kind(config.surfaces, results, names, config.gauge, fits, onto)
     if kind == "coefficients":
@@ -253,7 +259,15 @@ def _of_surfaces(
         listing.refuse_mixed_units()
     files = {surface_stem(file): file for file in listing.files if file.suffix.lower() != ".csv"}
     matched = [(files[key], row_index) for row_index, key in enumerate(keys) if key in files]
-    _note_unmatched(notes, table, keys, files, [surface_stem(file) for file, _ in matched], list(files), folder)
+    _note_unmatched(
+        notes=notes,
+        table=table,
+        keys=keys,
+        available=files,
+        used=[surface_stem(file) for file, _ in matched],
+        names=list(files),
+        folder=folder,
+    )
     least = config.least if onto is None else 1
     if len(matched) < least:
         raise InputError(

@@ -140,8 +140,8 @@ def read_table(path: Path) -> tuple[Table, tuple[str, ...]]:
     names = heads[key]
     places = [PurePath(row[key].replace("\\", "/")) for row in rows]
     # Scans of one name in different folders are called by their folders too, as their fits are.
-    repeated = {stem for stem, count in Counter(stem_of(place) for place in places).items() if count > 1}
-    keys = tuple(_with_folders(place) if stem_of(place) in repeated else stem_of(place) for place in places)
+    repeated = {stem for stem, count in Counter(stem_of(scan) for scan in places).items() if count > 1}
+    keys = tuple(_with_folders(scan) if stem_of(scan) in repeated else stem_of(scan) for scan in places)
     if "" in keys:
         raise FileFormatError(
             f"{path} has no {names} in row {keys.index('') + 1}; name the shape, or leave the row out."
@@ -160,8 +160,8 @@ def read_table(path: Path) -> tuple[Table, tuple[str, ...]]:
     return Table(columns, keys, str(path)), keys
 
 
-def _with_folders(place: PurePath) -> str:
-    return "_".join((*(part for part in place.parent.parts if part not in (".", "/")), stem_of(place)))
+def _with_folders(path: PurePath) -> str:
+    return "_".join((*(part for part in path.parent.parts if part not in (".", "/")), stem_of(path)))
 
 
 def plain_cell(cell: str) -> str:

@@ -40,9 +40,10 @@ from shapespace.version import __version__
 if TYPE_CHECKING:
     from shapespace.model.additive import AdditiveModel
 
+# shares of variance of identity and of expression in an additive model when the number of modes is automatic
 _IDENTITY_VARIANCE, _EXPRESSION_VARIANCE = 0.995, 0.99
 _SURFACES = (".dense.ply", ".fitted.ply")
-_NAMED = 3
+_NAMED = 3  # names in a message, so that it stays short
 _LEAST_MM, _MOST_MM = 1.0, 3000.0
 """Beyond this the largest extent of an object is likelier told in another unit."""
 
@@ -147,20 +148,20 @@ def build(
     """
     if output.suffix.lower() not in (".h5", ".hdf5"):
         raise InputError(f"{output}: a model file is HDF5, so give it a name that ends in .h5.")
-    found = surface_files(meshes, recursive=config.recursive)
-    notes = list(found.notes)
+    listed = surface_files(meshes, recursive=config.recursive)
+    notes = list(listed.notes)
     parent = None if config.add is None else _parent(config.add, output)
     gauge = parent.gauge if parent is not None else config.gauge or "shape"
     if gauge == "form" or not config.model.align:
-        found.refuse_mixed_units()
-    files, records = _trusted(found.files, notes, with_doubtful=config.with_doubtful)
+        listed.refuse_mixed_units()
+    files, records = _trusted(listed.files, notes, with_doubtful=config.with_doubtful)
     make_folder(output.absolute().parent)
-    on_disk = _OnDisk(files, config.unit, found.unit_ratios)
+    on_disk = _OnDisk(files, config.unit, listed.unit_ratios)
     streamed = config.streams or (config.of_vertices and _too_large(on_disk, config, notes))
     loaded = on_disk if streamed else _read(on_disk, quiet=quiet)
     first = on_disk[0] if streamed else loaded[0]
-    if found.unit_ratios:
-        notes.append(found.told_units(config.unit))
+    if listed.unit_ratios:
+        notes.append(listed.told_units(config.unit))
     marks = SurfaceLandmarks() if parent is not None else _landmarks(files, records, first, config, notes)
     regions = {
         name: region_vertices(read_region(file), len(first.vertices), name) for name, file in config.regions.items()
@@ -173,11 +174,20 @@ def build(
     if config.model.modes == "auto" and count > MOST_SHAPES:
         notes.append(f"The number of modes is chosen by {MOST_SHAPES} of the {count} shapes, drawn by --seed.")
     if not isinstance(loaded, list):
-        model = _streamed(on_disk, output, config, gauge, marks, parent, notes, quiet=quiet)
+        model = _streamed(
+            meshes=on_disk,
+            output=output,
+            config=config,
+            gauge=gauge,
+            landmarks=marks,
+            parent=parent,
+            notes=notes,
+            quiet=quiet,
+        )
         if regions:
             model = replace(model, regions=regions)
             model.save(output)
-        return model, notes + _told(model, config)
+        return model, notes + _model_notes(model, config)
     notes += _missing(loaded, marks, config)
     with waiting(f"aligning {len(files)} meshes and finding their modes", quiet=quiet):
         if config.labels is not None:
@@ -192,18 +202,20 @@ def build(
         chosen = replace(config.model, gauge=gauge, landmarks=marks, min_seen=_min_seen(config), out_of_core=False)
         model = build_model(loaded, chosen)
         if regions:
-            kept = ObservedMeshes.of(loaded, _min_seen(config)) if config.model.representation == "vertices" else None
-            model = replace(model, regions=regions if kept is None else kept.regions(regions))
+            observed = (
+                ObservedMeshes.of(loaded, _min_seen(config)) if config.model.representation == "vertices" else None
+            )
+            model = replace(model, regions=regions if observed is None else observed.regions(regions))
         model.save(output)
-    return model, notes + _told(model, config)
+    return model, notes + _model_notes(model, config)
 
 
-def _told(model: ShapeModel, config: BuildFilesConfig) -> list[str]:
+def _model_notes(model: ShapeModel, config: BuildFilesConfig) -> list[str]:
     """Return what the user should know of the model itself."""
     notes = _odd_size(model, config.unit)
     if model.left_out:
-        what = "1 mode is" if model.left_out == 1 else f"{model.left_out} modes are"
-        notes.append(f"{what} left out, since alignment or rounding made them and no shape did.")
+        count_text = "1 mode is" if model.left_out == 1 else f"{model.left_out} modes are"
+        notes.append(f"{count_text} left out, since alignment or rounding made them and no shape did.")
     return notes
 
 
@@ -222,8 +234,8 @@ def _parent(path: Path, output: Path) -> ShapeModel:
         raise InputError(f"{output} is the model that meshes are added to; give another name for the new one.")
     model = ShapeModel.load(path)
     if model.held_out or model.representation != "vertices":
-        what = "parts identity and expression" if model.held_out else "is of B-spline surfaces"
-        raise InputError(f"{path} {what}, and meshes can be added only to plain models of vertices; build it again.")
+        reason = "parts identity and expression" if model.held_out else "is of B-spline surfaces"
+        raise InputError(f"{path} {reason}, and meshes can be added only to plain models of vertices; build it again.")
     return model
 
 
@@ -253,7 +265,7 @@ def _streamed(
     """Build a model of meshes that are not held in memory, and save it."""
     folder = output.with_name(f"{output.name}.build")
     scratch = Scratch(folder, _identity(meshes, config, parent))
-    kept = shapes_folder(output) if config.keep_shapes else None
+    shapes_kept_in = shapes_folder(output) if config.keep_shapes else None
     with progress(None, "streaming", "mesh", quiet=quiet) as bar:
         if parent is not None and config.add is not None:
             chosen = replace(
@@ -263,15 +275,17 @@ def _streamed(
             )
             shapes = shapes_folder(config.add)
             model = extend_model(
-                parent, meshes, shapes, chosen, scratch=scratch, keep_shapes=kept, log=bar.set_description_str
+                parent, meshes, shapes, chosen, scratch=scratch, keep_shapes=shapes_kept_in, log=bar.set_description_str
             )
         else:
             chosen = replace(config.model, gauge=gauge, landmarks=landmarks, out_of_core=True)
-            model = build_model(meshes, chosen, scratch=scratch, keep_shapes=kept, log=bar.set_description_str)
+            model = build_model(
+                meshes, chosen, scratch=scratch, keep_shapes=shapes_kept_in, log=bar.set_description_str
+            )
         model.save(output)
-    if kept is not None:
-        size = sum(file.stat().st_size for file in kept.iterdir())
-        notes.append(f"The shapes are kept in {kept} ({size / 1e6:.1f} MB), for --add.")
+    if shapes_kept_in is not None:
+        size = sum(file.stat().st_size for file in shapes_kept_in.iterdir())
+        notes.append(f"The shapes are kept in {shapes_kept_in} ({size / 1e6:.1f} MB), for --add.")
     return model
 
 
@@ -324,23 +338,25 @@ def _trusted(
     records: dict[Path, FitRecord] = {}
     for file in files:
         name = next((file.name.removesuffix(ending) for ending in _SURFACES if file.name.endswith(ending)), None)
-        if name is not None and is_result(beside := file.with_name(f"{name}{RECORD}")):
-            record = read_record(beside)
+        if name is not None and is_result(record_file := file.with_name(f"{name}{RECORD}")):
+            record = read_record(record_file)
             records[file] = FitRecord(status=record.status, model=record.model)  # all of each would be large
     doubtful = [file for file in files if file in records and records[file].status == "doubtful"]
     if not doubtful:
         return list(files), records
     named = ", ".join(file.name for file in doubtful[:_NAMED]) + (", ..." if len(doubtful) > _NAMED else "")
-    what = "1 surface of a doubtful fit is" if len(doubtful) == 1 else f"{len(doubtful)} surfaces of doubtful fits are"
+    count_text = (
+        "1 surface of a doubtful fit is" if len(doubtful) == 1 else f"{len(doubtful)} surfaces of doubtful fits are"
+    )
     if with_doubtful:
-        notes.append(f"{what} taken too ({named}).")
+        notes.append(f"{count_text} taken too ({named}).")
         return list(files), records
     left = [file for file in files if file not in set(doubtful)]
     if not left:
         raise InputError(
             f"All meshes are surfaces of doubtful fits ({named}); --with-doubtful takes them all the same."
         )
-    notes.append(f"{what} left out ({named}); --with-doubtful takes them too.")
+    notes.append(f"{count_text} left out ({named}); --with-doubtful takes them too.")
     return left, {file: records[file] for file in left if file in records}
 
 
@@ -394,22 +410,23 @@ def _missing(meshes: Sequence[Mesh], landmarks: SurfaceLandmarks, config: BuildF
         )
     missing, every = sum(holed), len(meshes) * len(meshes[0].vertices)
     where, share = sum(count > 0 for count in holed), 100 * missing / every
-    told = [f"{missing} of {every} vertices are missing ({share:.1f} %), in {where} of {len(meshes)} meshes."]
+    sentences = [f"{missing} of {every} vertices are missing ({share:.1f} %), in {where} of {len(meshes)} meshes."]
     if config.model.representation != "vertices":
-        return told
-    kept = ObservedMeshes.of(meshes, _min_seen(config))
-    if out := int((~kept.vertices).sum()):
-        what = "1 vertex is" if out == 1 else f"{out} vertices are"
-        told.append(
-            f"{what} taken out of the model, since fewer than {100 * _min_seen(config):g} % of the meshes show them; "
+        return sentences
+    observed = ObservedMeshes.of(meshes, _min_seen(config))
+    if out := int((~observed.vertices).sum()):
+        number = "1 vertex is" if out == 1 else f"{out} vertices are"
+        sentences.append(
+            f"{number} taken out of the model, since fewer than {100 * _min_seen(config):g} % of the meshes show "
+            "them; "
             "--min-seen says how many must."
         )
-    if lost := sorted(set(landmarks) - set(kept.landmarks(landmarks))):
-        told.append(
+    if lost := sorted(set(landmarks) - set(observed.landmarks(landmarks))):
+        sentences.append(
             f"The model has no {', '.join(lost)}, since these landmarks lie in triangles with vertices that are taken "
             "out."
         )
-    return told
+    return sentences
 
 
 def _landmarks(
@@ -423,14 +440,14 @@ def _landmarks(
     mm = MM_PER_UNIT[config.unit]
     if config.landmarks is not None:
         return _read_landmarks(config.landmarks, first, mm, notes)
-    beside = files[0].parent / "landmarks.csv"
-    if beside.is_file():
+    landmark_file = files[0].parent / "landmarks.csv"
+    if landmark_file.is_file():
         try:
-            marks = _read_landmarks(beside, first, mm, placed := list[str]())
+            marks = _read_landmarks(landmark_file, first, mm, placed := list[str]())
         except ShapespaceError as error:
-            notes.append(f"The model has no landmarks, since {beside} cannot be used: {error}")
+            notes.append(f"The model has no landmarks, since {landmark_file} cannot be used: {error}")
             return SurfaceLandmarks()
-        notes += [f"Landmarks are taken from {beside}.", *placed]
+        notes += [f"Landmarks are taken from {landmark_file}.", *placed]
         return marks
     return _landmarks_of_parent(files, records, first, notes)
 
@@ -499,8 +516,8 @@ def _with_origin(files: Sequence[Path], config: BuildFilesConfig, notes: list[st
             notes.append(f"Provenance and licence are taken from {files[0].parent / ABOUT}.")
             return _with_words(config, f"{len(files)} meshes of: {about[0]}", about[1])
         notes.append("The meshes come from folders of different origin, so give --provenance and --licence.")
-    said = config.model.provenance or f"{len(files)} meshes, {files[0].name} to {files[-1].name}"
-    return _with_words(config, said, config.model.licence)
+    provenance = config.model.provenance or f"{len(files)} meshes, {files[0].name} to {files[-1].name}"
+    return _with_words(config, provenance, config.model.licence)
 
 
 def _with_words(config: BuildFilesConfig, provenance: str, licence: str) -> BuildFilesConfig:
@@ -518,10 +535,12 @@ def _additive(
     from shapespace.model.additive import AdditiveModel
 
     known = read_labels(labels)
-    found = [label_of(known, file) for file in files]
-    own = [label for label in found if label is not None and label.subject]
+    mesh_labels = [label_of(known, file) for file in files]
+    own = [label for label in mesh_labels if label is not None and label.subject]
     if len(own) < len(files):
-        lacking = [file.name for file, label in zip(files, found, strict=True) if label is None or not label.subject]
+        lacking = [
+            file.name for file, label in zip(files, mesh_labels, strict=True) if label is None or not label.subject
+        ]
         raise InputError(
             f"{labels} has no subject for {', '.join(lacking[:3])}; each mesh needs a label and a subject."
         )

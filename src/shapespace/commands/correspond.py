@@ -26,7 +26,7 @@ from shapespace.correspondence.correspondence_result import Correspondence, Corr
 from shapespace.correspondence.first_template import first_template
 from shapespace.correspondence.groupwise import ENOUGH_TO_JUDGE, correspond
 from shapespace.correspondence.landmark_guide import stray_landmarks, without_stray_landmarks
-from shapespace.correspondence.place import RegistrationTask, RoundContext, ScanRegistration
+from shapespace.correspondence.registration import RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.scan_set import copies, unit_ratios
 from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.errors import ShapespaceError
@@ -50,10 +50,10 @@ _BROKEN = "broken: "
 _UNREADABLE = "unreadable"
 _WITH_OTHER_FILES = (".gltf",)
 """Endings of mesh formats that can store vertices in other files."""
-_LISTED = 10
+_LISTED = 10  # names in a message, so that it stays readable
 _ANOTHER_SHAPE = 0.25
 """The mean change of another object, as a share of its size."""
-_OTHER_SIZE = 2.0
+_OTHER_SIZE = 2.0  # ratio of sizes: beyond twice the median a scan is probably of another object or unit
 _ENOUGH_TO_COMPARE, _FAR = 4, 3.0
 """Times the usual distance (95 % of both directions), sizes divided out."""
 _Say: TypeAlias = Callable[[str], None]
@@ -99,10 +99,10 @@ def correspond_files(
         InputError: fewer than two scans, or too few that can be reached.
     """
     given = given_scans(files.scans, folder, recursive=files.recursive, say=say)
-    found = list({one.place: one for one in given}.values())
-    scans = [one for one in found if not one.path.name.endswith(SURFACE)]
-    if len(scans) < len(found):
-        say(f"{len(found) - len(scans)} surfaces of an earlier correspondence are not taken for scans.")
+    distinct = list({one.source: one for one in given}.values())
+    scans = [one for one in distinct if not one.path.name.endswith(SURFACE)]
+    if len(scans) < len(distinct):
+        say(f"{len(distinct) - len(scans)} surfaces of an earlier correspondence are not taken for scans.")
     make_folder(folder)
     with only_writer(folder):
         return _corresponding(_jobs(scans), files, folder, config, quiet=quiet, say=say)
@@ -291,7 +291,7 @@ def _looked_at(scan: Mesh, *, strict: bool) -> tuple[Mesh, list[str]]:
         MeshError: it cannot be used.
     """
     mesh, findings = repair(scan, strict=strict)
-    notes = [f"{one.what} {one.action}" for one in findings if one.level == "note" or NON_FINITE in one.what]
+    notes = [f"{one.problem} {one.action}" for one in findings if one.level == "note" or NON_FINITE in one.problem]
     return without_stray_landmarks(mesh), [*notes, *_told_astray(mesh)]
 
 
@@ -377,9 +377,9 @@ def _tell(records: Sequence[CorrespondRecord], made: Correspondence, given: str,
         say(f"Notes on {len(noted) - _LISTED} more scans are in their records.")
     if others := [record for record in records if record.unit_ratio != 1.0]:
         named = ", ".join(record.name for record in others[:_LISTED]) + (", ..." if len(others) > _LISTED else "")
-        what = "scans is" if len(others) == 1 else "scans are"
+        noun = "scans is" if len(others) == 1 else "scans are"
         say(
-            f"{len(others)} of {len(records)} {what} in another unit than the majority, judging by size ({named}); "
+            f"{len(others)} of {len(records)} {noun} in another unit than the majority, judging by size ({named}); "
             "so are the surfaces, and build converts them to the unit of the majority."
         )
 
@@ -416,7 +416,7 @@ def _with_far_ones(records: Sequence[CorrespondRecord]) -> list[CorrespondRecord
     far = np.array([(r.distance_p95 or np.nan) / ((r.scale or np.nan) * r.unit_ratio) for r in records])
     if np.isfinite(far).sum() < _ENOUGH_TO_COMPARE:
         return list(records)
-    beside = far / np.nanmedian(far)
+    ratios = far / np.nanmedian(far)
     return [
         record
         if not times > _FAR
@@ -424,7 +424,7 @@ def _with_far_ones(records: Sequence[CorrespondRecord]) -> list[CorrespondRecord
             record,
             notes=[*record.notes, f"Its surface lies {times:.2g} times as far from it as is usual; look at it."],
         )
-        for record, times in zip(records, beside, strict=True)
+        for record, times in zip(records, ratios, strict=True)
     ]
 
 

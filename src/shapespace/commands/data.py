@@ -92,8 +92,8 @@ def write_simulated_faces(
             )  # fmt: skip
     licence, of = ("MIT", f"ICT-FaceKit, area {area or 'face'}") if source == "ict-facekit" else (LICENSE, "shapespace")
     who = "people who vary widely" if wide else "people"
-    said = f"{subjects} simulated {who} of {of}, seed {seed}, expressions: {', '.join(expressions)}"
-    write_about(folder, said, licence)
+    description = f"{subjects} simulated {who} of {of}, seed {seed}, expressions: {', '.join(expressions)}"
+    write_about(folder, description, licence)
     return total
 
 

@@ -22,7 +22,7 @@ from shapespace.store.results import ENDING, ENDINGS, Results, modes_of
 from shapespace.store.rows import META, coefficient_columns, kind_of
 
 _MAT_HEADER, _MAT_HEADER_BYTES = b"MATLAB 5.0 MAT-file, written by shapespace", 116
-_LONGEST_IN_MATLAB = 63
+_LONGEST_IN_MATLAB = 63  # characters; MATLAB's namelengthmax
 
 
 def export(
@@ -93,8 +93,8 @@ def _write(results: Results, name: str, output: Path) -> None:
         else:
             write_mesh(path, results.surface(name, kind))
     # No table of a store has the landmarks in columns; the record has them, and their files are made of it again.
-    if found := results.fit(name).found_landmarks:
-        for ending, text in fiducial_texts(to_json(found)).items():
+    if landmarks := results.fit(name).found_landmarks:
+        for ending, text in fiducial_texts(to_json(landmarks)).items():
             write_text(output / f"{name}{ending}", text)
     write_bytes(output / f"{name}{ENDING}", results.record_bytes(name))
 

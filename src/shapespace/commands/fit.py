@@ -34,7 +34,7 @@ from shapespace.store.manifest import read_manifest
 
 FULL_CHECK_BYTES = 2**28
 """Scans of so many bytes together are read whole before the first fit (256 MiB: 0.4 s of binary PLY, 14 s of OBJ)."""
-_LISTED = 10
+_LISTED = 10  # names in a message, so that it stays readable
 _STATUSES = ("converged", "max_iterations", "doubtful", "failed")
 _SURFACES = (".fitted.ply", ".dense.ply")
 
@@ -128,9 +128,9 @@ class _Watch:
     def say_removed(self) -> None:
         if self.removed:
             named = ", ".join(self.removed[:_LISTED]) + (", ..." if len(self.removed) > _LISTED else "")
-            what = "1 scan has" if len(self.removed) == 1 else f"{len(self.removed)} scans have"
+            count_text = "1 scan has" if len(self.removed) == 1 else f"{len(self.removed)} scans have"
             self.say(
-                f"{what} vertices with {NON_FINITE}, which were removed with their triangles ({named}); --strict "
+                f"{count_text} vertices with {NON_FINITE}, which were removed with their triangles ({named}); --strict "
                 "refuses such scans."
             )
 
@@ -222,7 +222,7 @@ def _refuse_to_overwrite(job: Job, folder: Path) -> None:
 
 def _scans(scans: Sequence[str | Path], folder: Path, *, recursive: bool, say: Callable[[str], None]) -> list[Given]:
     """Return the files to fit: without the surfaces that earlier runs left, where scans and results mix."""
-    found = given_scans(scans, folder, recursive=recursive, say=say)
+    scans_found = given_scans(scans, folder, recursive=recursive, say=say)
     here = folder.resolve()
     given = {Path(one).resolve() for one in scans if not is_address(str(one))}
 
@@ -234,11 +234,11 @@ def _scans(scans: Sequence[str | Path], folder: Path, *, recursive: bool, say: C
             return False
         return scan.parent.resolve() == here or not {scan.resolve(), scan.parent.resolve()} & given
 
-    left = [one for one in found if not is_result(one.place)]
+    left = [one for one in scans_found if not is_result(one.source)]
     if not left:
         raise InputError(f"{folder} holds only results of earlier fits; give the scans, or another folder for results.")
-    if len(left) < len(found):
-        results = len(found) - len(left)
-        what = "1 surface of an earlier fit is" if results == 1 else f"{results} surfaces of earlier fits are"
-        say(f"{what} not taken for a scan." if results == 1 else f"{what} not taken for scans.")
+    if len(left) < len(scans_found):
+        results = len(scans_found) - len(left)
+        count_text = "1 surface of an earlier fit is" if results == 1 else f"{results} surfaces of earlier fits are"
+        say(f"{count_text} not taken for a scan." if results == 1 else f"{count_text} not taken for scans.")
     return left

@@ -22,7 +22,7 @@ _PLACES = ("scan", "file", "path", "specimen", "name", "id")
 _LANDMARKS, _ID = "landmarks", "id"
 _LARGEST_BYTES = 2**26
 """Largest size of a list of scans in bytes; a million rows need less."""
-_LONGEST = 200
+_LONGEST = 200  # bytes of an id; file systems allow 255, and endings follow it
 
 
 @dataclass(frozen=True)
@@ -30,13 +30,13 @@ class Given:
     """A scan as it was given.
 
     Args:
-        place: path of the scan, or its address.
+        source: path of the scan, or its address.
         called: by the column `id` of a list, or empty.
         metadata: the other columns of the list.
         landmarks: of the scan, by the column `landmarks` of the list; None where it names none.
     """
 
-    place: Path | str
+    source: Path | str
     called: str = ""
     metadata: dict[str, str] = field(default_factory=dict[str, str])
     landmarks: Path | None = None
@@ -44,14 +44,14 @@ class Given:
     @property
     def address(self) -> str:
         """Of a scan that lies elsewhere; else empty."""
-        return self.place if isinstance(self.place, str) else ""
+        return self.source if isinstance(self.source, str) else ""
 
     @property
     def path(self) -> Path:
         """Of the scan; of one that lies elsewhere, what it would be, for its name."""
-        if isinstance(self.place, Path):
-            return self.place
-        head = self.place.split("::", 1)[0].partition("?")[0]
+        if isinstance(self.source, Path):
+            return self.source
+        head = self.source.split("::", 1)[0].partition("?")[0]
         return Path("/", *(part for part in head.replace("://", "/").split("/") if part not in ("", ".", "..")))
 
 
@@ -66,27 +66,27 @@ def given_scans(
             `id`, perhaps `id` and `landmarks` as well, and others that are kept.
         folder: of the results, not looked into.
         recursive: whether to take what lies in folders below too.
-        say: told what was not taken.
+        say: called with each message on skipped files.
 
     Raises:
         InputError: there is nothing, or a list is not one.
         FileError: a folder, a list or an address cannot be read.
     """
-    found: list[Given] = []
+    rows: list[Given] = []
     for one in scans:
         text = str(one)
         if not is_address(text) and text.lower().endswith(_LISTS) and Path(text).is_file():
             for row in _rows(Path(text)):
-                there = _expanded(row.place, folder, recursive=recursive, say=say)
+                there = _expanded(row.source, folder, recursive=recursive, say=say)
                 if row.called and len(there) > 1:
                     raise InputError(f"{text}: {row.called} stands for {len(there)} scans; give a row for each.")
                 if row.landmarks is not None and len(there) > 1:
                     raise InputError(f"{text}: the landmarks {row.landmarks} cannot be those of {len(there)} scans.")
-                found += [replace(row, place=place) for place in there]
+                rows += [replace(row, source=source) for source in there]
         else:
-            found += [Given(place) for place in _expanded(text, folder, recursive=recursive, say=say)]
-    _refuse_doubles(found)
-    return found
+            rows += [Given(source) for source in _expanded(text, folder, recursive=recursive, say=say)]
+    _refuse_doubles(rows)
+    return rows
 
 
 def with_ids(jobs: Sequence[Job], given: Sequence[Given]) -> list[Job]:
@@ -133,7 +133,7 @@ def _rows(file: Path) -> list[Given]:
         content = read_bytes(file)
         if file.suffix.lower() == ".txt":
             lines = [line.strip() for line in decoded_text(content).splitlines()]
-            rows = [Given(_beside(file, line)) for line in lines if line and not line.startswith("#")]
+            rows = [Given(_relative_to(file, line)) for line in lines if line and not line.startswith("#")]
         else:
             rows = _table(file, content)
     except ValueError as error:
@@ -161,36 +161,36 @@ def _table(file: Path, content: bytes) -> list[Given]:
         cells = [cell.strip() for cell in line]
         if any("\0" in cell for cell in cells):
             raise ValueError("is not a table but binary")
-        place, marks = cells[column], "" if marks_by is None else cells[marks_by]
+        source, marks = cells[column], "" if marks_by is None else cells[marks_by]
         called = "" if called_by is None or called_by == column else cells[called_by]
-        if not place:
+        if not source:
             raise InputError(f"{file}: row {number} names no scan in the column {header[column]}.")
         if called and (called.startswith(".") or len(called.encode()) > _LONGEST or set(called) & set('/\\:*?"<>|\0')):
             raise InputError(f"{file}: row {number} has an id that no file can have, {called[:40]!r}; change it.")
-        known = {head: cells[at] for at, head in enumerate(header) if head and at not in own}
-        rows.append(Given(_scan_at(file, place), called, known, file.parent / marks if marks else None))
+        known = {head: cells[index] for index, head in enumerate(header) if head and index not in own}
+        rows.append(Given(_scan_source(file, source), called, known, file.parent / marks if marks else None))
     return rows
 
 
-def _scan_at(file: Path, place: str) -> Path | str:
+def _scan_source(file: Path, text: str) -> Path | str:
     """Return the place of a scan, which may be named without its ending where one mesh file has that name."""
-    found = _beside(file, place)
-    if isinstance(found, str) or found.name.lower().endswith(MESH_FILE_ENDINGS) or glob.has_magic(place):
-        return found
+    source = _relative_to(file, text)
+    if isinstance(source, str) or source.name.lower().endswith(MESH_FILE_ENDINGS) or glob.has_magic(text):
+        return source
     try:
-        there = [one for one in sorted(found.parent.glob(f"{found.name}.*")) if stem_of(one) == found.name]
+        there = [one for one in sorted(source.parent.glob(f"{source.name}.*")) if stem_of(one) == source.name]
         meshes = [one for one in there if one.name.lower().endswith(MESH_FILE_ENDINGS)]
-        return meshes[0] if len(meshes) == 1 and not found.exists() else found
+        return meshes[0] if len(meshes) == 1 and not source.exists() else source
     except (OSError, ValueError):
-        return found  # the reader of the scans reports such a name
+        return source  # the reader of the scans reports such a name
 
 
-def _beside(file: Path, text: str) -> Path | str:
+def _relative_to(file: Path, text: str) -> Path | str:
     return text if is_address(text) else file.parent / text
 
 
-def _refuse_doubles(found: Sequence[Given]) -> None:
+def _refuse_doubles(scans: Sequence[Given]) -> None:
     named: dict[str, Given] = {}
-    for one in found:
-        if one.called and named.setdefault(one.called.casefold(), one).place != one.place:
+    for one in scans:
+        if one.called and named.setdefault(one.called.casefold(), one).source != one.source:
             raise InputError(f"Two scans have the id {one.called}; give each one of its own.")

@@ -12,7 +12,7 @@ from shapespace.io.landmarks.landmark_io import LANDMARK_FORMATS, READ_ONLY_LAND
 from shapespace.io.meshes.mesh_io import stem_of
 from shapespace.types import Mesh
 
-_LISTED = 5
+_LISTED = 5  # names in a message, so that it stays short
 
 
 def _is_result(file: Path) -> bool:
@@ -49,18 +49,18 @@ class LandmarkFiles:
         if not folder.is_dir():
             raise FileError(f"{folder} is no folder; give one with landmarks in files named as the scans.")
         endings = sorted([*LANDMARK_FORMATS, *READ_ONLY_LANDMARKS], key=len, reverse=True)
-        found: dict[str, Path] = {}
+        files: dict[str, Path] = {}
         unread: list[str] = []
         for file in sorted(folder.iterdir()):
             ending = next((one for one in endings if file.name.lower().endswith(one)), None)
             if ending is None or not file.is_file() or _is_result(file):
                 continue
-            first = found.setdefault(file.name[: -len(ending)], file)
+            first = files.setdefault(file.name[: -len(ending)], file)
             if first is not file:
                 unread.append(f"{file.name} is not read, since {first.name} has landmarks of the same scan.")
-        if not found:
+        if not files:
             raise FileError(f"{folder} holds no landmarks; they are read from files with {', '.join(endings)}.")
-        return LandmarkFiles(folder, found, unread=unread)
+        return LandmarkFiles(folder, files, unread=unread)
 
     def refuse_shared(self, scans: Sequence[Path]) -> None:
         """Raise InputError where two of `scans`, of one name in different folders, would take the same landmarks."""

@@ -35,13 +35,13 @@ def check(
         paths: files and folders.
         recursive: whether to take what lies in folders below these too.
         strict: whether a mesh with triangles that use vertices with non-finite coordinates is not usable.
-        say: told what was not taken.
+        say: called with each message on skipped files.
     """
     reports: list[dict[str, Any]] = []
-    found = mesh_files(paths, recursive=recursive)
-    for sentence in found.left_out:
+    listed = mesh_files(paths, recursive=recursive)
+    for sentence in listed.left_out:
         say(sentence)
-    for path in found.files:
+    for path in listed.files:
         try:
             report = examine(read_mesh(path), strict=strict)
         except ShapespaceError as error:
@@ -51,9 +51,9 @@ def check(
             short = f"{path}: not enough memory to read it; thin the scan first, as by MeshLab."
             reports.append({"file": str(path), "usable": False, "error": short})
             continue
-        facts = asdict(report)
-        usable = not any(finding["level"] == "refused" for finding in facts["findings"])
-        reports.append({"file": str(path), "usable": usable, **facts})
+        usable = not any(finding.level == "refused" for finding in report.findings)
+        findings = [{"level": one.level, "what": one.problem, "action": one.action} for one in report.findings]
+        reports.append({"file": str(path), "usable": usable, **asdict(report), "findings": findings})
     return reports
 
 
@@ -127,10 +127,10 @@ def correspondence_facts(folder: Path) -> dict[str, Any]:
             f"{folder} is a folder without {CorrespondenceRecord.FILE}; give a model, a mesh, a .fit.json, or a folder "
             "that shapespace correspond wrote."
         )
-    at = Corresponded(folder)
-    population = at.population()
-    records = [at.records[name] for name in population.names]
-    concerns = concerns_of(at)
+    result = Corresponded(folder)
+    population = result.population()
+    records = [result.records[name] for name in population.names]
+    concerns = concerns_of(result)
     far = {
         which: median(
             [distance_share(record, which, size) for record, size in zip(records, population.sizes, strict=True)]
@@ -139,23 +139,23 @@ def correspondence_facts(folder: Path) -> dict[str, Any]:
     }
     return {
         "folder": str(folder),
-        "scans": len(at.records) + len(at.unread),
+        "scans": len(result.records) + len(result.unread),
         "in_correspondence": len(records),
-        "set_aside": {record.name: record.reason for record in at.set_aside},
-        "unreadable": {**at.unread, **population.unread},
-        "to_be_looked_at": {name: concern.told for name, concern in concerns.items() if concern.reasons},
-        "vertices": len(at.mean.vertices),
-        "triangles": len(faces_of(at.mean)),
-        "template": at.run.template,
-        "units_mixed": at.units_mixed,
+        "set_aside": {record.name: record.reason for record in result.set_aside},
+        "unreadable": {**result.unread, **population.unread},
+        "to_be_looked_at": {name: concern.text for name, concern in concerns.items() if concern.reasons},
+        "vertices": len(result.mean.vertices),
+        "triangles": len(faces_of(result.mean)),
+        "template": result.run.template,
+        "units_mixed": result.units_mixed,
         "distance_share_median": far,
         "seen_share_median": median([known(record.seen_share) for record in records]),
         "vertices_missing_somewhere": int((population.seen_count < len(records)).sum()),
         "scans_with_folds": sum(bool(record.folded_share) for record in records),
-        "moved_share_by_round": list(at.run.rounds),
-        "settled": bool(at.run.rounds) and at.run.rounds[-1] < at.settled,
+        "moved_share_by_round": list(result.run.rounds),
+        "settled": bool(result.run.rounds) and result.run.rounds[-1] < result.settled,
         "cpu_s": sum(sum(record.cpu_s) for record in records),
-        "version": at.run.version,
+        "version": result.run.version,
     }
 
 
@@ -179,7 +179,7 @@ def model_facts(model: ShapeModel) -> dict[str, Any]:
         "noise_variance_mm2": model.noise_variance,
         "landmarks": list(model.landmarks),
         **_landmark_distances(model),
-        **({"regions": {name: len(at) for name, at in model.regions.items()}} if model.regions else {}),
+        **({"regions": {name: len(vertices) for name, vertices in model.regions.items()}} if model.regions else {}),
         "representation": model.representation,
         **({} if counts is None else {"control_points": counts.tolist()}),
         "provenance": model.provenance,

@@ -28,7 +28,7 @@ from shapespace.store.results import mesh_at
 from shapespace.types import Mesh
 
 _SURFACES = (".dense.ply", ".fitted.ply", SURFACE)
-_MOST_TARGETS = 2
+_MOST_TARGETS = 2  # differences are computed between two targets
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class _Target:
     """A model or meshes in correspondence, by a name that tells it from the other."""
 
     name: str
-    what: ShapeModel | Sequence[Mesh]
+    data: ShapeModel | Sequence[Mesh]
     config: QualityConfig
     unit_ratios: Mapping[str, float] = field(default_factory=dict[str, float])
     """Of meshes by their names without endings, as of `CorrespondRecord`."""
@@ -70,7 +70,7 @@ class _Target:
     @property
     def names(self) -> list[str]:
         """Names of its meshes, without endings."""
-        return [] if isinstance(self.what, ShapeModel) else [surface_stem(Path(mesh.name)) for mesh in self.what]
+        return [] if isinstance(self.data, ShapeModel) else [surface_stem(Path(mesh.name)) for mesh in self.data]
 
 
 def quality(
@@ -91,21 +91,21 @@ def quality(
         InputError: targets that there are not, too few meshes, or two that have not the same shapes.
     """
     notes: list[str] = []
-    found = _targets(targets, options, notes, quiet=quiet)
+    loaded = _targets(targets, options, notes, quiet=quiet)
     make_folder(output)
     run = QualityRunner(execution, output, quiet)
-    measured = [_measure(target, options, run, quiet=quiet) for target in found]
-    parts = [_as_quality(t, m, options) for t, m in zip(found, measured, strict=True)]
-    notes += [_missing(t, m) for t, m in zip(found, measured, strict=True) if m.missing_share or m.left_out_vertices]
+    measured = [_measure(target, options, run, quiet=quiet) for target in loaded]
+    parts = [_as_quality(t, m, options) for t, m in zip(loaded, measured, strict=True)]
+    notes += [_missing(t, m) for t, m in zip(loaded, measured, strict=True) if m.missing_share or m.left_out_vertices]
     result = parts[0]
     if len(parts) > 1:
         differences = {name: _measured(c) for name, c in measured[0].differences(measured[1]).items()}
-        told = _told_apart(found, measured[0].differences(measured[1]))
+        comparison = _comparison_sentences(loaded, measured[0].differences(measured[1]))
         result = replace_quality(
-            result, others=(parts[1],), differences=differences, sentences=(*result.sentences, *told)
+            result, others=(parts[1],), differences=differences, sentences=(*result.sentences, *comparison)
         )
-    for target in found:
-        if isinstance(target.what, ShapeModel):
+    for target in loaded:
+        if isinstance(target.data, ShapeModel):
             notes.append(
                 f"{target.name} is a model file, which does not keep its training shapes: only compactness is "
                 "computed; generalisation and specificity need a folder"
@@ -141,7 +141,7 @@ def _targets(paths: Sequence[Path], options: QualityOptions, notes: list[str], *
     for k, name in pairs:
         called = f"{paths[k]}, {name}" if several else str(paths[k])
         out.append(_Target(called, loaded[k][0], _of_representation(options.config, name, names), loaded[k][1]))
-    if len(out) == _MOST_TARGETS and not any(isinstance(target.what, ShapeModel) for target in out):
+    if len(out) == _MOST_TARGETS and not any(isinstance(target.data, ShapeModel) for target in out):
         _refuse_unlike(out)
     return out
 
@@ -156,22 +156,22 @@ def _refuse_unlike(targets: Sequence[_Target]) -> None:
     first, second = (target.names for target in targets)
     if len(first) != len(second) or (first != second and set(first) & set(second)):
         lacking = sorted(set(first) ^ set(second))
-        shown = f" ({', '.join(lacking[:3])})" if lacking else ""
+        names_text = f" ({', '.join(lacking[:3])})" if lacking else ""
         raise InputError(
             f"{targets[0].name} has {len(first)} shapes and {targets[1].name} {len(second)}, and they are compared "
-            f"shape by shape; give the same ones in both{shown}."
+            f"shape by shape; give the same ones in both{names_text}."
         )
 
 
 def _meshes(folder: Path, notes: list[str], gauge: Gauge, *, quiet: bool) -> tuple[list[Mesh], dict[str, float]]:
     """Return the meshes of a folder in the unit of most of them, and the ratios of those that were in another."""
-    found = surface_files([folder])
-    notes += found.notes
+    listed = surface_files([folder])
+    notes += listed.notes
     if gauge == "form":
-        found.refuse_mixed_units()
-    if found.unit_ratios:
-        notes.append(found.told_units("mm"))
-    files = list(found.files)
+        listed.refuse_mixed_units()
+    if listed.unit_ratios:
+        notes.append(listed.told_units("mm"))
+    files = list(listed.files)
     for ending in _SURFACES:
         if surfaces := [file for file in files if file.name.endswith(ending)]:
             if len(surfaces) < len(files):
@@ -187,9 +187,9 @@ def _meshes(folder: Path, notes: list[str], gauge: Gauge, *, quiet: bool) -> tup
                 raise MeshError(naming(file, str(error))) from error
             if not len(mesh.vertices):
                 raise MeshError(f"{file}: it has no vertices; leave it out.")
-            out.append(_scaled(replace(mesh, name=file.name), found.unit_ratios.get(file, 1.0)))
+            out.append(_scaled(replace(mesh, name=file.name), listed.unit_ratios.get(file, 1.0)))
             bar.update()
-    return out, {surface_stem(file): ratio for file, ratio in found.unit_ratios.items()}
+    return out, {surface_stem(file): ratio for file, ratio in listed.unit_ratios.items()}
 
 
 def _scaled(mesh: Mesh, ratio: float) -> Mesh:
@@ -199,7 +199,7 @@ def _scaled(mesh: Mesh, ratio: float) -> Mesh:
 
 def _scans(target: _Target, folder: Path | None, *, quiet: bool) -> list[Mesh] | None:
     """Return the scans of the meshes of a target, in their order; None where none are given, or none are needed."""
-    if folder is None or isinstance(target.what, ShapeModel):
+    if folder is None or isinstance(target.data, ShapeModel):
         return None
     by_name = {surface_stem(file): file for file in mesh_files([folder]).files}
     lacking = [name for name in target.names if name not in by_name]
@@ -221,69 +221,71 @@ def _measure(target: _Target, options: QualityOptions, run: Runner, *, quiet: bo
     unseen = [] if options.unseen is None else _meshes(options.unseen, [], "shape", quiet=quiet)[0]
     scans = _scans(target, options.scans, quiet=quiet)
     with steps(None, f"measuring {target.name}, in", "step", quiet=quiet) as step:
-        return measure_quality(target.what, target.config, scans=scans, unseen=unseen, progress=step, run=run)
+        return measure_quality(target.data, target.config, scans=scans, unseen=unseen, progress=step, run=run)
 
 
-def _missing(target: _Target, found: ModelQuality) -> str:
-    said = (
-        f"{target.name}: {100 * found.missing_share:.1f} % of the vertices are missing, and nothing is measured there"
+def _missing(target: _Target, result: ModelQuality) -> str:
+    text = (
+        f"{target.name}: {100 * result.missing_share:.1f} % of the vertices are missing, and nothing is measured there"
     )
-    if not found.left_out_vertices:
-        return f"{said}."
-    what = "1 vertex" if found.left_out_vertices == 1 else f"{found.left_out_vertices} vertices"
-    return f"{said}; {what} that fewer than half of the meshes show {'is' if what[:2] == '1 ' else 'are'} left out."
+    if not result.left_out_vertices:
+        return f"{text}."
+    number = "1 vertex" if result.left_out_vertices == 1 else f"{result.left_out_vertices} vertices"
+    return f"{text}; {number} that fewer than half of the meshes show {'is' if number[:2] == '1 ' else 'are'} left out."
 
 
 def _measured(curve: Curve) -> Measured:
     low, high = tuple(curve.low.tolist()), tuple(curve.high.tolist())
-    return Measured(mean=tuple(curve.mean.tolist()), modes=tuple(curve.at.tolist()), low=low, high=high)
+    return Measured(mean=tuple(curve.mean.tolist()), modes=tuple(curve.counts.tolist()), low=low, high=high)
 
 
-def _as_quality(target: _Target, found: ModelQuality, options: QualityOptions) -> Quality:
-    def told(curve: Curve | None) -> Measured | None:
+def _as_quality(target: _Target, result: ModelQuality, options: QualityOptions) -> Quality:
+    def measured(curve: Curve | None) -> Measured | None:
         return None if curve is None else _measured(curve)
 
-    size = found.by_shapes
+    size = result.by_shapes
     by_shapes = None
     if size is not None:
         lists = (tuple(values.tolist()) for values in (size.mean, size.low, size.high))
         mean, low, high = lists
-        by_shapes = BySize(shapes=tuple(size.at.tolist()), mean=mean, low=low, high=high)
+        by_shapes = BySize(shapes=tuple(size.counts.tolist()), mean=mean, low=low, high=high)
     return Quality(
         name=target.name,
-        compactness=told(found.compactness),
-        generalisation=told(found.generalisation),
-        specificity=told(found.specificity),
-        generalisation_vertices=told(found.generalisation_vertices),
-        specificity_vertices=told(found.specificity_vertices),
-        reconstruction=told(found.reconstruction),
-        reconstruction_vertices=told(found.reconstruction_vertices),
+        compactness=measured(result.compactness),
+        generalisation=measured(result.generalisation),
+        specificity=measured(result.specificity),
+        generalisation_vertices=measured(result.generalisation_vertices),
+        specificity_vertices=measured(result.specificity_vertices),
+        reconstruction=measured(result.reconstruction),
+        reconstruction_vertices=measured(result.reconstruction_vertices),
         generalisation_by_shapes=by_shapes,
-        supported_modes=found.supported_modes,
-        sentences=found.sentences(),
+        supported_modes=result.supported_modes,
+        sentences=result.sentences(),
         settings={
             **asdict(target.config),
-            "folds": found.folds,
-            "shapes": found.shapes,
-            "points": found.points,
-            "missing_share": found.missing_share,
-            "left_out_vertices": found.left_out_vertices,
+            "folds": result.folds,
+            "shapes": result.shapes,
+            "points": result.points,
+            "missing_share": result.missing_share,
+            "left_out_vertices": result.left_out_vertices,
             "scans": None if options.scans is None else str(options.scans),
             "unseen": None if options.unseen is None else str(options.unseen),
         },
     )
 
 
-def _told_apart(targets: Sequence[_Target], differences: dict[str, Curve]) -> list[str]:
+def _comparison_sentences(targets: Sequence[_Target], differences: dict[str, Curve]) -> list[str]:
     """Return in a sentence which of two generalises better, with all modes."""
     curve = differences.get("generalisation", differences.get("reconstruction"))
     if curve is None:
         return []
     off, low, high = (float(values[-1]) for values in (curve.mean, curve.low, curve.high))
-    said = f"the surfaces of {targets[1].name} are off by {off:+.3f} mm (95 %: {low:+.3f} to {high:+.3f}) against "
-    said += f"{targets[0].name}"
+    difference = (
+        f"the surfaces of {targets[1].name} are off by {off:+.3f} mm (95 %: {low:+.3f} to {high:+.3f}) against "
+    )
+    difference += f"{targets[0].name}"
     verdict = "no difference shows" if low <= 0 <= high else f"{targets[0 if off > 0 else 1].name} is better"
-    return [f"On unseen shapes with {curve.at[-1]} modes {said}: {verdict}."]
+    return [f"On unseen shapes with {curve.counts[-1]} modes {difference}: {verdict}."]
 
 
 def _draw(result: Quality, output: Path, notes: list[str]) -> None:

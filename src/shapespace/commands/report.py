@@ -19,7 +19,7 @@ def write_report(folder: Path, output: Path | None, *, model: Path | None, label
 
     with progress(None, "drawing", "picture", quiet=quiet) as bar:
 
-        def step(what: str, planned: int) -> None:
+        def step(name: str, planned: int) -> None:
             bar.total = max(planned, bar.n + 1)
             bar.update()
 

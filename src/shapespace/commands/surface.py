@@ -21,10 +21,10 @@ from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.io.volumes.volume_io import VOLUME_ENDINGS, read_volume, require_volumes_extra, volume_name
 from shapespace.types import MAX_MEMORY_BYTES
 
-_MANY = 4
-_MOST_OF_MEMORY = 0.8
-_OTHER_SIZE = 0.02
-_OTHER_VOLUME = 4.0
+_MANY = 4  # surfaces; a median of fewer does not show what is usual
+_MOST_OF_MEMORY = 0.8  # share of the free memory; the rest is for other processes
+_OTHER_SIZE = 0.02  # relative difference of voxel sizes beyond rounding in image headers
+_OTHER_VOLUME = 4.0  # ratio to the median volume; beyond it probably another object
 
 
 def write_surfaces(
@@ -39,21 +39,22 @@ def write_surfaces(
     quiet: bool = False,
     say: Callable[[str], None],
 ) -> list[dict[str, Any]]:
-    """Write the surface of each volume as NAME.ply into `folder`, RAS in mm, and return the facts of each, in order.
+    """Write the surface of each volume as NAME.ply into `folder`, in RAS coordinates and mm.
 
-    A volume that cannot be used has an `error`, and the others go on.
+    Returns:
+        A record of each volume, in order; that of an unusable volume has an `error`.
 
     Args:
         paths: label volumes, and folders of them.
-        folder: where surfaces go.
+        folder: output folder.
         labels: labels that form one object, or `all` (default: the only label of the volume).
         smooth: standard deviation of the smoothing in voxels, 0 to 10; 0 for none (default 1.3).
         keep_pieces: keep all pieces and cavities (default: the largest piece, cavities filled, with a message).
         recursive: also search subfolders of the given folders.
         max_memory_bytes: memory limit for a volume and its surface; a volume that needs more is refused before it is
             read (default: `MAX_MEMORY_BYTES`, 4G, or 80 % of the free memory if that is less).
-        quiet: no progress.
-        say: told what was not taken, and which volumes cannot be used.
+        quiet: show no progress.
+        say: called with each message on skipped files and unusable volumes.
 
     Raises:
         ShapespaceError: the extra `volumes` is not installed.
@@ -61,11 +62,11 @@ def write_surfaces(
         InputError: a folder without volumes.
     """
     require_volumes_extra()
-    found = mesh_files(paths, recursive=recursive, apart_from=folder, endings=VOLUME_ENDINGS, kind_name="volumes")
-    for sentence in found.left_out:
+    listed = mesh_files(paths, recursive=recursive, apart_from=folder, endings=VOLUME_ENDINGS, kind_name="volumes")
+    for sentence in listed.left_out:
         say(sentence)
     make_folder(folder)
-    files = list({path.resolve(): path for path in found.files}.values())
+    files = list({path.resolve(): path for path in listed.files}.values())
     records: list[dict[str, Any]] = []
     limit = _default_limit() if max_memory_bytes is None else max_memory_bytes
     with progress(len(files), "making", "surface", quiet=quiet) as bar:
@@ -143,10 +144,10 @@ def _name_the_odd(records: Sequence[dict[str, Any]]) -> None:
     middle = float(np.median([record["volume_mm3"] for record in records]))
     usual = np.median(np.array([record["voxel_mm"] for record in records]), axis=0)
     others = [bool((np.abs(np.array(record["voxel_mm"]) / usual - 1) > _OTHER_SIZE).any()) for record in records]
-    told = " x ".join(f"{mm:.3g}" for mm in usual)
+    voxel_text = " x ".join(f"{mm:.3g}" for mm in usual)
     for record, other in zip(records, others, strict=True):
         if other and sum(others) < len(others) / 2:
-            _add(record, f"Most of the others have voxels of {told} mm.")
+            _add(record, f"Most of the others have voxels of {voxel_text} mm.")
         ratio = float(record["volume_mm3"]) / middle
         if not 1 / _OTHER_VOLUME < ratio < _OTHER_VOLUME:
             _add(record, f"Its volume is {ratio:.2g} times that in the middle of all.")

@@ -10,8 +10,8 @@ from shapespace.geometry.similarity import small_poses
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh
 
-MODES = 60
-RANGE_SHARE = 0.4
+MODES = 60  # slowest harmonics, three coordinates each
+RANGE_SHARE = 0.4  # share of the size; range of the smooth deformations (C2)
 AMPLITUDE_SHARE = 0.1
 """Of the Gaussian process, as shares of the shape's size: how far it reaches along the surface, how much it moves."""
 

@@ -22,7 +22,7 @@ from shapespace.correspondence.guide import ShapePredictor, predict_leave_one_ou
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.landmark_guide import ScanLandmarks, consensus_landmarks
 from shapespace.correspondence.mirror_image import MirrorMap
-from shapespace.correspondence.place import RegistrationTask, RoundContext, ScanRegistration
+from shapespace.correspondence.registration import RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.scan_set import unit_ratios
 from shapespace.correspondence.settings import FEWEST, SIZE, CorrespondConfig
 from shapespace.correspondence.template import PoseModel
@@ -37,7 +37,7 @@ from shapespace.types import FloatArray, Mesh, Similarity, SurfaceLandmarks
 
 ENOUGH_TO_JUDGE, _ENOUGH_TO_PREDICT = 6, 4
 """Scans: fewer do not determine the normal range of shapes; fewer do not predict another one."""
-_PARTS = 4
+_PARTS = 4  # folds of the shapes: the pose model of a scan is built without it
 _WHOLE, _LEAST_SPREAD, _SIZE_UNSEEN = 0.9, 0.01, 0.3
 """Scans that observe more than this share of the template determine the usual size; the least standard deviation of
 log sizes; and that of a scan's own log size for each share that is missing."""
@@ -211,12 +211,12 @@ def _pose_with_usual_size(state: RegistrationState, i: int) -> Similarity:
     """
     T, observed = state.registrations[i].T_scan_template, state.registrations[i].observed
     order = sorted(state.registrations)
-    whole = np.array([state.registrations[j].observed.mean() > _WHOLE for j in order])
-    if observed.mean() > _WHOLE or whole.sum() < _ENOUGH_TO_PREDICT:
+    complete = np.array([state.registrations[j].observed.mean() > _WHOLE for j in order])
+    if observed.mean() > _WHOLE or complete.sum() < _ENOUGH_TO_PREDICT:
         return T
     log_sizes = np.log(unit_ratios([state.registrations[j].T_scan_template.scale for j in order])[0])
-    usual = float(np.median(log_sizes[whole]))
-    spread = max(float(np.std(log_sizes[whole])), _LEAST_SPREAD)
+    usual = float(np.median(log_sizes[complete]))
+    spread = max(float(np.std(log_sizes[complete])), _LEAST_SPREAD)
     own = log_sizes[order.index(i)]
     shrinkage = 1.0 / (1.0 + (_SIZE_UNSEEN * (1.0 - observed.mean()) / spread) ** 2)
     ratio = float(np.exp((1.0 - shrinkage) * (usual - own)))  # C16

@@ -22,9 +22,10 @@ from shapespace.types import FloatArray, IntArray, Mesh, Similarity, SurfaceLand
 
 FEWEST = 3
 """Landmarks: fewer do not determine a pose."""
-_OFF_SHARE = 0.5
+_OFF_SHARE = 0.5  # share of the range of deformations that a landmark of the stated uncertainty may move freely
 _AGREE = 0.2
 """Landmarks whose RMS distance from those of the template, posed, is beyond this share of their spread are others."""
+# ratio of landmark distances below which the mirror image is the better match, so that noise does not decide
 _MIRROR_SHARE = 0.5
 _FIRMEST = 1e-3
 """Two landmarks in one place leave (C8) without a solution where s / a is 0."""

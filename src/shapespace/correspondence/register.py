@@ -28,7 +28,7 @@ _NEAR = 3
 """Points of the other side that a point is matched with, by inverse squared distance."""
 _TOUCHING = 1e-8
 """Square of a length, mm^2, so that a point that touches another one has a finite weight."""
-_OUTLIER_ROUNDS = 4
+_OUTLIER_ROUNDS = 4  # reweighting iterations for outliers
 
 
 @dataclass(frozen=True)

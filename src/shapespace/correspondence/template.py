@@ -19,8 +19,9 @@ from shapespace.geometry.normals import boundary_edges, face_areas, faces_of, rm
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 
-_POSE_VERTICES = 1500
-_POSE_HARMONICS = 40
+_POSE_VERTICES = 1500  # vertices of the coarse mesh for poses, which need no detail; time grows with them
+_POSE_HARMONICS = 40  # harmonics on the coarse mesh of the pose model
+# scans that may become the template, and scans each one is tried on: 36 registrations at most
 _CANDIDATES, _OTHERS = 6, 6
 _FEWEST = 100
 """Vertices: fewer do not tell an object's shape."""

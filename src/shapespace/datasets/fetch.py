@@ -107,15 +107,15 @@ def _read_registry() -> Mapping[str, Dataset]:
             for path, f in entry["files"].items()
         )
         datasets[name] = Dataset(
-            name,
-            entry["title"],
-            entry["licence"],
-            entry["licence_text"],
-            entry["citation"],
-            entry["repository"],
-            entry["commit"],
-            files,
-            ict_files.PACKED_NAME if any(f.content_sha256 for f in files) else None,
+            name=name,
+            title=entry["title"],
+            licence=entry["licence"],
+            licence_text=entry["licence_text"],
+            citation=entry["citation"],
+            repository=entry["repository"],
+            commit=entry["commit"],
+            files=files,
+            packed=ict_files.PACKED_NAME if any(f.content_sha256 for f in files) else None,
         )
     return MappingProxyType(datasets)
 

@@ -215,9 +215,9 @@ def load_ict(folder: Path | None = None) -> IctFaces:
 def _read(folder: Path) -> ict_files.PackedIct:
     if (folder / ict_files.PACKED_NAME).is_file():
         return ict_files.read_packed(folder / ict_files.PACKED_NAME)
-    for place in (folder / "FaceXModel", folder):
-        if (place / f"{ict_files.NEUTRAL_NAME}.obj").is_file():
-            return ict_files.read_obj_folder(place)
+    for candidate in (folder / "FaceXModel", folder):
+        if (candidate / f"{ict_files.NEUTRAL_NAME}.obj").is_file():
+            return ict_files.read_obj_folder(candidate)
     raise DataError(
         f"{folder} has neither {ict_files.PACKED_NAME} nor {ict_files.NEUTRAL_NAME}.obj; give the folder of "
         "ICT-FaceKit."

@@ -29,6 +29,7 @@ _HALF_MM = np.array([55.0, 34.0, 19.0])
 _CENTRES, _WIDTH, _ROUGHNESS = 40, 0.35, 0.05
 _NOTCH, _RIDGE = np.array([0.35, -0.9, 0.25]), np.array([-0.2, 0.3, 0.95])
 _NOISE_MM, _POINTS = 0.15, 3000  # mm and vertices of a raw surface
+# mm; a usual abdominal CT, with slices thicker than pixels, and its margin around the organ
 _VOXEL_MM, _MARGIN_MM = (1.5, 1.5, 2.5), 8.0
 _MOST = 10_000  # limit on files written to the folder of a demonstration
 

@@ -14,7 +14,7 @@ from shapespace.types import MM_PER_UNIT, BoolArray, FloatArray, Mesh
 
 KINDS = {"sphere": 4, "box": 6, "landmarks": 1}
 """How many numbers each kind of crop needs."""
-_FEWEST = 30
+_FEWEST = 30  # vertices; with fewer no fit has enough matches (`_FEWEST_MATCHES` of the robust method)
 
 
 @dataclass(frozen=True)
@@ -81,8 +81,8 @@ class Crop:
                 f"{scan.name}: the crop {self.text} leaves {inside.sum()} of its {len(inside)} vertices, which lie "
                 f"between {low} and {high}; give a crop in the scan's own frame and unit."
             )
-        said = f"Cropped to {inside.sum():,} of {len(inside):,} vertices ({self.text})."
-        return part_of(scan, inside), said
+        note = f"Cropped to {inside.sum():,} of {len(inside):,} vertices ({self.text})."
+        return part_of(scan, inside), note
 
     def _inside(
         self, scan: Mesh, model: ShapeModel, landmarks: Mapping[str, FloatArray] | None, unit: str

@@ -18,8 +18,8 @@ def carried_colours(colours: ByteArray, scan: Mesh, closest: ClosestPoints, seen
         seen: (V,) False where the scan shows nothing that the surface follows: there it is `GREY`.
     """
     if closest.triangle is None or closest.barycentric is None or scan.faces is None:
-        found = colours[closest.vertex]
+        interpolated = colours[closest.vertex]
     else:
         corners = colours[scan.faces[closest.triangle]].astype(np.float64)
-        found = np.rint(np.einsum("vc,vcd->vd", closest.barycentric, corners)).clip(0, 255).astype(np.uint8)
-    return np.where(seen[:, None], found, np.uint8(GREY))
+        interpolated = np.rint(np.einsum("vc,vcd->vd", closest.barycentric, corners)).clip(0, 255).astype(np.uint8)
+    return np.where(seen[:, None], interpolated, np.uint8(GREY))

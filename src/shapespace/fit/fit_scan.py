@@ -39,9 +39,9 @@ from shapespace.version import __version__
 if TYPE_CHECKING:
     from shapespace.model.additive import AdditiveModel
 
-_FAR_OUT = 3.0
-_FAR_OUT_BY_CHANCE = 0.01
-_ALL_BUT_THE_RIM = 0.95
+_FAR_OUT = 3.0  # standard deviations; a normal coefficient exceeds them once in 370
+_FAR_OUT_BY_CHANCE = 0.01  # share of coefficients beyond it that raises no note; chance alone gives 0.3 %
+_ALL_BUT_THE_RIM = 0.95  # share of vertices; a complete scan still leaves out vertices at its border
 _VANISHED = 0.05
 """Share of the start's scale below which nothing is left to fit."""
 
@@ -97,12 +97,12 @@ class FitConfig:
     strict: bool = False
 
     def __post_init__(self) -> None:
-        for value, choices, what in (
+        for value, choices, name in (
             (self.unit, ["auto", *MM_PER_UNIT], "unit"),
             (self.scale, ("auto", "free", "fixed"), "scale"),
         ):
             if value not in choices:
-                raise InputError(f"There is no {what} {value!r}; choose one of {', '.join(choices)}.")
+                raise InputError(f"There is no {name} {value!r}; choose one of {', '.join(choices)}.")
         fitting = self.fitting
         if self.dense and not fitting.goes_on_densely:
             raise InputError(
@@ -127,7 +127,7 @@ class FitConfig:
         return method_named(self.method) if isinstance(self.method, str) else self.method
 
     def limits(self, model: ShapeModel) -> Limits:
-        """Return what the method is told; a scale that goes by the gauge is free where size was divided out."""
+        """Return the settings of the method; a scale that goes by the gauge is free where size was divided out."""
         with_scale = model.gauge == "shape" if self.scale == "auto" else self.scale == "free"
         return Limits(with_scale, self.modes, self.max_iterations)
 
@@ -181,7 +181,7 @@ def fit_scan(
     config = config or FitConfig()
     given = {"model": model, "scan": scan, "landmarks": landmarks}
     files = {
-        what: Path(cast(PathTo, path)).absolute() for what, path in given.items() if isinstance(path, str | os.PathLike)
+        name: Path(cast(PathTo, path)).absolute() for name, path in given.items() if isinstance(path, str | os.PathLike)
     }
     model, scan = _as_model(model), as_mesh(scan)
     if "landmarks" in files:
@@ -345,7 +345,7 @@ class _Recorder:
 
 
 def _place(
-    whole: ShapeModel,
+    full_model: ShapeModel,
     model: ShapeModel,
     scan: Mesh,
     config: FitConfig,
@@ -353,10 +353,10 @@ def _place(
     T_scan_model: Similarity | None,
 ) -> _Placed:
     """Crop and repair the scan, find its unit, and find where to begin; landmarks are those of the `whole` model."""
-    said: list[str] = []
+    notes: list[str] = []
     if config.crop:
-        scan, cropped = Crop.of(config.crop).cut(scan, whole, landmarks, config.unit)
-        said.append(cropped)
+        scan, cropped = Crop.of(config.crop).cut(scan, full_model, landmarks, config.unit)
+        notes.append(cropped)
     scan, findings = repair(scan, strict=config.strict)
     mm = MM_PER_UNIT[find_unit(model, scan) if config.unit == "auto" else config.unit]
     T_mm_scan = mm_frame(scan, mm)
@@ -366,14 +366,14 @@ def _place(
     if T_scan_model is not None:
         start = Start(T_mm_scan @ T_scan_model, "given", float("nan"))
     elif landmarks:
-        start = start_from_landmarks(whole, marks_mm, scan.name, with_scale=with_scale)
+        start = start_from_landmarks(full_model, marks_mm, scan.name, with_scale=with_scale)
     else:
         start = start_from_any_pose(model, scan_mm.vertices, seed=config.seed, with_scale=with_scale)
     if landmarks:
-        stddev_mm = config.landmark_stddev_mm or SHARE * rms_size(whole.mean_vertices) * start.T_scan_model.scale
+        stddev_mm = config.landmark_stddev_mm or SHARE * rms_size(full_model.mean_vertices) * start.T_scan_model.scale
         start = replace(start, marks=LandmarkConstraint.of(model, marks_mm, stddev_mm))
-    said += [*scan.notes, *(f"{finding.what} {finding.action}".strip() for finding in findings)]
-    return _Placed(scan, mm, T_mm_scan.inverse(), ScanTarget(scan_mm), start, said)
+    notes += [*scan.notes, *(f"{finding.problem} {finding.action}".strip() for finding in findings)]
+    return _Placed(scan, mm, T_mm_scan.inverse(), ScanTarget(scan_mm), start, notes)
 
 
 def _measure(
@@ -405,7 +405,7 @@ def _landmark_stddev_mm(
     variance = np.einsum("lii->li", fitted.landmark_covariance).copy()
     landmarks = model.landmarks if held is None else held.landmarks(model)
     if not dense:
-        # The surface was told in the model's modes, and what that moved a landmark by is an error of it.
+        # The surface was projected onto the model's modes; the motion of a landmark by it is an error of the landmark.
         modes = landmarks.interpolate(model.vertex_basis.reshape(model.n_vertices, 3, -1))[:, :, : len(fitted.b)]
         in_modes = fitted.T_scan_model.apply(landmarks.interpolate(model.mean_vertices) + modes @ fitted.b)
         variance += (in_modes - landmarks.interpolate(fitted.vertices_scan_mm)) ** 2

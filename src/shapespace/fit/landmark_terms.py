@@ -22,7 +22,8 @@ from shapespace.types import FloatArray, Similarity, SurfaceLandmarks
 
 SHARE = 0.03
 """Standard deviation of a landmark as a share of the model's size (RMS distance from its centre), if none is given."""
-_PATCHES = 300.0
+_PATCHES = 300.0  # independent patches that the matches of a surface count as, since neighbours share their errors
+# width and outlier limit of landmark residuals in SD (R16b), and the factor from MAD to SD of a normal distribution
 _WIDTH, _MAD, _FAR = 3.0, 1.48, 4.0
 
 
@@ -57,8 +58,8 @@ class LandmarkConstraint:
 
     def off_mm(self, surface: ModelSurface, T_scan_model: Similarity) -> FloatArray:
         """Return (L,) the distance of each landmark of the surface from that of the scan, mm of the scan."""
-        at = self.landmarks.interpolate(surface.vertices)
-        return np.linalg.norm(T_scan_model.apply(at) - self.points_mm, axis=1)
+        positions = self.landmarks.interpolate(surface.vertices)
+        return np.linalg.norm(T_scan_model.apply(positions) - self.points_mm, axis=1)
 
     def equations(self, surface: ModelSurface, T_scan_model: Similarity, modes: int) -> tuple[FloatArray, FloatArray]:
         """Return Hessian (7 + k, 7 + k) and gradient (7 + k,) of half the squares over the variance, robustly weighed.

@@ -16,7 +16,7 @@ from shapespace.model.shape_model import ShapeModel
 
 @dataclass(frozen=True)
 class Limits:
-    """What every method is told of a fit.
+    """Input of every fit method.
 
     Args:
         with_scale: whether the pose has a free scale.

@@ -1,4 +1,4 @@
-"""A fit that is held to a region: made with the model of that part, and told in the coefficients of the whole."""
+"""Region fit: computed with the model of the region, reported in the coefficients of the full model."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ class RegionFit:
     """What turns a fit of a part into one of the whole.
 
     Args:
-        whole: the model.
+        full: the model.
         part: of it.
     """
 
-    whole: ShapeModel
+    full: ShapeModel
     part: Part
 
     @staticmethod
-    def of(whole: ShapeModel, region: str | tuple[int, ...]) -> RegionFit:
+    def of(full: ShapeModel, region: str | tuple[int, ...]) -> RegionFit:
         """Return the region fit of a model.
 
         Raises:
             InputError: there is no such region, or no triangle lies in it.
         """
-        return RegionFit(whole, Part.of(whole, region))
+        return RegionFit(full, Part.of(full, region))
 
     def note(self, region: str | tuple[int, ...] | None) -> str:
         """Return a sentence on what the fit is held to."""
@@ -46,7 +46,7 @@ class RegionFit:
 
     def state(self, state: IcpState) -> IcpState:
         """Return a state with the coefficients of the whole."""
-        return replace(state, b=self.part.to_b(state.b, self.whole))
+        return replace(state, b=self.part.to_b(state.b, self.full))
 
     def telling(self, on_state: Callable[[IcpState], None]) -> Callable[[IcpState], None]:
         """Return what tells `on_state` of such states."""
@@ -60,13 +60,13 @@ class RegionFit:
         """Return where the fit ended with the first `modes` coefficients of the whole, None for all."""
         from shapespace.fit.robust.posterior import variance_of_new_shapes  # compiled, and loads SciPy
 
-        whole, part, k = self.whole, self.part, modes
-        b = part.to_b(fitted.b, whole)
+        full, part, k = self.full, self.part, modes
+        b = part.to_b(fitted.b, full)
         known = np.diag(fitted.b_stddev**2) if fitted.b_covariance is None else fitted.b_covariance
-        variance = variance_of_new_shapes(whole) if fitted.b_covariance is not None else whole.stddev**2
-        covariance = part.to_covariance(known, whole, variance)
+        variance = variance_of_new_shapes(full) if fitted.b_covariance is not None else full.stddev**2
+        covariance = part.to_covariance(known, full, variance)
         after = np.clip(covariance.diagonal(), 0.0, variance)
-        vertices = fitted.T_scan_model.apply(whole.reconstruct(b))
+        vertices = fitted.T_scan_model.apply(full.reconstruct(b))
         vertices[part.inside] = fitted.vertices_scan_mm
         return replace(
             fitted,

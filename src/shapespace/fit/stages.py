@@ -12,7 +12,7 @@ from shapespace.fit.scan_target import mm_frame
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray
 
-STAGES_VERSION = 2
+STAGES_VERSION = 2  # of the file with the stages of a fit; 2 is the format of the current release
 
 
 def stage_arrays(result: FitResult, model: ShapeModel) -> dict[str, npt.NDArray[Any]]:

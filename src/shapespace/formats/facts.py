@@ -88,14 +88,14 @@ def _landmarks(vertices: Mapping[str, Any], places: Mapping[str, Any], n: int, m
     """Return the landmarks of facts: in their triangles where these are given, else at their vertices."""
     landmarks: list[SurfaceLandmarks] = []
     for name, value in vertices.items():
-        vertex, place = _count(value), json_object(places.get(name))
+        vertex, entry = _count(value), json_object(places.get(name))
         if vertex is None or vertex >= n:
             continue
         landmark = SurfaceLandmarks.of({name: vertex})
         try:
-            corners = np.array([place["vertices"]], dtype=np.int32)
-            weights = np.array([place["barycentric"]], dtype=np.float64)
-            distance = np.array([place["distance_mm"]], dtype=np.float64) / mm
+            corners = np.array([entry["vertices"]], dtype=np.int32)
+            weights = np.array([entry["barycentric"]], dtype=np.float64)
+            distance = np.array([entry["distance_mm"]], dtype=np.float64) / mm
             exact = SurfaceLandmarks((name,), corners, weights, distance)
             landmark = exact if dict(exact) == dict(landmark) and corners.max() < n else landmark
         except (KeyError, ValueError, TypeError, OverflowError):
@@ -105,7 +105,7 @@ def _landmarks(vertices: Mapping[str, Any], places: Mapping[str, Any], n: int, m
 
 
 def total_variance(model: LinearModel) -> float | None:
-    """Return the variance of all modes, in the unit of the model squared; None where it is not told."""
+    """Return the variance of all modes, in the unit of the model squared; None if the file does not state it."""
     variances = [block.total_variance for block in (model.shape, model.expression) if block is not None]
     known = [variance for variance in variances if variance is not None]
     return sum(known) if known else None

@@ -27,7 +27,7 @@ class _TreeBuilder:
     """Builder of the tree of `model`."""
 
     model: LinearModel
-    told: Mapping[str, str]
+    parameters: Mapping[str, str]
     built: str
     arrays: dict[str, npt.NDArray[Any]] = field(default_factory=dict[str, npt.NDArray[Any]])
     texts: dict[str, str] = field(default_factory=dict[str, str])
@@ -49,7 +49,7 @@ class _TreeBuilder:
         self.arrays[f"{root}/modelinfo/scores"] = np.zeros((1, 1), dtype=np.float32)
         self.texts[f"{root}/modelinfo/build-time"] = self.texts[f"{builder}/buildTime"] = self.built
         self.texts[f"{builder}/builderName"] = "shapespace"
-        self.texts.update({f"{root}/{PARAMETERS}/{name}": text for name, text in self.told.items()})
+        self.texts.update({f"{root}/{PARAMETERS}/{name}": text for name, text in self.parameters.items()})
         self.groups += [f"{builder}/dataInfo", f"{root}/{PARAMETERS}", f"{root}/representer/pointData"]
         faces = self.model.faces
         self.attributes[f"{root}/representer"] = {

@@ -16,7 +16,7 @@ from shapespace.types import FloatArray
 _SINGULAR = 1e-7
 """Share of the largest pivot below which a matrix is singular but for rounding."""
 
-DEGREE = 3
+DEGREE = 3  # cubic: continuous curvature
 FEWEST, MOST = 4, 64
 """Control points along each side: a cubic needs four, and beyond 64 the normal equations outgrow memory."""
 LEAST_SMOOTHNESS = 1e-9

@@ -25,7 +25,7 @@ from shapespace.geometry.kdtree import (
 )
 from shapespace.types import FloatArray, IntArray
 
-_LEAF_TRIANGLES = 4
+_LEAF_TRIANGLES = 4  # triangles in a leaf, at most: all of them are compared, instead of another level of boxes
 # Squared sine of the angle between two edges below which a triangle has no area.
 _FLAT = 1e-14
 
@@ -36,14 +36,14 @@ class TriangleArrays(NamedTuple):
     Args:
         corners: (F, 9) float64, coordinates of the three corners, in leaf order.
         original: (F,) int32, the number each triangle had when it was given.
-        place: (F,) int32, the row of `corners` where each number is.
+        row_of: (F,) int32, the row of `corners` where each number is.
         boxes: (2^(depth + 1) - 1, 6) float64, lowest and highest coordinates below each node.
         depth: number of splits from the root to a leaf.
     """
 
     corners: FloatArray
     original: IntArray
-    place: IntArray
+    row_of: IntArray
     boxes: FloatArray
     depth: int
 
@@ -75,9 +75,9 @@ class TriangleTree:
             raise InputError("A triangle tree needs finite corners; drop the triangles whose corners are not.")
         order_into_leaves(middles, original, boxes, depth)
         del middles
-        place, corners = np.empty_like(original), np.empty((len(faces), 9))
-        _cover(vertices, faces, original, place, corners, boxes, depth)
-        self.arrays = TriangleArrays(corners, original, place, boxes, depth)
+        row_of, corners = np.empty_like(original), np.empty((len(faces), 9))
+        _cover(vertices, faces, original, row_of, corners, boxes, depth)
+        self.arrays = TriangleArrays(corners, original, row_of, boxes, depth)
         """The tree as compiled loops take it."""
 
     def closest(
@@ -113,7 +113,7 @@ def _cover(
     vertices: FloatArray,
     faces: IntArray,
     original: IntArray,
-    place: IntArray,
+    row_of: IntArray,
     corners: FloatArray,
     boxes: FloatArray,
     depth: int,
@@ -124,7 +124,7 @@ def _cover(
         box = boxes[first_leaf + leaf]
         box[:3], box[3:] = np.inf, -np.inf
         for row in range((leaf * count) >> depth, ((leaf + 1) * count) >> depth):
-            place[original[row]] = row
+            row_of[original[row]] = row
             for corner in range(3):
                 for k in range(3):
                     value = vertices[faces[original[row], corner], k]
@@ -264,7 +264,7 @@ def closest_one(
     best, squared, weight_b, weight_c = -1, np.inf, 0.0, 0.0
     node, top = 0, 0
     if guess >= 0:
-        best = tree.place[guess]
+        best = tree.row_of[guess]
         squared, weight_b, weight_c = on_triangle(corners, best, x, y, z, np.inf)
         node, top = start_at(boxes, best, count, depth, x, y, z, squared, stack)
     while True:
@@ -310,7 +310,7 @@ def closest_into(
     for i in range(len(queries)):
         triangle, squared, b, c = closest_one(tree, queries[i, 0], queries[i, 1], queries[i, 2], guess[i], stack)
         a = max(0.0, 1.0 - b - c)
-        row = tree.place[triangle]
+        row = tree.row_of[triangle]
         for k in range(3):
             points_out[i, k] = a * tree.corners[row, k] + b * tree.corners[row, 3 + k] + c * tree.corners[row, 6 + k]
         barycentric_out[i, 0], barycentric_out[i, 1], barycentric_out[i, 2] = a, b, c

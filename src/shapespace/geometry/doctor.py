@@ -37,12 +37,12 @@ class Finding:
 
     Args:
         level: "fixed" (repaired), "note" (left as it is) or "refused" (cannot be fitted).
-        what: a sentence on what is there.
+        problem: a sentence on what is there.
         action: a sentence on what fitting does about it, or for "refused", what the user can do.
     """
 
     level: FindingLevel
-    what: str
+    problem: str
     action: str
 
 
@@ -131,7 +131,7 @@ def repair(mesh: Mesh, *, strict: bool = False) -> tuple[Mesh, tuple[Finding, ..
     state = _examine_and_repair(mesh, strict=strict)
     for finding in state.report.findings:
         if finding.level == "refused":
-            raise MeshError(f"{mesh.name}: {finding.what[0].lower()}{finding.what[1:-1]}; {finding.action}")
+            raise MeshError(f"{mesh.name}: {finding.problem[0].lower()}{finding.problem[1:-1]}; {finding.action}")
     return state.repaired(mesh), state.report.findings
 
 
@@ -163,9 +163,9 @@ class _RepairState:
         """Return the state with these fields of the report."""
         return replace(self, report=replace(self.report, **values))
 
-    def reported(self, level: FindingLevel, what: str, action: str) -> _RepairState:
+    def reported(self, level: FindingLevel, problem: str, action: str) -> _RepairState:
         """Return the state with one more finding."""
-        return self.measured(findings=(*self.report.findings, Finding(level, what, action)))
+        return self.measured(findings=(*self.report.findings, Finding(level, problem, action)))
 
     def with_vertices_where(self, keep: BoolArray) -> _RepairState:
         """Return the state with some of the vertices, and the triangles between them."""
@@ -239,18 +239,18 @@ def _drop_non_finite(state: _RepairState, finite: BoolArray, *, strict: bool) ->
     count = state.report.non_finite_vertices
     if not count:
         return state
-    what = f"It has {_some(count, 'vertex', 'vertices')} with {NON_FINITE}"
-    whole = None if state.faces is None else np.asarray(finite[state.faces].all(axis=1))
-    lost = 0 if whole is None else int((~whole).sum())
-    if whole is None or not lost:
+    problem = f"It has {_some(count, 'vertex', 'vertices')} with {NON_FINITE}"
+    finite_faces = None if state.faces is None else np.asarray(finite[state.faces].all(axis=1))
+    lost = 0 if finite_faces is None else int((~finite_faces).sum())
+    if finite_faces is None or not lost:
         action = "They are missing points that no triangle uses, and are dropped."
-        return state.with_vertices_where(finite).reported("fixed", f"{what}.", action)
-    what += f", used by {_some(lost, 'triangle', 'triangles')}."
+        return state.with_vertices_where(finite).reported("fixed", f"{problem}.", action)
+    problem += f", used by {_some(lost, 'triangle', 'triangles')}."
     if strict:
         action = "export the scan again without them, or leave out --strict to remove them."
-        return state.reported("refused", what, action)
-    state = state.with_triangles_where(whole).with_vertices_where(finite)
-    return state.reported("fixed", what, "They are removed together, which leaves a hole.")
+        return state.reported("refused", problem, action)
+    state = state.with_triangles_where(finite_faces).with_vertices_where(finite)
+    return state.reported("fixed", problem, "They are removed together, which leaves a hole.")
 
 
 def _merge_vertices(state: _RepairState) -> _RepairState:
@@ -279,9 +279,9 @@ def _drop_degenerate(state: _RepairState) -> _RepairState:
     count = int(flat.sum())
     if not count:
         return state
-    what = f"{_some(count, 'triangle has', 'triangles have')} no area."
+    problem = f"{_some(count, 'triangle has', 'triangles have')} no area."
     state = state.with_triangles_where(~flat).measured(degenerate_triangles=count)
-    return state.reported("fixed", what, "They are dropped.")
+    return state.reported("fixed", problem, "They are dropped.")
 
 
 def _drop_repeated(state: _RepairState) -> _RepairState:
@@ -292,9 +292,9 @@ def _drop_repeated(state: _RepairState) -> _RepairState:
     count = len(state.faces) - len(first)
     if not count:
         return state
-    what = f"{_some(count, 'triangle repeats', 'triangles repeat')} an earlier one."
+    problem = f"{_some(count, 'triangle repeats', 'triangles repeat')} an earlier one."
     state = state.with_triangles_where(first).measured(duplicate_triangles=count)
-    return state.reported("fixed", what, "Only the first of each is kept.")
+    return state.reported("fixed", problem, "Only the first of each is kept.")
 
 
 def _drop_unreferenced(state: _RepairState) -> _RepairState:
@@ -306,9 +306,9 @@ def _drop_unreferenced(state: _RepairState) -> _RepairState:
     count = int((~used).sum())
     if not count:
         return state
-    what = f"{_some(count, 'vertex belongs', 'vertices belong')} to no triangle."
+    problem = f"{_some(count, 'vertex belongs', 'vertices belong')} to no triangle."
     state = state.with_vertices_where(used).measured(unreferenced_vertices=count)
-    return state.reported("fixed", what, "They are not part of the surface, and are dropped.")
+    return state.reported("fixed", problem, "They are not part of the surface, and are dropped.")
 
 
 def _check_spread(state: _RepairState) -> _RepairState:
@@ -399,8 +399,8 @@ def _inspect_surface(state: _RepairState) -> _RepairState:
     share = float(np.bincount(pieces[state.faces[:, 0]], weights=areas).max() / areas.sum())
     state = state.measured(components=components, largest_component_share=share)
     if components > 1:
-        what = f"It has {components} separate pieces; the largest has {100 * share:.1f} % of the area."
-        state = state.reported("note", what, "All are kept.")
+        problem = f"It has {components} separate pieces; the largest has {100 * share:.1f} % of the area."
+        state = state.reported("note", problem, "All are kept.")
     return state
 
 
@@ -415,8 +415,8 @@ def _cut_glued_edges(state: _RepairState, edges: _Edges) -> tuple[_RepairState, 
     seam = glued & edges.same_way
     if glued.mean() >= 0.5 or not seam.any():
         return state, edges
-    what = f"At {_some(int(seam.sum()), 'edge', 'edges')}, pieces that wind against each other touch."
-    return state.reported("note", what, "They are kept; winding is not carried across."), edges.without(seam)
+    problem = f"At {_some(int(seam.sum()), 'edge', 'edges')}, pieces that wind against each other touch."
+    return state.reported("note", problem, "They are kept; winding is not carried across."), edges.without(seam)
 
 
 def _make_winding_consistent(state: _RepairState, edges: _Edges) -> _RepairState:
@@ -434,8 +434,8 @@ def _make_winding_consistent(state: _RepairState, edges: _Edges) -> _RepairState
     one_sided = int((as_is == turned).sum())
     flip = smaller & (as_is != turned)
     if flip.any():
-        what = f"{_some(int(flip.sum()), 'triangle winds', 'triangles wind')} against the neighbours."
-        state = state.with_triangles_reversed(flip).reported("fixed", what, "They are turned round.")
+        problem = f"{_some(int(flip.sum()), 'triangle winds', 'triangles wind')} against the neighbours."
+        state = state.with_triangles_reversed(flip).reported("fixed", problem, "They are turned round.")
     if one_sided:
         state = state.reported(
             "note",
@@ -458,14 +458,14 @@ def _turn_outward(state: _RepairState, edges: _Edges, middles: FloatArray, norma
     closed = np.ones(count, dtype=np.bool_)
     closed[patch[edges.loose]] = False
     if closed.any() and (inside_out := _inside_out(closed, patch, middles, normals)).any():
-        what = f"{_some(int(inside_out.sum()), 'closed piece is', 'closed pieces are')} inside out."
+        problem = f"{_some(int(inside_out.sum()), 'closed piece is', 'closed pieces are')} inside out."
         action = "Its winding is reversed." if inside_out.sum() == 1 else "Their winding is reversed."
-        state = state.with_triangles_reversed(inside_out[patch]).reported("fixed", what, action)
+        state = state.with_triangles_reversed(inside_out[patch]).reported("fixed", problem, action)
     # Patches of one scan come from one scanner, so the open ones are judged and turned together.
     is_open = ~closed[patch]
     if is_open.any() and _points_inward(is_open, middles, normals):
-        what = "The normals of the open surface point to its inside, so its winding looks reversed."
-        state = state.with_triangles_reversed(is_open).reported("fixed", what, "Its winding is reversed.")
+        problem = "The normals of the open surface point to its inside, so its winding looks reversed."
+        state = state.with_triangles_reversed(is_open).reported("fixed", problem, "Its winding is reversed.")
     return state
 
 

@@ -19,9 +19,9 @@ from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
 
 _ROUNDNESS = 4.0
 """Exponent of the rim |x|^p + |y|^p = 1: strictly convex, and 93 % of the square (a circle has 79 %)."""
-_LEAST_GAIN = 2e-3
-_SMALLEST = 1e-3
-_TINY = 1e-9
+_LEAST_GAIN = 2e-3  # relative decrease of the stretch below which iterations end
+_SMALLEST = 1e-3  # share of the mean area that smaller triangles count as, so that their weights stay finite
+_TINY = 1e-9  # guard of divisions; areas and stretches are near 1
 
 
 def disc_map(mesh: Mesh, *, most_rounds: int = 40) -> FloatArray:
@@ -52,12 +52,12 @@ def disc_map(mesh: Mesh, *, most_rounds: int = 40) -> FloatArray:
         if (_turning(uv, filled) <= 0).any():
             break  # so much stretch that rounding folds it
         squared = wanted * _squared_stretch(vertices, uv, filled)
-        whole = float(np.sqrt((area * squared).sum() / area.sum()))
-        if whole > best[0] * (1 - _LEAST_GAIN):
-            if whole < best[0]:
-                best = (whole, uv)
+        mean_stretch = float(np.sqrt((area * squared).sum() / area.sum()))
+        if mean_stretch > best[0] * (1 - _LEAST_GAIN):
+            if mean_stretch < best[0]:
+                best = (mean_stretch, uv)
             break
-        best = (whole, uv)
+        best = (mean_stretch, uv)
         share = np.repeat(area * squared, 3), np.repeat(area, 3)
         flat = filled.ravel()
         stretch = np.sqrt(

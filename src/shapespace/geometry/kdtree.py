@@ -16,7 +16,7 @@ from shapespace.compiled import compiled
 from shapespace.errors import InputError
 from shapespace.types import FloatArray, IntArray
 
-_LEAF_POINTS = 12
+_LEAF_POINTS = 12  # points in a leaf, at most: all of them are compared, instead of another level of boxes
 _BLOCK = 16
 """Rows that `_select` compares before it swaps: fastest for 20,000 to 200,000 points."""
 NOTED = 2
@@ -31,14 +31,14 @@ class KdArrays(NamedTuple):
     Args:
         points: (N, 3) float64, in leaf order.
         original: (N,) int32, the number each of `points` had when it was given.
-        place: (N,) int32, the row of `points` where each number is.
+        row_of: (N,) int32, the row of `points` where each number is.
         boxes: (2^(depth + 1) - 1, 6) float64, lowest and highest coordinates below each node.
         depth: number of splits from the root to a leaf.
     """
 
     points: FloatArray
     original: IntArray
-    place: IntArray
+    row_of: IntArray
     boxes: FloatArray
     depth: int
 
@@ -83,9 +83,9 @@ class KdTree:
         index = np.arange(len(points), dtype=np.int32)
         boxes = np.empty((2 ** (depth + 1) - 1, 6))
         order_into_leaves(ordered, index, boxes, depth)
-        place = np.empty_like(index)
-        place[index] = np.arange(len(points), dtype=np.int32)
-        self.arrays = KdArrays(ordered, index, place, boxes, depth)
+        row_of = np.empty_like(index)
+        row_of[index] = np.arange(len(points), dtype=np.int32)
+        self.arrays = KdArrays(ordered, index, row_of, boxes, depth)
         """The tree as compiled loops take it."""
 
     def moved(self, points: FloatArray) -> KdTree:
@@ -98,7 +98,7 @@ class KdTree:
         boxes = np.empty_like(old.boxes)
         ordered = np.ascontiguousarray(points[old.original], dtype=np.float64)
         _boxes_of_leaves(ordered, boxes, old.depth)
-        tree.arrays = KdArrays(ordered, old.original, old.place, boxes, old.depth)
+        tree.arrays = KdArrays(ordered, old.original, old.row_of, boxes, old.depth)
         return tree
 
     def nearest(self, queries: FloatArray, guess: IntArray | None = None) -> tuple[IntArray, FloatArray]:
@@ -303,10 +303,10 @@ def start_at(
     leaf = (((row + 1) << depth) - 1) // count + (1 << depth) - 1
     top = 0
     for level in range(1, depth + 1):
-        beside = (((leaf + 1) >> (depth - level)) ^ 1) - 1
-        d = box_distance(boxes, beside, x, y, z)
+        sibling = (((leaf + 1) >> (depth - level)) ^ 1) - 1
+        d = box_distance(boxes, sibling, x, y, z)
         if d <= squared:
-            stack[top], stack[top + 1] = beside, d
+            stack[top], stack[top + 1] = sibling, d
             top += 2
     return leaf, top
 
@@ -328,7 +328,7 @@ def nearest_one(tree: KdArrays, x: float, y: float, z: float, guess: int, stack:
     best, squared = -1, np.inf
     node, top = 0, 0
     if guess >= 0:
-        row = tree.place[guess]
+        row = tree.row_of[guess]
         dx, dy, dz = points[row, 0] - x, points[row, 1] - y, points[row, 2] - z
         best, squared = guess, dx * dx + dy * dy + dz * dz
         node, top = start_at(boxes, row, count, depth, x, y, z, squared, stack)

@@ -49,13 +49,13 @@ def place_landmarks(mesh: Mesh, points: Mapping[str, FloatArray], *, precision: 
         near = build_engine(Mesh(mesh.vertices[there], name=mesh.name)).query(places)
         vertices = np.flatnonzero(there)[near.vertex].tolist()
         return replace(SurfaceLandmarks.of(dict(zip(points, vertices, strict=True))), distance_mm=near.distance)
-    whole = np.where(there[:, None], mesh.vertices, 0.0)  # no triangle has those that are not there
-    near = build_engine(Mesh(whole, faces, name=mesh.name)).query(places)
+    finite_vertices = np.where(there[:, None], mesh.vertices, 0.0)  # no triangle has those that are not there
+    near = build_engine(Mesh(finite_vertices, faces, name=mesh.name)).query(places)
     assert near.triangle is not None and near.barycentric is not None
     corners, weights = faces[near.triangle], np.clip(near.barycentric, 0.0, None)
     weights = weights / weights.sum(axis=1, keepdims=True)
-    rounding_mm = precision * rms_size(whole[there])
-    at_vertex = np.linalg.norm(near.points - whole[near.vertex], axis=1) <= rounding_mm
+    rounding_mm = precision * rms_size(finite_vertices[there])
+    at_vertex = np.linalg.norm(near.points - finite_vertices[near.vertex], axis=1) <= rounding_mm
     weights[at_vertex] = 1.0, 0.0, 0.0
     corners = np.where(at_vertex[:, None], near.vertex[:, None], corners)
     distance = np.where(near.distance <= rounding_mm, 0.0, near.distance)

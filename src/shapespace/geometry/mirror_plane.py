@@ -19,8 +19,8 @@ _OFF = 0.01
 """A surface whose mirror image lies within this share of its size is taken for symmetric."""
 FLIP = np.array([-1.0, 1.0, 1.0])
 """What turns points (..., 3) into their mirror images about x = 0."""
-_POINTS = 1_000
-_ITERATIONS = 30
+_POINTS = 1_000  # points of the mesh that planes are fitted to; time grows with them
+_ITERATIONS = 30  # limit of the iterations for one plane
 _STOP = 1e-5
 """The search for a plane ends when the RMS falls by less than this share of the size."""
 _TRIES = 50

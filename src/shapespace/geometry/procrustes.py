@@ -16,10 +16,12 @@ from shapespace.errors import InputError
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.types import FloatArray, IntArray, Similarity
 
+# limit of iterations to the tangent space, and the relative change that ends them, near float64 rounding
 _TANGENT_ROUNDS, _IN_TANGENT = 20, 1e-13
+# relative change of the mean that ends the alignment, and the limit of its iterations
 _TOLERANCE, _MOST_ROUNDS = 1e-10, 100
-_ON_A_LINE = 1e-9
-_WEIGHTED_ROUNDS = 6
+_ON_A_LINE = 1e-9  # ratio of singular values; points nearer to a line than rounding determine no rotation
+_WEIGHTED_ROUNDS = 6  # iterations of a weighted alignment, which starts from the unweighted one
 _LEAST_WEIGHT = 1e-3
 """So that a vertex that no shape observes has a mean."""
 

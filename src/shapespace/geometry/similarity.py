@@ -11,7 +11,7 @@ import numpy as np
 from shapespace.errors import InputError
 from shapespace.types import FloatArray, Similarity
 
-_RANK_TOLERANCE = 1e-9
+_RANK_TOLERANCE = 1e-9  # ratio of singular values; points nearer to a line than rounding determine no rotation
 
 POSE = 7
 """Pose parameters come before the coefficients: rotation, translation, scale."""

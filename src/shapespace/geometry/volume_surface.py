@@ -31,25 +31,26 @@ MOST_SMOOTH = 10.0
 """The largest that can be asked for."""
 
 _SLACK = np.float32(0.5)
-_CLIP = 2.0
+_CLIP = 2.0  # voxels; the distance field is exact up to here and only its sign matters beyond
 # How near to the middle of a voxel the surface may pass, so that no triangle shrinks to nothing.
 _CLEAR = np.float32(0.05)
 # Shares of the smoothing that are tried where something thin would vanish.
 _FINER = (0.5, 0.25)
 # How often voxels that vanish are put back, with more around them each time.
 _ROUNDS = 3
-_FEWEST = 8
+_FEWEST = 8  # voxels, a cube of 2 x 2 x 2: the least with an extent along each axis
+# bisections of the level that keeps the volume, to 1e-6 of the interval, and the step outside it in voxels
 _HALVINGS, _STEP = 20, 0.1
 _BLOCK = 1 << 20
 """Voxels of a volume that are processed together."""
 _MOST_LABELS = 1 << 16
 """A volume with more labels than this is an image, not a segmentation."""
-_BASE_BYTES = 1 << 27
+_BASE_BYTES = 1 << 27  # bytes; interpreter and libraries, whatever the volume
 _VOXEL_BYTES, _VERTEX_BYTES = 32, 400
 """Memory of smoothing and marching cubes: for each voxel of the box around the labels, and for each vertex of the
 surface. Upper bounds of the peaks of resident memory that benchmarks/volume_memory.py measures."""
-_LONG = 2.5
-_LISTED = 10
+_LONG = 2.5  # ratio of voxel edges from which a note warns of the gaps between slices
+_LISTED = 10  # labels in a message, so that it stays readable
 
 _Field = npt.NDArray[np.float32]
 _Labels = npt.NDArray[np.integer[Any]]
@@ -318,18 +319,18 @@ class _Solid:
 
     @staticmethod
     def of(mask: BoolArray, *, keep_pieces: bool) -> _Solid:
-        whole = _without_edge_contacts(mask)
-        label, pieces = _components(whole)
+        separated = _without_edge_contacts(mask)
+        label, pieces = _components(separated)
         sizes = np.bincount(label[mask], minlength=pieces + 1)
         if keep_pieces:
             return _Solid(
-                mask=whole,
+                mask=separated,
                 voxels=int(sizes.sum()),
                 pieces=pieces,
                 left_out=0,
                 filled=0,
-                added=int(whole.sum() - mask.sum()),
-                topology=(pieces, _components(~whole)[1] - 1),
+                added=int(separated.sum() - mask.sum()),
+                topology=(pieces, _components(~separated)[1] - 1),
             )
         largest = 1 + int(np.argmax(sizes[1:]))
         piece = label == largest

@@ -26,7 +26,7 @@ from shapespace.version import __version__
 MOST_BYTES = 500_000_000
 """The files used last stay below this together."""
 _FOLDER, _ENDING = "kept", ".kept"
-_DIGEST_BYTES = 64
+_DIGEST_BYTES = 64  # hexadecimal digits of SHA-256
 _OFF = ("no", "off", "0")
 
 

@@ -191,7 +191,14 @@ def mesh_of(
     Raises:
         MeshError: faces that point past the end of the vertices.
     """
-    return Mesh(vertices, faces, {}, path.name, colours, notes, observed)  # pyright: ignore[reportArgumentType]  # narrowed
+    return Mesh(
+        vertices=vertices,
+        faces=faces,  # pyright: ignore[reportArgumentType]  # Mesh narrows it to int32
+        name=path.name,
+        colours=colours,
+        notes=notes,
+        observed=observed,
+    )
 
 
 def bytes_of_colours(values: npt.NDArray[Any]) -> ByteArray | None:

@@ -34,11 +34,11 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks, common_faces, read_only
 
-_STILL_ROUNDS = 3
-_STILL_SHAPES = 60
-_NO_VARIANCE = 1e-10
-_NO_MOTION_MM = 1e-6
-_LOCAL_MODES = 150
+_STILL_ROUNDS = 3  # iterations of the alignment on the parts that expressions do not move
+_STILL_SHAPES = 60  # shapes, evenly spread, that show which vertices expressions move
+_NO_VARIANCE = 1e-10  # share of the first eigenvalue; below is rounding
+_NO_MOTION_MM = 1e-6  # mm per coordinate; far below any scanner's resolution
+_LOCAL_MODES = 150  # local modes of identity that are added when the number of modes is automatic
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,8 +13,8 @@ import numpy as np
 from shapespace.errors import InputError
 from shapespace.types import FloatArray
 
-_TOLERANCE = 1e-4
-_LEAST_VARIANCE_MM2 = 1e-4
+_TOLERANCE = 1e-4  # change of the expression, in standard deviations, that ends the iterations
+_LEAST_VARIANCE_MM2 = 1e-4  # mm^2; keeps the precision of exactly known coefficients finite
 
 
 @dataclass(frozen=True, eq=False)

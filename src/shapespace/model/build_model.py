@@ -183,7 +183,7 @@ def _of_streamed(
     log: Tell,
 ) -> ShapeModel:
     with stream as aligned:
-        training = aligned.kept
+        training = aligned.training
         model = _of_components(
             aligned.components(config.modes, config.seed, log),
             Vertices(),

@@ -15,7 +15,7 @@ from shapespace.types import BoolArray, FloatArray, IntArray
 
 MOST_SHAPES = 2000
 """Of more, so many are drawn: the choice takes the cube of their number, and its standard error is small by then."""
-_LEAST_NOISE = 1e-6
+_LEAST_NOISE = 1e-6  # share of the first variance per dimension, so that the likelihood of noise-free shapes is finite
 _NO_VARIANCE = 1e-10
 """Of the first mode's, as in `pca`."""
 _ALL_EQUAL = 1e-24
@@ -93,7 +93,7 @@ def drawn(n: int, seed: int) -> IntArray:
     return np.sort(np.random.default_rng(seed).permutation(n)[:MOST_SHAPES]).astype(np.int32)
 
 
-def _at(centred: FloatArray, vertices: BoolArray) -> FloatArray:
+def _coordinates_of(centred: FloatArray, vertices: BoolArray) -> FloatArray:
     return centred.take(np.flatnonzero(vertices), axis=2).reshape(len(centred), -1)
 
 
@@ -131,10 +131,10 @@ def _errors_of_hidden(
     variance, sums = _modes_as_sums(within, float(gram.trace()))
     total = float(within.trace()) / (len(known) - 1)
 
-    in_shown = from_mean @ _gram(_at(centred, observed)) @ from_mean.T
+    in_shown = from_mean @ _gram(_coordinates_of(centred, observed)) @ from_mean.T
     overlap = sums.T @ in_shown[np.ix_(known, known)] @ sums
     evidence = in_shown[np.ix_(held_out, known)] @ sums
-    hidden = _at(centred, ~observed)
+    hidden = _coordinates_of(centred, ~observed)
     mean = hidden[known].mean(axis=0)
     # The sums of each column are zero in all but rounding, so the mean need not be taken off first.
     modes = sums.T @ hidden[known]

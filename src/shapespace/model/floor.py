@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Similarity
 
-_STEPS, _REACHED_MM = 20, 1e-4
+_STEPS, _REACHED_MM = 20, 1e-4  # limit of Gauss-Newton steps, and the vertex motion in mm that ends them
 
 
 def floor_mm(model: ShapeModel, truth: FloatArray) -> float:

@@ -164,9 +164,9 @@ def _with_expressions(linear: LinearModel, path: Path, expressions: Path) -> Lin
             f"{expressions} is of {len(block.moved) // 3} vertices, and {path} has {len(linear.mean)}; give the "
             "blendshapes of that model."
         )
-    whole = replace(linear, expression=block)
-    whole.check(expressions)
-    return whole.noting(f"A weight of one of the {block.moved.shape[1]} blendshapes is one standard deviation.")
+    combined = replace(linear, expression=block)
+    combined.check(expressions)
+    return combined.noting(f"A weight of one of the {block.moved.shape[1]} blendshapes is one standard deviation.")
 
 
 def _changes(moved: FloatArray, count: int, *, parted: bool) -> list[str]:

@@ -12,8 +12,8 @@ from shapespace.geometry.flatten import disc_map
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
 
-_ROUNDS = 5
-_COUNTS = (16, 16)
+_ROUNDS = 5  # iterations of spline and alignment to fill holes
+_COUNTS = (16, 16)  # control points along each side, since fill-ins are to be smooth
 _SMOOTHNESS = 4e-7
 """With this, vertices of ICT-FaceKit are filled best: 1.7 mm off, where the mean alone is 3.6 mm off."""
 _PULL = 1e-3

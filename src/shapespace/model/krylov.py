@@ -70,7 +70,7 @@ class Stop:
 
     Args:
         radians: that a mode may be turned by.
-        least_gap: eigenvalues nearer than this share of the first are not told apart.
+        least_gap: eigenvalues nearer than this share of the first are not separated.
         enough: residual, as a share of the first eigenvalue, that will do where the basis may not grow any more.
     """
 
@@ -95,7 +95,7 @@ def leading(
     most_columns: int,
     stop: Stop,
     seed: int = 0,
-    kept: KeptPasses | None = None,
+    passes: KeptPasses | None = None,
     on_pass: Callable[[int, float], None] | None = None,
 ) -> Leading | None:
     """Return the leading eigenvectors of C (D, D); None where a basis of `most_columns` does not hold them.
@@ -109,7 +109,7 @@ def leading(
         most_columns: of the basis.
         stop: when to.
         seed: of the first block.
-        kept: where to keep each pass; None keeps nothing.
+        passes: where to keep each pass; None keeps nothing.
         on_pass: called with the number of a pass and the largest residual after it as a share of the first eigenvalue.
     """
     Q = np.linalg.qr(np.random.default_rng(seed).standard_normal((size, min(block, size))))[0]
@@ -118,14 +118,14 @@ def leading(
     while True:
         basis.append(Q)
         step = len(basis)
-        recalled = kept.recall(step) if kept is not None else None
+        recalled = passes.recall(step) if passes is not None else None
         if recalled is None:
             W = apply(Q)
             products = _taken_off(W, basis)
             products += _taken_off(W, basis)
             Q, beyond = _orthonormal(W, basis, _DEPENDENT * float(np.abs(T).max(initial=np.abs(products).max())))
-            if kept is not None:
-                kept.keep(step, Q, products, beyond)
+            if passes is not None:
+                passes.keep(step, Q, products, beyond)
         else:
             Q, products, beyond = recalled
         T = _bordered(T, products)

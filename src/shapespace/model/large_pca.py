@@ -33,9 +33,11 @@ EXACT = 15_000
 """Shapes of which the Gram matrix is made: 1.8 GB."""
 _WHOLE = 1000
 """Shapes of which all eigenvectors are found at once, which is then as quick as to find the first."""
-_BASIS_BYTES = 768 << 20
+_BASIS_BYTES = 768 << 20  # bytes of the Krylov basis in memory
+# vectors in a block: products of a few columns are slow, many cost memory
 _LEAST_BLOCK, _MOST_BLOCK = 32, 128
 _TO_ROUNDING = Stop(radians=1e-8, least_gap=1e-5, enough=1e-12)
+# 1/8 of the shapes: more modes are computed by the full decomposition; and a relative variance that is rounding
 _FEW, _NO_VARIATION = 8, 1e-12
 
 
@@ -44,7 +46,7 @@ def large_components(
     modes: int | float | None,
     *,
     seed: int = 0,
-    kept: KeptPasses | None = None,
+    passes: KeptPasses | None = None,
     on_pass: Callable[[int, float], None] | None = None,
 ) -> PrincipalComponents:
     """Return the principal components of the rows of `shapes`, each with its residual.
@@ -53,7 +55,7 @@ def large_components(
         shapes: N rows of D numbers, mm, about a template; the mean is returned about it too.
         modes: as of `principal_components`.
         seed: of the first block of directions.
-        kept: where the passes over many shapes are kept; None keeps nothing.
+        passes: where the passes over many shapes are kept; None keeps nothing.
         on_pass: called with the number of a pass and the largest residual after it as a share of the first variance.
 
     Raises:
@@ -71,7 +73,7 @@ def large_components(
     else:
         # All modes of so many shapes were refused.
         leading_modes = _leading(
-            covariance, d, cast(int | float, modes), total, Stop(), seed, kept=kept, on_pass=on_pass
+            covariance, d, cast(int | float, modes), total, Stop(), seed, passes=passes, on_pass=on_pass
         )
         if leading_modes is None:
             raise InputError(
@@ -155,14 +157,14 @@ def _leading(
     total: float,
     stop: Stop,
     seed: int,
-    kept: KeptPasses | None = None,
+    passes: KeptPasses | None = None,
     on_pass: Callable[[int, float], None] | None = None,
 ) -> Leading | None:
     half = -(-modes // 2) if isinstance(modes, int) else 0
     block = min(max(half, _LEAST_BLOCK), _MOST_BLOCK)
     most = max(_columns(size), modes + 4 * block if isinstance(modes, int) else 0)
     return leading(
-        apply, size, modes, total, block=block, most_columns=most, stop=stop, seed=seed, kept=kept, on_pass=on_pass
+        apply, size, modes, total, block=block, most_columns=most, stop=stop, seed=seed, passes=passes, on_pass=on_pass
     )
 
 

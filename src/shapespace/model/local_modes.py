@@ -12,12 +12,12 @@ from scipy.linalg import eigh
 from shapespace.geometry.normals import rms_size
 from shapespace.types import FloatArray, IntArray
 
-_CENTRES = 40
-_FIELD_SHARE = 0.999
-MOST_PRODUCTS = 600
+_CENTRES = 40  # centres of the smooth fields, spread evenly over the mean
+_FIELD_SHARE = 0.999  # share of the variance of the smooth fields that their leading ones must have
+MOST_PRODUCTS = 600  # products of modes and fields, the columns of the decomposition; time grows with the square
 _BLOCK = 250
 """Vertices: the products of all at once are many times as large as the model."""
-_RANGE_SHARE = 0.6
+_RANGE_SHARE = 0.6  # share of the model's size; range of the smooth fields
 _FAINT = 1e-7
 """Of the variance of the modes; local modes with less are not worth their time."""
 _ROOM = 4
@@ -52,15 +52,15 @@ def local_modes(
         inside += vertex_modes[rows].reshape(len(part), -1).T @ part
         gram += part.T @ part
     gram -= inside.T @ inside
-    whole, count = float(np.trace(gram)), min(most, len(gram), mean.size // _ROOM)
-    if count < 1 or whole <= 0 or left_mm2 <= 0:
+    total, count = float(np.trace(gram)), min(most, len(gram), mean.size // _ROOM)
+    if count < 1 or total <= 0 or left_mm2 <= 0:
         return np.zeros((mean.size, 0)), np.zeros(0)
     value, vector = largest_eigenpairs(gram, count)
-    significant = value * left_mm2 / whole > _FAINT * variance.sum()
+    significant = value * left_mm2 / total > _FAINT * variance.sum()
     mix = vector[:, significant] / np.sqrt(value[significant])
     local = np.concatenate([products(rows) @ mix for rows in blocks]) - modes @ (inside @ mix)
     # Faint ones lose digits where most of them lies inside.
-    return np.linalg.qr(local)[0], value[significant] * left_mm2 / whole
+    return np.linalg.qr(local)[0], value[significant] * left_mm2 / total
 
 
 def vertex_blocks(count: int) -> list[slice]:

@@ -27,12 +27,13 @@ from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity, 
 
 MIN_SEEN = 0.5
 """Share of the shapes that must observe a vertex for it to be in a model, by default."""
-_FEWEST = 2
+_FEWEST = 2  # shapes that must observe a vertex: fewer have no variance
 _POSES_BY = (8, 60)
 """Modes of the completions that poses are taken from, one after the other: with few only, variation that they lack
 becomes pose, and alignment then removes real modes."""
 _MODES_A_SHAPE, _MOST_MODES = 0.7, 60
 """Modes that probabilistic PCA begins with; those without evidence lose their width."""
+# limit of the iterations of the mean, and the change as a share of the size that ends them
 _MEAN_ROUNDS, _STILL = 50, 1e-8
 
 
@@ -131,16 +132,18 @@ class CompletedShapes:
         if modes == "auto":
             modes = choose_modes(data, seed=seed, counted=self.observed).modes
         modes = checked_modes(modes, n)
-        whole = principal_components(data)
-        conditional, total = self._conditional_covariance(whole.basis)
-        values, vectors = eigh(np.diag(whole.variance) + conditional / (n - 1))  # C29
+        components = principal_components(data)
+        conditional, total = self._conditional_covariance(components.basis)
+        values, vectors = eigh(np.diag(components.variance) + conditional / (n - 1))  # C29
         variance, vectors = values[::-1].copy(), vectors[:, ::-1]
         count = len(variance)
         if modes is not None:
             count = min(modes, count) if isinstance(modes, int) else modes_for_variance(variance, modes)
-        rows = vectors[:, :count].T @ whole.basis.T
+        rows = vectors[:, :count].T @ components.basis.T
         fix_signs(rows)
-        return PrincipalComponents(whole.mean, rows.T, variance[:count], whole.total_variance + total / (n - 1), n)
+        return PrincipalComponents(
+            components.mean, rows.T, variance[:count], components.total_variance + total / (n - 1), n
+        )
 
     def _conditional_covariance(self, basis: FloatArray) -> tuple[FloatArray, float]:
         """Return the covariance (R, R) of missing vertices along `basis` (3V, R), summed over shapes, and its trace.
@@ -243,8 +246,8 @@ def _filled(shapes: FloatArray, observed: BoolArray, by: FloatArray) -> FloatArr
     return np.where(observed[:, :, None], shapes, by)
 
 
-def _aligned(whole: FloatArray, gauge: Gauge, alignment_vertices: IntArray | None) -> FloatArray:
-    posed = whole.copy()
+def _aligned(shapes: FloatArray, gauge: Gauge, alignment_vertices: IntArray | None) -> FloatArray:
+    posed = shapes.copy()
     align_in_place(posed, gauge, alignment_vertices=alignment_vertices)
     if gauge == "shape" and alignment_vertices is None:
         scale_to_tangent(posed)

@@ -24,7 +24,7 @@ from shapespace.types import FloatArray, IntArray, SurfaceLandmarks
 from shapespace.version import __version__
 
 FORMAT_NAME = "shapespace model"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 2  # of the model file; 2 added landmarks between vertices, other models are still written as 1
 _VERSION_OF_VERTICES = 1
 """The version that stores landmarks as vertices."""
 _HELD_OUT = "held out"
@@ -33,8 +33,8 @@ _REGIONS = "regions"
 _CORNERS, _BARYCENTRIC, _DISTANCE = "landmark_corners", "landmark_barycentric", "landmark_distance_mm"
 _EVERY_MODEL = ("mean", "basis", "stddev", "faces", _RESIDUALS, _REGIONS, _CORNERS, _BARYCENTRIC, _DISTANCE)
 """What is not of one representation."""
-_UNIT_TOLERANCE = 1e-3
-_TOLD = 200
+_UNIT_TOLERANCE = 1e-3  # length of a mode off 1; float32 rounding over millions of coordinates is smaller
+_TOLD = 200  # characters of a library's error that a message repeats
 _WHOLE_NUMBERS = ("faces", "control_counts", "degree", _REGIONS, _CORNERS)
 
 

@@ -35,17 +35,17 @@ from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity, 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_FEWEST = 3
-_FEWEST_TO_CHOOSE = 4
+_FEWEST = 3  # shapes; without one of them two are left, and fewer have no mode
+_FEWEST_TO_CHOOSE = 4  # shapes; fewer leave no folds in which modes can be chosen
 _MOST_COUNTS, _MOST_SPECIFIC = 12, 6
 """Numbers of modes that are tried; specificity takes longest."""
 _POINTS = 1000
 """Vertices that distances between surfaces are measured at, spread evenly over their numbers."""
-_POSE_ROUNDS = 3
+_POSE_ROUNDS = 3  # alternations of pose and coefficients
 _NEAREST = 2
 """Training shapes nearest by vertices, of which the nearest by surface is taken."""
-_RESAMPLES = 2000
-_PARTS = (0.25, 0.5, 0.75, 1.0)
+_RESAMPLES = 2000  # bootstrap samples, enough for percentiles 2.5 and 97.5
+_PARTS = (0.25, 0.5, 0.75, 1.0)  # shares of the training shapes at which the learning curve is measured
 _ANY = 1e-9
 """Share of the shapes that show a vertex: two of them are enough for a model that is measured."""
 _LEAST_NOISE = 1e-6
@@ -65,14 +65,14 @@ class Curve:
     """A measure by the number of modes, or of training shapes.
 
     Args:
-        at: (n,) numbers of modes or shapes.
+        counts: (n,) numbers of modes or shapes.
         mean: (n,) mm, or a share.
         low: (n,) where its 95 % interval begins.
         high: (n,) where it ends.
         each: (S, n) of each shape or sample, where the mean is over them.
     """
 
-    at: IntArray
+    counts: IntArray
     mean: FloatArray
     low: FloatArray
     high: FloatArray
@@ -81,12 +81,12 @@ class Curve:
     __repr__ = short_repr
 
     @staticmethod
-    def over(each: FloatArray, at: Sequence[int] | IntArray, seed: int) -> Curve:
+    def over(each: FloatArray, counts: Sequence[int] | IntArray, seed: int) -> Curve:
         """Return the mean over the rows of `each` (S, n) with its interval by bootstrap over rows (percentiles)."""
         draws = np.random.default_rng(seed).integers(len(each), size=(_RESAMPLES, len(each)))
         weights = np.stack([np.bincount(draw, minlength=len(each)) for draw in draws]) / len(each)
         low, high = np.percentile(weights @ each, [2.5, 97.5], axis=0)
-        return Curve(np.asarray(at, dtype=np.int32), each.mean(axis=0), np.asarray(low), np.asarray(high), each)
+        return Curve(np.asarray(counts, dtype=np.int32), each.mean(axis=0), np.asarray(low), np.asarray(high), each)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,9 +128,9 @@ class ModelQuality:
     left_out_vertices: int = 0
 
     def __repr__(self) -> str:
-        parts = [f"compactness {self.compactness.mean[-1]:.3f} with {self.compactness.at[-1]} modes"]
+        parts = [f"compactness {self.compactness.mean[-1]:.3f} with {self.compactness.counts[-1]} modes"]
         for name, curve in (("generalisation", self.generalisation), ("specificity", self.specificity)):
-            parts += [] if curve is None else [f"{name} {curve.mean[-1]:.3g} mm with {curve.at[-1]}"]
+            parts += [] if curve is None else [f"{name} {curve.mean[-1]:.3g} mm with {curve.counts[-1]}"]
         return f"<ModelQuality of {self.shapes} shapes: {', '.join(parts)}>"
 
     def plot(self, **options: Any) -> Figure:
@@ -156,7 +156,7 @@ class ModelQuality:
                 f"These {self.shapes} shapes support {modes}: with more, hidden vertices of unseen shapes are foretold "
                 "no better."
             )
-        if self.by_shapes is not None and len(self.by_shapes.at) > 1:
+        if self.by_shapes is not None and len(self.by_shapes.counts) > 1:
             sentences.append(_more_shapes(self.by_shapes, self.seed))
         return tuple(sentences)
 
@@ -166,8 +166,8 @@ class ModelQuality:
         Raises:
             InputError: they are not of the same shapes in the same folds.
         """
-        whole = self.shapes and other.shapes
-        if whole and (self.shapes, self.folds, self.seed) != (other.shapes, other.folds, other.seed):
+        same_shapes = self.shapes and other.shapes
+        if same_shapes and (self.shapes, self.folds, self.seed) != (other.shapes, other.folds, other.seed):
             raise InputError(
                 f"Only what was measured on the same shapes in the same folds can be compared, not {self.shapes} "
                 f"shapes in {self.folds} folds with {other.shapes} in {other.folds}."
@@ -176,9 +176,9 @@ class ModelQuality:
         for name in ("generalisation", "generalisation_vertices", "reconstruction", "reconstruction_vertices"):
             a, b = getattr(self, name), getattr(other, name)
             if isinstance(a, Curve) and isinstance(b, Curve) and a.each is not None and b.each is not None:
-                at, own, others = np.intersect1d(a.at, b.at, return_indices=True)
-                if len(a.each) == len(b.each) and len(at):
-                    out[name] = Curve.over(b.each[:, others] - a.each[:, own], at.astype(np.int32), self.seed)
+                counts, own, others = np.intersect1d(a.counts, b.counts, return_indices=True)
+                if len(a.each) == len(b.each) and len(counts):
+                    out[name] = Curve.over(b.each[:, others] - a.each[:, own], counts.astype(np.int32), self.seed)
         return out
 
 
@@ -219,14 +219,14 @@ class QualityConfig:
 
     def space(self, meshes: Sequence[Mesh], modes: Literal["auto"] | None = None) -> _Space:
         """Return the shape space of `meshes`, of the vertices that at least two of them show."""
-        kept = np.ones(len(meshes[0].vertices), dtype=np.bool_)
+        included = np.ones(len(meshes[0].vertices), dtype=np.bool_)
         if not representation_named(self.representation, self.control_points).takes_holes:
-            kept = ObservedMeshes.of(meshes, _ANY).vertices
+            included = ObservedMeshes.of(meshes, _ANY).vertices
         model = ShapeModel.fit(
             meshes, modes=modes, gauge=self.gauge, align=self.align, representation=self.representation,
             control_points=self.control_points, min_seen=_ANY, seed=self.seed,
         )  # fmt: skip
-        return _Space(model, kept)
+        return _Space(model, included)
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,7 +234,7 @@ class _Space:
     """A model, and which vertices (V,) of the shapes it has: those that its training shapes show."""
 
     model: ShapeModel
-    kept: BoolArray
+    included: BoolArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,7 +258,7 @@ class _Target:
     @staticmethod
     def of(shape: Mesh, scan: Mesh | None) -> _Target:
         seen = np.flatnonzero(np.isfinite(shape.vertices).all(axis=1)).astype(np.int32)
-        surface = scan if scan is not None else _shown(shape, seen)
+        surface = scan if scan is not None else _observed_part(shape, seen)
         engine = build_engine(surface)
         if scan is not None:
             there = shape.vertices[seen]
@@ -278,11 +278,11 @@ class _Target:
         seen = np.flatnonzero(np.isfinite(shape.vertices).all(axis=1)).astype(np.int32)
         if self.is_scan:
             return _Target(shape, seen, self.surface, self.engine, True)
-        surface = _shown(shape, seen)
+        surface = _observed_part(shape, seen)
         return _Target(shape, seen, surface, build_engine(surface), False)
 
 
-def _shown(shape: Mesh, seen: IntArray) -> Mesh:
+def _observed_part(shape: Mesh, seen: IntArray) -> Mesh:
     """Return what of a shape is there."""
     if len(seen) == len(shape.vertices):
         return shape
@@ -357,7 +357,7 @@ class Shapes:
     @cached_property
     def trained(self) -> list[_Target]:
         """The same of the vertices that the shape space has."""
-        return [target.cut_to(self.space.kept) for target in self.targets]
+        return [target.cut_to(self.space.included) for target in self.targets]
 
     @cached_property
     def drawn(self) -> FloatArray:
@@ -394,12 +394,12 @@ class Shapes:
         space = self.config.space([self.meshes[i] for i in sorted(part.order)])
         out = np.zeros((len(held), len(self.counts) + len(self.sizes), 2))
         for row, target in enumerate(held):
-            out[row, : len(self.counts)] = _told(space.model, target.cut_to(space.kept), self.counts)
+            out[row, : len(self.counts)] = _errors_by_modes(space.model, target.cut_to(space.included), self.counts)
         for column, size in enumerate(self.sizes, len(self.counts)):
             fewer = self.config.space([self.meshes[i] for i in sorted(part.order[:size])])
             only = np.array([min(self.config.modes or size - 1, size - 1)], dtype=np.int32)
             for row, target in enumerate(held):
-                out[row, column] = _told(fewer.model, target.cut_to(fewer.kept), only, surface=False)[0]
+                out[row, column] = _errors_by_modes(fewer.model, target.cut_to(fewer.included), only, surface=False)[0]
         return out
 
     def _drawn(self, part: Part) -> FloatArray:
@@ -463,12 +463,12 @@ def measure_quality(
         _refuse_other(mesh, vertices)
     if isinstance(target, ShapeModel):
         return _of_model(target, new, config, progress)
-    whole = representation_named(config.representation, config.control_points).takes_holes
-    kept = np.ones(vertices, dtype=np.bool_) if whole else ObservedMeshes.of(meshes, MIN_SEEN).vertices
-    if not kept.all():
-        meshes, new = [part_of(mesh, kept) for mesh in meshes], [part_of(mesh, kept) for mesh in new]
+    takes_holes = representation_named(config.representation, config.control_points).takes_holes
+    included = np.ones(vertices, dtype=np.bool_) if takes_holes else ObservedMeshes.of(meshes, MIN_SEEN).vertices
+    if not included.all():
+        meshes, new = [part_of(mesh, included) for mesh in meshes], [part_of(mesh, included) for mesh in new]
     shapes = Shapes(meshes, scans, config)
-    return _of_meshes(shapes, new, progress, run, left_out=int((~kept).sum()))
+    return _of_meshes(shapes, new, progress, run, left_out=int((~included).sum()))
 
 
 def _of_model(
@@ -578,12 +578,12 @@ def _spread(vertices: int) -> IntArray:
 def _over_shapes(space: _Space, targets: Sequence[_Target], counts: IntArray, steps: StepCounter) -> FloatArray:
     out = np.zeros((len(targets), len(counts), 2))
     for row, target in enumerate(targets):
-        out[row] = _told(space.model, target.cut_to(space.kept), counts)
+        out[row] = _errors_by_modes(space.model, target.cut_to(space.included), counts)
         steps.add()
     return out
 
 
-def _told(model: ShapeModel, target: _Target, counts: IntArray, *, surface: bool = True) -> FloatArray:
+def _errors_by_modes(model: ShapeModel, target: _Target, counts: IntArray, *, surface: bool = True) -> FloatArray:
     """Return how far (n, 2), mm, a shape lies from what the first modes tell of it: its vertices, and its surface."""
     there, out = target.shape.vertices[target.seen], np.zeros((len(counts), 2))
     T_model_shape = _onto_mean(model, target)
@@ -592,7 +592,7 @@ def _told(model: ShapeModel, target: _Target, counts: IntArray, *, surface: bool
         fitted = T_model_shape.inverse().apply(reconstructed)
         out[column, 0] = np.linalg.norm(fitted[target.seen] - there, axis=1).mean()
         if surface:
-            out[column, 1] = _apart(target.shape.with_vertices(fitted), target)
+            out[column, 1] = _surface_distance(target.shape.with_vertices(fitted), target)
     return out
 
 
@@ -624,7 +624,7 @@ def _in_best_pose(model: ShapeModel, target: _Target, k: int, T: Similarity) -> 
     return reconstructed, T
 
 
-def _apart(fitted: Mesh, target: _Target) -> float:
+def _surface_distance(fitted: Mesh, target: _Target) -> float:
     """Return the mean of both mean distances between two surfaces, mm, each at points spread over what is seen."""
     seen = target.seen[_spread(len(target.seen))]
     there = target.engine.query(fitted.vertices[seen]).distance.mean()
@@ -663,7 +663,7 @@ class _Nearest:
         mean_of = np.nanmean if np.isnan(self.vertices).any() else np.mean
         off = mean_of(np.linalg.norm(self.vertices - shape[self.picked], axis=2), axis=1)
         drawn, nearest = self.meshes[0].with_vertices(shape), np.argsort(off, kind="stable")[:_NEAREST]
-        return float(off.min()), min(_apart(drawn, self.targets[int(i)]) for i in nearest)
+        return float(off.min()), min(_surface_distance(drawn, self.targets[int(i)]) for i in nearest)
 
 
 def _posed(model: ShapeModel, targets: Sequence[_Target], config: QualityConfig) -> list[Mesh]:
@@ -702,17 +702,17 @@ def _shares(gram: FloatArray, counts: IntArray, count: int) -> FloatArray:
 
 def _more_shapes(by_shapes: Curve, seed: int) -> str:
     """Return in a sentence what more training shapes did to the error, and so would do."""
-    each, at = by_shapes.each, by_shapes.at
+    each, counts = by_shapes.each, by_shapes.counts
     if each is None:
         return ""
-    few = int(np.argmin(np.abs(at - at[-1] / 2)))
-    few = min(few, len(at) - 2)
+    few = int(np.argmin(np.abs(counts - counts[-1] / 2)))
+    few = min(few, len(counts) - 2)
     draws = np.random.default_rng(seed).integers(len(each), size=(_RESAMPLES, len(each)))
     fell = 1 - each[draws, -1].mean(axis=1) / each[draws, few].mean(axis=1)
     now = 100 * float(1 - each[:, -1].mean() / each[:, few].mean())
     low, high = 100 * np.percentile(fell, [2.5, 97.5])
     changed = f"fell by {now:.0f} %" if now >= 0 else f"rose by {-now:.0f} %"
-    sentence = f"From {at[few]} to {at[-1]} training shapes the error on unseen ones {changed} "
+    sentence = f"From {counts[few]} to {counts[-1]} training shapes the error on unseen ones {changed} "
     sentence += f"(95 %: {low:.0f} to {high:.0f} %), "
     if low > 0 and now >= 5:
         return sentence + "so more shapes would help."

@@ -18,13 +18,14 @@ from scipy.optimize import isotonic_regression
 
 from shapespace.types import FloatArray
 
-_DEGREE = 5
+_DEGREE = 5  # of the polynomial in the rank of a mode; a smooth factor needs no more
 _WIDTHS = (0.03, 0.1, 0.3, 1.0, 3.0)
 """Standard deviations tried for the constant part of the log factor; wavier parts have less."""
+# limit of Newton steps, the step that ends them, and the longest step, all in the logarithm of the factor
 _STEPS, _STILL, _LONGEST = 60, 1e-7, 1.0
-_ALL_KEPT = 1e-6
-_BOUNDS = (1e-2, 1e4)
-_FARTHEST = 30.0
+_ALL_KEPT = 1e-6  # share of the variance; less beyond the retained modes is rounding
+_BOUNDS = (1e-2, 1e4)  # factors of a variance that no estimate may exceed
+_FARTHEST = 30.0  # bound of exponents, which keeps exp() finite
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ import numpy as np
 from shapespace.errors import InputError
 from shapespace.types import FloatArray
 
-_BLOCK = 1024
+_BLOCK = 1024  # coordinates at a time, so that no centred copy of all data is in memory
 _CANCELLATION = 1e4
 """Beyond this ratio of raw to centred sum of squares, centring the Gram matrix would cost too many digits."""
 _NO_VARIANCE = 1e-10

@@ -30,8 +30,8 @@ _FIRST_NOISE = 1e-3
 """Of the variance, at least: without noise nothing would move."""
 _CONVERGED = 1e-5
 """Nats a coordinate that is observed."""
-_MOST_ROUNDS = 60
-_BLOCK = 512
+_MOST_ROUNDS = 60  # limit of EM iterations
+_BLOCK = 512  # vertices at a time; bounds the memory of their (k + 1)^2 moments
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +171,7 @@ def _expect(
     n, k = len(centred), W.shape[-1] - 1
     flat = W.reshape(-1, k + 1)
     weighted = W_covariance.reshape(len(patterns.count), -1) * patterns.weight[:, None]
-    whole = flat.T @ flat + weighted.sum(axis=0).reshape(k + 1, k + 1)
+    summed = flat.T @ flat + weighted.sum(axis=0).reshape(k + 1, k + 1)
     unseen = (patterns.missing.T.astype(np.float64) @ weighted).reshape(n, k + 1, k + 1)
     y, covariance, bound = np.ones((n, k + 1)), np.zeros((n, k + 1, k + 1)), 0.0
     of_whole: tuple[FloatArray, FloatArray, float] | None = None
@@ -180,7 +180,7 @@ def _expect(
         solved = None if len(patterns.hidden[i]) else of_whole
         if solved is None:
             hidden = W[patterns.hidden[i]].reshape(-1, k + 1)
-            square = whole - hidden.T @ hidden - unseen[i]
+            square = summed - hidden.T @ hidden - unseen[i]
             root: FloatArray = np.asarray(np.linalg.cholesky(square[:k, :k] + noise * np.eye(k)), dtype=np.float64)
             half = np.asarray(solve_triangular(root, np.eye(k), lower=True), dtype=np.float64)
             solved = square, half.T @ half, float(np.log(root.diagonal()).sum())

@@ -2,7 +2,7 @@
 
 The region's vertices vary as the whole model has them vary: the modes of the part are the principal components of the
 model's own modes there, and each coefficient vector of one stands for one of the other. So nothing beyond the region
-has a say in the fit, and what comes of it is told in the coefficients of the whole.
+affects the fit, and its result is given in the coefficients of the full model.
 """
 
 from __future__ import annotations
@@ -38,63 +38,63 @@ class Part:
     lift: FloatArray
 
     @staticmethod
-    def of(whole: ShapeModel, region: str | tuple[int, ...]) -> Part:
+    def of(full: ShapeModel, region: str | tuple[int, ...]) -> Part:
         """Return the part of `whole` in `region`, one of its regions by name or vertices.
 
         Raises:
             InputError: there is no such region, or no triangle lies in it.
         """
-        return _part(whole, region)
+        return _part(full, region)
 
-    def to_b(self, b: FloatArray, whole: ShapeModel) -> FloatArray:
+    def to_b(self, b: FloatArray, full: ShapeModel) -> FloatArray:
         """Return the coefficients (K,) mm of the whole that `b` (k,) mm of the part stands for."""
-        return whole.stddev * (self.lift[:, : len(b)] @ (b / self.model.stddev[: len(b)]))
+        return full.stddev * (self.lift[:, : len(b)] @ (b / self.model.stddev[: len(b)]))
 
-    def to_covariance(self, b_covariance: FloatArray, whole: ShapeModel, variance: FloatArray) -> FloatArray:
+    def to_covariance(self, b_covariance: FloatArray, full: ShapeModel, variance: FloatArray) -> FloatArray:
         """Return the covariance (K, K) mm^2 of the whole's coefficients, of that (K', K') of the part's.
 
         Args:
             b_covariance: of all the part's coefficients.
-            whole: the model that this is a part of.
+            full: the model that this is a part of.
             variance: (K,) mm^2 of the whole's where nothing is seen, as of what no vertex of the part shows.
         """
-        to = whole.stddev[:, None] * self.lift / self.model.stddev
+        to = full.stddev[:, None] * self.lift / self.model.stddev
         unseen = np.eye(len(self.lift)) - self.lift @ self.lift.T
         stddev = np.sqrt(variance)
         return to @ b_covariance @ to.T + stddev[:, None] * unseen * stddev
 
 
 @cached_with_owner(limit=_MAX_PARTS)
-def _part(whole: ShapeModel, region: str | tuple[int, ...]) -> Part:
+def _part(full: ShapeModel, region: str | tuple[int, ...]) -> Part:
     if isinstance(region, str):
-        if region not in whole.regions:
-            there = f"it has {', '.join(whole.regions)}" if whole.regions else "it has none"
+        if region not in full.regions:
+            there = f"it has {', '.join(full.regions)}" if full.regions else "it has none"
             raise InputError(
                 f"The model has no region {region!r} ({there}); give one of them, or a CSV file of vertices, or build "
                 "the model with --region NAME=FILE."
             )
-        vertices = whole.regions[region]
+        vertices = full.regions[region]
     else:
-        vertices = region_vertices(region, whole.n_vertices, "given")
-    inside = np.zeros(whole.n_vertices, dtype=np.bool_)
+        vertices = region_vertices(region, full.n_vertices, "given")
+    inside = np.zeros(full.n_vertices, dtype=np.bool_)
     inside[vertices] = True
-    mean, faces = whole.mean_vertices[inside], whole.faces
+    mean, faces = full.mean_vertices[inside], full.faces
     if faces is not None:
-        mean, faces = without_vertices(whole.mean_vertices, faces, inside)
+        mean, faces = without_vertices(full.mean_vertices, faces, inside)
         if not len(faces):
             raise InputError("No triangle of the model lies in the region; give one with whole triangles.")
-    rows = whole.vertex_basis.reshape(whole.n_vertices, 3, -1)[inside].reshape(3 * len(mean), -1)
-    basis, stddev, lift = np.linalg.svd(rows * whole.stddev, full_matrices=False)
+    rows = full.vertex_basis.reshape(full.n_vertices, 3, -1)[inside].reshape(3 * len(mean), -1)
+    basis, stddev, lift = np.linalg.svd(rows * full.stddev, full_matrices=False)
     significant = stddev > _FAINTEST * stddev[0]
     model = ShapeModel(
         mean=mean.ravel(),
         basis=basis[:, significant],
         stddev=stddev[significant],
-        total_variance=float((stddev**2).sum() * whole.total_variance / (whole.stddev**2).sum()),
-        n_training=whole.n_training,
+        total_variance=float((stddev**2).sum() * full.total_variance / (full.stddev**2).sum()),
+        n_training=full.n_training,
         faces=faces,
-        gauge=whole.gauge,
-        landmarks=whole.landmarks.renumbered(inside),
-        held_out=whole.held_out,
+        gauge=full.gauge,
+        landmarks=full.landmarks.renumbered(inside),
+        held_out=full.held_out,
     )
     return Part(model, inside, lift[significant].T)

@@ -32,10 +32,10 @@ if TYPE_CHECKING:
 
     from shapespace.model.streamed import Meshes, Scratch, Tell
 
-_PROJECTION_ITERATIONS = 200
-_PROJECTION_TOLERANCE = 1e-10
-_SHARE_TOLERANCE = 1e-12
-_TOLD = 300
+_PROJECTION_ITERATIONS = 200  # limit of the alternation of pose and coefficients
+_PROJECTION_TOLERANCE = 1e-10  # change of coefficients, in SD of the first mode, that ends it: float64 rounding
+_SHARE_TOLERANCE = 1e-12  # share of variance; cumulative sums in float64 are off by less
+_TOLD = 300  # characters of a library's error that a message repeats
 _FILE = "_file"
 """Attribute that is no field: neither copies nor states of a model have it."""
 _PLACES = "landmark_places"

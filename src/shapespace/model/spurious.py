@@ -19,8 +19,8 @@ _TANGENT_SHARE = 0.1
 """Modes of shapes lie in the tangent by less than a fiftieth; those of alignment by a third and more, unless mixed."""
 _COARSE = 2.0
 """Rounding to one of two neighbours spreads almost twice as far as rounding over a whole step."""
-_MOST_DECIMALS = 6
-_ROUNDING = 1e-14
+_MOST_DECIMALS = 6  # decimals that files of rounded coordinates have at most; more are not tested for
+_ROUNDING = 1e-14  # relative; some units in the last place of float64
 
 
 def made_by_alignment(

@@ -46,9 +46,10 @@ Tell: TypeAlias = Callable[[str], None]
 _SHAPES, _START, _POSES, _ALIGNED = "shapes.f32", "start.npz", "poses.npz", "aligned"
 _IDENTITY, _LOCK = "identity.txt", "lock"
 _KEPT = "shapes.npz"
+# copies of the meshes in memory during a build, the same when modes are chosen; share of the free memory to use
 _COPIES, _COPIES_TO_CHOOSE, _MOST_OF_MEMORY = 2.0, 4.5, 0.8
-_SAMPLE_BYTES = 256 << 20
-_TOLD_EVERY = 200
+_SAMPLE_BYTES = 256 << 20  # bytes of the rows that are read to estimate the variance
+_TOLD_EVERY = 200  # meshes between two progress messages
 _ROUNDING = 64 * float(np.finfo(float).eps)
 
 
@@ -181,13 +182,13 @@ class Aligned:
     """Aligned shapes on the disk, and what is known of them.
 
     Args:
-        shapes: N rows of 3V numbers about `kept.template`.
-        kept: all the rest; its folder and model are not told yet.
+        shapes: N rows of 3V numbers about `training.template`.
+        training: the other data of the shapes; its folder and model are not yet set.
         passes: where those of the PCA are kept; None keeps nothing.
     """
 
     shapes: Spill
-    kept: KeptShapes
+    training: KeptShapes
     passes: KeptPasses | None
 
     def components(self, modes: int | float | Literal["auto"] | None, seed: int, tell: Tell) -> PrincipalComponents:
@@ -203,10 +204,10 @@ class Aligned:
             self.shapes,
             modes,
             seed=seed,
-            kept=self.passes,
+            passes=self.passes,
             on_pass=lambda n, share: tell(f"finding the modes, pass {n} (residual {share:.0e} of the first)"),
         )
-        mean = pc.mean + self.kept.template.reshape(-1)
+        mean = pc.mean + self.training.template.reshape(-1)
         return PrincipalComponents(mean, pc.basis, pc.variance, pc.total_variance, pc.n_samples, pc.residuals)
 
     def keep(self, folder: Path, model_hash: str) -> None:
@@ -223,7 +224,7 @@ class Aligned:
         except OSError as error:
             raise write_error(folder / _SHAPES, error) from error
         digest = sha256_of_file(folder / _SHAPES)
-        replace(self.kept, folder=folder, model_hash=model_hash, digest=digest).save()
+        replace(self.training, folder=folder, model_hash=model_hash, digest=digest).save()
 
 
 def bytes_in_memory(count: int, mesh: Mesh, *, choose: bool) -> int:
@@ -267,7 +268,7 @@ def aligned_on_disk(
         scratch: for what a build that is killed goes on with; None takes a temporary folder and keeps nothing.
         onto: shapes to which these are added.
         modes: that will be asked for; what cannot be had is refused before anything is read.
-        tell: told what is being done.
+        tell: called with the current step.
 
     Raises:
         CorrespondenceError: the meshes differ in vertices or triangles.
@@ -282,7 +283,7 @@ def aligned_on_disk(
         try:
             with work.aligned() as shapes:
                 passes = None if scratch is None else KeptPasses(folder)
-                yield Aligned(shapes, work.told(), passes)
+                yield Aligned(shapes, work.kept_shapes(), passes)
         finally:
             path.unlink(missing_ok=True)
 
@@ -372,7 +373,7 @@ class _Work:
         self.template: FloatArray = np.empty((0, 3))
         self.sizes: FloatArray = np.empty(0)
 
-    def told(self) -> KeptShapes:
+    def kept_shapes(self) -> KeptShapes:
         if self.onto is not None:
             reference, rounding = self.onto.reference, self.onto.rounding
         else:
@@ -396,9 +397,9 @@ class _Work:
         """Yield the file of aligned shapes: as a build that was killed left it, or made anew."""
         path, start, done = (self.folder / name for name in (_SHAPES, _START, _ALIGNED))
         poses = read_arrays(self.folder / _POSES)
-        whole = path.is_file() and path.stat().st_size == 4 * self.count * self.first.vertices.size
-        near = read_arrays(start) if whole else None
-        if whole and done.is_file() and poses is not None:
+        complete = path.is_file() and path.stat().st_size == 4 * self.count * self.first.vertices.size
+        near = read_arrays(start) if complete else None
+        if complete and done.is_file() and poses is not None:
             self.template, self.sizes = poses["template"], poses["sizes"]
             with Spill(path, self.count, self.template.size, new=False) as shapes:
                 yield shapes

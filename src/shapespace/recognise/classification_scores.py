@@ -176,12 +176,12 @@ def _with_probabilities(labels: Sequence[str], probabilities: FloatArray, classe
             f"{len(labels)} labels of {len(classes)} classes need probabilities of that shape, not "
             f"{probabilities.shape}."
         )
-    place = {name: k for k, name in enumerate(classes)}
-    unknown = sorted(set(labels) - set(place))
+    column = {name: k for k, name in enumerate(classes)}
+    unknown = sorted(set(labels) - set(column))
     if unknown:
         raise InputError(f"The label {unknown[0]!r} is none of the classes.")
     finite = np.isfinite(probabilities).all(axis=1)
     if not finite.any():
         raise InputError("There is no sample with probabilities, so they cannot be compared with the labels.")
-    truth = np.asarray([place[name] for name in labels], dtype=np.int64)
+    truth = np.asarray([column[name] for name in labels], dtype=np.int64)
     return truth[finite], probabilities[finite]

@@ -325,19 +325,19 @@ def _saved(path: Path, pipeline: Any, facts: Mapping[str, Any], projection: byte
             raise TypeError
         classes = tuple(_text(name) for name in cast(Sequence[Any], facts["classes"]))
         saved = SavedClassifier(
-            pipeline,
-            _text(facts["classifier"]),
-            _text(facts["model_hash"]),
-            int(facts["modes"]),
-            facts["relative_to_neutral"] is True,
-            _text(facts["neutral"]),
-            classes,
-            float(facts["confidence"]),
-            float(facts["temperature"]),
-            dict(facts["training"]),
-            dict(facts["cross_validation"]),
-            {str(name): str(number) for name, number in dict(facts["versions"]).items()},
-            None if projection is None else _projection(projection),
+            pipeline=pipeline,
+            classifier=_text(facts["classifier"]),
+            model_hash=_text(facts["model_hash"]),
+            modes=int(facts["modes"]),
+            relative_to_neutral=facts["relative_to_neutral"] is True,
+            neutral=_text(facts["neutral"]),
+            classes=classes,
+            confidence=float(facts["confidence"]),
+            temperature=float(facts["temperature"]),
+            training=dict(facts["training"]),
+            cross_validation=dict(facts["cross_validation"]),
+            versions={str(name): str(number) for name, number in dict(facts["versions"]).items()},
+            projection=None if projection is None else _projection(projection),
         )
         is_valid = (
             saved.classifier in CLASSIFIERS

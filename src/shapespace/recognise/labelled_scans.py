@@ -77,11 +77,11 @@ def from_record(name: str, record: FitRecord) -> ScanCoefficients:
 def from_results(results: Results) -> list[ScanCoefficients]:
     """Return the fits of a folder with a store, in the order of their names.
 
-    Those in shards that cannot be read are left out, see `Results.problems`.
+    Fits in unreadable shards are left out; `Results.problems` lists them.
 
     Raises:
-        FileFormatError: a fit lacks what recognition needs, or is damaged.
-        InputError: there are none.
+        FileFormatError: a fit is damaged, or lacks data that recognition needs.
+        InputError: the folder has no fits.
     """
     texts = ("scan", "status", "reason", "model_hash", "scan_name")
     columns = [f"z{k}" for k in range(1, modes_of(results) + 1)]

@@ -114,9 +114,20 @@ def train_classifier(
         "left_out": left_out_counts,
     }
     saved = SavedClassifier(
-        pipeline, classifier, model_hash, K, relative, neutral, tuple(classes), float(confidence), temperature,
-        training, checked, software_versions(), projection,
-    )  # fmt: skip
+        pipeline=pipeline,
+        classifier=classifier,
+        model_hash=model_hash,
+        modes=K,
+        relative_to_neutral=relative,
+        neutral=neutral,
+        classes=tuple(classes),
+        confidence=float(confidence),
+        temperature=temperature,
+        training=training,
+        cross_validation=checked,
+        versions=software_versions(),
+        projection=projection,
+    )
     return saved, notes
 
 
@@ -190,7 +201,9 @@ def _calibrate(
     if not splits or any(len(np.unique(labels[train])) < 2 for train, _ in splits):
         note = "There are too few subjects for cross-validation: accuracy is unknown, probabilities are not calibrated."
         return 1.0, {"macro_accuracy": None, "by": None, "folds": 0}, note
-    probabilities = cross_validated_probabilities(z, labels, splits, classes, classifier, {}, seed)
+    probabilities = cross_validated_probabilities(
+        X=z, labels=labels, folds=splits, classes=classes, classifier=classifier, parameters={}, seed=seed
+    )
     temperature = fit_temperature(labels.tolist(), probabilities, classes)
     answers = np.asarray(classes)[probabilities.argmax(axis=1)]
     accuracy = macro_accuracy(labels, answers, classes)

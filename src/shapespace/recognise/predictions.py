@@ -146,8 +146,8 @@ def folds_of(
     names, people = np.asarray(labels, dtype=str), np.asarray(subjects, dtype=str)
     return [
         Fold(
-            z[train], names[train].tolist(), people[train].tolist(),
-            z[test], names[test].tolist(), people[test].tolist(), test,
+            train=z[train], train_labels=names[train].tolist(), train_subjects=people[train].tolist(),
+            test=z[test], test_labels=names[test].tolist(), test_subjects=people[test].tolist(), test_index=test,
         )
         for train, test in subject_folds(subjects, n_folds, seed)
     ]  # fmt: skip
@@ -204,7 +204,12 @@ def _nested(
     inner = subject_folds(subjects.tolist(), inner_folds, seed)
     K = X.shape[1]
     counts = sorted({min(K if m is None else m, K) for m in modes})
-    by_modes = [cross_validated_probabilities(X[:, :m], labels, inner, classes, "lda", {}, seed) for m in counts]
+    by_modes = [
+        cross_validated_probabilities(
+            X=X[:, :m], labels=labels, folds=inner, classes=classes, classifier="lda", parameters={}, seed=seed
+        )
+        for m in counts
+    ]
     tried = [macro_accuracy(labels, likeliest_classes(candidate, classes), classes) for candidate in by_modes]
     m = counts[int(np.argmax(tried))]
     best: tuple[float, str, dict[str, Any], FloatArray] | None = None
@@ -213,7 +218,15 @@ def _nested(
         for parameters in _grid(name):
             if int(parameters.get("classify__n_neighbors", 1)) > fewest:
                 continue  # so many neighbours there are not
-            probabilities = cross_validated_probabilities(X[:, :m], labels, inner, classes, name, parameters, seed)
+            probabilities = cross_validated_probabilities(
+                X=X[:, :m],
+                labels=labels,
+                folds=inner,
+                classes=classes,
+                classifier=name,
+                parameters=parameters,
+                seed=seed,
+            )
             accuracy = macro_accuracy(labels, likeliest_classes(probabilities, classes), classes)
             if best is None or accuracy > best[0] + 1e-12:
                 best = accuracy, name, parameters, probabilities
@@ -221,7 +234,15 @@ def _nested(
         raise InputError("None of the classifiers can be had with so few training samples; add samples.")
     accuracy, name, parameters, probabilities = best
     temperature = fit_temperature(labels.tolist(), probabilities, classes)
-    fold_probabilities = predict_probabilities(X[:, :m], labels, fold.test[:, :m], classes, name, parameters, seed)
+    fold_probabilities = predict_probabilities(
+        X=X[:, :m],
+        labels=labels,
+        test=fold.test[:, :m],
+        classes=classes,
+        classifier=name,
+        parameters=parameters,
+        seed=seed,
+    )
     return calibrated(fold_probabilities, temperature), Choice(name, parameters, m, temperature, accuracy)
 
 
@@ -240,7 +261,15 @@ def fixed_predictions(
         for fold in folds:
             X, labels, _ = usable_training_rows(fold)
             m = min(modes or X.shape[1], X.shape[1])
-            probabilities = predict_probabilities(X[:, :m], labels, fold.test[:, :m], classes, classifier, {}, seed)
+            probabilities = predict_probabilities(
+                X=X[:, :m],
+                labels=labels,
+                test=fold.test[:, :m],
+                classes=classes,
+                classifier=classifier,
+                parameters={},
+                seed=seed,
+            )
             results.append((probabilities, Choice(classifier, {}, m, 1.0, float("nan"))))
     return _gather(folds, classes, results)
 
@@ -292,7 +321,13 @@ def cross_validated_probabilities(
     probabilities = np.full((len(X), len(classes)), np.nan)
     for train, test in folds:
         probabilities[test] = predict_probabilities(
-            X[train], labels[train], X[test], classes, classifier, parameters, seed
+            X=X[train],
+            labels=labels[train],
+            test=X[test],
+            classes=classes,
+            classifier=classifier,
+            parameters=parameters,
+            seed=seed,
         )
     return probabilities
 
@@ -347,11 +382,11 @@ def _gather(
         index = np.concatenate([np.asarray(fold.test_index) for fold in folds])
     order = np.argsort(index, kind="stable")
     return Predictions(
-        classes,
-        tuple(labels[order].tolist()),
-        tuple(likeliest_classes(probabilities, classes)[order].tolist()),
-        probabilities[order],
-        tuple(subjects[order].tolist()),
-        index[order],
-        tuple(choice for _, choice in results),
+        classes=classes,
+        labels=tuple(labels[order].tolist()),
+        predicted=tuple(likeliest_classes(probabilities, classes)[order].tolist()),
+        probabilities=probabilities[order],
+        subjects=tuple(subjects[order].tolist()),
+        index=index[order],
+        chosen=tuple(choice for _, choice in results),
     )

@@ -125,15 +125,15 @@ def _prepare(fold: Fold, classes: Sequence[str]) -> _Prepared:
     X = (X - mean) / spread
     names = np.asarray(classes)
     return _Prepared(
-        fold,
-        np.searchsorted(names, np.asarray(fold.train_labels, dtype=str)),
-        np.searchsorted(names, np.asarray(fold.test_labels, dtype=str)),
-        _rows(fold.train_subjects),
-        _rows(fold.test_subjects),
-        finite,
-        X,
-        (fold.test - mean) / spread,
-        X.T @ X,
+        fold=fold,
+        train_labels=np.searchsorted(names, np.asarray(fold.train_labels, dtype=str)),
+        test_labels=np.searchsorted(names, np.asarray(fold.test_labels, dtype=str)),
+        train_rows=_rows(fold.train_subjects),
+        test_rows=_rows(fold.test_subjects),
+        finite=finite,
+        X=X,
+        test=(fold.test - mean) / spread,
+        gram=X.T @ X,
     )
 
 
@@ -178,7 +178,13 @@ def _score_any(
     for p in folds:
         labels = names[_shuffled(p.train_labels, p.train_rows, order)][p.finite]
         probabilities = predict_probabilities(
-            p.fold.train[p.finite], labels, p.fold.test, classes, classifier, {}, seed
+            X=p.fold.train[p.finite],
+            labels=labels,
+            test=p.fold.test,
+            classes=classes,
+            classifier=classifier,
+            parameters={},
+            seed=seed,
         )
         truth += names[_shuffled(p.test_labels, p.test_rows, order)].tolist()
         answers += likeliest_classes(probabilities, classes).tolist()
@@ -224,7 +230,13 @@ def learning_curve(
                 people = rng.choice(np.unique(np.asarray(fold.train_subjects, dtype=str)), counts[i], replace=False)
                 is_train = np.isin(subjects, people)
                 probabilities = predict_probabilities(
-                    X[is_train], labels[is_train], fold.test, classes, classifier, {}, seed
+                    X=X[is_train],
+                    labels=labels[is_train],
+                    test=fold.test,
+                    classes=classes,
+                    classifier=classifier,
+                    parameters={},
+                    seed=seed,
                 )
                 answers += likeliest_classes(probabilities, classes).tolist()
             curve[i, j] = macro_accuracy(truth, answers, classes)

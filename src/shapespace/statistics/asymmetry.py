@@ -33,11 +33,11 @@ from shapespace.step_counter import StepCounter
 from shapespace.types import BoolArray, FloatArray, Mesh, read_only, require
 
 ERROR_ASYMMETRIC, ERROR_SYMMETRIC = "measurement error, asymmetric", "measurement error, symmetric"
-LEVEL = 0.95
-_BLOCK = 100
+LEVEL = 0.95  # of confidence intervals, the usual one
+_BLOCK = 100  # permutations at a time; bounds memory and spaces the progress messages
 _HEIGHT_OFF = 2.0
 """Error of the height of the surface above a triangle, as a share of the height: curvature differs at its corners."""
-_FEWEST = 3
+_FEWEST = 3  # subjects; two leave one degree of freedom
 _MOSTLY = 0.5
 """Share of the shapes of a subject that must observe a vertex, so that it counts as observed."""
 
@@ -242,9 +242,9 @@ def measure_asymmetry(
     who = _SubjectMeans(codes, counts)
     along = _along(difference, normals) if normals is not None else difference
     own, own_difference = who.of(along), who.of(difference)
-    told = own[..., None] * normals if normals is not None else own
-    scores = _scores(along, who, _shared(cohort, sides, mean, told, who))
-    vertex_scores = _scores(difference, who, _shared(cohort, sides, mean, own_difference, who))
+    asymmetry = own[..., None] * normals if normals is not None else own
+    scores = _scores(along, who, _shared_error(cohort, sides, mean, asymmetry, who))
+    vertex_scores = _scores(difference, who, _shared_error(cohort, sides, mean, own_difference, who))
     z, z_low, z_high = _standardised(scores, in_reference)
     steps = _Steps(4 * permutations, progress)
     parts = symmetric, difference
@@ -354,8 +354,8 @@ def _split(cohort: Cohort, sides: Sides) -> tuple[FloatArray, FloatArray, FloatA
     """Return the symmetric parts and differences (N, M, 3) of shapes superimposed with their images, and the mean."""
     n = len(cohort)
     both = np.empty((2 * n, len(sides), 3))
-    for at in range(n):
-        both[at] = cohort.vertices(at)[sides.vertices]
+    for k in range(n):
+        both[k] = cohort.vertices(k)[sides.vertices]
     both[n:] = sides.image(both[:n])
     align_in_place(both, cohort.gauge)
     if cohort.gauge == "shape":
@@ -420,26 +420,26 @@ def _anova(
     p_both = _p_permuting(gram_off, between, rng, steps) if repeated else None
     p_individual = _p_permuting(gram_s, between, rng, steps) if repeated else None
 
-    ms_individual, ms_side = individual / ((n - 1) * d_sym), side / d_asym
+    ms_subject, ms_side = individual / ((n - 1) * d_sym), side / d_asym
     ms_both = both / ((n - 1) * d_asym)
-    found = [
-        AnovaRow("individual", individual, (n - 1) * d_sym, ms_individual, _over(ms_individual, ms_both), p_individual),
-        AnovaRow("side", side, d_asym, ms_side, _over(ms_side, ms_both), p_side),
+    rows_of_table = [
+        AnovaRow("individual", individual, (n - 1) * d_sym, ms_subject, _f_ratio(ms_subject, ms_both), p_individual),
+        AnovaRow("side", side, d_asym, ms_side, _f_ratio(ms_side, ms_both), p_side),
     ]
     if not repeated:
-        return (*found, AnovaRow("individual x side", both, (n - 1) * d_asym, ms_both))
+        return (*rows_of_table, AnovaRow("individual x side", both, (n - 1) * d_asym, ms_both))
     df = rows - n
     ms_error = error_d / (df * d_asym)
     return (
-        *found,
-        AnovaRow("individual x side", both, (n - 1) * d_asym, ms_both, _over(ms_both, ms_error), p_both),
+        *rows_of_table,
+        AnovaRow("individual x side", both, (n - 1) * d_asym, ms_both, _f_ratio(ms_both, ms_error), p_both),
         AnovaRow(ERROR_ASYMMETRIC, error_d, df * d_asym, ms_error),
         AnovaRow(ERROR_SYMMETRIC, error_s, df * d_sym, error_s / (df * d_sym)),
     )
 
 
-def _over(ms: float, beside: float) -> float | None:
-    return ms / beside if beside > 0 else None
+def _f_ratio(ms: float, error: float) -> float | None:
+    return ms / error if error > 0 else None
 
 
 def _p_flipping(gram: FloatArray, rng: np.random.Generator, steps: _Steps) -> float | None:
@@ -494,7 +494,9 @@ def _family_wise(
     return read_only(beyond / (1 + steps.each)) if steps.each else read_only(np.full(m, np.nan))
 
 
-def _shared(cohort: Cohort, sides: Sides, mean: FloatArray, told: FloatArray, who: _SubjectMeans) -> FloatArray | None:
+def _shared_error(
+    cohort: Cohort, sides: Sides, mean: FloatArray, asymmetry: FloatArray, who: _SubjectMeans
+) -> FloatArray | None:
     """Return the variance (n,), mm^2, of the length of asymmetries (n, M, 3) by what their fits know of themselves.
 
     All scans of a subject share most of this error, as the model lacks the same of each; None where nothing was fitted.
@@ -506,7 +508,7 @@ def _shared(cohort: Cohort, sides: Sides, mean: FloatArray, told: FloatArray, wh
     turn = fit_similarity(model, mean, with_scale=False).rotation
     scale = centroid_size(mean) / centroid_size(model)
     modes = fitted.model.vertex_basis.reshape(-1, 3, fitted.model.n_modes)[sides.vertices][:, :, : fitted.b.shape[1]]
-    flat = (told @ turn).reshape(len(told), -1)
+    flat = (asymmetry @ turn).reshape(len(asymmetry), -1)
     unit = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
     # An asymmetric field is minus its own image, so that a mode and its image do the same to it.
     along = 2.0 * scale * unit @ modes.reshape(unit.shape[1], -1)
@@ -569,14 +571,14 @@ def _standardised(scores: AsymmetryScores, group: npt.NDArray[np.bool_]) -> tupl
     return z(scores.mm), z(scores.low), z(scores.high)
 
 
-def first_pattern(found: AsymmetryResult) -> tuple[FloatArray, float, FloatArray]:
+def first_pattern(result: AsymmetryResult) -> tuple[FloatArray, float, FloatArray]:
     """Return the first principal pattern of fluctuating asymmetry.
 
     Returns:
         (M, 3) mm, what one standard deviation of it adds to the difference; its share of the variance; (n,) how much
         of it each subject has, in standard deviations.
     """
-    off: Any = (found.difference - found.difference.mean(axis=0)).reshape(len(found.subjects), -1)
+    off: Any = (result.difference - result.difference.mean(axis=0)).reshape(len(result.subjects), -1)
     value, vector = np.linalg.eigh(off @ off.T)
     if value[-1] <= 0:
         raise InputError("All subjects are equally asymmetric, so there is no pattern of fluctuating asymmetry.")

@@ -22,14 +22,14 @@ KEPT_SHARE = 0.4
 """Share of the surface that must be unchanged for it to be found."""
 NEAR_MM = 10.0
 """How near to a landmark vertices are taken, where nothing else is said."""
-_PATCHES, _PATCH_SHARE = 24, 0.15
+_PATCHES, _PATCH_SHARE = 24, 0.15  # patches that alignments start from, and their share of the points
 _FIRST_STEPS, _GO_ON, _STEPS = 3, 4, 20
 """All starts take a few steps, and the best of them go on."""
-_FEWEST = 3
+_FEWEST = 3  # vertices that determine a rigid transformation
 _CUTOFF = 5.5
 """Residuals beyond so many standard deviations count nothing: Tukey's biweight, 95 % efficient in three dimensions."""
-_ROUNDS = 10
-_SMALLEST = 1e-9
+_ROUNDS = 10  # reweighting iterations
+_SMALLEST = 1e-9  # share of the size; keeps the spread of identical surfaces above zero
 
 
 def stable_vertices(cohort: Cohort, stable: str | Path | Sequence[int]) -> IntArray | None:

@@ -102,8 +102,8 @@ def volume_mm3(vertices: FloatArray, faces: IntArray) -> float:
 def contrast(visits: Sequence[Visit], *, rate: bool) -> FloatArray:
     """Return (T,) with which visits sum to last minus first, or to the slope of a line by time."""
     if rate:
-        at = np.array([visit.time for visit in visits])
-        away = at - at.mean()
+        times = np.array([visit.time for visit in visits])
+        away = times - times.mean()
         return away / float(away @ away)
     out = np.zeros(len(visits))
     out[0], out[-1] = -1.0, 1.0

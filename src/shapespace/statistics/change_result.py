@@ -39,7 +39,7 @@ class ChangeConfig:
         stable: the part that did not change, by which visits are aligned: `auto` (detected), `all`, a region of the
             model, a file of vertices, or `landmarks:NAME,NAME,MM`, the vertices within MM of these; in Python also the
             vertices.
-        regions: name -> vertices, whose volumes are told beside that of the whole; None takes those of the model.
+        regions: name -> vertices, whose volumes are reported in addition to the total; None takes those of the model.
         group: column of two groups whose changes are compared.
         rate: analyse mm per unit of time instead of last minus first visit.
         permutations: number of permutations.

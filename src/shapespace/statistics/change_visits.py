@@ -14,7 +14,7 @@ TIMES = ("time", "visit", "date")
 """The columns that may tell the time; the first that is there does."""
 RESCAN = "rescan"
 _NOT_MARKED = frozenset({"", "0", "0.0", "no", "false"})
-_DAYS_IN_A_YEAR = 365.25
+_DAYS_IN_A_YEAR = 365.25  # days; mean of the Julian calendar
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,8 @@ def visits_of(table: Table, subject: str, time: str | None, order: Sequence[str]
     subjects, labels = table.texts(subject), table.texts(column)
     marks = table.columns.get(RESCAN)
     rows: dict[str, dict[float, list[int]]] = {}
-    for row, (name, place) in enumerate(zip(subjects, places, strict=True)):
-        rows.setdefault(name, {}).setdefault(place, []).append(row)
+    for row, (name, when) in enumerate(zip(subjects, places, strict=True)):
+        rows.setdefault(name, {}).setdefault(when, []).append(row)
     if marks is not None:
         for name, times in rows.items():
             for scans in times.values():
@@ -85,7 +85,7 @@ def visits_of(table: Table, subject: str, time: str | None, order: Sequence[str]
                         "rescans; mark all but one, or correct their times."
                     )
     visits = {
-        name: tuple(Visit(place, labels[scans[0]], tuple(scans)) for place, scans in sorted(times.items()))
+        name: tuple(Visit(when, labels[scans[0]], tuple(scans)) for when, scans in sorted(times.items()))
         for name, times in rows.items()
     }
     return Visits(visits, unit, column)
@@ -111,7 +111,7 @@ def time_column(table: Table, time: str | None) -> str:
 def _places(table: Table, column: str, order: Sequence[str] | None) -> tuple[list[float], str]:
     cells = table.texts(column)
     if order is not None:
-        known = {word: float(place) for place, word in enumerate(order)}
+        known = {word: float(time) for time, word in enumerate(order)}
         if len(known) < max(len(order), 2):
             raise InputError(f"The order {','.join(order)} needs two or more words, each once.")
         odd = next((row for row, cell in enumerate(cells) if cell not in known), None)

@@ -35,8 +35,9 @@ FUNCTIONS: Mapping[str, str] = {
 }
 """What a formula may call, and what it is."""
 
+# characters, stars, names and constants that bound the time a formula takes to expand
 _LONGEST, _MOST_STARS, _MOST_NAMES, _LARGEST_CONSTANT = 1000, 5, 64, 20
-_MOST_CELLS = 100_000
+_MOST_CELLS = 100_000  # combinations of levels, which are enumerated
 _MOST_COLUMNS = 5000
 """Limit before repeated or implied columns are removed; more take seconds to expand, and need as many shapes."""
 _DEEPEST = 30
@@ -72,7 +73,7 @@ class Variable:
     high: float = 0.0
     middle: float = 0.0
 
-    def told(self, value: str | float) -> str:
+    def describe(self, value: str | float) -> str:
         """Return a value in words, such as `sex female` or `age 61`."""
         return f"{self.name} {value}" if isinstance(value, str) else f"{self.name} {value:.4g}"
 
@@ -144,7 +145,7 @@ class Design:
                 self._frame(self.values), context=_CONTEXT, na_action="ignore"
             )
         spec = made.model_spec
-        slices = [tuple(int(at) for at in indices) for indices in spec.term_indices.values()]
+        slices = [tuple(int(column) for column in indices) for indices in spec.term_indices.values()]
         terms = tuple(
             Term(":".join(product) or "1", frozenset(product), frozenset(self.factors[one] for one in product), own)
             for product, own in zip(ordered, slices, strict=True)
@@ -184,7 +185,7 @@ class Design:
                 choices.append((one.middle,))
         cells = _cells(choices, self.formula)
         return read_only(
-            self.rows({one.column: [cell[at] for cell in cells] for at, one in enumerate(self.variables)}).mean(axis=0)
+            self.rows({one.column: [cell[k] for cell in cells] for k, one in enumerate(self.variables)}).mean(axis=0)
         )
 
     def contrast(
@@ -201,7 +202,7 @@ class Design:
             fixed: values of other variables, by their names inside.
         """
         held = dict(fixed or {})
-        beside = {name for term in self.terms if column in term.variables for name in term.variables}
+        interacting = {name for term in self.terms if column in term.variables for name in term.variables}
         choices: list[Sequence[str | float]] = []
         for one in self.variables:
             if one.column == column:
@@ -209,11 +210,11 @@ class Design:
             elif one.column in held:
                 choices.append((held[one.column],))
             elif one.levels:
-                choices.append(one.levels if one.column in beside else one.levels[:1])
+                choices.append(one.levels if one.column in interacting else one.levels[:1])
             else:
                 choices.append((one.middle,))
         cells = _cells(choices, self.formula)
-        values = {one.column: [cell[at] for cell in cells] for at, one in enumerate(self.variables)}
+        values = {one.column: [cell[k] for cell in cells] for k, one in enumerate(self.variables)}
         rows = self.rows(values)
         at_high = np.array([value == high for value in values[column]])
         return read_only(rows[at_high].mean(axis=0) - rows[~at_high].mean(axis=0))
@@ -309,10 +310,10 @@ def design_of(formula: str, table: Table) -> Design:
         raise InputError(f"The formula {formula!r} cannot be worked out ({_first(error)}); correct it.") from error
     matrix = np.asarray(made, dtype=np.float64)
     spec = made.model_spec
-    slices = [tuple(int(at) - 1 for at in indices) for indices in spec.term_indices.values()][1:]
+    slices = [tuple(int(index) - 1 for index in indices) for indices in spec.term_indices.values()][1:]
     terms = tuple(Term(*parts) for parts in zip(labels, factors, members, slices, strict=True))
     for term in terms:
-        if not np.isfinite(matrix[:, [at + 1 for at in term.columns]]).all():
+        if not np.isfinite(matrix[:, [index + 1 for index in term.columns]]).all():
             raise InputError(f"{table.where}: {term.label} is not finite in all rows, as a logarithm of 0 would be.")
     return Design(
         formula=formula,
@@ -419,13 +420,13 @@ class _Bound:
     def __init__(self, text: str, table: Table, where: str) -> None:
         self.table, self.where = table, where
         self.tokens: list[str] = []
-        at = 0
-        while text[at:].strip():
-            found = _TOKEN.match(text, at)
+        position = 0
+        while text[position:].strip():
+            match = _TOKEN.match(text, position)
             # Only arguments of functions have other characters, and these are read by name and numbers alone.
-            self.tokens.append(found.group(1) if found else text[at])
-            at = found.end() if found else at + 1
-        self.at = self.depth = 0
+            self.tokens.append(match.group(1) if match else text[position])
+            position = match.end() if match else position + 1
+        self.position = self.depth = 0
 
     def columns(self) -> int:
         """Return an upper bound of the columns.
@@ -436,20 +437,20 @@ class _Bound:
         if not self.tokens:
             return 0
         size = self._sum()
-        if self.at < len(self.tokens):
+        if self.position < len(self.tokens):
             raise self._unreadable()
         return size.columns
 
     def _unreadable(self) -> InputError:
-        near = self.tokens[min(self.at, len(self.tokens) - 1)]
+        near = self.tokens[min(self.position, len(self.tokens) - 1)]
         return InputError(f"{self.where} cannot be read near {near[:20]!r}; write one such as '~ sex + age'.")
 
     def _next(self, *wanted: str) -> str:
         """Return the next token and go past it if it is one of those wanted, else an empty text."""
-        token = self.tokens[self.at] if self.at < len(self.tokens) else ""
+        token = self.tokens[self.position] if self.position < len(self.tokens) else ""
         if token not in wanted:
             return ""
-        self.at += 1
+        self.position += 1
         return token
 
     def _sum(self) -> _Size:
@@ -498,17 +499,17 @@ class _Bound:
             if not self._next(")"):
                 raise self._unreadable()
             return size
-        token = self.tokens[self.at] if self.at < len(self.tokens) else ""
+        token = self.tokens[self.position] if self.position < len(self.tokens) else ""
         if not re.match(r"[\w.`]", token):
             raise self._unreadable()
-        self.at += 1
+        self.position += 1
         if not self._next("("):
             return self._size_of(token.strip("`"))
         inside, depth = list[str](), 1
-        while depth and self.at < len(self.tokens):
-            inside.append(self.tokens[self.at])
+        while depth and self.position < len(self.tokens):
+            inside.append(self.tokens[self.position])
             depth += {"(": 1, ")": -1}.get(inside[-1], 0)
-            self.at += 1
+            self.position += 1
         if depth:
             raise self._unreadable()
         if token in ("poly", "bs"):
@@ -571,14 +572,14 @@ def _variable(table: Table, name: str, column: str, *, classes: bool) -> tuple[V
         return Variable(
             name=name, column=column, levels=(), groups=groups, low=low, high=high, middle=float(numbers.mean())
         ), [float(v) for v in numbers]
-    told = table.kind(name) == "number"
-    cells = [f"{float(cell):g}" if told else cell for cell in table.texts(name)]
-    levels = tuple(sorted(set(cells), key=float) if told else sorted(set(cells)))
+    numeric = table.kind(name) == "number"
+    cells = [f"{float(cell):g}" if numeric else cell for cell in table.texts(name)]
+    levels = tuple(sorted(set(cells), key=float) if numeric else sorted(set(cells)))
     if len(levels) == 1:
         raise InputError(
             f"{table.where}: {name!r} is {levels[0][:40]!r} for all {len(table)} shapes; a comparison needs two groups."
         )
-    return Variable(name=f"C({name})" if told else name, column=column, levels=levels, groups=levels), cells
+    return Variable(name=f"C({name})" if numeric else name, column=column, levels=levels, groups=levels), cells
 
 
 def _group(value: float) -> str:

@@ -24,15 +24,15 @@ from shapespace.statistics.compare_strata import Stratum
 from shapespace.statistics.dispersion import Estimate
 from shapespace.types import BoolArray, FloatArray, Mesh, read_only
 
-_VERTICES = 512
-_BYTES = 48 * 2**20
-_TIE = 1e-9
-_NONE = 1e-12
+_VERTICES = 512  # vertices at a time; with _BYTES it bounds the memory of permuted values
+_BYTES = 48 * 2**20  # bytes of permuted values at a time
+_TIE = 1e-9  # relative; statistics nearer than float64 sums are accurate count as equal
+_NONE = 1e-12  # share of the squares; a residual below is rounding
 _BINS = 6000
 """Of the logarithm of F, from a millionth to a million."""
 _REACH = 2.5
 """Standard deviations after which a bump ends."""
-_FLOOR = 1e-6
+_FLOOR = 1e-6  # share of the mean variance that the error variance is at least, so that the matrix is invertible
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,10 +93,10 @@ class EffectMap:
 
     def interval_mm(self, vertex: int) -> tuple[float, float]:
         """Return the interval of `shown_mm` at a vertex, which holds for all vertices at once."""
-        f, shown = float(self.shown.f[vertex]), float(self.shown_mm[vertex])
-        half = float("inf") if f <= 0 else abs(shown) * float(np.sqrt(self.shown.critical / f))  # S9
+        f, change = float(self.test.f[vertex]), float(self.shown_mm[vertex])
+        half = float("inf") if f <= 0 else abs(change) * float(np.sqrt(self.test.critical / f))  # S9
         # A length is not negative.
-        return (shown - half if self.normal_mm is not None else max(shown - half, 0.0)), shown + half
+        return (change - half if self.normal_mm is not None else max(change - half, 0.0)), change + half
 
     @property
     def shown_mm(self) -> FloatArray:
@@ -105,7 +105,7 @@ class EffectMap:
         return mm if self.blank is None else np.where(self.blank, 0.0, mm)
 
     @property
-    def shown(self) -> Tested:
+    def test(self) -> Tested:
         """The test of `shown_mm`."""
         return self.any_way if self.along is None else self.along
 
@@ -168,19 +168,19 @@ def effect_maps(
                 if start == 0:
                     observed[name][:, part] = f[:, 0]
                 as_large[name][:, part] += (f >= observed[name][:, None, part] * (1 - _TIE)).sum(axis=1)
-                for at in range(E):
-                    counted = f[at] if weights is None else f[at][:, weights[at, part] > 0]
-                    pooled[name][at] += np.bincount(_bin(counted).ravel(), minlength=_BINS)
+                for e in range(E):
+                    counted = f[e] if weights is None else f[e][:, weights[e, part] > 0]
+                    pooled[name][e] += np.bincount(_bin(counted).ravel(), minlength=_BINS)
                 so_far = largest[name][:, start : start + chunk]
                 np.maximum(so_far, f.max(axis=2), out=so_far)
     made: list[EffectMap] = []
-    for at in range(E):
+    for e in range(E):
         tests = {
-            name: _tested(observed[name][at], as_large[name][at] / P, largest[name][at], pooled[name][at], alpha)
+            name: _tested(observed[name][e], as_large[name][e] / P, largest[name][e], pooled[name][e], alpha)
             for name in lenses
         }
-        own = {name: read_only(values[at, :, 0]) for name, values in seen.items()}
-        change = seen["any_way"][at]
+        own = {name: read_only(values[e, :, 0]) for name, values in seen.items()}
+        change = seen["any_way"][e]
         made.append(
             EffectMap(
                 change_mm=read_only(change),
@@ -190,7 +190,7 @@ def effect_maps(
                 any_way=tests["any_way"],
                 bump_mm=own.get("bump"),
                 bump=tests.get("bump"),
-                weight=None if weights is None else read_only(weights[at]),
+                weight=None if weights is None else read_only(weights[e]),
             )
         )
     return made
@@ -249,8 +249,8 @@ def _precision(cohort: Cohort, residual: FloatArray) -> FloatArray:
         known = cohort.basis @ model.vertex_basis[:, :modes]
         variance = model.stddev[:modes] ** 2 + (cohort.fitted.b_stddev**2).mean(axis=0)
         # What no mode of the model makes is taken to vary alike in all directions.
-        beside = max(float((residual**2).sum() - ((residual @ known) ** 2).sum()), 0.0) / residual.size
-        prior = (known * variance) @ known.T + max(beside, _FLOOR * float(variance.mean())) * prior
+        error_variance = max(float((residual**2).sum() - ((residual @ known) ** 2).sum()), 0.0) / residual.size
+        prior = (known * variance) @ known.T + max(error_variance, _FLOOR * float(variance.mean())) * prior
     factor = np.linalg.cholesky(prior)
     white = np.linalg.solve(factor, residual.T).T
     shrunk: FloatArray = sklearn.LedoitWolf(assume_centered=True).fit(white).covariance_

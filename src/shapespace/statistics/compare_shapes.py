@@ -43,8 +43,8 @@ SquaresType: TypeAlias = Literal["I", "II", "III"]
 TYPES: tuple[SquaresType, ...] = ("I", "II", "III")
 """Of sums of squares: of a term after those before it, after all that do not contain it, or after all others."""
 
-_RANK = 1e-9
-_TIE = 1e-9
+_RANK = 1e-9  # ratio of singular values; below is float64 rounding
+_TIE = 1e-9  # relative; statistics nearer than float64 sums are accurate count as equal
 MOST_LEVELS = 6
 """Largest number of classes of a variable whose pairs are compared."""
 
@@ -431,7 +431,7 @@ def term_tests(
     for term in stratum.terms:
         reduced = stratum.reduced(term, config.anova_type)
         residual = stratum.residual(reduced)
-        own = _span(less(stratum.matrix[:, stratum.at([term])], stratum.matrix[:, stratum.at(reduced)]))
+        own = _span(less(stratum.matrix[:, stratum.columns_of([term])], stratum.matrix[:, stratum.columns_of(reduced)]))
         rest = _span(stratum.matrix - own @ (own.T @ stratum.matrix), stratum.matrix.shape[1] - own.shape[1])
         count = config.permutations if units is None else 1
         products = stratum.products(np.hstack([own, rest]), residual, count, config.seed, flips=stratum.flips(reduced))
@@ -504,15 +504,17 @@ def _families(design: Design, strata: ModelStrata) -> Iterator[_ContrastFamily]:
             if any(term in stratum.terms for term in wanted):
                 reduced = tuple(stratum.without(both))
                 ends = [
-                    _Contrast(one.told(low), one.told(high), stratum, reduced, design.contrast(one.column, low, high))
+                    _Contrast(
+                        one.describe(low), one.describe(high), stratum, reduced, design.contrast(one.column, low, high)
+                    )
                     for low, high in _pairs(one)
                 ]
                 yield _ContrastFamily(one.name, tuple(ends))
     for one, other in _interacting(design):
         both = frozenset({one.column, other.column})
         (low, high), (first, second) = _pairs(one)[0], _pairs(other)[0]
-        what, name = _told(one, low, high), f"{one.name}:{other.name}"
-        words = f"{what} at {other.told(first)}", f"the same at {other.told(second)}"
+        levels_text, name = _levels_text(one, low, high), f"{one.name}:{other.name}"
+        words = f"{levels_text} at {other.describe(first)}", f"the same at {other.describe(second)}"
         if within is not None and within.holds(both):
             yield _ContrastFamily(name, (_within_interaction(within, one, other, words),))
             continue
@@ -549,9 +551,9 @@ def _within_ends(within: WithinSubjects, one: Variable, low: str | float, high: 
     """Return the change of a variable within subjects, at the average of the variables between subjects."""
     own = frozenset({one.column})
     stratum, between = within.contrast_stratum(
-        within.effects.contrast(one.column, low, high), own, _told(one, low, high)
+        within.effects.contrast(one.column, low, high), own, _levels_text(one, low, high)
     )
-    return _Contrast(one.told(low), one.told(high), stratum, tuple(stratum.without(own)), between.average({}))
+    return _Contrast(one.describe(low), one.describe(high), stratum, tuple(stratum.without(own)), between.average({}))
 
 
 def _within_interaction(within: WithinSubjects, one: Variable, other: Variable, words: tuple[str, str]) -> _Contrast:
@@ -577,8 +579,8 @@ def _pairs(variable: Variable) -> list[tuple[str, str]] | list[tuple[float, floa
     return [(variable.low, variable.high)]
 
 
-def _told(one: Variable, low: str | float, high: str | float) -> str:
-    return f"{one.told(low)} to {one.told(high).removeprefix(f'{one.name} ')}"
+def _levels_text(one: Variable, low: str | float, high: str | float) -> str:
+    return f"{one.describe(low)} to {one.describe(high).removeprefix(f'{one.name} ')}"
 
 
 def _interacting(design: Design) -> Iterator[tuple[Variable, Variable]]:
@@ -605,7 +607,7 @@ def _effects(
     if config.maps:
         step()
     for own, (statistics, changes, maps) in zip(parts, made, strict=True):
-        for ends, f, change, shown in zip(own, statistics, changes, maps, strict=True):
+        for ends, f, change, effect_map in zip(own, statistics, changes, maps, strict=True):
             distance = float(np.linalg.norm(change))
             yield ShapeEffect(
                 name=family.name,
@@ -621,7 +623,7 @@ def _effects(
                 z=effect_size(f, config.effect_size),
                 p=_share(f),
                 p_family=float((largest >= f[0] * (1 - _TIE)).mean()),
-                map=shown,
+                map=effect_map,
             )
 
 
@@ -713,7 +715,7 @@ def _parallel(design: Design, strata: ModelStrata, config: CompareConfig) -> Ite
         if not together or not main or len(one.levels) > 2 or not other.levels:
             continue
         levels = other.levels[:MOST_LEVELS]
-        words = [f"{_told(one, *_pairs(one)[0])}, {other.told(level)}" for level in levels]
+        words = [f"{_levels_text(one, *_pairs(one)[0])}, {other.describe(level)}" for level in levels]
         pairs = list(itertools.combinations(range(len(levels)), 2))
         for (first, second), drawn in zip(pairs, _changes_in_pairs(design, strata, one, other, config), strict=False):
             angles = _angles(*drawn)

@@ -27,8 +27,8 @@ Rows: TypeAlias = npt.NDArray[np.intp]
 Scheme: TypeAlias = Literal["permute", "flip", "subjects"]
 """How rows are arranged: permuted, or with flipped signs; subjects either way, depending on the reduced model."""
 
-_ALIASED = 1e-8
-_CONSTANT = 1e-9
+_ALIASED = 1e-8  # relative length of a residual column; below it follows from the others
+_CONSTANT = 1e-9  # scale of a column of zeros, whose length would be zero
 _BATCH = 50
 """Arrangements that are drawn from one seed."""
 
@@ -100,7 +100,7 @@ class Stratum:
         every = np.bincount(self.groups)
         return float(sum(math.lgamma(n + 1) for n in every) - sum(math.lgamma(n + 1) for n in alike))
 
-    def at(self, terms: Sequence[Term]) -> Rows:
+    def columns_of(self, terms: Sequence[Term]) -> Rows:
         """Return the columns of `matrix` that some terms have."""
         wanted = [column for term in terms for column in term.columns]
         return np.flatnonzero(np.isin(self.columns, wanted))
@@ -118,12 +118,12 @@ class Stratum:
 
     def residual(self, terms: Sequence[Term]) -> FloatArray:
         """Return the (n, K) residuals of the model of some of the terms (S1)."""
-        return less(self.shapes, self.matrix[:, self.at(terms)])
+        return less(self.shapes, self.matrix[:, self.columns_of(terms)])
 
     def direction(self, contrast: FloatArray) -> FloatArray:
         """Return (n,) what gives the estimate of a contrast (P,) of the design when multiplied by the shapes (S6)."""
         own = np.zeros(len(self.columns))
-        tested = self.at(self.terms)
+        tested = self.columns_of(self.terms)
         own[tested] = contrast[self.columns[tested]]
         return np.linalg.pinv(self.matrix).T @ own
 
@@ -135,7 +135,7 @@ class Stratum:
         """
         if self.scheme != "subjects" or self.constant is None:
             return self.scheme == "flip"
-        left = less(self.constant[:, None], self.matrix[:, self.at(reduced)])
+        left = less(self.constant[:, None], self.matrix[:, self.columns_of(reduced)])
         return bool(np.linalg.norm(left) > _ALIASED * np.linalg.norm(self.constant))
 
     def products(
@@ -243,23 +243,23 @@ def between_stratum(
     refuse_aliased(covariates, own, terms, design, where)
     # A condition that is the same for all subjects, or follows from others, adds nothing.
     known = np.empty((n, 0))
-    nuisance, kept = list[Term](), list[FloatArray]()
+    nuisance, adjusted = list[Term](), list[FloatArray]()
     for term, values in conditions:
         columns: list[int] = []
         for column in values.T:
             rest = less(less((column - column.mean())[:, None], known), known)[:, 0]
             if np.linalg.norm(rest) > _ALIASED * math.sqrt(n) * max(float(np.abs(column).max()), _CONSTANT):
-                columns.append(matrix.shape[1] + len(kept))
-                kept.append(column - column.mean())
+                columns.append(matrix.shape[1] + len(adjusted))
+                adjusted.append(column - column.mean())
                 known = np.column_stack([known, rest / np.linalg.norm(rest)])
         if columns:
             nuisance.append(replace(term, columns=tuple(columns)))
-    if kept:
+    if adjusted:
         labels = ", ".join(term.label for term in nuisance)
-        if n - 1 - len(own) - len(kept) < 1:
+        if n - 1 - len(own) - len(adjusted) < 1:
             raise InputError(
-                f"{design.formula!r} has {len(own)} columns {where} and {len(kept)} for unequal {labels} of the {n} "
-                f"blocks, too many; leave out terms, or shapes so that each {blocks} has the same conditions."
+                f"{design.formula!r} has {len(own)} columns {where} and {len(adjusted)} for unequal {labels} of the "
+                f"{n} blocks, too many; leave out terms, or shapes so that each {blocks} has the same conditions."
             )
         for term in terms:
             values = covariates[:, np.isin(own, term.columns)]
@@ -269,8 +269,8 @@ def between_stratum(
                     f"In {design.formula!r} {term.label} follows from {labels} {where}, so the effects of groups and "
                     "conditions cannot be separated; leave out one of them."
                 )
-    model = np.column_stack([covariates, *kept])
-    ids = np.array([*own, *range(matrix.shape[1], matrix.shape[1] + len(kept))], dtype=np.intp)
+    model = np.column_stack([covariates, *adjusted])
+    ids = np.array([*own, *range(matrix.shape[1], matrix.shape[1] + len(adjusted))], dtype=np.intp)
     refuse_aliased(model, ids, (*nuisance, *terms), design, where)
     rows = np.zeros(n, dtype=np.intp)
     return Stratum(
@@ -287,7 +287,7 @@ def between_stratum(
 
 
 def common_stratum(
-    shapes: FloatArray, matrix: FloatArray, own_columns: FloatArray, at: Rows, design: Design,
+    shapes: FloatArray, matrix: FloatArray, own_columns: FloatArray, subject_of_cell: Rows, design: Design,
     terms: Sequence[Term], blocks: str,
 ) -> Stratum:  # fmt: skip
     """Return the stratum of cells within subjects, for effects that are assumed to be the same in all subjects.
@@ -296,7 +296,7 @@ def common_stratum(
         shapes: (C, K) mm, of the cells of subjects.
         matrix: (C, P) of the design.
         own_columns: (C, q) columns whose slopes, in addition to the mean, differ between subjects.
-        at: (C,) subject of each cell, from 0.
+        subject_of_cell: (C,) subject of each cell, from 0.
         design: of the model.
         terms: of these effects.
         blocks: what a subject is called, in messages.
@@ -309,24 +309,24 @@ def common_stratum(
     n = len(shapes)
     where = f"within {blocks}"
     if not own_columns.shape[1]:
-        subjects = int(at.max()) + 1
+        subjects = int(subject_of_cell.max()) + 1
         refuse_few(n - subjects, design, where, n, f"shapes in {subjects} blocks", len(columns))
-        inner = values - means_of(values, at)[at]
+        inner = values - means_of(values, subject_of_cell)[subject_of_cell]
         refuse_aliased(inner, columns, terms, design, where)
         return Stratum(
             name=where,
-            shapes=shapes - means_of(shapes, at)[at],
+            shapes=shapes - means_of(shapes, subject_of_cell)[subject_of_cell],
             matrix=inner,
             columns=columns,
             terms=tuple(terms),
-            groups=at,
+            groups=subject_of_cell,
             removed=subjects,
             number=2,
         )
     # Residuals of each subject's own model in orthonormal coordinates, where they are uncorrelated (Huh, Jhun 2001).
     rows, inner = list[FloatArray](), list[FloatArray]()
-    for subject in range(int(at.max()) + 1):
-        cells = np.flatnonzero(at == subject)
+    for subject in range(int(subject_of_cell.max()) + 1):
+        cells = np.flatnonzero(subject_of_cell == subject)
         u, s, _ = np.linalg.svd(np.column_stack([np.ones(len(cells)), own_columns[cells]]))
         free = u[:, int((s > _ALIASED * s.max()).sum()) :].T
         rows.append(free @ shapes[cells])
@@ -353,23 +353,24 @@ def columns_of_terms(terms: Sequence[Term]) -> Rows:
     return np.array(sorted(column for term in terms for column in term.columns), dtype=np.intp)
 
 
-def means_of(rows: FloatArray, at: Rows) -> FloatArray:
+def means_of(rows: FloatArray, group: Rows) -> FloatArray:
     """Return the mean of the rows of each group, whose numbers `at` (n,) count from 0."""
-    out = np.zeros((int(at.max()) + 1, rows.shape[1]))
-    np.add.at(out, at, rows)
-    return out / np.bincount(at)[:, None]
+    out = np.zeros((int(group.max()) + 1, rows.shape[1]))
+    np.add.at(out, group, rows)
+    return out / np.bincount(group)[:, None]
 
 
-def refuse_few(free: int, design: Design, where: str, count: int, what: str, columns: int) -> None:
+def refuse_few(free: int, design: Design, where: str, count: int, unit: str, columns: int) -> None:
     """Check that a model leaves degrees of freedom for its error.
 
     Raises:
         InputError: it has as many columns as rows that are free, or more.
     """
     if free - columns < 1:
-        place = f" {where}" if where else ""
+        where_text = f" {where}" if where else ""
         raise InputError(
-            f"{design.formula!r} has {columns} columns{place}, too many for {count} {what}; leave out terms or classes."
+            f"{design.formula!r} has {columns} columns{where_text}, too many for {count} {unit}; leave out terms or "
+            "classes."
         )
 
 
@@ -393,15 +394,16 @@ def refuse_aliased(
     known = np.empty((len(matrix), 0))
     for term in terms:
         for column in term.columns:
-            at = int(np.searchsorted(columns, column))
-            values = matrix[:, at]
-            length = float(np.linalg.norm(values) if scale is None else scale[at])
+            index = int(np.searchsorted(columns, column))
+            values = matrix[:, index]
+            length = float(np.linalg.norm(values) if scale is None else scale[index])
             rest = values - known @ (known.T @ values)
             rest -= known @ (known.T @ rest)
             if np.linalg.norm(rest) <= _ALIASED * length or length == 0:
-                place = f" {where}" if where else ""
+                where_text = f" {where}" if where else ""
                 raise InputError(
-                    f"In {design.formula!r} {term.label} follows from the other terms{place}, or has an empty group; "
+                    f"In {design.formula!r} {term.label} follows from the other terms{where_text}, or has an empty "
+                    "group; "
                     "leave out one of them."
                 )
             known = np.column_stack([known, rest / np.linalg.norm(rest)])

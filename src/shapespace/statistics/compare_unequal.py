@@ -46,7 +46,7 @@ class Units:
 
     def columns(self, terms: Sequence[Term]) -> FloatArray:
         """Return the (s, r) columns of the model of some terms, with the mean if it was removed."""
-        own = self.matrix[:, self.stratum.at(terms)[:: self.stratum.width] // self.stratum.width]
+        own = self.matrix[:, self.stratum.columns_of(terms)[:: self.stratum.width] // self.stratum.width]
         return np.hstack([self._mean, own])
 
     def own(self, term: Term, reduced: Sequence[Term]) -> FloatArray:

@@ -61,7 +61,7 @@ class WithinSubjects:
         random: numbers of the effects that differ between subjects.
         shapes: (C, K) mm, means of the shapes of each cell.
         rows: (C,) a row of the table in each cell.
-        at: (C,) subject of each cell, from 0.
+        subject_of_cell: (C,) subject of each cell, from 0.
     """
 
     design: Design
@@ -71,12 +71,12 @@ class WithinSubjects:
     random: tuple[int, ...]
     shapes: FloatArray
     rows: Rows
-    at: Rows
+    subject_of_cell: Rows
 
     @property
     def count(self) -> int:
         """Number of subjects."""
-        return int(self.at.max()) + 1
+        return int(self.subject_of_cell.max()) + 1
 
     def label(self, effect: int) -> str:
         """Return the name of an effect in the formula."""
@@ -104,7 +104,7 @@ class WithinSubjects:
                     shapes=self.shapes,
                     matrix=self.design.matrix[self.rows],
                     own_columns=self.effects.matrix[self.rows][:, own],
-                    at=self.at,
+                    subject_of_cell=self.subject_of_cell,
                     design=self.design,
                     terms=[term for term in self.design.terms if term in fixed],
                     blocks=self.blocks,
@@ -117,9 +117,9 @@ class WithinSubjects:
 
         The median is the balanced condition where most subjects have it, so that theirs needs no adjustment.
         """
-        means = means_of(self.effects.matrix[self.rows], self.at)
+        means = means_of(self.effects.matrix[self.rows], self.subject_of_cell)
         means = means - np.median(means, axis=0)
-        first = np.array([self.rows[np.flatnonzero(self.at == one)[0]] for one in range(self.count)])
+        first = np.array([self.rows[np.flatnonzero(self.subject_of_cell == one)[0]] for one in range(self.count)])
         scale = self.effects.matrix.std(axis=0)
         for effect, terms in self.terms.items():
             columns = list(self.effects.terms[effect].columns)
@@ -183,7 +183,7 @@ class WithinSubjects:
                 "it out, or leave out classes with few shapes."
             )
         terms, between = self._between(effects)
-        first = np.array([np.flatnonzero(self.at == one)[0] for one in responses.subjects])
+        first = np.array([np.flatnonzero(self.subject_of_cell == one)[0] for one in responses.subjects])
         matrix = between.matrix[self.rows[first]]
         if s - matrix.shape[1] < 1:
             raise InputError(
@@ -195,13 +195,13 @@ class WithinSubjects:
         refuse_aliased(matrix, columns, terms, self.design, where)
         roots = np.sqrt(_weights(responses, matrix))
         weighted = roots[:, None] * matrix
-        whole: FloatArray = np.kron(weighted, np.eye(d)).astype(np.float64)
+        expanded: FloatArray = np.kron(weighted, np.eye(d)).astype(np.float64)
         constant = np.zeros((s, d))
         constant[:, 0] = roots
         stratum = Stratum(
             name=where,
             shapes=(roots[:, None, None] * responses.values).reshape(s * d, -1),
-            matrix=whole,
+            matrix=expanded,
             columns=np.repeat(columns, d),
             terms=terms,
             groups=np.zeros(s, dtype=np.intp),
@@ -237,7 +237,7 @@ class WithinSubjects:
         wanted = target[columns] / scale[:, None]
         chosen, estimates, covariances = list[int](), list[FloatArray](), list[FloatArray]()
         for subject in range(self.count):
-            cells = np.flatnonzero(self.at == subject)
+            cells = np.flatnonzero(self.subject_of_cell == subject)
             weights, covariance = _estimate(values[cells] - values[cells].mean(axis=0), wanted)
             if weights is None or covariance is None:
                 continue
@@ -249,8 +249,8 @@ class WithinSubjects:
         information = sum(np.linalg.inv(one) for one in covariances) / len(covariances)
         metric = np.asarray(np.linalg.cholesky(information), dtype=np.float64)
         own = np.array([np.trace(metric.T @ one @ metric) for one in covariances]) / target.shape[1]
-        shown = np.stack(estimates) if in_mm else np.stack([metric.T @ one for one in estimates])
-        return SubjectResponses(np.array(chosen, dtype=np.intp), shown, own / np.median(own))
+        responses = np.stack(estimates) if in_mm else np.stack([metric.T @ one for one in estimates])
+        return SubjectResponses(np.array(chosen, dtype=np.intp), responses, own / np.median(own))
 
 
 def _weights(responses: SubjectResponses, matrix: FloatArray) -> FloatArray:
@@ -366,7 +366,7 @@ def strata_of(
         raise InputError(f"All {n} shapes are of one {blocks}, {names[0]}; a comparison needs several.")
     varying = {one.column for one in design.variables if _varies(design.values[one.column], who)}
     rows, cell = _cells(design, who, varying)
-    at = who[rows]
+    subject_of_cell = who[rows]
     means = means_of(shapes, cell)
     inner = [term for term in design.terms if term.variables & varying]
     outer = [term for term in design.terms if not term.variables & varying]
@@ -374,16 +374,26 @@ def strata_of(
     within = None
     if inner:
         within = _within(
-            design=design, inner=inner, varying=varying, blocks=blocks, random=random, shapes=means, rows=rows, at=at
+            design=design,
+            inner=inner,
+            varying=varying,
+            blocks=blocks,
+            random=random,
+            shapes=means,
+            rows=rows,
+            subject_of_cell=subject_of_cell,
         )
         strata += within.strata(squares)
     elif random:
         raise _no_effect(random[0], design)
     if outer:
-        first = np.array([np.flatnonzero(at == one)[0] for one in range(len(names))])
+        first = np.array([np.flatnonzero(subject_of_cell == one)[0] for one in range(len(names))])
         conditions = () if within is None else tuple(within.conditions())
         strata.insert(
-            0, between_stratum(means_of(means, at), design.matrix[rows[first]], conditions, design, outer, blocks)
+            0,
+            between_stratum(
+                means_of(means, subject_of_cell), design.matrix[rows[first]], conditions, design, outer, blocks
+            ),
         )
     repeated_measures = RepeatedMeasures(
         n_cells=len(rows),
@@ -397,7 +407,7 @@ def strata_of(
 
 def _within(
     design: Design, inner: Sequence[Term], varying: set[str], blocks: str, random: Sequence[frozenset[str]] | None,
-    shapes: FloatArray, rows: Rows, at: Rows,
+    shapes: FloatArray, rows: Rows, subject_of_cell: Rows,
 ) -> WithinSubjects:  # fmt: skip
     factors = {name for name, variable in design.factors.items() if variable in varying}
     effects = list(dict.fromkeys(term.factors & factors for term in inner))
@@ -427,7 +437,7 @@ def _within(
         random=tuple(chosen),
         shapes=shapes,
         rows=rows,
-        at=at,
+        subject_of_cell=subject_of_cell,
     )
 
 
@@ -451,6 +461,6 @@ def _cells(design: Design, who: Rows, varying: set[str]) -> tuple[Rows, Rows]:
     return np.array(rows, dtype=np.intp), np.array(cell, dtype=np.intp)
 
 
-def _varies(values: Sequence[str | float], at: Rows) -> bool:
+def _varies(values: Sequence[str | float], group: Rows) -> bool:
     """Return whether a variable differs within a group."""
-    return len(set(zip(at.tolist(), values, strict=True))) > int(at.max()) + 1
+    return len(set(zip(group.tolist(), values, strict=True))) > int(group.max()) + 1

@@ -31,12 +31,12 @@ Codes: TypeAlias = npt.NDArray[np.intp]
 
 FEWEST_OF_GROUP = 5
 """Subjects per class below which the test with unequal variances has over 7 % false positives (docs/compare.md)."""
-_TIE = 1e-9
+_TIE = 1e-9  # relative; statistics nearer than float64 sums are accurate count as equal
 _FULL_LEVERAGE = 1e-8
 """Rows with 1 - leverage below this limit are fitted exactly, so their residual is zero."""
 _BATCH = 50
 """Number of sign flips drawn from one seed."""
-_FLOOR = 1e-12
+_FLOOR = 1e-12  # share of the total; a variance below is rounding
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -368,8 +368,8 @@ def welch_flips(
             variance += within / (count - 1.0) / count
         difference = means[1] - means[0]
         t = np.divide(difference, np.sqrt(variance), out=np.zeros_like(difference), where=variance > 0)
-        whole = (difference**2 @ area) / np.maximum(variance @ area, 1e-300)
+        statistic = (difference**2 @ area) / np.maximum(variance @ area, 1e-300)
         if not arrangements:
             observed = t[0]
-        arrangements += zip(np.abs(t).max(axis=1).tolist(), whole.tolist(), strict=True)
+        arrangements += zip(np.abs(t).max(axis=1).tolist(), statistic.tolist(), strict=True)
     return observed, np.array(arrangements).T, every

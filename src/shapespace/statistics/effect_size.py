@@ -20,8 +20,8 @@ _LAMBDA_BOUNDS = (-2.0, 2.0)
 """Of the Box-Cox exponent, as in RRPP 2.1."""
 _LAMBDA_ZERO = 1e-3
 """Absolute exponents below this limit are replaced by the logarithm, as in RRPP 2.1."""
-_LAMBDA_TOLERANCE = 1e-5
-_SMALLEST = 1e-300
+_LAMBDA_TOLERANCE = 1e-5  # absolute, of the Box-Cox exponent
+_SMALLEST = 1e-300  # near the smallest float64, so that logarithms are finite
 
 
 def effect_size(statistic: FloatArray, kind: EffectSize = "box-cox") -> float:

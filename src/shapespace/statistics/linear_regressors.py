@@ -21,7 +21,7 @@ PENALTIES = tuple(10.0 ** (0.5 * k) for k in range(-10, 1))
 """Of ridge regression on coefficients in mm, times the largest squared singular value."""
 MODES = (1, 2, 3, 5, 8, 12, 20, 30, 50)
 """Leading principal components that a regression on whitened coefficients keeps."""
-_NOTHING = 1e-10
+_NOTHING = 1e-10  # share of the first singular value; below is rounding
 
 
 @dataclass(frozen=True)
@@ -74,8 +74,8 @@ class TrainingDecomposition:
         """Return the decomposition of coefficients (n, K) whose rows have weights (n,)."""
         middle = weighted_mean(X, weight)
         left, singular, right = np.linalg.svd(np.sqrt(weight)[:, None] * (X - middle), full_matrices=False)
-        kept = singular > _NOTHING * max(float(singular[0]), 1e-300)
-        return TrainingDecomposition(middle, left[:, kept], singular[kept], right[kept], weight)
+        significant = singular > _NOTHING * max(float(singular[0]), 1e-300)
+        return TrainingDecomposition(middle, left[:, significant], singular[significant], right[significant], weight)
 
     def predict(self, X: FloatArray, targets: FloatArray, choices: Sequence[Regularisation]) -> FloatArray:
         """Return the predictions (C, m, P) of each choice for coefficients (m, K), from targets (n, P) of the training
@@ -124,8 +124,8 @@ def errors_of(
     total = np.zeros((len(choices), targets.shape[1]))
     for fold in np.unique(folds):
         test = folds == fold
-        found = TrainingDecomposition.of(X[~test], weight[~test]).predict(X[test], targets[~test], choices)
-        total += np.einsum("m,cmp->cp", weight[test], (found - targets[test]) ** 2)
+        predicted = TrainingDecomposition.of(X[~test], weight[~test]).predict(X[test], targets[~test], choices)
+        total += np.einsum("m,cmp->cp", weight[test], (predicted - targets[test]) ** 2)
     return total
 
 
@@ -171,8 +171,8 @@ def nested(
         train = ~test
         errors = errors_of(X[train], targets[train], weight[train], own, choices)
         best = errors.argmin(axis=0)
-        found = TrainingDecomposition.of(X[train], weight[train]).predict(X[test], targets[train], choices)
-        predicted[test] = np.take_along_axis(found, best[None, None, :], axis=0)[0]
+        estimates = TrainingDecomposition.of(X[train], weight[train]).predict(X[test], targets[train], choices)
+        predicted[test] = np.take_along_axis(estimates, best[None, None, :], axis=0)[0]
         baseline[test] = weighted_mean(targets[train], weight[train])
         chosen.append(best)
         if on_fold is not None:

@@ -16,10 +16,10 @@ from shapespace.reprs import short_repr
 from shapespace.statistics.dispersion import welch_flips
 from shapespace.types import BoolArray, FloatArray
 
-_BLOCK = 64
+_BLOCK = 64  # permutations at a time; bounds memory
 _TIE = 1e-10
 """Share by which a statistic that is the same in other words may differ by rounding."""
-_FLOOR = 1e-12
+_FLOOR = 1e-12  # share of the squares; a variance below is rounding
 LEVEL = 0.05
 """Family-wise error of maps, and one minus the confidence of their intervals."""
 
@@ -123,9 +123,9 @@ def difference_test(
     """
     if unequal_variances:
         t, arrangements, every = welch_flips(maps, second, area, permutations, seed)
-        largest, whole = arrangements
+        largest, total = arrangements
         p = (len(largest) - np.searchsorted(np.sort(largest), np.abs(t) * (1 - _TIE))) / len(largest)
-        omnibus = float((whole >= whole[0] * (1 - _TIE)).mean())
+        omnibus = float((total >= total[0] * (1 - _TIE)).mean())
         counts = (int((~second).sum()), int(second.sum()))
         effect = maps[second].mean(axis=0) - maps[~second].mean(axis=0)
         return MapTest(

@@ -295,8 +295,8 @@ def _regions(cohort: Cohort, config: ChangeConfig) -> dict[str, IntArray]:
     regions = config.regions
     if regions is None:
         regions = {} if cohort.fitted is None else {k: v.tolist() for k, v in cohort.fitted.model.regions.items()}
-    whole = {WHOLE: np.arange(cohort.n_vertices, dtype=np.int32)}
-    return whole | {name: region_vertices(own, cohort.n_vertices, name) for name, own in regions.items()}
+    all_vertices = {WHOLE: np.arange(cohort.n_vertices, dtype=np.int32)}
+    return all_vertices | {name: region_vertices(own, cohort.n_vertices, name) for name, own in regions.items()}
 
 
 def _groups(cohort: Cohort, config: ChangeConfig, visits: Visits, single: Sequence[str]) -> dict[str, str]:

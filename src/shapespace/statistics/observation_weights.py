@@ -13,8 +13,8 @@ from shapespace.types import BoolArray, FloatArray
 
 LEAST_INFORMATION = 0.5
 """Share of the information below which a map is blank; the share of shapes that a model needs (`MIN_SEEN`)."""
-_ESTIMABLE = 1e-6
-_BLOCK = 4096
+_ESTIMABLE = 1e-6  # relative; a contrast off by less is estimable within rounding
+_BLOCK = 4096  # rows at a time; bounds memory
 
 
 def information(cohort: Cohort, matrix: FloatArray, contrasts: FloatArray) -> FloatArray | None:
@@ -38,7 +38,7 @@ def information(cohort: Cohort, matrix: FloatArray, contrasts: FloatArray) -> Fl
         observed = np.logical_and(observed, cohort.analysed)
     X = np.column_stack([np.ones(len(matrix)), matrix])
     C = np.column_stack([np.zeros(len(contrasts)), contrasts])
-    whole = _variance(X.T @ X, C)
+    complete = _variance(X.T @ X, C)
     patterns, of_vertex = np.unique(np.packbits(observed, axis=0).T, axis=0, return_inverse=True)
     rows = np.unpackbits(patterns, axis=1, count=len(X)).astype(np.float64)
     products = (X[:, :, None] * X[:, None, :]).reshape(len(X), -1)
@@ -46,7 +46,7 @@ def information(cohort: Cohort, matrix: FloatArray, contrasts: FloatArray) -> Fl
     for start in range(0, len(rows), _BLOCK):
         part = slice(start, start + _BLOCK)
         systems = (rows[part] @ products).reshape(-1, X.shape[1], X.shape[1])
-        out[:, part] = whole[:, None] / _variance(systems, C)
+        out[:, part] = complete[:, None] / _variance(systems, C)
     return np.minimum(out, 1.0)[:, of_vertex.reshape(-1)]
 
 

@@ -30,7 +30,7 @@ from shapespace.statistics.linear_regressors import IndexArray
 from shapespace.types import FloatArray, read_only
 
 FORMAT, VERSION = "shapespace predictor", 1
-_ROUNDING = 1e-9
+_ROUNDING = 1e-9  # relative slack, so that training shapes never count as outside their own range
 _AGAIN = "make it again with shapespace regress"
 _FLOATS = ("mean", "weights", "intercepts", "residuals", "share")
 _FACTS = ("target", "gauge", "model_hash", "lowest", "highest", "farthest_mm", "subjects", "confidence", "method")
@@ -115,7 +115,7 @@ class Predictor:
             InputError: another gauge.
         """
         self._check(cohort)
-        off = np.stack([self._placed(cohort.vertices(at)) for at in range(len(cohort))]) - self.mean
+        off = np.stack([self._placed(cohort.vertices(k)) for k in range(len(cohort))]) - self.mean
         all_ways = off.reshape(len(off), -1) @ self.weights.T + self.intercepts
         low, high = cv_plus(all_ways[:, 1:], self.residuals, self.fold - 1, self.share, self.confidence)
         away = np.sqrt((off**2).sum(axis=2).mean(axis=1))
@@ -208,10 +208,10 @@ class Predictor:
 
 
 def _facts(arrays: Mapping[str, npt.NDArray[Any]]) -> dict[str, Any]:
-    found: object = plain_json(str(arrays["facts"]))
-    if not isinstance(found, dict):
+    content: object = plain_json(str(arrays["facts"]))
+    if not isinstance(content, dict):
         raise ValueError("no facts")
-    facts = cast(dict[str, Any], found)
+    facts = cast(dict[str, Any], content)
     if facts.get("format") != FORMAT or facts.get("format_version") != VERSION:
         raise ValueError("another format")
     texts = {name: facts[name] for name in ("target", "gauge", "model_hash", "method")}

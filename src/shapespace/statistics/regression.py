@@ -35,8 +35,8 @@ from shapespace.types import FloatArray, Mesh, read_only, require
 FEWEST, SMALL = 10, 100
 """Subjects below which nothing is learned, and below which a sample is said to be small."""
 MEASURES = ("r2", "rmse", "mae", "slope", "intercept", "coverage", "width")
-_BLOCK = 500
-_EDGES = (5.0, 95.0)
+_BLOCK = 500  # permutations at a time; bounds memory
+_EDGES = (5.0, 95.0)  # percentiles of the target that the two predicted shapes stand for
 
 
 @dataclass(frozen=True)
@@ -193,7 +193,7 @@ def regress(
     _check_target(cohort, target, y)
     subjects = subjects_of(cohort, subject)
     names = tuple(dict.fromkeys(subjects))
-    number = {name: at for at, name in enumerate(names)}
+    number = {name: k for k, name in enumerate(names)}
     codes = np.array([number[name] for name in subjects])
     if len(names) < max(FEWEST, folds):
         raise InputError(
@@ -314,7 +314,7 @@ def _check_options(folds: int, permutations: int, draws: int, confidence: float,
 
 
 def _check_target(cohort: Cohort, target: str, y: FloatArray) -> None:
-    missing = [cohort.names[at] for at in np.flatnonzero(np.isnan(y))]
+    missing = [cohort.names[row] for row in np.flatnonzero(np.isnan(y))]
     if missing:
         raise InputError(
             f"{cohort.table.where}: {target} of {len(missing)} of {len(cohort)} shapes is missing "
@@ -370,12 +370,12 @@ def _predictor(
     confidence: float,
 ) -> tuple[Predictor, Regularisation, float]:
     X = cohort.coefficients
-    whole = TrainingDecomposition.of(X, share)
+    decomposition = TrainingDecomposition.of(X, share)
     if choice.space == "whitened":
-        choice = Regularisation("whitened", min(choice.amount, len(whole.singular)))
-    beta, intercept = whole.weights(y, choice)
+        choice = Regularisation("whitened", min(choice.amount, len(decomposition.singular)))
+    beta, intercept = decomposition.weights(y, choice)
     residuals, _, weights, intercepts = _left_out(X, y, share, outer, choice, X[:1])
-    middle = whole.middle
+    middle = decomposition.middle
     all_beta, all_intercepts = np.vstack([beta, weights]), np.concatenate([[intercept], intercepts])
     farthest = float(np.sqrt(((X - middle) ** 2).sum(axis=1).max() / cohort.n_vertices))
     predictor = Predictor(
@@ -395,7 +395,7 @@ def _predictor(
         confidence=confidence,
         method=choice.words(),
     )
-    return predictor, choice, whole.effective(choice)
+    return predictor, choice, decomposition.effective(choice)
 
 
 def _measures(
@@ -426,7 +426,7 @@ def _measures(
     _, square, by_mean, absolute, covered, width, m_p, m_y, m_pp, m_py = mean
     with np.errstate(divide="ignore", invalid="ignore"):
         slope = (m_py - m_p * m_y) / (m_pp - m_p**2)
-        found = (1.0 - square / by_mean, np.sqrt(square), absolute, slope, m_y - slope * m_p, covered, width)
+        measures = (1.0 - square / by_mean, np.sqrt(square), absolute, slope, m_y - slope * m_p, covered, width)
     tail = 50.0 * (1.0 - confidence)
 
     def measure(values: FloatArray) -> AccuracyMeasure:
@@ -434,7 +434,7 @@ def _measures(
         ends = np.percentile(drawn, [tail, 100.0 - tail]) if len(drawn) else (np.nan, np.nan)
         return AccuracyMeasure(float(values[0]), float(ends[0]), float(ends[1]))
 
-    measured = {name: measure(values) for name, values in zip(MEASURES, found, strict=True)}
+    measured = {name: measure(values) for name, values in zip(MEASURES, measures, strict=True)}
     inside = measured["coverage"]
     ends = widen_share(np.array(inside.low), np.array(inside.high), n, confidence)
     return {**measured, "coverage": AccuracyMeasure(inside.value, *map(float, ends))}
@@ -518,10 +518,10 @@ def _percentiles(
         weights[value, subject] = weights.get((value, subject), 0.0) + one
     own = sorted(weights)
     weight = np.array([weights[key] for key in own])
-    place = np.cumsum(weight) - 0.5 * (weight + 1.0)
+    midpoint = np.cumsum(weight) - 0.5 * (weight + 1.0)
     last = float(weight.sum()) - 1.0
     values = np.array([value for value, _ in own])
-    low, high = (float(np.interp(one / 100.0 * last, place, values)) for one in percent)
+    low, high = (float(np.interp(one / 100.0 * last, midpoint, values)) for one in percent)
     return low, high
 
 

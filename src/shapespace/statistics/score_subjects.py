@@ -29,12 +29,14 @@ from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, read_only, r
 FEWEST_PEOPLE, SMALL = 5, 30
 """The least reference, and one below which the answer says that it is small."""
 
-LEVEL = 0.05
+LEVEL = 0.05  # share of people of the reference beyond the limit of the maps
+# share of variance of the modes, people per mode that estimate its variance, and folds (each costs a decomposition)
 _SHARE, _PEOPLE_PER_MODE, _MOST_FOLDS = 0.95, 5, 100
-_LEAST_TOLD, _AS_WELL_SEEN = 1e-4, 0.95
-_VERTICES_AT_ONCE = 2000
-_SAME = 1e-6
-_OUTSIDE = 0.01
+# least shrinkage, which is divided by; and the ratio of shrinkages above which fits count as equally precise
+_LEAST_SHRINKAGE, _EQUALLY_PRECISE = 1e-4, 0.95
+_VERTICES_AT_ONCE = 2000  # vertices at a time; bounds memory
+_SAME = 1e-6  # share of the size; two different scans never agree to rounding
+_OUTSIDE = 0.01  # share of the reference beyond a subject from which it is reported as outside
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,7 +164,7 @@ class ScoreResult(AnalysisResult):
 
     def __repr__(self) -> str:
         percentiles = list_briefly(
-            [f"{name}: percentile {at:.0f}" for name, at in zip(self.names, self.percentile, strict=True)]
+            [f"{name}: percentile {value:.0f}" for name, value in zip(self.names, self.percentile, strict=True)]
         )
         return (
             f"<ScoreResult of {len(self.names)} shapes against {len(self.reference_names)} of {self.people} subjects, "
@@ -204,54 +206,54 @@ def score(
     people = _people(reference, config.subject)
     own, outside_basis = _in_basis_of(reference, subjects)
     _refuse_known(reference, subjects, own, outside_basis, config.subject)
-    ruler = _Ruler(reference, people, _modes(reference, people, config.modes))
-    theirs, ours = _Seen.of(reference), _Seen.of(subjects)
+    population = _Population(reference, people, _modes(reference, people, config.modes))
+    theirs, ours = _FitUncertainty.of(reference), _FitUncertainty.of(subjects)
     notes = [*reference.notes, *(note for note in subjects.notes if note not in reference.notes)]
     if theirs is None or ours is None or not np.array_equal(theirs.prior, ours.prior):
         if reference.fitted is not None:
             notes.append("How uncertain each fit is was not taken into account; that needs coefficients of fits.")
         theirs = ours = None
     m, draws = len(subjects), _draws(theirs, config)
-    found = np.empty((5, m))
+    measures = np.empty((5, m))
     nearest: list[tuple[NearestReference, ...]] = []
-    plain = None if theirs is not None else ruler.left_out(reference.coefficients[None], None)
+    plain = None if theirs is not None else population.left_out(reference.coefficients[None], None)
     for k in range(m):
         noise = None
         if theirs is not None and ours is not None:
             noise = ours.covariance(k)
-            d2, rest = ruler.left_out(theirs.as_seen(reference.coefficients, ours.told[k], draws), noise)
+            d2, rest = population.left_out(theirs.degraded(reference.coefficients, ours.shrinkage[k], draws), noise)
         else:
-            d2, rest = plain if plain is not None else ruler.left_out(reference.coefficients[None], None)
-        y = ruler.whole.scores(own[k])
-        own_d2 = float(ruler.whole.squared(y[None], noise)[0])
-        left = float(np.sum((own[k] - ruler.whole.mean) ** 2) - y @ y) + outside_basis[k]
-        own_rest = float(ruler.rms(np.array(left)))
-        found[:, k] = (
-            np.sqrt(own_d2), ruler.share(d2 >= own_d2), ruler.p_value(own_d2),
-            own_rest, ruler.share(rest >= own_rest),
+            d2, rest = plain if plain is not None else population.left_out(reference.coefficients[None], None)
+        y = population.distribution.scores(own[k])
+        own_d2 = float(population.distribution.squared(y[None], noise)[0])
+        left = float(np.sum((own[k] - population.distribution.mean) ** 2) - y @ y) + outside_basis[k]
+        own_rest = float(population.rms(np.array(left)))
+        measures[:, k] = (
+            np.sqrt(own_d2), population.share(d2 >= own_d2), population.p_value(own_d2),
+            own_rest, population.share(rest >= own_rest),
         )  # fmt: skip
-        nearest.append(_nearest(ruler, reference, own[k], outside_basis[k], noise, config.nearest))
+        nearest.append(_nearest(population, reference, own[k], outside_basis[k], noise, config.nearest))
         if progress is not None:
             progress(k + 1, m)
     beyond = np.array([_beyond(subjects), np.full(m, np.nan)])
     theirs_beyond = _beyond(reference)
     if np.isfinite(theirs_beyond).all():
         for k in np.flatnonzero(np.isfinite(beyond[0])):
-            beyond[1, k] = ruler.share(theirs_beyond[None] >= beyond[0, k])
-    own_d2, own_rest = ruler.left_out(reference.coefficients[None], None if theirs is None else theirs.typical())
+            beyond[1, k] = population.share(theirs_beyond[None] >= beyond[0, k])
+    own_d2, own_rest = population.left_out(reference.coefficients[None], None if theirs is None else theirs.typical())
     z, limit = _maps(reference, subjects, people, ours)
     sizes = reference.sizes_mm
     size_z = (subjects.sizes_mm - sizes.mean()) / max(float(sizes.std(ddof=1)), 1e-12)
     scores = ScoreResult(
-        names=subjects.names, reference_names=reference.names, people=ruler.people, modes=ruler.modes,
-        variance_share=ruler.variance_share,
-        mean=Mesh(reference.vertices(ruler.whole.mean), reference.faces, name="mean"),
-        distance=read_only(found[0]), farther=read_only(found[1]), p_value=read_only(found[2]),
-        rest_mm=read_only(found[3]), rest_farther=read_only(found[4]), beyond_mm=read_only(beyond[0]),
+        names=subjects.names, reference_names=reference.names, people=population.people, modes=population.modes,
+        variance_share=population.variance_share,
+        mean=Mesh(reference.vertices(population.distribution.mean), reference.faces, name="mean"),
+        distance=read_only(measures[0]), farther=read_only(measures[1]), p_value=read_only(measures[2]),
+        rest_mm=read_only(measures[3]), rest_farther=read_only(measures[4]), beyond_mm=read_only(beyond[0]),
         beyond_farther=read_only(beyond[1]), size_mm=subjects.sizes_mm, size_z=read_only(size_z), z=z, z_limit=limit,
         nearest=tuple(nearest), outside=(), reference_distance=read_only(np.sqrt(own_d2[0])),
         reference_rest_mm=read_only(own_rest[0]), subjects=subjects, config=config,
-        notes=(*notes, *_on_size(ruler.people)),
+        notes=(*notes, *_on_size(population.people)),
     )  # fmt: skip
     return replace(scores, outside=tuple(tuple(_outside(scores, k)) for k in range(m)))
 
@@ -310,22 +312,22 @@ def _in_basis_of(reference: Cohort, subjects: Cohort) -> tuple[FloatArray, Float
     into = subjects.basis @ reference.basis.T
     shift = (subjects.reference - reference.reference).ravel()
     own = subjects.coefficients @ into + reference.basis @ shift
-    apart = [float(np.sum((subjects.vertices(k) - reference.reference) ** 2)) for k in range(len(subjects))]
-    left = np.array(apart) - (own**2).sum(axis=1)
+    squared = [float(np.sum((subjects.vertices(k) - reference.reference) ** 2)) for k in range(len(subjects))]
+    left = np.array(squared) - (own**2).sum(axis=1)
     # Below rounding it is nothing.
-    return own, np.where(left > 1e-12 * np.array(apart), left, 0.0)
+    return own, np.where(left > 1e-12 * np.array(squared), left, 0.0)
 
 
 def _refuse_known(
     reference: Cohort, subjects: Cohort, own: FloatArray, outside: FloatArray, column: str | None
 ) -> None:
     """Refuse subjects whose scans, or other scans of them, are in the reference."""
-    apart = cdist(own, reference.coefficients)
-    near = np.sqrt(apart.min(axis=1) ** 2 + outside) < _SAME * centroid_size(reference.reference)
+    distance = cdist(own, reference.coefficients)
+    near = np.sqrt(distance.min(axis=1) ** 2 + outside) < _SAME * centroid_size(reference.reference)
     if near.any():
         k = int(np.flatnonzero(near)[0])
         raise InputError(
-            f"{subjects.names[k]} is in the reference too, as {reference.names[int(apart[k].argmin())]}"
+            f"{subjects.names[k]} is in the reference too, as {reference.names[int(distance[k].argmin())]}"
             f"{f', and {int(near.sum()) - 1} more are' if near.sum() > 1 else ''}; leave it out of one of them."
         )
     if column is not None:
@@ -337,20 +339,20 @@ def _refuse_known(
 
 
 @dataclass(frozen=True, eq=False)
-class _Measure:
-    """Mean (K,), components (q, K) and variances (q,) of some people; the last count that the mean is uncertain."""
+class _ShapeDistribution:
+    """Mean (K,), components (q, K) and variances (q,) of some people; the variances include that of the mean."""
 
     mean: FloatArray
     components: FloatArray
     variance: FloatArray
 
     @staticmethod
-    def of(coefficients: FloatArray, people: int, modes: int) -> _Measure:
+    def of(coefficients: FloatArray, people: int, modes: int) -> _ShapeDistribution:
         mean = coefficients.mean(axis=0)
         _, s, vt = np.linalg.svd(coefficients - mean, full_matrices=False)
         variance = s[:modes] ** 2 / (len(coefficients) - 1)
         floor = 1e-12 * max(float(variance.max()), 1e-300)
-        return _Measure(mean, vt[:modes], np.maximum(variance, floor) * (1 + 1 / people))
+        return _ShapeDistribution(mean, vt[:modes], np.maximum(variance, floor) * (1 + 1 / people))
 
     def scores(self, coefficients: FloatArray) -> FloatArray:
         return (coefficients - self.mean) @ self.components.T
@@ -365,25 +367,25 @@ class _Measure:
         ).sum(axis=-1)
 
 
-class _Ruler:
-    """The reference as it measures: all of it, and without some of its people in turn."""
+class _Population:
+    """Distribution of the reference: of all people, and with each fold of people left out."""
 
     def __init__(self, reference: Cohort, people: IntArray, modes: int) -> None:
         self.people, self.modes = int(people.max()) + 1, modes
         self.n_vertices = reference.n_vertices
         x = reference.coefficients
-        self.whole = _Measure.of(x, self.people, modes)
+        self.distribution = _ShapeDistribution.of(x, self.people, modes)
         centred = x - x.mean(axis=0)
         self.least = 1e-12 * float((centred**2).sum()) / len(x)
-        self.variance_share = float((self.whole.scores(x) ** 2).sum() / (centred**2).sum())
+        self.variance_share = float((self.distribution.scores(x) ** 2).sum() / (centred**2).sum())
         counts = np.bincount(people)
         self.weight = 1 / counts[people]
         parts = people % min(self.people, _MOST_FOLDS)
-        self.folds: list[tuple[IntArray, _Measure]] = []
+        self.folds: list[tuple[IntArray, _ShapeDistribution]] = []
         for part in range(int(parts.max()) + 1):
             inside = parts == part
             left = len(np.unique(people[~inside]))
-            self.folds.append((np.flatnonzero(inside).astype(np.int32), _Measure.of(x[~inside], left, modes)))
+            self.folds.append((np.flatnonzero(inside).astype(np.int32), _ShapeDistribution.of(x[~inside], left, modes)))
 
     def left_out(self, coefficients: FloatArray, noise: FloatArray | None) -> tuple[FloatArray, FloatArray]:
         """Return squared distances and RMS of the rest in mm, (R, N) each, of (R, N, K) measured by the others."""
@@ -411,26 +413,26 @@ class _Ruler:
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
-    """How well fits were seen.
+class _FitUncertainty:
+    """Uncertainty of the coefficients of fits.
 
     Args:
         b: (N, K) coefficients, mm.
-        told: (N, K) 1 where the scan told a coefficient, near 0 where only the model did.
-        variance: (N, K) of the coefficients, mm^2.
-        prior: (K,) of a new shape, mm^2.
-        into: (K, K') from the model's coefficients to those of the cohort.
+        shrinkage: (N, K) share of the prior variance that each scan removes.
+        variance: (N, K) variance of the coefficients, mm^2.
+        prior: (K,) variance of the coefficients of a new shape, mm^2.
+        into: (K, K') matrix from the model's coefficients to those of the cohort.
     """
 
     b: FloatArray
-    told: FloatArray
+    shrinkage: FloatArray
     variance: FloatArray
     prior: FloatArray
     into: FloatArray
 
     @staticmethod
-    def of(cohort: Cohort) -> _Seen | None:
-        """Return how well the fits of a cohort were seen; None for other surfaces than the model's own."""
+    def of(cohort: Cohort) -> _FitUncertainty | None:
+        """Return the uncertainty of the fits of a cohort; None for other surfaces than the model's own."""
         fitted = cohort.fitted
         if fitted is None or not np.isfinite(fitted.b_stddev).all():
             return None
@@ -441,8 +443,8 @@ class _Seen:
             return None
         scale = centroid_size(cohort.reference) / centroid_size(fitted.model.mean_vertices)
         prior = np.maximum(variance_of_new_shapes(fitted.model)[:modes], (fitted.b_stddev**2).max(axis=0))
-        told = np.clip(1 - fitted.b_stddev**2 / prior, _LEAST_TOLD, 1.0)
-        return _Seen(fitted.b, told, fitted.b_stddev**2, prior, into * scale)
+        shrinkage = np.clip(1 - fitted.b_stddev**2 / prior, _LEAST_SHRINKAGE, 1.0)
+        return _FitUncertainty(fitted.b, shrinkage, fitted.b_stddev**2, prior, into * scale)
 
     def covariance(self, k: int) -> FloatArray:
         """Return the covariance (K', K') of the coefficients of fit k."""
@@ -452,19 +454,19 @@ class _Seen:
         """Return the same of a usual fit."""
         return (self.into.T * np.median(self.variance, axis=0)) @ self.into
 
-    def as_seen(self, coefficients: FloatArray, told: FloatArray, draws: FloatArray) -> FloatArray:
-        """Return (R, N, K') coefficients as they would be if scans had told only `told` (K,) of each mode."""
-        ratio = np.minimum(told / self.told, 1.0)
-        if ratio.min() > _AS_WELL_SEEN:
+    def degraded(self, coefficients: FloatArray, shrinkage: FloatArray, draws: FloatArray) -> FloatArray:
+        """Return (R, N, K') coefficients as fits with less shrinkage (K,) would estimate them."""
+        ratio = np.minimum(shrinkage / self.shrinkage, 1.0)
+        if ratio.min() > _EQUALLY_PRECISE:
             return coefficients[None]
-        # What a scan does not tell goes to the model's mean, with what is left of the spread of such estimates.
-        moved = (ratio - 1) * self.b + np.sqrt(self.prior * told * (1 - ratio)) * draws
+        # What a scan does not show is estimated by the model's mean, with the remaining scatter of such estimates.
+        moved = (ratio - 1) * self.b + np.sqrt(self.prior * shrinkage * (1 - ratio)) * draws
         return coefficients + moved @ self.into
 
 
-def _draws(seen: _Seen | None, config: ScoreConfig) -> FloatArray:
+def _draws(uncertainty: _FitUncertainty | None, config: ScoreConfig) -> FloatArray:
     """Return standard normal numbers (R, N, K)."""
-    shape = (0, 0) if seen is None else seen.told.shape
+    shape = (0, 0) if uncertainty is None else uncertainty.shrinkage.shape
     return np.random.default_rng(config.seed).standard_normal((config.draws, *shape))
 
 
@@ -475,16 +477,18 @@ def _beyond(cohort: Cohort) -> FloatArray:
 
 
 def _nearest(
-    ruler: _Ruler, reference: Cohort, own: FloatArray, outside: float, noise: FloatArray | None, count: int
+    population: _Population, reference: Cohort, own: FloatArray, outside: float, noise: FloatArray | None, count: int
 ) -> tuple[NearestReference, ...]:
     between = own - reference.coefficients
-    far = np.sqrt(ruler.whole.squared(between @ ruler.whole.components.T, noise))
-    rms = np.sqrt(((between**2).sum(axis=1) + outside) / ruler.n_vertices)
+    far = np.sqrt(population.distribution.squared(between @ population.distribution.components.T, noise))
+    rms = np.sqrt(((between**2).sum(axis=1) + outside) / population.n_vertices)
     order: list[int] = np.argsort(far, kind="stable")[:count].tolist()
     return tuple(NearestReference(reference.names[k], float(far[k]), float(rms[k])) for k in order)
 
 
-def _maps(reference: Cohort, subjects: Cohort, people: IntArray, seen: _Seen | None) -> tuple[FloatArray, float]:
+def _maps(
+    reference: Cohort, subjects: Cohort, people: IntArray, uncertainty: _FitUncertainty | None
+) -> tuple[FloatArray, float]:
     """Return standard deviations (M, V) along the mean's normals, and the limit that 95 % of the people stay within."""
     mean = reference.vertices(reference.coefficients.mean(axis=0))
     mesh = Mesh(mean, reference.faces)
@@ -497,7 +501,7 @@ def _maps(reference: Cohort, subjects: Cohort, people: IntArray, seen: _Seen | N
     n, count = len(reference), int(people.max()) + 1
     z = np.empty((len(subjects), len(mean)))
     largest = np.zeros(n)
-    rows = None if seen is None else seen.into @ reference.basis
+    rows = None if uncertainty is None else uncertainty.into @ reference.basis
     groups = np.zeros((count, n))
     groups[people, np.arange(n)] = 1
     size = groups.sum(axis=1, keepdims=True)
@@ -511,9 +515,9 @@ def _maps(reference: Cohort, subjects: Cohort, people: IntArray, seen: _Seen | N
         moved = np.einsum("nmi,mi->nm", subjects.displacements(part), own)
         moved += np.einsum("mi,mi->m", (subjects.reference - mean)[part], own)
         uncertain = 0.0
-        if seen is not None and rows is not None:
+        if uncertainty is not None and rows is not None:
             along = np.einsum("kmi,mi->km", rows.reshape(len(rows), -1, 3)[:, part], own)
-            uncertain = seen.variance @ along**2
+            uncertain = uncertainty.variance @ along**2
         z[:, part] = moved / np.sqrt(variance * (1 + 1 / count) + uncertain)  # S54
         rest = n - size
         others = (total - groups @ x) / rest
@@ -521,11 +525,11 @@ def _maps(reference: Cohort, subjects: Cohort, people: IntArray, seen: _Seen | N
         left_out = (x - others[people]) / np.sqrt(spread[people] * (1 + 1 / (count - 1)))
         largest = np.maximum(largest, np.abs(left_out).max(axis=1))
     by_person = np.sort(np.array([largest[people == k].mean() for k in range(count)]))
-    at = int(np.ceil((1 - LEVEL) * (count + 1)))
+    rank = int(np.ceil((1 - LEVEL) * (count + 1)))
     for k in range(len(subjects)):
         mask = subjects.observed_in([k])
         z[k] = z[k] if mask is None else np.where(mask, z[k], np.nan)
-    return read_only(z), float(by_person[at - 1]) if at <= count else float("nan")
+    return read_only(z), float(by_person[rank - 1]) if rank <= count else float("nan")
 
 
 def _on_size(people: int) -> list[str]:

@@ -26,8 +26,8 @@ LARGEST_OFF = 0.02
 """A mean that lies further (RMS, share of its size) from its mirror image about any plane is not symmetric."""
 LARGEST_PAIRED_OFF = 0.1
 """The same where pairs are given, from vertex to vertex."""
-_LARGEST_BYTES = 2**26
-_FEWEST = 4
+_LARGEST_BYTES = 2**26  # bytes; a table of pairs of millions of vertices is smaller
+_FEWEST = 4  # vertices, two pairs: one pair leaves the plane of symmetry to chance
 _NUMBER = re.compile(r"[0-9]{1,12}")
 
 
@@ -75,9 +75,9 @@ class Sides:
             mean: (M, 3) mm.
             normals: (M, 3) of it.
         """
-        place = np.einsum("mc,mcd->md", self.weights, mean[self.corners])
+        image = np.einsum("mc,mcd->md", self.weights, mean[self.corners])
         return 0.5 * np.einsum(
-            "mc,mcd,mcd->m", self.weights, mean[self.corners] - place[:, None], normals[self.corners], optimize=True
+            "mc,mcd,mcd->m", self.weights, mean[self.corners] - image[:, None], normals[self.corners], optimize=True
         )
 
     @cached_property
@@ -111,22 +111,22 @@ def find_sides(cohort: Cohort) -> Sides:
     # A model is made of more shapes than most cohorts hold, so its mean is the more symmetric one.
     mean = cohort.reference if cohort.fitted is None else cohort.fitted.model.mean_vertices
     mesh = Mesh(mean, cohort.faces, name="mean")
-    found = find_mirror(mesh)
-    if found.off_share > LARGEST_OFF:
+    symmetry = find_mirror(mesh)
+    if symmetry.off_share > LARGEST_OFF:
         raise InputError(
-            f"The mean lies {100 * found.off_share:.1f} % of its size from its own mirror image about the best plane, "
-            f"and over {100 * LARGEST_OFF:.0f} % an object, such as a femur or a spleen, is taken to have no mirror "
-            "symmetry; leave asymmetry out, or name what mirrors what with --pairs."
+            f"The mean lies {100 * symmetry.off_share:.1f} % of its size from its own mirror image about the best "
+            f"plane, and over {100 * LARGEST_OFF:.0f} % an object, such as a femur or a spleen, is taken to have no "
+            "mirror symmetry; leave asymmetry out, or name what mirrors what with --pairs."
         )
     notes: list[str] = []
-    rival = found.others_share[0]
+    rival = symmetry.others_share[0]
     if rival <= LARGEST_OFF:
         notes.append(
             f"The mean has another plane of symmetry, {100 * rival:.2f} % of its size off beside "
-            f"{100 * found.off_share:.2f} %; if that is the one you mean, name the pairs with --pairs."
+            f"{100 * symmetry.off_share:.2f} %; if that is the one you mean, name the pairs with --pairs."
         )
     everything = np.arange(cohort.n_vertices, dtype=np.int32)
-    other = mirror_pairs(mesh, found)
+    other = mirror_pairs(mesh, symmetry)
     if other is not None:
         corners, weights = _alone(other)
         return Sides(
@@ -135,7 +135,7 @@ def find_sides(cohort: Cohort) -> Sides:
             corners=corners,
             weights=weights,
             paired=True,
-            off_share=found.off_share,
+            off_share=symmetry.off_share,
             notes=tuple(notes),
         )
     notes.append(
@@ -146,10 +146,10 @@ def find_sides(cohort: Cohort) -> Sides:
     return Sides(
         vertices=everything,
         faces=cohort.faces,
-        corners=found.corners,
-        weights=found.weights,
+        corners=symmetry.corners,
+        weights=symmetry.weights,
         paired=False,
-        off_share=found.off_share,
+        off_share=symmetry.off_share,
         notes=tuple(notes),
     )
 
@@ -181,7 +181,7 @@ def given_sides(cohort: Cohort, pairs: Sequence[tuple[int, int]], where: str = "
             f"{where} name {len(other)} vertices, and {_FEWEST} are the least that show a plane; add some."
         )
     vertices = np.array(sorted(other), dtype=np.int32)
-    number = {int(v): at for at, v in enumerate(vertices)}
+    number = {int(v): k for k, v in enumerate(vertices)}
     corners, weights = _alone(np.array([number[other[int(v)]] for v in vertices], dtype=np.int32))
     own = np.full(cohort.n_vertices, -1, dtype=np.int32)
     own[vertices] = np.arange(len(vertices))

@@ -46,7 +46,7 @@ class StoredFit(NamedTuple):
     Args:
         shard: which one, in the order of the manifest.
         row: of its table.
-        at: where in its arrays; -1 where there is no surface.
+        position: in its arrays; -1 where there is no surface.
         id: of the fit; empty where the record has none.
         status: of the fit.
         fitted: whether its surface is kept,
@@ -56,7 +56,7 @@ class StoredFit(NamedTuple):
 
     shard: int
     row: int
-    at: int
+    position: int
     id: str
     status: str
     fitted: bool
@@ -119,7 +119,7 @@ class ResultStore:
     def surface(self, name: str, kind: str) -> Mesh:
         """Return a surface of a fit in the frame and unit of its scan."""
         stored = self.index[name]
-        return self.shards[stored.shard].surface(stored.at, kind, f"{name}{ENDINGS[kind]}")
+        return self.shards[stored.shard].surface(stored.position, kind, f"{name}{ENDINGS[kind]}")
 
     def stages(self, name: str) -> bytes:
         """Return the content of NAME.stages.npz."""
@@ -389,10 +389,10 @@ class Results:
         try:
             return store_row(name, self.fit(name)) | {kind: kind in self.singles[name] for kind in FLAGS}
         except ShapespaceError as error:
-            told = str(error)
+            message = str(error)
         except (ValueError, OverflowError):
-            told = f"{self.folder / f'{name}{ENDING}'} is damaged; fit the scan again."
-        self._tell(told)
+            message = f"{self.folder / f'{name}{ENDING}'} is damaged; fit the scan again."
+        self._tell(message)
         return None
 
     def _tell(self, problem: str) -> None:

@@ -124,7 +124,7 @@ def _pose_cells(pose: Pose) -> dict[str, float]:
     turn = Rotation.from_matrix(np.asarray(pose.rotation, dtype=np.float64)).as_rotvec(degrees=True)
     cells = {"scale": float(pose.scale)}
     cells |= {f"rotation_{axis}_deg": float(angle) for axis, angle in zip(_AXES, turn, strict=True)}
-    return cells | {f"translation_{axis}": at for axis, at in zip(_AXES, pose.translation, strict=True)}
+    return cells | {f"translation_{axis}": offset for axis, offset in zip(_AXES, pose.translation, strict=True)}
 
 
 def coefficient_columns(n_modes: int, metadata_columns: Sequence[str] = ()) -> list[str]:

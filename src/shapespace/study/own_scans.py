@@ -32,9 +32,9 @@ from shapespace.study import parts
 from shapespace.types import BoolArray, FloatArray
 
 TextArray = npt.NDArray[np.str_]
-_FEWEST_SUBJECTS = 4
-_FEWEST_PER_CLASS = 2
-_CURVE = (2, 5, 10, 20, 40, 80)
+_FEWEST_SUBJECTS = 4  # subjects; two in each half of a split
+_FEWEST_PER_CLASS = 2  # scans of a class, one to train with and one to test
+_CURVE = (2, 5, 10, 20, 40, 80)  # training subjects at which the learning curve is measured, about doubling
 
 
 def run_own_study(

@@ -92,8 +92,8 @@ def accuracy_of(
     chosen: BoolRow | None = None,
 ) -> tuple[float, tuple[float, float]]:
     """Return macro accuracy with its bootstrap interval over people, of all or of the chosen samples."""
-    kept = np.ones(len(labels), dtype=np.bool_) if chosen is None else chosen
-    some = [np.asarray(values, dtype=str)[kept].tolist() for values in (labels, predicted, subjects)]
+    rows = np.ones(len(labels), dtype=np.bool_) if chosen is None else chosen
+    some = [np.asarray(values, dtype=str)[rows].tolist() for values in (labels, predicted, subjects)]
     classes = sorted(set(some[0]))
     return evaluate.macro_accuracy(some[0], some[1], classes), evaluate.subject_bootstrap(*some)
 
@@ -131,7 +131,7 @@ def document(
     model_hashes: Sequence[str],
 ) -> dict[str, Any]:
     """Return the whole of recognition.json, checked as the report will."""
-    whole = Recognition(
+    recognition = Recognition(
         version=__version__,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         title=title,
@@ -142,6 +142,6 @@ def document(
         versions={name: version_of(name) for name in ("numpy", "scipy", "scikit-learn")},
         model_hashes=tuple(model_hashes),
     )
-    content = to_json(whole)
+    content = to_json(recognition)
     Recognition.from_json(content)
     return content

@@ -24,8 +24,8 @@ from shapespace.version import __version__
 MAX_MARKED = 100
 """Vertices whose positions can be asked for at a time."""
 
-_PAGE, _PAGE_BYTES = 11, 24 * 2**20
-_BYTES_PER_VERTEX = 6
+_PAGE, _PAGE_BYTES = 11, 24 * 2**20  # surfaces on a page, and bytes that a page may send
+_BYTES_PER_VERTEX = 6  # bytes; three coordinates of 16 bits
 _STATUS_ORDER = ("unreadable", "set aside", "look", "corresponding")
 
 
@@ -97,7 +97,7 @@ class Surfaces:
         ]
         for name, record in self._corresponded.records.items():
             status = scan_status(record, concerns)
-            reason = record.reason or population.unread.get(name) or concerns.get(name, Concern()).told
+            reason = record.reason or population.unread.get(name) or concerns.get(name, Concern()).text
             share = distance_share(record, "mean", sizes[name]) if name in sizes else math.nan
             rows.append(
                 {

@@ -31,13 +31,13 @@ NAME = "fit"
 
 MAX_TRIANGLES = 300_000
 """Triangles of a scan that are sent to the page; the fit uses all."""
-_MAX_MESSAGE_BYTES = 2**24
+_MAX_MESSAGE_BYTES = 2**24  # bytes of a message of the fitting process; a state has some hundred kB
 _VERDICT_KEYS = (
     "status", "reason", "shown", "shown_scan_mm", "notes", "start", "seconds", "iterations", "b", "z", "b_stddev",
     "distances_mm",
 )  # fmt: skip
 """Keys of a record that are sent to the page."""
-_POLL_S = 0.05
+_POLL_S = 0.05  # seconds between two looks at the stop button, below what a user notices
 
 DIED = "The fit ended unexpectedly, most likely for lack of memory; thin the scan and try again."
 TOO_LONG = "The fit took longer than {:.0f} minutes and was stopped; thin or crop the scan and try again."

@@ -39,7 +39,7 @@ FRAMED_HEADERS: Mapping[str, str] = MappingProxyType(
     }
 )
 """The same headers for a page that notebooks on this machine may show in a frame."""
-_SECRET_BYTES = 32
+_SECRET_BYTES = 32  # bytes, 256 bits: cannot be guessed
 _IGNORED_HEADERS = (b"range", b"if-range")
 """Partial responses are not supported."""
 

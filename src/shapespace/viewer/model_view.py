@@ -38,11 +38,11 @@ from shapespace.viewer.fitting import pack_staged
 
 MAX_MODEL_BYTES = 48 * 2**20
 """Modes beyond this size are not sent, and the page says so; in the browser they take twice as much memory."""
-_BYTES_PER_VERTEX = 6
+_BYTES_PER_VERTEX = 6  # bytes of a mode; three coordinates of 16 bits
 MAX_LISTED = 1000
 """Fits of a store that the page lists: those with the most concerns."""
 _STATUS_ORDER = ("unreadable", "failed", "doubtful", "max_iterations", "converged")
-_DIGITS = 6
+_DIGITS = 6  # significant digits, about those of float32
 
 
 class ModelView:

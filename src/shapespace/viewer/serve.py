@@ -23,8 +23,8 @@ from shapespace.schemas import CorrespondenceRecord
 if TYPE_CHECKING:
     import uvicorn
 
-FIRST_PORT = 7860
-_PORTS_TRIED = 50
+FIRST_PORT = 7860  # first port that is tried, not a privileged one, and the number of ports after it
+_PORTS_TRIED = 50  # as many viewers at once on one machine
 _ALL_INTERFACES = ("0.0.0.0", "::", "")
 
 

@@ -34,7 +34,7 @@ from shapespace.viewer.responses import PAGES, application, asset, binary, json_
 from shapespace.viewer.uploaded_scans import MIN_LANDMARKS, Scans, UploadedScan
 
 EXPORTS = ("ply", "obj", "stl")
-_MAX_NAME = 120
+_MAX_NAME = 120  # characters of a file's name on the page, so that it fits one line
 _NO_SCAN = "There is no such scan; it was removed."
 _QUEUE_FULL = "{} scans are being fitted or wait; wait for one, or stop one."
 
@@ -109,7 +109,7 @@ class _Endpoints:
                 "has_fits": self._view.folder is not None,
                 "upload_bytes": limits.upload_bytes,
                 "unfinished": limits.unfinished,
-                "kept": limits.kept,
+                "kept": limits.max_fits,
                 "formats": list(MESH_ENDINGS),
                 "exports": [kind for kind in EXPORTS if model.faces is not None or kind != "stl"],
                 "sequential": colours.as_list(colours.SEQUENTIAL),

@@ -12,7 +12,7 @@ from shapespace.viewer.corresponding_surfaces import Surfaces
 from shapespace.viewer.guard import Access, Guard
 from shapespace.viewer.responses import PAGES, application, asset, binary, json_response
 
-_MAX_QUERY = 2000
+_MAX_QUERY = 2000  # characters; bounds the work of one request
 
 
 def make_surfaces_app(

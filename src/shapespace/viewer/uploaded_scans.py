@@ -16,7 +16,7 @@ from shapespace.viewer.fitting import NAME, PICTURE, PREVIEW, STOPPED, Message, 
 
 FOLDER_PREFIX = "shapespace-view-"
 """Of the temporary folder of a viewer."""
-MIN_LANDMARKS = 3
+MIN_LANDMARKS = 3  # landmarks that determine a pose
 _RESULT_FILES = (
     PREVIEW,
     PICTURE,
@@ -34,14 +34,14 @@ class Limits:
         upload_bytes: largest scan.
         request_bytes: largest body of any other request.
         unfinished: scans that may be uploading, waiting or being fitted.
-        kept: fitted scans that are kept; the oldest is removed.
+        max_fits: largest number of fitted scans in memory; the oldest is removed.
         fit_s: seconds that a fit may take.
     """
 
     upload_bytes: int = 200 * 2**20
     request_bytes: int = 2**20
     unfinished: int = 3
-    kept: int = 8
+    max_fits: int = 8
     fit_s: float = 600.0
 
 
@@ -144,7 +144,7 @@ class Scans:
         with self._lock:
             self._scans[scan.key] = scan
             done = [other for other in self._scans.values() if other.state == "done"]
-            surplus = done[: max(0, len(self._scans) - self.limits.kept)]
+            surplus = done[: max(0, len(self._scans) - self.limits.max_fits)]
         for old in surplus:
             self.remove(old)
         return scan

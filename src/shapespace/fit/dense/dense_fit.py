@@ -162,7 +162,14 @@ def _matcher(target: ScanTarget, topology: Topology, settings: DenseSettings) ->
     chosen = np.arange(count, dtype=np.int32)
     if count > settings.scan_points:
         chosen = np.sort(np.random.default_rng(settings.seed).choice(chosen, settings.scan_points, replace=False))
-    return Matcher.of(target, chosen, topology.used, target.engine, settings.normal_cosine, bulging=True)
+    return Matcher.of(
+        target=target,
+        points=chosen,
+        vertex=topology.used,
+        engine=target.engine,
+        normal_cosine=settings.normal_cosine,
+        bulging=True,
+    )
 
 
 def _match(

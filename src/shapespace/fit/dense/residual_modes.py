@@ -33,7 +33,7 @@ from shapespace.types import FloatArray
 
 _ALGORITHM_VERSION = 1
 """Part of the key of the disk cache: raise it whenever `_make`, `local_modes` or `mirror` compute other modes."""
-_LEAST_VALUE = 1e-8
+_LEAST_VALUE = 1e-8  # share of the largest eigenvalue; below are float32 rounding and linear dependence
 _SYMMETRIC_SHARE = 0.01
 """A mean whose mirror image lies within this share of its size is taken for symmetric."""
 
@@ -74,8 +74,10 @@ def _make(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
     mirror = _mirror(model)
     sources = [modes] if mirror is None else [modes, mirror(modes)]
     fields = smooth_fields(x, settings.range_share * rms_size(x))  # R17b
-    mode, at = strongest_products(model.stddev, np.linalg.norm(fields, axis=0), MOST_PRODUCTS // len(sources))
-    field = (np.sqrt(settings.local_share) * fields).astype(np.float32)[:, at] * stddev[mode]
+    mode, field_of_product = strongest_products(
+        model.stddev, np.linalg.norm(fields, axis=0), MOST_PRODUCTS // len(sources)
+    )
+    field = (np.sqrt(settings.local_share) * fields).astype(np.float32)[:, field_of_product] * stddev[mode]
     mirrored = np.float32(np.sqrt(settings.mirror_share)) * stddev
 
     def products(rows: slice) -> Float32Array:
@@ -94,9 +96,9 @@ def _make(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
         outside = products(rows) - P @ inside
         gram += outside.T @ outside
     value, vector = largest_eigenpairs(gram, settings.count)
-    kept = value > _LEAST_VALUE * value[0]
-    stddev_mm = np.sqrt(value[kept])
-    mix = (vector[:, kept] / stddev_mm).astype(np.float32)
+    significant = value > _LEAST_VALUE * value[0]
+    stddev_mm = np.sqrt(value[significant])
+    mix = (vector[:, significant] / stddev_mm).astype(np.float32)
     inside = inside @ mix
     together = np.empty((*modes.shape[:2], modes.shape[2] + len(stddev_mm)), dtype=np.float32)
     together[:, :, : modes.shape[2]] = modes
@@ -108,10 +110,10 @@ def _make(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
 def _mirror(model: ShapeModel) -> Callable[[Float32Array], Float32Array] | None:
     """Return what turns fields (V, 3, k) on the mean into their mirror images; None if the mean is not symmetric."""
     mean = model.mesh()
-    found = find_mirror(mean)
-    if found.off_share > _SYMMETRIC_SHARE:
+    symmetry = find_mirror(mean)
+    if symmetry.off_share > _SYMMETRIC_SHARE:
         return None
-    corners, weights, turn = found.corners, found.weights.astype(np.float32), found.turn.astype(np.float32)
+    corners, weights, turn = symmetry.corners, symmetry.weights.astype(np.float32), symmetry.turn.astype(np.float32)
 
     def mirrored(field: Float32Array) -> Float32Array:
         out = np.empty_like(field)

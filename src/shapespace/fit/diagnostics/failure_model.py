@@ -31,8 +31,8 @@ _PROBABLY_FAILED = 0.5
 """Failure probability above which a fit is doubtful, whatever its score is."""
 _SMALLEST = 1e-6
 """Of a ratio before its logarithm is taken; below the `lowest` of every term."""
-_SMALLEST_SHARE = 0.01
-_LARGEST_LOG_SCALE = 1.0
+_SMALLEST_SHARE = 0.01  # bound of a share before its logarithm, so that no term grows without limit
+_LARGEST_LOG_SCALE = 1.0  # bound of the logarithm of the scale, a factor of e, for the same reason
 _MOST_REASONS, _STATED_SHARE = 3, 0.4
 """At most so many reasons are stated, each with at least this share of the largest contribution."""
 _NEAR_THROUGHOUT = 0.8
@@ -104,7 +104,7 @@ class ScoreTerm(Term[MatchEvidence]):
         return self.predictor(evidence) > self.limit
 
 
-SCORE_OFFSET = -3.70
+SCORE_OFFSET = -3.70  # logit; intercept of the logistic regression whose terms follow
 SCORE_TERMS = (
     ScoreTerm(
         _posterior_error,

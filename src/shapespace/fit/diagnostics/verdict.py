@@ -10,7 +10,7 @@ from shapespace.fit.result import Status
 
 _FARTHEST_Z = 10.0
 """Standard deviations of new shapes; the plain method goes to 8 on real scans, where faint modes chase details."""
-_OTHER_SCALE = 0.05
+_OTHER_SCALE = 0.05  # logarithm, 5 %: scale that projection onto the modes may change
 _MOVED_AWAY, _LEAST_MOVED_SHARE = 1.5, 0.005
 """The nearest shape in the span lies as far from a surface as that leaves the span, and hardly farther."""
 _DENSE_MOVED_SHARE = 0.009
@@ -34,21 +34,21 @@ def find_contradictions(ended: Ended) -> list[Reason]:
     """Return how pose, coefficients and surface contradict each other; empty where they agree."""
     from shapespace.fit.robust.posterior import variance_of_new_shapes  # compiled, and loads SciPy
 
-    model, fitted, found = ended.model, ended.fitted, list[Reason]()
+    model, fitted, reasons = ended.model, ended.fitted, list[Reason]()
     z = np.abs(fitted.b) / np.sqrt(variance_of_new_shapes(model)[: len(fitted.b)])
     worst = int(z.argmax())
     if z[worst] > _FARTHEST_Z:
-        found.append(Reason(ReasonCode.MODE_IMPLAUSIBLE, {"mode": worst + 1, "z": float(z[worst])}))
+        reasons.append(Reason(ReasonCode.MODE_IMPLAUSIBLE, {"mode": worst + 1, "z": float(z[worst])}))
     scale_ratio = float(fitted.T_scan_model.scale / fitted.T_scan_fitted.scale)
     if abs(np.log(scale_ratio)) > _OTHER_SCALE:
-        found.append(Reason(ReasonCode.PROJECTED_SCALE, {"scale_ratio": scale_ratio}))
+        reasons.append(Reason(ReasonCode.PROJECTED_SCALE, {"scale_ratio": scale_ratio}))
     T_model_scan = fitted.T_scan_fitted.inverse()
     projected = (T_model_scan @ fitted.T_scan_model).apply(model.reconstruct(fitted.b))
     moved = T_model_scan.apply(fitted.vertices_scan_mm) - projected
     moved_mm = float(np.sqrt((moved**2).sum(axis=1).mean()))
     if moved_mm > _MOVED_AWAY * fitted.outside_mm + _LEAST_MOVED_SHARE * ended.size_mm:
-        found.append(Reason(ReasonCode.PROJECTED_SURFACE, {"moved_mm": moved_mm}))
+        reasons.append(Reason(ReasonCode.PROJECTED_SURFACE, {"moved_mm": moved_mm}))
     dense = ended.stages.get("dense")
     if dense is not None and dense.moved_mm > _DENSE_MOVED_SHARE * ended.size_mm:
-        found.append(Reason(ReasonCode.DENSE_SURFACE_MOVED, {"moved_mm": dense.moved_mm}))
-    return found
+        reasons.append(Reason(ReasonCode.DENSE_SURFACE_MOVED, {"moved_mm": dense.moved_mm}))
+    return reasons

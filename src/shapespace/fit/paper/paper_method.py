@@ -25,14 +25,14 @@ from shapespace.types import FloatArray
 
 # Set on simulated scans: clean ones stay far from each bound, cut ones cross at least one.
 _SHRUNK_BY_SHAPE = 0.85
-_SHRUNK_IN_ALL = 0.7
-_LEADING_SHARE = 0.9
-_IMPLAUSIBLE = 1e-5
-_CLOSE_SHARE = 0.01
-_FAR_SHARE = 0.05
-_GAP_RATIO = 4.0
-_GAP_SHARE = 0.02
-_SEEN_SHARE = 0.05
+_SHRUNK_IN_ALL = 0.7  # ratio of the final scale to that of the start
+_LEADING_SHARE = 0.9  # share of variance of the main coefficients
+_IMPLAUSIBLE = 1e-5  # probability that a new shape exceeds the bound on its coefficients
+_CLOSE_SHARE = 0.01  # share of the size; a surface nearer than this is right however unusual its coefficients
+_FAR_SHARE = 0.05  # share of the size that the model may lie from the scan (RMS)
+_GAP_RATIO = 4.0  # ratio of the median distances scan to model and model to scan
+_GAP_SHARE = 0.02  # share of the size; smaller medians are good whatever their ratio
+_SEEN_SHARE = 0.05  # share of the scan that the model must cover
 
 
 @dataclass(frozen=True)
@@ -106,30 +106,30 @@ class Paper:
         model, final, initial = ended.model, ended.stages["final"], ended.stages["initial"]
         forward, backward = final.distances.model_to_scan, final.distances.scan_to_model
         size_mm = ended.size_mm
-        found: list[Reason] = []
+        reasons: list[Reason] = []
         shrunk = min(
             final.T_scan_model.scale / initial.T_scan_model.scale / _SHRUNK_BY_SHAPE,
             ended.fitted.T_scan_model.scale / ended.start.T_scan_model.scale / _SHRUNK_IN_ALL,
         )
         if shrunk < 1.0:
-            found.append(Reason(ReasonCode.MODEL_SHRANK))
+            reasons.append(Reason(ReasonCode.MODEL_SHRANK))
         if forward.rms > _FAR_SHARE * size_mm:
-            found.append(Reason(ReasonCode.MODEL_DISTANT, {"rms_mm": forward.rms}))
+            reasons.append(Reason(ReasonCode.MODEL_DISTANT, {"rms_mm": forward.rms}))
         if backward.fraction < _SEEN_SHARE:
-            found.append(Reason(ReasonCode.SCAN_NOT_COVERED, {"scan_covered_share": backward.fraction}))
+            reasons.append(Reason(ReasonCode.SCAN_NOT_COVERED, {"scan_covered_share": backward.fraction}))
         elif backward.median > _GAP_RATIO * forward.median and backward.median > _GAP_SHARE * size_mm:
             medians_mm = {
                 "scan_to_model_median_mm": backward.median,
                 "model_to_scan_median_mm": forward.median,
             }
-            found.append(Reason(ReasonCode.DISTANCES_DIFFER, medians_mm))
+            reasons.append(Reason(ReasonCode.DISTANCES_DIFFER, medians_mm))
         leading = min(modes_for_variance(model.stddev**2, _LEADING_SHARE), len(final.b))
         z2 = float(((final.b[:leading] / model.stddev[:leading]) ** 2).mean())
         # An extreme shape that lies on the scan all over is what the scan shows.
         if z2 > _hotelling_bound(leading, model.n_training) and forward.rms > _CLOSE_SHARE * size_mm:
             data = {"coefficients": leading, "z_rms": float(np.sqrt(z2))}
-            found.append(Reason(ReasonCode.MAIN_COEFFICIENTS_IMPLAUSIBLE, data))
-        return found
+            reasons.append(Reason(ReasonCode.MAIN_COEFFICIENTS_IMPLAUSIBLE, data))
+        return reasons
 
 
 def posterior_stddev(model: ShapeModel, residual_variance: float) -> FloatArray:

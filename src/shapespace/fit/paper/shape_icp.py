@@ -55,6 +55,14 @@ def shape_icp(
         rms_mm.append(matched.rms / T_scan_model.scale)
         motion_mm = largest_motion(y - moved) / T_scan_model.scale
         stopped = stop.why(rms_mm, motion_mm)  # step 4
-        yield IcpState(2, iteration, T_scan_model, b, rms_mm[-1], motion_mm, stopped)
+        yield IcpState(
+            phase=2,
+            iteration=iteration,
+            T_scan_model=T_scan_model,
+            b=b,
+            rms_mm=rms_mm[-1],
+            motion_mm=motion_mm,
+            stopped=stopped,
+        )
         if stopped:
             return

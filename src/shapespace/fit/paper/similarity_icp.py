@@ -42,7 +42,15 @@ def similarity_icp(
         rms_mm.append(matched.rms / T_scan_model.scale)
         motion_mm = largest_motion(p - moved) / T_scan_model.scale
         stopped = stop.why(rms_mm, motion_mm)
-        yield IcpState(1, iteration, T_scan_model, b, rms_mm[-1], motion_mm, stopped)
+        yield IcpState(
+            phase=1,
+            iteration=iteration,
+            T_scan_model=T_scan_model,
+            b=b,
+            rms_mm=rms_mm[-1],
+            motion_mm=motion_mm,
+            stopped=stopped,
+        )
         if stopped:
             return
 

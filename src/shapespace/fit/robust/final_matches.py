@@ -51,9 +51,15 @@ class FinalMatches:
         """Return the code of each vertex, (V,)."""
         every = np.arange(len(self.surface.vertices), dtype=np.int32)
         matches = match_vertices(
-            self.target, self.target.engine, self.T_scan_model, self.surface, every, None,
-            winding=self.winding, normal_cosine=self.normal_cosine,
-        )  # fmt: skip
+            target=self.target,
+            engine=self.target.engine,
+            T_scan_model=self.T_scan_model,
+            surface=self.surface,
+            vertex=every,
+            near=None,
+            winding=self.winding,
+            normal_cosine=self.normal_cosine,
+        )
         w = match_weights(
             self.weight, matches.residual, np.zeros(len(every)), matches.allowed, self.width_mm, self.far_mm
         )

@@ -90,18 +90,18 @@ def walk_into(
         squared, here = dx * dx + dy * dy + dz * dz, -1
         while here != v:
             here = v
-            for at in range(ring_start[here], ring_start[here + 1]):
-                w = ring[at]
+            for entry in range(ring_start[here], ring_start[here + 1]):
+                w = ring[entry]
                 dx, dy, dz = vertices[w, 0] - x, vertices[w, 1] - y, vertices[w, 2] - z
                 d = dx * dx + dy * dy + dz * dz
                 if d < squared:
                     squared, v = d, w
         vertex[i] = v
-        best, b, c, found = -1, 0.0, 0.0, np.inf
-        for at in range(fan_start[v], fan_start[v + 1]):
-            d, wb, wc = on_face(vertices, faces, fan[at], x, y, z, found)
-            if d < found or best < 0:
-                best, found, b, c = fan[at], d, wb, wc
+        best, b, c, least = -1, 0.0, 0.0, np.inf
+        for entry in range(fan_start[v], fan_start[v + 1]):
+            d, wb, wc = on_face(vertices, faces, fan[entry], x, y, z, least)
+            if d < least or best < 0:
+                best, least, b, c = fan[entry], d, wb, wc
         triangle[i] = best
         weights[i, 0], weights[i, 1], weights[i, 2] = max(0.0, 1.0 - b - c), b, c
 

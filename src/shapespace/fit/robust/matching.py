@@ -199,24 +199,30 @@ class Matcher:
         *, bulging: bool = False,
     ) -> Matcher:  # fmt: skip
         """Return the matcher of the scan points `points` (M,) and the model vertices `vertex` (N,)."""
-        place = np.full(len(target.mesh.vertices), -1, dtype=np.int32)
-        place[points] = np.arange(len(points), dtype=np.int32)
-        order = place[target.vertex_engine.order]
+        row_of = np.full(len(target.mesh.vertices), -1, dtype=np.int32)
+        row_of[points] = np.arange(len(points), dtype=np.int32)
+        order = row_of[target.vertex_engine.order]
         return Matcher(
-            target, target.mesh.vertices[points], target.normals[points], order[order >= 0], vertex, engine,
-            normal_cosine, bulging,
-        )  # fmt: skip
+            target=target,
+            points_mm=target.mesh.vertices[points],
+            point_normals=target.normals[points],
+            order=order[order >= 0],
+            vertex=vertex,
+            engine=engine,
+            normal_cosine=normal_cosine,
+            bulging=bulging,
+        )
 
     def first_hint(
         self, surface: ModelSurface, T_scan_model: Similarity, tree: KdTree | None = None, winding: float | None = None
     ) -> MatchHint:
-        """Return a hint for the first search.
+        """Return the start of the first search: the closest vertices, and no matches yet.
 
         Args:
-            surface: of the model.
-            T_scan_model: its pose.
-            tree: of the vertices of a similar surface; None to build one.
-            winding: of the scan where it is known.
+            surface: surface of the model.
+            T_scan_model: pose of the model.
+            tree: search tree of the vertices of a similar surface; None to build one.
+            winding: -1 where the normals of the scan are reversed, else 1; None if unknown.
         """
         tree = tree or surface.vertex_tree()
         vertex = np.empty(len(self.points_mm), dtype=np.int32)
@@ -236,15 +242,21 @@ class Matcher:
         agree = winding * cosine > self.normal_cosine
         points = PointMatches(triangle, barycentric, nearest, residual, distance, covered & agree)
         vertices = match_vertices(
-            self.target, self.engine, T_scan_model, surface, self.vertex, hint.near,
-            winding=winding, normal_cosine=self.normal_cosine,
-        )  # fmt: skip
+            target=self.target,
+            engine=self.engine,
+            T_scan_model=T_scan_model,
+            surface=surface,
+            vertex=self.vertex,
+            near=hint.near,
+            winding=winding,
+            normal_cosine=self.normal_cosine,
+        )
         return Matches(points, vertices, winding)
 
 
 def match_vertices(
-    target: ScanTarget, engine: ClosestPointEngine, T_scan_model: Similarity, surface: ModelSurface, vertex: IntArray,
-    near: ClosestPoints | None, *, winding: float, normal_cosine: float,
+    *, target: ScanTarget, engine: ClosestPointEngine, T_scan_model: Similarity, surface: ModelSurface,
+    vertex: IntArray, near: ClosestPoints | None, winding: float, normal_cosine: float,
 ) -> VertexMatches:  # fmt: skip
     """Match some of the surface's vertices to the scan (R5, R6).
 

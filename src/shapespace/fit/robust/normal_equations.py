@@ -112,7 +112,7 @@ class NormalEquations:
 
 
 def normal_equations(
-    surface: ModelSurface, gathered: Gathered, prior: Prior, sigma_mm: float, at: Estimate, modes: int
+    surface: ModelSurface, gathered: Gathered, prior: Prior, sigma_mm: float, estimate: Estimate, modes: int
 ) -> NormalEquations:
     """Return the equations of one Gauss-Newton step on the pose and the first `modes` coefficients.
 
@@ -121,7 +121,7 @@ def normal_equations(
         gathered: weights and weighted residuals of the matches at each of its vertices.
         prior: of coefficients and scale.
         sigma_mm: spread of the residuals.
-        at: pose and coefficients.
+        estimate: pose and coefficients.
         modes: k, the number of free modes.
     """
     rows = np.empty((len(gathered.W), POSE + modes), dtype=np.float32)
@@ -132,10 +132,10 @@ def normal_equations(
     rho = prior.weight * sigma_mm**2
     D = np.zeros(POSE + modes)
     D[POSE:] = rho / prior.stddev[:modes] ** 2  # R13
-    gradient[POSE:] += D[POSE:] * at.b[:modes]
+    gradient[POSE:] += D[POSE:] * estimate.b[:modes]
     if not prior.holds_scale:
         D[SCALE] = rho / prior.scale_stddev**2  # R14
-        gradient[SCALE] += D[SCALE] * np.log(at.T_scan_model.scale / prior.start_scale)
+        gradient[SCALE] += D[SCALE] * np.log(estimate.T_scan_model.scale / prior.start_scale)
     H = np.asarray(rows[:count].T @ rows[:count], dtype=np.float64)  # R12
     return NormalEquations(H, D, gradient, prior.holds_scale)
 

@@ -27,6 +27,7 @@ from shapespace.types import FloatArray, SurfaceLandmarks
 
 # Chosen on the split "dev" of `benchmarks/calibration.py`, so that 68 % and 95 % of the truth lie where they should.
 _NOISE_TEMPERATURE = 1.7
+# independent patches of a completely observed surface, as neighbouring residuals are correlated (R20a)
 _PATCHES = 300.0
 _FEWEST_PATCHES = 100.0
 

@@ -52,13 +52,13 @@ class Topology:
         ring_start = np.zeros(count + 1, dtype=np.int32)
         np.cumsum(np.bincount(keys // count, minlength=count), out=ring_start[1:])
         return Topology(
-            faces,
-            ring_start,
-            (keys % count).astype(np.int32),
-            fan_start,
-            (order // 3).astype(np.int32),
-            boundary_vertices(mesh),
-            np.unique(flat).astype(np.int32),
+            faces=faces,
+            ring_start=ring_start,
+            ring=(keys % count).astype(np.int32),
+            fan_start=fan_start,
+            fan=(order // 3).astype(np.int32),
+            rim=boundary_vertices(mesh),
+            used=np.unique(flat).astype(np.int32),
         )
 
 

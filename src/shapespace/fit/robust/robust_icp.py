@@ -49,11 +49,11 @@ from shapespace.geometry.normals import rms_size
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Similarity
 
-_MOTION_STRIDE = 7
-_FEWEST_MATCHES = 30
-_FLICKER = 10.0
-_CLEARLY_BETTER = 0.95
-_FARTHEST = 5.0
+_MOTION_STRIDE = 7  # every seventh vertex measures the motion of an iteration, at a seventh of the cost
+_FEWEST_MATCHES = 30  # matches; fewer cannot estimate pose and leading modes robustly
+_FLICKER = 10.0  # multiple of the stop motion below which matches only alternate between neighbours
+_CLEARLY_BETTER = 0.95  # ratio of mismatches for which an alternative replaces the current pose
+_FARTHEST = 5.0  # multiple of the reach beyond which points are not matched
 _HALF, _LEADING, _NEAR = 0.5, 10, 0.05
 """A match counts at half weight; so many modes lead; near is this share of the model's size."""
 _LACK_LEFT = 0.5
@@ -165,7 +165,7 @@ class Problem:
         points = target.draw(level.scan_points, rng)
         vertex = _some(self.prepared.topology.used, level.vertices, rng)
         engine = target.engine if level.triangles else target.vertex_engine
-        return Matcher.of(target, points, vertex, engine, s.normal_cosine)
+        return Matcher.of(target=target, points=points, vertex=vertex, engine=engine, normal_cosine=s.normal_cosine)
 
     def match(self, matcher: Matcher, iterate: Iterate, hint: MatchHint) -> WeightedMatches:
         """Return the matches of an iterate with their weights (R4-R9).
@@ -418,11 +418,11 @@ def _summary(
             "landmarks (--landmarks)."
         ) from error
     # Modes that are not reported are no reason to doubt the fit, so the verdict is on all of them.
-    whole = reported = problem.in_model(iterate, known.surface_mm, model.n_modes)
+    all_regions = reported = problem.in_model(iterate, known.surface_mm, model.n_modes)
     wanted = model.n_modes if modes is None else min(modes, model.n_modes)
     if wanted < model.n_modes:
         reported = problem.in_model(iterate, known.surface_mm, wanted)
-    in_model = (T.inverse() @ whole.T_scan_model).apply(model.reconstruct(whole.b))
+    in_model = (T.inverse() @ all_regions.T_scan_model).apply(model.reconstruct(all_regions.b))
     left_out_mm2 = float(((surface.vertices - in_model) ** 2).sum(axis=1).mean())  # R22, second term
     return RobustFitted(
         T_scan_model=reported.T_scan_model,
@@ -434,8 +434,14 @@ def _summary(
         vertices_scan_mm=T.apply(surface.vertices),
         outside_mm=float(np.linalg.norm(iterate.b[wanted:]) / np.sqrt(len(surface.vertices))),
         regions=FinalMatches(
-            target, T, ModelSurface.of(surface.topology, surface.vertices), weighted.matches.winding,
-            settings.normal_cosine, settings.weight, weighted.weights.width_mm, weighted.weights.far_mm,
+            target=target,
+            T_scan_model=T,
+            surface=ModelSurface.of(surface.topology, surface.vertices),
+            winding=weighted.matches.winding,
+            normal_cosine=settings.normal_cosine,
+            weight=settings.weight,
+            width_mm=weighted.weights.width_mm,
+            far_mm=weighted.weights.far_mm,
         ),
         match_evidence=MatchEvidence(
             **_matched(weighted, gathered, iterate, model, known.prior_variance[: model.n_modes]),
@@ -508,7 +514,15 @@ def _states(
         # Where parts of the scan match now one way and now another, the last bit of motion never ends.
         still = step.motion_mm < _FLICKER * level.stop_motion_mm
         stopped = "rate" if still else "cap"
-        state = IcpState(state.phase, state.iteration + 1, T, b, step.weighted.rms_mm, step.motion_mm, stopped)
+        state = IcpState(
+            phase=state.phase,
+            iteration=state.iteration + 1,
+            T_scan_model=T,
+            b=b,
+            rms_mm=step.weighted.rms_mm,
+            motion_mm=step.motion_mm,
+            stopped=stopped,
+        )
         course = replace(course, iterate=step.iterate, hint=step.weighted.matches.hint)
     return replace(course, state=state if left > 0 else replace(state, stopped="cap"))
 

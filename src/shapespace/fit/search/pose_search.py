@@ -33,7 +33,7 @@ class Step(NamedTuple):
         narrowest: and in the last,
         iterations: of these many; the reach falls geometrically.
         modes: how many modes are free.
-        kept: how many distinct poses go on to the next step.
+        n_poses: how many distinct poses go on to the next step.
     """
 
     points: int
@@ -41,7 +41,7 @@ class Step(NamedTuple):
     narrowest: float
     iterations: int
     modes: int
-    kept: int
+    n_poses: int
 
     def reaches(self, size: float) -> FloatArray:
         """Return the reach in each iteration, mm."""
@@ -49,13 +49,13 @@ class Step(NamedTuple):
 
 
 # Chosen on simulated scans of other people than those of the tests.
-GLANCE = Step(points=250, widest=0.3, narrowest=0.04, iterations=14, modes=10, kept=1)
-FLIPS = Step(points=90, widest=0.3, narrowest=0.06, iterations=6, modes=3, kept=1)
-COARSE = Step(points=250, widest=0.5, narrowest=0.1, iterations=10, modes=0, kept=30)
-RIGID = Step(points=500, widest=0.2, narrowest=0.06, iterations=14, modes=0, kept=24)
-MIDDLE = Step(points=200, widest=0.3, narrowest=0.06, iterations=12, modes=3, kept=5)
-FINE = Step(points=400, widest=0.1, narrowest=0.03, iterations=10, modes=10, kept=2)
-LONG = Step(points=400, widest=0.15, narrowest=0.03, iterations=30, modes=10, kept=4)
+GLANCE = Step(points=250, widest=0.3, narrowest=0.04, iterations=14, modes=10, n_poses=1)
+FLIPS = Step(points=90, widest=0.3, narrowest=0.06, iterations=6, modes=3, n_poses=1)
+COARSE = Step(points=250, widest=0.5, narrowest=0.1, iterations=10, modes=0, n_poses=30)
+RIGID = Step(points=500, widest=0.2, narrowest=0.06, iterations=14, modes=0, n_poses=24)
+MIDDLE = Step(points=200, widest=0.3, narrowest=0.06, iterations=12, modes=3, n_poses=5)
+FINE = Step(points=400, widest=0.1, narrowest=0.03, iterations=10, modes=10, n_poses=2)
+LONG = Step(points=400, widest=0.15, narrowest=0.03, iterations=30, modes=10, n_poses=4)
 ROTATIONS = 96  # spread evenly over SO(3), about 55 degrees apart
 
 _MODEL_CELL, _SCAN_CELL = 0.07, 0.04  # grid cells for thinning, as shares of the model's size
@@ -234,28 +234,36 @@ class _Sides:
         R, t = np.concatenate([T.rotation[None], R]), np.concatenate([T.translation[None], t])
         for step in (COARSE, RIGID):
             R, t, score = rigid_search(
-                R, t, self.model.points[: step.points], self.scan[: step.points], self.model.grid, grid,
-                step.reaches(size), _RIGID_CAP * size,
-            )  # fmt: skip
+                R=R,
+                t=t,
+                model=self.model.points[: step.points],
+                scan=self.scan[: step.points],
+                model_grid=self.model.grid,
+                scan_grid=grid,
+                radii=step.reaches(size),
+                cap=_RIGID_CAP * size,
+            )
             order = np.argsort(score)
-            kept_rows = order[_distinct_rows(R[order], t[order], step.kept, _SAME_TURN, _SAME_PLACE * size)]
+            kept_rows = order[_distinct_rows(R[order], t[order], step.n_poses, _SAME_TURN, _SAME_PLACE * size)]
             R, t = R[kept_rows], t[kept_rows]
         coarse = sorted((self.refined(MIDDLE, *start) for start in zip(R, t, strict=True)), key=_score)
         coarse = _distinct(coarse, len(coarse), _SAME_TURN)
-        poses = [self._again(FINE, pose) for pose in coarse[: MIDDLE.kept]]
+        poses = [self._again(FINE, pose) for pose in coarse[: MIDDLE.n_poses]]
         poses = sorted([upright, *poses], key=_score)
-        poses = [self._again(LONG, pose) for pose in poses[: FINE.kept]] + poses[FINE.kept :]
+        poses = [self._again(LONG, pose) for pose in poses[: FINE.n_poses]] + poses[FINE.n_poses :]
         distinct_poses = _best_distinct(poses)
         if not _is_sure(distinct_poses):
-            second_batch = coarse[MIDDLE.kept : 2 * MIDDLE.kept]
-            poses = poses[: FINE.kept] + [self._again(LONG, pose) for pose in [*poses[FINE.kept :], *second_batch]]
+            second_batch = coarse[MIDDLE.n_poses : 2 * MIDDLE.n_poses]
+            poses = poses[: FINE.n_poses] + [
+                self._again(LONG, pose) for pose in [*poses[FINE.n_poses :], *second_batch]
+            ]
             distinct_poses = _best_distinct(poses)
         # A large part missing lets the model slide for long before it locks in.
         for _ in range(_MORE_ROUNDS):
             if _is_sure(distinct_poses):
                 break
             distinct_poses = _best_distinct(
-                [self._again(LONG, pose) for pose in distinct_poses[: FINE.kept]] + distinct_poses[FINE.kept :]
+                [self._again(LONG, pose) for pose in distinct_poses[: FINE.n_poses]] + distinct_poses[FINE.n_poses :]
             )
         return distinct_poses
 
@@ -266,7 +274,7 @@ class _Sides:
         first = min([upright, *similar], key=_score)
         if first.score_mm > limit:
             return ranked
-        return _distinct([first, *ranked], LONG.kept, _OTHER_TURN)
+        return _distinct([first, *ranked], LONG.n_poses, _OTHER_TURN)
 
     def _placed(self, rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return two poses for each of `rotations` (N, 3, 3): centres together, and the model's front at the scan's."""
@@ -303,7 +311,7 @@ class _Sides:
 
 
 def _best_distinct(poses: Sequence[Pose]) -> list[Pose]:
-    return _distinct(sorted(poses, key=_score), LONG.kept, _OTHER_TURN)
+    return _distinct(sorted(poses, key=_score), LONG.n_poses, _OTHER_TURN)
 
 
 def _is_sure(poses: Sequence[Pose]) -> bool:

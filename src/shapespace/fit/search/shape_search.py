@@ -108,7 +108,7 @@ def shape_search(
                 j, _ = nearest_one(tree, y[0], y[1], y[2], guess[i], stack)
                 guess[i] = j
                 for k in range(3):
-                    y[k] = tree.points[tree.place[j], k] - t[k]
+                    y[k] = tree.points[tree.row_of[j], k] - t[k]
                 for k in range(3):
                     q[k] = (R[0, k] * y[0] + R[1, k] * y[1] + R[2, k] * y[2]) / scale
             else:

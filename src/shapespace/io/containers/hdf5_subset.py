@@ -94,12 +94,12 @@ class _Parts:
         messages: list[tuple[int, memoryview]] = []
         blocks = [self._bytes(offset + 16, length)]
         for block in blocks:  # grows while it is walked, by what is continued elsewhere
-            place = 0
-            while place + 8 <= len(block):
-                kind, size, flags = _unpack("HHB", block[place : place + 5])
-                body = block[place + 8 : place + 8 + size]
-                place += 8 + size
-                if place > len(block) or flags & _SHARED or len(messages) + len(blocks) > _MOST:
+            position = 0
+            while position + 8 <= len(block):
+                kind, size, flags = _unpack("HHB", block[position : position + 5])
+                body = block[position + 8 : position + 8 + size]
+                position += 8 + size
+                if position > len(block) or flags & _SHARED or len(messages) + len(blocks) > _MOST:
                     raise OtherHdf5Error(f"{part_name} has a header that is damaged")
                 if kind == _CONTINUED:
                     blocks.append(self._bytes(*_unpack("QQ", body)))
@@ -167,15 +167,15 @@ class _Parts:
     def _text_in_heap(self, length: int, heap: int, text_index: int, attribute: str) -> str:
         mark, size = self._fields("4s4xQ", heap)
         objects = self._bytes(heap, size)
-        place = 16
+        offset = 16
         for _ in range(_MOST if mark == b"GCOL" else 0):
-            index, stored_length = _unpack("H6xQ", objects[place : place + 16])
+            index, stored_length = _unpack("H6xQ", objects[offset : offset + 16])
             if index == text_index:
-                if stored_length < length or place + 16 + stored_length > size:
+                if stored_length < length or offset + 16 + stored_length > size:
                     break
                 self._charge(length, f"the attribute {attribute!r}")
-                return _text(bytes(objects[place + 16 : place + 16 + length]))
-            place += 16 + -(-stored_length // 8) * 8
+                return _text(bytes(objects[offset + 16 : offset + 16 + length]))
+            offset += 16 + -(-stored_length // 8) * 8
         raise OtherHdf5Error(f"its attribute {attribute!r} is damaged")
 
 

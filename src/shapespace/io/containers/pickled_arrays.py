@@ -59,7 +59,7 @@ class PickleRefusedError(ValueError):
 class _PickledObject:
     """An object that the pickle would create: its kind from `_KNOWN`, its arguments, and its state."""
 
-    what: str
+    kind: str
     parts: tuple[Any, ...] = ()
     state: Any = None
 
@@ -118,17 +118,17 @@ def pickled_array(value: object, depth: int = 0) -> npt.NDArray[Any]:
     if not isinstance(value, _PickledObject) or depth > _DEEPEST:
         raise PickleRefusedError("what should be an array is none")
     state_items, state_fields = _tuple(value.state), _dict(value.state)
-    if value.what == "array" and len(state_items) == 5:
+    if value.kind == "array" and len(state_items) == 5:
         _, shape, dtype, fortran, data = state_items
         return _numbers(data, _dtype(dtype), shape, bool(fortran))
-    if value.what == "buffer" and len(value.parts) >= 4:
+    if value.kind == "buffer" and len(value.parts) >= 4:
         data, dtype, shape, order = value.parts[:4]
         return _numbers(data, _dtype(dtype), shape, order == "F")
-    if value.what == "scalar" and len(value.parts) == 2:
+    if value.kind == "scalar" and len(value.parts) == 2:
         return _numbers(value.parts[1], _dtype(value.parts[0]), (), False)
-    if value.what == "chumpy" and "x" in state_fields:
+    if value.kind == "chumpy" and "x" in state_fields:
         return pickled_array(state_fields["x"], depth + 1)
-    if value.what == "chumpy" and {"a", "idxs"} <= state_fields.keys():
+    if value.kind == "chumpy" and {"a", "idxs"} <= state_fields.keys():
         return _select_rows(state_fields, depth)
     raise PickleRefusedError("what should be an array is none")
 
@@ -144,7 +144,7 @@ def _select_rows(state: dict[str, Any], depth: int) -> npt.NDArray[Any]:
 
 
 def _dtype(value: object) -> np.dtype[Any]:
-    kind = value.parts[0] if isinstance(value, _PickledObject) and value.what == "dtype" and value.parts else None
+    kind = value.parts[0] if isinstance(value, _PickledObject) and value.kind == "dtype" and value.parts else None
     match = _DTYPE.fullmatch(kind) if isinstance(kind, str) else None
     if match is None:
         raise PickleRefusedError("an array in it is not of numbers")
@@ -272,11 +272,11 @@ def _resolve_name(module: str, name: str) -> _PickledObject:
 
 def _call(function: Any, arguments: Any) -> Any:
     """Return the object that a call of `function` creates."""
-    if not isinstance(function, _PickledObject) or function.what != "name" or not isinstance(arguments, tuple):
+    if not isinstance(function, _PickledObject) or function.kind != "name" or not isinstance(arguments, tuple):
         raise PickleRefusedError("it calls what is no name")
     values = cast(tuple[Any, ...], arguments)
     kind = function.parts[0]
-    if kind == "object" and values and isinstance(values[0], _PickledObject) and values[0].what == "name":
+    if kind == "object" and values and isinstance(values[0], _PickledObject) and values[0].kind == "name":
         return _PickledObject(values[0].parts[0])
     if kind == "bytes":
         if len(values) != 2 or not isinstance(values[0], str) or values[1] not in ("latin1", "latin-1"):

@@ -59,8 +59,8 @@ def _mesh(tree: Tree) -> tuple[npt.NDArray[Any], npt.NDArray[Any]] | None:
     places: dict[str, dict[str, npt.NDArray[Any]]] = {}
     arrays: Mapping[str, npt.NDArray[Any]] = tree.arrays
     for name, array in arrays.items():
-        place, _, last = name.rpartition("/")
+        group, _, last = name.rpartition("/")
         if array.ndim == 2:
-            places.setdefault(place, {})[last.lower()] = array
-    complete = (place for place in places.values() if {"vertices", "faces"} <= place.keys())
-    return next(((place["vertices"], place["faces"]) for place in complete), None)
+            places.setdefault(group, {})[last.lower()] = array
+    complete = (group for group in places.values() if {"vertices", "faces"} <= group.keys())
+    return next(((group["vertices"], group["faces"]) for group in complete), None)

@@ -79,7 +79,7 @@ class _Words:
         self.data = data
         self.begin = self.end = offset
         self.block: list[bytes] = []
-        self.at = 0
+        self.position = 0
 
     @property
     def left(self) -> int:
@@ -88,36 +88,36 @@ class _Words:
 
     def mark(self) -> tuple[int, int, list[bytes], int]:
         """Return where the next word is, for `back_to`."""
-        return self.begin, self.end, self.block, self.at
+        return self.begin, self.end, self.block, self.position
 
     def back_to(self, mark: tuple[int, int, list[bytes], int]) -> None:
         """Go back to where `mark` was taken."""
-        self.begin, self.end, self.block, self.at = mark
+        self.begin, self.end, self.block, self.position = mark
 
     def __iter__(self) -> Iterator[bytes]:
         return self
 
     def __next__(self) -> bytes:
-        while self.at == len(self.block):
+        while self.position == len(self.block):
             if self.end >= len(self.data):
                 raise StopIteration
-            self.begin, self.at = self.end, 0
+            self.begin, self.position = self.end, 0
             self.block, self.end = word_block(self.data, self.begin)
-        self.at += 1
-        return self.block[self.at - 1]
+        self.position += 1
+        return self.block[self.position - 1]
 
     def take(self, count: int) -> Iterator[list[bytes]]:
         """Yield the next `count` words in lists; fewer where the text ends."""
         while count > 0 and (word := next(self, None)) is not None:
-            part = [word, *self.block[self.at : self.at + count - 1]]
-            self.at += len(part) - 1
+            part = [word, *self.block[self.position : self.position + count - 1]]
+            self.position += len(part) - 1
             count -= len(part)
             yield part
 
     def some(self, count: int) -> list[bytes]:
         """Return the next `count` words; fewer where the text ends."""
-        part = self.block[self.at : self.at + count]
-        self.at += len(part)
+        part = self.block[self.position : self.position + count]
+        self.position += len(part)
         # The rest of a long list lies in the blocks that follow.
         return part if len(part) == count else [*part, *chain.from_iterable(self.take(count - len(part)))]
 

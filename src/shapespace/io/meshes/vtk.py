@@ -67,14 +67,14 @@ class _Cursor(ABC):
     """Read position in a legacy file, with words read here and numbers by the ascii or binary subclass."""
 
     def __init__(self, data: bytes, path: Path) -> None:
-        self.data, self.at, self.path = data, 0, path
+        self.data, self.position, self.path = data, 0, path
 
     def word(self) -> bytes:
         """Return the next word, or nothing at the end."""
-        match = _WORD.match(self.data, self.at)
+        match = _WORD.match(self.data, self.position)
         if match is None:
             return b""
-        self.at = match.end()
+        self.position = match.end()
         return match[1]
 
     @abstractmethod
@@ -91,42 +91,42 @@ class _Cursor(ABC):
 
     def skip_lines(self, count: int) -> None:
         """Move past `count` lines, which are text in binary files too."""
-        check_count(count, 1, len(self.data) - self.at + 1, "lines", self.path)
+        check_count(count, 1, len(self.data) - self.position + 1, "lines", self.path)
         for _ in range(count):
-            end = self.data.find(b"\n", self.at)
+            end = self.data.find(b"\n", self.position)
             if end < 0:
                 raise damage_error(self.path, f"it ends among its fields; {CUT_SHORT}")
-            self.at = end + 1
+            self.position = end + 1
 
     def skip_metadata(self) -> None:
         """Move past a METADATA section, which a blank line ends."""
-        blank = _BLANK_LINE.search(self.data, max(self.at - 1, 0))
+        blank = _BLANK_LINE.search(self.data, max(self.position - 1, 0))
         if blank is None:
             raise damage_error(self.path, f"it ends among its METADATA; {CUT_SHORT}")
-        self.at = blank.end()
+        self.position = blank.end()
 
     def skip_if_offsets(self) -> bool:
         """Move past the word OFFSETS if it comes next, and return whether it did."""
         # As a number, 'OFFS' would be a polygon of a thousand million corners.
-        match = _OFFSETS.match(self.data, self.at)
-        self.at = match.end() if match else self.at
+        match = _OFFSETS.match(self.data, self.position)
+        self.position = match.end() if match else self.position
         return match is not None
 
 
 class _TextCursor(_Cursor):
     def array(self, count: int, kind: str) -> Values:
-        check_count(count, 2, len(self.data) - self.at + 1, "numbers", self.path)
+        check_count(count, 2, len(self.data) - self.position + 1, "numbers", self.path)
         parts: list[Values] = []
         while count:
-            words, stop = word_block(self.data, self.at, 16 * count)
+            words, stop = word_block(self.data, self.position, 16 * count)
             if not words and stop == len(self.data):
                 raise damage_error(self.path, f"it ends among its numbers; {CUT_SHORT}")
             if len(words) > count:
                 # Cut again, to see where the last of them ends.
-                remainder = self.data[self.at : stop].split(None, count)[count]
+                remainder = self.data[self.position : stop].split(None, count)[count]
                 words, stop = words[:count], stop - len(remainder)
             parts.append(floats(words, self.path) if kind[0] == "f" else ints(words, self.path))
-            self.at = stop
+            self.position = stop
             count -= len(words)
         return join_parts(parts, np.float64 if kind[0] == "f" else np.int64)
 
@@ -140,19 +140,20 @@ class _TextCursor(_Cursor):
 class _BinaryCursor(_Cursor):
     def array(self, count: int, kind: str) -> Values:
         big = np.dtype(">" + kind)
-        check_count(count, big.itemsize, len(self.data) - self.at, "numbers", self.path)
-        values = np.frombuffer(self.data, dtype=big, count=count, offset=self.at)
-        self.at += count * big.itemsize
+        check_count(count, big.itemsize, len(self.data) - self.position, "numbers", self.path)
+        values = np.frombuffer(self.data, dtype=big, count=count, offset=self.position)
+        self.position += count * big.itemsize
         return values.astype(np.float64 if kind[0] == "f" else np.int64)
 
     def skip_texts(self, count: int) -> None:
-        check_count(count, 1, len(self.data) - self.at, "pieces of text", self.path)
+        check_count(count, 1, len(self.data) - self.position, "pieces of text", self.path)
         for _ in range(count):
             # The two highest bits of the length tell how many bytes it has.
-            width = 8 >> (self.data[self.at] >> 6) if self.at < len(self.data) else 1
-            length = int.from_bytes(self.data[self.at : self.at + width], "big") & ((1 << (8 * width - 2)) - 1)
-            self.at += width + length
-            if self.at > len(self.data):
+            width = 8 >> (self.data[self.position] >> 6) if self.position < len(self.data) else 1
+            prefix = self.data[self.position : self.position + width]
+            length = int.from_bytes(prefix, "big") & ((1 << (8 * width - 2)) - 1)
+            self.position += width + length
+            if self.position > len(self.data):
                 raise damage_error(self.path, f"it ends among its fields; {CUT_SHORT}")
 
     def skip_bits(self, count: int) -> None:
@@ -396,7 +397,15 @@ def read_vtp(data: bytes, path: Path) -> Mesh:
     base = block is not None and block.get("encoding", "base64") == "base64"
     order = ">" if root.get("byte_order") == "BigEndian" else "<"
     header = order + ("u8" if root.get("header_type") == "UInt64" else "u4")
-    xml = _Xml(path, order, header, compressor != "", appended, base, Allowance(len(data), path))
+    xml = _Xml(
+        path=path,
+        order=order,
+        header=header,
+        compressed=compressor != "",
+        appended=appended,
+        appended_base64=base,
+        allowance=Allowance(len(data), path),
+    )
     points: list[FloatArray] = []
     colours: list[ByteArray | None] = []
     faces: list[IndexArray] = []

@@ -78,15 +78,15 @@ def read_labels(path: Path, *, of_subjects: bool = True, of_any: bool = False) -
     for row in rows:
         text, subject = row[label], "" if owner is None else row[owner]
         if row[name] and (text or subject):
-            place = PurePath(row[name].replace("\\", "/").removesuffix(".gz")).with_suffix("")
+            scan_path = PurePath(row[name].replace("\\", "/").removesuffix(".gz")).with_suffix("")
             known = None if intensity is None else _intensity(row[intensity])
-            labels_by_stem.setdefault(place.name, {})[place] = Label(text, known, subject)
+            labels_by_stem.setdefault(scan_path.name, {})[scan_path] = Label(text, known, subject)
     labels: dict[str, Label] = {}
     for stem, group in labels_by_stem.items():
         if len(set(group.values())) == 1:
             labels[stem] = next(iter(group.values()))
         else:
-            labels |= {"_".join(place.parts): group_label for place, group_label in group.items()}
+            labels |= {"_".join(scan_path.parts): group_label for scan_path, group_label in group.items()}
     return labels
 
 

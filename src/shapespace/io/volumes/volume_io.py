@@ -296,7 +296,15 @@ def _nifti_head(start: bytes, path: Path) -> _VolumeHeader:
     if offset < size:
         raise damage_error(path, f"its header says that the voxels begin within the header; {CUT_SHORT}")
     slope, shift = (1.0, 0.0) if slope is None else (float(slope), float(shift or 0.0))
-    return _VolumeHeader(shape, kind, offset, _in_mm(affine, _NIFTI_MM[unit]), slope, shift, notes)
+    return _VolumeHeader(
+        shape=shape,
+        kind=kind,
+        start=offset,
+        affine=_in_mm(affine, _NIFTI_MM[unit]),
+        slope=slope,
+        shift=shift,
+        notes=notes,
+    )
 
 
 def _nifti_affine(header: Any) -> tuple[FloatArray, tuple[str, ...]]:

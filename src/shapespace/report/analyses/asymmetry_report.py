@@ -27,14 +27,12 @@ from shapespace.statistics.asymmetry import AnovaRow, AsymmetryResult, first_pat
 from shapespace.statistics.observation_weights import blank_where
 from shapespace.types import BoolArray, FloatArray, Mesh, SurfaceLandmarks
 
-_ALPHA = 0.05
-_MOST_MAPS = 2
-_MOST_ROWS = 10
-_BINS = 20
+_ALPHA = 0.05  # significance level of the summary, the usual one
+_MOST_MAPS, _MOST_ROWS, _BINS = 2, 10, 20  # maps, rows and bins of the report: what fits one screen each
 _MORPH_SHARE = 0.05
 """Largest displacement in an exaggerated morph, as a share of the size (RMS distance from the centroid)."""
 _FILE = "asymmetry.npz"
-_FEWEST_REPEATS = 10
+_FEWEST_REPEATS = 10  # repeated scans; with fewer the measurement error is known to no better than 22 %
 
 
 def asymmetry_report(result: AsymmetryResult) -> AnalysisReport:
@@ -98,11 +96,11 @@ def _summary(result: AsymmetryResult, order: Any) -> tuple[str, ...]:
             "in one shape, and is subtracted."
         )
     if result.permutations:
-        shown = int((result.directional_p <= _ALPHA).sum())
+        n_significant = int((result.directional_p <= _ALPHA).sum())
         sentences.append(
-            f"Directional asymmetry is shown at {shown} of {len(result.mean)} vertices (family-wise p at most "
+            f"Directional asymmetry is shown at {n_significant} of {len(result.mean)} vertices (family-wise p at most "
             f"{_ALPHA})."
-            if shown
+            if n_significant
             else f"No vertex shows directional asymmetry (family-wise p above {_ALPHA} everywhere)."
         )
     first = int(order[0])
@@ -249,7 +247,7 @@ def _finite_or_none(value: float) -> float | None:
 
 
 def _maps_and_morphs(result: AsymmetryResult, order: Any) -> tuple[Mapping[str, Any], list[Part]]:
-    shown = [int(k) for k in order[:_MOST_MAPS]]
+    subjects = [int(k) for k in order[:_MOST_MAPS]]
     half_difference = result.difference.mean(axis=0) / 2.0
     arrays: dict[str, Any] = {
         "vertices": result.mean,
@@ -328,7 +326,7 @@ def _maps_and_morphs(result: AsymmetryResult, order: Any) -> tuple[Mapping[str, 
             low="two one way",
             high="two the other",
         )
-    for rank, k in enumerate(shown, 1):
+    for rank, k in enumerate(subjects, 1):
         name = result.subjects[k]
         hidden = _unobserved(result)
         arrays[f"subject_{rank}_mm"] = blank_where(result.maps[k], None if hidden is None else hidden[k])
@@ -341,7 +339,7 @@ def _maps_and_morphs(result: AsymmetryResult, order: Any) -> tuple[Mapping[str, 
                 note=f"{_score_text(result, k)}.",
             )
         )
-    k = shown[0]
+    k = subjects[0]
     morph(
         title=f"{result.subjects[k]} and its mirror image",
         key="subject",

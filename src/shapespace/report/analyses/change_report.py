@@ -44,11 +44,12 @@ from shapespace.types import FloatArray, Mesh
 ARRAYS, MAPS = "change.npz", "subjects.npz"
 MOST_MAPS = 6
 """Subjects whose maps the report draws."""
+# rows and curves of the report: what can be read without scrolling far, and curves that stay distinguishable
 MOST_ROWS, MOST_CURVES = 50, 12
 _LEVEL = LEVEL
 _LEAST_ML_MM3 = 100.0
 """Volumes below this limit (mm³) are written in mm³, others in ml; 0.1 ml needs more than two decimals."""
-_FEW = 10
+_FEW = 10  # degrees of freedom; with fewer a standard deviation is known to no better than 22 %
 _SOURCES = {
     "rescans": "Standard deviations are those of rescans.",
     "fits": "Standard deviations are those that the fits state of their coefficients, carried through modes and "
@@ -374,7 +375,7 @@ def _subject_parts(change: ChangeResult, arrays: dict[str, npt.NDArray[Any]]) ->
     columns = [
         TableColumn(name="subject"), TableColumn(name="first"), TableColumn(name="last"),
         TableColumn(name="RMS", kind="mm"), TableColumn(name="beyond its uncertainty", kind="percent"),
-        *(TableColumn(name=f"{what}, {unit.name}", kind="number") for what in ("volume", "stddev")),
+        *(TableColumn(name=f"{quantity}, {unit.name}", kind="number") for quantity in ("volume", "stddev")),
     ]  # fmt: skip
     if change.is_closed:
         columns.append(TableColumn(name="of the volume before", kind="percent"))

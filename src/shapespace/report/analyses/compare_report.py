@@ -39,8 +39,8 @@ from shapespace.types import BoolArray, FloatArray, Mesh
 
 _LARGEST_SHARE = 0.05
 """A morph shows changes exaggerated to about this share of the size."""
-_EXAGGERATIONS = (1, 2, 3, 5, 10, 20, 50)
-_BINS = 40
+_EXAGGERATIONS = (1, 2, 3, 5, 10, 20, 50)  # factors of a displacement; the largest that stays plausible is taken
+_BINS = 40  # bins of a histogram of thousands of permutations
 _FEWEST_ARRANGEMENTS = 20
 """Number of different arrangements below which no p value can be small."""
 _PALE = "Vertices that are not found to differ are pale."
@@ -218,27 +218,27 @@ def _repeated_measures_notes(result: CompareResult) -> Iterator[str]:
 _EXPLORATORY = "exploratory, since its term is not significant: "
 
 
-def _map_sentence(result: CompareResult, effect: ShapeEffect, shown: EffectMap) -> str:
+def _map_sentence(result: CompareResult, effect: ShapeEffect, effect_map: EffectMap) -> str:
     """Return what the map of an effect shows; it is exploratory where no term of the effect is significant."""
     level = result.config.alpha
     scope = f"family-wise error {100 * level:g} % within this map"
-    significant = shown.shown.p_family <= level
+    significant = effect_map.test.p_family <= level
     if not significant.any():
         return f"{effect.label}: no vertex differs ({scope})."
     return (
         f"{effect.label}: {_EXPLORATORY if effect.exploratory else ''}{100 * significant.mean():.1f} % of the vertices "
-        f"differ ({scope}), the clearest by {_clearest(result, shown)}."
+        f"differ ({scope}), the clearest by {_clearest(result, effect_map)}."
     )
 
 
-def _clearest(result: CompareResult, shown: EffectMap) -> str:
+def _clearest(result: CompareResult, effect_map: EffectMap) -> str:
     """Return the change at the vertex with the largest F, with its simultaneous interval."""
-    lengths, vertex = _lengths(result), int(shown.shown.f.argmax())
-    low, high = shown.interval_mm(vertex)
-    sign = "" if shown.normal_mm is None else "+"
+    lengths, vertex = _lengths(result), int(effect_map.test.f.argmax())
+    low, high = effect_map.interval_mm(vertex)
+    sign = "" if effect_map.normal_mm is None else "+"
     return (
-        f"{lengths.text(shown.shown_mm[vertex], sign)} (simultaneous {100 * (1 - result.config.alpha):g} % interval "
-        f"{lengths.number(low, sign)} to {lengths.text(high, sign)}){_near_landmark(result.cohort, vertex)}"
+        f"{lengths.text(effect_map.shown_mm[vertex], sign)} (simultaneous {100 * (1 - result.config.alpha):g} % "
+        f"interval {lengths.number(low, sign)} to {lengths.text(high, sign)}){_near_landmark(result.cohort, vertex)}"
     )
 
 
@@ -459,9 +459,9 @@ def _arrays(result: CompareResult, effect: ShapeEffect) -> Mapping[str, npt.NDAr
 def _meshes(result: CompareResult) -> Iterator[tuple[str, Mesh]]:
     if result.cohort.faces is None:
         return
-    for at, effect in enumerate(result.effects, 1):
+    for number, effect in enumerate(result.effects, 1):
         for end, shape, name in (("low", effect.at_low, effect.low), ("high", effect.at_high, effect.high)):
-            yield f"effect_{at}_{end}.ply", result.cohort.mesh(shape, name)
+            yield f"effect_{number}_{end}.ply", result.cohort.mesh(shape, name)
 
 
 def _tables(result: CompareResult) -> Mapping[str, Rows]:
@@ -488,8 +488,8 @@ def _tables(result: CompareResult) -> Mapping[str, Rows]:
                 "p_of_all_pairs",
             ),
             [
-                (at, e.name, e.low, e.high, e.stratum, e.distance_mm, e.rms_mm, e.f, e.z, e.p, e.p_family)
-                for at, e in enumerate(result.effects, 1)
+                (number, e.name, e.low, e.high, e.stratum, e.distance_mm, e.rms_mm, e.f, e.z, e.p, e.p_family)
+                for number, e in enumerate(result.effects, 1)
             ],
         ),
     }

@@ -15,7 +15,7 @@ from shapespace.statistics.identity.rates import RateEstimate
 from shapespace.statistics.identity.trial import IdentityConfig, Trial
 from shapespace.types import FloatArray
 
-_POINTS = 300
+_POINTS = 300  # points of a drawn curve, more than its pixels show
 SCORE_NAMES = {
     "plda": "PLDA score",
     "cosine": "cosine",

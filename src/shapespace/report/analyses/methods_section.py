@@ -130,7 +130,7 @@ def scheme_text(test: TestScheme) -> str:
     if test.resampling == "leave-one-out":
         return f"leaving out each {test.unit} of the reference"
     every = ", all of them" if test.exhaustive else ""
-    what = (
+    units = (
         "values"
         if test.reduced_model is None
         else f"residuals of shape ~ {' + '.join(test.reduced_model)}"
@@ -138,12 +138,12 @@ def scheme_text(test: TestScheme) -> str:
         else "residuals of the mean"
     )
     if test.resampling == "sign flips":
-        return f"{what} with signs flipped by {test.unit}{every}"
-    difference, _, whole = test.unit.partition(" within a ")
-    scope = f"of {difference}s permuted within {whole}s" if whole else f"permuted between {test.unit}s"
+        return f"{units} with signs flipped by {test.unit}{every}"
+    difference, _, block = test.unit.partition(" within a ")
+    scope = f"of {difference}s permuted within {block}s" if block else f"permuted between {test.unit}s"
     if test.unit == SCAN_OF_SUBJECT:
         scope = "permuted within subjects, and between subjects with the same number of scans"
-    return f"{what} {scope}{every}"
+    return f"{units} {scope}{every}"
 
 
 def dispersion_sentence(one: Dispersion, unequal_variances: bool | None, unit: str) -> str:

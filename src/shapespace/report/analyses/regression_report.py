@@ -24,7 +24,7 @@ from shapespace.statistics.regression import (
 from shapespace.types import Mesh
 
 _FILE = "regression.npz"
-_MOST_ROWS = 20
+_MOST_ROWS = 20  # rows that fit one screen; files have all
 _MEASURE_NAMES = {
     "r2": "R²", "rmse": "RMSE", "mae": "mean absolute error", "slope": "calibration slope",
     "intercept": "calibration intercept", "coverage": "coverage of intervals", "width": "width of intervals",
@@ -42,8 +42,8 @@ def regression_report(result: RegressionResult, new: tuple[Cohort, Predictions] 
         tables["new.csv"] = _prediction_rows(*new)
     faces = result.cohort.faces
     meshes = {
-        f"{name}.ply": Mesh(result.shape_at(at), faces, name=f"{result.target} {at:g}")
-        for name, at in (("low", result.low_at), ("high", result.high_at))
+        f"{name}.ply": Mesh(result.shape_at(value), faces, name=f"{result.target} {value:g}")
+        for name, value in (("low", result.low_at), ("high", result.high_at))
     }
     report = AnalysisReport(
         question="regress",

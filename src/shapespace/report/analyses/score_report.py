@@ -14,8 +14,9 @@ from shapespace.report.analyses.shape_data import add_shape_data, model_hashes
 from shapespace.schemas import Counts, HistogramPart, MorphPart, Part, SurfaceMapPart, TableColumn, TablePart, TextPart
 from shapespace.statistics.score_subjects import SMALL, ScoreResult
 
+# maps, morphs, sentences and bins of the report: what can be looked through; files have all
 _MOST_MAPS, _MOST_MORPHS, _MOST_SENTENCES, _BINS = 12, 3, 12, 24
-_LIMIT_SD = 4.0
+_LIMIT_SD = 4.0  # standard deviations at the ends of the colour scale: beyond 4 all is far outside
 _FILE = "score.npz"
 
 

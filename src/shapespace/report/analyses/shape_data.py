@@ -11,7 +11,7 @@ from shapespace.schemas import TableColumn, TablePart
 from shapespace.statistics.observation_weights import LEAST_INFORMATION
 
 _FILE = "observed.csv"
-_MOST_ROWS = 10
+_MOST_ROWS = 10  # rows that fit one screen; files have all
 
 
 def blank_sentence(count: int, total: int) -> str:

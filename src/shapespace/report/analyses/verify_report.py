@@ -24,9 +24,9 @@ from shapespace.report.analyses.shape_data import add_shape_data, model_hashes
 from shapespace.schemas import Counts, CurvePart, HistogramPart, Part, Series, TableColumn, TablePart, TextPart
 from shapespace.statistics.identity.verify import FAR, GRID, VerificationRates, VerificationResult
 
-_LEAST_RATE = 1e-4
-_BINS = 40
-_ERRORS = 30
+_LEAST_RATE = 1e-4  # lowest false accept rate of the plot, the end of `GRID`
+_BINS = 40  # bins of a histogram of thousands of pairs
+_ERRORS = 30  # expected errors; a rate from fewer is uncertain by more than 30 % ("rule of 30")
 
 
 def verify_report(result: VerificationResult) -> AnalysisReport:
@@ -197,14 +197,14 @@ def _roc_curve(result: VerificationResult) -> CurvePart:
     least = max(1.0 / int((~result.pairs.same).sum()), _LEAST_RATE)
     series: list[Series] = []
     for one in result.scores:
-        shown = np.unique(np.concatenate([[least], GRID[least <= GRID]]))
-        grid_points = np.searchsorted(GRID, shown)
+        far = np.unique(np.concatenate([[least], GRID[least <= GRID]]))
+        grid_points = np.searchsorted(GRID, far)
         band = [tuple(side[np.minimum(grid_points, len(GRID) - 1)].tolist()) for side in one.band]
         has_band = bool(np.isfinite(one.band).all())
         series.append(
             Series(
-                x=tuple(shown.tolist()),
-                y=tuple(one.roc.tar_at(shown).tolist()),
+                x=tuple(far.tolist()),
+                y=tuple(one.roc.tar_at(far).tolist()),
                 label=score_label(one.name),
                 low=band[0] if has_band else None,
                 high=band[1] if has_band else None,

@@ -33,13 +33,13 @@ class Cell:
         text: what is read.
         value: the number that a table sorts it by; None sorts by the text, not-a-number comes last.
         status: which of the statuses it is, for its colour; empty for none.
-        place: where in the page it leads, or None.
+        anchor: where in the page it leads, or None.
     """
 
     text: str
     value: float | None = None
     status: str = ""
-    place: str | None = None
+    anchor: str | None = None
 
     @property
     def sort_key(self) -> float | str:
@@ -178,21 +178,21 @@ class Card:
     """One fit in a gallery.
 
     Args:
-        place: its name in the page.
+        anchor: its name in the page.
         name: of the fit.
         status: of the fit.
         label: beside it; empty for none.
-        told: in a sentence or two.
+        text: in a sentence or two.
         image: its picture, or None.
         why_none: why there is no picture.
         detail: the place with all its pictures, or None.
     """
 
-    place: str
+    anchor: str
     name: str
     status: Cell
     label: str
-    told: str
+    text: str
     image: Image | None
     why_none: str = ""
     detail: str | None = None
@@ -217,7 +217,7 @@ class ScaleKey:
 class StripKey:
     """The key of other strips: what their panels show in words, and scales, each (bar, its ends in words)."""
 
-    told: str
+    text: str
     bars: Sequence[tuple[Image, str, str]]
     note: str = ""
 
@@ -243,7 +243,7 @@ class Section:
     """A part of the page under a heading of `level` 2 to 6, at a place that links lead to; perhaps folded away."""
 
     heading: str
-    place: str
+    anchor: str
     body: Sequence[Block]
     level: int = 3
     link: str = ""

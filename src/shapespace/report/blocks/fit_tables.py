@@ -25,29 +25,29 @@ def fits_table(fits: Sequence[SavedFit], places: Mapping[str, str], *, caption: 
         caption: of the table.
     """
     texts: list[tuple[str, _Make]] = [
-        ("Scan", lambda fit: Cell(fit.name, place=places.get(fit.name))),
+        ("Scan", lambda fit: Cell(fit.name, anchor=places.get(fit.name))),
         ("Label", lambda fit: Cell(fit.label if fit.label != fit.name else "")),
         ("Status", lambda fit: status(fit.status)),
     ]
     columns = [(Column(head), make) for head, make in texts]
     columns += [(Column(head, "number"), make) for head, make in _NUMBERS]
     made = [(column, [make(fit) for fit in fits]) for column, make in columns]
-    kept = [
+    nonempty = [
         (column, cells)
         for column, cells in made
         if any(cell.text if cell.value is None else isfinite(cell.value) for cell in cells)
     ]
-    rows = [[cells[k] for _, cells in kept] for k in range(len(fits))]
-    return Table([column for column, _ in kept], rows, caption, sortable=len(fits) > 1)
+    rows = [[cells[k] for _, cells in nonempty] for k in range(len(fits))]
+    return Table([column for column, _ in nonempty], rows, caption, sortable=len(fits) > 1)
 
 
 def _error(of: Callable[[SavedFit], VertexErrors | None], measure: str) -> _Make:
     return lambda fit: length(getattr(of(fit), measure, nan))
 
 
-def _distance(direction: Direction, measure: Measure, *, shown: bool) -> _Make:
+def _distance(direction: Direction, measure: Measure, *, over_overlap: bool) -> _Make:
     """Return what makes the cell of a distance over what the scan shows, or over all in fits that do not tell that."""
-    return lambda fit: length(fit.distance_mm(direction, measure) if fit.shown == shown else nan)
+    return lambda fit: length(fit.distance_mm(direction, measure) if fit.has_overlap_distances == over_overlap else nan)
 
 
 def _share(key: str) -> _Make:
@@ -59,7 +59,7 @@ def _known(share: float | None) -> float:
 
 
 def _counted(fit: SavedFit) -> Cell:
-    return number(nan if fit.shown else 100 * fit.summary_mm("final", "scan_to_model", "fraction"), 0)
+    return number(nan if fit.has_overlap_distances else 100 * fit.summary_mm("final", "scan_to_model", "fraction"), 0)
 
 
 def _total(values: Mapping[str, float], digits: int) -> Cell:
@@ -71,16 +71,16 @@ _NUMBERS: list[tuple[str, _Make]] = [
     ("True vertex error, max", _error(lambda fit: fit.entry.vertex_error_mm, "max")),
     ("Floor of that, mean", _error(lambda fit: fit.entry.floor_mm, "mean")),
     ("Expected vertex error", lambda fit: length(fit.expected_error_mm)),
-    ("Model to scan where shown, mean", _distance("model_to_scan", "mean", shown=True)),
-    ("Model to scan where shown, 95 %", _distance("model_to_scan", "p95", shown=True)),
-    ("Scan to model where covered, mean", _distance("scan_to_model", "mean", shown=True)),
-    ("Scan to model where covered, 95 %", _distance("scan_to_model", "p95", shown=True)),
+    ("Model to scan where shown, mean", _distance("model_to_scan", "mean", over_overlap=True)),
+    ("Model to scan where shown, 95 %", _distance("model_to_scan", "p95", over_overlap=True)),
+    ("Scan to model where covered, mean", _distance("scan_to_model", "mean", over_overlap=True)),
+    ("Scan to model where covered, 95 %", _distance("scan_to_model", "p95", over_overlap=True)),
     ("Model shown, %", _share("model_seen_share")),
     ("Scan covered, %", _share("scan_covered_share")),
-    ("Scan to model, mean", _distance("scan_to_model", "mean", shown=False)),
-    ("Scan to model, 95 %", _distance("scan_to_model", "p95", shown=False)),
-    ("Whole model to scan, mean", _distance("model_to_scan", "mean", shown=False)),
-    ("Whole model to scan, max", _distance("model_to_scan", "max", shown=False)),
+    ("Scan to model, mean", _distance("scan_to_model", "mean", over_overlap=False)),
+    ("Scan to model, 95 %", _distance("scan_to_model", "p95", over_overlap=False)),
+    ("Whole model to scan, mean", _distance("model_to_scan", "mean", over_overlap=False)),
+    ("Whole model to scan, max", _distance("model_to_scan", "max", over_overlap=False)),
     ("Scan counted, %", _counted),
     ("RMS of z", lambda fit: number(float(np.sqrt(np.mean(np.square(fit.record.z)))) if fit.record.z else nan, 1)),
     ("Steps", lambda fit: _total(fit.record.iterations, 0)),
@@ -115,8 +115,8 @@ def score_tables(scores: Mapping[str, Any], *, many: str, single: str) -> list[B
     """
 
     def row(key: str, values: Sequence[object]) -> list[Cell]:
-        told = [f"{value:.3f}" if isinstance(value, float) and abs(value) < 10 else plain(value) for value in values]
-        return [Cell(SCORE_WORDS.get(key, words(key))), *map(Cell, told)]
+        texts = [f"{value:.3f}" if isinstance(value, float) and abs(value) < 10 else plain(value) for value in values]
+        return [Cell(SCORE_WORDS.get(key, words(key))), *map(Cell, texts)]
 
     by_thing = {key: _object(value) for key, value in scores.items() if key.startswith("line_")}
     out: list[Block] = []

@@ -39,7 +39,7 @@ ORDER_OF_CONCERN = ("failed", "unreadable", "doubtful", "max_iterations", "conve
 MODEL_PICTURES, FIT_PICTURES = 4, 9
 """How many pictures `model_part` and `fit_in_full` make."""
 
-MODES_IN_WIDGET = 8
+MODES_IN_WIDGET = 8  # sliders that fit beside the picture; their displacements are most of the payload
 SCAN_TRIANGLES = 8_000
 """How many triangles of a scan turn in the page; the file of the scan has them all."""
 
@@ -47,8 +47,8 @@ _From = TypeVar("_From")
 _To = TypeVar("_To")
 _CAPTION_HEIGHT = 0.14
 """Of a figure, beside its width."""
-_DETAIL_BYTES = 1_300_000
-_VARIANCE_SHARES = (0.90, 0.95, 0.98, 0.99)
+_DETAIL_BYTES = 1_300_000  # bytes of the page that all pictures of one fit take
+_VARIANCE_SHARES = (0.90, 0.95, 0.98, 0.99)  # shares of the variance that are usual in publications
 
 
 def concern(fit: SavedFit) -> tuple[int, float]:
@@ -103,7 +103,7 @@ def model_part(page: Page, model: ShapeModel, *, figure_of: str = "", to_move: i
         ("Provenance", model.provenance),
         ("Licence", model.licence or "not stated"),
     ]
-    shown = min(5, model.n_modes)
+    n_shown = min(5, model.n_modes)
     return [
         modes_to_move(page, model, to_move),
         Facts(rows, "The shape model"),
@@ -112,10 +112,10 @@ def model_part(page: Page, model: ShapeModel, *, figure_of: str = "", to_move: i
             [
                 in_columns(
                     page.figure(
-                        figures.modes_figure(model, modes=shown),
+                        figures.modes_figure(model, modes=n_shown),
                         f"{figure_of}Each row: the mean with one mode at −3, 0 and +3 standard deviations, and how far "
                         "each point moves at 3. One scale for all rows.",
-                        alt=f"Mean shape and the first {counted(shown, 'mode')} at minus and plus three standard "
+                        alt=f"Mean shape and the first {counted(n_shown, 'mode')} at minus and plus three standard "
                         "deviations, with maps of the displacement",
                     ),
                     page.figure(
@@ -196,10 +196,10 @@ def fit_in_full(
         return [Text("Its pictures would make this file larger than 8 MB, so they are left out.", "soft")]
     turning = page.tried(lambda: fit_to_turn(page, fit))
     pictures = fit_pictures(page, fit, population, of_paper=of_paper)
-    told = "More pictures: stages, both ways of distance, regions, thresholds, iterations, coefficients"
+    heading = "More pictures: stages, both ways of distance, regions, thresholds, iterations, coefficients"
     if fit.regions is None:
-        told = "More pictures: both ways of distance, thresholds, coefficients"
-    return [*turning, Folded(told, [pictures]) if folded else pictures]
+        heading = "More pictures: both ways of distance, thresholds, coefficients"
+    return [*turning, Folded(heading, [pictures]) if folded else pictures]
 
 
 def fit_to_turn(page: Page, fit: StagedFit) -> Turning | Figure:
@@ -345,10 +345,10 @@ def fit_facts(fit: SavedFit) -> list[Block]:
 def distances_told(fit: SavedFit) -> str:
     """Return the mean distances of one fit both ways, what they are over, and the shares seen."""
     to_scan, to_model = mm(fit.distance_mm("model_to_scan")), mm(fit.distance_mm("scan_to_model"))
-    shown = fit.record.shown
-    if shown is None:
+    overlap = fit.record.shown
+    if overlap is None:
         return f"On average: the whole model to the scan {to_scan}, the scan to the model {to_model}."
-    seen, covered = shown.model_seen_share, shown.scan_covered_share
+    seen, covered = overlap.model_seen_share, overlap.scan_covered_share
     return (
         f"On average, over what the scan shows: model to scan {to_scan}{_over(seen, 'model')}, scan to model "
         f"{to_model}{_over(covered, 'scan')}."
@@ -369,14 +369,14 @@ def common_limit_mm(fits: Sequence[StagedFit]) -> float:
 
 def usable(items: Sequence[_From], load: Callable[[_From], _To]) -> tuple[list[_To], list[str]]:
     """Return what `load` gives, and one sentence for each of the items that it refuses."""
-    found: list[_To] = []
+    usable_fits: list[_To] = []
     problems: list[str] = []
     for item in items:
         try:
-            found.append(load(item))
+            usable_fits.append(load(item))
         except ShapespaceError as error:
             problems.append(str(error))
-    return found, problems
+    return usable_fits, problems
 
 
 # Coefficients

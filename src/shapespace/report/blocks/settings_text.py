@@ -32,31 +32,31 @@ def settings_told(configs: Sequence[Mapping[str, Any]], first: Sequence[tuple[st
     """
     rows = list(first)
     for name, tell in _CHOICES:
-        told = list(dict.fromkeys(tell(config) for config in configs))
-        if any(told):
-            rows.append((name, "; of others: ".join(told[:4])))
+        texts = list(dict.fromkeys(tell(config) for config in configs))
+        if any(texts):
+            rows.append((name, "; of others: ".join(texts[:4])))
     out: list[Block] = [Facts(rows, _CAPTION)]
     parts = dict.fromkeys(str(config.get("method")) for config in configs)
     wanted = [*parts, *(["dense_settings"] if any(config.get("dense") is True for config in configs) else [])]
     for key in wanted:
-        found = [_mapping(config.get(key)) for config in configs]
-        values = next((value for value in found if value), _NOTHING)
+        mappings = [_mapping(config.get(key)) for config in configs]
+        values = next((value for value in mappings if value), _NOTHING)
         if not values:
             continue
-        what = "the dense stage" if key == "dense_settings" else f"the {key} method"
-        differs = " of the first fit; others differ" if any(value and value != values for value in found) else ""
-        out.append(Folded(f"All numbers of {what}{differs}", _numbers(key, values, what)))
+        part_name = "the dense stage" if key == "dense_settings" else f"the {key} method"
+        differs = " of the first fit; others differ" if any(value and value != values for value in mappings) else ""
+        out.append(Folded(f"All numbers of {part_name}{differs}", _numbers(key, values, part_name)))
     return out
 
 
 def described(cls: type) -> dict[str, str]:
     """Return what each argument of a class is, from its docstring."""
     args = (inspect.getdoc(cls) or "").partition("Args:\n")[2].partition("\n\n")[0]
-    found = re.findall(r"^    (\w+): (.*(?:\n        .*)*)", args, re.MULTILINE)
-    return {name: " ".join(text.split()).strip(" ,;") for name, text in found}
+    entries = re.findall(r"^    (\w+): (.*(?:\n        .*)*)", args, re.MULTILINE)
+    return {name: " ".join(text.split()).strip(" ,;") for name, text in entries}
 
 
-def _numbers(key: str, values: Mapping[str, Any], what: str) -> list[Block]:
+def _numbers(key: str, values: Mapping[str, Any], part_name: str) -> list[Block]:
     """Return the settings of one part of the fit as tables of words."""
     out: list[Block] = []
     steps = [_mapping(step) for step in _list(values.get("levels"))]
@@ -65,12 +65,12 @@ def _numbers(key: str, values: Mapping[str, Any], what: str) -> list[Block]:
     ]
     if rows:
         out.append(text_table(_LEVEL_HEADS, rows, "The steps from coarse to fine"))
-    told: list[list[str]] = []
+    cells: list[list[str]] = []
     for name, value in _flat(key, values):
         owner, _, own = name.rpartition(".")
         meaning = described(_OF[owner]).get(own, "") if owner in _OF else ""
-        told.append([words(own), plain(value), meaning or DASH])
-    return [*out, text_table(("Setting", "Value", "What it is"), told, f"Settings of {what}")]
+        cells.append([words(own), plain(value), meaning or DASH])
+    return [*out, text_table(("Setting", "Value", "What it is"), cells, f"Settings of {part_name}")]
 
 
 def _level(name: str, value: object) -> str:
@@ -116,10 +116,10 @@ def _unit(config: Mapping[str, Any]) -> str:
 
 def _scale(config: Mapping[str, Any]) -> str:
     effect = str(config.get("scale_in_effect", config.get("scale")))
-    told = {"free": "free: each fit finds its own", "fixed": "fixed: scans and model are of one size"}.get(
+    text = {"free": "free: each fit finds its own", "fixed": "fixed: scans and model are of one size"}.get(
         effect, plain(effect)
     )
-    return f"{told}, as the model is made" if config.get("scale") == "auto" else told
+    return f"{text}, as the model is made" if config.get("scale") == "auto" else text
 
 
 def _dense(config: Mapping[str, Any]) -> str:

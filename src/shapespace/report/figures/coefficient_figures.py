@@ -199,8 +199,8 @@ def b_space(
     size = _dot_size(len(scans))
     for k, azimuth in enumerate((-62, 24)):
         # matplotlib's 3-D axes have no usable types.
-        place = (0.54 * k, foot + 0.06 / total, 0.44, plot_box[3] - foot + 0.5 / total)
-        axes = cast(Any, figure.add_axes(place, projection="3d"))
+        axes_box = (0.54 * k, foot + 0.06 / total, 0.44, plot_box[3] - foot + 0.5 / total)
+        axes = cast(Any, figure.add_axes(axes_box, projection="3d"))
         for _, marker_style, scores in groups:
             group_scans = [scans[i] for i in scores]
             sizes = _sizes(group_scans) if neutral is not None or any(scan.intensity for scan in group_scans) else size
@@ -217,7 +217,7 @@ def b_space(
         if neutral is not None:
             axes.plot(*neutral.b[:3, None], marker="+", ms=14, mew=2.4, color=INK, ls="")
         aside = _style_space(axes, low - room, high + room) / 72 * DPI / WIDTH
-        axes.set_position((place[0] + k * aside, place[1], place[2] - aside, place[3]))
+        axes.set_position((axes_box[0] + k * aside, axes_box[1], axes_box[2] - aside, axes_box[3]))
         axes.view_init(elev=20, azim=azimuth)
         axes.set_box_aspect((1, 1, 0.85), zoom=0.92)
     if handles:

@@ -59,6 +59,7 @@ FEWEST_BINNED = 10
 """Values of which a histogram tells something; fewer are drawn one by one."""
 _GAP, _EDGE = 8, 4  # layout: pixels
 _MOST_LINES = 4  # layout: lines of a caption
+# steps between tick labels, and how many labels fit beside each other
 _STEPS, _MOST_NUMBERS = (1, 5, 10, 20, 50, 100, 200, 500), 22
 _Item = TypeVar("_Item")
 

@@ -43,7 +43,7 @@ from shapespace.schemas import BySize, Measured, Quality, read
 from shapespace.types import FloatArray, Mesh
 
 SHARES = (0.90, 0.95, 0.98, 0.99)
-"""Shares of the variance for which the number of modes is told."""
+"""Shares of the variance for which the number of modes is labelled."""
 
 _LANDMARK = (0.78, 0.20, 0.14)  # red, sRGB from 0 to 1
 _BARS = "#a9c9e2"

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 _BINS, _TIMES = 60, 5  # layout: bins of a histogram, ticks of a time axis
 _FEWEST = 20  # fits below which no quantiles are drawn
+# percentiles of each band and its opacity, from the outside to the middle half
 _BANDS = ((1, 99, 0.16), (5, 95, 0.3), (25, 75, 0.5))
 
 

@@ -43,9 +43,9 @@ CurveScale: TypeAlias = Literal["linear", "log", "probit"]
 """How the numbers of a curve stand along an axis."""
 
 _BARS = "#a9c9e2"
-_MOST_CLASSES_IN_FULL, _MOST_CLASSES = 12, 40
-_MOST_SERIES, _MOST_TICKS = 60, 9
-_LEAST_SHARE, _PROBIT_ROOM = 1e-6, 0.12
+_MOST_CLASSES_IN_FULL, _MOST_CLASSES = 12, 40  # classes with numbers, and without: legible at the figure's size
+_MOST_SERIES, _MOST_TICKS = 60, 9  # curves and tick labels: legible at the figure's size
+_LEAST_SHARE, _PROBIT_ROOM = 1e-6, 0.12  # ends of a probit axis, which cannot show 0, and its margin in probits
 _SHARES = (
     1e-6, 1e-5, 1e-4, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995,
     0.998, 0.999, 1 - 1e-4,

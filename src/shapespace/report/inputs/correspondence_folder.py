@@ -181,7 +181,7 @@ class Corresponded:
         """Summarise all surfaces, and bring the mean shape upright; each surface is read once.
 
         Args:
-            on_scan: told of each scan that was read.
+            on_scan: called after each scan.
         """
         if self._population is None:
             counts = np.zeros(len(self._mean.vertices), dtype=np.int64)

@@ -33,9 +33,9 @@ def find_labels(folder: Folder, fits: Sequence[SavedFit], labels_path: Path | No
         return read_labels(places[0]), f"Labels are from {LABELS_FILE} in the folder."
     labels: dict[str, Label] = {}
     used_names: list[str] = []
-    for place in filter(Path.is_file, places[1:]):
-        labels |= read_labels(place)
-        used_names.append(f"{place.parent.name}/{LABELS_FILE}")
+    for file in filter(Path.is_file, places[1:]):
+        labels |= read_labels(file)
+        used_names.append(f"{file.parent.name}/{LABELS_FILE}")
     return labels, f"Labels are from {listed(used_names)}, beside the scans." if used_names else ""
 
 

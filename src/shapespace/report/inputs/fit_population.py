@@ -28,11 +28,11 @@ MEASURES: Mapping[str, str] = {
     "to_model_mm": "mean, scan to model (mm)",
     "seen_percent": "model that the scan shows (%)",
 }
-"""What is told of each fit, in words."""
+"""Measures of each fit, with their labels."""
 
 MOST_LEVELS, MOST_BINS = 24, 40  # layout: rows of a table and bins of a figure
 FEWEST = 20
-"""Fits of a level or a stretch of time below which nothing is said about it."""
+"""Fits of a level or a stretch of time below which it is not reported."""
 
 _MOST_VALUES = 500  # distinct texts of a column that counts as a category
 _FEWEST_NUMBERS = 12  # distinct values of a column that counts as numeric
@@ -75,7 +75,7 @@ class ListedColumn:
         bin_index[~np.isfinite(self.values)] = -1
         middles = (edges[1:] + edges[:-1]) / 2
         return [
-            (f"{self.told(edges[k])} to {self.told(edges[k + 1])}", bin_index == k, float(middles[k]))
+            (f"{self.value_text(edges[k])} to {self.value_text(edges[k + 1])}", bin_index == k, float(middles[k]))
             for k in range(len(middles))
         ]
 
@@ -89,7 +89,7 @@ class ListedColumn:
             return np.asarray(np.arange(low, high + step + 1, step), dtype=np.float64)
         return np.asarray(np.linspace(low, np.nextafter(high, np.inf), max_bins + 1), dtype=np.float64)
 
-    def told(self, value: float) -> str:
+    def value_text(self, value: float) -> str:
         """Format a value as text."""
         if self.kind == "time":
             return datetime.fromtimestamp(value, UTC).strftime("%Y-%m-%d")
@@ -251,7 +251,16 @@ class Population:
                 shift = float(shifts[mode - 1])
                 if abs(shift) > max(_SIGNS / np.sqrt(len(group_errors)), _LEAST_SHIFT):
                     out.append(f"z{mode} is {'higher' if shift > 0 else 'lower'} by {abs(shift):.2f} on average")
-            yield Group(name, count, untrusted, error, error - middle, mode, shift, tuple(out))
+            yield Group(
+                name=name,
+                count=count,
+                untrusted=untrusted,
+                error_mm=error,
+                error_off_mm=error - middle,
+                mode=mode,
+                shift=shift,
+                stands_out=tuple(out),
+            )
 
     def _count_reasons(self, statuses: Sequence[str], reasons: Sequence[str | None]) -> None:
         for status, reason in zip(statuses, reasons, strict=True):

@@ -168,7 +168,7 @@ class SavedFit:
     def distance_mm(self, direction: Direction, measure: Measure = "mean") -> float:
         """Return a distance of the final stage over the overlap, in mm; NaN if there is none.
 
-        Records of earlier versions do not have it, see `shown`; of them it is that of `summary_mm`.
+        Records of earlier versions do not have it, see `has_overlap_distances`; of them it is that of `summary_mm`.
         """
         overlap = self.record.shown
         return (
@@ -178,7 +178,7 @@ class SavedFit:
         )
 
     @property
-    def shown(self) -> bool:
+    def has_overlap_distances(self) -> bool:
         """Whether distances are over the overlap."""
         return self.record.shown is not None
 

@@ -134,9 +134,21 @@ class StagedFit:
             forward[stage] = np.where(unseen, np.nan, distances.model_to_scan_signed_mm)
             backward[stage] = distances.scan_to_model_signed_mm
         return StagedFit(
-            name, label, record.status, record.reason, scan, surfaces, forward, backward, None, b, z, b_stddev,
-            shrinkage, (),
-        )  # fmt: skip
+            name=name,
+            label=label,
+            status=record.status,
+            reason=record.reason,
+            scan=scan,
+            surfaces=surfaces,
+            model_to_scan_mm=forward,
+            scan_to_model_mm=backward,
+            regions=None,
+            b=b,
+            z=z,
+            b_stddev=b_stddev,
+            shrinkage=shrinkage,
+            history=(),
+        )
 
     @staticmethod
     @np.errstate(all="ignore")  # what overflows, or is divided by zero, is refused at the end
@@ -196,9 +208,21 @@ class StagedFit:
         unseen = regions == UNSEEN
         overlap_mm = {stage: np.where(unseen, np.nan, d) for stage, d in forward.items()}
         return StagedFit(
-            name, label, record.status, record.reason, scan, surfaces, overlap_mm, backward, regions, b, z, b_stddev,
-            shrinkage, history,
-        )  # fmt: skip
+            name=name,
+            label=label,
+            status=record.status,
+            reason=record.reason,
+            scan=scan,
+            surfaces=surfaces,
+            model_to_scan_mm=overlap_mm,
+            scan_to_model_mm=backward,
+            regions=regions,
+            b=b,
+            z=z,
+            b_stddev=b_stddev,
+            shrinkage=shrinkage,
+            history=history,
+        )
 
 
 def measured_mm(distances_mm: FloatArray) -> FloatArray:

@@ -31,7 +31,7 @@ class Concern:
     reasons: tuple[str, ...] = ()
 
     @property
-    def told(self) -> str:
+    def text(self) -> str:
         """Reasons as a sentence."""
         return sentence("; ".join(self.reasons)) if self.reasons else "Nothing about it stands out."
 
@@ -41,15 +41,15 @@ class _Measure:
     """A measure with its usual range.
 
     Args:
-        of: the value of each scan, not-a-number where it is not known.
-        told: a value in words.
+        of: value of each scan, not-a-number where it is not known.
+        describe: formats a value as a clause.
         least_spread: the spread of values is at least this.
-        at_least: below this nothing is said.
-        always: above this it is said however many others are alike.
+        at_least: smaller values are not reported.
+        always: larger values are reported however many scans have them.
     """
 
     of: Sequence[float]
-    told: Callable[[float], str]
+    describe: Callable[[float], str]
     least_spread: float
     at_least: float = 0.0
     always: float = inf
@@ -69,7 +69,7 @@ def concerns_of(folder: Corresponded) -> dict[str, Concern]:
             if value > measure.always:
                 over = max(over, _STANDS_OUT * value / measure.always)
             if over > _STANDS_OUT and value > measure.at_least:
-                reasons.append((over, measure.told(value)))
+                reasons.append((over, measure.describe(value)))
     ordered = [sorted(reasons, reverse=True) for reasons in reasons_by_record]
     return {
         record.name: Concern(reasons[0][0] if reasons else 0.0, tuple(reason for _, reason in reasons))

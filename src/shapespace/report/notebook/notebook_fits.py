@@ -77,7 +77,7 @@ def plot_quality(quality: ModelQuality, **options: Any) -> Figure:
 
 
 def _numbers(curve: Curve) -> dict[str, list[float]]:
-    of = {"modes": curve.at, "mean": curve.mean, "low": curve.low, "high": curve.high}
+    of = {"modes": curve.counts, "mean": curve.mean, "low": curve.low, "high": curve.high}
     return {name: values.tolist() for name, values in of.items()}
 
 
@@ -145,7 +145,7 @@ def html_of_quality(quality: ModelQuality) -> str:
             value, low, high = curve.mean[-1], curve.low[-1], curve.high[-1]
             value_text = percent(value) if name == "compactness" else f"{mm(value)} ({low:.3g} to {high:.3g})"
             rows.append(
-                (name.replace("_vertices", " (vertices)").capitalize(), f"{value_text} with {curve.at[-1]} modes")
+                (name.replace("_vertices", " (vertices)").capitalize(), f"{value_text} with {curve.counts[-1]} modes")
             )
 
     def draw() -> Drawn:

@@ -50,8 +50,10 @@ from shapespace.schemas import CORRESPOND_AGAIN, CorrespondRecord, Quality, read
 from shapespace.types import FloatArray, Mesh
 from shapespace.version import __version__
 
+# Items on a page: what can be looked through without paging, and a page that stays within its bytes.
 MOST_CARDS, MOST_EMPTY_CARDS, MOST_BOARDS, MOST_ROWS = 24, 6, 11, 2000
-_MOST_NAMED = 12
+_MOST_NAMED = 12  # items of a list; the table has all
+# share of the scans that observe a hardly seen vertex, and of vertices for a complete surface
 _HARDLY_SEEN, _WHOLE_SHARE = 0.5, 0.9
 _STATUS = {
     "unreadable": ("unreadable", "failed"),
@@ -59,7 +61,7 @@ _STATUS = {
     "look": ("to be looked at", "doubtful"),
     "corresponding": ("in correspondence", "converged"),
 }
-_TRIANGLES_DRAWN = 400_000
+_TRIANGLES_DRAWN = 400_000  # triangles; more are smaller than a pixel of the pictures
 
 _Make: TypeAlias = Callable[[CorrespondRecord], Cell]
 
@@ -77,19 +79,19 @@ class CorrespondencePage:
     """
 
     def __init__(self, folder: Folder, on_step: Step | None = None) -> None:
-        self.at = Corresponded(folder.root)
-        if not self.at.records:
+        self.result = Corresponded(folder.root)
+        if not self.result.records:
             raise FileFormatError(f"{folder.root} holds no record of a scan; {CORRESPOND_AGAIN}.")
-        together = len(self.at.corresponding)
-        self.page = Page(together + min(len(self.at.records), MOST_CARDS) + 5, on_step)
-        self.all = self.at.population(self.page.step)
-        self.mean = self.at.mean
+        together = len(self.result.corresponding)
+        self.page = Page(together + min(len(self.result.records), MOST_CARDS) + 5, on_step)
+        self.all = self.result.population(self.page.step)
+        self.mean = self.result.mean
         self.size = dict(zip(self.all.names, self.all.sizes, strict=True))
-        self.records = [self.at.records[name] for name in self.all.names]
-        self.concerns = concerns_of(self.at)
+        self.records = [self.result.records[name] for name in self.all.names]
+        self.concerns = concerns_of(self.result)
         self.ordered = sorted(self.records, key=lambda record: (-self.concerns[record.name].weight, record.name))
-        self.out = [*self.at.set_aside, *(self.at.records[name] for name in self.all.unread)]
-        self._cards = {record.name: self.page.place(f"scan-{record.name}") for record in self._carded()}
+        self.out = [*self.result.set_aside, *(self.result.records[name] for name in self.all.unread)]
+        self._cards = {record.name: self.page.anchor(f"scan-{record.name}") for record in self._carded()}
 
     # What is told of each
 
@@ -99,9 +101,9 @@ class CorrespondencePage:
 
     def status(self, record: CorrespondRecord) -> Cell:
         """Return what came of a scan, sorted from bad to good."""
-        found = scan_status(record, self.concerns)
-        words, colour = _STATUS[found]
-        return Cell(words, float(list(_STATUS).index(found)), colour)
+        cell = scan_status(record, self.concerns)
+        words, colour = _STATUS[cell]
+        return Cell(words, float(list(_STATUS).index(cell)), colour)
 
     @property
     def looked_at(self) -> list[CorrespondRecord]:
@@ -112,7 +114,7 @@ class CorrespondencePage:
 
     def html(self) -> str:
         """Return the page."""
-        name = self.at.root.resolve().name
+        name = self.result.root.resolve().name
         chapters = [
             Chapter("Summary", self.summary),
             Chapter("The same places on every scan", self.same_places, "Same places"),
@@ -121,7 +123,7 @@ class CorrespondencePage:
             Chapter("The rounds", self.rounds, "Rounds"),
             Chapter("Settings and hashes", self.settings, "Settings"),
         ]
-        if (self.at.root / "quality.json").is_file():
+        if (self.result.root / "quality.json").is_file():
             chapters.insert(4, Chapter("Quality of the shape space", self.quality, "Quality"))
         lead = (
             "Raw scans brought to one surface: the same vertex is meant to be the same place on all of them. The size "
@@ -135,7 +137,7 @@ class CorrespondencePage:
     @property
     def total(self) -> int:
         """How many scans there are, unreadable ones too."""
-        return len(self.at.records) + len(self.at.unread)
+        return len(self.result.records) + len(self.result.unread)
 
     def summary(self) -> list[Block]:
         """Return what came of the scans, in a sentence, in figures, and those that need a look."""
@@ -143,7 +145,7 @@ class CorrespondencePage:
         seen = median([known(record.seen_share) for record in self.records])
         tiles = [
             (str(len(self.records)), f"of {self.total}", "scans in correspondence"),
-            (f"{self.at.run.vertices:,}", "", "vertices, the same on all"),
+            (f"{self.result.run.vertices:,}", "", "vertices, the same on all"),
             (
                 percent_of(mean).removesuffix(" %"),
                 "%",
@@ -152,8 +154,8 @@ class CorrespondencePage:
             (percent_of(far).removesuffix(" %"), "%", "of its size: 99 % of the points lie nearer, median scan"),
             (percent(seen).removesuffix(" %"), "%", "of the vertices are shown by the median scan"),
         ]
-        if self.at.run.rounds:
-            last = percent_of(self.at.run.rounds[-1])
+        if self.result.run.rounds:
+            last = percent_of(self.result.run.rounds[-1])
             tiles.append((last.removesuffix(" %"), "%", "of the size: movement of vertices in the last round (RMS)"))
         return [
             Text(self.verdict()),
@@ -162,37 +164,37 @@ class CorrespondencePage:
             self._to_look_at(),
             Notice("Cannot be read", [Item(text, Cell(name)) for name, text in self._damaged().items()], "broken"),
             Text("To look at single vertices on all scans, and to go on to a shape space:"),
-            Command(f"shapespace view {self.at.root.name}\nshapespace build {self.at.root.name} -o model.h5"),
+            Command(f"shapespace view {self.result.root.name}\nshapespace build {self.result.root.name} -o model.h5"),
         ]
 
     def verdict(self) -> str:
         """Return in a few sentences whether to go on, and what to look at first."""
-        n, aside = len(self.records), len(self.out) + len(self.at.unread)
-        told = f"{n} of {counted(self.total, 'scan')} {'is' if n == 1 else 'are'} in correspondence"
+        n, aside = len(self.records), len(self.out) + len(self.result.unread)
+        text = f"{n} of {counted(self.total, 'scan')} {'is' if n == 1 else 'are'} in correspondence"
         some = self.looked_at
-        told += f"; {counted(len(some), 'of them stands', 'of them stand')} out and should be looked at" if some else (
+        text += f"; {counted(len(some), 'of them stands', 'of them stand')} out and should be looked at" if some else (
             " and none of them stands out"
         )  # fmt: skip
-        told += f"; {aside} {'is' if aside == 1 else 'are'} excluded." if aside else "."
+        text += f"; {aside} {'is' if aside == 1 else 'are'} excluded." if aside else "."
         folded = [record.folded_share for record in self.records if record.folded_share]
-        told += " No triangle is folded over." if not folded else (
+        text += " No triangle is folded over." if not folded else (
             f" {counted(len(folded), 'scan has', 'scans have')} folded triangles, {percent_of(max(folded))} at most."
         )  # fmt: skip
-        return f"{told} {self._settling()}"
+        return f"{text} {self._settling()}"
 
     def _settling(self) -> str:
-        moved = self.at.run.rounds
+        moved = self.result.run.rounds
         if not moved:
             return ""
-        if moved[-1] < self.at.settled:
+        if moved[-1] < self.result.settled:
             return f"The rounds have settled: in the last one vertices moved by {percent_of(moved[-1])} of the size."
         return (
             f"The rounds have not settled: in the last one vertices still moved by {percent_of(moved[-1])} of the "
-            f"size, and {percent_of(self.at.settled)} counts as settled; more --rounds may still better it."
+            f"size, and {percent_of(self.result.settled)} counts as settled; more --rounds may still better it."
         )
 
     def _set_aside(self) -> Notice:
-        items = [Item(sentence(r.reason), Cell(r.name, place=self._cards.get(r.name))) for r in self.at.set_aside]
+        items = [Item(sentence(r.reason), Cell(r.name, anchor=self._cards.get(r.name))) for r in self.result.set_aside]
         if len(items) > _MOST_NAMED:
             items = [*items[:_MOST_NAMED], Item(f"{counted(len(items) - _MOST_NAMED, 'other')}, in the table of all.")]
         return Notice("Excluded scans: they are not in a model built from this folder", items, "broken")
@@ -200,7 +202,7 @@ class CorrespondencePage:
     def _to_look_at(self) -> Notice:
         some = self.looked_at
         items = [
-            Item(self.concerns[record.name].told, Cell(record.name, place=self._cards.get(record.name)))
+            Item(self.concerns[record.name].text, Cell(record.name, anchor=self._cards.get(record.name)))
             for record in some[:_MOST_NAMED]
         ]
         if len(some) > _MOST_NAMED:
@@ -208,7 +210,7 @@ class CorrespondencePage:
         return Notice("In correspondence, and to be looked at", items)
 
     def _damaged(self) -> Mapping[str, str]:
-        return {**self.at.unread, **self.all.unread}
+        return {**self.result.unread, **self.all.unread}
 
     # The pictures
 
@@ -216,14 +218,15 @@ class CorrespondencePage:
         """Return a checkerboard on the mean shape, carried to the worst scans and to some of the others."""
         from shapespace.report import figures
 
-        shown = self._boards()
-        if not shown:
+        pictured = self._boards()
+        if not pictured:
             return [Text("There is no surface to show.", "broken")]
-        placed = {record.name: self.at.placed(record.name) for record in shown}
-        which = "All scans." if len(shown) == len(self.records) else (
-            f"{len(shown)} of {counted(len(self.records), 'scan')}: those that stand out most, then some of the others."
+        placed = {record.name: self.result.placed(record.name) for record in pictured}
+        which = "All scans." if len(pictured) == len(self.records) else (
+            f"{len(pictured)} of {counted(len(self.records), 'scan')}: those that stand out most, then some of the "
+            "others."
         )  # fmt: skip
-        surfaces, labels = [placed[r.name].vertices for r in shown], [record.name for record in shown]
+        surfaces, labels = [placed[r.name].vertices for r in pictured], [record.name for record in pictured]
         pictures: list[Block] = []
         for yaw, side in ((0.0, "from the front"), (figures.SIDE_DEG, "from one side")):
             title = f"The same squares on every scan, {side}"
@@ -259,27 +262,27 @@ class CorrespondencePage:
         shares = np.array([[self.share(r, w) for w in ("mean", "p95", "p99", "max")] for r in self.records])
         share = 1 - self.all.seen_count / len(self.records)
         hardly = float((share > 1 - _HARDLY_SEEN).mean())
-        told = "Every scan shows every vertex."
+        text = "Every scan shows every vertex."
         if share.any():
             most = (
                 f"{percent(hardly)} on more than half, which build leaves out" if hardly else "none on more than half"
             )
-            told = f"{percent(float((share > 0).mean()))} of the vertices are missing on at least one scan, and {most}."
+            text = f"{percent(float((share > 0).mean()))} of the vertices are missing on at least one scan, and {most}."
         there = median([known(record.area_share) for record in self.records])
         lacking: list[Block] = []
         if there < _WHOLE_SHARE:
-            what = (
+            caption = (
                 f"The mean shape lacks parts that the scans show: its surface is {percent(there)} of the median "
                 "scan's, mostly because the first template lacked them. Give a whole one with --template."
             )
-            lacking.append(Text(what, "notice"))
-        if self.at.holes:
-            what = (
-                f"The mean shape has {counted(self.at.holes, 'hole')} beside its border. Where the object has no "
+            lacking.append(Text(caption, "notice"))
+        if self.result.holes:
+            caption = (
+                f"The mean shape has {counted(self.result.holes, 'hole')} beside its border. Where the object has no "
                 "opening, the first template had a hole, and no scan can show anything there; give a whole one with "
                 "--template."
             )
-            lacking.append(Text(what, "notice"))
+            lacking.append(Text(caption, "notice"))
         return [
             Text(
                 "Distances are measured both ways: from the vertices that a scan shows to the scan, and from its "
@@ -295,7 +298,7 @@ class CorrespondencePage:
                 ),
                 self.page.figure(
                     figures.missing_figure(self.mean, share),
-                    f"{told} The mean shape from four sides.",
+                    f"{text} The mean shape from four sides.",
                     alt="Share of scans that do not show each vertex, on the mean shape from four sides",
                 ),
             ),
@@ -350,10 +353,18 @@ class CorrespondencePage:
         self.page.step(record.name)
         status = self.status(record)
         if record in self.out:
-            return Card(self._cards[record.name], record.name, status, "", self._reason(record), image, note)
-        told = f"Mean distance {percent_of(self.share(record, 'mean'))} of its size. {self.concerns[record.name].told}"
-        told += f" {note}" if note else ""
-        return Card(self._cards[record.name], record.name, status, "", told, image)
+            return Card(
+                anchor=self._cards[record.name],
+                name=record.name,
+                status=status,
+                label="",
+                text=self._reason(record),
+                image=image,
+                why_none=note,
+            )
+        text = f"Mean distance {percent_of(self.share(record, 'mean'))} of its size. {self.concerns[record.name].text}"
+        text += f" {note}" if note else ""
+        return Card(self._cards[record.name], record.name, status, "", text, image)
 
     def _still(self, record: CorrespondRecord, limit: float) -> tuple[Image, str]:
         """Return the picture of a scan, and what it lacks."""
@@ -364,12 +375,12 @@ class CorrespondencePage:
             if scan.faces is not None:
                 scan = scan.with_vertices(scan.vertices @ upright(scan).T)
             return self.page.image(thumbnails.mesh_still(scan), f"The scan {record.name}, excluded"), ""
-        placed = self.at.placed(record.name)
+        placed = self.result.placed(record.name)
         scan, note = None, ""
         far = np.full(len(placed.vertices), nan)
         try:
             own = drawable(self._bounded(record))[0]
-            scan, far = self._beside(own, placed)
+            scan, far = self._scan_on_mean(own, placed)
         except FileFormatError as error:
             note = f"Without the scan beside it: {error}"
         still = thumbnails.correspondence_strip(self.mean, placed.vertices, scan, far, limit)
@@ -379,9 +390,9 @@ class CorrespondencePage:
     def _bounded(self, record: CorrespondRecord) -> Mesh:
         from shapespace.report.render.decimate import decimate
 
-        return decimate(self.at.raw_scan(record), _TRIANGLES_DRAWN)[0]
+        return decimate(self.result.raw_scan(record), _TRIANGLES_DRAWN)[0]
 
-    def _beside(self, scan: Mesh, placed: PlacedSurface) -> tuple[Mesh, FloatArray]:
+    def _scan_on_mean(self, scan: Mesh, placed: PlacedSurface) -> tuple[Mesh, FloatArray]:
         """Return the scan moved onto the mean shape, and how far off each vertex lies, percent of the size."""
         moved = scan.with_vertices(placed.T_scan_mean.inverse().apply(scan.vertices))
         far = np.full(len(placed.vertices), nan)
@@ -392,10 +403,10 @@ class CorrespondencePage:
     def numbers(self) -> list[Block]:
         """Return the table of all scans."""
         out: list[Block] = []
-        if self.at.units_mixed:
+        if self.result.units_mixed:
             out.append(Text("The scans are in different units: compare distances in % of the size.", "notice"))
         columns: list[tuple[Column, _Make]] = [
-            (Column("Scan"), lambda r: Cell(r.name, place=self._cards.get(r.name))),
+            (Column("Scan"), lambda r: Cell(r.name, anchor=self._cards.get(r.name))),
             (Column("Status"), lambda r: self.status(r)),
             (Column("Mean distance", "number"), lambda r: _cell(known(r.distance_mean))),
             (Column("95 % within", "number"), lambda r: _cell(known(r.distance_p95))),
@@ -417,12 +428,12 @@ class CorrespondencePage:
         if len(records) > MOST_ROWS:
             out.append(Text(f"The first {MOST_ROWS:,} of {len(records):,} scans; their records have all."))
         table = Table([column for column, _ in columns], rows, "All scans", sortable=len(rows) > 1)
-        what = (
+        caption = (
             "Distances are both ways; those without % are in the unit of the scan's file. Area covered: that of the "
             "surface beside that of the scan. Folded: triangles that turn back over their neighbours. Area change: "
             "95 % of the triangles grow or shrink by less than so many times beside the mean shape, size divided out."
         )
-        notes: list[Block] = [Text(what, "soft")]
+        notes: list[Block] = [Text(caption, "soft")]
         why = [[record.name, self._reason(record)] for record in records if self._reason(record)]
         if why:
             heading = f"The reasons of {counted(len(why), 'scan')}"
@@ -432,7 +443,7 @@ class CorrespondencePage:
     def _reason(self, record: CorrespondRecord) -> str:
         if record in self.out:
             return sentence(record.reason or self.all.unread.get(record.name, ""))
-        return self.concerns[record.name].told if self.concerns[record.name].reasons else ""
+        return self.concerns[record.name].text if self.concerns[record.name].reasons else ""
 
     # The rest
 
@@ -440,9 +451,9 @@ class CorrespondencePage:
         """Return by how much vertices moved in each round, and what it cost."""
         from shapespace.report import figures
 
-        run = self.at.run
+        run = self.result.run
         figure = self.page.figure(
-            figures.movement_figure(run.rounds, [record.moved_share for record in self.records], self.at.settled),
+            figures.movement_figure(run.rounds, [record.moved_share for record in self.records], self.result.settled),
             "Each round begins at what the last one found. The first counts from the first template, so it is the "
             "largest; when vertices move no more, another round changes nothing.",
             alt=f"Movement of vertices in {counted(len(run.rounds), 'round')}: "
@@ -463,16 +474,16 @@ class CorrespondencePage:
 
     def quality(self) -> list[Block]:
         """Return what quality.json says."""
-        measured = read(Quality, self.at.folder.json("quality.json"), "quality.json", "measure it again")
+        measured = read(Quality, self.result.folder.json("quality.json"), "quality.json", "measure it again")
         return [sections.quality_part(self.page, measured)]
 
     def settings(self) -> list[Block]:
         """Return settings, versions and hashes."""
-        run = self.at.run
+        run = self.result.run
         rows = [("Report", f"shapespace {__version__}"), ("Correspondence", f"shapespace {run.version}")]
         rows += [("First template", run.template), ("Vertices made", f"{run.vertices:,}")]
         rows += [(words(key), setting(value)) for key, value in run.settings.items() if key != "vertices"]
-        files = [[r.name, r.path or DASH, r.hash or DASH] for r in list(self.at.records.values())[:MOST_ROWS]]
+        files = [[r.name, r.path or DASH, r.hash or DASH] for r in list(self.result.records.values())[:MOST_ROWS]]
         hashes = text_table(("Scan", "File", "Hash"), files, "Content hashes of the scans")
         return [Facts(rows, "Settings and versions"), Folded("Content hashes (SHA-256)", [hashes])]
 

@@ -22,9 +22,9 @@ from shapespace.schemas import DEMO_AGAIN, Case, Demo, DemoModel, ExpressionsOfO
 if TYPE_CHECKING:
     from shapespace.report.inputs.staged_fit import StagedFit
 
-_RESERVE_BYTES = 1_200_000
-_PICTURES = 30
-_MODES_OF_A_CASE = 4
+_RESERVE_BYTES = 1_200_000  # bytes that stay free for the parts after the fits
+_PICTURES = 30  # planned pictures, for the progress bar alone
+_MODES_OF_A_CASE = 4  # leading modes that are drawn for each case, one row of pictures
 _NOTHING = Text("No fit kept its surfaces.", "broken")
 
 
@@ -128,7 +128,8 @@ class DemoPage:
         counts = Counter(fit.status for fit in fits)
         tests = [fit.entry for fit in fits if fit.entry.intensity and fit.status != "failed"]
         distances = [fit.distance_mm("model_to_scan") for fit in fits if fit.entry in tests]
-        where = ", over what it shows" if fits and all(fit.shown for fit in fits if fit.entry in tests) else ""
+        over_overlap = fits and all(fit.has_overlap_distances for fit in fits if fit.entry in tests)
+        where = ", over what it shows" if over_overlap else ""
         errors = _mean([entry.vertex_error_mm.mean for entry in tests if entry.vertex_error_mm])
         floors = _mean([entry.floor_mm.mean for entry in tests if entry.floor_mm])
         blind = "fits converged with nothing found against them; the plain method is blind to some errors"
@@ -310,9 +311,9 @@ class DemoPage:
     def directions(self, one: ExpressionsOfOne, fits: Sequence[SavedFit]) -> list[Block]:
         """Return the coefficients of the test faces, and the scores of recognition."""
         left_out = plain(one.scores.get("left_out")).split(", ")
-        kept = [fit for fit in fits if fit.status != "failed" and fit.name not in left_out]
-        scans = [sections.coefficients_of(fit) for fit in _tests(kept)]
-        neutral = next((sections.coefficients_of(fit) for fit in kept if not fit.entry.intensity), None)
+        usable = [fit for fit in fits if fit.status != "failed" and fit.name not in left_out]
+        scans = [sections.coefficients_of(fit) for fit in _tests(usable)]
+        neutral = next((sections.coefficients_of(fit) for fit in usable if not fit.entry.intensity), None)
         out: list[Block] = []
         if scans and all(len(scan.b) >= 2 for scan in scans):
             of = ("Paper, figure 9. ", "Paper, figure 10. ")

@@ -53,15 +53,17 @@ if TYPE_CHECKING:
     from shapespace.model.shape_model import ShapeModel
     from shapespace.report.inputs.staged_fit import StagedFit
 
+# Items on a page: what can be looked through without paging, and a page that stays within its bytes.
 MOST_CARDS = 24
-MOST_EMPTY_CARDS = 6
-MOST_OPEN_CARDS = 6
-MOST_DETAILS = 3
-MOST_ROWS = 2000
-MOST_CURVES = 100
-_MOST_NAMED = 12
-_MOST_WORST = 3
-_FEWEST_LEVELS = 2
+MOST_EMPTY_CARDS = 6  # cards of fits without a surface
+MOST_OPEN_CARDS = 6  # cards that are not folded away
+MOST_DETAILS = 3  # fits with all pictures, about 1.3 MB each
+MOST_ROWS = 2000  # rows of the table of all fits
+MOST_CURVES = 100  # curves of iterations; more cover each other
+_MOST_NAMED = 12  # items of a list; the table has all
+_MOST_WORST = 3  # fits named in one sentence
+_FEWEST_LEVELS = 2  # scans of a subject; one shows no progression
+# bytes that stay free for tables, and sections of analyses that room is reserved for
 _RESERVE_BYTES, _MOST_RESERVED = 400_000, 2
 
 
@@ -89,14 +91,14 @@ class FolderPage:
         self.recognised = (folder.root / recognition.STUDY.file).is_file()
         self.analyses = recognition.find_analyses(folder.root)
         self.label_note = ""
-        found: Mapping[str, Label] = {}
+        found_labels: Mapping[str, Label] = {}
         try:
-            found, self.label_note = find_labels(folder, fits, labels)
+            found_labels, self.label_note = find_labels(folder, fits, labels)
         except ShapespaceError as error:
             if labels is not None:
                 raise
             self.label_note = f"There are no labels: {error}"
-        self.fits = sorted((with_label(fit, found) for fit in fits), key=sections.concern)
+        self.fits = sorted((with_label(fit, found_labels) for fit in fits), key=sections.concern)
         self.main = _main_fits(self.fits)
         planned = sections.MODEL_PICTURES + min(len(fits), MOST_CARDS) + 4 + len(self.main) * sections.FIT_PICTURES
         self.page = Page(planned, on_step)
@@ -105,9 +107,9 @@ class FolderPage:
         if model is not None:
             self.model()
         self._staged: dict[str, StagedFit] = {}
-        self._details = {fit.name: self.page.place(f"pictures-of-{fit.name}") for fit in self.main}
+        self._details = {fit.name: self.page.anchor(f"pictures-of-{fit.name}") for fit in self.main}
         carded = _carded(self.fits) if len(fits) > 1 or not self.main else []
-        self._cards = {fit.name: self.page.place(f"fit-{fit.name}") for fit in carded}
+        self._cards = {fit.name: self.page.anchor(f"fit-{fit.name}") for fit in carded}
         self.carded = carded
 
     # What is read, once
@@ -139,8 +141,8 @@ class FolderPage:
         if sum(fit.fitted for fit in self.fits) < 2:
             del chapters[2]
         if self.recognised:
-            found = Chapter("Recognition", lambda: recognition.study_section(self.page, self.folder))
-            chapters.insert(-2, found)
+            recognition_chapter = Chapter("Recognition", lambda: recognition.study_section(self.page, self.folder))
+            chapters.insert(-2, recognition_chapter)
         chapters[-2:-2] = recognition.analysis_chapters(self.page, self.folder.root, self.analyses)
         lead = "What a statistical shape model made of raw surfaces. Distances are in millimetres of the model's frame."
         made = f"Made by shapespace {__version__} from the files in {name}."
@@ -177,17 +179,17 @@ class FolderPage:
             (str(counts["failed"] + counts["unreadable"]), "", "without a result"),
         ]
         to_scan = "from model to scan, over what the scan shows"
-        if not all(fit.shown for fit in trusted):
+        if not all(fit.has_overlap_distances for fit in trusted):
             to_scan = "from the whole model to the scan"
-        for value, what in (
+        for value, label in (
             (_median([fit.expected_error_mm for fit in trusted]), "vertex error that such a fit expects of itself"),
             (_median([fit.distance_mm("model_to_scan") for fit in trusted]), f"mean distance {to_scan}"),
             (_median([fit.distance_mm("scan_to_model") for fit in trusted]), "mean distance from scan to model"),
         ):
             if isfinite(value):
-                tiles.append((mm(value).removesuffix(" mm"), "mm", f"{what}, median of those"))
+                tiles.append((mm(value).removesuffix(" mm"), "mm", f"{label}, median of those"))
         return [
-            Text(self.told(counts)),
+            Text(self.overview(counts)),
             Tiles(tiles),
             *self.other_models(),
             self.doubts(),
@@ -195,15 +197,15 @@ class FolderPage:
             *self.without_stages(),
         ]
 
-    def told(self, counts: Mapping[str, int]) -> str:
+    def overview(self, counts: Mapping[str, int]) -> str:
         """Return in a sentence or two what was fitted, and how many fits have which status."""
         models = sorted({fit.record.model.name or "an unknown model" for fit in self.fits})
         methods = sorted({fit.record.method for fit in self.fits} - {""})
-        told = f"{counted(len(self.fits), 'scan was', 'scans were')} fitted with {listed(models)}"
-        told += f" by the {listed(methods)} method{'s' if len(methods) > 1 else ''}. " if methods else ". "
+        text = f"{counted(len(self.fits), 'scan was', 'scans were')} fitted with {listed(models)}"
+        text += f" by the {listed(methods)} method{'s' if len(methods) > 1 else ''}. " if methods else ". "
         trusted = counts["converged"]
-        told += counted(trusted, "fit") if trusted else "None"
-        told += f" converged with nothing {'found against them' if trusted != 1 else 'against it'}"
+        text += counted(trusted, "fit") if trusted else "None"
+        text += f" converged with nothing {'found against them' if trusted != 1 else 'against it'}"
         rest = {
             "max_iterations": "stopped at the limit of steps",
             "doubtful": "doubtful",
@@ -211,14 +213,14 @@ class FolderPage:
             "unreadable": "cannot be read",
         }
         others = listed([f"{counts[key]} {word}" for key, word in rest.items() if counts[key]])
-        return f"{told}; {others}." if others else f"{told}."
+        return f"{text}; {others}." if others else f"{text}."
 
     def other_models(self) -> list[Block]:
         """Return which fits are by another model than the one shown, where one was given."""
         if self.model_path is None:
             return []
-        shown = self.model_hash()
-        others = [fit.name for fit in self.fits if fit.fitted and fit.record.model.hash != shown]
+        model_hash = self.model_hash()
+        others = [fit.name for fit in self.fits if fit.fitted and fit.record.model.hash != model_hash]
         return [Notice(f"Fitted with another model than {self.model_path.name}", others)]
 
     def doubts(self) -> Notice:
@@ -228,7 +230,7 @@ class FolderPage:
         items: list[str | Item] = [
             Item(
                 f"{STATUS_WORDS[fit.status]}. {_all_reasons(fit)}",
-                Cell(fit.name, place=places.get(fit.name)),
+                Cell(fit.name, anchor=places.get(fit.name)),
             )
             for fit in bad[:_MOST_NAMED]
         ]
@@ -242,9 +244,9 @@ class FolderPage:
         far = sorted(good, key=lambda fit: -fit.distance_mm("model_to_scan"))[:_MOST_WORST]
         if len(good) < 2:
             return []
-        told = listed([f"{fit.name} ({mm(fit.distance_mm('model_to_scan'))})" for fit in far])
+        farthest = listed([f"{fit.name} ({mm(fit.distance_mm('model_to_scan'))})" for fit in far])
         which = "These" if len(good) == len(self.fits) else "Of those with nothing against them, these"
-        return [Text(f"{which} lie farthest from their scans on average: {told}.")]
+        return [Text(f"{which} lie farthest from their scans on average: {farthest}.")]
 
     def curves(self) -> Figure:
         """Return which share of the surface lies within each distance."""
@@ -252,15 +254,15 @@ class FolderPage:
 
         # Without stages, each curve needs the scan to be read and the distances to be measured.
         pictured = [fit for fit in self.fits if fit.pictured and (fit.entry.stages or fit.name in self.places)]
-        shown, problems = sections.usable(pictured[:MOST_CURVES], self.staged)
-        if not shown:
+        fits, problems = sections.usable(pictured[:MOST_CURVES], self.staged)
+        if not fits:
             raise InputError(f"There are no distances to draw: {problems[0]}" if problems else "No surface was saved.")
-        some = f" The first {len(shown)} fits of the table." if sum(f.pictured for f in self.fits) > len(shown) else ""
+        some = f" The first {len(fits)} fits of the table." if sum(f.pictured for f in self.fits) > len(fits) else ""
         return self.page.figure(
-            figures.error_curves(shown),
+            figures.error_curves(fits),
             "Share of the model's vertices that lie within each distance of the scan, one curve a fit. Vertices at "
             f"which the scan shows nothing are not counted.{some}",
-            alt=f"Cumulative distances of {counted(len(shown), 'fit')}",
+            alt=f"Cumulative distances of {counted(len(fits), 'fit')}",
             chart=True,
         )
 
@@ -315,7 +317,7 @@ class FolderPage:
         several = len(self.fits) > 1
         for fit in self.main:
             made = page.section(
-                f"{fit.name} in detail", lambda fit=fit: self.detail(fit), place=self._details[fit.name],
+                f"{fit.name} in detail", lambda fit=fit: self.detail(fit), anchor=self._details[fit.name],
                 folded=several, status=status(fit.status) if several else None,
             )  # fmt: skip
             # Of a single fit, its pictures matter more than its numbers.
@@ -359,18 +361,18 @@ class FolderPage:
             why = f"No picture: {error}"
         self.page.step(fit.name)
         seen = fit.distance_mm("scan_to_model")
-        told = f"Scan to model {mm(seen)} on average. " if isfinite(seen) else ""
+        text = f"Scan to model {mm(seen)} on average. " if isfinite(seen) else ""
         # The summary has the whole reason of these.
         named = [bad.name for bad in self.fits if bad.status != "converged"][:_MOST_NAMED]
         return Card(
-            self._cards[fit.name],
-            fit.name,
-            status(fit.status),
-            fit.label if fit.label != fit.name else "",
-            told + (_first_reason(fit) if fit.name in named else fit.reason),
-            image,
-            why,
-            self._details.get(fit.name),
+            anchor=self._cards[fit.name],
+            name=fit.name,
+            status=status(fit.status),
+            label=fit.label if fit.label != fit.name else "",
+            text=text + (_first_reason(fit) if fit.name in named else fit.reason),
+            image=image,
+            why_none=why,
+            detail=self._details.get(fit.name),
         )
 
     def still(self, fit: SavedFit, limit_mm: float) -> Image:
@@ -394,11 +396,11 @@ class FolderPage:
 
     def numbers(self) -> list[Block]:
         """Return the table of all fits."""
-        shown = self.fits[:MOST_ROWS]
+        rows = self.fits[:MOST_ROWS]
         caption = "Every fit: distances and errors at the end in mm. A dash: not known."
-        out: list[Block] = [tables.fits_table(shown, self.places, caption=caption)]
-        if len(self.fits) > len(shown):
-            left = counted(len(self.fits) - len(shown), "other fit")
+        out: list[Block] = [tables.fits_table(rows, self.places, caption=caption)]
+        if len(self.fits) > len(rows):
+            left = counted(len(self.fits) - len(rows), "other fit")
             out.append(Text(f"{left} are left out here; coefficients.csv has all."))
         return [*out, *([Text(self.label_note, "soft")] if self.label_note else [])]
 

@@ -50,12 +50,13 @@ WORST = {"failed": 12, "doubtful": 60, "max_iterations": 20, "converged": 60}
 MOST_SINGLE, MOST_STORED = 10_000, 2_000
 """Fits of which a folder of single files, and a store, are reported with one row for each."""
 
+# Items on a page, and points in a picture: what can be looked through without paging.
 _FARTHEST, _MOST_REASONS, _MOST_NOTED, _MOST_LINES, _IN_PICTURE = 20, 20, 24, 6, 400
-_MOST_COLUMNS = 12
+_MOST_COLUMNS = 12  # columns of metadata; each has a figure
 
 
 def is_many(results: Results) -> bool:
-    """Return whether a folder has so many fits that not each of them is told of."""
+    """Return whether a folder has too many fits to report each one."""
     return len(results) > (MOST_SINGLE if results.store is None else MOST_STORED)
 
 
@@ -123,7 +124,9 @@ class ManyPage(FolderPage):
             Tiles(tiles),
             *self.other_models(),
             Notice(
-                "Cannot be read", [without_folders(printable(told)) for told in self.problems[:_MOST_NOTED]], "broken"
+                "Cannot be read",
+                [without_folders(printable(text)) for text in self.problems[:_MOST_NOTED]],
+                "broken",
             ),
             *([] if len(self.population.models) < 2 else [Text(self._of_models())]),
             *self.page.tried(self.stands_out),
@@ -143,8 +146,8 @@ class ManyPage(FolderPage):
         for column in self.population.listed:
             for group in self.population.compared(column):
                 if group.stands_out:
-                    told = "; ".join(group.stands_out)
-                    items.append(Item(f"{told[:1].upper()}{told[1:]}.", Cell(f"{column.name} {printable(group.name)}")))
+                    text = "; ".join(group.stands_out)
+                    items.append(Item(f"{text[:1].upper()}{text[1:]}.", Cell(f"{column.name} {printable(group.name)}")))
         if len(items) > _MOST_NOTED:
             items = [*items[:_MOST_NOTED], f"{len(items) - _MOST_NOTED} more, in the tables of Time and site."]
         return Notice("Differ from all the others", items)
@@ -225,7 +228,7 @@ class ManyPage(FolderPage):
             ]
             name = self.population.names[k]
             rows.append([
-                Cell(printable(name), place=self.place_of(name)),
+                Cell(printable(name), anchor=self.place_of(name)),
                 status(sections.ORDER_OF_CONCERN[int(self.population.status[k])]),
                 number(float(self._far[k]), 2),
                 Cell(f"z{most + 1} = {float(z[most]):+.1f}".replace("-", "−"), float(np.abs(z[most]))),
@@ -316,12 +319,12 @@ class ManyPage(FolderPage):
     def numbers(self) -> list[Block]:
         """Return the table of the fits that are looked at."""
         wanted = listed([f"{most} {STATUS_WORDS[kind]}" for kind, most in WORST.items()])
-        told = (
+        text = (
             f"Of {counted(len(self.population), 'fit')} these {len(self.fits)}: the worst of each status ({wanted}), "
             f"and the {_FARTHEST} farthest from the mean. shapespace export gives the table of all, and fits as files."
         )
         table = tables.fits_table(self.fits, self.places, caption="Fits to look at: distances and errors in mm")
-        return [Text(told), table, *([Text(self.label_note, "soft")] if self.label_note else [])]
+        return [Text(text), table, *([Text(self.label_note, "soft")] if self.label_note else [])]
 
     def together(self) -> list[Block]:
         """Return the first coefficients of the fits that are looked at, to be turned."""

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 LARGEST_REPORT_BYTES = 8_000_000
 """A report stays below this size, so that it can be mailed."""
 
-_SHELL_BYTES = 250_000
-_RESERVE_BYTES = 700_000
+_SHELL_BYTES = 250_000  # bytes of scripts and styles of a page
+_RESERVE_BYTES = 700_000  # bytes that stay free for tables and text after the last picture
 
 Step = Callable[[str, int], None]
 """Told what was just made, and about how many such things there will be, for a progress bar."""
@@ -46,7 +46,7 @@ class Page:
 
     Args:
         planned: about how many pictures there will be.
-        on_step: told of each picture.
+        on_step: called after each picture.
     """
 
     def __init__(self, planned: int, on_step: Step | None = None) -> None:
@@ -65,12 +65,12 @@ class Page:
         """Count bytes that are embedded by other means than this page's."""
         self._spent += n_bytes
 
-    def step(self, what: str) -> None:
+    def step(self, name: str) -> None:
         """Tell the progress bar what was just made."""
         if self._on_step is not None:
-            self._on_step(what, self._planned)
+            self._on_step(name, self._planned)
 
-    def place(self, text: str) -> str:
+    def anchor(self, text: str) -> str:
         """Return a name for a place in the page, made of `text` and taken only once."""
         name = base = anchor(text)
         count = 1
@@ -81,12 +81,20 @@ class Page:
         return name
 
     def section(
-        self, heading: str, make: Make, level: int = 3, place: str | None = None, link: str = "", *,
+        self, heading: str, make: Make, level: int = 3, anchor: str | None = None, link: str = "", *,
         folded: bool = False, status: Cell | None = None,
     ) -> Section:  # fmt: skip
         """Return a section, or its heading and why it could not be made."""
-        place = place or self.place(heading)
-        return Section(heading, place, self.tried(make), level, link or heading, folded, status)
+        anchor = anchor or self.anchor(heading)
+        return Section(
+            heading=heading,
+            anchor=anchor,
+            body=self.tried(make),
+            level=level,
+            link=link or heading,
+            folded=folded,
+            status=status,
+        )
 
     def tried(self, make: Make) -> Sequence[Block]:
         """Return what `make` gives, or why it could not."""
@@ -155,10 +163,10 @@ class Page:
         from markupsafe import Markup
 
         # Their places come first, so that no part inside takes the name of a chapter.
-        places = [self.place(chapter.heading) for chapter in chapters]
+        places = [self.anchor(chapter.heading) for chapter in chapters]
         sections = [
-            self.section(chapter.heading, chapter.make, 2, place, chapter.link)
-            for chapter, place in zip(chapters, places, strict=True)
+            self.section(chapter.heading, chapter.make, 2, anchor, chapter.link)
+            for chapter, anchor in zip(chapters, places, strict=True)
         ]
         style, early, scripts = _asset("report.css"), _script(_asset("theme.js")), [_script(_asset("report.js"))]
         if self._payloads:

@@ -47,12 +47,13 @@ SECTION_BYTES = 1_500_000
 MOST_ANALYSES = 12
 """How many analyses a report of fits shows."""
 
+# parts of a study, and characters of a damaged value, that a page shows: bounds its length
 _MOST_PARTS, _MOST_TEXT = 120, 400
-_PART_BYTES = 700_000
-_MOST_NOTES = 40
+_PART_BYTES = 700_000  # bytes that one part of a study takes with its figures
+_MOST_NOTES = 40  # notes on the page; the file has all
 _BESIDE = ("confusion", "calibration", "learning_curve", "curve", "histogram")
 """Kinds of parts that share the page's width with their neighbour; the views of a surface map need all of it."""
-_CHAPTER = 2
+_CHAPTER = 2  # level of parts that begin a chapter (`Part` in schemas)
 _T = TypeVar("_T")
 
 
@@ -87,8 +88,8 @@ def study_page(folder: Folder, parts_file: PartsFile, on_step: Step | None = Non
     provenance = f"shapespace {study.head['version']}".strip()
     if study.head["created"]:
         provenance += f", {moment(study.head['created'])}"
-    beside = ", beside the targets that were set for it" if content.get("targets") else ""
-    lead = [Text(f"{parts_file.lead}{beside}."), Text(f"{provenance}.", "soft")]
+    targets_text = ", beside the targets that were set for it" if content.get("targets") else ""
+    lead = [Text(f"{parts_file.lead}{targets_text}."), Text(f"{provenance}.", "soft")]
     has_summary = any(content.get(key) for key in ("summary", "targets", "notes"))
     chapters = [Chapter("Summary", study.summary)] if has_summary else []
     for heading, make in study.chapters("Results", 3):
@@ -170,11 +171,11 @@ def _shortened(value: object, most: int = _MOST_TEXT) -> object:
     if isinstance(value, list):
         return [_shortened(item, most) for item in cast(list[object], value)]
     if isinstance(value, dict):
-        found = cast(dict[str, object], value)
+        mapping = cast(dict[str, object], value)
         long = ("note", "notes", "text", "summary", "settings")
         return {
             str(_shortened(key)): _shortened(item, MOST_PARAGRAPH if key in long else most)
-            for key, item in found.items()
+            for key, item in mapping.items()
         }
     return value
 
@@ -286,17 +287,17 @@ class _Study:
     def parts(self, parts: Sequence[object], level: int) -> list[Block]:
         """Return parts under their headings, charts that follow each other side by side."""
         out: list[Block] = []
-        beside: list[Block] = []
+        blocks: list[Block] = []
 
         def flush() -> None:
-            out.extend([Group("beside", beside.copy())] if len(beside) > 1 else beside)
-            beside.clear()
+            out.extend([Group("beside", blocks.copy())] if len(blocks) > 1 else blocks)
+            blocks.clear()
 
         for part in parts:
             section = self.page.section(_title(part), lambda part=part: self.body(part), level)
             if _raw(part, "kind") not in _BESIDE:
                 flush()
-            beside.append(section)
+            blocks.append(section)
             if _raw(part, "kind") not in _BESIDE:
                 flush()
         flush()
@@ -338,10 +339,10 @@ class _Study:
 
     def hashes(self) -> Folded:
         """Return the hashes of the models that took part."""
-        found = self._read("model_hashes", tuple[str, ...])
-        rows = [[str(k), one] for k, one in enumerate(found[:MOST_ROWS], 1)]
+        hashes = self._read("model_hashes", tuple[str, ...])
+        rows = [[str(k), one] for k, one in enumerate(hashes[:MOST_ROWS], 1)]
         table = text_table(("Model", "Hash"), rows, "Content hashes of the models")
-        return Folded(f"Content hashes (SHA-256) of {counted(len(found), 'model')}", [table])
+        return Folded(f"Content hashes (SHA-256) of {counted(len(hashes), 'model')}", [table])
 
 
 def _title(part: object) -> str:

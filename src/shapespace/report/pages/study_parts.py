@@ -68,14 +68,25 @@ class PartsFile:
 
 
 STUDY = PartsFile(
-    "recognition.json", Recognition, STUDY_AGAIN, "study", "a study", "Recognition study",
-    "What a study of recognition measured",
-)  # fmt: skip
-ANALYSIS = PartsFile(
-    Analysis.FILE, Analysis, ANALYSIS_AGAIN, "analysis", "an analysis", "Analysis", "What an analysis of shapes found"
+    file="recognition.json",
+    struct=Recognition,
+    again=STUDY_AGAIN,
+    word="study",
+    article="a study",
+    title="Recognition study",
+    lead="What a study of recognition measured",
 )
-MOST_ROWS, MOST_PARAGRAPH = 500, 2000
-_MOST_COLUMNS = 30
+ANALYSIS = PartsFile(
+    file=Analysis.FILE,
+    struct=Analysis,
+    again=ANALYSIS_AGAIN,
+    word="analysis",
+    article="an analysis",
+    title="Analysis",
+    lead="What an analysis of shapes found",
+)
+MOST_ROWS, MOST_PARAGRAPH = 500, 2000  # rows and characters of a paragraph that a page shows: bounds its length
+_MOST_COLUMNS = 30  # columns; a wider table is unreadable, and probably damage
 TITLES = {
     "table": "Table",
     "confusion": "Confusion matrix",

@@ -50,7 +50,7 @@ def write_report(
         output: the file; None writes `folder`/report.html.
         model: file of the model of the fits; None goes by their records. The demo names its own, a study has none.
         labels: table of labels of the scans; None looks for labels.csv in `folder`, then beside the scans.
-        on_step: told of each picture as it is made.
+        on_step: called after each picture.
 
     Raises:
         FileError: the folder, demo.json, `model` or `labels` cannot be read, or the report cannot be written.
@@ -77,17 +77,17 @@ def write_report(
         if model is not None or labels is not None:
             raise InputError(f"{folder} is a correspondence without fits; leave out --model and --labels.")
         page = CorrespondencePage(results, on_step).html()
-    elif (kept := standalone_file(results)) is not None:
+    elif (standalone := standalone_file(results)) is not None:
         if model is not None or labels is not None:
-            raise InputError(f"{folder} holds {kept.article} without fits; leave out --model and --labels.")
-        page = study_page(results, kept, on_step)
+            raise InputError(f"{folder} holds {standalone.article} without fits; leave out --model and --labels.")
+        page = study_page(results, standalone, on_step)
     else:
         from shapespace.report.pages.folder_page import FolderPage
         from shapespace.report.pages.many_page import ManyPage, is_many
 
-        kept = Results(folder)
-        if is_many(kept):
-            write_text(path, ManyPage(results, kept, model=model, labels=labels, on_step=on_step).html())
+        standalone = Results(folder)
+        if is_many(standalone):
+            write_text(path, ManyPage(results, standalone, model=model, labels=labels, on_step=on_step).html())
             return path
         fits = find_fits(results)
         if all(fit.status == "unreadable" for fit in fits):

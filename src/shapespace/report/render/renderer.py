@@ -396,8 +396,8 @@ def _balls(layer: Layer, camera: Camera, size: tuple[int, int], supersample: int
     return _Surfels(pixel, depth_mm, normal, scalar, is_back, _occlusion(pixel, depth_mm, size, supersample, camera))
 
 
-_CLOSING = 0.8
-_NEIGHBOURS = 10
+_CLOSING = 0.8  # radius of a point's disc in spacings: neighbours overlap, so that a cloud looks closed
+_NEIGHBOURS = 10  # nearest points that the spacing of a cloud is the median distance of
 
 
 @cached_with_owner()

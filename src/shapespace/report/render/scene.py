@@ -158,7 +158,7 @@ def pack_model(model: ShapeModel, modes: int | None = None, *, small: bool = Fal
     }
     if faces is not None:
         arrays["faces"] = _indices(faces, model.n_vertices, coded=small)
-    place = np.argsort(order)
+    rank = np.argsort(order)
     facts = {
         "kind": "model",
         "names": [f"mode {k + 1}" for k in range(K)],
@@ -166,7 +166,7 @@ def pack_model(model: ShapeModel, modes: int | None = None, *, small: bool = Fal
         "n_training": model.n_training,
         "gauge": model.gauge,
         "landmarks": {
-            name: {"vertices": place[corners].tolist(), "weights": weights.tolist()}
+            name: {"vertices": rank[corners].tolist(), "weights": weights.tolist()}
             for name, corners, weights in zip(
                 model.landmarks.names, model.landmarks.corners, model.landmarks.barycentric, strict=True
             )
@@ -474,9 +474,9 @@ def _neighbours_together(faces: IntArray, vertices: int) -> tuple[npt.NDArray[np
     rows, columns = faces[:, [0, 1, 2, 1, 2, 0]].ravel(), faces[:, [1, 2, 0, 0, 1, 2]].ravel()
     graph = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(vertices, vertices)).tocsr()
     order = np.asarray(reverse_cuthill_mckee(graph, symmetric_mode=True), dtype=np.intp)
-    place = np.empty(vertices, dtype=np.int32)
-    place[order] = np.arange(vertices, dtype=np.int32)
-    new_faces = place[faces]
+    rank = np.empty(vertices, dtype=np.int32)
+    rank[order] = np.arange(vertices, dtype=np.int32)
+    new_faces = rank[faces]
     rotation = new_faces.argmin(axis=1)[:, None]
     new_faces = np.take_along_axis(new_faces, (rotation + np.arange(3)) % 3, axis=1)
     return order, new_faces[np.lexsort((new_faces[:, 2], new_faces[:, 1], new_faces[:, 0]))]

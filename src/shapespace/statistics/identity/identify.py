@@ -1,4 +1,4 @@
-"""Which of the people enrolled does a scan show: ranks, and what is missed where nobody need be enrolled."""
+"""Identification of the enrolled person that a scan shows: ranks, and miss rates of open-set searches."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from shapespace.statistics.identity.trial import IdentityConfig, Trial, scores_o
 from shapespace.types import BoolArray, FloatArray, IntArray, require
 
 FPIR = (1e-1, 1e-2)
-"""Shares of searches for people who are not enrolled that find somebody, at which the misses are told."""
+"""False positive identification rates at which the miss rate is reported."""
 
-_JUST = 1e-12
+_JUST = 1e-12  # relative slack for rates that rounding puts just below a step
 
 
 @dataclass(frozen=True, eq=False)
 class Searches:
-    """What each probe found in a gallery.
+    """Results of searching a gallery for each probe.
 
     Args:
-        person: (S,) number of whom each probe shows.
+        person: (S,) number of the person of each probe.
         rank: (S,) place of that person among all enrolled, 1 for the first, ties counted against it; 0 where they are
             not enrolled.
         own: (S,) score of that person; minus infinity where they are not enrolled.
-        best_other: (S,) the highest score of anybody else.
+        best_other: (S,) highest score of another person.
     """
 
     person: IntArray
@@ -55,8 +55,8 @@ class Searches:
     def cmc(self, most: int, weights: FloatArray | None = None) -> FloatArray:
         """Return (most,) the share of enrolled probes found within the first 1, 2, ... people."""
         w = (np.ones(len(self.rank)) if weights is None else weights)[self.enrolled]
-        at = np.minimum(self.rank[self.enrolled] - 1, most)
-        return np.cumsum(np.bincount(at, weights=w, minlength=most + 1))[:most] / w.sum()
+        rank = np.minimum(self.rank[self.enrolled] - 1, most)
+        return np.cumsum(np.bincount(rank, weights=w, minlength=most + 1))[:most] / w.sum()
 
     def fnir(self, fpir: FloatArray, weights: FloatArray | None = None) -> FloatArray:
         """Return the share of enrolled probes missed at thresholds that let at most `fpir` of others in.
@@ -79,11 +79,11 @@ class Searches:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class IdentificationRates:
-    """How well one score finds people.
+    """Error rates of identification by one score.
 
     Args:
-        name: of the score.
-        searches: of all probes.
+        name: name of the score.
+        searches: results of all probes.
         rank_1: share of enrolled probes whose person is first.
         cmc: (R,) share found within the first 1 to R people.
         band: (2, R) ends of its interval.
@@ -102,14 +102,14 @@ class IdentificationRates:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class IdentificationResult(AnalysisResult):
-    """What identification in a cohort found.
+    """Result of the identification in a cohort.
 
     Args:
-        scores: one for each score that was asked for, in that order.
-        enrolled: people in the gallery; the least of all rounds.
-        probes: how many searches there were.
-        trained_on: how many people were learned from; the least of all rounds.
-        trial: who was who.
+        scores: rates of each requested score, in that order.
+        enrolled: number of people in the gallery; the smallest of all rounds.
+        probes: number of searches.
+        trained_on: number of training people; the smallest of all rounds.
+        trial: roles of the scans.
         config: options of the analysis.
     """
 
@@ -130,12 +130,12 @@ class IdentificationResult(AnalysisResult):
 
 
 def search(scores: FloatArray, gallery: IntArray, probes: IntArray) -> Searches:
-    """Return what probes find: a person's score is that of the scan of them that is most like the probe.
+    """Search the gallery for each probe; the score of a person is that of the most similar scan.
 
     Args:
         scores: (G, P).
-        gallery: (G,) number of whom each scan shows.
-        probes: (P,) the same.
+        gallery: (G,) number of the person of each scan.
+        probes: (P,) number of the person of each probe.
 
     Raises:
         InputError: fewer than two people are enrolled.
@@ -156,11 +156,11 @@ def search(scores: FloatArray, gallery: IntArray, probes: IntArray) -> Searches:
 def identify(
     cohort: Cohort, config: IdentityConfig | None = None, *, progress: Callable[[int, int], None] | None = None
 ) -> IdentificationResult:
-    """Return how well people are found among those enrolled.
+    """Estimate the error rates of identification: which enrolled person does a scan show?
 
     Args:
-        cohort: scans of which the table says whom they show.
-        config: who is enrolled; None enrols the first scan of each person. With folds, people are searched for among
+        cohort: scans with a column that identifies the person.
+        config: roles of the scans; None enrols the first scan of each person. With folds, people are searched for among
             those of their own fold.
         progress: called with (done, total).
 
@@ -173,15 +173,15 @@ def identify(
     trial = trial_of(cohort, config, enrol=True)
     parts: dict[str, list[Searches]] = {name: [] for name in config.scores}
     sizes: list[int] = []
-    for round_, found in scores_of(trial, config, config.modes):
+    for round_, matrices in scores_of(trial, config, config.modes):
         gallery, probes = (trial.person[list(rows)] for rows in (round_.gallery, round_.probes))
         sizes.append(len(np.unique(gallery)))
-        for name, scores in found.items():
+        for name, scores in matrices.items():
             parts[name].append(search(scores, gallery, probes))
     people = people_drawn(trial.tested, config.draws, config.seed)
     rates: list[IdentificationRates] = []
-    for number, (name, told) in enumerate(parts.items()):
-        rates.append(identification_rates(name, joined(told), min(sizes), people))
+    for number, (name, searches) in enumerate(parts.items()):
+        rates.append(identification_rates(name, joined(searches), min(sizes), people))
         if progress is not None:
             progress(number + 1, len(parts))
     return IdentificationResult(
@@ -200,13 +200,13 @@ def joined(parts: Sequence[Searches]) -> Searches:
     return Searches(*(np.concatenate([getattr(part, field) for part in parts]) for field in fields))
 
 
-def identification_rates(name: str, searches: Searches, most: int, people: FloatArray) -> IdentificationRates:
-    """Return the figures of one score.
+def identification_rates(name: str, searches: Searches, n_ranks: int, people: FloatArray) -> IdentificationRates:
+    """Return the error rates of one score.
 
     Args:
-        name: of it.
-        searches: of all probes.
-        most: ranks that are told.
+        name: name of the score.
+        searches: results of all probes.
+        n_ranks: number of ranks of the CMC curve.
         people: (draws, P) from `people_drawn`.
     """
     rates = np.array(FPIR)
@@ -215,14 +215,14 @@ def identification_rates(name: str, searches: Searches, most: int, people: Float
         weights = times[searches.person]
         strangers = ~searches.enrolled if not searches.enrolled.all() else searches.enrolled
         if weights[searches.enrolled].sum() > 0 and weights[strangers].sum() > 0:
-            rows.append(np.concatenate([searches.cmc(most, weights), searches.fnir(rates, weights)]))
-    drawn = np.array(rows).reshape(len(rows), most + len(rates))
-    cmc, fnir = searches.cmc(most), searches.fnir(rates)
+            rows.append(np.concatenate([searches.cmc(n_ranks, weights), searches.fnir(rates, weights)]))
+    drawn = np.array(rows).reshape(len(rows), n_ranks + len(rates))
+    cmc, fnir = searches.cmc(n_ranks), searches.fnir(rates)
     searched = len(searches.rank) if searches.enrolled.all() else int((~searches.enrolled).sum())
-    band = np.percentile(drawn[:, :most], [2.5, 97.5], axis=0) if len(drawn) else np.full((2, most), np.nan)
+    band = np.percentile(drawn[:, :n_ranks], [2.5, 97.5], axis=0) if len(drawn) else np.full((2, n_ranks), np.nan)
     band = np.stack(widen_share(band[0], band[1], searches.people))
     missed = {
-        rate: rate_estimate(float(fnir[k]), drawn[:, most + k], searches.people)
+        rate: rate_estimate(float(fnir[k]), drawn[:, n_ranks + k], searches.people)
         if searched * rate >= 1
         else RateEstimate(None)
         for k, rate in enumerate(FPIR)

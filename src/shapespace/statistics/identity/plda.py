@@ -19,6 +19,7 @@ from shapespace.lazy import require_package
 from shapespace.statistics.identity.samples import Samples
 from shapespace.types import FloatArray, read_only
 
+# bounds as shares of the variance within and between people, so that both stay positive
 _MOST_NOISE, _LEAST_BETWEEN = 0.9, 1e-3
 
 
@@ -111,8 +112,8 @@ class TwoCovariance:
         return 1.0 - self.noise + self.noise_scale * (samples.variance @ self.basis**2)
 
 
-def _less(whole: FloatArray, part: FloatArray, least: float) -> FloatArray:
+def _less(total: FloatArray, part: FloatArray, least: float) -> FloatArray:
     """Return `whole` less `part`, of which in no direction less than the share `least` of `whole` is left."""
-    shares, vectors = eigh(part, whole)
+    shares, vectors = eigh(part, total)
     back = np.linalg.inv(vectors)
     return (back.T * np.maximum(1.0 - shares, least)) @ back

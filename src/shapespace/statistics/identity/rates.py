@@ -13,8 +13,8 @@ from shapespace.errors import InputError
 from shapespace.reprs import short_repr
 from shapespace.types import BoolArray, FloatArray, IntArray
 
-_LEVEL = 0.95
-_JUST = 1e-12
+_LEVEL = 0.95  # of confidence intervals, the usual one
+_JUST = 1e-12  # relative slack for rates that rounding puts just below a step
 
 
 @dataclass(frozen=True, eq=False)

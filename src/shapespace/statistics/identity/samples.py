@@ -12,7 +12,7 @@ from shapespace.errors import InputError
 from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, read_only
 
-_NO_VARIANCE = 1e-9
+_NO_VARIANCE = 1e-9  # share of the largest; below is rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,12 +51,12 @@ class Samples:
 
     def take(self, rows: Sequence[int]) -> Samples:
         """Return some of them, in their order."""
-        at = np.asarray(rows, dtype=np.intp)
+        indices = np.asarray(rows, dtype=np.intp)
         return replace(
             self,
-            x=self.x[at],
-            variance=self.variance[at],
-            mm=self.mm[at],
+            x=self.x[indices],
+            variance=self.variance[indices],
+            mm=self.mm[indices],
             subjects=tuple(self.subjects[row] for row in rows),
         )
 
@@ -102,9 +102,9 @@ def samples_of(
     known = mm[np.asarray(training, dtype=np.intp)]
     mean = known.mean(axis=0)
     _, sizes, rows = np.linalg.svd(known - mean, full_matrices=False)
-    kept = sizes > _NO_VARIANCE * sizes[0]
-    stddev = sizes[kept] / np.sqrt(len(known) - 1)
-    x = (mm - mean) @ rows[kept].T / stddev
+    significant = sizes > _NO_VARIANCE * sizes[0]
+    stddev = sizes[significant] / np.sqrt(len(known) - 1)
+    x = (mm - mean) @ rows[significant].T / stddev
     return Samples(read_only(x), np.zeros_like(x), mm, tuple(subjects), vertices)
 
 

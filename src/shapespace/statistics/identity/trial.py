@@ -19,7 +19,7 @@ from shapespace.statistics.identity.scores import SCORES, refuse_unknown_scores,
 from shapespace.types import BoolArray, FloatArray, IntArray
 
 ROLES = ("gallery", "probe", "train")
-_FOLDS, _GROUPS = 4, 5
+_FOLDS, _GROUPS = 4, 5  # folds of people, and groups for the calibration
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,11 +114,11 @@ class Trial:
     def pairs(self, round_: Round) -> tuple[Pairs, IntArray]:
         """Return the pairs of a round, and (M, 2) the places of each in gallery and probes."""
         gallery, probes = (np.asarray(rows, dtype=np.int32) for rows in (round_.gallery, round_.probes))
-        at = np.indices((len(gallery), len(probes)), dtype=np.int32).reshape(2, -1).T
+        indices = np.indices((len(gallery), len(probes)), dtype=np.int32).reshape(2, -1).T
         if self.all_pairs:
-            at = at[at[:, 0] < at[:, 1]]
-        rows = np.column_stack([gallery[at[:, 0]], probes[at[:, 1]]])
-        return Pairs(self.person[rows[:, 0]], self.person[rows[:, 1]], rows), at
+            indices = indices[indices[:, 0] < indices[:, 1]]
+        rows = np.column_stack([gallery[indices[:, 0]], probes[indices[:, 1]]])
+        return Pairs(self.person[rows[:, 0]], self.person[rows[:, 1]], rows), indices
 
 
 def rows_of(table: Table, expression: str) -> list[int]:
@@ -127,10 +127,10 @@ def rows_of(table: Table, expression: str) -> list[int]:
     Raises:
         InputError: it is none, there is no such column, or it names no row.
     """
-    found = re.fullmatch(r"\s*([^=!]+?)\s*(!?=)\s*(.+?)\s*", expression)
-    if found is None:
+    match = re.fullmatch(r"\s*([^=!]+?)\s*(!?=)\s*(.+?)\s*", expression)
+    if match is None:
         raise InputError(f"{expression!r} names no scans; write a column and its values, such as expression=neutral.")
-    column, sign, text = found.groups()
+    column, sign, text = match.groups()
     values = {value.strip() for value in text.split(",")}
     cells = table.texts(column)
     rows = [row for row, cell in enumerate(cells) if (cell in values) == (sign == "=")]
@@ -161,8 +161,8 @@ def trial_of(cohort: Cohort, config: IdentityConfig, *, enrol: bool = False) -> 
     table, notes = cohort.table, list(cohort.notes)
     subjects = table.texts(config.subject)
     people = sorted(set(subjects))
-    place = {name: k for k, name in enumerate(people)}
-    person = np.array([place[name] for name in subjects], dtype=np.int32)
+    number = {name: k for k, name in enumerate(people)}
+    person = np.array([number[name] for name in subjects], dtype=np.int32)
     gallery, probes, training = _roles(table, role, config)
     tested = sorted({*gallery, *probes})
     both = sorted({subjects[row] for row in tested} & {subjects[row] for row in training})
@@ -219,7 +219,7 @@ def _roles(table: Table, role: str | None, config: IdentityConfig) -> tuple[list
         odd = sorted({cell for cell in cells if cell not in ROLES})
         if odd:
             raise InputError(f"{table.where}: {role!r} is {list_names(odd)}; it may be gallery, probe or train.")
-        gallery, probes, training = ([row for row, cell in enumerate(cells) if cell == what] for what in ROLES)
+        gallery, probes, training = ([row for row, cell in enumerate(cells) if cell == wanted] for wanted in ROLES)
         if gallery and not probes:
             raise InputError(f"{table.where}: {role!r} names a gallery and no probe.")
         return gallery, probes, training

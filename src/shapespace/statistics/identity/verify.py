@@ -19,20 +19,21 @@ from shapespace.statistics.identity.trial import IdentityConfig, Trial, scores_o
 from shapespace.types import BoolArray, FloatArray, IntArray, require
 
 FAR = (1e-1, 1e-2, 1e-3)
-"""Shares of impostor pairs accepted, at which the genuine pairs accepted are told."""
+"""False accept rates at which the true accept rate is reported."""
 
 GRID = np.geomspace(1e-4, 1.0, 61)
-_BY_DRAWS = 200
-_ENDS = (2.5, 97.5)
+"""False accept rates of the ROC curve: 15 in each decade."""
+_BY_DRAWS = 200  # bootstrap draws of a subgroup; fewer than for all, since there are many subgroups
+_ENDS = (2.5, 97.5)  # percentiles of a 95 % interval
 
 
 @dataclass(frozen=True, eq=False)
 class SubgroupRates:
-    """The figures of some pairs.
+    """Error rates of a subgroup of pairs.
 
     Args:
-        genuine: pairs of one person.
-        impostor: pairs of two.
+        genuine: number of pairs of the same person.
+        impostor: number of pairs of two people.
         eer: equal error rate.
         tar: FAR -> TAR.
     """
@@ -47,19 +48,19 @@ class SubgroupRates:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class VerificationRates:
-    """How well one score tells pairs of one person from pairs of two.
+    """Error rates of verification by one score.
 
     Args:
-        name: of the score.
-        score: (M,) of all pairs.
+        name: name of the score.
+        score: (M,) score of each pair.
         llr: (M,) calibrated log likelihood ratios, natural; None where there are too few people to calibrate.
-        roc: the rates.
+        roc: ROC curve.
         eer: equal error rate.
         tar: FAR -> TAR; without a value where there are too few impostor pairs to say.
         cllr: cost of the calibrated ratios, in bits.
-        cllr_min: of the best monotone calibration.
+        cllr_min: cost after the best monotone calibration.
         band: (2, 61) ends of the interval of TAR at the FAR of `GRID`.
-        by: value of the column `by` -> its figures.
+        by: value of the column `by` -> rates of its pairs.
         curve: number of modes -> EER.
     """
 
@@ -80,14 +81,14 @@ class VerificationRates:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class VerificationResult(AnalysisResult):
-    """What verification of a cohort found.
+    """Result of the verification of a cohort.
 
     Args:
-        scores: one for each score that was asked for, in that order.
-        pairs: that were compared.
-        people: names.
-        trained_on: how many people were learned from; the least of all rounds.
-        trial: who was who.
+        scores: rates of each requested score, in that order.
+        pairs: compared pairs of scans.
+        people: names of the people.
+        trained_on: number of training people; the smallest of all rounds.
+        trial: roles of the scans.
         config: options of the analysis.
     """
 
@@ -110,11 +111,11 @@ class VerificationResult(AnalysisResult):
 def verify(
     cohort: Cohort, config: IdentityConfig | None = None, *, progress: Callable[[int, int], None] | None = None
 ) -> VerificationResult:
-    """Return how well scans of one person are told from scans of two.
+    """Estimate the error rates of verification: do two scans show the same person?
 
     Args:
-        cohort: scans of which the table says whom they show.
-        config: who is compared with whom; None for all against all, by folds of the people.
+        cohort: scans with a column that identifies the person.
+        config: roles of the scans; None compares all with all, by folds of the people.
         progress: called with (done, total).
 
     Raises:
@@ -139,27 +140,27 @@ def verify(
     curves: dict[int, Mapping[str, FloatArray]] = {
         modes: _pairs_and_scores(trial, config, modes)[1] for modes in config.curve
     }
-    found = tuple(
+    rates = tuple(
         verification_rates(name, score, pairs, trial.group, people, chosen=chosen, on_draw=step,
                  curve={modes: Sweep(curves[modes][name], pairs.same).roc().eer for modes in curves})
         for name, score in scores.items()
     )  # fmt: skip
     n_training = min(len({trial.subjects[row] for row in one.training}) for one in trial.rounds)
     return VerificationResult(
-        scores=found, pairs=pairs, people=trial.people, trained_on=n_training, trial=trial, config=config
+        scores=rates, pairs=pairs, people=trial.people, trained_on=n_training, trial=trial, config=config
     )
 
 
 def _pairs_and_scores(trial: Trial, config: IdentityConfig, modes: int | None) -> tuple[Pairs, dict[str, FloatArray]]:
     parts: list[Pairs] = []
     scores: dict[str, list[FloatArray]] = {name: [] for name in config.scores}
-    for round_, found in scores_of(trial, config, modes):
-        pairs, at = trial.pairs(round_)
+    for round_, matrices in scores_of(trial, config, modes):
+        pairs, indices = trial.pairs(round_)
         parts.append(pairs)
-        for name, matrix in found.items():
-            scores[name].append(matrix[at[:, 0], at[:, 1]])
+        for name, matrix in matrices.items():
+            scores[name].append(matrix[indices[:, 0], indices[:, 1]])
     one, other, rows = (np.concatenate([getattr(part, field) for part in parts]) for field in ("one", "other", "rows"))
-    return Pairs(one, other, rows), {name: np.concatenate(told) for name, told in scores.items()}
+    return Pairs(one, other, rows), {name: np.concatenate(parts_of_score) for name, parts_of_score in scores.items()}
 
 
 def verification_rates(
@@ -173,15 +174,15 @@ def verification_rates(
     curve: Mapping[int, float] | None = None,
     on_draw: Callable[[], None] | None = None,
 ) -> VerificationRates:
-    """Return the figures of one score.
+    """Return the error rates of one score.
 
     Args:
-        name: of it.
-        score: (M,) of all pairs.
-        pairs: of whom.
-        group: (P,) of each person, for calibration on people of other groups.
+        name: name of the score.
+        score: (M,) score of each pair.
+        pairs: the pairs.
+        group: (P,) group of each person, for calibration on people of other groups.
         people: (draws, P) from `people_drawn`.
-        chosen: value -> (M,) pairs that have figures of their own.
+        chosen: value -> (M,) pairs of a subgroup.
         curve: number of modes -> EER.
         on_draw: called after each draw.
 
@@ -200,7 +201,7 @@ def verification_rates(
         return np.concatenate([[own], _figures(rates), rates.tar_at(GRID)])
 
     drawn = resampled(pairs, people, of, 2 + len(FAR) + len(GRID), on_draw)
-    eer, tar = _told(roc, pairs, drawn[:, 1:])
+    eer, tar = _rate_estimates(roc, pairs, drawn[:, 1:])
     usable = drawn[np.isfinite(drawn[:, 1]), 2 + len(FAR) :]
     band = np.percentile(usable, _ENDS, axis=0) if len(usable) else np.full((2, len(GRID)), np.nan)
     band = np.stack(widen_share(band[0], band[1], pairs.genuine_people))
@@ -212,7 +213,7 @@ def verification_rates(
             continue
         own_sweep = Sweep(score[own], part.same)
         spread = resampled(part, people[:_BY_DRAWS], lambda w, s=own_sweep: _figures(s.roc(w)), 1 + len(FAR))
-        by[value] = SubgroupRates(genuine, len(part) - genuine, *_told(own_sweep.roc(), part, spread))
+        by[value] = SubgroupRates(genuine, len(part) - genuine, *_rate_estimates(own_sweep.roc(), part, spread))
     least = cllr_min(score, pairs.same)
     return VerificationRates(
         name=name,
@@ -233,7 +234,7 @@ def _figures(rates: Roc) -> FloatArray:
     return np.concatenate([[rates.eer], rates.tar_at(np.array(FAR))])
 
 
-def _told(roc: Roc, pairs: Pairs, drawn: FloatArray) -> tuple[RateEstimate, dict[float, RateEstimate]]:
+def _rate_estimates(roc: Roc, pairs: Pairs, drawn: FloatArray) -> tuple[RateEstimate, dict[float, RateEstimate]]:
     """Return EER and TAR at each FAR with their intervals; no value where no impostor pair may be accepted."""
     impostors = int((~pairs.same).sum())
     tar = {

@@ -33,10 +33,10 @@ from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
 
 REACHED = 0.03
 """A scan's point is covered when the surface is this near, as a share of the size."""
-_ALTERNATIVES = 3
+_ALTERNATIVES = 3  # poses that are registered; each costs a whole registration
 _AS_GOOD = 0.8
 """Poses are all tried whose score times this is no worse than the best one's."""
-_LEFT_OVER = 0.05
+_LEFT_OVER = 0.05  # share of the scan covered; registrations within it of the best count as equally complete
 _BETTER_POSE = 0.95
 """A pose that the search with the modes of the other scans makes likelier than all others is tried beside the known."""
 _OTHER_SIZE = 8.0
@@ -46,9 +46,9 @@ _CONTRADICTED = 2.0
 _SAME_TURN_TRACE = 1 + 2 * np.cos(np.radians(40.0))
 _BULGING = 0.2
 """How far the normals of a sheet point away from its middle, 0 to 1, when it is clear which way it bulges."""
-_FEW_HARMONICS = 4
+_FEW_HARMONICS = 4  # slowest harmonics: the pose model before any shapes are known may only stretch and bend
 _GUIDE_CONFIG = FitConfig(unit="mm", scale="free")
-_MEASURED = 20_000
+_MEASURED = 20_000  # points of a scan that distances are measured at: an error below 1 % of their mean
 _Distances: TypeAlias = tuple[float, float, float, float]
 _FAR: _Distances = (np.inf, np.inf, np.inf, np.inf)
 
