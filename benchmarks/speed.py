@@ -3,6 +3,7 @@
     python benchmarks/speed.py                          the complete scan, 100 modes, 40,000 triangles
     python benchmarks/speed.py --case holes_clean --rounds 3
     python benchmarks/speed.py --peers none             ours only, in seconds rather than minutes
+    python benchmarks/speed.py --peers none --scan 4    the person for whom the paper's method takes least
 
 Everything runs in one process, in rounds that take turns, with one BLAS thread: CPU seconds are the work done,
 whatever else the machine is doing. Search structures are built anew in every call. First calls run in processes of
@@ -207,6 +208,7 @@ def targets(cpu: Mapping[str, list[float]]) -> list[str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--case", choices=[n for n, c in CASES.items() if c.with_start], default="complete")
+    parser.add_argument("--scan", type=int, default=0, help="number of the person")
     parser.add_argument("--modes", type=int, help="of the model; all by default")
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--peer-rounds", type=int, default=1)
@@ -218,14 +220,14 @@ def main() -> None:
     threadpool_limits(1)
     bench = Bench("test", args.cache)
     case = CASES[args.case]
-    model, scan = bench.model(case.model, args.modes), bench.scan(case, 0)
+    model, scan = bench.model(case.model, args.modes), bench.scan(case, args.scan)
     if args.first_call:
         ticks = time.process_time()
         fit_scan(model, scan.mesh, FitConfig(method=args.first_call), T_scan_model=scan.start)
         print(json.dumps(time.process_time() - ticks))
         return
 
-    fits = contenders(model, scan, bench.scan("any_pose", 0))
+    fits = contenders(model, scan, bench.scan("any_pose", args.scan))
     heavy: dict[str, Callable[[], float]] = {}
     assert scan.start is not None
     mean = Mesh(scan.start.apply(model.mean_vertices), model.faces, name="mean")
@@ -249,7 +251,7 @@ def main() -> None:
         "",
         f"{facts['machine']}; Python {facts['python']}; {versions}.",
         "",
-        f"{model.n_vertices:,} vertices, {model.n_modes} modes; scan `{args.case}` of {count:,} triangles; "
+        f"{model.n_vertices:,} vertices, {model.n_modes} modes; scan `{args.case}` {args.scan} of {count:,} triangles; "
         f"{args.rounds} rounds, one BLAS thread.",
         "",
         "| method | CPU s, min | CPU s, median | wall s, min | wall s, median | NumPy version's CPU over its |",
