@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from shapespace.correspondence.config import CorrespondConfig
 
 from raw_blobs import marked, raw_blob
 from shapespace.batch.execution import ExecutionConfig
@@ -15,6 +14,7 @@ from shapespace.correspondence.groupwise import correspond
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.register import ElasticSettings
 from shapespace.correspondence.registration import RegistrationTask, RoundContext, ScanRegistration
+from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.correspondence.template import PoseModel, resample
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from shapespace.correspondence.config import CorrespondConfig
 
 import shapespace as ss
 from raw_blobs import LANDMARKS, RawBlob, dispersion_mm, marked, raw_blob
@@ -17,6 +16,7 @@ from shapespace.correspondence.landmark_guide import ScanLandmarks, consensus_la
 from shapespace.correspondence.mirror_image import MirrorMap
 from shapespace.correspondence.register import ElasticSettings
 from shapespace.correspondence.registration import RegistrationTask, RoundContext, ScanRegistration
+from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.correspondence.template import PoseModel, choose_template
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.closest import build_engine

@@ -487,11 +487,11 @@ def test_every_dependency_has_its_line_and_every_line_its_dependency() -> None:
         assert all(len(row) == 4 and all(row) for row in table)
 
 
-def test_every_plug_is_where_the_document_says_with_its_choices_and_its_test() -> None:
+def test_every_extension_point_is_where_the_document_says_with_its_choices_and_its_test() -> None:
     document = ROOT / "docs" / "extending.md"
-    table = rows(document, "The plugs")
-    for plug, home, choices, test in table:
-        (name,) = code_in(plug)
+    table = rows(document, "Extension points")
+    for point, home, choices, test in table:
+        (name,) = code_in(point)
         module = importlib.import_module(code_in(home)[0])
         assert sorted(code_in(choices)) == sorted(getattr(module, name)), f"{name} has other choices"
         assert "../tests/" in test
@@ -503,7 +503,7 @@ def test_every_plug_is_where_the_document_says_with_its_choices_and_its_test() -
         for node in ast.parse(file.read_text("utf-8")).body:
             if isinstance(node, ast.AnnAssign) and "Mapping[str, Callable" in ast.unparse(node.annotation):
                 found |= {node.target.id} if isinstance(node.target, ast.Name) else set()
-    assert found and found <= {code_in(row[0])[0] for row in table}, "a plug is missing from the table"
+    assert found and found <= {code_in(row[0])[0] for row in table}, "an extension point is missing from the table"
 
 
 def test_the_pages_of_commands_are_those_of_the_parser() -> None:

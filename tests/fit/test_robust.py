@@ -99,7 +99,10 @@ def test_compiled_comparison_of_vertices_is_that_of_plain_numpy(triangles: bool,
     target, vertex = ScanTarget(raw_scan(Z, NEAR, keep=-0.5).scan), np.arange(0, 600, 3, dtype=np.int32)
     surface, rotation = surface_at(0.5 * Z * blob_model().stddev), NEAR.rotation
     engine = target.engine if triangles else target.vertex_engine
-    found = match_vertices(target, engine, NEAR, surface, vertex, None, winding=winding, normal_cosine=0.4)
+    found = match_vertices(
+        target=target, engine=engine, T_scan_model=NEAR, surface=surface, vertex=vertex, near=None,
+        winding=winding, normal_cosine=0.4,
+    )  # fmt: skip
     near = engine.query(NEAR.apply(surface.vertices[vertex]))
     n = surface.normals[vertex]
     to_scan = surface.vertices[vertex] - NEAR.inverse().apply(near.points)

@@ -337,11 +337,11 @@ def test_twice_the_materials_of_an_obj_take_twice_the_work(tmp_path: Path) -> No
 def test_the_ceilings_are_those_that_are_documented() -> None:
     said = " ".join((Path(__file__).parents[2] / "docs" / "mesh-formats.md").read_text().split())
     for ceiling in (
-        f"mesh file up to {limits.LARGEST_MESH_FILE_BYTES >> 30} GiB",
-        f"landmark file up to {limits.LARGEST_LANDMARK_FILE_BYTES >> 20} MiB",
-        f"{MOST_FOR_A_BYTE} bytes of memory for each byte of the file, and {MOST_BESIDES >> 20} MiB besides",
-        f"more than {limits.GROWTH} times their bytes and {limits.SPARE_BYTES >> 20} MiB",
-        f"more than {limits.MOST_PARTS:,} parts",
+        f"mesh files up to {limits.LARGEST_MESH_FILE_BYTES >> 30} GiB",
+        f"landmark files up to {limits.LARGEST_LANDMARK_FILE_BYTES >> 20} MiB",
+        f"{MOST_FOR_A_BYTE} bytes of memory per byte of the file plus {MOST_BESIDES >> 20} MiB",
+        f"more than {limits.GROWTH} times their size and {limits.SPARE_BYTES >> 20} MiB",
+        f"files of more than {limits.MOST_PARTS:,} parts",
     ):
         assert ceiling in said
 

@@ -172,7 +172,7 @@ def test_a_run_that_was_stopped_goes_on_with_its_pass(tmp_path: Path, monkeypatc
                 raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):
-            large_components(table, 30, kept=kept, on_pass=stop)
+            large_components(table, 30, passes=kept, on_pass=stop)
         assert len(list(tmp_path.glob("pass-*.npz"))) == 3
         # A pass that is cut short is made again.
         third = tmp_path / "pass-003.npz"
@@ -186,7 +186,7 @@ def test_a_run_that_was_stopped_goes_on_with_its_pass(tmp_path: Path, monkeypatc
 
         monkeypatch.setattr(large_pca._Covariance, "__call__", counted)
         passes: list[int] = []
-        again = large_components(table, 30, kept=kept, on_pass=lambda number, share: passes.append(number))
+        again = large_components(table, 30, passes=kept, on_pass=lambda number, share: passes.append(number))
     assert np.array_equal(again.basis, undisturbed.basis)
     # Two of the passes were kept, and the last product is that of the residuals.
     assert len(products) == passes[-1] - 2 + 1

@@ -299,9 +299,9 @@ def test_what_is_chosen_is_chosen_on_people_that_were_not_trained_on(monkeypatch
     owner = {row.tobytes(): person for row, person in zip(z[:, :1], subjects, strict=True)}
     seen = []
 
-    def watched(X, y, test, *rest):
-        seen.append(({owner[row[:1].tobytes()] for row in X}, {owner[row[:1].tobytes()] for row in test}))
-        return original(X, y, test, *rest)
+    def watched(**given):
+        seen.append(tuple({owner[row[:1].tobytes()] for row in given[part]} for part in ("X", "test")))
+        return original(**given)
 
     original = predictions.predict_probabilities
     monkeypatch.setattr(predictions, "predict_probabilities", watched)

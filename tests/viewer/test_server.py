@@ -179,7 +179,7 @@ def test_the_oldest_fitted_scan_is_removed_and_a_waiting_one_at_once(
     start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("shapespace.viewer.uploaded_scans.cores", lambda: 1)
-    viewer = start(worker=agrees, kept=2)
+    viewer = start(worker=agrees, max_fits=2)
     user = viewer.user()
     keys = []
     for _ in range(3):
