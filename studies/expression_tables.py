@@ -36,7 +36,7 @@ def compare(maker: Maker) -> dict[str, float]:
     rows: list[tuple[object, ...]] = []
     accuracy: dict[str, float] = {}
     for name, approach in APPROACHES.items():
-        maker.told(name)
+        maker.on_part(name)
         learned = [approach(study.models[f], study.training(f)) for f in range(config.folds)]
         maker.features[name] = learned
         for relative in (False, True):
@@ -131,7 +131,7 @@ def automatic(maker: Maker, ceiling: Mapping[str, float]) -> dict[str, float]:
     by_neutral: dict[bool, evaluate.Predictions] = {}
     for relative in (False, True):
         folds = maker.additive_folds("known" if relative else "unknown")
-        maker.told("the classifier, by nested cross-validation")
+        maker.on_part("the classifier, by nested cross-validation")
         nested = evaluate.nested_predictions(folds, modes=(10, None), inner_folds=parts.inner_folds(folds))
         by_neutral[relative] = nested
         chosen = ", ".join(sorted({choice.classifier for choice in nested.chosen}))
@@ -162,7 +162,7 @@ def automatic(maker: Maker, ceiling: Mapping[str, float]) -> dict[str, float]:
         ]  # fmt: skip
     found = by_neutral[False]
     folds = maker.additive_folds("unknown")
-    maker.told("permutations")
+    maker.on_part("permutations")
     test = evaluate.permutation_test(_same_rows(folds), permutations=99)
     maker.parts += [
         parts.table(

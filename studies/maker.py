@@ -21,7 +21,7 @@ from shapespace.types import BoolArray, FloatArray, IntArray
 from simulated import StudyConfig
 from study_fits import Fits, model_path, person_path, read_fits
 
-Told = Callable[[str], None]
+OnPart = Callable[[str], None]
 TextArray = npt.NDArray[np.str_]
 
 HIGH = 0.75
@@ -114,9 +114,9 @@ class Study:
 class Maker:
     """The parts made so far, the targets that they answer, and folds of the fits."""
 
-    def __init__(self, study: Study, told: Told) -> None:
+    def __init__(self, study: Study, on_part: OnPart) -> None:
         self.study = study
-        self.told = told
+        self.on_part = on_part
         self.targets: list[Target] = []
         self.parts: list[Part] = []
         self.features: dict[str, list[Features]] = {}

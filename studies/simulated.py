@@ -29,7 +29,7 @@ from shapespace.fit.robust.robust_method import Robust
 from shapespace.fit.robust.robust_settings import Level
 from shapespace.geometry.mirror_plane import mirror_vertices, mirrored
 from shapespace.io.files import make_folder, read_bytes, write_bytes, write_text
-from shapespace.model.additive import AdditiveModel, Told
+from shapespace.model.additive import AdditiveModel, FitInformation
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 from study_fits import STATUSES, model_path, paper_path, person_path, stranger_path
@@ -152,7 +152,7 @@ def run_fits(folder: Path, config: StudyConfig, *, workers: int, on_progress: Pr
         FitError: a worker was stopped from outside.
         FileError: the folder cannot be written.
     """
-    told: Progress = on_progress or _untold
+    progress: Progress = on_progress or _no_progress
     run_jobs(
         [
             ("models", [(_make_model, (folder, config, fold)) for fold in range(config.folds)],
@@ -164,7 +164,7 @@ def run_fits(folder: Path, config: StudyConfig, *, workers: int, on_progress: Pr
              [stranger_path(folder, person) for person in range(config.strangers)]),
         ],
         workers=workers,
-        on_progress=told,
+        on_progress=progress,
     )  # fmt: skip
 
 
@@ -193,7 +193,7 @@ def run_jobs(stages: Sequence[Stage], *, workers: int, on_progress: Progress) ->
                 on_progress(what, done, len(jobs))
 
 
-def _untold(what: str, done: int, total: int) -> None:
+def _no_progress(what: str, done: int, total: int) -> None:
     pass
 
 
@@ -205,7 +205,7 @@ def _pool(workers: int) -> Executor:
 
 
 def _begin(folder: Path) -> None:
-    """Start a worker; it is told where ICT-FaceKit is, since its environment may be older than this process's."""
+    """Start a worker; it receives the place of ICT-FaceKit, since its environment may be older than this process's."""
     global _ict_folder
     _ict_folder = folder
     threadpool_limits(1)
@@ -375,7 +375,7 @@ def _fit_all(
     z, stddev = np.full((folds, n, k), np.nan), np.full((folds, n, k), np.nan)
     status = np.full((folds, n), -1, dtype=np.int32)
     error_mm, seconds = np.full(n, np.nan), np.full(n, np.nan)
-    told: dict[int, dict[int, Told]] = {fold: {} for fold in order}
+    information: dict[int, dict[int, FitInformation]] = {fold: {} for fold in order}
     for row, scan in enumerate(scans):
         T: Similarity | None = None
         for fold in order if taught is None or taught[row] else order[:1]:
@@ -393,14 +393,14 @@ def _fit_all(
             z[fold, row, shape.n_modes :], stddev[fold, row, shape.n_modes :] = 0.0, 1.0
             status[fold, row] = STATUSES.index(fitted.status)
             assert fitted.z_covariance is not None
-            told[fold][row] = models[fold].told(fitted.z, fitted.z_covariance)
+            information[fold][row] = models[fold].information(fitted.z, fitted.z_covariance)
             if T is None:
                 T = fitted.T_scan_model
                 seconds[row] = time.perf_counter() - since
                 if taught is not None:
                     away = T.apply(shape.reconstruct(fitted.b)) - scan.truth_vertices
                     error_mm[row] = float(np.linalg.norm(away, axis=1).mean()) / scan.T_scan_model.scale
-    tied = _tied(models, told, folds, n)
+    tied = _tied(models, information, folds, n)
     memory = io.BytesIO()
     np.savez(
         memory,
@@ -418,7 +418,7 @@ def _fit_all(
 
 
 def _tied(
-    models: Mapping[int, AdditiveModel], told: Mapping[int, Mapping[int, Told]], folds: int, scans: int
+    models: Mapping[int, AdditiveModel], information: Mapping[int, Mapping[int, FitInformation]], folds: int, scans: int
 ) -> dict[str, FloatArray]:
     """Return e beside the neutral scan, which is row 0, and e and a of all others together, by fold."""
     most_e = max(model.n_expression for model in models.values())
@@ -426,7 +426,7 @@ def _tied(
     beside, together = np.full((folds, scans, most_e), np.nan), np.full((folds, scans, most_e), np.nan)
     identity = np.full((folds, 1, most_a), np.nan)
     for fold, model in models.items():
-        known = told[fold]
+        known = information[fold]
         rows = [row for row in known if row != 0]
         if not rows:
             continue

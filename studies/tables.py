@@ -12,7 +12,7 @@ from typing import Any, cast
 import numpy as np
 
 from expression_tables import automatic, compare, where
-from maker import Maker, Study, Told
+from maker import Maker, OnPart, Study
 from people_tables import identity, strangers, transfer
 from shapespace.io.files import write_text
 from shapespace.recognise import evaluate
@@ -46,7 +46,7 @@ def make_tables(
     config: StudyConfig,
     *,
     seconds: Mapping[str, float],
-    on_part: Told | None = None,
+    on_part: OnPart | None = None,
     further: Sequence[Part] = (),
 ) -> Path:
     """Write recognition.json and what it shows, and return its path.
@@ -55,23 +55,23 @@ def make_tables(
         folder: of a study whose fits are done.
         config: its settings.
         seconds: what each part of the run took, for the record.
-        on_part: told what is made next.
+        on_part: called with what is made next.
         further: parts that follow, such as those of other shape spaces.
 
     Raises:
         FileError: files cannot be read or written.
         FileFormatError: a file of the study is damaged.
     """
-    told: Told = on_part or _untold
-    told("reading the fits")
+    on_part = on_part or _no_progress
+    on_part("reading the fits")
     study = Study.read(folder, config)
-    made = document(Maker(study, told), seconds, further)
+    made = document(Maker(study, on_part), seconds, further)
     path = folder / "recognition.json"
     write_text(path, json.dumps(made, indent=1, allow_nan=False) + "\n")
     return path
 
 
-def _untold(what: str) -> None:
+def _no_progress(what: str) -> None:
     pass
 
 
@@ -83,21 +83,21 @@ def seconds_of_study(seconds: Mapping[str, float]) -> float:
 def document(maker: Maker, seconds: Mapping[str, float], further: Sequence[Part]) -> dict[str, Any]:
     """Return recognition.json."""
     study, config = maker.study, maker.study.config
-    maker.told("the ceiling")
+    maker.on_part("the ceiling")
     most = ceiling(maker)
-    maker.told("the paper's experiment 1")
+    maker.on_part("the paper's experiment 1")
     paper(maker)
-    maker.told("six approaches")
+    maker.on_part("six approaches")
     compared = compare(maker)
-    maker.told("classifiers")
+    maker.on_part("classifiers")
     chosen = automatic(maker, most)
-    maker.told("where the decision lies")
+    maker.on_part("where the decision lies")
     where(maker)
-    maker.told("identity")
+    maker.on_part("identity")
     identity(maker)
-    maker.told("another generator")
+    maker.on_part("another generator")
     of_strangers = strangers(maker)
-    maker.told("transfer")
+    maker.on_part("transfer")
     transfer(maker)
     own = study.fits.status[study.fold, np.arange(len(study.fold))]
     counts = ", ".join(

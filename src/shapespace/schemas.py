@@ -425,7 +425,7 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
         area_share: area of its surface in correspondence beside that of the scan; well below 1 where the template lacks
             parts that the scan shows.
         distance_mean, distance_p95, distance_p99, distance_max: both ways, over what is seen and reached.
-        scale: its size beside the usual one, units told apart.
+        scale: its size beside the usual one, units distinguished.
         unit_ratio: how many times as large as in the unit of most scans its coordinates are, such as 0.001 for metres
             among millimetres.
         notes: sentences on what should be known.
@@ -543,7 +543,7 @@ class BySize(Struct, frozen=True, kw_only=True):
 class Quality(Struct, frozen=True, kw_only=True):
     """A quality.json: shares of the variance (0 to 1), and errors in mm, those that were measured.
 
-    What is not told apart is measured from surface to surface; `..._vertices` from each vertex to its own place.
+    Names without a suffix are measured from surface to surface; `..._vertices` from each vertex to its own place.
     `others` were measured on the same shapes and folds, and each has what it has more than this in `differences`.
     """
 

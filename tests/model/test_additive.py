@@ -115,7 +115,7 @@ def test_scans_of_one_person_together_tell_identity_better_than_one(model: Addit
         truth = np.concatenate([np.tile(a, (5, 1)), e], axis=1) @ model.rotation
         covariances = [covariance(rng, 0.5) for _ in truth]
         seen = np.stack([fitted(rng, t, C) for t, C in zip(truth, covariances, strict=True)])
-        found, shown = model.tie([model.told(z, C) for z, C in zip(seen, covariances, strict=True)])
+        found, shown = model.tie([model.information(z, C) for z, C in zip(seen, covariances, strict=True)])
         assert shown.shape == (5, EXPRESSIONS)
         single.append(np.abs(model.split(seen)[0] - a).mean())
         tied.append(np.abs(found - a).mean())
@@ -125,13 +125,13 @@ def test_scans_of_one_person_together_tell_identity_better_than_one(model: Addit
 def test_one_scan_tied_with_nothing_is_the_scan(model: AdditiveModel) -> None:
     rng = np.random.default_rng(4)
     z = rng.standard_normal(7)
-    a, e = model.tie([model.told(z, covariance(rng, 0.3))])
+    a, e = model.tie([model.information(z, covariance(rng, 0.3))])
     assert np.allclose(np.concatenate([a, e[0]]), np.concatenate(model.split(z)), atol=1e-8)
 
 
 def test_tying_is_the_least_squares_over_all_scans_at_once(model: AdditiveModel) -> None:
     rng = np.random.default_rng(6)
-    told = [model.told(rng.standard_normal(7), covariance(rng, 0.4)) for _ in range(3)]
+    told = [model.information(rng.standard_normal(7), covariance(rng, 0.4)) for _ in range(3)]
     for neutral in (None, [True, False, False]):
         blocks = [np.zeros((7, 4 + 3 * EXPRESSIONS)) for _ in told]
         for k, block in enumerate(blocks):
@@ -141,7 +141,7 @@ def test_tying_is_the_least_squares_over_all_scans_at_once(model: AdditiveModel)
         left, right = np.eye(4 + 3 * EXPRESSIONS), np.zeros(4 + 3 * EXPRESSIONS)
         left[4:, 4:] /= 3
         for B, one in zip(blocks, told, strict=True):
-            left, right = left + B.T @ one.precision @ B / 3, right + B.T @ one.pull / 3
+            left, right = left + B.T @ one.precision @ B / 3, right + B.T @ one.vector / 3
         wanted = np.linalg.solve(left, right)
         a, e = model.tie(told, neutral)
         assert np.allclose(a, wanted[:4]) and np.allclose(e.ravel(), wanted[4:])
@@ -154,7 +154,7 @@ def test_a_known_neutral_scan_frees_expressions_from_identity(model: AdditiveMod
         a, e = rng.standard_normal(4), rng.standard_normal(EXPRESSIONS)
         truths = np.stack([np.r_[a, np.zeros(EXPRESSIONS)], np.r_[a, e]]) @ model.rotation
         C = [covariance(rng, 0.5) for _ in truths]
-        told = [model.told(fitted(rng, t, c), c) for t, c in zip(truths, C, strict=True)]
+        told = [model.information(fitted(rng, t, c), c) for t, c in zip(truths, C, strict=True)]
         alone.append(np.abs(model.tie(told[1:])[1][0] - e).mean())
         beside.append(np.abs(model.tie(told, [True, False])[1][1] - e).mean())
     assert np.mean(beside) < 0.95 * np.mean(alone)
@@ -165,7 +165,7 @@ def test_what_a_robust_fit_knows_can_be_tied(world: World, model: AdditiveModel)
     one = fit_scan(model.shape, scan, FitConfig(unit="mm"), T_scan_model=Similarity.identity())
     assert one.z_covariance is not None
     assert np.allclose(np.sqrt(one.z_covariance.diagonal()) * model.shape.stddev, one.b_stddev, rtol=1e-6)
-    a, _ = model.tie([model.told(one.z, one.z_covariance)])
+    a, _ = model.tie([model.information(one.z, one.z_covariance)])
     assert np.allclose(a, model.split(one.z)[0], atol=1e-6)
     config = FitConfig(method="paper", unit="mm")
     assert fit_scan(model.shape, scan, config, T_scan_model=Similarity.identity()).z_covariance is None
@@ -219,9 +219,9 @@ def test_coefficients_of_another_number_are_refused(model: AdditiveModel) -> Non
     with pytest.raises(InputError, match="at most 4 finite coefficients of identity"):
         model.join_z(np.zeros(5), ())
     with pytest.raises(InputError, match=r"their \(7, 7\) covariance"):
-        model.told(np.zeros(7), np.ones(7))
+        model.information(np.zeros(7), np.ones(7))
     with pytest.raises(InputError, match="positive definite"):
-        model.told(np.zeros(7), np.zeros((7, 7)))
+        model.information(np.zeros(7), np.zeros((7, 7)))
     with pytest.raises(InputError, match="at least one estimate"):
         model.tie([])
 
@@ -300,6 +300,6 @@ def test_kin_are_left_out_together_when_variances_are_found(
 
 def test_the_same_scan_many_times_is_the_scan(model: AdditiveModel) -> None:
     rng = np.random.default_rng(9)
-    told = model.told(rng.standard_normal(7), covariance(rng, 0.4))
+    told = model.information(rng.standard_normal(7), covariance(rng, 0.4))
     once, often = model.tie([told]), model.tie([told] * 24)
     assert np.allclose(often[0], once[0]) and np.allclose(often[1], once[1])

@@ -45,7 +45,7 @@ _IDENTITY_VARIANCE, _EXPRESSION_VARIANCE = 0.995, 0.99
 _SURFACES = (".dense.ply", ".fitted.ply")
 _NAMED = 3  # names in a message, so that it stays short
 _LEAST_MM, _MOST_MM = 1.0, 3000.0
-"""Beyond this the largest extent of an object is likelier told in another unit."""
+"""Beyond this the largest extent of an object is more likely given in another unit."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,7 +161,7 @@ def build(
     loaded = on_disk if streamed else _read(on_disk, quiet=quiet)
     first = on_disk[0] if streamed else loaded[0]
     if listed.unit_ratios:
-        notes.append(listed.told_units(config.unit))
+        notes.append(listed.unit_note(config.unit))
     marks = SurfaceLandmarks() if parent is not None else _landmarks(files, records, first, config, notes)
     regions = {
         name: region_vertices(read_region(file), len(first.vertices), name) for name, file in config.regions.items()

@@ -132,7 +132,7 @@ def _corresponding(
     scans, notes = read.scans, read.notes
     marks.tell(say)
     if template is not None:
-        for sentence in _told_astray(template):
+        for sentence in _stray_landmarks_note(template):
             say(f"{template.name}: {sentence}")
     rounds = _Rounds(folder / _KEPT, files.execution, quiet=quiet)
     with telling_of_compiling(quiet=quiet), waiting("choosing the template", quiet=quiet):
@@ -292,7 +292,7 @@ def _looked_at(scan: Mesh, *, strict: bool) -> tuple[Mesh, list[str]]:
     """
     mesh, findings = repair(scan, strict=strict)
     notes = [f"{one.problem} {one.action}" for one in findings if one.level == "note" or NON_FINITE in one.problem]
-    return without_stray_landmarks(mesh), [*notes, *_told_astray(mesh)]
+    return without_stray_landmarks(mesh), [*notes, *_stray_landmarks_note(mesh)]
 
 
 def _far_notes(scan: Mesh, placed: SurfaceLandmarks) -> list[str]:
@@ -330,8 +330,8 @@ def _report_landmarks(records: Sequence[CorrespondRecord], read: _Read, say: _Sa
     say(f"{sentence}{after}.")
 
 
-def _told_astray(scan: Mesh) -> list[str]:
-    """Return a sentence on landmarks that are none of `scan`, where it has such."""
+def _stray_landmarks_note(scan: Mesh) -> list[str]:
+    """Return a sentence on landmarks that do not belong to `scan`, if there are any."""
     off = stray_landmarks(scan)
     if not off:
         return []
@@ -405,7 +405,7 @@ def _records(
         record = structs.replace(record, landmark_distances=read.landmark_distances.get(name, {}))
         if name in sizes:
             scale, ratio = map(float, sizes[name])
-            odd = [] if 1 / _OTHER_SIZE < scale < _OTHER_SIZE else [_told_size(scale)]
+            odd = [] if 1 / _OTHER_SIZE < scale < _OTHER_SIZE else [_size_note(scale)]
             record = structs.replace(record, scale=scale, unit_ratio=ratio, notes=[*record.notes, *odd])
         records.append(record)
     return _with_far_ones(records)
@@ -428,7 +428,7 @@ def _with_far_ones(records: Sequence[CorrespondRecord]) -> list[CorrespondRecord
     ]
 
 
-def _told_size(scale: float) -> str:
+def _size_note(scale: float) -> str:
     return f"It is {scale:.2g} times as large as most; look whether it is the same kind of object."
 
 

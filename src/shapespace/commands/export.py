@@ -46,7 +46,7 @@ def export(
         every: export all fits.
         table: write the coefficients of all fits to this file: FILE.csv, or FILE.mat for MATLAB.
         quiet: no progress.
-        say: told of what cannot be read; the rest is written.
+        say: called with what cannot be read; the rest is written.
 
     Raises:
         FileError: something cannot be written.

@@ -82,7 +82,7 @@ def fit_scans(
         folder: where results go.
         settings: how.
         quiet: no progress.
-        say: told what was not taken, and of each scan whose fit did not converge.
+        say: called with what was not taken, and of each scan whose fit did not converge.
 
     Raises:
         FileError: the model cannot be read, or the results not written.

@@ -170,7 +170,7 @@ def _meshes(folder: Path, notes: list[str], gauge: Gauge, *, quiet: bool) -> tup
     if gauge == "form":
         listed.refuse_mixed_units()
     if listed.unit_ratios:
-        notes.append(listed.told_units("mm"))
+        notes.append(listed.unit_note("mm"))
     files = list(listed.files)
     for ending in _SURFACES:
         if surfaces := [file for file in files if file.name.endswith(ending)]:

@@ -33,7 +33,7 @@ from shapespace.types import FloatArray
 def read_scans(path: Path, say: Callable[[str], None] = lambda _: None) -> list[ScanCoefficients]:
     """Return the fits in a folder that `fit` wrote, or in a coefficients.csv, in the order of their names or rows.
 
-    `say` is told of shards of a store that cannot be read; the fits in them are left out.
+    `say` is called for shards of a store that cannot be read; the fits in them are left out.
 
     Raises:
         FileError: it cannot be read.
@@ -127,7 +127,8 @@ def recognise_predict(
     """Write the classifier's answer for each fit in `results`; return the rows, and counts of what came out.
 
     The counts are `answered`, `unsure`, `doubtful` (unsure for the fit's sake), `failed` (the fit failed, or its
-    neutral face is missing) and `neutral` (faces that others are compared with). `say` is told of what cannot be read.
+    neutral face is missing) and `neutral` (faces that others are compared with). `say` is called with what cannot be
+    read.
 
     Raises:
         FileError: something cannot be read, or the answers not written.

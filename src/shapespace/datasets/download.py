@@ -32,7 +32,7 @@ def download(url: str, path: Path, bar: tqdm[Any], *, sha256: str | None = None,
     Args:
         url: where it is.
         path: where it goes.
-        bar: told of each block.
+        bar: updated after each block.
         sha256: what it must hash to, or None.
         size: in bytes, or None where it is not known.
 

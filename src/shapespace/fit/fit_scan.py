@@ -136,14 +136,14 @@ class FitConfig:
         # Not `asdict` of the whole: a method given by name has settings too.
         common = {name: getattr(self, name) for name in ("modes", "unit", "scale", "max_iterations", "seed", "dense")}
         method = self.fitting
-        # Options that are left out are not told, so that such fits are those of versions that did not know them.
+        # Options that are not set are not written, so that such records equal those of versions without them.
         if self.landmark_stddev_mm is not None:
             # JSON has no infinity.
             common["landmark_stddev_mm"] = self.landmark_stddev_mm if np.isfinite(self.landmark_stddev_mm) else "inf"
         if self.crop:
             common["crop"] = self.crop
         if self.region is not None:
-            common["region"] = self.region if isinstance(self.region, str) else _told_vertices(self.region)
+            common["region"] = self.region if isinstance(self.region, str) else _region_settings(self.region)
         if self.strict:
             common["strict"] = True
         return {
@@ -412,8 +412,8 @@ def _landmark_stddev_mm(
     return dict(zip(landmarks, np.sqrt(variance), strict=True))
 
 
-def _told_vertices(vertices: tuple[int, ...]) -> dict[str, Any]:
-    """Return what a record says of a region that no model has by name."""
+def _region_settings(vertices: tuple[int, ...]) -> dict[str, Any]:
+    """Return the entry of a record for a region that no model has by name."""
     numbers = np.array(vertices, dtype="<i8").tobytes()
     return {"vertices": len(vertices), "hash": hashlib.sha256(numbers).hexdigest()}
 

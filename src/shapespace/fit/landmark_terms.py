@@ -4,7 +4,7 @@ Each pulls its point of the model's surface with its standard deviation; that po
 its triangle, and so are its rows of the Jacobian. Matches count far more often than they know something
 new, which the posterior mends by a temperature; so that a landmark weighs what it is worth beside them, they are taken
 for as many observations as there are patches, and landmarks are weighed up by the same factor. While the matches still
-lie far apart landmarks lead the fit, and in the end, where matches are told to a fraction of a millimetre, they yield.
+lie far apart landmarks lead the fit, and in the end, where matches are known to a fraction of a millimetre, they yield.
 """
 
 from __future__ import annotations

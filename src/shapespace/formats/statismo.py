@@ -1,8 +1,8 @@
 """statismo and scalismo models in HDF5, and the tree of groups that both of their containers share.
 
 Dialects differ in how texts, attributes and sizes are stored, in whether a column of the basis is of length 1, and in
-where the points are; all are told apart by what the tree holds. A Morphable Model (Basel Face Model, scalismo-faces) is
-three such models in one: shape, colour, expression.
+where the points are; all are recognised by what the tree contains. A Morphable Model (Basel Face Model,
+scalismo-faces) is three such models in one: shape, colour, expression.
 """
 
 from __future__ import annotations

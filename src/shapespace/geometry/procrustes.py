@@ -162,8 +162,8 @@ def scale_to_tangent(shapes: FloatArray) -> None:
     """Scale each of the aligned `shapes` (N, V, 3) in place so that none varies along the mean.
 
     Shapes of one size lie on a sphere, so to second order they vary along its radius, which is what a scaling does to
-    the mean. In the tangent plane at the mean they are the same shapes, and no mode can be told from the scale of a
-    pose (Dryden and Mardia, Statistical Shape Analysis, 2016, section 4.4).
+    the mean. In the tangent plane at the mean they are the same shapes, and no mode can be separated from the scale of
+    a pose (Dryden and Mardia, Statistical Shape Analysis, 2016, section 4.4).
     """
     flat = shapes.reshape(len(shapes), -1)
     mean = flat.mean(axis=0)

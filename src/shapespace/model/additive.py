@@ -8,6 +8,7 @@ Knothe and Vetter, FG 2008, for the additive model of expressions.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,16 +43,18 @@ _LOCAL_MODES = 150  # local modes of identity that are added when the number of 
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
-    """What one fit told of [a; e], in standard deviations, its prior taken out.
+class FitInformation:
+    """The information of one fit on [a; e], in standard deviations, without its prior.
+
+    The precision and the information vector are the natural parameters of a normal distribution.
 
     Args:
         precision: (K, K) of the scan alone.
-        pull: (K,) precision @ what the scan alone would have.
+        vector: (K,) precision @ the estimate by the scan alone.
     """
 
     precision: FloatArray
-    pull: FloatArray
+    vector: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,8 +211,8 @@ class AdditiveModel:
         """Return the person of coefficients `z_of` (K,) with the expression of `z_expression` (K,), as a mesh in mm."""
         return self.mesh(self.split(z_of)[0], self.split(z_expression)[1])
 
-    def told(self, z: npt.ArrayLike, z_covariance: npt.ArrayLike) -> Told:
-        """Return what a fit told of identity and expression, for `tie`.
+    def information(self, z: npt.ArrayLike, z_covariance: npt.ArrayLike) -> FitInformation:
+        """Return the information of a fit on identity and expression, for `tie`.
 
         Args:
             z: (K,) coefficients, in standard deviations: `FitResult.z`.
@@ -229,9 +232,16 @@ class AdditiveModel:
         if values[0] <= 0:
             raise InputError("The covariance of coefficients must be positive definite.")
         known, turned = np.maximum(1.0 / values - 1.0, 0.0), self.rotation @ vectors
-        return Told((turned * known) @ turned.T, turned @ ((known + 1.0) * (vectors.T @ z)))
+        return FitInformation((turned * known) @ turned.T, turned @ ((known + 1.0) * (vectors.T @ z)))
 
-    def tie(self, told: Sequence[Told], neutral: Sequence[bool] | None = None) -> tuple[FloatArray, FloatArray]:
+    def told(self, z: npt.ArrayLike, z_covariance: npt.ArrayLike) -> FitInformation:
+        """Return `information`; the former name, for this release."""
+        warnings.warn("This method is now AdditiveModel.information.", DeprecationWarning, stacklevel=2)
+        return self.information(z, z_covariance)
+
+    def tie(
+        self, fits: Sequence[FitInformation], neutral: Sequence[bool] | None = None
+    ) -> tuple[FloatArray, FloatArray]:
         """Return one identity and the expressions of several scans of one person, by all their fits together.
 
         The normal equations are block-arrow, so a is solved for first and each e after it. What identity has outside
@@ -240,29 +250,29 @@ class AdditiveModel:
         of a neutral scan tied with it.
 
         Args:
-            told: what each fit told.
+            fits: the information of each fit.
             neutral: (n,) which scans are known to show the neutral face, with e = 0; None of them.
 
         Returns:
             a (Ka,) and e (n, Ke), in standard deviations.
 
         Raises:
-            InputError: no scans, or another number of words on neutral.
+            InputError: no scans, or another number of values of neutral.
         """
-        if not told or (neutral is not None and len(neutral) != len(told)):
+        if not fits or (neutral is not None and len(neutral) != len(fits)):
             raise InputError("Pass at least one estimate of a fit, and one value of neutral for each or none.")
-        k, share = self.n_identity, 1.0 / len(told)
+        k, share = self.n_identity, 1.0 / len(fits)
         left: FloatArray = np.eye(k)
         right: FloatArray = np.zeros(k)
         solves: list[FloatArray | None] = []
-        for number, one in enumerate(told):
-            precision, pull = share * one.precision, share * one.pull
-            left, right = left + precision[:k, :k], right + pull[:k]
+        for number, one in enumerate(fits):
+            precision, vector = share * one.precision, share * one.vector
+            left, right = left + precision[:k, :k], right + vector[:k]
             if neutral is not None and neutral[number]:
                 solves.append(None)
                 continue
             cross, own = precision[:k, k:], precision[k:, k:] + share * np.eye(self.n_expression)
-            solved = np.asarray(np.linalg.solve(own, np.column_stack([cross.T, pull[k:]])), dtype=np.float64)
+            solved = np.asarray(np.linalg.solve(own, np.column_stack([cross.T, vector[k:]])), dtype=np.float64)
             left, right = left - cross @ solved[:, :-1], right - cross @ solved[:, -1]
             solves.append(solved)
         a: FloatArray = np.asarray(np.linalg.solve(left, right), dtype=np.float64)

@@ -34,11 +34,11 @@ _CORNERS, _BARYCENTRIC, _DISTANCE = "landmark_corners", "landmark_barycentric", 
 _EVERY_MODEL = ("mean", "basis", "stddev", "faces", _RESIDUALS, _REGIONS, _CORNERS, _BARYCENTRIC, _DISTANCE)
 """What is not of one representation."""
 _UNIT_TOLERANCE = 1e-3  # length of a mode off 1; float32 rounding over millions of coordinates is smaller
-_TOLD = 200  # characters of a library's error that a message repeats
+_LONGEST_DETAIL = 200  # characters of a library's error that a message repeats
 _WHOLE_NUMBERS = ("faces", "control_counts", "degree", _REGIONS, _CORNERS)
 
 
-class _Told(Struct, frozen=True):
+class _FileAttributes(Struct, frozen=True):
     """The attributes that a reader needs, and their types."""
 
     total_variance: float
@@ -160,7 +160,7 @@ def load(path: Path) -> ModelFields:
             f"versions {_VERSION_OF_VERTICES} and {FORMAT_VERSION}; update shapespace."
         )
     try:
-        attributes_of_file = msgspec.convert(attributes, _Told)
+        attributes_of_file = msgspec.convert(attributes, _FileAttributes)
         vertices = msgspec.convert(plain_json(attributes_of_file.landmarks), dict[str, int])
         for name, array in arrays.items():
             if array.dtype != (np.int32 if name in _WHOLE_NUMBERS else np.float64):
@@ -190,5 +190,5 @@ def load(path: Path) -> ModelFields:
             "regions": _regions(attributes_of_file.regions, owned.get(_REGIONS)),
         }
     except (KeyError, ValueError) as error:
-        reason = str(error)[:_TOLD].replace("`", "").replace("Object missing", "missing")
+        reason = str(error)[:_LONGEST_DETAIL].replace("`", "").replace("Object missing", "missing")
         raise ModelFileError(f"{path} is a shapespace model but a part of it is missing or wrong: {reason}.") from error

@@ -1,12 +1,12 @@
 """How good a shape space is: compactness, generalisation and specificity over the number of modes, with intervals.
 
 Compactness is the share of the variance that the first modes hold. Generalisation is the error on shapes that the model
-did not see: in each fold poses, mean and modes are found anew without them, and each is told by the first modes in its
-best pose. Specificity is the distance of random shapes of the model from the nearest training shape. Davies, Twining,
-Cootes, Waterton and Taylor, TMI 21(5), 2002; Styner et al., IPMI 2003. Distances are told twice and never mixed:
-`vertices`, from each vertex to the one that corresponds, and `surface`, from vertices to the nearest point of the other
-surface, the mean of both directions: the first flatters shapes whose vertices slid (Ericsson and Karlsson, 2007), the
-second does not see it at all.
+did not see: in each fold poses, mean and modes are found anew without them, and each is reconstructed from the first
+modes in its best pose. Specificity is the distance of random shapes of the model from the nearest training shape.
+Davies, Twining, Cootes, Waterton and Taylor, TMI 21(5), 2002; Styner et al., IPMI 2003. Distances are given twice and
+never mixed: `vertices`, from each vertex to the one that corresponds, and `surface`, from vertices to the nearest point
+of the other surface, the mean of both directions: the first flatters shapes whose vertices slid (Ericsson and Karlsson,
+2007), the second does not see it at all.
 """
 
 from __future__ import annotations
@@ -153,8 +153,8 @@ class ModelQuality:
         if self.supported_modes is not None:
             modes = "1 mode" if self.supported_modes == 1 else f"{self.supported_modes} modes"
             sentences.append(
-                f"These {self.shapes} shapes support {modes}: with more, hidden vertices of unseen shapes are foretold "
-                "no better."
+                f"These {self.shapes} shapes support {modes}: with more, hidden vertices of unseen shapes are "
+                "predicted no better."
             )
         if self.by_shapes is not None and len(self.by_shapes.counts) > 1:
             sentences.append(_more_shapes(self.by_shapes, self.seed))
@@ -370,7 +370,7 @@ class Shapes:
         return _Nearest.of(_posed(self.space.model, self.trained, self.config), self.space.model.n_vertices)
 
     def parts(self) -> list[Part]:
-        """Return all parts of the work, in the order in which they are told."""
+        """Return all parts of the work, in the order of the output."""
         n, rng = len(self.meshes), np.random.default_rng(self.config.seed + 1)
         folds: list[Part] = []
         for fold in self.folds:

@@ -4,8 +4,8 @@ Modes are chosen to fit the training shapes, so the first variances are too larg
 Nonlinear shrinkage foretells from the spectrum alone what new shapes have (Ledoit and Wolf, Annals of Statistics 48(5),
 2020, section 4.5 for more coordinates than shapes). It takes shapes for independent, which mirror images and several
 expressions of one person are not. Where shapes were left out, what they have along modes made without them corrects it
-by a smooth factor of the rank. How far the factor may leave 1 is told by the same shapes (empirical Bayes: MacKay,
-Neural Computation 4(3), 1992), so that a few move it a little and many as far as they must.
+by a smooth factor of the rank. How far the factor may leave 1 is estimated from the same shapes (empirical Bayes:
+MacKay, Neural Computation 4(3), 1992), so that a few move it a little and many as far as they must.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def variances_of_new_shapes(
     """
     count = len(sample) if held_out is None else len(held_out.squares)
     spectrum = whole_spectrum(sample, total, n_shapes)
-    # Where shapes are not independent a single mode can be foretold absurdly, which its neighbours then correct.
+    # Where shapes are not independent a single mode can be predicted absurdly, which its neighbours then correct.
     bounded = np.clip(_shrunk(spectrum, n_shapes) / spectrum, *_BOUNDS) * spectrum
     variance = np.exp(isotonic_regression(np.log(bounded[:count]), increasing=False).x)
     if held_out is not None:

@@ -120,7 +120,7 @@ class KeptShapes:
             )
         try:
             arrays = read_arrays(path) or {}
-            header = json.loads(str(arrays["told"]))
+            header = json.loads(str(arrays["header"]))
             shape = arrays["template"].shape
             if len(shape) != 2 or shape[1] != 3 or arrays["reference"].shape != shape or arrays["sizes"].ndim != 1:
                 raise ValueError
@@ -152,7 +152,7 @@ class KeptShapes:
         arrays = {"template": self.template, "reference": self.reference, "sizes": self.sizes}
         optional = {"faces": self.faces, "alignment_vertices": self.alignment_vertices}
         there = {name: array for name, array in optional.items() if array is not None}
-        write_arrays(self.folder / _KEPT, {**arrays, **there, "told": np.array(json.dumps(header))})
+        write_arrays(self.folder / _KEPT, {**arrays, **there, "header": np.array(json.dumps(header))})
 
     def check(self) -> None:
         """Refuse shapes that have changed since they were kept.

@@ -67,7 +67,7 @@ def train_classifier(
     """Train a classifier on fitted scans with labels; return it with notes for the user.
 
     Failed and doubtful fits and scans without a label are left out and counted. Probabilities are calibrated on people
-    left out in turn (on scans left out where no people are named), which also gives the accuracy that is told.
+    left out in turn (on scans left out where no people are named), which also gives the accuracy that is reported.
 
     Args:
         scans: with labels, and for `relative` with subjects.

@@ -174,7 +174,7 @@ def nested_predictions(
         inner_folds: folds of the training people.
         seed: of the inner folds and the classifiers.
         modes: numbers of leading modes to choose from; None is all.
-        on_fold: told of folds done and their number.
+        on_fold: called with the number of folds done and of all.
 
     Raises:
         InputError: no folds, an unknown classifier, too few people, or a class in too few of them.

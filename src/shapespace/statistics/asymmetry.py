@@ -3,7 +3,7 @@
 Klingenberg, Barluenga and Meyer, Evolution 56(10), 2002; Mardia, Bookstein and Moreton, Biometrika 87(2), 2000;
 Klingenberg, Symmetry 7(2), 2015. Every shape and its mirror image in correspondence are superimposed together. Half
 their sum is the symmetric part of a shape, half their difference the asymmetric one; here the whole difference is
-told, which is how far the sides are apart.
+given, which is how far the sides are apart.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ class SurfaceFiles:
     unit_ratios: Mapping[Path, float]
     notes: tuple[str, ...]
 
-    def told_units(self, unit: str) -> str:
+    def unit_note(self, unit: str) -> str:
         """Return in a sentence which files are in another unit, and that they are brought to that of most."""
         return f"{self._others()}; they are brought to that of most, which is taken for {unit}."
 

@@ -1,8 +1,7 @@
 """Projection of a fitted surface onto the span of the model.
 
-A surface that was met beside the model is told by the model's own coefficients, so it is projected. Plain least squares
-send faint modes, and modes that lie nearly inside the motions of the pose, anywhere to win a hair; weighed by the prior
-they stay where they are plausible.
+A surface outside the span of the model is projected onto it. Ordinary least squares would give weak modes, and modes
+close to motions of the pose, large coefficients for a negligible gain; the prior keeps them plausible.
 """
 
 from __future__ import annotations

@@ -60,7 +60,7 @@ class Spill:
             raise
 
     def _reserve(self, size: int) -> None:
-        # A disk that is too small is told now, and not after an hour.
+        # A disk that is too small is reported now, and not after an hour.
         if hasattr(os, "posix_fallocate") and size:
             os.posix_fallocate(self._file.fileno(), 0, size)
         else:

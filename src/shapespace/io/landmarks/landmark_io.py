@@ -55,8 +55,8 @@ def read_landmarks(path: Path | str) -> dict[str, FloatArray]:
     their points.
 
     Args:
-        path: a file with one of the endings in `LANDMARK_FORMATS` or `READ_ONLY_LANDMARKS`; `.json` is told
-            apart by its content.
+        path: a file with one of the endings in `LANDMARK_FORMATS` or `READ_ONLY_LANDMARKS`; the kind of a
+            `.json` is determined from its content.
 
     Returns:
         name -> (3,) float64, in the file's order.

@@ -162,7 +162,7 @@ class Turning:
         poster: the still.
         caption: of both.
         label: what it is, for screen readers.
-        still: what the still shows, told with it alone.
+        still: what the still shows, printed with it alone.
     """
 
     widget: Literal["modes", "morph", "fit", "scatter"]
@@ -296,7 +296,7 @@ def text_table(heads: Sequence[str], rows: Sequence[Sequence[str]], caption: str
 
 
 def facts_of(values: Mapping[str, object], caption: str) -> Facts:
-    """Return settings or measures by name, those with parts told by the parts that are plain."""
+    """Return settings or measures by name, those with parts by their plain parts."""
     from shapespace.report.blocks.wording import setting, words
 
     return Facts([(words(key), setting(value)) for key, value in values.items()], caption)

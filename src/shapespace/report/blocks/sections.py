@@ -334,7 +334,7 @@ def region_shares(fit: StagedFit) -> str:
 
 def fit_facts(fit: SavedFit) -> list[Block]:
     """Return status, reason, distances and notes of one fit, and its evidence folded away."""
-    out: list[Block] = [Verdict(status(fit.status), fit.reason), Text(distances_told(fit))]
+    out: list[Block] = [Verdict(status(fit.status), fit.reason), Text(distances_text(fit))]
     if fit.record.notes:
         out.append(Notes(fit.record.notes))
     if fit.record.evidence:
@@ -342,7 +342,7 @@ def fit_facts(fit: SavedFit) -> list[Block]:
     return out
 
 
-def distances_told(fit: SavedFit) -> str:
+def distances_text(fit: SavedFit) -> str:
     """Return the mean distances of one fit both ways, what they are over, and the shares seen."""
     to_scan, to_model = mm(fit.distance_mm("model_to_scan")), mm(fit.distance_mm("scan_to_model"))
     overlap = fit.record.shown

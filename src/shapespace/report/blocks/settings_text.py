@@ -23,7 +23,7 @@ _LEVEL_HEADS = (
 )  # fmt: skip
 
 
-def settings_told(configs: Sequence[Mapping[str, Any]], first: Sequence[tuple[str, str]]) -> list[Block]:
+def settings_blocks(configs: Sequence[Mapping[str, Any]], first: Sequence[tuple[str, str]]) -> list[Block]:
     """Return what fits ran with: choices as sentences, and the numbers of the method folded away.
 
     Args:

@@ -7,7 +7,7 @@
     result = ss.fit_scan(model, scan)
     figures.signed_maps(StagedFit.of(model, result)).savefig("distances.png")
 
-Pictures of one row share camera and light, one figure has one scale, and the maps can be told apart by colour-blind
+Pictures of one row share camera and light, one figure has one scale, and the maps are distinguishable for colour-blind
 readers. Importing this package needs the extra `report`.
 """
 

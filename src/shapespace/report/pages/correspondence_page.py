@@ -71,7 +71,7 @@ class CorrespondencePage:
 
     Args:
         folder: that `shapespace correspond` wrote.
-        on_step: told of each picture, and of each scan that is read.
+        on_step: called after each picture and each scan that is read.
 
     Raises:
         FileError: correspondence.json or the mean shape cannot be read.
@@ -93,7 +93,7 @@ class CorrespondencePage:
         self.out = [*self.result.set_aside, *(self.result.records[name] for name in self.all.unread)]
         self._cards = {record.name: self.page.anchor(f"scan-{record.name}") for record in self._carded()}
 
-    # What is told of each
+    # Facts of each
 
     def share(self, record: CorrespondRecord, which: str) -> float:
         """Return a distance of a record as a share of the object's size."""

@@ -31,7 +31,7 @@ from shapespace.report.blocks.blocks import (
     status,
     text_table,
 )
-from shapespace.report.blocks.settings_text import settings_told
+from shapespace.report.blocks.settings_text import settings_blocks
 from shapespace.report.blocks.wording import DASH, STATUS_WORDS, counted, isfinite, listed, mm, printable
 from shapespace.report.inputs.fit_labels import find_labels, with_label
 from shapespace.report.inputs.saved_fits import (
@@ -75,7 +75,7 @@ class FolderPage:
         fits: found there, one or more.
         model: the model's file, or None to go by the records.
         labels: a table of labels, or None to look for one.
-        on_step: told of each picture.
+        on_step: called after each picture.
     """
 
     def __init__(
@@ -476,7 +476,7 @@ class FolderPage:
         ]
         heads = ("Fit", "Scan", "Hash of the scan", "Hash of the model")
         hashes = text_table(heads, files, "Content hashes of the files that took part")
-        return [*settings_told(configs, rows), Folded("Content hashes (SHA-256)", [hashes])]
+        return [*settings_blocks(configs, rows), Folded("Content hashes (SHA-256)", [hashes])]
 
 
 def _main_fits(fits: Sequence[SavedFit]) -> list[SavedFit]:

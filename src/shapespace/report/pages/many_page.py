@@ -68,7 +68,7 @@ class ManyPage(FolderPage):
         results: of it.
         model: the model's file, or None to go by the records.
         labels: a table of labels, or None to look for one.
-        on_step: told of each picture.
+        on_step: called after each picture.
 
     Raises:
         InputError: none of the fits can be read.
@@ -270,7 +270,7 @@ class ManyPage(FolderPage):
         from shapespace.report import figures
 
         people, trusted = self.population, self.population.trusted
-        # What is said of errors is said of trusted fits; how many are not is told beside it.
+        # Errors are of trusted fits; the number of the others is given beside them.
         measures = {words: np.where(trusted, people.measures[key], np.nan) for key, words in MEASURES.items()}
         error = next(iter(MEASURES.values()))
         if column.kind == "level":

@@ -26,7 +26,7 @@ _SHELL_BYTES = 250_000  # bytes of scripts and styles of a page
 _RESERVE_BYTES = 700_000  # bytes that stay free for tables and text after the last picture
 
 Step = Callable[[str, int], None]
-"""Told what was just made, and about how many such things there will be, for a progress bar."""
+"""Called with what was just made and about how many such things there will be, for a progress bar."""
 
 Make: TypeAlias = Callable[[], Block | Sequence[Block]]
 """Makes a part of a page."""

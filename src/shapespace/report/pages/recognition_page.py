@@ -74,7 +74,7 @@ def study_page(folder: Folder, parts_file: PartsFile, on_step: Step | None = Non
     Args:
         folder: with its file.
         parts_file: which of them it is.
-        on_step: told of each picture.
+        on_step: called after each picture.
 
     Raises:
         FileError: the file cannot be read.

@@ -349,7 +349,7 @@ def _surfels(layer: Layer, camera: Camera, size: tuple[int, int], supersample: i
 def squares(along: npt.NDArray[np.floating[Any]], across: npt.NDArray[np.floating[Any]]) -> _Single:
     """Return square codes (n,) of a checkerboard: 0 for every second square, the others 1, 2, ... in turn.
 
-    Those nearest to each other differ, also two columns or rows apart, so that a square is told from the next ones.
+    Those nearest to each other differ, also two columns or rows apart, so that neighbouring squares are visible.
 
     Args:
         along: (n,) where the points lie in one direction, a square being 1 wide.
@@ -388,7 +388,7 @@ def _balls(layer: Layer, camera: Camera, size: tuple[int, int], supersample: int
     if surface is not None:
         view_directions = (surface @ _view_axes(camera.yaw_deg, camera.pitch_deg).T).astype(np.float32)
         view_directions *= np.where(view_directions[:, 2:] < 0, np.float32(-1), np.float32(1))
-        # A little of the ball is kept, by which a cloud is told from a closed surface.
+        # A little of the ball is kept, which distinguishes a cloud from a closed surface.
         normal = np.ascontiguousarray(_unit((view_directions[owner].T + 0.35 * normal).astype(np.float32)))
     scalar = (np.zeros(0) if layer.scalars is None else layer.scalars[owner]).astype(np.float32)
     depth_mm = nearest[pixel].astype(np.float32)

@@ -14,7 +14,7 @@ from shapespace.fit.paper.paper_method import Paper
 from shapespace.fit.robust.robust_settings import DenseSettings, ResidualSettings, RobustSettings
 from shapespace.report.blocks.blocks import Block, Facts, Folded, Table
 from shapespace.report.blocks.evidence_text import EVIDENCE, evidence_facts
-from shapespace.report.blocks.settings_text import described, settings_told
+from shapespace.report.blocks.settings_text import described, settings_blocks
 from synthetic_shapes import blob_model, raw_scan
 
 
@@ -35,7 +35,7 @@ def config(**settings: Any) -> Mapping[str, Any]:
 
 
 def test_choices_are_sentences_and_numbers_say_what_they_are() -> None:
-    words = told(settings_told([config(dense=True)], [("Report", "shapespace")]))
+    words = told(settings_blocks([config(dense=True)], [("Report", "shapespace")]))
     assert "Unit of the scans: found from the size of each scan" in words
     assert "Method: robust: what does not match the model is left out" in words
     assert "beyond share | 0.2 | it follows when what the model leaves is this share" in words
@@ -44,7 +44,7 @@ def test_choices_are_sentences_and_numbers_say_what_they_are() -> None:
 
 
 def test_what_differs_between_fits_is_said() -> None:
-    words = told(settings_told([config(), config(unit="cm", max_iterations=9)], []))
+    words = told(settings_blocks([config(), config(unit="cm", max_iterations=9)], []))
     assert "found from the size of each scan; of others: cm, as given" in words
     assert "at most 500 in each phase; of others: at most 9 in each phase" in words
     assert "dense stage" not in words.replace("Dense stage: not made", "")
@@ -58,7 +58,7 @@ def test_every_number_is_described(settings: type) -> None:
 
 @pytest.mark.parametrize("damaged", [{}, {"method": 3}, {"method": "robust", "robust": 7}, {"robust": {"levels": [1]}}])
 def test_damaged_settings_break_nothing(damaged: Mapping[str, Any]) -> None:
-    assert "Method" in told(settings_told([damaged, config()], []))
+    assert "Method" in told(settings_blocks([damaged, config()], []))
 
 
 def test_all_that_the_verdict_goes_by_is_told_in_words() -> None:
