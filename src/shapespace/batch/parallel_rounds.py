@@ -15,7 +15,7 @@ from shapespace.batch.executors import Serial
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.landmark_guide import ScanLandmarks
 from shapespace.correspondence.register import ElasticSettings
-from shapespace.correspondence.registration import RegistrationTask, RoundContext, ScanRegistration
+from shapespace.correspondence.registration import Comparison, RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.template import PoseModel
 from shapespace.errors import FileError
 from shapespace.io.containers.archives import read_arrays
@@ -93,10 +93,14 @@ class _FileTask:
     index: int
     pose_model: int
     settings: ElasticSettings
+    mirrored: bool
+    sides: Comparison
 
     @staticmethod
     def of(task: RegistrationTask, file: Path) -> _FileTask:
-        return _FileTask(file, _task_arrays(task), task.index, task.pose_model, task.settings)
+        return _FileTask(
+            file, _task_arrays(task), task.index, task.pose_model, task.settings, task.mirrored, task.sides
+        )
 
     def task(self) -> RegistrationTask:
         arrays = self.arrays
@@ -110,6 +114,8 @@ class _FileTask:
             settings=self.settings,
             pose_model=self.pose_model,
             landmarks=_landmarks_of(arrays),
+            mirrored=self.mirrored,
+            sides=self.sides,
         )
 
 
@@ -237,7 +243,8 @@ def _shared_hash(context: RoundContext, pose_model: PoseModel) -> str:
 
 
 def _key(task: RegistrationTask, shared: str) -> str:
-    return content_hash(_task_arrays(task), {"shared": shared, "settings": str(task.settings), "version": __version__})
+    settings = f"{task.settings} {task.mirrored} {task.sides}"
+    return content_hash(_task_arrays(task), {"shared": shared, "settings": settings, "version": __version__})
 
 
 def _write(file: Path, placed: ScanRegistration) -> None:
@@ -246,7 +253,8 @@ def _write(file: Path, placed: ScanRegistration) -> None:
         result: Arrays = {
             "vertices": one.vertices, "observed": one.observed, "covered": np.array(one.covered),
             "distance": np.array(one.distance), "cpu_s": np.array(one.cpu_s), "reason": np.array(one.reason),
-            "mirror_ratio": np.array(one.mirror_ratio), "posed_by_landmarks": np.array(one.posed_by_landmarks),
+            "mirrored": np.array(one.mirrored), "scores": np.array(one.scores),
+            "posed_by_landmarks": np.array(one.posed_by_landmarks),
             **_pose_arrays(one.T_scan_template),
         }  # fmt: skip
         arrays |= {f"{name}_{number}": array for name, array in result.items()}
@@ -279,6 +287,7 @@ def _read_one(stored: Mapping[str, npt.NDArray[Any]], number: int, index: int) -
         distance=(mean, p95, p99, largest),
         cpu_s=float(of("cpu_s")),
         reason=str(of("reason")),
-        mirror_ratio=float(of("mirror_ratio")),
+        mirrored=bool(of("mirrored")),
+        scores=(float(of("scores")[0]), float(of("scores")[1])),
         posed_by_landmarks=bool(of("posed_by_landmarks")),
     )

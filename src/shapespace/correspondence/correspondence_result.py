@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from shapespace.geometry.mirror_plane import FLIP
 from shapespace.lazy import lazy_import
 from shapespace.reprs import short_repr
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity, SurfaceLandmarks
@@ -20,7 +21,8 @@ class Corresponding:
         reason: why it is excluded; empty where it is not.
         vertices: (V, 3) in the scan's own frame and unit, finite everywhere: where the scan shows nothing they are
             estimates, the conditional means given the observed vertices; None if excluded.
-        T_scan_template: to the scan's own frame; None where no pose was found.
+        T_scan_template: to the scan's own frame, or to that of its mirror image; None where no pose was found.
+        mirrored: whether the scan is a mirror image of the majority; `vertices` are in its own frame nevertheless.
         seen: share of the template's vertices that the scan observes.
         covered: share of the scan that the template covers.
         distance: (4,) mean, 95 %, 99 % and largest distance both ways over the overlap, in the scan's unit.
@@ -42,6 +44,7 @@ class Corresponding:
     seconds: tuple[float, ...] = ()
     landmarks: float = np.nan
     observed: BoolArray | None = None
+    mirrored: bool = False
 
     __repr__ = short_repr
 
@@ -56,6 +59,8 @@ class Correspondence:
         why: where the first template came from, in a sentence.
         moved: RMS movement in each round, share of the size.
         landmarks: the landmarks that scans have, on each of the surfaces.
+        sides_decided: whether scans could be distinguished from their mirror images; False for a symmetric object,
+            and where they were not compared.
     """
 
     template: Mesh
@@ -63,6 +68,7 @@ class Correspondence:
     why: str
     moved: tuple[float, ...]
     landmarks: SurfaceLandmarks = field(default_factory=SurfaceLandmarks)
+    sides_decided: bool = False
 
     __repr__ = short_repr
 
@@ -72,9 +78,14 @@ class Correspondence:
     def meshes(self) -> list[Mesh]:
         """Return the complete surfaces of scans that are not excluded, in their own frames, with `Mesh.observed`.
 
-        They have the landmarks in whose triangles all vertices are observed.
+        They have the landmarks in whose triangles all vertices are observed. Surfaces of mirrored scans are reflected
+        at the plane x = 0 of their frame, so that all are of one side.
         """
-        return [self._mesh(scan, scan.vertices) for scan in self.scans if scan.vertices is not None]
+        return [
+            self._mesh(scan, scan.vertices * (FLIP if scan.mirrored else 1.0))
+            for scan in self.scans
+            if scan.vertices is not None
+        ]
 
     def _mesh(self, scan: Corresponding, vertices: FloatArray) -> Mesh:
         observed = np.ones(len(vertices), dtype=np.bool_) if scan.observed is None else scan.observed

@@ -16,18 +16,20 @@ from typing import Protocol
 
 import numpy as np
 
+from shapespace.correspondence.chirality import Sides, mirror_image, solve_sides
 from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
 from shapespace.correspondence.first_template import FirstTemplate, first_template
 from shapespace.correspondence.guide import ShapePredictor, predict_leave_one_out
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.landmark_guide import ScanLandmarks, consensus_landmarks
 from shapespace.correspondence.mirror_image import MirrorMap
-from shapespace.correspondence.registration import RegistrationTask, RoundContext, ScanRegistration
+from shapespace.correspondence.registration import Comparison, RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.scan_set import unit_ratios
 from shapespace.correspondence.settings import FEWEST, SIZE, CorrespondConfig
-from shapespace.correspondence.template import PoseModel
-from shapespace.errors import InputError
+from shapespace.correspondence.template import PoseModel, clean_scan
+from shapespace.errors import InputError, ShapespaceError
 from shapespace.geometry.landmark_placement import place_landmarks
+from shapespace.geometry.mirror_plane import FLIP
 from shapespace.geometry.procrustes import align_to_weighted_mean
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.interop import as_meshes
@@ -41,9 +43,7 @@ _PARTS = 4  # folds of the shapes: the pose model of a scan is built without it
 _WHOLE, _LEAST_SPREAD, _SIZE_UNSEEN = 0.9, 0.01, 0.3
 """Scans that observe more than this share of the template determine the usual size; the least standard deviation of
 log sizes; and that of a scan's own log size for each share that is missing."""
-_MIRRORED = 0.85
-"""A scan whose mirror image lies nearer to the template, by this ratio, is mirrored: of 60 faces, femora and spleens
-that were not mirrored none had less than 0.88."""
+_ANCHORS = 2  # scans that all others are compared with, beside the template
 
 
 class Runner(Protocol):
@@ -86,7 +86,8 @@ def correspond(
     config = config or CorrespondConfig()
     first = first or first_template(scans, template, config, model)
     problem = _Problem.of([scan.name for scan in scans], first, config)
-    state = _initial_state(problem)
+    problem, sides = _with_sides(problem, run, may_reflect=template is None and model is None)
+    state = _initial_state(problem, sides)
     for _ in range(config.rounds):
         registrations = run(_context(problem, state), [_task(problem, state, i) for i in problem.first.repaired])
         state = _next_state(problem, state, registrations)
@@ -119,9 +120,14 @@ class _Problem:
         mirror = MirrorMap.of(first.mesh, harmonics, config.first, config.seed) if config.symmetric else None
         return _Problem(names, first, config, harmonics, mirror)
 
-    def landmarks(self, places: SurfaceLandmarks, i: int) -> ScanLandmarks | None:
-        """Return the landmarks of scan `i` that the template has at `places`."""
-        return ScanLandmarks.shared(places, self.first.repaired[i], self.config.landmark_uncertainty)
+    def scan(self, i: int, *, mirrored: bool) -> Mesh:
+        """Return scan `i`, or its mirror image."""
+        scan = self.first.repaired[i]
+        return mirror_image(scan) if mirrored else scan
+
+    def landmarks(self, places: SurfaceLandmarks, scan: Mesh) -> ScanLandmarks | None:
+        """Return the landmarks of `scan` that the template has at `places`."""
+        return ScanLandmarks.shared(places, scan, self.config.landmark_uncertainty)
 
 
 @dataclass(frozen=True)
@@ -149,6 +155,7 @@ class RegistrationState:
         registrations: of the scans that are not excluded, by their number.
         excluded: the reason for each other scan.
         predictions: (V, 3) where the registration of a scan begins in the next round.
+        sides: of all scans, by the comparisons before the first round.
         rounds: one record for each round so far.
     """
 
@@ -157,7 +164,14 @@ class RegistrationState:
     registrations: Mapping[int, ScanRegistration]
     excluded: Mapping[int, str]
     predictions: Mapping[int, FloatArray]
+    sides: Sides
     rounds: tuple[RoundRecord, ...]
+
+    def is_mirrored(self, i: int) -> bool:
+        """Return whether scan `i` is a mirror image of the majority, as far as is known."""
+        if i in self.registrations:
+            return self.registrations[i].mirrored
+        return bool(self.sides.mirrored[i])
 
     def shapes(self, order: Sequence[int]) -> tuple[FloatArray, FloatArray]:
         """Return the vertices (N, V, 3) of scans in the template's frame, and (N, V) 1.0 where they are observed."""
@@ -165,9 +179,55 @@ class RegistrationState:
         return shapes, np.stack([self.registrations[i].observed for i in order]).astype(np.float64)
 
 
-def _initial_state(problem: _Problem) -> RegistrationState:
-    mesh = problem.first.mesh
-    return RegistrationState(mesh, place_landmarks(mesh, mesh.landmarks), {}, dict(problem.first.broken), {}, ())
+def _initial_state(problem: _Problem, sides: Sides) -> RegistrationState:
+    mesh, broken = problem.first.mesh, dict(problem.first.broken)
+    return RegistrationState(mesh, place_landmarks(mesh, mesh.landmarks), {}, broken, {}, sides, ())
+
+
+# Sides
+
+
+def _with_sides(problem: _Problem, run: Runner, *, may_reflect: bool) -> tuple[_Problem, Sides]:
+    """Return the sides of all scans, and the problem with its template on the side of the majority.
+
+    Args:
+        problem: the scans and the first template.
+        run: does the comparisons.
+        may_reflect: whether the template may be reflected; otherwise its side is that of the majority.
+    """
+    count = len(problem.names)
+    unknown = Sides(np.zeros(count, np.bool_), np.zeros(count), decided=False)
+    if problem.config.mirror == "never" or problem.config.symmetric:
+        return problem, unknown
+    context = _context(problem, _initial_state(problem, unknown))
+    anchors = {-1: context.pose_models[0]} | _anchors(problem)
+    scores = np.full((len(anchors), count, 2), np.nan)
+    for row, pose_model in zip(scores, anchors.values(), strict=True):
+        tasks = [
+            RegistrationTask(i, scan, None, None, problem.config.first, sides="scores")
+            for i, scan in problem.first.repaired.items()
+        ]
+        for compared in run(replace(context, pose_models=(pose_model,)), tasks):
+            row[compared.index] = compared.scores
+    sides = solve_sides(scores, list(anchors), problem.config.seed)
+    if may_reflect and sides.decided and sides.mirrored.sum() > len(problem.first.repaired) / 2:
+        first = replace(problem.first, mesh=mirror_image(problem.first.mesh))
+        usable = np.isin(np.arange(count), list(problem.first.repaired))
+        return _Problem.of(problem.names, first, problem.config), replace(sides, mirrored=usable & ~sides.mirrored)
+    return problem, sides
+
+
+def _anchors(problem: _Problem) -> dict[int, PoseModel]:
+    """Return the pose models of some scans that can be templates, by their number."""
+    anchors: dict[int, PoseModel] = {}
+    for i in np.random.default_rng(problem.config.seed).permutation(list(problem.first.repaired)).tolist():
+        if len(anchors) == _ANCHORS:
+            break
+        try:
+            anchors[i] = PoseModel.of(clean_scan(problem.first.repaired[i]))
+        except ShapespaceError:
+            continue
+    return anchors
 
 
 # What a round does
@@ -193,15 +253,26 @@ def _part(i: int) -> int:
 def _task(problem: _Problem, state: RegistrationState, i: int) -> RegistrationTask:
     """Return the task of scan `i` in the next round; an excluded scan is searched for in all poses."""
     known, config = i in state.registrations, problem.config
+    mirrored = state.is_mirrored(i)
+    scan = problem.scan(i, mirrored=mirrored)
     return RegistrationTask(
         index=i,
-        scan=problem.first.repaired[i],
+        scan=scan,
         T_scan_template=_pose_with_usual_size(state, i) if known else None,
         expected=state.predictions.get(i) if known else None,
         settings=config.next if known else config.first,
         pose_model=_part(i) if len(state.registrations) >= ENOUGH_TO_JUDGE else 0,
-        landmarks=problem.landmarks(state.landmarks, i),
+        landmarks=problem.landmarks(state.landmarks, scan),
+        mirrored=mirrored,
+        sides=_comparison(problem, state),
     )
+
+
+def _comparison(problem: _Problem, state: RegistrationState) -> Comparison:
+    """Return how scans are compared with their mirror images in the next round."""
+    if problem.config.mirror == "never" or problem.config.symmetric:
+        return "as given"
+    return "both" if state.sides.decided and state.rounds else "one"
 
 
 def _pose_with_usual_size(state: RegistrationState, i: int) -> Similarity:
@@ -238,6 +309,7 @@ def _next_state(
     state = _exclude_outliers(problem, state, sure)
     state = _resolve_alternatives(problem, state)
     state = _exclude_outliers(problem, state, list(state.registrations))
+    state = _exclude_mirrored(problem, state)
     if len(state.registrations) < FEWEST:
         reasons = "; ".join(f"{problem.names[i]}: {reason}" for i, reason in list(state.excluded.items())[:3])
         raise InputError(
@@ -255,22 +327,17 @@ def _accept(problem: _Problem, previous: RegistrationState, ended: Sequence[Scan
     excluded = dict(problem.first.broken)
     for registration in ended:
         i = registration.index
-        if reason := _exclusion_reason(problem.config, registration, first=i not in previous.registrations):
+        if reason := _exclusion_reason(problem.config, registration):
             excluded[i] = reason
         else:
             registrations[i] = registration
     return replace(previous, registrations=registrations, excluded=excluded)
 
 
-def _exclusion_reason(config: CorrespondConfig, registration: ScanRegistration, *, first: bool) -> str:
-    """Return why a registration is not used; empty if it is. `first`: its pose was searched for in this round."""
+def _exclusion_reason(config: CorrespondConfig, registration: ScanRegistration) -> str:
+    """Return why a registration is not used; empty if it is."""
     if registration.reason:
         return registration.reason
-    if first and not config.symmetric and registration.mirror_ratio < _MIRRORED:
-        return (
-            f"mirrored: its mirror image lies {registration.mirror_ratio:.2f} times as far from the template as "
-            "itself; turn it over, or do such scans on their own"
-        )
     if registration.covered < config.fewest_covered:
         return (
             f"surface not reached: the template covers {100 * registration.covered:.0f} % of it; another object, or "
@@ -327,6 +394,16 @@ def _resolve_alternatives(problem: _Problem, state: RegistrationState) -> Regist
     return replace(state, registrations={i: best(one) for i, one in state.registrations.items()})
 
 
+def _exclude_mirrored(problem: _Problem, state: RegistrationState) -> RegistrationState:
+    """Exclude mirrored scans, where the user wants to be asked."""
+    if problem.config.mirror != "ask":
+        return state
+    reason = "mirrored: its mirror image fits the other scans better; reflect it, or choose --mirror auto"
+    mirrored = {i: reason for i, one in state.registrations.items() if one.mirrored}
+    registrations = {i: one for i, one in state.registrations.items() if not one.mirrored}
+    return replace(state, registrations=registrations, excluded={**state.excluded, **mirrored})
+
+
 # The mean of a round
 
 
@@ -361,6 +438,7 @@ def _update_template(
         registrations=registrations,
         excluded=state.excluded,
         predictions=predictions,
+        sides=state.sides,
         rounds=(*state.rounds, record),
     )
 
@@ -388,7 +466,8 @@ def _landmarks_on(template: Mesh, problem: _Problem, registrations: Mapping[int,
 
     def in_template_frame(i: int) -> dict[str, FloatArray]:
         T_template_scan = registrations[i].T_scan_template.inverse()
-        return {name: T_template_scan.apply(point) for name, point in problem.first.repaired[i].landmarks.items()}
+        scan = problem.scan(i, mirrored=registrations[i].mirrored)
+        return {name: T_template_scan.apply(point) for name, point in scan.landmarks.items()}
 
     return consensus_landmarks(template, [(one.vertices, in_template_frame(i)) for i, one in registrations.items()])
 
@@ -403,7 +482,9 @@ def _result(problem: _Problem, state: RegistrationState) -> Correspondence:
     template = state.template.with_vertices(state.template.vertices, points)
     landmarks = replace(state.landmarks, distance_mm=np.empty(0))  # places on a mean have no given point
     moved = tuple(record.moved for record in state.rounds)
-    return Correspondence(template, tuple(scans), problem.first.origin, moved, landmarks)
+    return Correspondence(
+        template, tuple(scans), problem.first.origin, moved, landmarks, sides_decided=state.sides.decided
+    )
 
 
 def _complete_shapes(problem: _Problem, state: RegistrationState) -> dict[int, FloatArray]:
@@ -431,12 +512,12 @@ def _scan_result(problem: _Problem, state: RegistrationState, i: int, complete: 
     registration = state.registrations[i]
     T = registration.T_scan_template
     vertices = T.apply(complete)
-    landmarks = problem.landmarks(state.landmarks, i)
+    landmarks = problem.landmarks(state.landmarks, problem.scan(i, mirrored=registration.mirrored))
     mean, p95, p99, largest = (T.scale * length for length in registration.distance)
     return Corresponding(
         name=problem.names[i],
         reason="",
-        vertices=vertices,
+        vertices=vertices * FLIP if registration.mirrored else vertices,
         T_scan_template=T,
         seen=float(registration.observed.mean()),
         covered=registration.covered,
@@ -445,4 +526,5 @@ def _scan_result(problem: _Problem, state: RegistrationState, i: int, complete: 
         seconds=cpu_s,
         landmarks=np.nan if landmarks is None else landmarks.rms_distance(vertices),
         observed=registration.observed,
+        mirrored=registration.mirrored,
     )

@@ -35,6 +35,10 @@ _STRAY = 0.25
 """A landmark that lies farther than this share of a scan's size off its surface does not belong to it."""
 
 
+class MirroredLandmarksError(InputError):
+    """The landmarks of a scan are those of a mirror image."""
+
+
 @dataclass(frozen=True, eq=False)
 class ScanLandmarks:
     """The landmarks of one scan that the template has too.
@@ -61,11 +65,16 @@ class ScanLandmarks:
         """Return the same landmarks with their points transformed by `T`."""
         return ScanLandmarks(self.places, T.apply(self.points), self.uncertainty)
 
+    def reflected(self) -> ScanLandmarks:
+        """Return the landmarks of the mirror image of the scan."""
+        return ScanLandmarks(self.places, self.points * FLIP, self.uncertainty)
+
     def pose(self, vertices: FloatArray) -> Similarity | None:
         """Return T_scan_template by the landmarks, or None where they are too few, or as good as on a line.
 
         Raises:
-            InputError: they are those of a mirror image, or contradict the template.
+            MirroredLandmarksError: they are those of a mirror image.
+            InputError: they contradict the template.
         """
         if len(self.points) < FEWEST:
             return None
@@ -83,8 +92,8 @@ class ScanLandmarks:
         other = _rms(mirrored.apply(own * FLIP) - self.points) / spread
         if len(self.points) > FEWEST and off > _AGREE:
             if other < _MIRROR_SHARE * off:
-                raise InputError(
-                    "mirrored: its landmarks are those of a mirror image of the other scans; turn it over, or check "
+                raise MirroredLandmarksError(
+                    "mirrored: its landmarks are those of a mirror image of the other scans; reflect it, or check "
                     "their names"
                 )
             raise InputError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 from shapespace.correspondence.register import ElasticSettings
 
@@ -30,6 +31,8 @@ class CorrespondConfig:
             are excluded as other objects.
         symmetric: the object is its own mirror image: the template is made symmetric, and a scan is also predicted from
             the mirror images of the other scans.
+        mirror: what is done with scans that are mirror images of the majority, such as left among right teeth: they are
+            reflected (auto), excluded (ask), or the files are trusted (never).
         landmark_uncertainty: standard deviation of the landmarks, as a share of the object's size (RMS distance from
             its centre).
         seed: random seed.
@@ -46,5 +49,6 @@ class CorrespondConfig:
     fewest_covered: float = 0.6
     outlier_threshold: float = 3.0
     symmetric: bool = False
+    mirror: Literal["auto", "ask", "never"] = "auto"
     landmark_uncertainty: float = 0.02
     seed: int = 0
