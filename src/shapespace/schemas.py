@@ -436,6 +436,8 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
         cpu_s: of each round.
         landmark_rms: distance of its landmarks from their places on the surface.
         landmark_distances: name -> distance of each given landmark from the surface of the scan, in its unit.
+        mirrored: whether the scan is a mirror image of the majority. Its surface is in its own frame, with triangles
+            whose corners are in reverse order, so that their normals point outwards.
         metadata: by the columns of the list that named it.
     """
 
@@ -466,6 +468,7 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
     cpu_s: list[float] = []
     landmark_rms: float | None = None
     landmark_distances: Mapping[str, float] = {}
+    mirrored: bool = False
     metadata: Mapping[str, str | int | float | None] = {}
     format: str = FORMAT
     format_version: int = VERSION
@@ -481,6 +484,8 @@ class CorrespondenceRecord(Struct, frozen=True, kw_only=True):
         corresponding: NAMEs in correspondence.
         set_aside: NAME to reason of the others.
         other_units: NAME to `unit_ratio` of those that are in another unit than most.
+        mirrored: NAMEs of those that are mirror images of the majority.
+        sides_decided: whether scans could be distinguished from their mirror images.
         settings: of the run.
         version: of shapespace.
         inputs_hash: SHA-256 of the scans, landmarks, template, model, settings and version; a run with the same inputs
@@ -502,6 +507,8 @@ class CorrespondenceRecord(Struct, frozen=True, kw_only=True):
     settings: dict[str, Any]
     version: str
     other_units: dict[str, float] = {}
+    mirrored: list[str] = []
+    sides_decided: bool = False
     inputs_hash: str = ""
     results_hash: str = ""
     format: str = FORMAT

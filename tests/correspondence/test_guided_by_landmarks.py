@@ -1,6 +1,5 @@
 """Landmarks, a model to begin with, mirror images and scans that lack a part: what each tells a correspondence."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +14,7 @@ from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.landmark_guide import ScanLandmarks, consensus_landmarks, stray_landmarks
 from shapespace.correspondence.mirror_image import MirrorMap
 from shapespace.correspondence.register import ElasticSettings
-from shapespace.correspondence.registration import RegistrationTask, RoundContext, ScanRegistration
+from shapespace.correspondence.registration import RegistrationTask, RoundContext
 from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.correspondence.template import PoseModel, choose_template
 from shapespace.errors import InputError, MeshError
@@ -46,11 +45,6 @@ def cut(one: RawBlob, share: float) -> Mesh:
     number = np.full(len(kept), -1)
     number[used] = np.arange(len(used))
     return Mesh(one.scan.vertices[used], number[faces].astype(np.int32), name=one.scan.name)
-
-
-def mirrored(mesh: Mesh) -> Mesh:
-    """Return the mirror image of a scan."""
-    return Mesh(mesh.vertices * FLIP, mesh.faces[:, ::-1], name=mesh.name)
 
 
 def bowl(mesh: Mesh) -> Mesh:
@@ -246,27 +240,6 @@ def test_a_model_of_splines_guides_with_its_shapes_and_one_of_points_is_refused(
     points = ss.ShapeModel.fit([Mesh(mesh.vertices, None, name=mesh.name) for mesh in meshes])
     with pytest.raises(MeshError, match="no triangles"):
         first_template(scans, None, SETTINGS, points)
-
-
-def test_a_mirrored_scan_is_named(blobs: list[RawBlob]) -> None:
-    scans = [one.scan for one in blobs]
-    scans[3] = mirrored(scans[3])
-    made = correspond(scans, SETTINGS)
-    assert [scan.reason.startswith("mirrored") for scan in made.scans] == [k == 3 for k in range(6)]
-
-
-def test_no_scan_of_a_symmetric_object_is_mirrored() -> None:
-    directions, faces = sphere(900)
-    mesh = Mesh(even(directions), faces, name="even")
-    scans = [Mesh(mesh.vertices * (1 + 0.1 * k), np.roll(faces, k, axis=1), name=str(k)) for k in range(2)]
-
-    def run(context: RoundContext, tasks: Sequence[RegistrationTask]) -> list[ScanRegistration]:
-        return [replace(context.register(task), mirror_ratio=0.5) for task in tasks]
-
-    made = correspond(scans, replace(SETTINGS, symmetric=True), template=mesh, run=run)
-    assert not any(scan.reason for scan in made.scans)
-    with pytest.raises(InputError, match="mirrored"):
-        correspond(scans, SETTINGS, template=mesh, run=run)
 
 
 def test_the_mirror_image_of_a_shape_is_its_surface_turned_over() -> None:

@@ -294,6 +294,7 @@ COMMANDS: tuple[Command, ...] = (
             advanced("--model",
                      "MODEL.h5", "shape model of such objects: its mean is the template, and its fit to a scan "
                      "initialises the first round", parse=Path),
+            advanced("--mirror", source=CORRESPOND),
             advanced("--landmark-std", "SHARE", source=CORRESPOND, field="landmark_uncertainty", parse=values.share,
                      formerly="--landmark-error"),
             advanced("--rounds", "N", source=CORRESPOND, parse=values.positive),

@@ -19,7 +19,7 @@ from shapespace.io.meshes.mesh_io import stem_of
 from shapespace.model.additive import AdditiveModel, load_model
 from shapespace.model.shape_model import ShapeModel
 from shapespace.store.corresponding import SURFACE, surface_files, surface_stem
-from shapespace.store.results import Results, mesh_at, modes_of
+from shapespace.store.results import Results, modes_of
 from shapespace.store.rows import META
 from shapespace.types import FloatArray, Mesh, read_only
 
@@ -275,9 +275,7 @@ def _of_surfaces(
         )
     meshes: list[Mesh] = []
     for n_read, (file, _) in enumerate(matched, 1):
-        mesh = mesh_at(file)
-        ratio = listing.unit_ratios.get(file, 1.0)
-        meshes.append(replace(mesh.with_vertices(mesh.vertices / ratio), name=surface_stem(file)))
+        meshes.append(replace(listing.mesh(file), name=surface_stem(file)))
         if on_shape is not None:
             on_shape(n_read, len(matched))
     cohort = Cohort.of_meshes(

@@ -32,8 +32,8 @@ from shapespace.model.shape_model import ShapeModel, region_vertices
 from shapespace.model.streamed import Scratch, bytes_in_memory, too_large
 from shapespace.recognise.labelled_scans import NEUTRAL
 from shapespace.schemas import FitRecord
-from shapespace.store.corresponding import surface_files
-from shapespace.store.results import is_result, mesh_at
+from shapespace.store.corresponding import SurfaceFiles, surface_files
+from shapespace.store.results import is_result
 from shapespace.types import MM_PER_UNIT, Mesh, SurfaceLandmarks, common_faces
 from shapespace.version import __version__
 
@@ -156,7 +156,7 @@ def build(
         listed.refuse_mixed_units()
     files, records = _trusted(listed.files, notes, with_doubtful=config.with_doubtful)
     make_folder(output.absolute().parent)
-    on_disk = _OnDisk(files, config.unit, listed.unit_ratios)
+    on_disk = _OnDisk(files, config.unit, listed)
     streamed = config.streams or (config.of_vertices and _too_large(on_disk, config, notes))
     loaded = on_disk if streamed else _read(on_disk, quiet=quiet)
     first = on_disk[0] if streamed else loaded[0]
@@ -310,24 +310,23 @@ def _identity(meshes: _OnDisk, config: BuildFilesConfig, parent: ShapeModel | No
 
 @dataclass(frozen=True)
 class _OnDisk:
-    """Meshes in mm, each read when it is asked for; those with a unit ratio are in other units than most.
+    """Meshes in mm, on one side, each read when it is asked for.
 
     Args:
         files: of the meshes.
         unit: of most.
-        unit_ratios: as of `SurfaceFiles`.
+        listed: reads them.
     """
 
     files: Sequence[Path]
     unit: str
-    unit_ratios: Mapping[Path, float]
+    listed: SurfaceFiles
 
     def __len__(self) -> int:
         return len(self.files)
 
     def __getitem__(self, index: int, /) -> Mesh:
-        file = self.files[index]
-        mesh, mm = _training_mesh(file), MM_PER_UNIT[self.unit] / self.unit_ratios.get(file, 1.0)
+        mesh, mm = _training_mesh(self.listed, self.files[index]), MM_PER_UNIT[self.unit]
         return mesh if mm == 1.0 else mesh.with_vertices(mesh.vertices * mm)
 
 
@@ -378,9 +377,9 @@ def _odd_size(model: ShapeModel, unit: str) -> list[str]:
     return [f"The mean is {size} mm large, which is odd for mm; --unit says in which unit the meshes are."]
 
 
-def _training_mesh(path: Path) -> Mesh:
+def _training_mesh(listed: SurfaceFiles, path: Path) -> Mesh:
     try:
-        mesh = without_estimates(mesh_at(path))
+        mesh = without_estimates(listed.mesh(path))
     except MeshError as error:
         raise MeshError(naming(path, str(error))) from error
     if not len(mesh.vertices):

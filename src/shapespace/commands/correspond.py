@@ -33,6 +33,7 @@ from shapespace.errors import ShapespaceError
 from shapespace.geometry.distortion import Distortion
 from shapespace.geometry.doctor import NON_FINITE, repair
 from shapespace.geometry.landmark_placement import far_landmarks, place_landmarks
+from shapespace.geometry.mirror_plane import mirror_image
 from shapespace.geometry.normals import face_areas, rms_size, without_estimates
 from shapespace.io.containers.json_files import read_json
 from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_text
@@ -148,7 +149,7 @@ def _corresponding(
     # Until all is written the folder is none that build takes.
     remove_file(folder / SUMMARY)
     _forget_others({record.name for record in records}, folder, say)
-    _write(made, records, list(scans), folder)
+    _write(made, records, folder)
     summary = CorrespondenceRecord(
         template=made.why,
         vertices=len(made.template.vertices),
@@ -158,6 +159,8 @@ def _corresponding(
         settings=asdict(config),
         version=__version__,
         other_units={record.name: record.unit_ratio for record in records if record.unit_ratio != 1.0},
+        mirrored=[record.name for record in records if record.mirrored],
+        sides_decided=made.sides_decided,
         inputs_hash=inputs_hash,
         results_hash=_results_hash(jobs, folder),
     )
@@ -234,8 +237,10 @@ class _Rounds:
         self._folder, self._execution_config, self._quiet, self._number = folder, execution, quiet, 0
 
     def __call__(self, context: RoundContext, tasks: Sequence[RegistrationTask]) -> list[ScanRegistration]:
-        self._number += 1
-        with progress(len(tasks), f"round {self._number}: registering", "scan", quiet=self._quiet) as bar:
+        comparing = bool(tasks) and tasks[0].sides == "scores"
+        self._number += not comparing
+        label = "comparing with mirror images" if comparing else f"round {self._number}: registering"
+        with progress(len(tasks), label, "scan", quiet=self._quiet) as bar:
 
             def count() -> None:
                 bar.update()
@@ -370,6 +375,13 @@ def _tell(records: Sequence[CorrespondRecord], made: Correspondence, given: str,
             f"{given} had to change by {100 * made.moved[0]:.0f} % of its size to become these scans, so it is "
             "hardly an object of their kind; look at the surfaces, or leave it out."
         )
+    if mirrored := [record.name for record in records if record.mirrored]:
+        named = ", ".join(mirrored[:_LISTED]) + (", ..." if len(mirrored) > _LISTED else "")
+        of = "scan is a mirror image" if len(mirrored) == 1 else "scans are mirror images"
+        say(
+            f"{len(mirrored)} {of} of the others ({named}) and reflected for the correspondence; surfaces are in the "
+            "frames of their scans."
+        )
     noted = [record for record in records if record.notes]
     for record in noted[:_LISTED]:
         say(f"{record.name}: {' '.join(record.notes)}")
@@ -391,6 +403,7 @@ def _records(
     folder: Path,
 ) -> list[CorrespondRecord]:
     came = {scan.name: scan for scan in made.scans}
+    surfaces = {mesh.name: mesh for mesh in made.meshes()}
     scaled = {scan.name: scan.T_scan_template.scale for scan in made.scans if scan.T_scan_template is not None}
     sizes = dict(zip(scaled, zip(*unit_ratios(list(scaled.values())), strict=True), strict=True))
     records: list[CorrespondRecord] = []
@@ -399,9 +412,8 @@ def _records(
         source = replace(job.source(folder), content_hash=read.hashes.get(name, ""))
         record = _record(name, source, one, read.unread.get(name, ""), read.notes.get(name, []))
         record = structs.replace(record, metadata=dict(job.metadata))
-        if one is not None and one.vertices is not None:
-            surface = without_estimates(Mesh(one.vertices, made.template.faces, name=name, observed=one.observed))
-            record = _judged(record, surface, made.template, read.scans[name])
+        if name in surfaces:
+            record = _judged(record, without_estimates(surfaces[name]), made.template, read.scans[name])
         record = structs.replace(record, landmark_distances=read.landmark_distances.get(name, {}))
         if name in sizes:
             scale, ratio = map(float, sizes[name])
@@ -453,19 +465,19 @@ def _record(
         name=name, path=path, hash=source.content_hash, status="corresponding", seen_share=one.seen,
         covered_share=one.covered, distance_mean=mean, distance_p95=p95, distance_p99=p99, distance_max=largest,
         notes=list(notes), moved_share=list(one.moved), cpu_s=list(one.seconds),
-        landmark_rms=one.landmarks if np.isfinite(one.landmarks) else None,
+        landmark_rms=one.landmarks if np.isfinite(one.landmarks) else None, mirrored=one.mirrored,
     )  # fmt: skip
 
 
-def _write(made: Correspondence, records: Sequence[CorrespondRecord], read: Sequence[str], folder: Path) -> None:
-    came = dict(zip(read, made.scans, strict=True))
+def _write(made: Correspondence, records: Sequence[CorrespondRecord], folder: Path) -> None:
+    surfaces = {mesh.name: replace(mesh, landmarks={}) for mesh in made.meshes()}
     for record in records:
-        surface = folder / f"{record.name}{SURFACE}"
-        one = came.get(record.name)
-        if record.reason or one is None or one.vertices is None:
-            remove_file(surface)
+        file = folder / f"{record.name}{SURFACE}"
+        surface = surfaces.get(record.name)
+        if record.reason or surface is None:
+            remove_file(file)
         else:
-            write_mesh(surface, Mesh(one.vertices, made.template.faces, name=record.name, observed=one.observed))
+            write_mesh(file, mirror_image(surface) if record.mirrored else surface)
         write_text(folder / f"{record.name}{RECORD}", json_text(record))
     make_folder((folder / MEAN).parent)
     write_mesh(folder / MEAN, made.template)

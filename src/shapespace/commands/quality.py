@@ -24,7 +24,6 @@ from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import BySize, Measured, Quality, json_text
 from shapespace.store.corresponding import SURFACE, surface_files, surface_stem
-from shapespace.store.results import mesh_at
 from shapespace.types import Mesh
 
 _SURFACES = (".dense.ply", ".fitted.ply", SURFACE)
@@ -182,12 +181,12 @@ def _meshes(folder: Path, notes: list[str], gauge: Gauge, *, quiet: bool) -> tup
     with progress(len(files), "reading", "mesh", quiet=quiet) as bar:
         for file in files:
             try:
-                mesh = mesh_at(file)
+                mesh = listed.mesh(file)
             except MeshError as error:
                 raise MeshError(naming(file, str(error))) from error
             if not len(mesh.vertices):
                 raise MeshError(f"{file}: it has no vertices; leave it out.")
-            out.append(_scaled(replace(mesh, name=file.name), listed.unit_ratios.get(file, 1.0)))
+            out.append(replace(mesh, name=file.name))
             bar.update()
     return out, {surface_stem(file): ratio for file, ratio in listed.unit_ratios.items()}
 

@@ -7,13 +7,12 @@ The sides of anchors and scans that explain the scores best are those of the col
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 
-from shapespace.geometry.mirror_plane import FLIP
-from shapespace.types import BoolArray, FloatArray, Mesh
+from shapespace.types import BoolArray, FloatArray
 
 _LARGEST_EVIDENCE = 0.3
 """Log ratio of scores beyond which a comparison counts no more: among 39 molars that were alike it was at most 0.2."""
@@ -37,13 +36,6 @@ class Sides:
     mirrored: BoolArray
     margin: FloatArray
     decided: bool
-
-
-def mirror_image(mesh: Mesh) -> Mesh:
-    """Return the mirror image of a mesh at the plane x = 0, with triangles that are seen from the same side."""
-    faces = None if mesh.faces is None else np.ascontiguousarray(mesh.faces[:, ::-1])
-    landmarks = {name: point * FLIP for name, point in mesh.landmarks.items()}
-    return replace(mesh, vertices=mesh.vertices * FLIP, faces=faces, landmarks=landmarks)
 
 
 def solve_sides(scores: FloatArray, anchors: Sequence[int], seed: int) -> Sides:

@@ -16,7 +16,7 @@ from typing import Protocol
 
 import numpy as np
 
-from shapespace.correspondence.chirality import Sides, mirror_image, solve_sides
+from shapespace.correspondence.chirality import Sides, solve_sides
 from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
 from shapespace.correspondence.first_template import FirstTemplate, first_template
 from shapespace.correspondence.guide import ShapePredictor, predict_leave_one_out
@@ -29,7 +29,7 @@ from shapespace.correspondence.settings import FEWEST, SIZE, CorrespondConfig
 from shapespace.correspondence.template import PoseModel, clean_scan
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.geometry.landmark_placement import place_landmarks
-from shapespace.geometry.mirror_plane import FLIP
+from shapespace.geometry.mirror_plane import FLIP, mirror_image
 from shapespace.geometry.procrustes import align_to_weighted_mean
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.interop import as_meshes

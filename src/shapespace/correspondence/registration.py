@@ -14,7 +14,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 
-from shapespace.correspondence.chirality import mirror_image
 from shapespace.correspondence.generic import generic_model
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.landmark_guide import MirroredLandmarksError, ScanLandmarks
@@ -27,6 +26,7 @@ from shapespace.fit.robust.robust_settings import DenseSettings
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.search.initialisation import Start
 from shapespace.geometry.closest import ClosestPoints, build_engine, on_boundary
+from shapespace.geometry.mirror_plane import mirror_image
 from shapespace.geometry.normals import boundary_edges, boundary_vertices, rms_size, vertex_normals
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -19,6 +19,7 @@ _OFF = 0.01
 """A surface whose mirror image lies within this share of its size is taken for symmetric."""
 FLIP = np.array([-1.0, 1.0, 1.0])
 """What turns points (..., 3) into their mirror images about x = 0."""
+
 _POINTS = 1_000  # points of the mesh that planes are fitted to; time grows with them
 _ITERATIONS = 30  # limit of the iterations for one plane
 _STOP = 1e-5
@@ -55,6 +56,13 @@ def mirrored(vertices: FloatArray, other: IntArray) -> FloatArray:
         other: (V,) from `mirror_vertices`.
     """
     return vertices[..., other, :] * FLIP
+
+
+def mirror_image(mesh: Mesh) -> Mesh:
+    """Return the mirror image of a mesh at the plane x = 0, with triangles that are seen from the same side."""
+    faces = None if mesh.faces is None else np.ascontiguousarray(mesh.faces[:, ::-1])
+    landmarks = {name: point * FLIP for name, point in mesh.landmarks.items()}
+    return replace(mesh, vertices=mesh.vertices * FLIP, faces=faces, landmarks=landmarks)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,11 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from shapespace.errors import InputError
+from shapespace.geometry.mirror_plane import mirror_image
 from shapespace.io.containers.json_files import read_json
 from shapespace.io.meshes.mesh_folders import mesh_files
 from shapespace.io.meshes.mesh_io import stem_of
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord
-from shapespace.store.results import ENDINGS, results_at, surfaces_of
+from shapespace.store.results import ENDINGS, mesh_at, results_at, surfaces_of
+from shapespace.types import Mesh
 
 SURFACE, RECORD = CorrespondRecord.SURFACE, CorrespondRecord.ENDING
 SUMMARY, MEAN = CorrespondenceRecord.FILE, CorrespondenceRecord.MEAN
@@ -27,12 +29,24 @@ class SurfaceFiles:
     Args:
         files: in the order given.
         unit_ratios: of files in another unit than most of their folder, as of `CorrespondRecord`.
+        mirrored: files of surfaces that are mirror images of the majority of their folder.
         notes: what the user should know.
     """
 
     files: tuple[Path, ...]
     unit_ratios: Mapping[Path, float]
+    mirrored: frozenset[Path]
     notes: tuple[str, ...]
+
+    def mesh(self, file: Path) -> Mesh:
+        """Return the mesh in one of the files, in the unit and on the side of the majority.
+
+        Raises:
+            As `mesh_at`.
+        """
+        mesh, ratio = mesh_at(file), self.unit_ratios.get(file, 1.0)
+        mesh = mirror_image(mesh) if file in self.mirrored else mesh
+        return mesh if ratio == 1.0 else mesh.with_vertices(mesh.vertices / ratio)
 
     def unit_note(self, unit: str) -> str:
         """Return in a sentence which files are in another unit, and that they are brought to that of most."""
@@ -51,8 +65,7 @@ class SurfaceFiles:
             )
 
     def _others(self) -> str:
-        file_names = ", ".join(path.name for path in list(self.unit_ratios)[:_NAMED])
-        file_names += ", ..." if len(self.unit_ratios) > _NAMED else ""
+        file_names = _listed([path.name for path in self.unit_ratios])
         of = "meshes is" if len(self.unit_ratios) == 1 else "meshes are"
         return f"{len(self.unit_ratios)} of {len(self.files)} {of} in another unit than most ({file_names})"
 
@@ -83,13 +96,22 @@ def surface_files(paths: Sequence[Path], *, recursive: bool = False) -> SurfaceF
         else:
             files += _surfaces(path, summary)
             if summary.set_aside:
-                notes.append(f"{path}: without {len(summary.set_aside)} excluded scans ({_names(summary)}).")
+                notes.append(
+                    f"{path}: without {len(summary.set_aside)} excluded scans ({_listed(list(summary.set_aside))})."
+                )
     ratios: dict[Path, float] = {}
+    mirrored: set[Path] = set()
     for folder in dict.fromkeys(file.parent for file in files if file.name.endswith(SURFACE)):
         if (summary := _summary_of(folder)) is not None:
             other_units = {folder / f"{name}{SURFACE}": ratio for name, ratio in summary.other_units.items()}
             ratios |= {file: other_units[file] for file in files if file in other_units}
-    return SurfaceFiles(tuple(files), ratios, tuple(notes))
+            reflected = {folder / f"{name}{SURFACE}" for name in summary.mirrored}
+            mirrored |= reflected.intersection(files)
+    if mirrored:
+        of = "mesh is a mirror image" if len(mirrored) == 1 else "meshes are mirror images"
+        names = _listed([file.name for file in files if file in mirrored])
+        notes.append(f"{len(mirrored)} of {len(files)} {of} of the others ({names}) and reflected.")
+    return SurfaceFiles(tuple(files), ratios, frozenset(mirrored), tuple(notes))
 
 
 def _summary_of(folder: Path) -> CorrespondenceRecord | None:
@@ -136,6 +158,5 @@ def _stored_surfaces(path: Path, notes: list[str]) -> list[Path]:
     return files
 
 
-def _names(summary: CorrespondenceRecord) -> str:
-    names = list(summary.set_aside)
+def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from shapespace.errors import InputError, ShapespaceError
+from shapespace.geometry.mirror_plane import FLIP
 from shapespace.io.tables.table_io import table_text
 from shapespace.report.blocks.wording import without_folders
 from shapespace.report.inputs.correspondence_folder import Corresponded
@@ -139,6 +140,7 @@ class Surfaces:
         for record in self._corresponded.corresponding:
             try:
                 points = self._corresponded.surface(record.name).vertices[list(vertices)]
+                points = points * FLIP if record.mirrored else points
             except ShapespaceError:
                 points = np.full((len(vertices), 3), np.nan)
             for vertex, point in zip(vertices, points.tolist(), strict=True):

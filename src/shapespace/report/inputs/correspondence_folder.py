@@ -12,6 +12,7 @@ import numpy.typing as npt
 from msgspec import structs
 
 from shapespace.errors import FileFormatError, ShapespaceError
+from shapespace.geometry.mirror_plane import mirror_image
 from shapespace.geometry.normals import (
     boundary_edges,
     face_vectors,
@@ -127,11 +128,14 @@ class Corresponded:
     def surface(self, name: str) -> Mesh:
         """Return the surface of the scan `name` in its own frame and unit, NaN where it is not observed.
 
+        That of a mirrored scan is reflected at x = 0, as `raw_scan` is.
+
         Raises:
             FileError: it cannot be read.
             FileFormatError: it is damaged, or not on the template of this folder.
         """
         mesh = without_estimates(self.folder.mesh(f"{name}{CorrespondRecord.SURFACE}"))
+        mesh = mirror_image(mesh) if self.records[name].mirrored else mesh
         if mesh.faces is None or not np.array_equal(mesh.faces, faces_of(self._mean)):
             raise FileFormatError(
                 f"{name}{CorrespondRecord.SURFACE} is not on the template of this folder; {CORRESPOND_AGAIN}."
@@ -160,7 +164,7 @@ class Corresponded:
         return PlacedSurface(np.where(is_observed[:, None], T.inverse().apply(vertices), np.nan), T)
 
     def raw_scan(self, record: CorrespondRecord) -> Mesh:
-        """Return the scan of a record, if it is in the same place with the same content.
+        """Return the scan of a record, reflected if it is mirrored, if it is in the same place with the same content.
 
         Raises:
             FileFormatError: it is not, or cannot be read.
@@ -173,7 +177,7 @@ class Corresponded:
         if not file.is_file() or sha256_of_file(file) != record.hash:
             raise FileFormatError("the scan is no longer where it was, or has changed.")
         try:
-            return read_mesh(file)
+            return mirror_image(read_mesh(file)) if record.mirrored else read_mesh(file)
         except ShapespaceError as error:
             raise FileFormatError("the scan cannot be read.") from error
 
