@@ -19,7 +19,7 @@ from shapespace.types import Mesh
 from synthetic_shapes import sphere
 
 SCANS = 4
-QUICK = ("--vertices", "500", "--rounds", "1", "--jobs", "1", "--quiet")
+QUICK = ("--mirror", "never", "--vertices", "500", "--rounds", "1", "--jobs", "1", "--quiet")
 
 
 @pytest.fixture(scope="module")

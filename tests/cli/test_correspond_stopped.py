@@ -18,7 +18,7 @@ from shapespace.correspondence import generic
 from shapespace.io.meshes.mesh_io import write_mesh
 
 SCANS = 3
-QUICK = ("--vertices", "300", "--rounds", "2", "--jobs", "1", "--quiet")
+QUICK = ("--mirror", "never", "--vertices", "300", "--rounds", "2", "--jobs", "1", "--quiet")
 
 
 def scans(folder: Path, *numbers: int) -> Path:

@@ -24,7 +24,7 @@ from shapespace.types import FloatArray, Mesh
 from synthetic_shapes import sphere
 
 QUICK = ElasticSettings(harmonics=150, points=1000)
-ONE_ROUND = CorrespondConfig(vertices=500, rounds=1, first=QUICK, next=QUICK)
+ONE_ROUND = CorrespondConfig(vertices=500, rounds=1, mirror="never", first=QUICK, next=QUICK)
 BLOBS = [raw_blob(k, points=1200) for k in range(4)]
 SCANS = [one.scan for one in BLOBS]
 

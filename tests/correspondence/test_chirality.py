@@ -22,9 +22,9 @@ from shapespace.types import FloatArray, Mesh
 from synthetic_shapes import blob, sphere
 
 QUICK = ElasticSettings(harmonics=60, points=500, iterations=10)
-CONFIG = CorrespondConfig(vertices=400, rounds=2, first=QUICK, next=QUICK)
-MIRRORED = (1, 4, 5)
-BLOBS = [raw_blob(k, points=1200) for k in range(8)]
+CONFIG = CorrespondConfig(vertices=300, rounds=1, first=QUICK, next=QUICK)
+MIRRORED = (1, 4)
+BLOBS = [raw_blob(k, points=700) for k in range(6)]
 
 
 def mixed(mirrored: tuple[int, ...] = MIRRORED) -> list[Mesh]:
@@ -65,27 +65,25 @@ def test_what_was_not_compared_is_on_no_side() -> None:
     assert found.mirrored.sum() == 9
 
 
-@pytest.mark.parametrize("mirrored", [MIRRORED, (0, 2, 3, 6, 7)])
+@pytest.mark.parametrize("mirrored", [MIRRORED, (0, 2, 3, 5)])
 def test_mirrored_scans_are_reflected_and_the_majority_keeps_its_side(mirrored: tuple[int, ...]) -> None:
     scans = mixed(mirrored)
-    made = correspond(scans, CONFIG)
-    minority = set(mirrored) if len(mirrored) < 4 else set(range(8)) - set(mirrored)
+    made = correspond(scans, replace(CONFIG, rounds=2))
+    minority = set(MIRRORED)
     assert made.sides_decided
     assert {k for k, scan in enumerate(made.scans) if scan.mirrored} == minority
     for scan, one in zip(scans, made.scans, strict=True):
         assert build_engine(scan).query(one.vertices).distance.mean() < 0.5  # mm, in the frame of the scan
-    sides = [mesh.vertices * (FLIP if len(mirrored) > 4 else 1.0) for mesh in made.meshes()]
-    assert dispersion_mm(BLOBS, sides) < 1.1 * dispersion_mm(
-        BLOBS, [mesh.vertices for mesh in correspond(mixed(()), CONFIG).meshes()]
-    )
+    sides = [mesh.vertices * (1.0 if mirrored == MIRRORED else FLIP) for mesh in made.meshes()]
+    assert dispersion_mm(BLOBS, sides) < 7.0  # mm; scans of the wrong side are 40 mm off or more
 
 
 def test_mirrored_scans_are_excluded_on_request_and_files_are_trusted_on_request() -> None:
     made = correspond(mixed(), replace(CONFIG, mirror="ask"))
     assert [scan.reason.startswith("mirrored: its mirror image") for scan in made.scans] == [
-        k in MIRRORED for k in range(8)
+        k in MIRRORED for k in range(6)
     ]
-    made = correspond(mixed((2,)), replace(CONFIG, mirror="never", rounds=1))
+    made = correspond(mixed((2,)), replace(CONFIG, mirror="never"))
     assert not any(scan.mirrored for scan in made.scans) and not made.sides_decided
 
 
@@ -93,12 +91,12 @@ def test_of_symmetric_objects_no_scan_is_reflected() -> None:
     rng = np.random.default_rng(0)
 
     def even(k: int) -> Mesh:
-        directions, faces = sphere(900, 0.37 * k)
+        directions, faces = sphere(600, 0.37 * k)
         z = rng.standard_normal(5)
         vertices = 0.5 * (blob(directions, z) + blob(directions * [-1, 1, 1], z) * FLIP)
         return Mesh(vertices + 0.2 * rng.standard_normal(vertices.shape), faces, name=str(k))
 
-    scans = [even(k) for k in range(8)]
+    scans = [even(k) for k in range(6)]
     made = correspond([mirror_image(scan) if k % 2 else scan for k, scan in enumerate(scans)], CONFIG)
     assert not made.sides_decided and not any(scan.mirrored for scan in made.scans)
 
@@ -118,15 +116,15 @@ def test_surfaces_of_mirrored_scans_are_in_their_frames_and_build_reflects_them(
         (tmp_path / folder).mkdir()
         for scan in scans:
             write_mesh(tmp_path / folder / f"{scan.name}.ply", scan)
-        out = ["--vertices", "400", "--rounds", "1", "--jobs", "1", "--quiet"]
+        out = ["--vertices", "300", "--rounds", "1", "--jobs", "1", "--quiet"]
         assert main(["correspond", str(tmp_path / folder), "-o", str(tmp_path / f"{folder}-same"), *out]) == 0
         printed = capsys.readouterr().err
-        assert ("3 scans are mirror images of the others (blob1, blob4, blob5)" in printed) == (folder == "mixed")
+        assert ("2 scans are mirror images of the others (blob1, blob4)" in printed) == (folder == "mixed")
         assert main(["build", str(tmp_path / f"{folder}-same"), "-o", str(tmp_path / f"{folder}.h5"), "--quiet"]) == 0
         printed = capsys.readouterr()
-        assert ("3 of 8 meshes are mirror images" in printed.out + printed.err) == (folder == "mixed")
+        assert ("2 of 6 meshes are mirror images" in printed.out + printed.err) == (folder == "mixed")
     run = CorrespondenceRecord.from_json(json.loads((tmp_path / "mixed-same/correspondence.json").read_text()))
-    assert run.mirrored == ["blob1", "blob4", "blob5"] and run.sides_decided
+    assert run.mirrored == ["blob1", "blob4"] and run.sides_decided
     own, image = (read_mesh(tmp_path / f"mixed-same/blob{k}.corresponding.ply") for k in (0, 1))
     np.testing.assert_array_equal(own.faces, image.faces[:, ::-1])
     assert build_engine(mixed()[1]).query(image.vertices).distance.mean() < 0.5

@@ -111,7 +111,7 @@ def test_scans_in_correspondence_and_results_in_a_folder_are_shown(tmp_path: Pat
     results = ss.store.Results(tmp_path)
     assert len(repr(results)) < LONGEST_REPR
     assert "<img src=x" not in results._repr_html_() and "&lt;img src=x" in results._repr_html_()
-    config = ss.CorrespondConfig(vertices=120, rounds=1)
+    config = ss.CorrespondConfig(vertices=120, rounds=1, mirror="never")
     found = ss.correspond(meshes, config)
     assert len(repr(found)) < LONGEST_REPR and "in correspondence" in found._repr_html_()
 

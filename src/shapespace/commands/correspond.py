@@ -12,6 +12,7 @@ from typing import TypeAlias
 
 import numpy as np
 from msgspec import structs
+from threadpoolctl import threadpool_limits
 
 from shapespace.batch.execution import ExecutionConfig
 from shapespace.batch.fit_records import Source
@@ -136,7 +137,8 @@ def _corresponding(
         for sentence in _stray_landmarks_note(template):
             say(f"{template.name}: {sentence}")
     rounds = _Rounds(folder / _KEPT, files.execution, quiet=quiet)
-    with telling_of_compiling(quiet=quiet), waiting("choosing the template", quiet=quiet):
+    one_thread = threadpool_limits(1, user_api="blas")  # small matrices: more threads cost more than they give
+    with telling_of_compiling(quiet=quiet), waiting("choosing the template", quiet=quiet), one_thread:
         first = first_template(list(scans.values()), template, config, model)
     made = correspond(list(scans.values()), config, first=first, run=rounds)
     _note_copies(scans, notes)

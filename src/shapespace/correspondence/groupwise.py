@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from shapespace.correspondence.chirality import Sides, solve_sides
 from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
@@ -43,6 +44,7 @@ _PARTS = 4  # folds of the shapes: the pose model of a scan is built without it
 _WHOLE, _LEAST_SPREAD, _SIZE_UNSEEN = 0.9, 0.01, 0.3
 """Scans that observe more than this share of the template determine the usual size; the least standard deviation of
 log sizes; and that of a scan's own log size for each share that is missing."""
+_CLEARLY_WORSE = 1.1  # ratio of the scores of the other side and a scan's own: beyond it the side is settled
 _ANCHORS = 2  # scans that all others are compared with, beside the template
 
 
@@ -84,9 +86,16 @@ def correspond(
     """
     scans = list(as_meshes(scans, "correspond"))
     config = config or CorrespondConfig()
-    first = first or first_template(scans, template, config, model)
+    with threadpool_limits(1, user_api="blas"):  # small matrices: more threads cost more than they give
+        first = first or first_template(scans, template, config, model)
+        return _correspond(scans, config, first, run, may_reflect=template is None and model is None)
+
+
+def _correspond(
+    scans: Sequence[Mesh], config: CorrespondConfig, first: FirstTemplate, run: Runner, *, may_reflect: bool
+) -> Correspondence:
     problem = _Problem.of([scan.name for scan in scans], first, config)
-    problem, sides = _with_sides(problem, run, may_reflect=template is None and model is None)
+    problem, sides = _with_sides(problem, run, may_reflect=may_reflect)
     state = _initial_state(problem, sides)
     for _ in range(config.rounds):
         registrations = run(_context(problem, state), [_task(problem, state, i) for i in problem.first.repaired])
@@ -264,15 +273,16 @@ def _task(problem: _Problem, state: RegistrationState, i: int) -> RegistrationTa
         pose_model=_part(i) if len(state.registrations) >= ENOUGH_TO_JUDGE else 0,
         landmarks=problem.landmarks(state.landmarks, scan),
         mirrored=mirrored,
-        sides=_comparison(problem, state),
+        sides=_comparison(problem, state, i),
     )
 
 
-def _comparison(problem: _Problem, state: RegistrationState) -> Comparison:
-    """Return how scans are compared with their mirror images in the next round."""
+def _comparison(problem: _Problem, state: RegistrationState, i: int) -> Comparison:
+    """Return how scan `i` is compared with its mirror image in the next round."""
     if problem.config.mirror == "never" or problem.config.symmetric:
         return "as given"
-    return "both" if state.sides.decided and state.rounds else "one"
+    own, other = state.registrations[i].scores if i in state.registrations else (np.nan, np.nan)
+    return "both" if state.sides.decided and state.rounds and not other > _CLEARLY_WORSE * own else "one"
 
 
 def _pose_with_usual_size(state: RegistrationState, i: int) -> Similarity:

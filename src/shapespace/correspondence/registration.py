@@ -212,7 +212,8 @@ class RoundContext:
         return replace(first, alternatives=(*first.alternatives, *others), scores=scores)
 
     def _search(self, task: RegistrationTask) -> Start:
-        return self.pose_models[task.pose_model].search(np.array(task.scan.vertices), self.seed)
+        vertices, quick = np.array(task.scan.vertices), task.sides == "scores"
+        return self.pose_models[task.pose_model].search(vertices, self.seed, quick=quick)
 
     def _register_side(self, task: RegistrationTask, start: Start) -> ScanRegistration:
         """Register from the known pose, or from the likely poses of the search."""

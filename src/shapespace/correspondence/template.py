@@ -57,15 +57,15 @@ class PoseModel:
         harmonics = Harmonics.of(coarse, _POSE_HARMONICS)
         return PoseModel(generic_model(coarse, harmonics, None if shapes is None else shapes[:, origin]))
 
-    def search(self, vertices_mm: FloatArray, seed: int) -> Start:
-        """Search all poses and sizes of the surface in a scan with `vertices_mm` (S, 3).
+    def search(self, vertices_mm: FloatArray, seed: int, *, quick: bool = False) -> Start:
+        """Search all poses and sizes of the surface in a scan with `vertices_mm` (S, 3); `quick` for a score alone.
 
         The score is in mm of this surface.
         """
         size = rms_size(self.model.mean_vertices)
         centre, ratio = np.median(vertices_mm, axis=0), rms_size(vertices_mm) / size
         T = Similarity(1.0 / ratio, np.eye(3), -centre / ratio)
-        start = start_from_any_pose(self.model, T.apply(vertices_mm), seed=seed, with_scale=True)
+        start = start_from_any_pose(self.model, T.apply(vertices_mm), seed=seed, with_scale=True, quick=quick)
         back = T.inverse()
         return Start(
             back @ start.T_scan_model, start.how, start.score_mm, start.b, start.runner_up_score_mm,

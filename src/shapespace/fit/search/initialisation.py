@@ -116,7 +116,7 @@ def start_from_landmarks(
 
 
 def start_from_any_pose(
-    model: ShapeModel, scan_vertices_mm: FloatArray, *, seed: int, with_scale: bool | None = None
+    model: ShapeModel, scan_vertices_mm: FloatArray, *, seed: int, with_scale: bool | None = None, quick: bool = False
 ) -> Start:
     """Return the best pose of a search over all rotations, with the leading modes adapted, and the alternatives.
 
@@ -128,11 +128,12 @@ def start_from_any_pose(
         scan_vertices_mm: (S, 3), at least one.
         seed: of the subsample that is searched.
         with_scale: whether the pose has a free scale; None goes by the model's gauge.
+        quick: whether ambiguous poses are refined once only, which is enough for a score.
     """
     from shapespace.fit.search.pose_search import search  # numba takes a while to import
 
     scaled = model.gauge == "shape" if with_scale is None else with_scale
-    upright, poses = search(model, scan_vertices_mm, with_scale=scaled, seed=seed)
+    upright, poses = search(model, scan_vertices_mm, with_scale=scaled, seed=seed, quick=quick)
     traces = [float(np.trace(upright.T_scan_model.rotation @ pose.T_scan_model.rotation.T)) for pose in poses]
     starts = [
         Start(pose.T_scan_model, "upright" if trace > _SAME_TURN_TRACE else "rotations", pose.score_mm, pose.b)

@@ -91,7 +91,9 @@ class Pose:
     covered: float
 
 
-def search(model: ShapeModel, scan_vertices_mm: FloatArray, *, with_scale: bool, seed: int) -> tuple[Pose, list[Pose]]:
+def search(
+    model: ShapeModel, scan_vertices_mm: FloatArray, *, with_scale: bool, seed: int, quick: bool = False
+) -> tuple[Pose, list[Pose]]:
     """Return the pose that begins from no rotation, and distinct poses, best first, from everywhere.
 
     Where no rotation is clearly right, nothing more than its likeliest confusions is tried; where another one is not
@@ -102,6 +104,7 @@ def search(model: ShapeModel, scan_vertices_mm: FloatArray, *, with_scale: bool,
         scan_vertices_mm: (S, 3).
         with_scale: whether the pose has a free scale.
         seed: of the subsample that is searched.
+        quick: whether ambiguous poses are refined once only, which is enough for a score.
     """
     sides = _Sides.of(model, scan_vertices_mm, with_scale, seed)
     upright = sides.upright()
@@ -109,7 +112,7 @@ def search(model: ShapeModel, scan_vertices_mm: FloatArray, *, with_scale: bool,
         flipped = sides.flips(upright)
         if upright.score_mm <= _CLEARLY_BETTER * min(pose.score_mm for pose in flipped):
             return upright, _best_distinct([upright, *flipped])
-    return upright, sides.upright_unless_clearly_worse(upright, sides.everywhere(upright))
+    return upright, sides.upright_unless_clearly_worse(upright, sides.everywhere(upright, quick=quick))
 
 
 def refine(
@@ -226,8 +229,8 @@ class _Sides:
             out.append(self.refined(FLIPS, R, T.apply(centre) - T.scale * R @ centre, T.scale))
         return out
 
-    def everywhere(self, upright: Pose) -> list[Pose]:
-        """Return distinct poses, best first, of a search over all rotations."""
+    def everywhere(self, upright: Pose, *, quick: bool) -> list[Pose]:
+        """Return distinct poses, best first, of a search over all rotations; `quick` as for `search`."""
         grid, size = NearGrid.of(self.scan, self.model.size), self.model.size
         R, t = self._placed(_even_rotations(ROTATIONS))
         T = upright.T_scan_model
@@ -252,6 +255,8 @@ class _Sides:
         poses = sorted([upright, *poses], key=_score)
         poses = [self._again(LONG, pose) for pose in poses[: FINE.n_poses]] + poses[FINE.n_poses :]
         distinct_poses = _best_distinct(poses)
+        if quick:
+            return distinct_poses
         if not _is_sure(distinct_poses):
             second_batch = coarse[MIDDLE.n_poses : 2 * MIDDLE.n_poses]
             poses = poses[: FINE.n_poses] + [
