@@ -1,4 +1,4 @@
-"""Which scans of a collection are mirror images of the others, decided for the collection as a whole (C30 to C32).
+"""Which scans of a collection are mirror images of the others, decided for the collection as a whole (C30, C31).
 
 A few scans are anchors. Each scan and its mirror image are compared with each anchor by the scores of the pose search.
 The sides of anchors and scans that explain the scores best are those of the collection.
