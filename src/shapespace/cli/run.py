@@ -192,6 +192,7 @@ def correspond(arguments: argparse.Namespace) -> int:
 
         start_loading(tell=not arguments.quiet)
     from shapespace.commands.correspond import CorrespondFiles, correspond_files
+    from shapespace.commands.correspond_changes import Change, change_correspondence
     from shapespace.correspondence.settings import CorrespondConfig
     from shapespace.schemas import to_json
 
@@ -205,7 +206,12 @@ def correspond(arguments: argparse.Namespace) -> int:
         recursive=arguments.recursive,
         strict=arguments.strict,
     )
-    summary, records = correspond_files(files, arguments.output, config, quiet=arguments.quiet, say=warn)
+    change = Change(**given(arguments, Change))
+    folder, quiet = arguments.output, arguments.quiet
+    if change:
+        summary, records = change_correspondence(change, files, folder, config, quiet=quiet, say=warn)
+    else:
+        summary, records = correspond_files(files, folder, config, quiet=quiet, say=warn)
     if arguments.json:
         show_json({"folder": str(arguments.output), **to_json(summary), "records": to_json(records)})
     else:

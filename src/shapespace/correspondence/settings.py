@@ -30,6 +30,8 @@ class CorrespondConfig:
             are excluded as other objects.
         symmetric: the object is its own mirror image: the template is made symmetric, and a scan is also predicted from
             the mirror images of the other scans.
+        outer: remove inner surfaces first, such as marrow cavities and trabeculae of CT scans, which are hardly visible
+            from outside.
         landmark_uncertainty: standard deviation of the landmarks, as a share of the object's size (RMS distance from
             its centre).
         seed: random seed.
@@ -46,5 +48,6 @@ class CorrespondConfig:
     fewest_covered: float = 0.6
     outlier_threshold: float = 3.0
     symmetric: bool = False
+    outer: bool = False
     landmark_uncertainty: float = 0.02
     seed: int = 0
