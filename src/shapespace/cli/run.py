@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from shapespace.cli.options import given
 from shapespace.cli.printing import arrow, now, say, short, show, show_json, warn
+from shapespace.errors import InputError
 
 if TYPE_CHECKING:
     from shapespace.batch.execution import ExecutionConfig
@@ -208,6 +209,8 @@ def correspond(arguments: argparse.Namespace) -> int:
     )
     change = Change(**given(arguments, Change))
     folder, quiet = arguments.output, arguments.quiet
+    if not (change or files.scans):
+        raise InputError("Give scans, or a change of a finished correspondence by --redo, --remove or --update.")
     if change:
         summary, records = change_correspondence(change, files, folder, config, quiet=quiet, say=warn)
     else:

@@ -473,11 +473,16 @@ def _sizes(
 
 
 def _with_far_ones(records: Sequence[CorrespondRecord]) -> list[CorrespondRecord]:
-    """Return `records` with a note on those whose surface lies much farther from its scan than is usual."""
+    """Return `records` with a note on those whose surface lies much farther from its scan than is usual.
+
+    Point clouds are compared with each other, since their distances are those to points.
+    """
     far = np.array([(r.distance_p95 or np.nan) / ((r.scale or np.nan) * r.unit_ratio) for r in records])
-    if np.isfinite(far).sum() < _ENOUGH_TO_COMPARE:
-        return list(records)
-    ratios = far / np.nanmedian(far)
+    is_cloud = np.array([r.area_share is None for r in records])
+    ratios = np.full(len(records), np.nan)
+    for alike in (is_cloud, ~is_cloud):
+        if np.isfinite(far[alike]).sum() >= _ENOUGH_TO_COMPARE:
+            ratios[alike] = far[alike] / np.nanmedian(far[alike])
     return [
         record
         if not times > _FAR

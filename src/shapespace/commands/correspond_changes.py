@@ -125,10 +125,15 @@ class _Finished:
             records[name] = read(CorrespondRecord, json_of(file), str(file), CORRESPOND_AGAIN)
         mean = read_mesh(folder / MEAN)
         surfaces = {name: read_mesh(folder / f"{name}{SURFACE}") for name in summary.corresponding}
-        for name, surface in {MEAN: mean, **surfaces}.items():
-            if len(surface.vertices) != summary.vertices or not np.array_equal(faces_of(surface), faces_of(mean)):
+        if len(mean.vertices) != summary.vertices:
+            raise InputError(
+                f"{folder / MEAN} has {len(mean.vertices)} vertices, and the correspondence {summary.vertices}; "
+                f"{CORRESPOND_AGAIN}."
+            )
+        for name, surface in surfaces.items():
+            if not np.array_equal(faces_of(surface), faces_of(mean)):
                 raise InputError(
-                    f"{folder}: {name} is not a surface of this correspondence, which has {summary.vertices} vertices; "
+                    f"{folder}: {name}{SURFACE} and {MEAN} have different triangles, so one of them was changed; "
                     f"{CORRESPOND_AGAIN}."
                 )
         if summary.results_hash not in ("", results_hash_of(summary, folder)):
