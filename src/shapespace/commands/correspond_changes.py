@@ -55,13 +55,9 @@ from shapespace.store.corresponding import LANDMARKS, MEAN, RECORD, SUMMARY, SUR
 from shapespace.types import Mesh, SurfaceLandmarks
 
 _OPTIONS = {
-    "vertices": "--vertices",
-    "rounds": "--rounds",
-    "symmetric": "--symmetric",
-    "outer": "--outer",
-    "landmark_uncertainty": "--landmark-std",
-    "seed": "--seed",
-}
+    "vertices": "--vertices", "rounds": "--rounds", "symmetric": "--symmetric", "outer": "--outer",
+    "landmark_uncertainty": "--landmark-std", "seed": "--seed",
+}  # fmt: skip
 """Options of the settings that a change takes from the finished correspondence, by their fields."""
 _LISTED = 5  # names in a message, so that it stays short
 _Say: TypeAlias = Callable[[str], None]
@@ -125,19 +121,15 @@ class _Finished:
             records[name] = read(CorrespondRecord, json_of(file), str(file), CORRESPOND_AGAIN)
         mean = read_mesh(folder / MEAN)
         surfaces = {name: read_mesh(folder / f"{name}{SURFACE}") for name in summary.corresponding}
+        fault = ""
         if len(mean.vertices) != summary.vertices:
-            raise InputError(
-                f"{folder / MEAN} has {len(mean.vertices)} vertices, and the correspondence {summary.vertices}; "
-                f"{CORRESPOND_AGAIN}."
-            )
-        for name, surface in surfaces.items():
-            if not np.array_equal(faces_of(surface), faces_of(mean)):
-                raise InputError(
-                    f"{folder}: {name}{SURFACE} and {MEAN} have different triangles, so one of them was changed; "
-                    f"{CORRESPOND_AGAIN}."
-                )
-        if summary.results_hash not in ("", results_hash_of(summary, folder)):
-            raise InputError(f"{folder}: its files were changed after the correspondence; {CORRESPOND_AGAIN}.")
+            fault = f"{MEAN} has {len(mean.vertices)} vertices, and the correspondence {summary.vertices}"
+        elif other := [name for name, one in surfaces.items() if not np.array_equal(faces_of(one), faces_of(mean))]:
+            fault = f"{other[0]}{SURFACE} and {MEAN} have different triangles, so one of them was changed"
+        elif summary.results_hash not in ("", results_hash_of(summary, folder)):
+            fault = "its files were changed after the correspondence"
+        if fault:
+            raise InputError(f"{folder}: {fault}; {CORRESPOND_AGAIN}.")
         return _Finished(folder, summary, records, mean, surfaces)
 
     def config(self, files: CorrespondFiles, asked: CorrespondConfig) -> CorrespondConfig:
@@ -221,8 +213,7 @@ def _changed(
             "shapespace correspond on all scans instead."
         )
     read = read_scans(jobs, marks, strict=files.strict, outer=config.outer, quiet=quiet, say=say)
-    _check_old(finished, read, kept if change.update else [])
-    _check_landmarks(finished, read, files)
+    _refuse_changed(finished, read, files, kept if change.update else [])
     say_excluded(read.unread, len(jobs), say)
     marks.tell(say)
     rounds = RoundsWithProgress(folder / ROUNDS_FOLDER, files.execution, quiet=quiet)
@@ -239,41 +230,42 @@ def _changed(
     if change.update:
         summary = structs.replace(summary, rounds=[*summary.rounds, *made.moved])
     else:
-        say(_sentence(change, records, len(kept), folder))
+        done = "removed from" if change.remove else "registered to the mean in"
+        count = len(set(change.remove)) or sum(not record.reason for record in records)
+        were = "scan was" if count == 1 else "scans were"
+        say(f"{count} {were} {done} {folder}; the other {len(kept)} are unchanged.")
     _publish(folder, made, records, summary, updated=change.update)
     return summary, list(every.values())
-
-
-def _sentence(change: Change, records: Sequence[CorrespondRecord], kept: int, folder: Path) -> str:
-    if change.remove:
-        return f"{_scans(len(set(change.remove)))} removed from {folder}; the other {kept} are unchanged."
-    registered = sum(not record.reason for record in records)
-    return f"{_scans(registered)} registered to the mean in {folder}; the other {kept} are unchanged."
-
-
-def _scans(count: int) -> str:
-    return "1 scan was" if count == 1 else f"{count} scans were"
 
 
 # Which scans
 
 
 def _new_jobs(finished: _Finished, change: Change, given: Sequence[Job]) -> list[Job]:
-    """Return the scans that are registered to the mean.
-
-    Raises:
-        InputError: names are unknown, or belong to other scans.
-    """
+    """Return the scans that are registered to the mean: new ones, or those that are registered again."""
     if change.add:
         return _not_there(finished, given)
     finished.refuse_unknown(change.redo, "--redo")
     if given and not (change.redo or change.update):
         raise InputError("--remove takes the names of scans, and no files; leave the files out.")
     by_name = {job.name: job for job in given}
-    for name in change.redo:
-        if given and name not in by_name:
-            raise InputError(f"None of the given scans is named {name}; name its file so, or give a list with the id.")
+    if given and (unnamed := [name for name in change.redo if name not in by_name]):
+        raise InputError(f"None of the given scans is named {unnamed[0]}; rename its file, or give a list with ids.")
     return [by_name.get(name) or finished.job(name) for name in dict.fromkeys(change.redo)]
+
+
+def _not_there(finished: _Finished, given: Sequence[Job]) -> list[Job]:
+    """Return the `given` scans that the correspondence does not have yet; it has no others of the same names."""
+    if not given:
+        raise InputError("--add needs scans; give their files or folders.")
+    for job in given:
+        record = finished.records.get(job.name)
+        if record is not None and record.hash and record.hash != content_hash_of(job):
+            raise InputError(
+                f"{job.label} differs from the scan {job.name} in {finished.folder}; register it again with --redo "
+                f"{job.name}, or rename its file."
+            )
+    return [job for job in given if job.name not in finished.records]
 
 
 def _old_jobs(finished: _Finished, change: Change, given: Sequence[Job]) -> list[Job]:
@@ -283,48 +275,14 @@ def _old_jobs(finished: _Finished, change: Change, given: Sequence[Job]) -> list
     return [moved.get(name) or finished.job(name) for name in names]
 
 
-def _not_there(finished: _Finished, given: Sequence[Job]) -> list[Job]:
-    """Return the `given` scans that the correspondence does not have yet.
-
-    Raises:
-        InputError: it has another scan of the same name.
-    """
-    if not given:
-        raise InputError("--add needs scans; give their files or folders.")
-    new: list[Job] = []
-    for job in given:
-        record = finished.records.get(job.name)
-        if record is None:
-            new.append(job)
-        elif record.hash and record.hash != content_hash_of(job):
-            raise InputError(
-                f"{job.label} differs from the scan {job.name} in {finished.folder}; register it again with --redo "
-                f"{job.name}, or rename its file."
-            )
-    return new
-
-
-def _check_old(finished: _Finished, read: ScansRead, kept: Sequence[str]) -> None:
-    """Check that the scans in correspondence are still there as they were.
-
-    Raises:
-        InputError: one is not.
-    """
+def _refuse_changed(finished: _Finished, read: ScansRead, files: CorrespondFiles, kept: Sequence[str]) -> None:
+    """Raise InputError where a scan of `kept` is not as it was, or where a scan had landmarks that are not given."""
     for name in kept:
+        record = finished.records[name]
         if name in read.unread:
             raise InputError(f"--update reads all scans again, and {name} is {read.unread[name]}")
-        if read.hashes[name] != finished.records[name].hash:
-            raise InputError(
-                f"{finished.records[name].path} has changed since it was registered; run --redo {name} before --update."
-            )
-
-
-def _check_landmarks(finished: _Finished, read: ScansRead, files: CorrespondFiles) -> None:
-    """Check that scans that had landmarks are not registered again without them by mistake.
-
-    Raises:
-        InputError: they would be.
-    """
+        if read.hashes[name] != record.hash:
+            raise InputError(f"{record.path} has changed since it was registered; run --redo {name} before --update.")
     for name, scan in read.scans.items():
         had = name in finished.records and finished.records[name].landmark_distances
         if had and not scan.landmarks and files.landmarks is None:
@@ -383,11 +341,7 @@ def _summary(
     records: Sequence[CorrespondRecord],
     every: Mapping[str, CorrespondRecord],
 ) -> CorrespondenceRecord:
-    """Return the summary of the scans in `every`, of which `records` are new.
-
-    Raises:
-        InputError: fewer than two are in correspondence.
-    """
+    """Return the summary of the scans in `every`, of which `records` are new."""
     there = [name for name, record in every.items() if not record.reason]
     aside = {name: record.reason for name, record in every.items() if record.reason}
     if len(there) < FEWEST:

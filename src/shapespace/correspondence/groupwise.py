@@ -545,13 +545,10 @@ def _next_added_state(
 
 def _merged(start: RegistrationState, states: Mapping[int, RegistrationState]) -> RegistrationState:
     """Return the state with the finished scans and all added ones."""
-    registrations, excluded = dict(start.registrations), dict(start.excluded)
-    for i, state in states.items():
-        if i in state.registrations:
-            registrations[i] = state.registrations[i]
-        else:
-            excluded[i] = state.excluded[i]
-    return replace(start, registrations=registrations, excluded=excluded)
+    registered = {i: state.registrations[i] for i, state in states.items() if i in state.registrations}
+    excluded = {i: state.excluded[i] for i, state in states.items() if i not in registered}
+    registrations, reasons = {**start.registrations, **registered}, {**start.excluded, **excluded}
+    return replace(start, registrations=registrations, excluded=reasons)
 
 
 # The result
