@@ -37,6 +37,7 @@ from shapespace.types import FloatArray, Mesh, Similarity, SurfaceLandmarks
 
 ENOUGH_TO_JUDGE, _ENOUGH_TO_PREDICT = 6, 4
 """Scans: fewer do not determine the normal range of shapes; fewer do not predict another one."""
+_JUDGES = 40  # finished scans, at most, that an added one is compared with: time grows with their square
 _PARTS = 4  # folds of the shapes: the pose model of a scan is built without it
 _WHOLE, _LEAST_SPREAD, _SIZE_UNSEEN = 0.9, 0.01, 0.3
 """Scans that observe more than this share of the template determine the usual size; the least standard deviation of
@@ -462,11 +463,15 @@ def add_scans(
         state = replace(_update_template(problem, state, state, {}), rounds=())
         registrations = run(_context(problem, state), [_task(problem, state, i) for i in raw])
         return _result(problem, _next_state(problem, state, registrations))
-    results = [
-        _scan_result(problem, one, i, _complete_shapes(problem, one).get(i))
-        for i, one in ((i, states.get(i, start)) for i in range(kept, len(names)))
-    ]
+    results = [_added_result(problem, states.get(i, start), i) for i in range(kept, len(names))]
     return Correspondence(finished.mean, tuple(results), first.origin, (), start.landmarks)
+
+
+def _added_result(problem: _Problem, state: RegistrationState, i: int) -> Corresponding:
+    own = state.registrations.get(i)
+    if own is None or own.observed.all():  # estimates take long where there are many scans
+        return _scan_result(problem, state, i, None if own is None else own.vertices)
+    return _scan_result(problem, state, i, _complete_shapes(problem, state)[i])
 
 
 def _finished_state(problem: _Problem, finished: FinishedCorrespondence) -> RegistrationState:
@@ -513,7 +518,7 @@ def _added_states(
             states[i] = _next_added_state(problem, start, states[i], registration, predictor)
         # The mean stays, so an excluded scan would be excluded again.
         left = [i for i in left if states[i].rounds and states[i].rounds[-1].moved >= problem.config.settled]
-    return states
+    return {i: _judged_by_finished(problem, state, i) for i, state in states.items()}
 
 
 def _next_added_state(
@@ -523,15 +528,14 @@ def _next_added_state(
     registration: ScanRegistration,
     predictor: ShapePredictor | None,
 ) -> RegistrationState:
-    """Return the state after a round of one added scan: it is judged by the finished scans, which stay."""
+    """Return the state after a round of one added scan; the finished scans and their mean stay."""
     i, kept = registration.index, start.registrations
     state = _accept(problem, previous, [registration])
-    if i in state.registrations:
-        state = replace(state, registrations={**kept, i: state.registrations[i]})
-        state = _resolve_alternatives(problem, state)
-        state = _exclude_outliers(problem, state, list(state.registrations))
     if i not in state.registrations:
         return replace(start, excluded={i: state.excluded[i]})
+    state = replace(state, registrations={**kept, i: state.registrations[i]})
+    if registration.alternatives:
+        state = _resolve_alternatives(problem, state)
     own, mean = state.registrations[i], start.template.vertices
     T = fit_similarity(own.vertices[own.observed], mean[own.observed])  # C11
     shape = T.apply(own.vertices)
@@ -541,6 +545,17 @@ def _next_added_state(
     record = RoundRecord(moved, {i: moved}, {i: registration.cpu_s})
     rounds = (*previous.rounds, record)
     return replace(start, registrations={**kept, i: own}, predictions=predicted, rounds=rounds)
+
+
+def _judged_by_finished(problem: _Problem, state: RegistrationState, i: int) -> RegistrationState:
+    """Return the state of an added scan after its last round, without it if it is an outlier among the others."""
+    if i not in state.registrations:
+        return state
+    kept = sorted(state.registrations.keys() - {i})
+    judged = _exclude_outliers(problem, state, [*kept[:: -(-len(kept) // _JUDGES)], i])
+    if i in judged.registrations:
+        return state
+    return replace(state, registrations={j: state.registrations[j] for j in kept}, excluded={i: judged.excluded[i]})
 
 
 def _merged(start: RegistrationState, states: Mapping[int, RegistrationState]) -> RegistrationState:
