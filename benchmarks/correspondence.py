@@ -6,6 +6,8 @@
     python benchmarks/correspondence.py faces damaged expressions --people bundled
     python benchmarks/correspondence.py faces --given              template: the first one's true mesh
     python benchmarks/correspondence.py templates                  from two templates: how far apart
+    python benchmarks/correspondence.py added --scans 16           the last four added to the others
+    python benchmarks/correspondence.py faces --scans 6 --triangles 100000
 
 Faces (ICT-FaceKit, or the bundled ones) and femora (samples of the open femur model) are known, so dispersion can be
 told: each vertex is carried to the true surface of every scan, from there to the mean; its distance from the median
@@ -18,10 +20,11 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import resource
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +33,7 @@ from reliability import Femora
 from shapespace.batch.execution import ExecutionConfig
 from shapespace.batch.parallel_rounds import RoundRunner
 from shapespace.correspondence.correspondence_result import Correspondence
-from shapespace.correspondence.groupwise import correspond, run_here
+from shapespace.correspondence.groupwise import FinishedCorrespondence, add_scans, correspond, run_here
 from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.datasets.faces import load_faces
 from shapespace.datasets.ict import EXPRESSIONS, LANDMARK_VERTICES, load_ict
@@ -109,7 +112,7 @@ def damaged(mesh: Mesh, rng: np.random.Generator, triangles: int, name: str, mid
 def dispersion(made: Correspondence, of: Set) -> dict[str, float]:
     """Return dispersion in mm on the mean, over the vertices that lie near those counted, and to the true surface."""
     places, gaps = [], []
-    for one, truth in zip(made.scans, of.known, strict=True):
+    for one, truth in zip(made.scans, of.known[: len(made.scans)], strict=True):
         if one.vertices is None:
             continue
         there = np.isfinite(one.vertices).all(axis=1)
@@ -130,6 +133,7 @@ def dispersion(made: Correspondence, of: Set) -> dict[str, float]:
         "median_mm": float(np.nanmedian(apart)),
         "p95_mm": float(np.nanquantile(apart, 0.95)),
         "worst_scan_mm": float(np.nanmean(apart, axis=1).max()),
+        "last_scans_mm": float(np.nanmean(apart[-ADDED:])),
         "to_true_surface_mm": float(np.nanmean(gap[:, inside])),
         "seen": float(np.isfinite(place[:, :, 0]).mean()),
         "mean_share_of_length": float(np.nanmean(apart)) / of.length_mm,
@@ -156,13 +160,23 @@ def people(source: str, scans: int, seed: int, expressions: Sequence[str]) -> tu
     return meshes[:scans], mean, heads.landmarks["pronasale"]
 
 
-def faces(scans: int, seed: int, source: str = "ict", *, harm: bool = False, expressive: bool = False) -> Set:
-    """Simulated people, heads and necks, 30,000 triangles."""
+def faces(
+    scans: int,
+    seed: int,
+    source: str = "ict",
+    *,
+    harm: bool = False,
+    expressive: bool = False,
+    triangles: int = 30_000,
+) -> Set:
+    """Simulated people, heads and necks."""
     rng = np.random.default_rng(seed)
     meshes, mean, nose = people(source, scans, seed, EXPRESSION_NAMES if expressive else ("neutral",))
     middle = mean.vertices[nose]
     known = [
-        damaged(mesh, rng, 30_000, f"person{k}", mesh.vertices[nose]) if harm else raw(mesh, rng, 30_000, f"person{k}")
+        damaged(mesh, rng, 30_000, f"person{k}", mesh.vertices[nose])
+        if harm
+        else raw(mesh, rng, triangles, f"person{k}")
         for k, mesh in enumerate(meshes)
     ]
     counted = np.linalg.norm(mean.vertices - middle, axis=1) < FACE_MM
@@ -195,7 +209,9 @@ SETS: dict[str, tuple[Callable[..., Set], dict[str, object], int]] = {
     "cut-femora": (femora, {"cut_every": 4}, 40),
     "cut-femora-of-own-size": (femora, {"cut_every": 4, "own_size": True}, 40),
 }
-OTHERS = ("templates", "spleens")
+OTHERS = ("templates", "spleens", "added")
+ADDED = 4
+"""Scans that are added to the others."""
 
 
 def spleens(scans: int, seed: int, run: Callable[[list[Mesh], Mesh | None], Correspondence]) -> dict[str, object]:
@@ -248,6 +264,35 @@ def templates(of: Set, run: Callable[[list[Mesh], Mesh | None], Correspondence],
     }  # fmt: skip
 
 
+def added(
+    of: Set, run: Callable[[list[Mesh], Mesh | None], Correspondence], config: CorrespondConfig
+) -> dict[str, object]:
+    """The last scans added to a correspondence of the others, with and without an update, beside all together."""
+    scans = [one.scan for one in of.known]
+    others, last = scans[:-ADDED], scans[-ADDED:]
+    seconds = [time.process_time()]
+
+    def timed(made: Correspondence) -> tuple[Correspondence, float]:
+        seconds.append(time.process_time())
+        return made, seconds[-1] - seconds[-2]
+
+    joint, joint_s = timed(run(scans, None))
+    first, first_s = timed(run(others, None))
+    finished = FinishedCorrespondence(first.template, first.landmarks, first.meshes())
+    rest, added_s = timed(add_scans(finished, last, config))
+    updated, updated_s = timed(add_scans(replace(finished, scans=others), last, config))
+    outcomes = {
+        "together": (joint, joint_s),
+        "others alone": (first, first_s),
+        "added": (replace(first, scans=(*first.scans, *rest.scans)), added_s),
+        "added with --update": (updated, updated_s),
+    }
+    return {
+        name: {**dispersion(made, of), "set_aside": summary(made)["set_aside"], "cpu_s": cpu_s}
+        for name, (made, cpu_s) in outcomes.items()
+    }
+
+
 def summary(made: Correspondence) -> dict[str, object]:
     """Return what a correspondence says of itself."""
     return {
@@ -268,6 +313,7 @@ def main() -> None:
     parser.add_argument("--vertices", type=int, default=CorrespondConfig.vertices)
     parser.add_argument("--rounds", type=int, default=CorrespondConfig.rounds)
     parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--triangles", type=int, default=30_000, help="of each face")
     arguments = parser.parse_args()
     config = CorrespondConfig(vertices=arguments.vertices, rounds=arguments.rounds)
 
@@ -283,16 +329,21 @@ def main() -> None:
         report: dict[str, object]
         if name == "spleens":
             report = spleens(arguments.scans or 40, arguments.seed, run)
+        elif name == "added":
+            drawn = faces(arguments.scans or 16, arguments.seed, arguments.people)
+            report = added(drawn, run, config)
         elif name == "templates":
             report = templates(faces(arguments.scans or 24, arguments.seed, arguments.people), run, arguments.vertices)
         else:
             make, options, usual = SETS[name]
+            options = options | ({"triangles": arguments.triangles} if make is faces else {})
             drawn = make(arguments.scans or usual, arguments.seed, arguments.people, **options)
             first = drawn.known[0]
             true = drawn.mean.with_vertices(first.T_scan_model.inverse().apply(first.truth))
             made = run([one.scan for one in drawn.known], true if arguments.given else None)
             report = {**dispersion(made, drawn), **summary(made)}
-        report |= {"cpu_s": time.process_time() - begun}
+        peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        report |= {"cpu_s": time.process_time() - begun, "peak_memory_mb": peak_mb}
         asked = {"case": name, **vars(arguments), "cases": None}
         print(json.dumps({**asked, **report}, indent=1), flush=True)
 

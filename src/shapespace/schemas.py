@@ -491,6 +491,7 @@ class CorrespondenceRecord(Struct, frozen=True, kw_only=True):
         inputs_hash: SHA-256 of the scans, landmarks, template, model, settings and version; a run with the same inputs
             reuses the results.
         results_hash: SHA-256 of the files that the run wrote, except this one.
+        added: NAMEs that were registered to the mean after the run, and are not part of it.
     """
 
     CALLED: ClassVar = "a correspondence"
@@ -511,6 +512,7 @@ class CorrespondenceRecord(Struct, frozen=True, kw_only=True):
     sides_decided: bool = False
     inputs_hash: str = ""
     results_hash: str = ""
+    added: list[str] = []
     format: str = FORMAT
     format_version: int = VERSION
 

@@ -233,6 +233,25 @@ def test_a_scan_that_its_surface_hardly_follows_is_named_whatever_its_unit(say: 
     assert said.count("as is usual") == 1
 
 
+def test_point_clouds_among_meshes_are_registered_as_their_meshes_are(say: Callable[..., str], tmp_path: Path) -> None:
+    names = "abcd"
+    said = say("--template", mesh_file(tmp_path, SCANS[3]), **dict(zip(names, SCANS, strict=True)))
+    meshes = [ss.read_mesh(tmp_path / "same" / f"{name}.corresponding.ply").vertices for name in names]
+    assert "as is usual" not in said
+    (tmp_path / "scans" / "a.ply").unlink()
+    np.savetxt(tmp_path / "scans" / "a.xyz", SCANS[0].vertices)
+    said = say("--template", tmp_path / "template.ply", b=Mesh(SCANS[1].vertices, None))
+    assert said.count("It has no triangles: a point cloud") == 2 and "as is usual" not in said
+    for name, mesh in zip(names, meshes, strict=True):
+        surface = ss.read_mesh(tmp_path / "same" / f"{name}.corresponding.ply").vertices
+        assert np.linalg.norm(surface - mesh, axis=1).mean() < 1.0
+
+
+def mesh_file(folder: Path, mesh: Mesh) -> Path:
+    ss.write_mesh(folder / "template.ply", mesh)
+    return folder / "template.ply"
+
+
 def test_a_template_of_another_kind_is_named(say: Callable[..., str], tmp_path: Path) -> None:
     directions, faces = sphere(400)
     ss.write_mesh(tmp_path / "rod.ply", Mesh(directions * np.array([10.0, 10.0, 200.0]), faces))

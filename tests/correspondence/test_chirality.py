@@ -128,5 +128,12 @@ def test_surfaces_of_mirrored_scans_are_in_their_frames_and_build_reflects_them(
     own, image = (read_mesh(tmp_path / f"mixed-same/blob{k}.corresponding.ply") for k in (0, 1))
     np.testing.assert_array_equal(own.faces, image.faces[:, ::-1])
     assert build_engine(mixed()[1]).query(image.vertices).distance.mean() < 0.5
+    before = image.vertices
+    write_mesh(tmp_path / "new.ply", mirror_image(raw_blob(6, points=700).scan))
+    added = ["correspond", str(tmp_path / "new.ply"), "--add", "-o", str(tmp_path / "mixed-same")]
+    assert main([*added, "--jobs", "1", "--quiet"]) == 0
+    run = CorrespondenceRecord.from_json(json.loads((tmp_path / "mixed-same/correspondence.json").read_text()))
+    assert run.mirrored == ["blob1", "blob4", "new"] and run.sides_decided
+    np.testing.assert_array_equal(read_mesh(tmp_path / "mixed-same/blob1.corresponding.ply").vertices, before)
     models = [ss.ShapeModel.load(tmp_path / f"{folder}.h5") for folder in ("mixed", "plain")]
     np.testing.assert_allclose(models[0].total_variance, models[1].total_variance, rtol=0.1)

@@ -19,6 +19,7 @@ from shapespace.cli.options import Option, Source, advanced, basic
 COHORT = Source("cohort.read", "CohortConfig")
 EXECUTION = Source("batch.execution", "ExecutionConfig")
 CORRESPOND = Source("correspondence.settings", "CorrespondConfig")
+CHANGE_CORRESPONDENCE = Source("commands.correspond_changes", "Change")
 BUILD = Source("model.build_config", "BuildConfig")
 BUILD_FILES = Source("commands.build", "BuildFilesConfig")
 QUALITY = Source("model.model_quality", "QualityConfig")
@@ -116,6 +117,7 @@ _IDENTITY_RULES = (
 )
 _TARGET = "target"
 _MODES = "modes"
+_CHANGE = "change"
 
 
 def _execution(what: str) -> tuple[Option, ...]:
@@ -279,10 +281,12 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command(
         "correspond", "bring raw scans into dense correspondence; no model is needed",
-        ("shapespace correspond scans -o same", "shapespace build same -o model.h5"), run.correspond,
+        ("shapespace correspond scans -o same", "shapespace build same -o model.h5",
+         "shapespace correspond new_scans --add -o same"),
+        run.correspond,
         (
             basic("scans", "SCAN", "scans of one kind of object: files, folders, patterns, addresses or lists (.csv)",
-                  nargs="+"),
+                  nargs="*"),
             _OUTPUT,
             basic("--template",
                   "FILE", "template mesh, used unchanged (default: the scan closest to all others, meshed "
@@ -291,10 +295,17 @@ COMMANDS: tuple[Command, ...] = (
                   "ending, in any landmark format", parse=Path),
             basic("--symmetric", source=CORRESPOND),
             basic("--vertices", "N", source=CORRESPOND, parse=values.positive),
+            basic("--add", source=CHANGE_CORRESPONDENCE, either=_CHANGE),
+            advanced("--redo", "NAME", source=CHANGE_CORRESPONDENCE, repeat=True, default=[],
+                     either=_CHANGE),
+            advanced("--remove", "NAME", source=CHANGE_CORRESPONDENCE, repeat=True, default=[],
+                     either=_CHANGE),
+            advanced("--update", source=CHANGE_CORRESPONDENCE),
             advanced("--model",
                      "MODEL.h5", "shape model of such objects: its mean is the template, and its fit to a scan "
                      "initialises the first round", parse=Path),
             advanced("--mirror", source=CORRESPOND),
+            advanced("--outer", source=CORRESPOND),
             advanced("--landmark-std", "SHARE", source=CORRESPOND, field="landmark_uncertainty", parse=values.share,
                      formerly="--landmark-error"),
             advanced("--rounds", "N", source=CORRESPOND, parse=values.positive),

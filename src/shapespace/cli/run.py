@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from shapespace.cli.options import given
 from shapespace.cli.printing import arrow, now, say, short, show, show_json, warn
+from shapespace.errors import InputError
 
 if TYPE_CHECKING:
     from shapespace.batch.execution import ExecutionConfig
@@ -192,6 +193,7 @@ def correspond(arguments: argparse.Namespace) -> int:
 
         start_loading(tell=not arguments.quiet)
     from shapespace.commands.correspond import CorrespondFiles, correspond_files
+    from shapespace.commands.correspond_changes import Change, change_correspondence
     from shapespace.correspondence.settings import CorrespondConfig
     from shapespace.schemas import to_json
 
@@ -205,7 +207,14 @@ def correspond(arguments: argparse.Namespace) -> int:
         recursive=arguments.recursive,
         strict=arguments.strict,
     )
-    summary, records = correspond_files(files, arguments.output, config, quiet=arguments.quiet, say=warn)
+    change = Change(**given(arguments, Change))
+    folder, quiet = arguments.output, arguments.quiet
+    if not (change or files.scans):
+        raise InputError("Give scans, or a change of a finished correspondence by --redo, --remove or --update.")
+    if change:
+        summary, records = change_correspondence(change, files, folder, config, quiet=quiet, say=warn)
+    else:
+        summary, records = correspond_files(files, folder, config, quiet=quiet, say=warn)
     if arguments.json:
         show_json({"folder": str(arguments.output), **to_json(summary), "records": to_json(records)})
     else:

@@ -21,7 +21,7 @@ from shapespace.batch.lock import only_writer
 from shapespace.batch.parallel_rounds import RoundRunner
 from shapespace.batch.progress import progress, telling_of_compiling, waiting
 from shapespace.batch.result_folder import names_for
-from shapespace.commands.inputs import Given, given_scans, with_ids
+from shapespace.commands.inputs import given_scans, with_ids
 from shapespace.commands.landmark_files import LandmarkFiles
 from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
 from shapespace.correspondence.first_template import first_template
@@ -35,9 +35,10 @@ from shapespace.geometry.distortion import Distortion
 from shapespace.geometry.doctor import NON_FINITE, repair
 from shapespace.geometry.landmark_placement import far_landmarks, place_landmarks
 from shapespace.geometry.mirror_plane import mirror_image
-from shapespace.geometry.normals import face_areas, rms_size, without_estimates
+from shapespace.geometry.normals import face_areas, faces_of, rms_size, without_estimates
+from shapespace.geometry.outer_surface import outer_surface
 from shapespace.io.containers.json_files import read_json
-from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_text
+from shapespace.io.files import make_folder, move_file, remove_file, sha256_of_file, write_text
 from shapespace.io.landmarks.landmark_io import write_surface_landmarks
 from shapespace.io.meshes.mesh_io import ending_of, read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
@@ -46,7 +47,8 @@ from shapespace.store.corresponding import LANDMARKS, MEAN, RECORD, SUMMARY, SUR
 from shapespace.types import Mesh, SurfaceLandmarks
 from shapespace.version import __version__
 
-_KEPT = ".rounds"
+ROUNDS_FOLDER, CHANGE_FOLDER = ".rounds", ".change"
+"""Folders in that of the results: finished work of a run that is not finished, and the files of a change of results."""
 _BROKEN = "broken: "
 """Beginning of the reason for a scan that cannot be used."""
 _UNREADABLE = "unreadable"
@@ -58,7 +60,7 @@ _ANOTHER_SHAPE = 0.25
 _OTHER_SIZE = 2.0  # ratio of sizes: beyond twice the median a scan is probably of another object or unit
 _ENOUGH_TO_COMPARE, _FAR = 4, 3.0
 """Times the usual distance (95 % of both directions), sizes divided out."""
-_Say: TypeAlias = Callable[[str], None]
+Say: TypeAlias = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,7 @@ def correspond_files(
     config: CorrespondConfig,
     *,
     quiet: bool,
-    say: _Say,
+    say: Say,
 ) -> tuple[CorrespondenceRecord, list[CorrespondRecord]]:
     """Bring scans from files into correspondence and write what came of each into `folder`.
 
@@ -100,100 +102,125 @@ def correspond_files(
         FileError: the results cannot be written.
         InputError: fewer than two scans, or too few that can be reached.
     """
+    jobs = find_jobs(files, folder, say)
+    make_folder(folder)
+    with only_writer(folder):
+        complete_change(folder)
+        return _corresponding(jobs, files, folder, config, quiet=quiet, say=say)
+
+
+def find_jobs(files: CorrespondFiles, folder: Path, say: Say) -> list[Job]:
+    """Return the given scans, but for the surfaces of an earlier correspondence, with the names of their results.
+
+    Raises:
+        FileError: a folder, a list or an address cannot be read.
+        InputError: there are no scans, or two would have one name.
+    """
     given = given_scans(files.scans, folder, recursive=files.recursive, say=say)
     distinct = list({one.source: one for one in given}.values())
     scans = [one for one in distinct if not one.path.name.endswith(SURFACE)]
     if len(scans) < len(distinct):
         say(f"{len(distinct) - len(scans)} surfaces of an earlier correspondence are not taken for scans.")
-    make_folder(folder)
-    with only_writer(folder):
-        return _corresponding(_jobs(scans), files, folder, config, quiet=quiet, say=say)
-
-
-def _jobs(given: Sequence[Given]) -> list[Job]:
-    paths = [one.path for one in given]
-    names = names_for(paths, None, {one.path: one.address for one in given if one.address})
+    paths = [one.path for one in scans]
+    names = names_for(paths, None, {one.path: one.address for one in scans if one.address})
     return with_ids(
-        [Job(n, one.path, one.landmarks, address=one.address) for n, one in zip(names, given, strict=True)], given
+        [Job(n, one.path, one.landmarks, address=one.address) for n, one in zip(names, scans, strict=True)], scans
     )
 
 
 def _corresponding(
-    jobs: Sequence[Job], files: CorrespondFiles, folder: Path, config: CorrespondConfig, *, quiet: bool, say: _Say
+    jobs: Sequence[Job], files: CorrespondFiles, folder: Path, config: CorrespondConfig, *, quiet: bool, say: Say
 ) -> tuple[CorrespondenceRecord, list[CorrespondRecord]]:
     marks = LandmarkFiles.of(files.landmarks)
     marks.refuse_shared([job.scan for job in jobs if job.landmarks is None])
-    inputs_hash = _inputs_hash(jobs, marks, files, config)
+    inputs_hash = inputs_hash_of(jobs, marks, files, config)
     if (finished := _finished(jobs, folder, inputs_hash)) is not None:
         say(f"{folder} already contains the results of these scans and settings; nothing is computed.")
         return finished
     template = None if files.template is None else marks.onto(read_mesh(files.template), files.template)
     model = None if files.model is None else ShapeModel.load(files.model)
-    read = _read_all(jobs, marks, strict=files.strict, quiet=quiet)
-    _say_excluded(read.unread, len(jobs), say)
+    read = read_scans(jobs, marks, strict=files.strict, outer=config.outer, quiet=quiet, say=say)
+    say_excluded(read.unread, len(jobs), say)
     scans, notes = read.scans, read.notes
     marks.tell(say)
     if template is not None:
         for sentence in _stray_landmarks_note(template):
             say(f"{template.name}: {sentence}")
-    rounds = _Rounds(folder / _KEPT, files.execution, quiet=quiet)
+    settings, config = asdict(config), replace(config, outer=False)  # the scans are without inner surfaces now
+    rounds = RoundsWithProgress(folder / ROUNDS_FOLDER, files.execution, quiet=quiet)
     one_thread = threadpool_limits(1, user_api="blas")  # small matrices: more threads cost more than they give
     with telling_of_compiling(quiet=quiet), waiting("choosing the template", quiet=quiet), one_thread:
         first = first_template(list(scans.values()), template, config, model)
     made = correspond(list(scans.values()), config, first=first, run=rounds)
-    _note_copies(scans, notes)
+    note_copies(scans, notes)
     given = template.name if template is not None else "" if model is None else "The model's mean"
     if not given or made.moved[0] < _ANOTHER_SHAPE:
         _note_other_objects(made, notes)
-    records = _records(made, read, jobs, folder)
-    _tell(records, made, given, say)
-    _report_landmarks(records, read, say)
+    records = records_of(made, read, jobs, folder)
+    say_notes(records, made, given, say)
+    report_landmarks(records, read, say)
     # Until all is written the folder is none that build takes.
     remove_file(folder / SUMMARY)
-    _forget_others({record.name for record in records}, folder, say)
-    _write(made, records, folder)
+    # Surfaces of an earlier run are on another template.
+    if old := _forget_others({record.name for record in records}, folder):
+        say(f"Results of {old} scans that are not among those given were removed from {folder}.")
+    write_results(made, records, folder)
+    write_mean(made, folder)
     summary = CorrespondenceRecord(
         template=made.why,
         vertices=len(made.template.vertices),
         rounds=list(made.moved),
         corresponding=[record.name for record in records if not record.reason],
         set_aside={record.name: record.reason for record in records if record.reason},
-        settings=asdict(config),
+        settings=settings,
         version=__version__,
         other_units={record.name: record.unit_ratio for record in records if record.unit_ratio != 1.0},
         mirrored=[record.name for record in records if record.mirrored],
         sides_decided=made.sides_decided,
         inputs_hash=inputs_hash,
-        results_hash=_results_hash(jobs, folder),
     )
+    summary = structs.replace(summary, results_hash=results_hash_of(summary, folder))
     write_text(folder / SUMMARY, json_text(summary))
-    shutil.rmtree(folder / _KEPT, ignore_errors=True)
+    shutil.rmtree(folder / ROUNDS_FOLDER, ignore_errors=True)
     return summary, records
 
 
-def _inputs_hash(jobs: Sequence[Job], marks: LandmarkFiles, files: CorrespondFiles, config: CorrespondConfig) -> str:
-    """Return the SHA-256 of all inputs of a run, without parsing the scans; it does not depend on the executor."""
+def inputs_hash_of(
+    jobs: Sequence[Job],
+    marks: LandmarkFiles,
+    files: CorrespondFiles,
+    config: CorrespondConfig,
+    change: Sequence[object] = (),
+) -> str:
+    """Return the SHA-256 of all inputs of a run, without parsing the scans; it does not depend on the executor.
+
+    `change` is what is changed in a finished correspondence.
+    """
 
     def landmarks_hash(scan: Path, own: Path | None) -> str:
         file = own or marks.of_scan(scan)
-        return "" if file is None else _hash_of(file)
+        return "" if file is None else file_hash(file)
 
     scans: list[object] = []
     for job in jobs:
-        try:
-            with job.readable() as file:
-                content = _hash_of(file)
-        except ShapespaceError:
-            content = _UNREADABLE
-        scans.append([job.name, content, landmarks_hash(job.scan, job.landmarks), dict(job.metadata)])
-    template = None if files.template is None else [_hash_of(files.template), landmarks_hash(files.template, None)]
-    model = None if files.model is None else _hash_of(files.model)
-    inputs = [scans, template, model, asdict(config), files.strict, __version__]
+        scans.append([job.name, content_hash_of(job), landmarks_hash(job.scan, job.landmarks), dict(job.metadata)])
+    template = None if files.template is None else [file_hash(files.template), landmarks_hash(files.template, None)]
+    model = None if files.model is None else file_hash(files.model)
+    inputs = [scans, template, model, asdict(config), files.strict, __version__, *change]
     content = json.dumps(inputs, sort_keys=True, default=str)
     return hashlib.sha256(content.encode()).hexdigest()
 
 
-def _hash_of(file: Path) -> str:
+def content_hash_of(job: Job) -> str:
+    """Return the SHA-256 of the file of a scan."""
+    try:
+        with job.readable() as file:
+            return file_hash(file)
+    except ShapespaceError:
+        return _UNREADABLE
+
+
+def file_hash(file: Path) -> str:
     """Return the SHA-256 of a file, and of the vertices of a mesh that names other files with its content."""
     try:
         own = sha256_of_file(file)
@@ -206,13 +233,20 @@ def _hash_of(file: Path) -> str:
     return hashlib.sha256(b"".join(parts)).hexdigest()
 
 
-def _results_hash(jobs: Sequence[Job], folder: Path) -> str:
-    """Return the SHA-256 of the names and contents of all files of a run except its summary."""
-    names = [MEAN, LANDMARKS, *(f"{job.name}{ending}" for job in jobs for ending in (RECORD, SURFACE))]
+def results_hash_of(summary: CorrespondenceRecord, *folders: Path) -> str:
+    """Return the SHA-256 of the names and contents of all files of a correspondence, except its summary.
+
+    Each file is that of the first of `folders` that has it.
+    """
+    every = sorted([*summary.corresponding, *summary.set_aside])
+    records = [[f"{name}{RECORD}", *([f"{name}{SURFACE}"] * (name in summary.corresponding))] for name in every]
     digest = hashlib.sha256()
-    for name in names:
-        if (folder / name).is_file():
-            digest.update(f"{name} {sha256_of_file(folder / name)}\n".encode())
+    for name in (MEAN, LANDMARKS, *(file for files in records for file in files)):
+        # A mean has landmarks of its own, or none.
+        places = folders[:1] if name == LANDMARKS and (folders[0] / MEAN).is_file() else folders
+        file = next((folder / name for folder in places if (folder / name).is_file()), None)
+        if file is not None:
+            digest.update(f"{name} {sha256_of_file(file)}\n".encode())
     return digest.hexdigest()
 
 
@@ -222,7 +256,7 @@ def _finished(
     """Return the summary and records of a finished run with the same inputs whose files are whole; else None."""
     try:
         summary = CorrespondenceRecord.from_json(read_json(folder / SUMMARY, CORRESPOND_AGAIN))
-        if summary.inputs_hash != inputs_hash or summary.results_hash != _results_hash(jobs, folder):
+        if summary.inputs_hash != inputs_hash or summary.results_hash != results_hash_of(summary, folder):
             return None
         files = [folder / f"{job.name}{RECORD}" for job in jobs]
         return summary, [
@@ -232,13 +266,14 @@ def _finished(
         return None
 
 
-class _Rounds:
+class RoundsWithProgress:
     """Runs rounds with a bar for each."""
 
     def __init__(self, folder: Path, execution: ExecutionConfig, *, quiet: bool) -> None:
         self._folder, self._execution_config, self._quiet, self._number = folder, execution, quiet, 0
 
     def __call__(self, context: RoundContext, tasks: Sequence[RegistrationTask]) -> list[ScanRegistration]:
+        """Register the scans of one round, or compare them with their mirror images."""
         comparing = bool(tasks) and tasks[0].sides == "scores"
         self._number += not comparing
         label = "comparing with mirror images" if comparing else f"round {self._number}: registering"
@@ -251,7 +286,7 @@ class _Rounds:
 
 
 @dataclass(frozen=True)
-class _Read:
+class ScansRead:
     """By the names of the scans: what they hold, what is to be known of them, their hashes, and why others are not."""
 
     scans: dict[str, Mesh] = field(default_factory=dict[str, Mesh])
@@ -261,7 +296,7 @@ class _Read:
     landmark_distances: dict[str, dict[str, float]] = field(default_factory=dict[str, dict[str, float]])
 
 
-def _say_excluded(reasons: Mapping[str, str], scans: int, say: _Say) -> None:
+def say_excluded(reasons: Mapping[str, str], scans: int, say: Say) -> None:
     """Print the excluded scans, with the reason, before the first round."""
     for name, reason in reasons.items():
         say(f"{name} is excluded: {reason.removeprefix(_BROKEN)}")
@@ -269,9 +304,12 @@ def _say_excluded(reasons: Mapping[str, str], scans: int, say: _Say) -> None:
         say(f"{len(reasons)} of {scans} {'scan is' if scans == 1 else 'scans are'} excluded before the first round.")
 
 
-def _read_all(jobs: Sequence[Job], marks: LandmarkFiles, *, strict: bool, quiet: bool) -> _Read:
+def read_scans(
+    jobs: Sequence[Job], marks: LandmarkFiles, *, strict: bool, outer: bool, quiet: bool, say: Say
+) -> ScansRead:
     """Read and repair every scan; those that cannot be used are in `unread`, with the reason."""
-    read = _Read()
+    read = ScansRead()
+    removed: list[float] = []
     with progress(len(jobs), "reading", "scan", quiet=quiet) as bar:
         for job in jobs:
             try:
@@ -280,6 +318,9 @@ def _read_all(jobs: Sequence[Job], marks: LandmarkFiles, *, strict: bool, quiet:
                 mesh = marks.onto(mesh, job.scan, job.landmarks)
                 read.hashes[job.name] = content_hash
                 own = Mesh(mesh.vertices, mesh.faces, mesh.landmarks, job.name)
+                if outer and (visible := outer_surface(own)) is not own:
+                    removed.append(1 - len(faces_of(visible)) / len(faces_of(own)))
+                    own = visible
                 read.scans[job.name], read.notes[job.name] = scan, notes = _looked_at(own, strict=strict)
                 if scan.landmarks:
                     placed = place_landmarks(scan, scan.landmarks)
@@ -288,6 +329,11 @@ def _read_all(jobs: Sequence[Job], marks: LandmarkFiles, *, strict: bool, quiet:
             except ShapespaceError as error:
                 read.unread[job.name] = f"{_BROKEN}{error}"
             bar.update()
+    if removed:
+        say(
+            f"Inner surfaces of {len(removed)} of {len(jobs)} scans were removed: {100 * np.mean(removed):.0f} % of "
+            "their triangles on average."
+        )
     return read
 
 
@@ -315,7 +361,7 @@ def _far_notes(scan: Mesh, placed: SurfaceLandmarks) -> list[str]:
     ]
 
 
-def _report_landmarks(records: Sequence[CorrespondRecord], read: _Read, say: _Say) -> None:
+def report_landmarks(records: Sequence[CorrespondRecord], read: ScansRead, say: Say) -> None:
     """Print the distances of the given landmarks from the scans, and from those of the corresponding surfaces."""
     shares = {
         (name, scan): distance / rms_size(read.scans[scan].vertices)
@@ -351,7 +397,8 @@ def _stray_landmarks_note(scan: Mesh) -> list[str]:
     return [f"Landmarks that lie far off its surface are left out: {named}."]
 
 
-def _note_copies(scans: dict[str, Mesh], notes: dict[str, list[str]]) -> None:
+def note_copies(scans: dict[str, Mesh], notes: dict[str, list[str]]) -> None:
+    """Add a note to each scan that is an earlier one again."""
     names = list(scans)
     for copy, first in copies(list(scans.values())).items():
         notes[names[copy]].append(f"It is {names[first]} again; leave one of them out.")
@@ -370,7 +417,7 @@ def _note_other_objects(made: Correspondence, notes: dict[str, list[str]]) -> No
             )
 
 
-def _tell(records: Sequence[CorrespondRecord], made: Correspondence, given: str, say: _Say) -> None:
+def say_notes(records: Sequence[CorrespondRecord], made: Correspondence, given: str, say: Say) -> None:
     """Say what should be known before the results are used; `given` is what the template given is called, if one is."""
     if given and made.moved[0] >= _ANOTHER_SHAPE:
         say(
@@ -398,16 +445,18 @@ def _tell(records: Sequence[CorrespondRecord], made: Correspondence, given: str,
         )
 
 
-def _records(
+def records_of(
     made: Correspondence,
-    read: _Read,
+    read: ScansRead,
     jobs: Sequence[Job],
     folder: Path,
+    kept: Sequence[tuple[float, CorrespondRecord]] = (),
 ) -> list[CorrespondRecord]:
+    """Return the records of the scans `jobs`; `kept` are scales and records of the scans that they are added to."""
     came = {scan.name: scan for scan in made.scans}
     surfaces = {mesh.name: mesh for mesh in made.meshes()}
     scaled = {scan.name: scan.T_scan_template.scale for scan in made.scans if scan.T_scan_template is not None}
-    sizes = dict(zip(scaled, zip(*unit_ratios(list(scaled.values())), strict=True), strict=True))
+    sizes = _sizes(scaled, kept)
     records: list[CorrespondRecord] = []
     for job in jobs:
         name, one = job.name, came.get(job.name)
@@ -422,15 +471,32 @@ def _records(
             odd = [] if 1 / _OTHER_SIZE < scale < _OTHER_SIZE else [_size_note(scale)]
             record = structs.replace(record, scale=scale, unit_ratio=ratio, notes=[*record.notes, *odd])
         records.append(record)
-    return _with_far_ones(records)
+    before = [record for _, record in kept]
+    return _with_far_ones([*before, *records])[len(before) :]
+
+
+def _sizes(
+    scales: Mapping[str, float], kept: Sequence[tuple[float, CorrespondRecord]]
+) -> dict[str, tuple[np.float64, np.float64]]:
+    """Return size and unit of scans, by name, relative to the others, or to the scans that they are added to."""
+    if not kept:
+        return dict(zip(scales, zip(*unit_ratios(list(scales.values())), strict=True), strict=True))
+    usual = [scale / record.unit_ratio for scale, record in kept]
+    ratios = {name: unit_ratios([*usual, *usual, scale]) for name, scale in scales.items()}  # the others are most
+    return {name: (sizes[-1], units[-1]) for name, (sizes, units) in ratios.items()}
 
 
 def _with_far_ones(records: Sequence[CorrespondRecord]) -> list[CorrespondRecord]:
-    """Return `records` with a note on those whose surface lies much farther from its scan than is usual."""
+    """Return `records` with a note on those whose surface lies much farther from its scan than is usual.
+
+    Point clouds are compared with each other, since their distances are those to points.
+    """
     far = np.array([(r.distance_p95 or np.nan) / ((r.scale or np.nan) * r.unit_ratio) for r in records])
-    if np.isfinite(far).sum() < _ENOUGH_TO_COMPARE:
-        return list(records)
-    ratios = far / np.nanmedian(far)
+    is_cloud = np.array([r.area_share is None for r in records])
+    ratios = np.full(len(records), np.nan)
+    for alike in (is_cloud, ~is_cloud):
+        if np.isfinite(far[alike]).sum() >= _ENOUGH_TO_COMPARE:
+            ratios[alike] = far[alike] / np.nanmedian(far[alike])
     return [
         record
         if not times > _FAR
@@ -471,7 +537,12 @@ def _record(
     )  # fmt: skip
 
 
-def _write(made: Correspondence, records: Sequence[CorrespondRecord], folder: Path) -> None:
+def write_results(made: Correspondence, records: Sequence[CorrespondRecord], folder: Path) -> None:
+    """Write records and surfaces into `folder`, and remove those surfaces that the records do not have.
+
+    Raises:
+        FileError: they cannot be written.
+    """
     surfaces = {mesh.name: replace(mesh, landmarks={}) for mesh in made.meshes()}
     for record in records:
         file = folder / f"{record.name}{SURFACE}"
@@ -481,6 +552,14 @@ def _write(made: Correspondence, records: Sequence[CorrespondRecord], folder: Pa
         else:
             write_mesh(file, mirror_image(surface) if record.mirrored else surface)
         write_text(folder / f"{record.name}{RECORD}", json_text(record))
+
+
+def write_mean(made: Correspondence, folder: Path) -> None:
+    """Write the mean and its landmarks into `folder`.
+
+    Raises:
+        FileError: they cannot be written.
+    """
     make_folder((folder / MEAN).parent)
     write_mesh(folder / MEAN, made.template)
     if made.landmarks:
@@ -489,11 +568,35 @@ def _write(made: Correspondence, records: Sequence[CorrespondRecord], folder: Pa
         remove_file(folder / LANDMARKS)
 
 
-def _forget_others(names: set[str], folder: Path, say: _Say) -> None:
-    """Remove surfaces of an earlier run of scans that are not in this one: they are on another template."""
+def complete_change(folder: Path) -> None:
+    """Move the files of a change into `folder` if all are written; otherwise remove what was written of them.
+
+    A folder that is left in between has no summary, so that nothing takes it; this function then completes it.
+
+    Raises:
+        FileError: they cannot be moved.
+    """
+    change = folder / CHANGE_FOLDER
+    if (change / SUMMARY).is_file():
+        summary = CorrespondenceRecord.from_json(read_json(change / SUMMARY, CORRESPOND_AGAIN))
+        remove_file(folder / SUMMARY)
+        for name in summary.set_aside:
+            remove_file(folder / f"{name}{SURFACE}")
+        if (change / MEAN).is_file() and not (change / LANDMARKS).is_file():
+            remove_file(folder / LANDMARKS)
+        results = (file for pattern in (RECORD, SURFACE) for file in sorted(change.glob(f"*{pattern}")))
+        for file in (*results, change / MEAN, change / LANDMARKS):
+            if file.is_file():
+                move_file(file, folder / file.relative_to(change))
+        _forget_others({*summary.corresponding, *summary.set_aside}, folder)
+        move_file(change / SUMMARY, folder / SUMMARY)
+    shutil.rmtree(change, ignore_errors=True)
+
+
+def _forget_others(names: set[str], folder: Path) -> int:
+    """Remove the results of scans other than `names`, and return of how many."""
     old = [file for file in sorted(folder.glob(f"*{RECORD}")) if file.name.removesuffix(RECORD) not in names]
     for file in old:
         remove_file(folder / (file.name.removesuffix(RECORD) + SURFACE))
         remove_file(file)
-    if old:
-        say(f"Results of {len(old)} scans that are not among those given were removed from {folder}.")
+    return len(old)

@@ -14,6 +14,7 @@ from shapespace.correspondence.template import check_template, choose_template, 
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.doctor import repair
 from shapespace.geometry.normals import rms_size
+from shapespace.geometry.outer_surface import outer_surface
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh, Similarity
 
@@ -55,7 +56,7 @@ def first_template(
         raise InputError(f"Landmarks have an uncertainty above 0, not {config.landmark_uncertainty}; give another.")
     if template is not None and model is not None:
         raise InputError("Both a template and a model are given, and the model's mean is a template; leave one out.")
-    repaired, broken = _repaired(scans)
+    repaired, broken = repaired_scans(scans, outer=config.outer)
     if len(repaired) < FEWEST:
         raise InputError(f"Hardly any of the scans can be used: {'; '.join(broken.values())}")
     if len(copies(list(repaired.values()))) == len(repaired) - 1:
@@ -76,12 +77,13 @@ def first_template(
     return FirstTemplate(mesh, origin, repaired, broken, None if model is None else _transformed(model, T))
 
 
-def _repaired(scans: Sequence[Mesh]) -> tuple[dict[int, Mesh], dict[int, str]]:
+def repaired_scans(scans: Sequence[Mesh], *, outer: bool) -> tuple[dict[int, Mesh], dict[int, str]]:
+    """Return the scans that can be used, by number, and why the others cannot; `outer` removes inner surfaces."""
     repaired: dict[int, Mesh] = {}
     broken: dict[int, str] = {}
     for i, scan in enumerate(scans):
         try:
-            repaired[i] = without_stray_landmarks(repair(scan)[0])
+            repaired[i] = without_stray_landmarks(repair(outer_surface(scan) if outer else scan)[0])
         except MeshError as error:
             broken[i] = f"broken: {error}"
     return repaired, broken

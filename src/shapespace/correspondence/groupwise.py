@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from shapespace.correspondence.chirality import Sides, solve_sides
 from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
-from shapespace.correspondence.first_template import FirstTemplate, first_template
+from shapespace.correspondence.first_template import FirstTemplate, first_template, repaired_scans
 from shapespace.correspondence.guide import ShapePredictor, predict_leave_one_out
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.landmark_guide import ScanLandmarks, consensus_landmarks
@@ -40,6 +40,7 @@ from shapespace.types import FloatArray, Mesh, Similarity, SurfaceLandmarks
 
 ENOUGH_TO_JUDGE, _ENOUGH_TO_PREDICT = 6, 4
 """Scans: fewer do not determine the normal range of shapes; fewer do not predict another one."""
+_JUDGES = 40  # finished scans, at most, that an added one is compared with: time grows with their square
 _PARTS = 4  # folds of the shapes: the pose model of a scan is built without it
 _WHOLE, _LEAST_SPREAD, _SIZE_UNSEEN = 0.9, 0.01, 0.3
 """Scans that observe more than this share of the template determine the usual size; the least standard deviation of
@@ -282,7 +283,7 @@ def _comparison(problem: _Problem, state: RegistrationState, i: int) -> Comparis
     if problem.config.mirror == "never" or problem.config.symmetric:
         return "as given"
     own, other = state.registrations[i].scores if i in state.registrations else (np.nan, np.nan)
-    return "both" if state.sides.decided and state.rounds and not other > _CLEARLY_WORSE * own else "one"
+    return "both" if state.sides.decided and state.registrations and not other > _CLEARLY_WORSE * own else "one"
 
 
 def _pose_with_usual_size(state: RegistrationState, i: int) -> Similarity:
@@ -429,9 +430,7 @@ def _update_template(
         registration = state.registrations[i]
         T = registration.T_scan_template @ fit_similarity(shape, registration.vertices)
         registrations[i] = replace(registration, vertices=shape, T_scan_template=T)
-        known = i in previous.registrations
-        before = previous.registrations[i].vertices if known else previous.template.vertices
-        squares[i] = float(((fit_similarity(before, shape).apply(before) - shape) ** 2).sum(axis=1).mean())
+        squares[i] = _squared_movement(previous, i, shape)
     predictions = state.predictions
     if problem.config.guided and len(order) >= _ENOUGH_TO_PREDICT:
         predicted = predict_leave_one_out(shapes, observed, problem.config.noise_share, images)
@@ -451,6 +450,13 @@ def _update_template(
         sides=state.sides,
         rounds=(*state.rounds, record),
     )
+
+
+def _squared_movement(previous: RegistrationState, i: int, shape: FloatArray) -> float:
+    """Return the mean squared movement of the vertices of scan `i` since the last round; its first is from the mean."""
+    known = i in previous.registrations
+    before = previous.registrations[i].vertices if known else previous.template.vertices
+    return float(((fit_similarity(before, shape).apply(before) - shape) ** 2).sum(axis=1).mean())
 
 
 def _aligned_shapes(
@@ -480,6 +486,183 @@ def _landmarks_on(template: Mesh, problem: _Problem, registrations: Mapping[int,
         return {name: T_template_scan.apply(point) for name, point in scan.landmarks.items()}
 
     return consensus_landmarks(template, [(one.vertices, in_template_frame(i)) for i, one in registrations.items()])
+
+
+# Scans added to a finished correspondence
+
+
+@dataclass(frozen=True, eq=False)
+class FinishedCorrespondence:
+    """The result of `correspond` that scans are added to.
+
+    Args:
+        mean: its mean shape, of the size `SIZE`.
+        landmarks: on the mean.
+        surfaces: in correspondence, each in the frame and unit of its scan, with `Mesh.observed`; those of mirrored
+            scans are reflected. Their landmarks are used if the mean has none.
+        scans: the raw scans of the surfaces; empty if the mean and the surfaces stay.
+        mirrored: which of the scans are mirrored; empty if none is.
+        sides_decided: as of `Correspondence`.
+    """
+
+    mean: Mesh
+    landmarks: SurfaceLandmarks
+    surfaces: Sequence[Mesh]
+    scans: Sequence[Mesh] = ()
+    mirrored: Sequence[bool] = ()
+    sides_decided: bool = False
+
+
+def add_scans(
+    finished: FinishedCorrespondence,
+    scans: Sequence[Mesh],
+    config: CorrespondConfig | None = None,
+    *,
+    run: Runner = run_here,
+) -> Correspondence:
+    """Register `scans` to the mean of a finished correspondence, each with the finished surfaces as prior.
+
+    No result depends on the other added scans, and mean and surfaces stay as they are. With `finished.scans` one more
+    round over all scans follows, which computes the mean and all surfaces anew.
+
+    Args:
+        finished: the correspondence.
+        scans: the scans to add, in any pose, size and unit.
+        config: of the finished correspondence.
+        run: does the tasks of a round.
+
+    Returns:
+        The mean, and the results of `scans` alone; with `finished.scans` those of all scans, the finished ones first.
+
+    Raises:
+        InputError: a scan of `finished` cannot be used, or the round over all scans registers fewer than two.
+    """
+    config = config or CorrespondConfig()
+    kept = len(finished.surfaces)
+    scans = list(as_meshes(scans, "add_scans"))
+    repaired, broken = repaired_scans(scans, outer=config.outer)
+    raw, unusable = repaired_scans(finished.scans, outer=config.outer)
+    if unusable:
+        raise InputError(f"A scan of the finished correspondence is {next(iter(unusable.values()))}")
+    raw |= {kept + i: scan for i, scan in repaired.items()}
+    reasons = {kept + i: reason for i, reason in broken.items()}
+    names = [mesh.name for mesh in (*finished.surfaces, *scans)]
+    first = FirstTemplate(finished.mean, "The template is the mean of the finished correspondence.", raw, reasons)
+    problem = _Problem.of(names, first, config)
+    start = _finished_state(problem, finished)
+    states = _added_states(problem, start, [i for i in raw if i >= kept], run)
+    if finished.scans:
+        state = _merged(start, states)
+        state = replace(_update_template(problem, state, state, {}), rounds=())
+        registrations = run(_context(problem, state), [_task(problem, state, i) for i in raw])
+        return _result(problem, _next_state(problem, state, registrations))
+    results = [_added_result(problem, states.get(i, start), i) for i in range(kept, len(names))]
+    return Correspondence(finished.mean, tuple(results), first.origin, (), start.landmarks)
+
+
+def _added_result(problem: _Problem, state: RegistrationState, i: int) -> Corresponding:
+    own = state.registrations.get(i)
+    if own is None or own.observed.all():  # estimates take long where there are many scans
+        return _scan_result(problem, state, i, None if own is None else own.vertices)
+    return _scan_result(problem, state, i, _complete_shapes(problem, state)[i])
+
+
+def _finished_state(problem: _Problem, finished: FinishedCorrespondence) -> RegistrationState:
+    """Return the state after the last round of a finished correspondence, from its surfaces aligned to its mean."""
+    registrations: dict[int, ScanRegistration] = {}
+    for i, surface in enumerate(finished.surfaces):
+        observed = np.ones(len(surface.vertices), np.bool_) if surface.observed is None else surface.observed
+        T = fit_similarity(surface.vertices[observed], finished.mean.vertices[observed])  # C11
+        nan = np.nan
+        registrations[i] = ScanRegistration(
+            i, T.apply(surface.vertices), T.inverse(), observed, covered=1.0, distance=(nan, nan, nan, nan), cpu_s=0.0,
+            mirrored=bool(finished.mirrored) and finished.mirrored[i],
+        )  # fmt: skip
+    places = finished.landmarks or consensus_landmarks(
+        finished.mean,
+        [
+            (
+                one.vertices,
+                {k: one.T_scan_template.inverse().apply(x) for k, x in finished.surfaces[i].landmarks.items()},
+            )
+            for i, one in registrations.items()
+        ],
+    )
+    unknown = np.zeros(len(problem.names))
+    sides = Sides(unknown > 0, unknown, finished.sides_decided)
+    return RegistrationState(finished.mean, places, registrations, dict(problem.first.broken), {}, sides, ())
+
+
+def _added_states(
+    problem: _Problem, start: RegistrationState, added: Sequence[int], run: Runner
+) -> dict[int, RegistrationState]:
+    """Return for each scan of `added` the state with the finished scans and it alone, after its last round."""
+    shapes = start.shapes(sorted(start.registrations))[0]
+    prior = shapes if len(shapes) >= ENOUGH_TO_JUDGE else None
+    pose_models = (PoseModel.of(start.template, prior),)  # it is trained without all added scans
+    context = RoundContext(start.template, problem.harmonics, pose_models, problem.config.seed)
+    if problem.mirror is not None:
+        shapes = np.concatenate([shapes, np.stack([problem.mirror.image(shape) for shape in shapes])])
+    can_predict = problem.config.guided and len(start.registrations) >= _ENOUGH_TO_PREDICT
+    predictor = ShapePredictor.of(shapes, problem.config.noise_share) if can_predict else None
+    states = dict.fromkeys(added, start)
+    left = list(added)
+    for _ in range(problem.config.rounds):
+        tasks = [replace(_task(problem, states[i], i), pose_model=0) for i in left]
+        for registration in run(context, tasks):
+            i = registration.index
+            states[i] = _next_added_state(problem, start, states[i], registration, predictor)
+        # The mean stays, so an excluded scan would be excluded again.
+        left = [i for i in left if states[i].rounds and states[i].rounds[-1].moved >= problem.config.settled]
+    return {i: _judged_by_finished(problem, state, i) for i, state in states.items()}
+
+
+def _next_added_state(
+    problem: _Problem,
+    start: RegistrationState,
+    previous: RegistrationState,
+    registration: ScanRegistration,
+    predictor: ShapePredictor | None,
+) -> RegistrationState:
+    """Return the state after a round of one added scan; the finished scans and their mean stay."""
+    i, kept = registration.index, start.registrations
+    state = _accept(problem, previous, [registration])
+    if i not in state.registrations:
+        return replace(start, excluded={i: state.excluded[i]})
+    state = replace(state, registrations={**kept, i: state.registrations[i]})
+    if registration.alternatives:
+        state = _resolve_alternatives(problem, state)
+    state = _exclude_mirrored(problem, state)
+    if i not in state.registrations:
+        return replace(start, excluded={i: state.excluded[i]})
+    own, mean = state.registrations[i], start.template.vertices
+    T = fit_similarity(own.vertices[own.observed], mean[own.observed])  # C11
+    shape = T.apply(own.vertices)
+    moved = float(np.sqrt(_squared_movement(previous, i, shape))) / SIZE
+    own = replace(own, vertices=shape, T_scan_template=own.T_scan_template @ T.inverse())
+    predicted = {} if predictor is None else {i: predictor.predict(shape, own.observed.astype(np.float64))}
+    record = RoundRecord(moved, {i: moved}, {i: registration.cpu_s})
+    rounds = (*previous.rounds, record)
+    return replace(start, registrations={**kept, i: own}, predictions=predicted, rounds=rounds)
+
+
+def _judged_by_finished(problem: _Problem, state: RegistrationState, i: int) -> RegistrationState:
+    """Return the state of an added scan after its last round, without it if it is an outlier among the others."""
+    if i not in state.registrations:
+        return state
+    kept = sorted(state.registrations.keys() - {i})
+    judged = _exclude_outliers(problem, state, [*kept[:: -(-len(kept) // _JUDGES)], i])
+    if i in judged.registrations:
+        return state
+    return replace(state, registrations={j: state.registrations[j] for j in kept}, excluded={i: judged.excluded[i]})
+
+
+def _merged(start: RegistrationState, states: Mapping[int, RegistrationState]) -> RegistrationState:
+    """Return the state with the finished scans and all added ones."""
+    registered = {i: state.registrations[i] for i, state in states.items() if i in state.registrations}
+    excluded = {i: state.excluded[i] for i, state in states.items() if i not in registered}
+    registrations, reasons = {**start.registrations, **registered}, {**start.excluded, **excluded}
+    return replace(start, registrations=registrations, excluded=reasons)
 
 
 # The result

@@ -33,6 +33,8 @@ class CorrespondConfig:
             the mirror images of the other scans.
         mirror: what is done with scans that are mirror images of the majority, such as left among right teeth: they are
             reflected (auto), excluded (ask), or the files are trusted (never).
+        outer: remove inner surfaces first, such as marrow cavities and trabeculae of CT scans, which are hardly visible
+            from outside.
         landmark_uncertainty: standard deviation of the landmarks, as a share of the object's size (RMS distance from
             its centre).
         seed: random seed.
@@ -50,5 +52,6 @@ class CorrespondConfig:
     outlier_threshold: float = 3.0
     symmetric: bool = False
     mirror: Literal["auto", "ask", "never"] = "auto"
+    outer: bool = False
     landmark_uncertainty: float = 0.02
     seed: int = 0

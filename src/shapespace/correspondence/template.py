@@ -16,6 +16,7 @@ from shapespace.fit.search.initialisation import Start, start_from_any_pose
 from shapespace.geometry import remesh
 from shapespace.geometry.doctor import repair
 from shapespace.geometry.normals import boundary_edges, face_areas, faces_of, rms_size, without_vertices
+from shapespace.geometry.outer_surface import hidden_share
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 
@@ -27,6 +28,8 @@ _FEWEST = 100
 """Vertices: fewer do not tell an object's shape."""
 _AS_WHOLE = 0.93
 """Candidates that show less than this share of what the most whole one shows lack a part."""
+_INSIDE = 0.05
+"""Scans of which more than this share of the area cannot be seen from outside have inner surfaces, as CT scans do."""
 _SMALL_HOLE, _LONGEST_HOLE = 0.15, 0.05
 """Holes with a border shorter than this share of the longest border, or of a circle of that size, are closed;
 the longest border of all may be one that the object has, and must be shorter to be closed."""
@@ -90,7 +93,8 @@ class TemplateChoice:
 def choose_template(scans: Sequence[Mesh], seed: int) -> TemplateChoice:
     """Return which of `scans` is nearest to the others, judged by a few candidates and a few others.
 
-    Candidates are some with few pieces and short borders, as those lack least. One that lacks a part shows less of the
+    Candidates are some with few pieces and short borders, as those lack least, without inner surfaces where there are
+    such. One that lacks a part shows less of the
     surface than the others do where it lies on them, and is chosen only if all lack as much.
 
     Raises:
@@ -98,6 +102,9 @@ def choose_template(scans: Sequence[Mesh], seed: int) -> TemplateChoice:
     """
     rng = np.random.default_rng(seed)
     incompleteness = np.array([_incompleteness(scan) for scan in scans])
+    has_inside = np.array([hidden_share(scan) > _INSIDE for scan in scans])
+    if np.isfinite(incompleteness[~has_inside]).any():
+        incompleteness[has_inside] = np.inf
     candidates = np.argsort(incompleteness, kind="stable")[: max(_CANDIDATES, len(scans) // 2)]
     candidates = candidates[np.isfinite(incompleteness[candidates])]
     candidates = np.sort(rng.choice(candidates, min(_CANDIDATES, len(candidates)), replace=False))

@@ -275,6 +275,18 @@ def remove_file(path: Path) -> None:
         raise write_error(path, error) from error
 
 
+def move_file(source: Path, target: Path) -> None:
+    """Move `source` to `target` in the same file system, in one step; a file there is replaced.
+
+    Raises:
+        FileError: it cannot be moved.
+    """
+    try:
+        source.replace(target)
+    except OSError as error:
+        raise write_error(target, error) from error
+
+
 def sha256_of_file(path: Path) -> str:
     """Return the hexadecimal SHA-256 of the file at `path`.
 

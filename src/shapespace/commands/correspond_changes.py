@@ -1,0 +1,383 @@
+"""Changes of a finished correspondence: scans are added, registered again or removed, and all others stay bit for bit.
+
+With an update one more round over all scans follows, which computes the mean and all surfaces anew.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+from msgspec import structs
+
+from shapespace.batch.fit_work import Job
+from shapespace.batch.lock import only_writer
+from shapespace.batch.progress import telling_of_compiling
+from shapespace.commands.correspond import (
+    CHANGE_FOLDER,
+    ROUNDS_FOLDER,
+    CorrespondFiles,
+    RoundsWithProgress,
+    ScansRead,
+    complete_change,
+    content_hash_of,
+    find_jobs,
+    inputs_hash_of,
+    note_copies,
+    read_scans,
+    records_of,
+    report_landmarks,
+    results_hash_of,
+    say_excluded,
+    say_notes,
+    write_mean,
+    write_results,
+)
+from shapespace.commands.inputs import Given
+from shapespace.commands.landmark_files import LandmarkFiles
+from shapespace.correspondence.correspondence_result import Correspondence
+from shapespace.correspondence.groupwise import FinishedCorrespondence, add_scans
+from shapespace.correspondence.settings import FEWEST, CorrespondConfig
+from shapespace.errors import InputError
+from shapespace.geometry.mirror_plane import mirror_image
+from shapespace.geometry.normals import faces_of
+from shapespace.geometry.similarity import fit_similarity
+from shapespace.io.files import make_folder, write_text
+from shapespace.io.landmarks.landmark_io import read_surface_landmarks
+from shapespace.io.meshes.mesh_io import read_mesh
+from shapespace.io.remote import is_address
+from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, json_text, read
+from shapespace.store.corresponding import LANDMARKS, MEAN, RECORD, SUMMARY, SURFACE, json_of
+from shapespace.types import Mesh, SurfaceLandmarks
+
+_OPTIONS = {
+    "vertices": "--vertices", "rounds": "--rounds", "symmetric": "--symmetric", "outer": "--outer",
+    "mirror": "--mirror", "landmark_uncertainty": "--landmark-std", "seed": "--seed",
+}  # fmt: skip
+"""Options of the settings that a change takes from the finished correspondence, by their fields."""
+_LISTED = 5  # names in a message, so that it stays short
+_Say: TypeAlias = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Change:
+    """What is changed in a finished correspondence; `add`, `redo` and `remove` exclude each other.
+
+    Args:
+        add: add the given scans to the finished correspondence in the output folder; all others stay as they are.
+        redo: register this scan of the output folder again, from its file as it is now, or from the given scans.
+        remove: remove the results of this scan from the output folder.
+        update: also compute the mean and all surfaces anew, by one more round over all scans.
+    """
+
+    add: bool = False
+    redo: Sequence[str] = ()
+    remove: Sequence[str] = ()
+    update: bool = False
+
+    def __bool__(self) -> bool:
+        return bool(self.add or self.redo or self.remove or self.update)
+
+    @property
+    def option(self) -> str:
+        """The option that asks for it."""
+        return "--add" if self.add else "--redo" if self.redo else "--remove" if self.remove else "--update"
+
+
+@dataclass(frozen=True)
+class _Finished:
+    """A finished correspondence in a folder.
+
+    Args:
+        folder: with its files.
+        summary: of the run.
+        records: of all scans by name, those in correspondence first.
+        mean: its mean shape.
+        surfaces: of the scans in correspondence, by name; those of mirrored scans are reflected.
+    """
+
+    folder: Path
+    summary: CorrespondenceRecord
+    records: dict[str, CorrespondRecord]
+    mean: Mesh
+    surfaces: dict[str, Mesh]
+
+    @staticmethod
+    def of(folder: Path) -> _Finished:
+        """Read all files of the correspondence in `folder`.
+
+        Raises:
+            InputError: its files do not belong together.
+            FileError, FileFormatError: a file cannot be read, or is damaged.
+        """
+        summary = CorrespondenceRecord.from_json(json_of(folder / SUMMARY), str(folder / SUMMARY))
+        records: dict[str, CorrespondRecord] = {}
+        for name in (*summary.corresponding, *summary.set_aside):
+            file = folder / f"{name}{RECORD}"
+            records[name] = read(CorrespondRecord, json_of(file), str(file), CORRESPOND_AGAIN)
+        mean = read_mesh(folder / MEAN)
+        files = {name: read_mesh(folder / f"{name}{SURFACE}") for name in summary.corresponding}
+        surfaces = {name: mirror_image(one) if name in summary.mirrored else one for name, one in files.items()}
+        fault = ""
+        if len(mean.vertices) != summary.vertices:
+            fault = f"{MEAN} has {len(mean.vertices)} vertices, and the correspondence {summary.vertices}"
+        elif other := [name for name, one in surfaces.items() if not np.array_equal(faces_of(one), faces_of(mean))]:
+            fault = f"{other[0]}{SURFACE} and {MEAN} have different triangles, so one of them was changed"
+        elif summary.results_hash not in ("", results_hash_of(summary, folder)):
+            fault = "its files were changed after the correspondence"
+        if fault:
+            raise InputError(f"{folder}: {fault}; {CORRESPOND_AGAIN}.")
+        return _Finished(folder, summary, records, mean, surfaces)
+
+    def config(self, files: CorrespondFiles, asked: CorrespondConfig) -> CorrespondConfig:
+        """Return the settings of the correspondence, which `asked` must not contradict.
+
+        Raises:
+            InputError: options ask for something else.
+        """
+        config = read(CorrespondConfig, self.summary.settings, str(self.folder / SUMMARY), CORRESPOND_AGAIN)
+        for option, file in (("--template", files.template), ("--model", files.model)):
+            if file is not None:
+                raise InputError(f"The template of a finished correspondence is its mean; leave {option} out.")
+        usual = CorrespondConfig()
+        for name, option in _OPTIONS.items():
+            own = getattr(config, name)
+            if getattr(asked, name) not in (own, getattr(usual, name)):
+                value = f"without {option}" if own is False else f"with {option} {own}"
+                raise InputError(f"{self.folder} was computed {value}, and a change keeps that; leave {option} out.")
+        return config
+
+    def refuse_unknown(self, names: Sequence[str], option: str) -> None:
+        """Raise InputError where no scan of the correspondence has one of `names`."""
+        for name in names:
+            if name not in self.records:
+                known = ", ".join(list(self.records)[:_LISTED]) + (", ..." if len(self.records) > _LISTED else "")
+                raise InputError(f"{option} {name}: {self.folder} has no scan of that name; it has {known}.")
+
+    def job(self, name: str) -> Job:
+        """Return the job of a scan, from where it was."""
+        record = self.records[name]
+        known = {key: str(value) for key, value in record.metadata.items() if value is not None}
+        if is_address(record.path):
+            return Job(name, Given(record.path).path, metadata=known, address=record.path)
+        return Job(name, Path(os.path.normpath(self.folder / record.path)), metadata=known)
+
+
+def change_correspondence(
+    change: Change, files: CorrespondFiles, folder: Path, config: CorrespondConfig, *, quiet: bool, say: _Say
+) -> tuple[CorrespondenceRecord, list[CorrespondRecord]]:
+    """Change the finished correspondence in `folder`, and return its summary and all records.
+
+    What was done is kept in the folder until the end, so the same command goes on from there after an interruption.
+
+    Raises:
+        FileError: something cannot be read or written.
+        InputError: there is no finished correspondence, it is contradicted, or fewer than two scans would be left.
+    """
+    if not (folder / SUMMARY).is_file() and not (folder / CHANGE_FOLDER).is_dir():
+        raise InputError(
+            f"{folder} contains no finished correspondence, and {change.option} needs one; run shapespace correspond "
+            f"without {change.option} first."
+        )
+    with only_writer(folder):
+        complete_change(folder)
+        finished = _Finished.of(folder)
+        return _changed(finished, change, files, finished.config(files, config), quiet=quiet, say=say)
+
+
+def _changed(
+    finished: _Finished, change: Change, files: CorrespondFiles, config: CorrespondConfig, *, quiet: bool, say: _Say
+) -> tuple[CorrespondenceRecord, list[CorrespondRecord]]:
+    folder, summary = finished.folder, finished.summary
+    marks = LandmarkFiles.of(files.landmarks)
+    for record in finished.records.values():
+        marks.of_scan(Path(record.path))  # so that it is not said to belong to no scan
+    given = find_jobs(files, folder, say) if files.scans else []
+    new = _new_jobs(finished, change, given)
+    kept = [name for name in summary.corresponding if name not in (*change.redo, *change.remove)]
+    old = _old_jobs(finished, change, given) if change.update else []
+    jobs = list({job.name: job for job in (*old, *new)}.values())
+    marks.refuse_shared([job.scan for job in jobs if job.landmarks is None])
+    what = [change.option, sorted({*change.redo, *change.remove}), change.update]
+    inputs_hash = inputs_hash_of(sorted(jobs, key=lambda job: job.name), marks, files, config, what)
+    if inputs_hash == summary.inputs_hash or not (new or change.remove or change.update):
+        say(f"{folder} already contains the results of this command; nothing is computed.")
+        return summary, list(finished.records.values())
+    finished.refuse_unknown(change.remove, "--remove")
+    if len(kept) < (1 if new else FEWEST):
+        raise InputError(
+            f"{change.option} leaves {len(kept)} of the scans in {folder} as they are, which are too few; run "
+            "shapespace correspond on all scans instead."
+        )
+    read = read_scans(jobs, marks, strict=files.strict, outer=config.outer, quiet=quiet, say=say)
+    _refuse_changed(finished, read, files, kept if change.update else [])
+    say_excluded(read.unread, len(jobs), say)
+    marks.tell(say)
+    rounds = RoundsWithProgress(folder / ROUNDS_FOLDER, files.execution, quiet=quiet)
+    with telling_of_compiling(quiet=quiet):
+        made = _registered(finished, kept, read, marks, replace(config, outer=False), rounds, update=change.update)
+    _note_copies(finished, kept, read)
+    before = [] if change.update else [(_scale(finished, name), finished.records[name]) for name in kept]
+    records = records_of(made, read, jobs, folder, before)
+    say_notes(records, made, "", say)
+    report_landmarks(records, read, say)
+    every = {name: record for name, record in finished.records.items() if name not in change.remove}
+    every |= {record.name: record for record in records}
+    summary = structs.replace(_summary(finished, change, records, every), inputs_hash=inputs_hash)
+    if change.update:
+        summary = structs.replace(summary, rounds=[*summary.rounds, *made.moved])
+    else:
+        done = "removed from" if change.remove else "registered to the mean in"
+        count = len(set(change.remove)) or sum(not record.reason for record in records)
+        were = "scan was" if count == 1 else "scans were"
+        say(f"{count} {were} {done} {folder}; the other {len(kept)} are unchanged.")
+    _publish(folder, made, records, summary, updated=change.update)
+    return summary, list(every.values())
+
+
+# Which scans
+
+
+def _new_jobs(finished: _Finished, change: Change, given: Sequence[Job]) -> list[Job]:
+    """Return the scans that are registered to the mean: new ones, or those that are registered again."""
+    if change.add:
+        return _not_there(finished, given)
+    finished.refuse_unknown(change.redo, "--redo")
+    if given and not (change.redo or change.update):
+        raise InputError("--remove takes the names of scans, and no files; leave the files out.")
+    by_name = {job.name: job for job in given}
+    if given and (unnamed := [name for name in change.redo if name not in by_name]):
+        raise InputError(f"None of the given scans is named {unnamed[0]}; rename its file, or give a list with ids.")
+    return [by_name.get(name) or finished.job(name) for name in dict.fromkeys(change.redo)]
+
+
+def _not_there(finished: _Finished, given: Sequence[Job]) -> list[Job]:
+    """Return the `given` scans that the correspondence does not have yet; it has no others of the same names."""
+    if not given:
+        raise InputError("--add needs scans; give their files or folders.")
+    for job in given:
+        record = finished.records.get(job.name)
+        if record is not None and record.hash and record.hash != content_hash_of(job):
+            raise InputError(
+                f"{job.label} differs from the scan {job.name} in {finished.folder}; register it again with --redo "
+                f"{job.name}, or rename its file."
+            )
+    return [job for job in given if job.name not in finished.records]
+
+
+def _old_jobs(finished: _Finished, change: Change, given: Sequence[Job]) -> list[Job]:
+    """Return the scans of the correspondence that stay in it, from the `given` scans or from where they were."""
+    moved = {} if change.add else {job.name: job for job in given}
+    names = [name for name in finished.records if name not in (*change.redo, *change.remove)]
+    return [moved.get(name) or finished.job(name) for name in names]
+
+
+def _refuse_changed(finished: _Finished, read: ScansRead, files: CorrespondFiles, kept: Sequence[str]) -> None:
+    """Raise InputError where a scan of `kept` is not as it was, or where a scan had landmarks that are not given."""
+    for name in kept:
+        record = finished.records[name]
+        if name in read.unread:
+            raise InputError(f"--update reads all scans again, and {name} is {read.unread[name]}")
+        if read.hashes[name] != record.hash:
+            raise InputError(f"{record.path} has changed since it was registered; run --redo {name} before --update.")
+    for name, scan in read.scans.items():
+        had = name in finished.records and finished.records[name].landmark_distances
+        if had and not scan.landmarks and files.landmarks is None:
+            raise InputError(f"{name} was registered with landmarks; give them again with --landmarks.")
+
+
+def _note_copies(finished: _Finished, kept: Sequence[str], read: ScansRead) -> None:
+    """Note scans that are equal to others of the command, or to one that stays."""
+    note_copies(read.scans, read.notes)
+    first = {finished.records[name].hash: name for name in kept if name not in read.scans}
+    for name, content_hash in read.hashes.items():
+        if name in read.notes and content_hash in first:
+            read.notes[name].append(f"It is {first[content_hash]} again; leave one of them out.")
+
+
+# Their registration
+
+
+def _registered(
+    finished: _Finished,
+    kept: Sequence[str],
+    read: ScansRead,
+    marks: LandmarkFiles,
+    config: CorrespondConfig,
+    rounds: RoundsWithProgress,
+    *,
+    update: bool,
+) -> Correspondence:
+    """Return the correspondence of the scans in `read`, which with an update are all; `kept` are prior."""
+    if not read.scans:
+        return Correspondence(finished.mean, (), "", ())
+    added = [scan for name, scan in read.scans.items() if not update or name not in kept]
+    raw = [read.scans[name] for name in kept] if update else []
+    file = finished.folder / LANDMARKS
+    landmarks = read_surface_landmarks(file) if file.is_file() else SurfaceLandmarks()
+    surfaces = [replace(finished.surfaces[name], name=name) for name in kept]
+    if not landmarks and not raw:  # the landmarks of scans that stay determine where the mean has them
+        paths = [Path(finished.records[name].path) for name in kept]
+        surfaces = [marks.onto(surface, path) for surface, path in zip(surfaces, paths, strict=True)]
+    mirrored = [name in finished.summary.mirrored for name in kept]
+    start = FinishedCorrespondence(
+        finished.mean, landmarks, surfaces, raw, mirrored, sides_decided=finished.summary.sides_decided
+    )
+    return add_scans(start, added, config, run=rounds)
+
+
+def _scale(finished: _Finished, name: str) -> float:
+    """Return how many times as large as the mean a surface is."""
+    surface, mean = finished.surfaces[name], finished.mean
+    observed = np.ones(len(mean.vertices), np.bool_) if surface.observed is None else surface.observed
+    return fit_similarity(mean.vertices[observed], surface.vertices[observed]).scale
+
+
+# The folder
+
+
+def _summary(
+    finished: _Finished,
+    change: Change,
+    records: Sequence[CorrespondRecord],
+    every: Mapping[str, CorrespondRecord],
+) -> CorrespondenceRecord:
+    """Return the summary of the scans in `every`, of which `records` are new."""
+    there = [name for name, record in every.items() if not record.reason]
+    aside = {name: record.reason for name, record in every.items() if record.reason}
+    if len(there) < FEWEST:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(aside.items())[:_LISTED])
+        raise InputError(f"Only {len(there)} of {len(every)} scans would be in correspondence: {reasons}.")
+    added = dict.fromkeys([*finished.summary.added, *(record.name for record in records)])
+    return structs.replace(
+        finished.summary,
+        corresponding=there,
+        set_aside=aside,
+        other_units={name: record.unit_ratio for name, record in every.items() if record.unit_ratio != 1.0},
+        mirrored=[name for name, record in every.items() if record.mirrored],
+        added=[] if change.update else [name for name in added if name in there],
+    )
+
+
+def _publish(
+    folder: Path,
+    made: Correspondence,
+    records: Sequence[CorrespondRecord],
+    summary: CorrespondenceRecord,
+    *,
+    updated: bool,
+) -> None:
+    """Write what is new apart, the summary last, and then move it into `folder`."""
+    change = make_folder(folder / CHANGE_FOLDER)
+    write_results(made, records, change)
+    if updated:
+        write_mean(made, change)
+    summary = structs.replace(summary, results_hash=results_hash_of(summary, change, folder))
+    write_text(change / SUMMARY, json_text(summary))
+    complete_change(folder)
+    shutil.rmtree(folder / ROUNDS_FOLDER, ignore_errors=True)
