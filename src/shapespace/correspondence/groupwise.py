@@ -17,13 +17,13 @@ from typing import Protocol
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from shapespace.correspondence.chirality import Sides, solve_sides
 from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
 from shapespace.correspondence.first_template import FirstTemplate, first_template, repaired_scans
 from shapespace.correspondence.guide import ShapePredictor, predict_leave_one_out
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.landmark_guide import ScanLandmarks, consensus_landmarks
 from shapespace.correspondence.mirror_image import MirrorMap
+from shapespace.correspondence.mirrored_scans import Sides, solve_sides
 from shapespace.correspondence.registration import Comparison, RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.scan_set import unit_ratios
 from shapespace.correspondence.settings import FEWEST, SIZE, CorrespondConfig

@@ -10,8 +10,8 @@ import pytest
 import shapespace as ss
 from raw_blobs import dispersion_mm, marked, raw_blob
 from shapespace.cli import main
-from shapespace.correspondence.chirality import solve_sides
 from shapespace.correspondence.groupwise import correspond
+from shapespace.correspondence.mirrored_scans import solve_sides
 from shapespace.correspondence.register import ElasticSettings
 from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.geometry.closest import build_engine
