@@ -135,5 +135,8 @@ def test_surfaces_of_mirrored_scans_are_in_their_frames_and_build_reflects_them(
     run = CorrespondenceRecord.from_json(json.loads((tmp_path / "mixed-same/correspondence.json").read_text()))
     assert run.mirrored == ["blob1", "blob4", "new"] and run.sides_decided
     np.testing.assert_array_equal(read_mesh(tmp_path / "mixed-same/blob1.corresponding.ply").vertices, before)
+    assert main(["report", str(tmp_path / "mixed-same"), "--quiet"]) == 0
+    page = (tmp_path / "mixed-same/report.html").read_text("utf-8")
+    assert "3 scans are mirror images of the others and shown reflected (blob1, blob4, new)" in page
     models = [ss.ShapeModel.load(tmp_path / f"{folder}.h5") for folder in ("mixed", "plain")]
     np.testing.assert_allclose(models[0].total_variance, models[1].total_variance, rtol=0.1)

@@ -180,6 +180,11 @@ class CorrespondencePage:
         text += " No triangle is folded over." if not folded else (
             f" {counted(len(folded), 'scan has', 'scans have')} folded triangles, {percent_of(max(folded))} at most."
         )  # fmt: skip
+        mirrored = [record.name for record in self.records if record.mirrored]
+        if mirrored:
+            named = ", ".join(mirrored[:_MOST_NAMED]) + (", ..." if len(mirrored) > _MOST_NAMED else "")
+            of = counted(len(mirrored), "scan is a mirror image", "scans are mirror images")
+            text += f" {of} of the others and shown reflected ({named})."
         return f"{text} {self._settling()}"
 
     def _settling(self) -> str:
