@@ -35,7 +35,7 @@ from simulated import StudyConfig, prepare_folder, run_fits
 from study_fits import STATUSES, model_path, person_path, read_fits
 from study_people import StudyPeople
 
-AS_EXACT = "plda, fits taken for exact"
+AS_EXACT = "plda, errors of fits ignored"
 MODES = (1, 2, 3, 5, 10, 20, 40, 80, 160)
 STUDY = "10 % missing"
 

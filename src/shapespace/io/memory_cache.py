@@ -1,6 +1,6 @@
 """Caches in memory: values computed from an object, and values that the tasks of a run share.
 
-All are emptied by `clear`, and by `shapespace cache --clear` together with those on disk (`disk_cache`).
+All are emptied by `clear` and end with the process; `shapespace cache --clear` empties those on disk (`disk_cache`).
 """
 
 from __future__ import annotations
