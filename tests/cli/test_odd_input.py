@@ -192,7 +192,7 @@ def test_ctrl_c_ends_with_130_and_whole_files(
             raise KeyboardInterrupt
         return read_mesh(path)
 
-    for reader in ("commands.build.mesh_at", "commands.look.read_mesh", "batch.fit_work.read_mesh"):
+    for reader in ("store.corresponding.mesh_at", "commands.look.read_mesh", "batch.fit_work.read_mesh"):
         monkeypatch.setattr(f"shapespace.{reader}", interrupted)
     arguments: dict[str, tuple[object, ...]] = {
         "build": ("build", world.meshes, "-o", tmp_path / "m.h5"),

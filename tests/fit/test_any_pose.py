@@ -88,7 +88,7 @@ def test_the_modes_found_bring_the_model_nearer_to_the_truth(head_model: ShapeMo
 def test_what_fits_clearly_as_it_stands_is_not_searched_further(
     head_model: ShapeModel, head: FloatArray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuse(*_: object) -> None:
+    def refuse(*_: object, **__: object) -> None:
         raise AssertionError("the search went on")
 
     monkeypatch.setattr(any_pose._Sides, "everywhere", refuse)  # pyright: ignore[reportPrivateUsage]
