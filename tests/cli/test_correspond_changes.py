@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,6 @@ from raw_blobs import LANDMARKS, dispersion_mm, marked, raw_blob
 from shapespace.batch import parallel_rounds as rounds
 from shapespace.cli import main
 from shapespace.commands import correspond
-from shapespace.correspondence import generic
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.normals import faces_of
 from shapespace.io.landmarks.landmark_io import write_landmarks
@@ -22,6 +20,7 @@ from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.types import FloatArray, Mesh
 from synthetic_shapes import sphere
 
+pytestmark = pytest.mark.usefixtures("few_modes")
 OLD = 5
 """Scans, which with an added one are enough to judge it by."""
 QUIET = ("--jobs", "1", "--quiet")
@@ -30,14 +29,6 @@ SETTINGS = ("--vertices", "300", "--rounds", "2", *QUIET)
 
 def scan(k: int) -> Mesh:
     return raw_blob(k, points=700).scan
-
-
-@pytest.fixture(scope="module", autouse=True)
-def few_modes() -> Iterator[None]:
-    """Poses of blobs need few modes, and their search takes most of the time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(generic, "MODES", 15)
-        yield
 
 
 @pytest.fixture(scope="module")

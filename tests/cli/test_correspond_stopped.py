@@ -2,7 +2,7 @@
 
 import errno
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,9 @@ from raw_blobs import raw_blob
 from shapespace.batch import parallel_rounds as rounds
 from shapespace.cli import main
 from shapespace.commands import correspond
-from shapespace.correspondence import generic
 from shapespace.io.meshes.mesh_io import write_mesh
 
+pytestmark = pytest.mark.usefixtures("few_modes")
 SCANS = 3
 QUICK = ("--mirror", "never", "--vertices", "300", "--rounds", "2", "--jobs", "1", "--quiet")
 
@@ -26,14 +26,6 @@ def scans(folder: Path, *numbers: int) -> Path:
     for k, number in enumerate(numbers):
         write_mesh(folder / f"blob{k}.ply", raw_blob(number, points=700).scan)
     return folder
-
-
-@pytest.fixture(scope="module", autouse=True)
-def few_modes() -> Iterator[None]:
-    """Files are what is tested here; the smooth modes that poses are searched with take most of the time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(generic, "MODES", 15)
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,6 @@ from typing import TypeAlias
 
 import numpy as np
 from msgspec import structs
-from threadpoolctl import threadpool_limits
 
 from shapespace.batch.execution import ExecutionConfig
 from shapespace.batch.fit_records import Source
@@ -148,8 +147,7 @@ def _corresponding(
             say(f"{template.name}: {sentence}")
     settings, config = asdict(config), replace(config, outer=False)  # the scans are without inner surfaces now
     rounds = RoundsWithProgress(folder / ROUNDS_FOLDER, files.execution, quiet=quiet)
-    one_thread = threadpool_limits(1, user_api="blas")  # small matrices: more threads cost more than they give
-    with telling_of_compiling(quiet=quiet), waiting("choosing the template", quiet=quiet), one_thread:
+    with telling_of_compiling(quiet=quiet), waiting("choosing the template", quiet=quiet):
         first = first_template(list(scans.values()), template, config, model)
     made = correspond(list(scans.values()), config, first=first, run=rounds)
     note_copies(scans, notes)

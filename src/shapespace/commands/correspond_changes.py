@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 from msgspec import structs
@@ -23,6 +22,7 @@ from shapespace.commands.correspond import (
     ROUNDS_FOLDER,
     CorrespondFiles,
     RoundsWithProgress,
+    Say,
     ScansRead,
     complete_change,
     content_hash_of,
@@ -61,7 +61,6 @@ _OPTIONS = {
 }  # fmt: skip
 """Options of the settings that a change takes from the finished correspondence, by their fields."""
 _LISTED = 5  # names in a message, so that it stays short
-_Say: TypeAlias = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -169,7 +168,7 @@ class _Finished:
 
 
 def change_correspondence(
-    change: Change, files: CorrespondFiles, folder: Path, config: CorrespondConfig, *, quiet: bool, say: _Say
+    change: Change, files: CorrespondFiles, folder: Path, config: CorrespondConfig, *, quiet: bool, say: Say
 ) -> tuple[CorrespondenceRecord, list[CorrespondRecord]]:
     """Change the finished correspondence in `folder`, and return its summary and all records.
 
@@ -191,7 +190,7 @@ def change_correspondence(
 
 
 def _changed(
-    finished: _Finished, change: Change, files: CorrespondFiles, config: CorrespondConfig, *, quiet: bool, say: _Say
+    finished: _Finished, change: Change, files: CorrespondFiles, config: CorrespondConfig, *, quiet: bool, say: Say
 ) -> tuple[CorrespondenceRecord, list[CorrespondRecord]]:
     folder, summary = finished.folder, finished.summary
     marks = LandmarkFiles.of(files.landmarks)

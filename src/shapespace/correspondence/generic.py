@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.geometry.normals import rms_size
@@ -37,7 +38,8 @@ def generic_model(mesh: Mesh, harmonics: Harmonics, shapes: FloatArray | None = 
         columns = np.column_stack([of_shapes, 0.5 * columns])
     pose = np.linalg.qr(small_poses(mesh.vertices - mesh.vertices.mean(axis=0)))[0]
     columns -= pose @ (pose.T @ columns)
-    basis, stddev, _ = np.linalg.svd(columns, full_matrices=False)
+    with threadpool_limits(limits=1, user_api="blas"):  # threads take up to 50 times as long on a busy machine
+        basis, stddev, _ = np.linalg.svd(columns, full_matrices=False)
     significant = stddev > 1e-3 * stddev[0]
     basis, stddev = basis[:, significant], stddev[significant]
     return ShapeModel(mesh.vertices.ravel(), basis, stddev, float((stddev**2).sum()), 1, faces=mesh.faces)

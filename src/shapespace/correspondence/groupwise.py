@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
 from shapespace.correspondence.first_template import FirstTemplate, first_template, repaired_scans
@@ -87,16 +86,9 @@ def correspond(
     """
     scans = list(as_meshes(scans, "correspond"))
     config = config or CorrespondConfig()
-    with threadpool_limits(1, user_api="blas"):  # small matrices: more threads cost more than they give
-        first = first or first_template(scans, template, config, model)
-        return _correspond(scans, config, first, run, may_reflect=template is None and model is None)
-
-
-def _correspond(
-    scans: Sequence[Mesh], config: CorrespondConfig, first: FirstTemplate, run: Runner, *, may_reflect: bool
-) -> Correspondence:
+    first = first or first_template(scans, template, config, model)
     problem = _Problem.of([scan.name for scan in scans], first, config)
-    problem, sides = _with_sides(problem, run, may_reflect=may_reflect)
+    problem, sides = _with_sides(problem, run, may_reflect=template is None and model is None)
     state = _initial_state(problem, sides)
     for _ in range(config.rounds):
         registrations = run(_context(problem, state), [_task(problem, state, i) for i in problem.first.repaired])
@@ -223,7 +215,7 @@ def _with_sides(problem: _Problem, run: Runner, *, may_reflect: bool) -> tuple[_
     if may_reflect and sides.decided and sides.mirrored.sum() > len(problem.first.repaired) / 2:
         first = replace(problem.first, mesh=mirror_image(problem.first.mesh))
         usable = np.isin(np.arange(count), list(problem.first.repaired))
-        return _Problem.of(problem.names, first, problem.config), replace(sides, mirrored=usable & ~sides.mirrored)
+        return replace(problem, first=first), replace(sides, mirrored=usable & ~sides.mirrored)
     return problem, sides
 
 

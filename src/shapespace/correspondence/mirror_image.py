@@ -12,8 +12,8 @@ from shapespace.correspondence.register import ElasticSettings, Template, regist
 from shapespace.correspondence.template import PoseModel
 from shapespace.errors import InputError
 from shapespace.fit.scan_target import ScanTarget
-from shapespace.geometry.mirror_plane import FLIP
-from shapespace.geometry.normals import faces_of, rms_size
+from shapespace.geometry.mirror_plane import FLIP, mirror_image
+from shapespace.geometry.normals import rms_size
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.types import FloatArray, IntArray, Mesh
 
@@ -40,7 +40,7 @@ class MirrorMap:
         Raises:
             InputError: the template is not symmetric.
         """
-        image = Mesh(mesh.vertices * FLIP, faces_of(mesh)[:, ::-1], name=mesh.name)
+        image = mirror_image(mesh)
         T = PoseModel.of(mesh).search(np.array(image.vertices), seed).T_scan_model
         registered = register(Template.of(mesh, harmonics), ScanTarget(image), T, settings, seed=seed)
         mirror = MirrorMap(*on_triangles(image, registered.T_scan_template.apply(registered.vertices)))
