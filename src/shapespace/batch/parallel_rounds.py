@@ -16,6 +16,7 @@ from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.landmark_guide import ScanLandmarks
 from shapespace.correspondence.register import ElasticSettings
 from shapespace.correspondence.registration import Comparison, RegistrationTask, RoundContext, ScanRegistration
+from shapespace.correspondence.settings import PoseRange
 from shapespace.correspondence.template import PoseModel
 from shapespace.errors import FileError
 from shapespace.io.containers.archives import read_arrays
@@ -95,11 +96,12 @@ class _FileTask:
     settings: ElasticSettings
     mirrored: bool
     sides: Comparison
+    pose: PoseRange
 
     @staticmethod
     def of(task: RegistrationTask, file: Path) -> _FileTask:
         return _FileTask(
-            file, _task_arrays(task), task.index, task.pose_model, task.settings, task.mirrored, task.sides
+            file, _task_arrays(task), task.index, task.pose_model, task.settings, task.mirrored, task.sides, task.pose
         )
 
     def task(self) -> RegistrationTask:
@@ -116,6 +118,7 @@ class _FileTask:
             landmarks=_landmarks_of(arrays),
             mirrored=self.mirrored,
             sides=self.sides,
+            pose=self.pose,
         )
 
 
@@ -243,7 +246,7 @@ def _shared_hash(context: RoundContext, pose_model: PoseModel) -> str:
 
 
 def _key(task: RegistrationTask, shared: str) -> str:
-    settings = f"{task.settings} {task.mirrored} {task.sides}"
+    settings = f"{task.settings} {task.mirrored} {task.sides} {task.pose}"
     return content_hash(_task_arrays(task), {"shared": shared, "settings": settings, "version": __version__})
 
 

@@ -305,6 +305,7 @@ COMMANDS: tuple[Command, ...] = (
                      "MODEL.h5", "shape model of such objects: its mean is the template, and its fit to a scan "
                      "initialises the first round", parse=Path),
             advanced("--mirror", source=CORRESPOND),
+            advanced("--pose", source=CORRESPOND),
             advanced("--outer", source=CORRESPOND),
             advanced("--landmark-std", "SHARE", source=CORRESPOND, field="landmark_uncertainty", parse=values.share,
                      formerly="--landmark-error"),

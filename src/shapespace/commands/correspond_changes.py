@@ -57,7 +57,7 @@ from shapespace.types import Mesh, SurfaceLandmarks
 
 _OPTIONS = {
     "vertices": "--vertices", "rounds": "--rounds", "symmetric": "--symmetric", "outer": "--outer",
-    "mirror": "--mirror", "landmark_uncertainty": "--landmark-std", "seed": "--seed",
+    "mirror": "--mirror", "pose": "--pose", "landmark_uncertainty": "--landmark-std", "seed": "--seed",
 }  # fmt: skip
 """Options of the settings that a change takes from the finished correspondence, by their fields."""
 _LISTED = 5  # names in a message, so that it stays short

@@ -213,6 +213,11 @@ def _with_sides(problem: _Problem, run: Runner, *, may_reflect: bool) -> tuple[_
             row[compared.index] = compared.scores
     sides = solve_sides(scores, list(anchors), problem.config.seed)
     if may_reflect and sides.decided and sides.mirrored.sum() > len(problem.first.repaired) / 2:
+        if problem.config.pose != "search":  # the frame of a reflected template is that of no file
+            raise InputError(
+                f"--pose {problem.config.pose} cannot be used: the first template is a mirror image of most scans. Give "
+                "one of those as --template, or leave --pose out."
+            )
         first = replace(problem.first, mesh=mirror_image(problem.first.mesh))
         usable = np.isin(np.arange(count), list(problem.first.repaired))
         return replace(problem, first=first), replace(sides, mirrored=usable & ~sides.mirrored)
@@ -267,6 +272,7 @@ def _task(problem: _Problem, state: RegistrationState, i: int) -> RegistrationTa
         landmarks=problem.landmarks(state.landmarks, scan),
         mirrored=mirrored,
         sides=_comparison(problem, state, i),
+        pose=config.pose,
     )
 
 

@@ -18,6 +18,7 @@ from shapespace.correspondence.generic import generic_model
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.landmark_guide import MirroredLandmarksError, ScanLandmarks
 from shapespace.correspondence.register import ElasticSettings, Template, register
+from shapespace.correspondence.settings import PoseRange
 from shapespace.correspondence.template import PoseModel
 from shapespace.errors import FitError, InputError, ShapespaceError
 from shapespace.fit.dense.dense_fit import DenseSurface, dense_surface
@@ -41,6 +42,10 @@ _BETTER_POSE = 0.95
 """A pose that the search with the modes of the other scans makes likelier than all others is tried beside the known."""
 _OTHER_SIZE = 8.0
 """Units differ by more, and what a scan shows beside the object hardly does."""
+_OTHER_FRAME = 0.75
+"""A pose of the search whose score is below this ratio of that near the frame of the file shows that the frame is
+another one: of 26 molars in their own frames it is so for the four that landmarks show to be rotated by 60 degrees or
+more, and for no other."""
 _CONTRADICTED = 2.0
 """Landmarks too few for a pose rule poses out in which they lie this many times as far off as in another."""
 _SAME_TURN_TRACE = 1 + 2 * np.cos(np.radians(40.0))
@@ -73,6 +78,7 @@ class RegistrationTask:
         mirrored: whether `scan` and `landmarks` are the mirror image of what is in the file.
         sides: whether the scan is compared with its mirror image: never, by its landmarks alone, by the scores of the
             pose search (nothing is registered), or by scores and registrations where the scores are about equal.
+        pose: poses that are searched; for mirror images and comparisons of scores all.
     """
 
     index: int
@@ -84,6 +90,7 @@ class RegistrationTask:
     landmarks: ScanLandmarks | None = None
     mirrored: bool = False
     sides: Comparison = "as given"
+    pose: PoseRange = "search"
 
     def reflected(self) -> RegistrationTask:
         """Return the same task for the mirror image of its scan, at an unknown pose."""
@@ -213,7 +220,17 @@ class RoundContext:
 
     def _search(self, task: RegistrationTask) -> Start:
         vertices, quick = np.array(task.scan.vertices), task.sides == "scores"
-        return self.pose_models[task.pose_model].search(vertices, self.seed, quick=quick)
+        model, pose = self.pose_models[task.pose_model], "search" if quick or task.mirrored else task.pose
+        start = model.search(vertices, self.seed, quick=quick, pose=pose)
+        if pose != "search" and len(self.pose_models) > 1:  # with the modes of the other scans, scores are reliable
+            best = model.search(vertices, self.seed, quick=True)
+            if best.score_mm < _OTHER_FRAME * start.score_mm:
+                degrees = np.degrees(np.arccos(np.clip((np.trace(best.T_scan_model.rotation) - 1) / 2, -1, 1)))
+                raise FitError(
+                    f"the frame of its file is rotated by about {degrees:.0f} degrees from those of the others; rotate "
+                    "it, or leave --pose out"
+                )
+        return start
 
     def _register_side(self, task: RegistrationTask, start: Start) -> ScanRegistration:
         """Register from the known pose, or from the likely poses of the search."""

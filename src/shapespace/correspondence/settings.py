@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, TypeAlias
 
 from shapespace.correspondence.register import ElasticSettings
 
+PoseRange: TypeAlias = Literal["search", "near", "as-given"]
 SIZE = 100.0
 """The template's RMS size in its own frame: all lengths of the method are in hundredths of an object's size."""
+LARGEST_ROTATION_DEG: Mapping[PoseRange, float] = {"near": 60.0, "as-given": 30.0}
+"""Rotation by which the pose of a scan may differ from the frame of its file."""
 FEWEST = 2
 """Scans in a correspondence, and scans that must observe a vertex for it to be estimated where it is missing."""
 
@@ -33,6 +37,9 @@ class CorrespondConfig:
             the mirror images of the other scans.
         mirror: what is done with scans that are mirror images of the majority, such as left among right teeth: they are
             reflected (auto), excluded (ask), or the files are trusted (never).
+        pose: rotation of the scans: found by a search over all rotations (search), or that of the frames of the files,
+            refined by at most 30 degrees (as-given) or 60 degrees (near). Position and size are always found. A scan
+            whose frame is another one is excluded from the second round on, if there are six scans or more.
         outer: remove inner surfaces first, such as marrow cavities and trabeculae of CT scans, which are hardly visible
             from outside.
         landmark_uncertainty: standard deviation of the landmarks, as a share of the object's size (RMS distance from
@@ -52,6 +59,7 @@ class CorrespondConfig:
     outlier_threshold: float = 3.0
     symmetric: bool = False
     mirror: Literal["auto", "ask", "never"] = "auto"
+    pose: PoseRange = "search"
     outer: bool = False
     landmark_uncertainty: float = 0.02
     seed: int = 0

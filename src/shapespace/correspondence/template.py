@@ -11,8 +11,9 @@ from scipy.sparse.csgraph import connected_components
 
 from shapespace.correspondence.generic import generic_model
 from shapespace.correspondence.harmonics import Harmonics
+from shapespace.correspondence.settings import LARGEST_ROTATION_DEG, PoseRange
 from shapespace.errors import MeshError, ShapespaceError
-from shapespace.fit.search.initialisation import Start, start_from_any_pose
+from shapespace.fit.search.initialisation import Start, start_from_any_pose, start_near_frame
 from shapespace.geometry import remesh
 from shapespace.geometry.doctor import repair
 from shapespace.geometry.normals import boundary_edges, face_areas, faces_of, rms_size, without_vertices
@@ -60,15 +61,21 @@ class PoseModel:
         harmonics = Harmonics.of(coarse, _POSE_HARMONICS)
         return PoseModel(generic_model(coarse, harmonics, None if shapes is None else shapes[:, origin]))
 
-    def search(self, vertices_mm: FloatArray, seed: int, *, quick: bool = False) -> Start:
-        """Search all poses and sizes of the surface in a scan with `vertices_mm` (S, 3); `quick` for a score alone.
+    def search(
+        self, vertices_mm: FloatArray, seed: int, *, quick: bool = False, pose: PoseRange = "search"
+    ) -> Start:
+        """Search the poses and sizes of the surface in a scan with `vertices_mm` (S, 3); `quick` for a score alone.
 
         The score is in mm of this surface.
         """
         size = rms_size(self.model.mean_vertices)
         centre, ratio = np.median(vertices_mm, axis=0), rms_size(vertices_mm) / size
         T = Similarity(1.0 / ratio, np.eye(3), -centre / ratio)
-        start = start_from_any_pose(self.model, T.apply(vertices_mm), seed=seed, with_scale=True, quick=quick)
+        if pose == "search":
+            start = start_from_any_pose(self.model, T.apply(vertices_mm), seed=seed, with_scale=True, quick=quick)
+        else:
+            largest_deg = LARGEST_ROTATION_DEG[pose]
+            start = start_near_frame(self.model, T.apply(vertices_mm), largest_deg=largest_deg, seed=seed)
         back = T.inverse()
         return Start(
             back @ start.T_scan_model, start.how, start.score_mm, start.b, start.runner_up_score_mm,

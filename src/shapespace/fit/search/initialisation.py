@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from shapespace.errors import FitError, InputError
 from shapespace.fit.landmark_terms import LandmarkConstraint
@@ -22,6 +23,7 @@ _TYPICAL_COVER = 1.2  # scan size over model size of a typical crop
 _INCH_IS_RARE = 0.5  # penalty in log size
 _PLAUSIBLE_COVER = (0.45, 2.6)  # scan size over model size that a unit may leave
 _LIKELIER_BY_FAR = 0.5  # difference in log size from which the second unit is ruled out
+_ONE_BASIN_DEG = 30.0  # rotation from which a refinement finds the pose of simulated scans
 _STANDS_OUT = 0.8  # score relative to that of the runner-up below which a start is unambiguous
 
 
@@ -142,6 +144,36 @@ def start_from_any_pose(
     best, alternatives = starts[0], tuple(starts[1:])
     runner_up = min((other.score_mm for other in alternatives), default=float("inf"))
     return replace(best, runner_up_score_mm=runner_up, alternatives=alternatives)
+
+
+def start_near_frame(model: ShapeModel, scan_vertices_mm: FloatArray, *, largest_deg: float, seed: int) -> Start:
+    """Return the best pose with free scale whose rotation from the scan's frame is at most `largest_deg`.
+
+    Args:
+        model: what is placed.
+        scan_vertices_mm: (S, 3), at least one.
+        largest_deg: rotation, degrees; beyond 30, poses rotated by two thirds of it begin too. If no refined pose is
+            within it, the pose has the rotation of the frame.
+        seed: of the subsample that is searched.
+    """
+    from shapespace.fit.search.pose_search import refine  # numba takes a while to import
+
+    middle, centre = model.mean_vertices.mean(axis=0), scan_vertices_mm.mean(axis=0)
+    turns = np.vstack([np.zeros((1, 3)), np.eye(3), -np.eye(3)])[: 1 if largest_deg <= _ONE_BASIN_DEG else None]
+    rotations = Rotation.from_rotvec(2 / 3 * largest_deg * turns, degrees=True).as_matrix()
+    poses = refine(
+        model,
+        scan_vertices_mm,
+        [Similarity(1.0, R, centre - R @ middle) for R in rotations],
+        with_scale=True,
+        seed=seed,
+    )
+    limit = 1 + 2 * np.cos(np.radians(largest_deg))
+    near = [pose for pose in poses if np.isfinite(pose.score_mm) and np.trace(pose.T_scan_model.rotation) >= limit]
+    if not near:
+        return Start(Similarity(1.0, np.eye(3), centre - middle), "given", poses[0].score_mm)
+    best = min(near, key=lambda pose: pose.score_mm)
+    return Start(best.T_scan_model, "given", best.score_mm, best.b)
 
 
 def _size(points: FloatArray) -> float:
