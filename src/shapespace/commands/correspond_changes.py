@@ -56,7 +56,7 @@ from shapespace.store.corresponding import LANDMARKS, MEAN, RECORD, SUMMARY, SUR
 from shapespace.types import Mesh, SurfaceLandmarks
 
 _OPTIONS = {
-    "vertices": "--vertices", "rounds": "--rounds", "symmetric": "--symmetric", "outer": "--outer",
+    "vertices": "--vertices", "rounds": "--rounds", "outer": "--outer",
     "mirror": "--mirror", "landmark_uncertainty": "--landmark-std", "seed": "--seed",
 }  # fmt: skip
 """Options of the settings that a change takes from the finished correspondence, by their fields."""
@@ -140,6 +140,10 @@ class _Finished:
             InputError: options ask for something else.
         """
         config = read(CorrespondConfig, self.summary.settings, str(self.folder / SUMMARY), CORRESPOND_AGAIN)
+        if self.summary.settings.get("symmetric"):
+            raise InputError(
+                f"{self.folder} was computed with --symmetric, which this version does not have; {CORRESPOND_AGAIN}."
+            )
         for option, file in (("--template", files.template), ("--model", files.model)):
             if file is not None:
                 raise InputError(f"The template of a finished correspondence is its mean; leave {option} out.")
