@@ -51,6 +51,7 @@ from shapespace.io.files import make_folder, write_text
 from shapespace.io.landmarks.landmark_io import read_surface_landmarks
 from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.io.remote import is_address
+from shapespace.reprs import first_names
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, json_text, read
 from shapespace.store.corresponding import LANDMARKS, MEAN, RECORD, SUMMARY, SURFACE, json_of
 from shapespace.types import Mesh, SurfaceLandmarks
@@ -159,7 +160,7 @@ class _Finished:
         """Raise InputError where no scan of the correspondence has one of `names`."""
         for name in names:
             if name not in self.records:
-                known = ", ".join(list(self.records)[:_LISTED]) + (", ..." if len(self.records) > _LISTED else "")
+                known = first_names(list(self.records), _LISTED)
                 raise InputError(f"{option} {name}: {self.folder} has no scan of that name; it has {known}.")
 
     def job(self, name: str) -> Job:
