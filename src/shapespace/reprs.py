@@ -23,6 +23,11 @@ def short_repr(self: Any) -> str:
     return f"{type(self).__name__}({', '.join(shown_fields)})"
 
 
+def first_names(names: Sequence[object], most: int) -> str:
+    """Return the first `most` of `names` with commas; dots stand for the others."""
+    return ", ".join(map(str, names[:most])) + (", ..." if len(names) > most else "")
+
+
 def list_briefly(parts: Sequence[str]) -> str:
     """Return the first of `parts`, and the number of further ones, in one line."""
     others_note = f"; and {len(parts) - _MOST_NAMES} more" if len(parts) > _MOST_NAMES else ""

@@ -252,7 +252,7 @@ def test_refusals_are_one_sentence_and_change_nothing(run: Run, same: Path, tmp_
         (("--add", "-o", same), "--add needs scans"),
         (("-o", same), "Give scans"),
         ((added, "--add", "--vertices", "400", "-o", same), "was computed with --vertices 300"),
-        ((added, "--add", "--symmetric", "-o", same), "was computed without --symmetric"),
+        ((added, "--add", "--outer", "-o", same), "was computed without --outer"),
         ((added, "--add", "--rounds", "1", "-o", same), "leave --rounds out"),
         ((added, "--add", "--template", added / "blob5.ply", "-o", same), "leave --template out"),
         ((added, "--add", "--model", "m.h5", "-o", same), "leave --model out"),
@@ -262,6 +262,21 @@ def test_refusals_are_one_sentence_and_change_nothing(run: Run, same: Path, tmp_
     assert (files(same), summary(same)) == before and not empty.exists()
     outcome = run("correspond", added, "--add", "--redo", "blob0", "-o", same, *QUIET)
     assert outcome.code == 2 and "not allowed with argument" in outcome.err
+
+
+def test_a_correspondence_with_the_removed_option_symmetric_is_read_but_not_changed(
+    run: Run, same: Path, tmp_path: Path
+) -> None:
+    added, file = new(tmp_path / "new", blob5=scan(5)), same / "correspondence.json"
+    record = json.loads(file.read_text())
+    record["settings"]["symmetric"] = True
+    file.write_text(json.dumps(record))
+    assert run("build", same, "-o", tmp_path / "model.h5").code == 0
+    outcome = run("correspond", added, "--add", "-o", same, *QUIET)
+    assert outcome.code == 2 and "was computed with --symmetric" in outcome.sentence(), outcome.err
+    record["settings"]["symmetric"] = False
+    file.write_text(json.dumps(record))
+    assert add(run, same, added).code == 0
 
 
 def test_the_settings_of_the_run_may_be_repeated(run: Run, same: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""With `pose="as-given"` or `"near"`, the rotation of a scan is that of the frame of its file, within a stated range."""
+"""With `pose="as-given"` or `"near"`, the rotation of a scan is that of the frame of its file, within a range."""
 
 from dataclasses import replace
 

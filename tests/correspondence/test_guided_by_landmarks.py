@@ -12,13 +12,11 @@ from shapespace.correspondence.first_template import first_template
 from shapespace.correspondence.groupwise import correspond
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.landmark_guide import ScanLandmarks, consensus_landmarks, stray_landmarks
-from shapespace.correspondence.mirror_image import MirrorMap
 from shapespace.correspondence.register import ElasticSettings
 from shapespace.correspondence.registration import RegistrationTask, RoundContext
 from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.correspondence.template import PoseModel, choose_template
 from shapespace.errors import InputError, MeshError
-from shapespace.geometry.closest import build_engine
 from shapespace.geometry.landmark_placement import place_landmarks
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.types import FloatArray, Mesh, Similarity, SurfaceLandmarks
@@ -240,36 +238,6 @@ def test_a_model_of_splines_guides_with_its_shapes_and_one_of_points_is_refused(
     points = ss.ShapeModel.fit([Mesh(mesh.vertices, None, name=mesh.name) for mesh in meshes])
     with pytest.raises(MeshError, match="no triangles"):
         first_template(scans, None, SETTINGS, points)
-
-
-def test_the_mirror_image_of_a_shape_is_its_surface_turned_over() -> None:
-    directions, faces = sphere(900)
-    mesh = Mesh(even(directions), faces)
-    mirror = MirrorMap.of(mesh, Harmonics.of(mesh, 150), QUICK, 0)
-    assert np.linalg.norm(mirror.image(mesh.vertices) - mesh.vertices, axis=1).mean() < 1.0
-    other = mesh.vertices + 15 * np.exp(-(((directions - [0.8, 0.6, 0]) / 0.5) ** 2).sum(axis=1))[:, None] * directions
-    flipped = Mesh(other * FLIP, faces[:, ::-1])
-    off = build_engine(flipped).query(mirror.image(other)).distance.mean()
-    assert off < 0.5 * build_engine(flipped).query(other).distance.mean()
-
-
-def test_what_a_scan_lacks_its_mirror_image_lacks_on_the_other_side() -> None:
-    directions, faces = sphere(900)
-    mesh = Mesh(even(directions), faces)
-    mirror = MirrorMap.of(mesh, Harmonics.of(mesh, 150), QUICK, 0)
-    seen = (directions[:, 0] < 0.3).astype(np.float64)
-    shown = mirror.observed(seen[None])[0]
-    assert shown[directions[:, 0] > -0.1].all() and not shown[directions[:, 0] < -0.5].any()
-
-
-def test_an_object_that_is_not_symmetric_is_refused_as_such() -> None:
-    directions, faces = sphere(900)
-    spiral = directions * np.array([30.0, 100.0, 30.0])
-    spiral[:, 0] += 60 * np.sin(2.5 * directions[:, 1])
-    spiral[:, 2] += 60 * np.cos(2.5 * directions[:, 1])
-    scans = [Mesh(spiral * (1 + 0.01 * k), np.roll(faces, k, axis=1), name=str(k)) for k in range(2)]
-    with pytest.raises(InputError, match="leave --symmetric out"):
-        correspond(scans, replace(SETTINGS, symmetric=True), template=scans[0])
 
 
 def test_a_scan_that_lacks_a_part_is_no_template(blobs: list[RawBlob]) -> None:

@@ -293,7 +293,6 @@ COMMANDS: tuple[Command, ...] = (
                   "evenly)", parse=Path),
             basic("--landmarks", "DIR", "landmarks of all or some scans: files with the names of the scans and another "
                   "ending, in any landmark format", parse=Path),
-            basic("--symmetric", source=CORRESPOND),
             basic("--vertices", "N", source=CORRESPOND, parse=values.positive),
             basic("--add", source=CHANGE_CORRESPONDENCE, either=_CHANGE),
             advanced("--redo", "NAME", source=CHANGE_CORRESPONDENCE, repeat=True, default=[],

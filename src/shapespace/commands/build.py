@@ -31,6 +31,7 @@ from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel, region_vertices
 from shapespace.model.streamed import Scratch, bytes_in_memory, too_large
 from shapespace.recognise.labelled_scans import NEUTRAL
+from shapespace.reprs import first_names
 from shapespace.schemas import FitRecord
 from shapespace.store.corresponding import SurfaceFiles, surface_files
 from shapespace.store.results import is_result
@@ -343,7 +344,7 @@ def _trusted(
     doubtful = [file for file in files if file in records and records[file].status == "doubtful"]
     if not doubtful:
         return list(files), records
-    named = ", ".join(file.name for file in doubtful[:_NAMED]) + (", ..." if len(doubtful) > _NAMED else "")
+    named = first_names([file.name for file in doubtful], _NAMED)
     count_text = (
         "1 surface of a doubtful fit is" if len(doubtful) == 1 else f"{len(doubtful)} surfaces of doubtful fits are"
     )
@@ -496,8 +497,8 @@ def _placing_notes(landmarks: SurfaceLandmarks, surface: Mesh) -> list[str]:
         f"it on average, at most {distance[worst]:.2g} mm ({landmarks.names[worst]})."
     ]
     if far := far_landmarks(surface, landmarks):
-        listed = sorted(far, key=lambda name: -far[name])[:_NAMED]
-        named = ", ".join(f"{name} ({far[name]:.2g} mm)" for name in listed) + (", ..." if len(far) > _NAMED else "")
+        farthest = sorted(far, key=lambda name: -far[name])
+        named = first_names([f"{name} ({far[name]:.2g} mm)" for name in farthest], _NAMED)
         some = "1 landmark is" if len(far) == 1 else f"{len(far)} landmarks are"
         notes.append(
             f"Warning: {some} farther from that surface than 1 % of its size and than its mean edge: {named}. Check "

@@ -41,6 +41,7 @@ from shapespace.io.files import make_folder, move_file, remove_file, sha256_of_f
 from shapespace.io.landmarks.landmark_io import write_surface_landmarks
 from shapespace.io.meshes.mesh_io import ending_of, read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
+from shapespace.reprs import first_names
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, json_text, read
 from shapespace.store.corresponding import LANDMARKS, MEAN, RECORD, SUMMARY, SURFACE
 from shapespace.types import Mesh, SurfaceLandmarks
@@ -351,8 +352,8 @@ def _far_notes(scan: Mesh, placed: SurfaceLandmarks) -> list[str]:
     far = far_landmarks(scan, placed)
     if not far:
         return []
-    listed = sorted(far, key=lambda name: -far[name])[:_LISTED]
-    named = ", ".join(f"{name} ({far[name]:.2g})" for name in listed) + (", ..." if len(far) > _LISTED else "")
+    farthest = sorted(far, key=lambda name: -far[name])
+    named = first_names([f"{name} ({far[name]:.2g})" for name in farthest], _LISTED)
     return [
         "Landmarks are farther from its surface than 1 % of its size and than its mean edge (distances in its unit): "
         f"{named}."
@@ -423,7 +424,7 @@ def say_notes(records: Sequence[CorrespondRecord], made: Correspondence, given: 
             "hardly an object of their kind; look at the surfaces, or leave it out."
         )
     if mirrored := [record.name for record in records if record.mirrored]:
-        named = ", ".join(mirrored[:_LISTED]) + (", ..." if len(mirrored) > _LISTED else "")
+        named = first_names(mirrored, _LISTED)
         of = "scan is a mirror image" if len(mirrored) == 1 else "scans are mirror images"
         say(
             f"{len(mirrored)} {of} of the others ({named}) and reflected for the correspondence; surfaces are in the "
@@ -435,7 +436,7 @@ def say_notes(records: Sequence[CorrespondRecord], made: Correspondence, given: 
     if len(noted) > _LISTED:
         say(f"Notes on {len(noted) - _LISTED} more scans are in their records.")
     if others := [record for record in records if record.unit_ratio != 1.0]:
-        named = ", ".join(record.name for record in others[:_LISTED]) + (", ..." if len(others) > _LISTED else "")
+        named = first_names([record.name for record in others], _LISTED)
         noun = "scans is" if len(others) == 1 else "scans are"
         say(
             f"{len(others)} of {len(records)} {noun} in another unit than the majority, judging by size ({named}); "

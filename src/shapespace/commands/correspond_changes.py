@@ -51,12 +51,13 @@ from shapespace.io.files import make_folder, write_text
 from shapespace.io.landmarks.landmark_io import read_surface_landmarks
 from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.io.remote import is_address
+from shapespace.reprs import first_names
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, json_text, read
 from shapespace.store.corresponding import LANDMARKS, MEAN, RECORD, SUMMARY, SURFACE, json_of
 from shapespace.types import Mesh, SurfaceLandmarks
 
 _OPTIONS = {
-    "vertices": "--vertices", "rounds": "--rounds", "symmetric": "--symmetric", "outer": "--outer",
+    "vertices": "--vertices", "rounds": "--rounds", "outer": "--outer",
     "mirror": "--mirror", "pose": "--pose", "landmark_uncertainty": "--landmark-std", "seed": "--seed",
 }  # fmt: skip
 """Options of the settings that a change takes from the finished correspondence, by their fields."""
@@ -140,6 +141,10 @@ class _Finished:
             InputError: options ask for something else.
         """
         config = read(CorrespondConfig, self.summary.settings, str(self.folder / SUMMARY), CORRESPOND_AGAIN)
+        if self.summary.settings.get("symmetric"):
+            raise InputError(
+                f"{self.folder} was computed with --symmetric, which this version does not have; {CORRESPOND_AGAIN}."
+            )
         for option, file in (("--template", files.template), ("--model", files.model)):
             if file is not None:
                 raise InputError(f"The template of a finished correspondence is its mean; leave {option} out.")
@@ -155,7 +160,7 @@ class _Finished:
         """Raise InputError where no scan of the correspondence has one of `names`."""
         for name in names:
             if name not in self.records:
-                known = ", ".join(list(self.records)[:_LISTED]) + (", ..." if len(self.records) > _LISTED else "")
+                known = first_names(list(self.records), _LISTED)
                 raise InputError(f"{option} {name}: {self.folder} has no scan of that name; it has {known}.")
 
     def job(self, name: str) -> Job:

@@ -29,6 +29,7 @@ from shapespace.io.landmarks.fiducials import FIDUCIAL_ENDINGS
 from shapespace.io.meshes.mesh_io import probe_mesh, read_mesh
 from shapespace.io.remote import is_address
 from shapespace.model.shape_model import ShapeModel
+from shapespace.reprs import first_names
 from shapespace.schemas import FitRecord
 from shapespace.store.manifest import read_manifest
 
@@ -127,7 +128,7 @@ class _Watch:
 
     def say_removed(self) -> None:
         if self.removed:
-            named = ", ".join(self.removed[:_LISTED]) + (", ..." if len(self.removed) > _LISTED else "")
+            named = first_names(self.removed, _LISTED)
             count_text = "1 scan has" if len(self.removed) == 1 else f"{len(self.removed)} scans have"
             self.say(
                 f"{count_text} vertices with {NON_FINITE}, which were removed with their triangles ({named}); --strict "

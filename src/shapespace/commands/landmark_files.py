@@ -10,6 +10,7 @@ from shapespace.errors import FileError, InputError, ShapespaceError
 from shapespace.io.landmarks.fiducials import FIDUCIAL_ENDINGS
 from shapespace.io.landmarks.landmark_io import LANDMARK_FORMATS, READ_ONLY_LANDMARKS, read_landmarks
 from shapespace.io.meshes.mesh_io import stem_of
+from shapespace.reprs import first_names
 from shapespace.types import Mesh
 
 _LISTED = 5  # names in a message, so that it stays short
@@ -108,5 +109,4 @@ class LandmarkFiles:
         for sentence in self.unread:
             say(sentence)
         if left := sorted(set(self.files) - self.used):
-            more = ", ..." if len(left) > _LISTED else ""
-            say(f"{len(left)} files of landmarks belong to no scan that is given: {', '.join(left[:_LISTED])}{more}.")
+            say(f"{len(left)} files of landmarks belong to no scan that is given: {first_names(left, _LISTED)}.")

@@ -21,7 +21,6 @@ from shapespace.correspondence.first_template import FirstTemplate, first_templa
 from shapespace.correspondence.guide import ShapePredictor, predict_leave_one_out
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.landmark_guide import ScanLandmarks, consensus_landmarks
-from shapespace.correspondence.mirror_image import MirrorMap
 from shapespace.correspondence.mirrored_scans import Sides, solve_sides
 from shapespace.correspondence.registration import Comparison, RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.scan_set import unit_ratios
@@ -107,20 +106,16 @@ class _Problem:
         first: the first template, and the scans that can be used.
         config: of the correspondence.
         harmonics: of the first template, used on every later one.
-        mirror: of the first template; None if the object is not symmetric.
     """
 
     names: Sequence[str]
     first: FirstTemplate
     config: CorrespondConfig
     harmonics: Harmonics
-    mirror: MirrorMap | None
 
     @staticmethod
     def of(names: Sequence[str], first: FirstTemplate, config: CorrespondConfig) -> _Problem:
-        harmonics = Harmonics.of(first.mesh, config.first.harmonics)
-        mirror = MirrorMap.of(first.mesh, harmonics, config.first, config.seed) if config.symmetric else None
-        return _Problem(names, first, config, harmonics, mirror)
+        return _Problem(names, first, config, Harmonics.of(first.mesh, config.first.harmonics))
 
     def scan(self, i: int, *, mirrored: bool) -> Mesh:
         """Return scan `i`, or its mirror image."""
@@ -199,7 +194,7 @@ def _with_sides(problem: _Problem, run: Runner, *, may_reflect: bool) -> tuple[_
     """
     count = len(problem.names)
     unknown = Sides(np.zeros(count, np.bool_), np.zeros(count), decided=False)
-    if problem.config.mirror == "never" or problem.config.symmetric:
+    if problem.config.mirror == "never":
         return problem, unknown
     context = _context(problem, _initial_state(problem, unknown))
     anchors = {-1: context.pose_models[0]} | _anchors(problem)
@@ -215,8 +210,8 @@ def _with_sides(problem: _Problem, run: Runner, *, may_reflect: bool) -> tuple[_
     if may_reflect and sides.decided and sides.mirrored.sum() > len(problem.first.repaired) / 2:
         if problem.config.pose != "search":  # the frame of a reflected template is that of no file
             raise InputError(
-                f"--pose {problem.config.pose} cannot be used: the first template is a mirror image of most scans. Give "
-                "one of those as --template, or leave --pose out."
+                f"--pose {problem.config.pose} cannot be used: the first template is a mirror image of most scans. "
+                "Give one of those as --template, or leave --pose out."
             )
         first = replace(problem.first, mesh=mirror_image(problem.first.mesh))
         usable = np.isin(np.arange(count), list(problem.first.repaired))
@@ -278,7 +273,7 @@ def _task(problem: _Problem, state: RegistrationState, i: int) -> RegistrationTa
 
 def _comparison(problem: _Problem, state: RegistrationState, i: int) -> Comparison:
     """Return how scan `i` is compared with its mirror image in the next round."""
-    if problem.config.mirror == "never" or problem.config.symmetric:
+    if problem.config.mirror == "never":
         return "as given"
     own, other = state.registrations[i].scores if i in state.registrations else (np.nan, np.nan)
     return "both" if state.sides.decided and state.registrations and not other > _CLEARLY_WORSE * own else "one"
@@ -421,7 +416,8 @@ def _update_template(
 ) -> RegistrationState:
     """Make the mean of the round the template, and predict each scan from the others."""
     order = sorted(state.registrations)
-    shapes, images, observed, mean = _aligned_shapes(problem, state, order)
+    shapes, observed = state.shapes(order)
+    shapes, mean = align_to_weighted_mean(shapes, observed, state.template.vertices)
     registrations: dict[int, ScanRegistration] = {}
     squares: dict[int, float] = {}
     for i, shape in zip(order, shapes, strict=True):
@@ -431,7 +427,7 @@ def _update_template(
         squares[i] = _squared_movement(previous, i, shape)
     predictions = state.predictions
     if problem.config.guided and len(order) >= _ENOUGH_TO_PREDICT:
-        predicted = predict_leave_one_out(shapes, observed, problem.config.noise_share, images)
+        predicted = predict_leave_one_out(shapes, observed, problem.config.noise_share)
         predictions = dict(zip(order, predicted, strict=True))
     template = Mesh(mean, state.template.faces, name=state.template.name)
     record = RoundRecord(
@@ -455,24 +451,6 @@ def _squared_movement(previous: RegistrationState, i: int, shape: FloatArray) ->
     known = i in previous.registrations
     before = previous.registrations[i].vertices if known else previous.template.vertices
     return float(((fit_similarity(before, shape).apply(before) - shape) ** 2).sum(axis=1).mean())
-
-
-def _aligned_shapes(
-    problem: _Problem, state: RegistrationState, order: Sequence[int]
-) -> tuple[FloatArray, FloatArray | None, FloatArray, FloatArray]:
-    """Return the aligned shapes (N, V, 3), their mirror images or None, (N, V) what is observed, and the mean (V, 3).
-
-    The mean of a symmetric object is that of the shapes and their mirror images.
-    """
-    shapes, observed = state.shapes(order)
-    shapes, mean = align_to_weighted_mean(shapes, observed, state.template.vertices)
-    if problem.mirror is None:
-        return shapes, None, observed, mean
-    images = np.stack([problem.mirror.image(shape) for shape in shapes])
-    weights = np.concatenate([observed, problem.mirror.observed(observed)])
-    both, mean = align_to_weighted_mean(np.concatenate([shapes, images]), weights, mean)
-    shapes, images = np.split(both, 2)
-    return shapes, images, observed, mean
 
 
 def _landmarks_on(template: Mesh, problem: _Problem, registrations: Mapping[int, ScanRegistration]) -> SurfaceLandmarks:
@@ -599,8 +577,6 @@ def _added_states(
     prior = shapes if len(shapes) >= ENOUGH_TO_JUDGE else None
     pose_models = (PoseModel.of(start.template, prior),)  # it is trained without all added scans
     context = RoundContext(start.template, problem.harmonics, pose_models, problem.config.seed)
-    if problem.mirror is not None:
-        shapes = np.concatenate([shapes, np.stack([problem.mirror.image(shape) for shape in shapes])])
     can_predict = problem.config.guided and len(start.registrations) >= _ENOUGH_TO_PREDICT
     predictor = ShapePredictor.of(shapes, problem.config.noise_share) if can_predict else None
     states = dict.fromkeys(added, start)

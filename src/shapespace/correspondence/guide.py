@@ -53,22 +53,17 @@ class ShapePredictor:
         return float(np.sqrt(((shape - self.predict(shape, weights))[used] ** 2).sum(axis=1).mean()))
 
 
-def predict_leave_one_out(
-    shapes: FloatArray, weights: FloatArray, noise_share: float, images: FloatArray | None = None
-) -> FloatArray:
+def predict_leave_one_out(shapes: FloatArray, weights: FloatArray, noise_share: float) -> FloatArray:
     """Return (N, V, 3) the prediction of each of the aligned `shapes` (N, V, 3) from the others.
 
     Args:
         shapes: aligned.
         weights: (N, V) of their vertices, 0 to 1.
         noise_share: as in `ShapePredictor.of`.
-        images: (N, V, 3) the mirror images of the shapes, which are training shapes too.
     """
     n, predicted = len(shapes), np.empty_like(shapes)
     for fold in np.array_split(np.arange(n), min(n, _FOLDS)):
-        rest = np.setdiff1d(np.arange(n), fold)
-        training = shapes[rest] if images is None else np.concatenate([shapes[rest], images[rest]])
-        predictor = ShapePredictor.of(training, noise_share)
+        predictor = ShapePredictor.of(np.delete(shapes, fold, axis=0), noise_share)
         for i in fold.tolist():
             predicted[i] = predictor.predict(shapes[i], weights[i])
     return predicted

@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from shapespace.correspondence.harmonics import Harmonics
-from shapespace.errors import InputError, MeshError
+from shapespace.errors import InputError
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.landmark_placement import place_landmarks
 from shapespace.geometry.mirror_plane import FLIP
-from shapespace.geometry.normals import faces_of, rms_size
+from shapespace.geometry.normals import rms_size
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.types import FloatArray, IntArray, Mesh, Similarity, SurfaceLandmarks
+from shapespace.types import FloatArray, Mesh, Similarity, SurfaceLandmarks
 
 FEWEST = 3
 """Landmarks: fewer do not determine a pose."""
@@ -115,14 +115,6 @@ class ScanLandmarks:
     def rms_distance(self, vertices: FloatArray) -> float:
         """Return the RMS distance between the points and their places on `vertices` (V, 3), in one frame."""
         return _rms(self.places.interpolate(vertices) - self.points)
-
-
-def on_triangles(mesh: Mesh, points: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Return (M, 3) corners of the triangles of `mesh` that lie nearest to `points` (M, 3), and weights (M, 3)."""
-    near = build_engine(mesh).query(points)
-    if near.triangle is None or near.barycentric is None:
-        raise MeshError(f"{mesh.name} has no triangles, so no points can be placed on it; give a surface.")
-    return np.asarray(faces_of(mesh)[near.triangle], dtype=np.int32), near.barycentric
 
 
 def stray_landmarks(scan: Mesh) -> dict[str, float]:

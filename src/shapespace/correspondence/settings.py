@@ -33,8 +33,6 @@ class CorrespondConfig:
         fewest_covered: smallest share of a scan that the template must cover.
         outlier_threshold: scans whose distance from their leave-one-out prediction is beyond this many times the median
             are excluded as other objects.
-        symmetric: the object is its own mirror image: the template is made symmetric, and a scan is also predicted from
-            the mirror images of the other scans.
         mirror: what is done with scans that are mirror images of the majority, such as left among right teeth: they are
             reflected (auto), excluded (ask), or the files are trusted (never).
         pose: rotation of the scans: found by a search over all rotations (search), or that of the frames of the files,
@@ -57,7 +55,6 @@ class CorrespondConfig:
     fewest_seen: float = 0.4
     fewest_covered: float = 0.6
     outlier_threshold: float = 3.0
-    symmetric: bool = False
     mirror: Literal["auto", "ask", "never"] = "auto"
     pose: PoseRange = "search"
     outer: bool = False

@@ -61,9 +61,7 @@ class PoseModel:
         harmonics = Harmonics.of(coarse, _POSE_HARMONICS)
         return PoseModel(generic_model(coarse, harmonics, None if shapes is None else shapes[:, origin]))
 
-    def search(
-        self, vertices_mm: FloatArray, seed: int, *, quick: bool = False, pose: PoseRange = "search"
-    ) -> Start:
+    def search(self, vertices_mm: FloatArray, seed: int, *, quick: bool = False, pose: PoseRange = "search") -> Start:
         """Search the poses and sizes of the surface in a scan with `vertices_mm` (S, 3); `quick` for a score alone.
 
         The score is in mm of this surface.

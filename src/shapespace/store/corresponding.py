@@ -11,6 +11,7 @@ from shapespace.geometry.mirror_plane import mirror_image
 from shapespace.io.containers.json_files import read_json
 from shapespace.io.meshes.mesh_folders import mesh_files
 from shapespace.io.meshes.mesh_io import stem_of
+from shapespace.reprs import first_names
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord
 from shapespace.store.results import ENDINGS, mesh_at, results_at, surfaces_of
 from shapespace.types import Mesh
@@ -65,7 +66,7 @@ class SurfaceFiles:
             )
 
     def _others(self) -> str:
-        file_names = _listed([path.name for path in self.unit_ratios])
+        file_names = first_names([path.name for path in self.unit_ratios], _NAMED)
         of = "meshes is" if len(self.unit_ratios) == 1 else "meshes are"
         return f"{len(self.unit_ratios)} of {len(self.files)} {of} in another unit than most ({file_names})"
 
@@ -96,9 +97,8 @@ def surface_files(paths: Sequence[Path], *, recursive: bool = False) -> SurfaceF
         else:
             files += _surfaces(path, summary)
             if summary.set_aside:
-                notes.append(
-                    f"{path}: without {len(summary.set_aside)} excluded scans ({_listed(list(summary.set_aside))})."
-                )
+                names = first_names(list(summary.set_aside), _NAMED)
+                notes.append(f"{path}: without {len(summary.set_aside)} excluded scans ({names}).")
     ratios: dict[Path, float] = {}
     mirrored: set[Path] = set()
     for folder in dict.fromkeys(file.parent for file in files if file.name.endswith(SURFACE)):
@@ -109,7 +109,7 @@ def surface_files(paths: Sequence[Path], *, recursive: bool = False) -> SurfaceF
             mirrored |= reflected.intersection(files)
     if mirrored:
         of = "mesh is a mirror image" if len(mirrored) == 1 else "meshes are mirror images"
-        names = _listed([file.name for file in files if file in mirrored])
+        names = first_names([file.name for file in files if file in mirrored], _NAMED)
         notes.append(f"{len(mirrored)} of {len(files)} {of} of the others ({names}) and reflected.")
     return SurfaceFiles(tuple(files), ratios, frozenset(mirrored), tuple(notes))
 
@@ -156,7 +156,3 @@ def _stored_surfaces(path: Path, notes: list[str]) -> list[Path]:
         notes.append(f"{path}: of {len(results)} fits the {len(files)} surfaces that end as {files[0].name} are taken.")
     notes += results.problems
     return files
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")

@@ -9,6 +9,7 @@ from pathlib import Path
 from shapespace.errors import InputError
 from shapespace.io.files import read_error
 from shapespace.io.meshes.mesh_io import MESH_ENDINGS, MESH_FILE_ENDINGS
+from shapespace.reprs import first_names
 
 _NAMED = 3  # names in a message before the rest is only counted
 
@@ -116,5 +117,5 @@ def _omission_notes(folder: Path, listing: _FolderListing, kind_name: str) -> It
     ):
         if names:
             count_words = f"1 {singular} is" if len(names) == 1 else f"{len(names)} {plural} are"
-            names_shown = ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")
+            names_shown = first_names(names, _NAMED)
             yield f"{folder}: {count_words} not {verb} ({names_shown}); {advice}."

@@ -46,6 +46,7 @@ from shapespace.report.inputs.triage import (
 )
 from shapespace.report.pages.page import Chapter, Page, Step
 from shapespace.report.render.palette import DIVERGING, SEQUENTIAL
+from shapespace.reprs import first_names
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondRecord, Quality, read
 from shapespace.types import FloatArray, Mesh
 from shapespace.version import __version__
@@ -182,7 +183,7 @@ class CorrespondencePage:
         )  # fmt: skip
         mirrored = [record.name for record in self.records if record.mirrored]
         if mirrored:
-            named = ", ".join(mirrored[:_MOST_NAMED]) + (", ..." if len(mirrored) > _MOST_NAMED else "")
+            named = first_names(mirrored, _MOST_NAMED)
             of = counted(len(mirrored), "scan is a mirror image", "scans are mirror images")
             text += f" {of} of the others and shown reflected ({named})."
         return f"{text} {self._settling()}"
