@@ -486,6 +486,7 @@ class CorrespondenceRecord(Struct, frozen=True, kw_only=True):
         other_units: NAME to `unit_ratio` of those that are in another unit than most.
         mirrored: NAMEs of those that are mirror images of the majority.
         sides_decided: whether scans could be distinguished from their mirror images.
+        groups: NAMEs in correspondence, then those of each other kind of object; empty where all are of one kind.
         settings: of the run.
         version: of shapespace.
         inputs_hash: SHA-256 of the scans, landmarks, template, model, settings and version; a run with the same inputs
@@ -510,6 +511,7 @@ class CorrespondenceRecord(Struct, frozen=True, kw_only=True):
     other_units: dict[str, float] = {}
     mirrored: list[str] = []
     sides_decided: bool = False
+    groups: list[list[str]] = []
     inputs_hash: str = ""
     results_hash: str = ""
     added: list[str] = []

@@ -49,9 +49,8 @@ def known(meshes: list[Mesh], triangles: int) -> Known:
         T = random_similarity(rng, 180.0, (0.9, 1.1))
         made.append(simulate_scan(mesh, rng, triangles=triangles, noise_mm=0.2, T_scan_model=T, name=f"scan{k}"))
     mean = Mesh(np.mean([mesh.vertices for mesh in meshes], axis=0), meshes[0].faces)
-    return Known(
-        [one.scan for one in made], [one.truth_vertices for one in made], [one.T_scan_model for one in made], mean
-    )
+    truth = [one.truth_vertices for one in made]
+    return Known([one.scan for one in made], truth, [one.T_scan_model for one in made], mean)
 
 
 def faces() -> Known:

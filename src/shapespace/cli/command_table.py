@@ -304,6 +304,8 @@ COMMANDS: tuple[Command, ...] = (
                      "MODEL.h5", "shape model of such objects: its mean is the template, and its fit to a scan "
                      "initialises the first round", parse=Path),
             advanced("--mirror", source=CORRESPOND),
+            advanced("--groups", help="bring each kind of object into correspondence, in folders group_1 (the largest "
+                     "group), group_2, ... of the output folder (default: the largest group only)"),
             advanced("--pose", source=CORRESPOND),
             advanced("--outer", source=CORRESPOND),
             advanced("--landmark-std", "SHARE", source=CORRESPOND, field="landmark_uncertainty", parse=values.share,

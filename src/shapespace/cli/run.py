@@ -192,7 +192,7 @@ def correspond(arguments: argparse.Namespace) -> int:
         from shapespace.batch.workers import start_loading
 
         start_loading(tell=not arguments.quiet)
-    from shapespace.commands.correspond import CorrespondFiles, correspond_files
+    from shapespace.commands.correspond import CorrespondFiles, correspond_files, correspond_groups
     from shapespace.commands.correspond_changes import Change, change_correspondence
     from shapespace.correspondence.settings import CorrespondConfig
     from shapespace.schemas import to_json
@@ -209,12 +209,15 @@ def correspond(arguments: argparse.Namespace) -> int:
     )
     change = Change(**given(arguments, Change))
     folder, quiet = arguments.output, arguments.quiet
+    if change and arguments.groups:
+        raise InputError(f"--groups cannot be combined with {change.option}; leave one of them out.")
     if not (change or files.scans):
         raise InputError("Give scans, or a change of a finished correspondence by --redo, --remove or --update.")
     if change:
         summary, records = change_correspondence(change, files, folder, config, quiet=quiet, say=warn)
     else:
-        summary, records = correspond_files(files, folder, config, quiet=quiet, say=warn)
+        bring = correspond_groups if arguments.groups else correspond_files
+        summary, records = bring(files, folder, config, quiet=quiet, say=warn)
     if arguments.json:
         show_json({"folder": str(arguments.output), **to_json(summary), "records": to_json(records)})
     else:

@@ -109,6 +109,25 @@ def correspond_files(
         return _corresponding(jobs, files, folder, config, quiet=quiet, say=say)
 
 
+def correspond_groups(
+    files: CorrespondFiles, folder: Path, config: CorrespondConfig, *, quiet: bool, say: Say
+) -> tuple[CorrespondenceRecord, list[CorrespondRecord]]:
+    """Bring the scans of each kind of object into correspondence, in folders group_1, group_2, ... of `folder`.
+
+    Returns:
+        The summary and records of the largest group, which also name all other scans.
+
+    Raises:
+        FileError, InputError: as for `correspond_files`.
+    """
+    paths = {job.name: job.address or job.scan for job in find_jobs(files, folder, lambda _: None)}
+    summary, records = correspond_files(files, folder / "group_1", config, quiet=quiet, say=say)
+    for number, group in enumerate(summary.groups[1:], start=2):
+        own = replace(files, scans=[paths[name] for name in group])
+        correspond_files(own, folder / f"group_{number}", config, quiet=quiet, say=say)
+    return summary, records
+
+
 def find_jobs(files: CorrespondFiles, folder: Path, say: Say) -> list[Job]:
     """Return the given scans, but for the surfaces of an earlier correspondence, with the names of their results.
 
@@ -176,6 +195,7 @@ def _corresponding(
         other_units={record.name: record.unit_ratio for record in records if record.unit_ratio != 1.0},
         mirrored=[record.name for record in records if record.mirrored],
         sides_decided=made.sides_decided,
+        groups=[list(group) for group in made.groups],
         inputs_hash=inputs_hash,
     )
     summary = structs.replace(summary, results_hash=results_hash_of(summary, folder))
@@ -430,6 +450,11 @@ def say_notes(records: Sequence[CorrespondRecord], made: Correspondence, given: 
             f"{len(mirrored)} {of} of the others ({named}) and reflected for the correspondence; surfaces are in the "
             "frames of their scans."
         )
+    if made.groups:
+        first, *others = (len(group) for group in made.groups)
+        alone = len(made.scans) - first - sum(others)
+        parts = [f"{first} scans are alike", *(f"{count} are alike and differ from them" for count in others)]
+        say("; ".join(parts) + (f"; {alone} others are excluded" if alone else "") + ".")
     noted = [record for record in records if record.notes]
     for record in noted[:_LISTED]:
         say(f"{record.name}: {' '.join(record.notes)}")

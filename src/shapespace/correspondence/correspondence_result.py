@@ -61,6 +61,8 @@ class Correspondence:
         landmarks: the landmarks that scans have, on each of the surfaces.
         sides_decided: whether scans could be distinguished from their mirror images; False for a symmetric object,
             and where they were not compared.
+        groups: names of the scans in correspondence, then of those of each other kind of object; empty where all are of
+            one kind.
     """
 
     template: Mesh
@@ -69,6 +71,7 @@ class Correspondence:
     moved: tuple[float, ...]
     landmarks: SurfaceLandmarks = field(default_factory=SurfaceLandmarks)
     sides_decided: bool = False
+    groups: tuple[tuple[str, ...], ...] = ()
 
     __repr__ = short_repr
 

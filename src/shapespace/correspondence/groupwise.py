@@ -11,7 +11,7 @@ those of docs/correspondence.md.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -20,6 +20,7 @@ from shapespace.correspondence.correspondence_result import Correspondence, Corr
 from shapespace.correspondence.first_template import FirstTemplate, first_template, repaired_scans
 from shapespace.correspondence.guide import ShapePredictor, predict_leave_one_out
 from shapespace.correspondence.harmonics import Harmonics
+from shapespace.correspondence.kinds import Collection, find_kinds
 from shapespace.correspondence.landmark_guide import ScanLandmarks, consensus_landmarks
 from shapespace.correspondence.mirrored_scans import Sides, solve_sides
 from shapespace.correspondence.registration import Comparison, RegistrationTask, RoundContext, ScanRegistration
@@ -154,6 +155,7 @@ class RegistrationState:
         predictions: (V, 3) where the registration of a scan begins in the next round.
         sides: of all scans, by the comparisons before the first round.
         rounds: one record for each round so far.
+        other_kinds: of the scans that were in another group than the largest, the first scan of their group.
     """
 
     template: Mesh
@@ -163,6 +165,7 @@ class RegistrationState:
     predictions: Mapping[int, FloatArray]
     sides: Sides
     rounds: tuple[RoundRecord, ...]
+    other_kinds: Mapping[int, int] = field(default_factory=dict[int, int])
 
     def is_mirrored(self, i: int) -> bool:
         """Return whether scan `i` is a mirror image of the majority, as far as is known."""
@@ -310,9 +313,9 @@ def _next_state(
     ended = sorted(registrations, key=lambda registration: registration.index)
     state = _accept(problem, previous, ended)
     sure = [i for i, registration in state.registrations.items() if not registration.alternatives]
-    state = _exclude_outliers(problem, state, sure)
+    state = _exclude_other_kinds(problem, state, sure)
     state = _resolve_alternatives(problem, state)
-    state = _exclude_outliers(problem, state, list(state.registrations))
+    state = _exclude_other_kinds(problem, state, list(state.registrations))
     state = _exclude_mirrored(problem, state)
     if len(state.registrations) < FEWEST:
         reasons = "; ".join(f"{problem.names[i]}: {reason}" for i, reason in list(state.excluded.items())[:3])
@@ -357,25 +360,36 @@ def _wrong_names(registration: ScanRegistration) -> str:
     return "; or its landmarks, which determine its pose, have wrong names" if registration.posed_by_landmarks else ""
 
 
-def _exclude_outliers(problem: _Problem, state: RegistrationState, order: Sequence[int]) -> RegistrationState:
-    """Exclude the scans in `order` that are far from their leave-one-out prediction."""
+def _exclude_other_kinds(problem: _Problem, state: RegistrationState, order: Sequence[int]) -> RegistrationState:
+    """Exclude the scans in `order` that are another kind of object than the largest group, or are like no other."""
     if len(order) < ENOUGH_TO_JUDGE:
         return state
-    config = problem.config
+    order, config = sorted(order), problem.config
     shapes, observed = state.shapes(order)
-    shapes, _ = align_to_weighted_mean(shapes, observed, state.template.vertices)
-    predicted = predict_leave_one_out(shapes, observed, config.noise_share)
-    squares = ((shapes - predicted) ** 2).sum(axis=2)
-    rms = np.sqrt((observed * squares).sum(axis=1) / np.maximum(observed.sum(axis=1), 1))  # C14
-    median = float(np.median(rms))
-    outliers = {
-        i: f"another object, or wrongly placed: {distance / median:.1f} times as far as usual from its leave-one-out "
-        f"prediction{_wrong_names(state.registrations[i])}"
-        for i, distance in zip(order, rms, strict=True)
-        if distance > config.outlier_threshold * median  # C14
+    kinds = find_kinds(shapes, observed, state.template.vertices, config.noise_share)
+    reasons = {
+        order[k]: _outlier_reason(state.registrations[order[k]], float(kinds.distance[k]))
+        for k in np.flatnonzero(kinds.distance > config.outlier_threshold).tolist()  # C14
     }
-    registrations = {i: one for i, one in state.registrations.items() if i not in outliers}
-    return replace(state, registrations=registrations, excluded={**state.excluded, **outliers})
+    other_kinds = dict(state.other_kinds)
+    for group in kinds.groups[1:]:
+        members = [order[k] for k in group.tolist()]
+        other_kinds |= dict.fromkeys(members, members[0])
+        reasons |= dict.fromkeys(members, _another_kind(len(members), len(kinds.groups[0])))
+    registrations = {i: one for i, one in state.registrations.items() if i not in reasons}
+    excluded = {**state.excluded, **reasons}
+    return replace(state, registrations=registrations, excluded=excluded, other_kinds=other_kinds)
+
+
+def _another_kind(alike: int, largest: int) -> str:
+    return f"another kind of object: one of {alike} scans that are alike and differ from the largest group of {largest}"
+
+
+def _outlier_reason(registration: ScanRegistration, distance: float) -> str:
+    return (
+        f"another object, or wrongly placed: {distance:.1f} times as far as usual from its prediction by the other "
+        f"scans{_wrong_names(registration)}"
+    )
 
 
 def _resolve_alternatives(problem: _Problem, state: RegistrationState) -> RegistrationState:
@@ -443,6 +457,7 @@ def _update_template(
         predictions=predictions,
         sides=state.sides,
         rounds=(*state.rounds, record),
+        other_kinds=state.other_kinds,
     )
 
 
@@ -625,10 +640,15 @@ def _judged_by_finished(problem: _Problem, state: RegistrationState, i: int) -> 
     if i not in state.registrations:
         return state
     kept = sorted(state.registrations.keys() - {i})
-    judged = _exclude_outliers(problem, state, [*kept[:: -(-len(kept) // _JUDGES)], i])
-    if i in judged.registrations:
+    judges = kept[:: -(-len(kept) // _JUDGES)]
+    if len(judges) < ENOUGH_TO_JUDGE - 1:
         return state
-    return replace(state, registrations={j: state.registrations[j] for j in kept}, excluded={i: judged.excluded[i]})
+    collection = Collection.of(*state.shapes([*judges, i]), state.template.vertices, problem.config.noise_share)
+    distance = float(collection.distances(np.arange(len(judges)))[-1])
+    if distance <= problem.config.outlier_threshold:  # C14
+        return state
+    excluded = {i: _outlier_reason(state.registrations[i], distance)}
+    return replace(state, registrations={j: state.registrations[j] for j in kept}, excluded=excluded)
 
 
 def _merged(start: RegistrationState, states: Mapping[int, RegistrationState]) -> RegistrationState:
@@ -642,16 +662,29 @@ def _merged(start: RegistrationState, states: Mapping[int, RegistrationState]) -
 # The result
 
 
+def _groups(state: RegistrationState) -> list[list[int]]:
+    """Return the scans in correspondence, then those of each other kind; empty where all are of one kind."""
+    others: dict[int, list[int]] = {}
+    for i in sorted(state.other_kinds.keys() & state.excluded.keys()):
+        others.setdefault(state.other_kinds[i], []).append(i)
+    alike = [group for group in others.values() if len(group) > 1]
+    return [sorted(state.registrations), *sorted(alike, key=len, reverse=True)] if alike else []
+
+
 def _result(problem: _Problem, state: RegistrationState) -> Correspondence:
-    complete = _complete_shapes(problem, state)
+    complete, groups = _complete_shapes(problem, state), _groups(state)
+    # A scan of another kind is tried again in each round, and can end with a reason that names no kind.
+    kinds = {i: _another_kind(len(group), len(groups[0])) for group in groups[1:] for i in group}
+    state = replace(state, excluded={**state.excluded, **kinds})
     scans = [_scan_result(problem, state, i, complete.get(i)) for i in range(len(problem.names))]
     points = state.landmarks.positions(state.template.vertices)
     template = state.template.with_vertices(state.template.vertices, points)
     landmarks = replace(state.landmarks, distance_mm=np.empty(0))  # places on a mean have no given point
     moved = tuple(record.moved for record in state.rounds)
     return Correspondence(
-        template, tuple(scans), problem.first.origin, moved, landmarks, sides_decided=state.sides.decided
-    )
+        template, tuple(scans), problem.first.origin, moved, landmarks, sides_decided=state.sides.decided,
+        groups=tuple(tuple(problem.names[i] for i in group) for group in groups),
+    )  # fmt: skip
 
 
 def _complete_shapes(problem: _Problem, state: RegistrationState) -> dict[int, FloatArray]:

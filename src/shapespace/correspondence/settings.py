@@ -31,8 +31,8 @@ class CorrespondConfig:
         noise_share: noise variance of a prediction, as a share of a mode's mean variance.
         fewest_seen: smallest share of the template that a scan must observe.
         fewest_covered: smallest share of a scan that the template must cover.
-        outlier_threshold: scans whose distance from their leave-one-out prediction is beyond this many times the median
-            are excluded as other objects.
+        outlier_threshold: scans whose distance from their prediction by the largest group of similar scans is beyond
+            this many times the median of that group are excluded as other objects.
         mirror: what is done with scans that are mirror images of the majority, such as left among right teeth: they are
             reflected (auto), excluded (ask), or the files are trusted (never).
         pose: rotation of the scans: found by a search over all rotations (search), or that of the frames of the files,
@@ -54,7 +54,7 @@ class CorrespondConfig:
     noise_share: float = 1.0
     fewest_seen: float = 0.4
     fewest_covered: float = 0.6
-    outlier_threshold: float = 3.0
+    outlier_threshold: float = 2.5
     mirror: Literal["auto", "ask", "never"] = "auto"
     pose: PoseRange = "search"
     outer: bool = False
