@@ -179,7 +179,9 @@ class MarkedSpecimens:
             # The 90 % quantile of F with 2 and `degrees` degrees of freedom, for an isotropic error on the surface.
             quantile = 0.5 * degrees[row] * (0.1 ** (-2.0 / degrees[row]) - 1.0)
             radius[row] = size * np.sqrt(variance * quantile)
-        on_scan = place_landmarks(scan or Mesh(surface.vertices, surface.faces), dict(zip(names, positions, strict=True)))
+        on_scan = place_landmarks(
+            scan or Mesh(surface.vertices, surface.faces), dict(zip(names, positions, strict=True))
+        )
         reasons = tuple(
             "unobserved" if seen < 0.5 else "off_scan" if off > _OFF_SCAN * size else "wide_region" if wide else ""
             for seen, off, wide in zip(observed, on_scan.distance_mm, radius > _WIDE * size, strict=True)
@@ -283,6 +285,8 @@ def _with_outliers(checks: Sequence[LandmarkCheck], specimens: int) -> list[Land
     usual = of_specimen * of_landmark / max(float(np.median(share)), 1e-300)
     is_outlier = share > np.maximum(_OUTLIER * usual, _LEAST_ERROR)
     return [
-        LandmarkCheck(c.specimen, c.landmark, c.error, c.error_share, c.radius_90, c.distance, c.finding or "outlier" * bool(o))
+        LandmarkCheck(
+            c.specimen, c.landmark, c.error, c.error_share, c.radius_90, c.distance, c.finding or "outlier" * bool(o)
+        )
         for c, o in zip(checks, is_outlier, strict=True)
     ]
