@@ -1,4 +1,4 @@
-"""What `landmarks` does: landmarks of marked specimens carried to all scans of a correspondence, checked, and planned."""
+"""What `landmarks` does: landmarks of marked specimens carried to all scans of a correspondence, and checked."""
 
 from __future__ import annotations
 
@@ -185,9 +185,7 @@ def _say_names(given: Mapping[str, Mapping[str, FloatArray]], say: Say) -> None:
         if len(names) > 1:
             say(f"The landmark names {' and '.join(map(repr, names))} differ in spelling only, and count as different.")
     if some := [f"{name} ({n})" for name, n in count.items() if n < len(given)]:
-        say(
-            f"Not all {len(given)} marked specimens have {', '.join(some)}; each is transferred from those that have it."
-        )
+        say(f"Not all {len(given)} marked specimens have {', '.join(some)}; each comes from those that have it.")
 
 
 def _scan(same: _Correspondence, surface: Mesh, say: Say) -> Mesh | None:
@@ -241,6 +239,6 @@ def _transferred(same: _Correspondence, surface: Mesh, scan: Mesh | None) -> tup
 
 def _sentence(one: LandmarkCheck) -> str:
     return (
-        f"{one.specimen}: landmark {one.landmark!r} is {100 * one.error_share:.1f} % of the size from its prediction by "
-        f"the other marked specimens ({one.finding})."
+        f"{one.specimen}: landmark {one.landmark!r} is {100 * one.error_share:.1f} % of the size from its prediction "
+        f"by the other marked specimens ({one.finding})."
     )
