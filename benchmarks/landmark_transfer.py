@@ -89,9 +89,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=5)
     parser.add_argument("--folder", type=Path)
     arguments = parser.parse_args()
-    print(
-        "| set | marked | chosen | error, % | median, % | coverage, % | rigid, % | TPS, % |\n|---|---|---|---|---|---|---|---|"
-    )
+    print("| set | marked | chosen | error, % | median, % | coverage, % | rigid, % | TPS, % |")
+    print("|---|---|---|---|---|---|---|---|")
     for kind in arguments.sets:
         surfaces, mirrored, scans, truth = known(arguments, kind)
         by_name, raw = {mesh.name: mesh for mesh in surfaces}, {scan.name: scan for scan in scans}
