@@ -32,7 +32,7 @@ from shapespace.geometry.normals import rms_size
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.store.corresponding import surface_files, surface_stem
 from shapespace.store.results import mesh_at
-from shapespace.types import FloatArray, Mesh
+from shapespace.types import BoolArray, FloatArray, Mesh
 
 POINTS, DRAWS, SPLINE_POINTS = 30, 10, 100
 SCATTERED = (0, 5)
@@ -98,7 +98,9 @@ def main() -> None:
         for count in (1, 3, 5):
             draws = [[str(n) for n in rng.choice(list(by_name), count, replace=False)] for _ in range(DRAWS)]
             for chosen, sets in (("random", draws), ("suggested", [[name for name, _ in bare.suggest(count)]])):
-                errors, inside, others = [], [], []
+                errors: list[FloatArray] = []
+                inside: list[BoolArray] = []
+                others: list[list[float]] = []
                 for names in sets:
                     marks = {name: {f"{k}": p for k, p in enumerate(truth[name])} for name in names}
                     marked = MarkedSpecimens.of(surfaces, marks, mirrored)
@@ -110,9 +112,9 @@ def main() -> None:
                         if count == 1:
                             flip = (name in mirrored) != (names[0] in mirrored)
                             pair = beside(by_name[names[0]], by_name[name], raw[name], truth[names[0]], flip)
-                            others.append([np.linalg.norm(p - truth[name], axis=1).mean() / size for p in pair])
-                row = [100 * np.mean(errors), 100 * np.median(errors), 100 * np.mean(inside)]
-                row += list(100 * np.mean(others, axis=0)) if others else []
+                            others.append([float(np.linalg.norm(p - truth[name], axis=1).mean()) / size for p in pair])
+                row = [100 * float(one) for one in (np.mean(errors), np.median(errors), np.mean(inside))]
+                row += (100 * np.mean(others, axis=0)).tolist() if others else []
                 cells = [f"{value:.1f}" for value in row] + [""] * (5 - len(row))
                 print(f"| {kind} | {count} | {chosen} | {' | '.join(cells)} |", flush=True)
 

@@ -25,7 +25,7 @@ def specimens(z: FloatArray) -> list[Mesh]:
 
 def centres(mesh: Mesh, triangles: Sequence[int]) -> dict[str, FloatArray]:
     """Return the centres of `triangles` as landmarks."""
-    return {f"lm{t}": mesh.vertices[mesh.faces[t]].mean(axis=0) for t in triangles}
+    return {f"lm{t}": mesh.vertices[np.asarray(mesh.faces)[t]].mean(axis=0) for t in triangles}
 
 
 def drawn(count: int, seed: int = 0) -> list[Mesh]:
@@ -102,7 +102,7 @@ def test_a_check_names_swapped_and_displaced_landmarks_and_no_others() -> None:
     assert not [one for one in MarkedSpecimens.of(meshes, marked).check() if one.finding]
     s1, s4 = marked["s1"], marked["s4"]
     s1["lm70"], s1["lm200"] = s1["lm200"], s1["lm70"]
-    s4["lm3"] = meshes[4].vertices[meshes[4].faces[100]].mean(axis=0)
+    s4["lm3"] = meshes[4].vertices[np.asarray(meshes[4].faces)[100]].mean(axis=0)
     found = {
         (one.specimen, one.landmark): one.finding for one in MarkedSpecimens.of(meshes, marked).check() if one.finding
     }
@@ -127,7 +127,7 @@ def test_landmarks_are_doubtful_where_the_scan_shows_nothing_or_lies_elsewhere()
     meshes = drawn(3)
     marked = {"s0": centres(meshes[0], (3, 400))}
     hidden = np.ones(VERTICES, dtype=np.bool_)
-    hidden[meshes[1].faces[3]] = False
+    hidden[np.asarray(meshes[1].faces)[3]] = False
     meshes[1] = replace(meshes[1], observed=hidden)
     specimens = MarkedSpecimens.of(meshes, marked)
     assert specimens.transfer("s1").reasons == ("unobserved", "")
