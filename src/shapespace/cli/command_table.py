@@ -37,6 +37,7 @@ FACES = Source("commands.data", "write_simulated_faces")
 ORGANS = Source("commands.data", "write_simulated_organs")
 BONES = Source("commands.data", "write_simulated_bones")
 SURFACE = Source("commands.surface", "write_surfaces")
+LANDMARKS = Source("commands.landmarks", "suggest_specimens")
 TRAIN = Source("commands.recognise", "recognise_train")
 STUDY = Source("commands.recognise", "recognise_study")
 VIEW = Source("viewer.serve", "serve")
@@ -50,6 +51,7 @@ _GOES_ON: Mapping[str, Any] = {"goes_on": "; the same command goes on from there
 
 GROUPS: Mapping[str, str] = {
     "data": "open data sets, simulated faces, organs and bones",
+    "landmarks": "transfer landmarks from a few marked specimens to all scans in correspondence, and check them",
     "recognise": "classify scans (for example, facial expressions) by fitted coefficients",
 }
 """Commands that have commands."""
@@ -103,6 +105,9 @@ class Command:
 _QUIET = basic("--quiet", help="do not show progress")
 _JSON = basic("--json", help="print the results as JSON")
 _OUTPUT = basic("-o --output", "DIR", "output folder", parse=Path, required=True)
+_MARKED = basic("marked", "MARKED", "folder of landmark files with the names of the scans, in any landmark format",
+                parse=Path)  # fmt: skip
+_SAME = basic("scans", "SAME", "folder that correspond wrote", parse=Path)
 _RECURSIVE = advanced("--recursive", help="also search subfolders of the given folders")
 _STRICT_HELP = (
     "refuse scans with coordinates that are NaN or infinite (default: remove the triangles that use them, with a note)"
@@ -484,6 +489,33 @@ COMMANDS: tuple[Command, ...] = (
             "which nothing is answered. Ctrl-C ends the viewer. Needs the extra view.",
         ),
         json=False,
+    ),
+    Command(
+        "landmarks transfer", "transfer landmarks from a few marked specimens to all scans in correspondence",
+        ("shapespace correspond scans -o same", "shapespace landmarks transfer marked same -o landmarks"),
+        run.landmarks_transfer,
+        (_MARKED, _SAME, _OUTPUT),
+        (
+            "Writes the landmarks of each scan, in its frame and unit: NAME.landmarks.csv (position, triangle with "
+            "barycentric weights, radius of the 90 % region, status), NAME.landmarks.mrk.json and NAME.landmarks.fcsv, "
+            "and landmarks.tps with all scans. Landmarks of marked specimens stay as they are.",
+        ),
+    ),
+    Command(
+        "landmarks check", "compare the landmarks of each marked specimen with their prediction from the others",
+        ("shapespace landmarks check marked same -o check.csv",), run.landmarks_check,
+        (_MARKED, _SAME,
+         basic("-o --output", "FILE.csv", "table of the error of each landmark and specimen", parse=Path)),
+        ("The exit code is 1 if an outlier or landmarks with exchanged names are found.",),
+    ),
+    Command(
+        "landmarks suggest", "name the specimens to mark next",
+        ("shapespace landmarks suggest same --marked marked",), run.landmarks_suggest,
+        (
+            _SAME,
+            basic("--marked", "DIR", source=LANDMARKS, parse=Path),
+            basic("--count", "N", source=LANDMARKS, parse=values.positive),
+        ),
     ),
     Command(
         "recognise train", "train a classifier on fitted scans with labels",

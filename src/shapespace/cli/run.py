@@ -371,6 +371,62 @@ def _execution_config(arguments: argparse.Namespace) -> ExecutionConfig:
     return ExecutionConfig(**given(arguments, ExecutionConfig))
 
 
+def landmarks_transfer(arguments: argparse.Namespace) -> int:
+    """Transfer landmarks."""
+    from shapespace.commands.landmarks import TPS, transfer_landmarks
+
+    folder = arguments.output
+    records = transfer_landmarks(arguments.marked, arguments.scans, folder, quiet=arguments.quiet, say=warn)
+    if arguments.json:
+        show_json({"folder": str(folder), "records": records})
+        return 0
+    doubtful = [record for record in records if record["status"] == "doubtful"]
+    for record in doubtful[:_LISTED]:
+        reasons = ", ".join(f"{one['name']} ({one['reason']})" for one in record["landmarks"] if one["reason"])
+        show(f"{record['name']}: doubtful landmarks: {reasons}")
+    if len(doubtful) > _LISTED:
+        show(f"and {len(doubtful) - _LISTED} more scans with doubtful landmarks")
+    show(f"landmarks of {len(records)} scans in {folder} and in {folder / TPS}")
+    return 0
+
+
+def landmarks_check(arguments: argparse.Namespace) -> int:
+    """Check given landmarks."""
+    from dataclasses import asdict
+    from statistics import fmean
+
+    from shapespace.commands.landmarks import check_landmarks
+
+    checks = check_landmarks(arguments.marked, arguments.scans, arguments.output, say=warn)
+    findings = sum(bool(one.finding) for one in checks)
+    if arguments.json:
+        show_json([asdict(one) for one in checks])
+        return 1 if findings else 0
+    for kind in ("landmark", "specimen"):
+        errors: dict[str, list[float]] = {}
+        for one in checks:
+            errors.setdefault(getattr(one, kind), []).append(100 * one.error_share)
+        means = sorted(((fmean(shares), name) for name, shares in errors.items()), reverse=True)
+        listed = ", ".join(f"{name} {share:.1f} %" for share, name in means[:_LISTED])
+        show(f"mean leave-one-out error by {kind}, largest first, of the size: {listed}")
+    show(f"{len(checks)} landmarks compared, {findings} with a finding")
+    return 1 if findings else 0
+
+
+def landmarks_suggest(arguments: argparse.Namespace) -> int:
+    """Suggest specimens to mark."""
+    from shapespace.commands.landmarks import suggest_specimens
+
+    options = given(arguments, suggest_specimens)
+    found = suggest_specimens(arguments.scans, **options, say=warn)
+    if arguments.json:
+        show_json([{"name": name, "mean_distance_share": share} for name, share in found])
+        return 0
+    for rank, (name, share) in enumerate(found, start=1):
+        show(f"{rank}. {name}: mean shape distance to the nearest marked specimen {100 * share:.1f} % of the size")
+    return 0
+
+
 def recognise_train(arguments: argparse.Namespace) -> int:
     """Train a classifier."""
     from shapespace.commands.recognise import recognise_train

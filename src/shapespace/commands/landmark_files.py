@@ -31,12 +31,14 @@ class LandmarkFiles:
         files: name of a scan without its ending -> file.
         used: names that a scan had.
         unread: what is to be said of files that cannot be used.
+        duplicates: name of a scan -> further files with its landmarks.
     """
 
     folder: Path | None
     files: dict[str, Path] = field(default_factory=dict[str, Path])
     used: set[str] = field(default_factory=set[str])
     unread: list[str] = field(default_factory=list[str])
+    duplicates: dict[str, list[Path]] = field(default_factory=dict[str, list[Path]])
 
     @staticmethod
     def of(folder: Path | None) -> LandmarkFiles:
@@ -52,16 +54,18 @@ class LandmarkFiles:
         endings = sorted([*LANDMARK_FORMATS, *READ_ONLY_LANDMARKS], key=len, reverse=True)
         files: dict[str, Path] = {}
         unread: list[str] = []
+        duplicates: dict[str, list[Path]] = {}
         for file in sorted(folder.iterdir()):
             ending = next((one for one in endings if file.name.lower().endswith(one)), None)
             if ending is None or not file.is_file() or _is_result(file):
                 continue
             first = files.setdefault(file.name[: -len(ending)], file)
             if first is not file:
+                duplicates.setdefault(file.name[: -len(ending)], []).append(file)
                 unread.append(f"{file.name} is not read, since {first.name} has landmarks of the same scan.")
         if not files:
             raise FileError(f"{folder} holds no landmarks; they are read from files with {', '.join(endings)}.")
-        return LandmarkFiles(folder, files, unread=unread)
+        return LandmarkFiles(folder, files, unread=unread, duplicates=duplicates)
 
     def refuse_shared(self, scans: Sequence[Path]) -> None:
         """Raise InputError where two of `scans`, of one name in different folders, would take the same landmarks."""

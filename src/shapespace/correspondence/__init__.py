@@ -10,12 +10,16 @@ from shapespace.lazy import lazy_names
 if TYPE_CHECKING:
     from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
     from shapespace.correspondence.groupwise import correspond
+    from shapespace.correspondence.landmark_transfer import LandmarkCheck, MarkedSpecimens, TransferredLandmarks
     from shapespace.correspondence.settings import CorrespondConfig
 
 __all__ = [
     "CorrespondConfig",
     "Correspondence",
     "Corresponding",
+    "LandmarkCheck",
+    "MarkedSpecimens",
+    "TransferredLandmarks",
     "correspond",
 ]
 __getattr__, __dir__ = lazy_names(
@@ -23,6 +27,7 @@ __getattr__, __dir__ = lazy_names(
     {
         "correspondence.correspondence_result": ("Correspondence", "Corresponding"),
         "correspondence.groupwise": ("correspond",),
+        "correspondence.landmark_transfer": ("LandmarkCheck", "MarkedSpecimens", "TransferredLandmarks"),
         "correspondence.settings": ("CorrespondConfig",),
     },
 )

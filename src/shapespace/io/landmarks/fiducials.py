@@ -28,7 +28,12 @@ def fiducial_texts(fiducials: Found) -> dict[str, str]:
     """
     points = {name: np.array(fiducial["at"], dtype=np.float64) for name, fiducial in fiducials.items()}
     descriptions = {name: _describe(fiducial["stddev_mm"]) for name, fiducial in fiducials.items()}
-    texts = _table(fiducials), _markups(points, descriptions), fcsv_text(points, descriptions)
+    return point_texts(points, descriptions, _table(fiducials))
+
+
+def point_texts(points: Mapping[str, FloatArray], descriptions: Mapping[str, str], table: str) -> dict[str, str]:
+    """Return ending -> text of each file: `table`, and 3D Slicer's two formats of `points` with `descriptions`."""
+    texts = table, _markups(points, descriptions), fcsv_text(points, descriptions)
     return dict(zip(FIDUCIAL_ENDINGS, texts, strict=True))
 
 

@@ -208,18 +208,20 @@ def write_surface_landmarks(path: Path | str, landmarks: SurfaceLandmarks) -> No
     if landmarks.are_vertices:
         write_landmark_indices(path, landmarks)
         return
-    header = ["name", *(name for pair in _CORNER_COLUMNS for name in pair), _DISTANCE_COLUMN]
+    columns, cells = surface_landmark_cells(landmarks)
+    rows = [[name, *row] for name, row in zip(landmarks.names, cells, strict=True)]
+    write_text(Path(path), rows_text([["name", *columns], *rows]))
+
+
+def surface_landmark_cells(landmarks: SurfaceLandmarks) -> tuple[list[str], list[list[str]]]:
+    """Return the columns of `write_surface_landmarks` after the name, and the cells of each landmark."""
     rows = [
-        [name, *(text for pair in zip(corners, weights, strict=True) for text in map(repr, pair)), repr(distance)]
-        for name, corners, weights, distance in zip(
-            landmarks.names,
-            landmarks.corners.tolist(),
-            landmarks.barycentric.tolist(),
-            landmarks.distance_mm.tolist(),
-            strict=True,
+        [*(text for pair in zip(corners, weights, strict=True) for text in map(repr, pair)), repr(distance)]
+        for corners, weights, distance in zip(
+            landmarks.corners.tolist(), landmarks.barycentric.tolist(), landmarks.distance_mm.tolist(), strict=True
         )
     ]
-    write_text(Path(path), rows_text([header, *rows]))
+    return [*(name for pair in _CORNER_COLUMNS for name in pair), _DISTANCE_COLUMN], rows
 
 
 def write_landmark_indices(path: Path | str, indices: Mapping[str, int]) -> None:
@@ -545,6 +547,15 @@ def _read_tps(data: bytes, path: Path) -> Pairs:
         # As geomorph and tps programs have a point that is not there.
         if "NA" not in line.upper().split()
     ]
+
+
+def tps_text(specimens: Mapping[str, FloatArray]) -> str:
+    """Return a TPS file of several specimens, as geomorph reads it: name -> (L, 3), rows of not-a-number as NA."""
+    blocks: list[str] = []
+    for name, points in specimens.items():
+        rows = [" ".join(map(repr, _numbers(p))) if np.isfinite(p).all() else "NA NA NA" for p in points]
+        blocks.append("\n".join([f"LM3={len(points)}", *rows, f"ID={name}"]))
+    return "\n".join(blocks) + "\n"
 
 
 def _read_tlms(data: bytes, path: Path) -> Pairs:
