@@ -366,14 +366,14 @@ def _exclude_other_kinds(problem: _Problem, state: RegistrationState, order: Seq
         return state
     order, config = sorted(order), problem.config
     shapes, observed = state.shapes(order)
-    kinds = find_kinds(shapes, observed, state.template.vertices, config.noise_share)
+    kinds = find_kinds(shapes, observed, state.template.vertices)
     reasons = {
         order[k]: _outlier_reason(state.registrations[order[k]], float(kinds.distance[k]))
         for k in np.flatnonzero(kinds.distance > config.outlier_threshold).tolist()  # C14
     }
     other_kinds = dict(state.other_kinds)
     for group in kinds.groups[1:]:
-        members = [order[k] for k in group.tolist()]
+        members = [order[int(k)] for k in group]
         other_kinds |= dict.fromkeys(members, members[0])
         reasons |= dict.fromkeys(members, _another_kind(len(members), len(kinds.groups[0])))
     registrations = {i: one for i, one in state.registrations.items() if i not in reasons}
@@ -643,7 +643,7 @@ def _judged_by_finished(problem: _Problem, state: RegistrationState, i: int) -> 
     judges = kept[:: -(-len(kept) // _JUDGES)]
     if len(judges) < ENOUGH_TO_JUDGE - 1:
         return state
-    collection = Collection.of(*state.shapes([*judges, i]), state.template.vertices, problem.config.noise_share)
+    collection = Collection.of(*state.shapes([*judges, i]), state.template.vertices)
     distance = float(collection.distances(np.arange(len(judges)))[-1])
     if distance <= problem.config.outlier_threshold:  # C14
         return state

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.correspondence.guide import ShapePredictor, predict_leave_one_out
+from shapespace.geometry.normals import rms_size
 from shapespace.geometry.procrustes import align_to_weighted_mean
 from shapespace.types import FloatArray
 
@@ -22,11 +23,21 @@ SAME_KIND = 2.0
 """Distance from the prediction, in medians of the core's own, up to which the core takes a shape: it was at most 1.7 in
 12 collections of one kind, but for one wrong pose, and at least 2.4 for another kind in 9 mixed ones
 (benchmarks/kinds.py)."""
+ANOTHER_KIND = 2.2
+"""Median distance of a group from the largest one, beyond which it is another kind: it was at least 2.4 in mixed
+collections."""
+_NOISE_SHARE = 0.1
+"""Noise of predictions (C13). With 1, shapes of few modes are shrunk so much that their extremes look like others: 15
+of 20 simulated collections of 80 shapes with three modes were split, with 0.1 none of 8 of 40 shapes."""
+_LEAST_DISTANCE = 0.01
+"""Usual distance from the prediction, at least, share of the size: that of simulated shapes without noise goes to 0."""
 _FEWEST = 5  # shapes of a core
 _POINTS = 600  # vertices that shapes are compared at
 _SEEDS = 8  # shapes that a core is grown from
 _GROWTH = 1.25  # factor by which a core grows in one step at most, so that its prediction follows
 _STEPS = 30  # at most
+_SEPARATED = 1.0
+"""Nearest shape outside a core of all shapes, in units of `SAME_KIND`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,27 +53,28 @@ class Kinds:
     distance: FloatArray
 
 
-def find_kinds(shapes: FloatArray, observed: FloatArray, template: FloatArray, noise_share: float) -> Kinds:
+def find_kinds(shapes: FloatArray, observed: FloatArray, template: FloatArray) -> Kinds:
     """Return the groups of `shapes` that predict each other.
 
     Args:
         shapes: (N, V, 3) in correspondence.
         observed: (N, V) weights, 1 where a vertex is observed.
         template: (V, 3) that shapes are aligned to.
-        noise_share: as in `ShapePredictor.of`.
     """
-    collection = Collection.of(shapes, observed, template, noise_share)
+    collection = Collection.of(shapes, observed, template)
     groups: list[_Indices] = []
     rest = np.arange(len(shapes))
     while len(rest) >= _FEWEST:
-        core = collection.largest_core(rest)
+        core = collection.separate_core(rest)
         if not len(core):
             break
         groups.append(core)
         rest = np.setdiff1d(rest, core)
     groups.sort(key=len, reverse=True)
     groups = groups or [np.arange(len(shapes))]
-    return Kinds(tuple(groups), collection.distances(groups[0]))
+    distance = collection.distances(groups[0])
+    others = [group for group in groups[1:] if np.median(distance[group]) > ANOTHER_KIND]
+    return Kinds((groups[0], *others), distance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,27 +84,29 @@ class Collection:
     shapes: FloatArray
     observed: FloatArray
     template: FloatArray
-    noise_share: float
 
     @staticmethod
-    def of(shapes: FloatArray, observed: FloatArray, template: FloatArray, noise_share: float) -> Collection:
+    def of(shapes: FloatArray, observed: FloatArray, template: FloatArray) -> Collection:
         """Return a collection at `_POINTS` of the vertices, drawn at random."""
         chosen = np.sort(np.random.default_rng(0).permutation(len(template))[:_POINTS])
-        return Collection(shapes[:, chosen], observed[:, chosen], template[chosen], noise_share)
+        return Collection(shapes[:, chosen], observed[:, chosen], template[chosen])
 
     def distances(self, core: _Indices) -> FloatArray:
         """Return (N,) the distance of each shape from its prediction by the rest of `core`, in medians of the core."""
         aligned, _ = align_to_weighted_mean(self.shapes[core], self.observed[core], self.template)
-        predictor = ShapePredictor.of(aligned, self.noise_share)
+        predictor = ShapePredictor.of(aligned, _NOISE_SHARE)
         rms = np.array([predictor.distance(*one) for one in zip(self.shapes, self.observed, strict=True)])
-        predicted = predict_leave_one_out(aligned, self.observed[core], self.noise_share)
+        predicted = predict_leave_one_out(aligned, self.observed[core], _NOISE_SHARE)
         squares = ((aligned - predicted) ** 2).sum(axis=2)
         weights = self.observed[core]
         rms[core] = np.sqrt((weights * squares).sum(axis=1) / np.maximum(weights.sum(axis=1), 1))
-        return rms / np.median(rms[core])
+        return rms / max(float(np.median(rms[core])), _LEAST_DISTANCE * rms_size(self.template))
 
-    def largest_core(self, candidates: _Indices) -> _Indices:
-        """Return the largest core of `candidates` (M,) that grows from one of them and those most similar; or none."""
+    def separate_core(self, candidates: _Indices) -> _Indices:
+        """Return the core of `candidates` (M,) that is most separate from the rest, of some grown from similar ones.
+
+        It is empty if there is none. A core of two kinds also predicts both, so the largest one can be mixed.
+        """
         aligned, _ = align_to_weighted_mean(self.shapes[candidates], self.observed[candidates], self.template)
         flat = aligned.reshape(len(candidates), -1)
         squares = (flat**2).sum(axis=1)
@@ -100,16 +114,25 @@ class Collection:
         size = max(_FEWEST, len(candidates) // 4)
         seeds = np.unique(np.linspace(0, len(candidates) - 1, _SEEDS).round().astype(int))
         cores = [self._grown(candidates[np.argsort(squared[seed])[:size]], candidates) for seed in seeds]
-        return max(cores, key=len)
+        return max(cores, key=lambda core: self._separation(core, candidates))
+
+    def _separation(self, core: _Indices, candidates: _Indices) -> float:
+        """Return the distance of the nearest shape outside `core`, as a ratio to that of the farthest one inside."""
+        if not len(core):
+            return 0.0
+        distance = self.distances(core)
+        outside = distance[np.setdiff1d(candidates, core)]
+        return float(outside.min(initial=_SEPARATED * SAME_KIND) / max(distance[core].max(), SAME_KIND / 2))
 
     def _grown(self, core: _Indices, candidates: _Indices) -> _Indices:
+        core = last = np.sort(core)
         for _ in range(_STEPS):
-            distance = self.distances(np.sort(core))[candidates]
+            distance = self.distances(core)[candidates]
             nearest = np.argsort(distance)[: int(_GROWTH * len(core)) + 1]
             grown = np.sort(candidates[nearest[distance[nearest] <= SAME_KIND]])
-            if np.array_equal(grown, np.sort(core)):
-                break
-            if len(grown) < _FEWEST:
-                return grown[:0]
-            core = grown
-        return np.sort(core)
+            if np.array_equal(grown, core) or len(grown) < _FEWEST:
+                return grown if len(grown) >= _FEWEST else grown[:0]
+            if np.array_equal(grown, last):  # one shape comes and goes
+                return np.intersect1d(grown, core)
+            core, last = grown, core
+        return core

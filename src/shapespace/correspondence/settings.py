@@ -54,7 +54,7 @@ class CorrespondConfig:
     noise_share: float = 1.0
     fewest_seen: float = 0.4
     fewest_covered: float = 0.6
-    outlier_threshold: float = 2.5
+    outlier_threshold: float = 2.7
     mirror: Literal["auto", "ask", "never"] = "auto"
     pose: PoseRange = "search"
     outer: bool = False
