@@ -66,3 +66,11 @@ def _of_array(array: npt.NDArray[Any]) -> str:
 
 def _clip(text: str) -> str:
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 2]} …"
+
+
+def describe_groups(groups: Sequence[Sequence[str]]) -> str:
+    """Return a sentence on the groups of scans of a correspondence; empty if all are of one kind."""
+    if not groups:
+        return ""
+    others = (f"{len(group)} are alike and differ from them" for group in groups[1:])
+    return "; ".join([f"{len(groups[0])} scans are alike", *others]) + "."

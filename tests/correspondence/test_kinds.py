@@ -106,5 +106,8 @@ def test_each_group_gets_its_own_folder(
     assert "9 scans are alike; 6 are alike and differ from them." in capsys.readouterr().err
     own = [read_json(tmp_path / "same" / f"group_{k}" / "correspondence.json", "")["corresponding"] for k in (1, 2)]
     assert own == [[f"blob{k}" for k in range(9)], [f"other{k}" for k in range(6)]]
+    assert main(["report", str(tmp_path / "same" / "group_1"), "--quiet"]) == 0
+    page = (tmp_path / "same/group_1/report.html").read_text("utf-8")
+    assert "9 scans are alike; 6 are alike and differ from them." in page
     assert main(["correspond", "x.ply", "-o", str(tmp_path / "same"), "--groups", "--add"]) == 2
     assert "--groups cannot be combined with --add" in capsys.readouterr().err

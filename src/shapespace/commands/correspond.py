@@ -41,7 +41,7 @@ from shapespace.io.files import make_folder, move_file, remove_file, sha256_of_f
 from shapespace.io.landmarks.landmark_io import write_surface_landmarks
 from shapespace.io.meshes.mesh_io import ending_of, read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
-from shapespace.reprs import first_names
+from shapespace.reprs import describe_groups, first_names
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, json_text, read
 from shapespace.store.corresponding import LANDMARKS, MEAN, RECORD, SUMMARY, SURFACE
 from shapespace.types import Mesh, SurfaceLandmarks
@@ -451,10 +451,7 @@ def say_notes(records: Sequence[CorrespondRecord], made: Correspondence, given: 
             "frames of their scans."
         )
     if made.groups:
-        first, *others = (len(group) for group in made.groups)
-        alone = len(made.scans) - first - sum(others)
-        parts = [f"{first} scans are alike", *(f"{count} are alike and differ from them" for count in others)]
-        say("; ".join(parts) + (f"; {alone} others are excluded" if alone else "") + ".")
+        say(describe_groups(made.groups))
     noted = [record for record in records if record.notes]
     for record in noted[:_LISTED]:
         say(f"{record.name}: {' '.join(record.notes)}")

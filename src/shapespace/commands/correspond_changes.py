@@ -357,6 +357,8 @@ def _summary(
     if len(there) < FEWEST:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in list(aside.items())[:_LISTED])
         raise InputError(f"Only {len(there)} of {len(every)} scans would be in correspondence: {reasons}.")
+    other_kinds = [[name for name in group if name in aside] for group in finished.summary.groups[1:]]
+    groups = [group for group in other_kinds if group]
     added = dict.fromkeys([*finished.summary.added, *(record.name for record in records)])
     return structs.replace(
         finished.summary,
@@ -364,6 +366,7 @@ def _summary(
         set_aside=aside,
         other_units={name: record.unit_ratio for name, record in every.items() if record.unit_ratio != 1.0},
         mirrored=[name for name, record in every.items() if record.mirrored],
+        groups=[there, *groups] if groups else [],
         added=[] if change.update else [name for name in added if name in there],
     )
 

@@ -46,7 +46,7 @@ from shapespace.report.inputs.triage import (
 )
 from shapespace.report.pages.page import Chapter, Page, Step
 from shapespace.report.render.palette import DIVERGING, SEQUENTIAL
-from shapespace.reprs import first_names
+from shapespace.reprs import describe_groups, first_names
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondRecord, Quality, read
 from shapespace.types import FloatArray, Mesh
 from shapespace.version import __version__
@@ -186,6 +186,8 @@ class CorrespondencePage:
             named = first_names(mirrored, _MOST_NAMED)
             of = counted(len(mirrored), "scan is a mirror image", "scans are mirror images")
             text += f" {of} of the others and shown reflected ({named})."
+        if self.result.run.groups:
+            text += f" {describe_groups(self.result.run.groups)}"
         return f"{text} {self._settling()}"
 
     def _settling(self) -> str:
