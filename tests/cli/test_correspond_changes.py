@@ -273,7 +273,7 @@ def test_a_correspondence_with_the_removed_option_symmetric_is_read_but_not_chan
     file.write_text(json.dumps(record))
     assert run("build", same, "-o", tmp_path / "model.h5").code == 0
     outcome = run("correspond", added, "--add", "-o", same, *QUIET)
-    assert outcome.code == 2 and "was computed with --symmetric" in outcome.sentence(), outcome.err
+    assert outcome.code == 2 and "was computed with the setting symmetric" in outcome.sentence(), outcome.err
     record["settings"]["symmetric"] = False
     file.write_text(json.dumps(record))
     assert add(run, same, added).code == 0
