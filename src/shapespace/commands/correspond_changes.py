@@ -143,7 +143,7 @@ class _Finished:
         config = read(CorrespondConfig, self.summary.settings, str(self.folder / SUMMARY), CORRESPOND_AGAIN)
         if self.summary.settings.get("symmetric"):
             raise InputError(
-                f"{self.folder} was computed with the setting symmetric, which this version does not have; {CORRESPOND_AGAIN}."
+                f"{self.folder} was computed with the setting symmetric, which was removed; {CORRESPOND_AGAIN}."
             )
         for option, file in (("--template", files.template), ("--model", files.model)):
             if file is not None:
