@@ -67,7 +67,7 @@ def known(arguments: argparse.Namespace, kind: str) -> tuple[list[Mesh], set[str
     return surfaces, {one.name for one in same.scans if one.mirrored}, scans, truth
 
 
-def beside(source: Mesh, target: Mesh, scan: Mesh, points: FloatArray, flip: bool) -> tuple[FloatArray, FloatArray]:
+def baselines(source: Mesh, target: Mesh, scan: Mesh, points: FloatArray, flip: bool) -> tuple[FloatArray, FloatArray]:
     """Return `points` of one specimen on another by a similarity, and by a thin-plate spline."""
     sign = FLIP if flip else np.ones(3)
     pose = fit_similarity(source.vertices * sign, target.vertices)
@@ -111,7 +111,7 @@ def main() -> None:
                         inside.append((off <= found.radius_90)[1::2])
                         if count == 1:
                             flip = (name in mirrored) != (names[0] in mirrored)
-                            pair = beside(by_name[names[0]], by_name[name], raw[name], truth[names[0]], flip)
+                            pair = baselines(by_name[names[0]], by_name[name], raw[name], truth[names[0]], flip)
                             others.append([float(np.linalg.norm(p - truth[name], axis=1).mean()) / size for p in pair])
                 row = [100 * float(one) for one in (np.mean(errors), np.median(errors), np.mean(inside))]
                 row += (100 * np.mean(others, axis=0)).tolist() if others else []

@@ -118,5 +118,5 @@ def test_bad_input_ends_with_one_sentence_that_names_it(run: Run, same: Path) ->
     (marked / "able.csv").rename(marked / f"{ASIDE}.csv")
     (marked / f"{ASIDE}.csv").write_text("name,x,y,z\na,1,3,2\n")
     assert "all marked specimens are excluded" in refusal(marked, same)
-    (marked / f"{ASIDE}.csv").rename(marked / "nobody.csv")
+    (marked / f"{ASIDE}.csv").rename(marked / "unknown.csv")
     assert "is named as one of the scans" in refusal(marked, same)

@@ -36,8 +36,6 @@ _POINTS = 600  # vertices that shapes are compared at
 _SEEDS = 8  # shapes that a core is grown from
 _GROWTH = 1.25  # factor by which a core grows in one step at most, so that its prediction follows
 _STEPS = 30  # at most
-_SEPARATED = 1.0
-"""Nearest shape outside a core of all shapes, in units of `SAME_KIND`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +93,9 @@ class Collection:
         """Return (N,) the distance of each shape from its prediction by the rest of `core`, in medians of the core."""
         aligned, _ = align_to_weighted_mean(self.shapes[core], self.observed[core], self.template)
         predictor = ShapePredictor.of(aligned, _NOISE_SHARE)
-        rms = np.array([predictor.distance(*one) for one in zip(self.shapes, self.observed, strict=True)])
+        rms = np.empty(len(self.shapes))
+        for i in np.setdiff1d(np.arange(len(rms)), core):
+            rms[i] = predictor.distance(self.shapes[i], self.observed[i])
         predicted = predict_leave_one_out(aligned, self.observed[core], _NOISE_SHARE)
         squares = ((aligned - predicted) ** 2).sum(axis=2)
         weights = self.observed[core]
@@ -114,7 +114,8 @@ class Collection:
         size = max(_FEWEST, len(candidates) // 4)
         seeds = np.unique(np.linspace(0, len(candidates) - 1, _SEEDS).round().astype(int))
         cores = [self._grown(candidates[np.argsort(squared[seed])[:size]], candidates) for seed in seeds]
-        return max(cores, key=lambda core: self._separation(core, candidates))
+        distinct = {core.tobytes(): core for core in cores}.values()  # mostly all are the same one
+        return max(distinct, key=lambda core: self._separation(core, candidates))
 
     def _separation(self, core: _Indices, candidates: _Indices) -> float:
         """Return the distance of the nearest shape outside `core`, as a ratio to that of the farthest one inside."""
@@ -122,7 +123,7 @@ class Collection:
             return 0.0
         distance = self.distances(core)
         outside = distance[np.setdiff1d(candidates, core)]
-        return float(outside.min(initial=_SEPARATED * SAME_KIND) / max(distance[core].max(), SAME_KIND / 2))
+        return float(outside.min(initial=SAME_KIND) / max(distance[core].max(), SAME_KIND / 2))
 
     def _grown(self, core: _Indices, candidates: _Indices) -> _Indices:
         core = last = np.sort(core)

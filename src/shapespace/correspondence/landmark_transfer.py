@@ -11,7 +11,7 @@ the factor usual for the set, and this to `_USUAL_FACTOR`.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -285,8 +285,6 @@ def _with_outliers(checks: Sequence[LandmarkCheck], specimens: int) -> list[Land
     usual = of_specimen * of_landmark / max(float(np.median(share)), 1e-300)
     is_outlier = share > np.maximum(_OUTLIER * usual, _LEAST_ERROR)
     return [
-        LandmarkCheck(
-            c.specimen, c.landmark, c.error, c.error_share, c.radius_90, c.distance, c.finding or "outlier" * bool(o)
-        )
-        for c, o in zip(checks, is_outlier, strict=True)
+        replace(check, finding="outlier") if outlier and not check.finding else check
+        for check, outlier in zip(checks, is_outlier, strict=True)
     ]
