@@ -418,8 +418,10 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
         name: NAME of the result files.
         path: of the scan, relative to the folder where there is such a path.
         hash: SHA-256 of its content.
-        status: `corresponding` or `set aside`.
-        reason: why it is set aside.
+        status: `converged`, `doubtful` or `excluded`; of earlier versions `corresponding` or `set aside`.
+        reason: why it is excluded.
+        probability: that its surface is right, as far as the other scans show.
+        doubt: why it is doubtful.
         seen_share: share of the template's vertices that it shows; the others are estimates.
         covered_share: share of its points that the template reaches, leaving out those beyond the template's rim.
         area_share: area of its surface in correspondence beside that of the scan; well below 1 where the template lacks
@@ -450,8 +452,10 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
     name: str
     path: str
     hash: str
-    status: Literal["corresponding", "set aside"]
+    status: Literal["converged", "doubtful", "excluded", "corresponding", "set aside"]
     reason: str = ""
+    probability: float | None = None
+    doubt: str = ""
     seen_share: float | None = None
     covered_share: float | None = None
     area_share: float | None = None
@@ -473,6 +477,11 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
     format: str = FORMAT
     format_version: int = VERSION
 
+    @property
+    def is_excluded(self) -> bool:
+        """Whether the scan has no surface."""
+        return self.status in ("excluded", "set aside")
+
 
 class CorrespondenceRecord(Struct, frozen=True, kw_only=True):
     """A correspondence.json: the run as a whole.
@@ -483,6 +492,7 @@ class CorrespondenceRecord(Struct, frozen=True, kw_only=True):
         rounds: RMS by which vertices moved in each, as a share of the size.
         corresponding: NAMEs in correspondence.
         set_aside: NAME to reason of the others.
+        doubtful: NAMEs in correspondence whose surfaces are probably wrong.
         other_units: NAME to `unit_ratio` of those that are in another unit than most.
         mirrored: NAMEs of those that are mirror images of the majority.
         sides_decided: whether scans could be distinguished from their mirror images.
@@ -515,6 +525,7 @@ class CorrespondenceRecord(Struct, frozen=True, kw_only=True):
     inputs_hash: str = ""
     results_hash: str = ""
     added: list[str] = []
+    doubtful: list[str] = []
     format: str = FORMAT
     format_version: int = VERSION
 

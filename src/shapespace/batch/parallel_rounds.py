@@ -15,7 +15,13 @@ from shapespace.batch.executors import Serial
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.landmark_guide import ScanLandmarks
 from shapespace.correspondence.register import ElasticSettings
-from shapespace.correspondence.registration import Comparison, RegistrationTask, RoundContext, ScanRegistration
+from shapespace.correspondence.registration import (
+    Comparison,
+    PoseScores,
+    RegistrationTask,
+    RoundContext,
+    ScanRegistration,
+)
 from shapespace.correspondence.settings import PoseRange
 from shapespace.correspondence.template import PoseModel
 from shapespace.errors import FileError
@@ -119,6 +125,7 @@ class _FileTask:
             mirrored=self.mirrored,
             sides=self.sides,
             pose=self.pose,
+            other_pose=_pose_of(arrays, "other_") if "other_scale" in arrays else None,
         )
 
 
@@ -210,6 +217,8 @@ def _task_arrays(task: RegistrationTask) -> Arrays:
         arrays["faces"] = np.array(task.scan.faces)
     if task.T_scan_template is not None:
         arrays |= _pose_arrays(task.T_scan_template)
+    if task.other_pose is not None:
+        arrays |= {f"other_{name}": array for name, array in _pose_arrays(task.other_pose).items()}
     if task.expected is not None:
         arrays["expected"] = task.expected
     if (landmarks := task.landmarks) is not None:
@@ -234,8 +243,9 @@ def _pose_arrays(T: Similarity) -> Arrays:
     return {"scale": np.array(T.scale), "rotation": np.array(T.rotation), "translation": np.array(T.translation)}
 
 
-def _pose_of(arrays: Mapping[str, npt.NDArray[Any]]) -> Similarity:
-    return Similarity(float(arrays["scale"]), arrays["rotation"], arrays["translation"])
+def _pose_of(arrays: Mapping[str, npt.NDArray[Any]], prefix: str = "") -> Similarity:
+    scale, rotation, translation = (arrays[f"{prefix}{name}"] for name in ("scale", "rotation", "translation"))
+    return Similarity(float(scale), rotation, translation)
 
 
 def _shared_hash(context: RoundContext, pose_model: PoseModel) -> str:
@@ -291,6 +301,6 @@ def _read_one(stored: Mapping[str, npt.NDArray[Any]], number: int, index: int) -
         cpu_s=float(of("cpu_s")),
         reason=str(of("reason")),
         mirrored=bool(of("mirrored")),
-        scores=(float(of("scores")[0]), float(of("scores")[1])),
+        scores=PoseScores(*(float(score) for score in of("scores"))),
         posed_by_landmarks=bool(of("posed_by_landmarks")),
     )

@@ -613,10 +613,14 @@ def _print_correspondence(summary: CorrespondenceRecord, records: Sequence[Corre
     for record in records:
         if record.reason:
             warn(f"{record.name} is excluded: {record.reason}")
+        elif record.doubt:
+            warn(f"{record.name} is doubtful: {record.doubt}")
     there = [record for record in records if not record.reason]
     seen = sum(record.seen_share or 0.0 for record in there) / len(there)
+    doubtful = sum(bool(record.doubt) for record in there)
     show(
-        f"{len(there)} of {len(records)} scans in correspondence, {summary.vertices} vertices, of which a scan shows "
+        f"{len(there)} of {len(records)} scans in correspondence{f' ({doubtful} doubtful)' if doubtful else ''}, "
+        f"{summary.vertices} vertices, of which a scan shows "
         f"{100 * seen:.1f} % on average; results in {folder}"
     )
     show(f"next: shapespace build {folder} -o model.h5")

@@ -40,7 +40,7 @@ class CohortConfig:
         surfaces: shapes of fits: `coefficients` of the model, its `fitted` surface, or the `dense` surface on the scan;
             `auto` uses dense surfaces if all fits have one, otherwise coefficients.
         gauge: `form` keeps size, `shape` divides size out.
-        doubtful: include doubtful fits (default: excluded, and counted).
+        doubtful: include doubtful fits and corresponding surfaces (default: excluded, and counted).
         least: shapes that there must be; one will do where it is compared with what is known already.
     """
 
@@ -254,6 +254,7 @@ def _of_surfaces(
     on_shape: Callable[[int, int], None] | None,
 ) -> Cohort:
     listing = surface_files([folder])
+    listing = listing if config.doubtful else listing.without_doubtful("--doubtful")
     notes = list(listing.notes)
     if config.gauge == "form":
         listing.refuse_mixed_units()

@@ -73,7 +73,8 @@ class BuildFilesConfig:
         add: add the meshes to this model, which was built with its shapes kept; gauge, alignment and landmarks are
             those of that model.
         recursive: also search subfolders of the given folders.
-        with_doubtful: include surfaces of doubtful fits (default: excluded, and counted).
+        with_doubtful: include surfaces of doubtful fits and doubtful corresponding surfaces (default: excluded, and
+            counted).
 
     Raises:
         InputError: options that do not go together.
@@ -150,6 +151,7 @@ def build(
     if output.suffix.lower() not in (".h5", ".hdf5"):
         raise InputError(f"{output}: a model file is HDF5, so give it a name that ends in .h5.")
     listed = surface_files(meshes, recursive=config.recursive)
+    listed = listed if config.with_doubtful else listed.without_doubtful("--with-doubtful")
     notes = list(listed.notes)
     parent = None if config.add is None else _parent(config.add, output)
     gauge = parent.gauge if parent is not None else config.gauge or "shape"

@@ -197,6 +197,7 @@ def _corresponding(
         sides_decided=made.sides_decided,
         groups=[list(group) for group in made.groups],
         inputs_hash=inputs_hash,
+        doubtful=[record.name for record in records if record.doubt],
     )
     summary = structs.replace(summary, results_hash=results_hash_of(summary, folder))
     write_text(folder / SUMMARY, json_text(summary))
@@ -547,11 +548,12 @@ def _record(
     if one is None or one.vertices is None:
         reason = unread if one is None else one.reason
         return CorrespondRecord(
-            name=name, path=path, hash=source.content_hash, status="set aside", reason=reason, notes=list(notes)
+            name=name, path=path, hash=source.content_hash, status="excluded", reason=reason, notes=list(notes)
         )
     mean, p95, p99, largest = one.distance
     return CorrespondRecord(
-        name=name, path=path, hash=source.content_hash, status="corresponding", seen_share=one.seen,
+        name=name, path=path, hash=source.content_hash, status=one.status, doubt=one.doubt,
+        probability=one.probability if np.isfinite(one.probability) else None, seen_share=one.seen,
         covered_share=one.covered, distance_mean=mean, distance_p95=p95, distance_p99=p99, distance_max=largest,
         notes=list(notes), moved_share=list(one.moved), cpu_s=list(one.seconds),
         landmark_rms=one.landmarks if np.isfinite(one.landmarks) else None, mirrored=one.mirrored,

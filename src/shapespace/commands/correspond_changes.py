@@ -368,6 +368,7 @@ def _summary(
         mirrored=[name for name, record in every.items() if record.mirrored],
         groups=[there, *groups] if groups else [],
         added=[] if change.update else [name for name in added if name in there],
+        doubtful=[name for name, record in every.items() if record.doubt],
     )
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from shapespace.correspondence.scan_status import ScanEvidence, ScanStatus
 from shapespace.geometry.mirror_plane import FLIP
 from shapespace.lazy import lazy_import
 from shapespace.reprs import short_repr
@@ -19,6 +20,10 @@ class Corresponding:
     Args:
         name: of the scan.
         reason: why it is excluded; empty where it is not.
+        status: converged, doubtful or excluded.
+        probability: that the surface is right, by its evidence; not-a-number if excluded.
+        doubt: why it is doubtful; empty where it is not.
+        evidence: what the shapes of the others say of the surface; None if excluded.
         vertices: (V, 3) in the scan's own frame and unit, finite everywhere: where the scan shows nothing they are
             estimates, the conditional means given the observed vertices; None if excluded.
         T_scan_template: to the scan's own frame, or to that of its mirror image; None where no pose was found.
@@ -45,6 +50,10 @@ class Corresponding:
     landmarks: float = np.nan
     observed: BoolArray | None = None
     mirrored: bool = False
+    status: ScanStatus = "excluded"
+    probability: float = np.nan
+    doubt: str = ""
+    evidence: ScanEvidence | None = None
 
     __repr__ = short_repr
 

@@ -10,7 +10,7 @@ those of docs/correspondence.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -23,8 +23,16 @@ from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.kinds import Collection, find_kinds
 from shapespace.correspondence.landmark_guide import ScanLandmarks, consensus_landmarks
 from shapespace.correspondence.mirrored_scans import Sides, solve_sides
+from shapespace.correspondence.pose_consensus import (
+    SAME_POSE_DEG,
+    TEMPLATE,
+    PoseComparison,
+    angle_deg,
+    consensus_poses,
+)
 from shapespace.correspondence.registration import Comparison, RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.scan_set import unit_ratios
+from shapespace.correspondence.scan_status import Judgement, ScanEvidence, judge, usual_ratios
 from shapespace.correspondence.settings import FEWEST, SIZE, CorrespondConfig
 from shapespace.correspondence.template import PoseModel, clean_scan
 from shapespace.errors import InputError, ShapespaceError
@@ -40,12 +48,15 @@ from shapespace.types import FloatArray, Mesh, Similarity, SurfaceLandmarks
 ENOUGH_TO_JUDGE, _ENOUGH_TO_PREDICT = 6, 4
 """Scans: fewer do not determine the normal range of shapes; fewer do not predict another one."""
 _JUDGES = 40  # finished scans, at most, that an added one is compared with: time grows with their square
+_LEAST_SCORE = 1e-6  # share of the size: scores of copies are 0
+_REFERENCES = 9  # finished surfaces whose scores are the usual ones for an added scan
 _PARTS = 4  # folds of the shapes: the pose model of a scan is built without it
 _WHOLE, _LEAST_SPREAD, _SIZE_UNSEEN = 0.9, 0.01, 0.3
 """Scans that observe more than this share of the template determine the usual size; the least standard deviation of
 log sizes; and that of a scan's own log size for each share that is missing."""
 _CLEARLY_WORSE = 1.1  # ratio of the scores of the other side and a scan's own: beyond it the side is settled
-_ANCHORS = 2  # scans that all others are compared with, beside the template
+_ANCHORS, _MOST_ANCHORS = 2, 6
+"""Scans that all others are compared with, in addition to the template; at most, until the sides are decided."""
 
 
 class Runner(Protocol):
@@ -95,7 +106,7 @@ def correspond(
         state = _next_state(problem, state, registrations)
         if state.rounds[-1].moved < config.settled:  # C17
             break
-    return _result(problem, state)
+    return _result(problem, state, _evidence(problem, state, run))
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,12 +118,16 @@ class _Problem:
         first: the first template, and the scans that can be used.
         config: of the correspondence.
         harmonics: of the first template, used on every later one.
+        comparisons: poses of scans in relation to the anchors.
+        reflected: whether the first template was reflected after the comparisons.
     """
 
     names: Sequence[str]
     first: FirstTemplate
     config: CorrespondConfig
     harmonics: Harmonics
+    comparisons: tuple[PoseComparison, ...] = ()
+    reflected: bool = False
 
     @staticmethod
     def of(names: Sequence[str], first: FirstTemplate, config: CorrespondConfig) -> _Problem:
@@ -156,6 +171,7 @@ class RegistrationState:
         sides: of all scans, by the comparisons before the first round.
         rounds: one record for each round so far.
         other_kinds: of the scans that were in another group than the largest, the first scan of their group.
+        consensus: poses of the scans, or of their mirror images, on which the comparisons with anchors agree (C32).
     """
 
     template: Mesh
@@ -166,6 +182,7 @@ class RegistrationState:
     sides: Sides
     rounds: tuple[RoundRecord, ...]
     other_kinds: Mapping[int, int] = field(default_factory=dict[int, int])
+    consensus: Mapping[int, Similarity] = field(default_factory=dict[int, Similarity])
 
     def is_mirrored(self, i: int) -> bool:
         """Return whether scan `i` is a mirror image of the majority, as far as is known."""
@@ -188,7 +205,7 @@ def _initial_state(problem: _Problem, sides: Sides) -> RegistrationState:
 
 
 def _with_sides(problem: _Problem, run: Runner, *, may_reflect: bool) -> tuple[_Problem, Sides]:
-    """Return the sides of all scans, and the problem with its template on the side of the majority.
+    """Return the sides of all scans, and the problem with their comparisons and its template on the majority's side.
 
     Args:
         problem: the scans and the first template.
@@ -196,20 +213,18 @@ def _with_sides(problem: _Problem, run: Runner, *, may_reflect: bool) -> tuple[_
         may_reflect: whether the template may be reflected; otherwise its side is that of the majority.
     """
     count = len(problem.names)
-    unknown = Sides(np.zeros(count, np.bool_), np.zeros(count), decided=False)
-    if problem.config.mirror == "never":
-        return problem, unknown
-    context = _context(problem, _initial_state(problem, unknown))
-    anchors = {-1: context.pose_models[0]} | _anchors(problem)
-    scores = np.full((len(anchors), count, 2), np.nan)
-    for row, pose_model in zip(scores, anchors.values(), strict=True):
-        tasks = [
-            RegistrationTask(i, scan, None, None, problem.config.first, sides="scores")
-            for i, scan in problem.first.repaired.items()
-        ]
-        for compared in run(replace(context, pose_models=(pose_model,)), tasks):
-            row[compared.index] = compared.scores
-    sides = solve_sides(scores, list(anchors), problem.config.seed)
+    sides = Sides(np.zeros(count, np.bool_), np.zeros(count), decided=False)
+    context, scores = _context(problem, _initial_state(problem, sides)), np.zeros((0, count, 2))
+    anchors: list[int] = []
+    for i, pose_model in ((TEMPLATE, context.pose_models[0]), *_anchors(problem)):
+        enough = 1 + (_ANCHORS if sides.decided or problem.config.mirror == "never" else _MOST_ANCHORS)
+        if len(anchors) >= enough:
+            break
+        anchors.append(i)
+        problem, row = _compared_with(problem, replace(context, pose_models=(pose_model,)), i, run)
+        scores = np.concatenate([scores, row[None]])
+        if len(anchors) > _ANCHORS and problem.config.mirror != "never":
+            sides = solve_sides(scores, anchors, problem.config.seed)
     if may_reflect and sides.decided and sides.mirrored.sum() > len(problem.first.repaired) / 2:
         if problem.config.pose != "search":  # the frame of a reflected template is that of no file
             raise InputError(
@@ -218,21 +233,32 @@ def _with_sides(problem: _Problem, run: Runner, *, may_reflect: bool) -> tuple[_
             )
         first = replace(problem.first, mesh=mirror_image(problem.first.mesh))
         usable = np.isin(np.arange(count), list(problem.first.repaired))
-        return replace(problem, first=first), replace(sides, mirrored=usable & ~sides.mirrored)
+        return replace(problem, first=first, reflected=True), replace(sides, mirrored=usable & ~sides.mirrored)
     return problem, sides
 
 
-def _anchors(problem: _Problem) -> dict[int, PoseModel]:
-    """Return the pose models of some scans that can be templates, by their number."""
-    anchors: dict[int, PoseModel] = {}
+def _compared_with(problem: _Problem, context: RoundContext, anchor: int, run: Runner) -> tuple[_Problem, FloatArray]:
+    """Return the problem with the comparisons of all scans with an anchor, and the scores (N, 2) of both sides."""
+    tasks = [
+        RegistrationTask(i, scan, None, None, problem.config.first, sides=_comparison_of_poses(problem))
+        for i, scan in problem.first.repaired.items()
+    ]
+    scores = np.full((len(problem.names), 2), np.nan)
+    comparisons = list(problem.comparisons)
+    for compared in run(context, tasks):
+        scores[compared.index] = compared.scores.pose, compared.scores.mirrored
+        T_image = next((one.T_scan_template for one in compared.alternatives if one.mirrored), None)
+        comparisons.append(PoseComparison(anchor, compared.index, compared.T_scan_template, T_image))
+    return replace(problem, comparisons=tuple(comparisons)), scores
+
+
+def _anchors(problem: _Problem) -> Iterator[tuple[int, PoseModel]]:
+    """Yield the number and the pose model of some scans that can be templates."""
     for i in np.random.default_rng(problem.config.seed).permutation(list(problem.first.repaired)).tolist():
-        if len(anchors) == _ANCHORS:
-            break
         try:
-            anchors[i] = PoseModel.of(clean_scan(problem.first.repaired[i]))
+            yield i, PoseModel.of(clean_scan(problem.first.repaired[i]))
         except ShapespaceError:
             continue
-    return anchors
 
 
 # What a round does
@@ -271,15 +297,32 @@ def _task(problem: _Problem, state: RegistrationState, i: int) -> RegistrationTa
         mirrored=mirrored,
         sides=_comparison(problem, state, i),
         pose=config.pose,
+        other_pose=_other_pose(problem, state, i),
     )
+
+
+def _other_pose(problem: _Problem, state: RegistrationState, i: int) -> Similarity | None:
+    """Return the pose of scan `i` on which the comparisons agree, if it is known and another one than its own."""
+    T = state.consensus.get(i)
+    if T is None or i not in state.registrations or problem.config.pose != "search":
+        return None
+    return T if angle_deg(T, state.registrations[i].T_scan_template) > SAME_POSE_DEG else None
 
 
 def _comparison(problem: _Problem, state: RegistrationState, i: int) -> Comparison:
     """Return how scan `i` is compared with its mirror image in the next round."""
     if problem.config.mirror == "never":
         return "as given"
-    own, other = state.registrations[i].scores if i in state.registrations else (np.nan, np.nan)
-    return "both" if state.sides.decided and state.registrations and not other > _CLEARLY_WORSE * own else "one"
+    if not (state.sides.decided and state.registrations):
+        return "one"
+    is_settled = i in state.registrations and state.registrations[i].scores.mirrored > (
+        _CLEARLY_WORSE * state.registrations[i].scores.pose
+    )
+    return "one" if is_settled else "both"
+
+
+def _comparison_of_poses(problem: _Problem) -> Comparison:
+    return "pose" if problem.config.mirror == "never" else "scores"
 
 
 def _pose_with_usual_size(state: RegistrationState, i: int) -> Similarity:
@@ -422,6 +465,51 @@ def _exclude_mirrored(problem: _Problem, state: RegistrationState) -> Registrati
     return replace(state, registrations=registrations, excluded={**state.excluded, **mirrored})
 
 
+# Evidence
+
+
+def _evidence(problem: _Problem, state: RegistrationState, run: Runner) -> dict[int, ScanEvidence]:
+    """Return the evidence on each registered scan, by comparisons of its poses with the modes of the others."""
+    order = sorted(state.registrations)
+    compared = {one.index: one for one in run(_context(problem, state), [_pose_task(problem, state, i) for i in order])}
+    distances = np.ones(len(order))
+    if len(order) >= ENOUGH_TO_JUDGE:
+        distances = find_kinds(*state.shapes(order), state.template.vertices).distance
+    evidence = {
+        i: _scan_evidence(state, compared[i], distance) for i, distance in zip(order, distances.tolist(), strict=True)
+    }
+    return _with_usual_ratios(evidence, list(evidence.values()))
+
+
+def _with_usual_ratios(evidence: Mapping[int, ScanEvidence], others: Sequence[ScanEvidence]) -> dict[int, ScanEvidence]:
+    """Return the evidence in relation to that on `others`."""
+    other_pose, mirrored = usual_ratios(others)
+    return {
+        i: replace(one, usual_other_pose_ratio=other_pose, usual_mirrored_ratio=mirrored) for i, one in evidence.items()
+    }
+
+
+def _pose_task(problem: _Problem, state: RegistrationState, i: int) -> RegistrationTask:
+    """Return the task that compares the pose of a registered scan with other ones."""
+    T = state.registrations[i].T_scan_template
+    task = replace(_task(problem, state, i), T_scan_template=T, expected=None, landmarks=None, other_pose=None)
+    return replace(task, sides="scores")
+
+
+def _scan_evidence(state: RegistrationState, compared: ScanRegistration, distance: float) -> ScanEvidence:
+    """Return the evidence on one scan; `distance` is that from its prediction, relative to the usual one (C14)."""
+    T, scores = state.registrations[compared.index].T_scan_template, compared.scores
+    others = [angle_deg(T, one.T_scan_template) for one in compared.alternatives if not one.mirrored]
+    consensus, own = state.consensus.get(compared.index), max(scores.pose, _LEAST_SCORE)
+    return ScanEvidence(
+        other_pose_ratio=scores.other_pose / own,
+        other_pose_deg=others[0] if others else 0.0,
+        mirrored_ratio=scores.mirrored / own,
+        distance_ratio=distance,
+        consensus_deg=0.0 if consensus is None else angle_deg(T, consensus),
+    )
+
+
 # The mean of a round
 
 
@@ -458,6 +546,10 @@ def _update_template(
         sides=state.sides,
         rounds=(*state.rounds, record),
         other_kinds=state.other_kinds,
+        consensus=consensus_poses(
+            problem.comparisons,
+            {TEMPLATE: problem.reflected} | {i: state.is_mirrored(i) for i in range(len(problem.names))},
+        ),
     )
 
 
@@ -542,20 +634,53 @@ def add_scans(
     problem = _Problem.of(names, first, config)
     start = _finished_state(problem, finished)
     states = _added_states(problem, start, [i for i in raw if i >= kept], run)
+    evidence = {} if finished.scans else _added_evidence(problem, start, states, finished.surfaces, run)
     if finished.scans:
         state = _merged(start, states)
         state = replace(_update_template(problem, state, state, {}), rounds=())
         registrations = run(_context(problem, state), [_task(problem, state, i) for i in raw])
-        return _result(problem, _next_state(problem, state, registrations))
-    results = [_added_result(problem, states.get(i, start), i) for i in range(kept, len(names))]
+        state = _next_state(problem, state, registrations)
+        return _result(problem, state, _evidence(problem, state, run))
+    results = [_added_result(problem, states.get(i, start), i, evidence.get(i)) for i in range(kept, len(names))]
     return Correspondence(finished.mean, tuple(results), first.origin, (), start.landmarks)
 
 
-def _added_result(problem: _Problem, state: RegistrationState, i: int) -> Corresponding:
+def _added_result(problem: _Problem, state: RegistrationState, i: int, evidence: ScanEvidence | None) -> Corresponding:
     own = state.registrations.get(i)
     if own is None or own.observed.all():  # estimates take long where there are many scans
-        return _scan_result(problem, state, i, None if own is None else own.vertices)
-    return _scan_result(problem, state, i, _complete_shapes(problem, state)[i])
+        return _scan_result(problem, state, i, None if own is None else own.vertices, evidence)
+    return _scan_result(problem, state, i, _complete_shapes(problem, state)[i], evidence)
+
+
+def _added_evidence(
+    problem: _Problem,
+    start: RegistrationState,
+    states: Mapping[int, RegistrationState],
+    surfaces: Sequence[Mesh],
+    run: Runner,
+) -> dict[int, ScanEvidence]:
+    """Return the evidence on each added scan that is registered, in relation to scores of some finished surfaces."""
+    added = {i: state for i, state in states.items() if i in state.registrations}
+    if not added:
+        return {}
+    compared_with = _some(sorted(start.registrations), _REFERENCES)
+    problem = replace(
+        problem,
+        first=replace(problem.first, repaired={**problem.first.repaired, **{
+            i: mirror_image(surfaces[i]) if start.is_mirrored(i) else surfaces[i] for i in compared_with
+        }}),
+    )  # fmt: skip
+    tasks = [_pose_task(problem, start, i) for i in compared_with]
+    tasks += [_pose_task(problem, state, i) for i, state in added.items()]
+    compared = {one.index: one for one in run(_context(problem, start), tasks)}
+    usual = [_scan_evidence(start, compared[i], 1.0) for i in compared_with]
+    evidence = {i: _scan_evidence(state, compared[i], _distance_from_finished(state, i)) for i, state in added.items()}
+    return _with_usual_ratios(evidence, usual)
+
+
+def _some(numbers: Sequence[int], most: int) -> Sequence[int]:
+    """Return up to `most` of some numbers, evenly spread."""
+    return numbers[:: -(-len(numbers) // most)]
 
 
 def _finished_state(problem: _Problem, finished: FinishedCorrespondence) -> RegistrationState:
@@ -639,16 +764,21 @@ def _judged_by_finished(problem: _Problem, state: RegistrationState, i: int) -> 
     """Return the state of an added scan after its last round, without it if it is an outlier among the others."""
     if i not in state.registrations:
         return state
-    kept = sorted(state.registrations.keys() - {i})
-    judges = kept[:: -(-len(kept) // _JUDGES)]
-    if len(judges) < ENOUGH_TO_JUDGE - 1:
-        return state
-    collection = Collection.of(*state.shapes([*judges, i]), state.template.vertices)
-    distance = float(collection.distances(np.arange(len(judges)))[-1])
+    distance = _distance_from_finished(state, i)
     if distance <= problem.config.outlier_threshold:  # C14
         return state
     excluded = {i: _outlier_reason(state.registrations[i], distance)}
-    return replace(state, registrations={j: state.registrations[j] for j in kept}, excluded=excluded)
+    kept = {j: one for j, one in state.registrations.items() if j != i}
+    return replace(state, registrations=kept, excluded=excluded)
+
+
+def _distance_from_finished(state: RegistrationState, i: int) -> float:
+    """Return the distance of an added scan from its prediction by finished ones (C14); 1 where these are too few."""
+    judges = _some(sorted(state.registrations.keys() - {i}), _JUDGES)
+    if len(judges) < ENOUGH_TO_JUDGE - 1:
+        return 1.0
+    collection = Collection.of(*state.shapes([*judges, i]), state.template.vertices)
+    return float(collection.distances(np.arange(len(judges)))[-1])
 
 
 def _merged(start: RegistrationState, states: Mapping[int, RegistrationState]) -> RegistrationState:
@@ -671,12 +801,12 @@ def _groups(state: RegistrationState) -> list[list[int]]:
     return [sorted(state.registrations), *sorted(alike, key=len, reverse=True)] if alike else []
 
 
-def _result(problem: _Problem, state: RegistrationState) -> Correspondence:
+def _result(problem: _Problem, state: RegistrationState, evidence: Mapping[int, ScanEvidence]) -> Correspondence:
     complete, groups = _complete_shapes(problem, state), _groups(state)
     # A scan of another kind is tried again in each round, and can end with a reason that names no kind.
     kinds = {i: _another_kind(len(group), len(groups[0])) for group in groups[1:] for i in group}
     state = replace(state, excluded={**state.excluded, **kinds})
-    scans = [_scan_result(problem, state, i, complete.get(i)) for i in range(len(problem.names))]
+    scans = [_scan_result(problem, state, i, complete.get(i), evidence.get(i)) for i in range(len(problem.names))]
     points = state.landmarks.positions(state.template.vertices)
     template = state.template.with_vertices(state.template.vertices, points)
     landmarks = replace(state.landmarks, distance_mm=np.empty(0))  # places on a mean have no given point
@@ -703,13 +833,20 @@ def _complete_shapes(problem: _Problem, state: RegistrationState) -> dict[int, F
     return dict(zip(order, shapes, strict=True))
 
 
-def _scan_result(problem: _Problem, state: RegistrationState, i: int, complete: FloatArray | None) -> Corresponding:
+def _scan_result(
+    problem: _Problem,
+    state: RegistrationState,
+    i: int,
+    complete: FloatArray | None,
+    evidence: ScanEvidence | None = None,
+) -> Corresponding:
     """Return the result of scan `i`; `complete` are its vertices (V, 3) in the template's frame, None if excluded."""
     moved = tuple(record.scan_moved[i] for record in state.rounds if i in record.scan_moved)
     cpu_s = tuple(record.cpu_s[i] for record in state.rounds if i in record.cpu_s)
     if complete is None:
         return Corresponding(problem.names[i], state.excluded[i], moved=moved, seconds=cpu_s)
     registration = state.registrations[i]
+    judgement = Judgement("converged", np.nan, "") if evidence is None else judge(evidence)
     T = registration.T_scan_template
     vertices = T.apply(complete)
     landmarks = problem.landmarks(state.landmarks, problem.scan(i, mirrored=registration.mirrored))
@@ -727,4 +864,8 @@ def _scan_result(problem: _Problem, state: RegistrationState, i: int, complete: 
         landmarks=np.nan if landmarks is None else landmarks.rms_distance(vertices),
         observed=registration.observed,
         mirrored=registration.mirrored,
+        status=judgement.status,
+        probability=judgement.probability,
+        doubt=judgement.doubt,
+        evidence=evidence,
     )

@@ -6,9 +6,9 @@ Equations Cn are those of docs/correspondence.md.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -58,9 +58,23 @@ _BULGING = 0.2
 _FEW_HARMONICS = 4  # slowest harmonics: the pose model before any shapes are known may only stretch and bend
 _GUIDE_CONFIG = FitConfig(unit="mm", scale="free")
 _MEASURED = 20_000  # points of a scan that distances are measured at: an error below 1 % of their mean
-Comparison: TypeAlias = Literal["as given", "one", "scores", "both"]
+Comparison: TypeAlias = Literal["as given", "one", "pose", "scores", "both"]
 _Distances: TypeAlias = tuple[float, float, float, float]
 _FAR: _Distances = (np.inf, np.inf, np.inf, np.inf)
+
+
+class PoseScores(NamedTuple):
+    """Scores of poses of one scan, shares of the template's size.
+
+    Args:
+        pose: of its pose.
+        other_pose: of the best pose that is another one; infinite where all others are clearly worse.
+        mirrored: of the best pose of its mirror image.
+    """
+
+    pose: float
+    other_pose: float
+    mirrored: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +91,10 @@ class RegistrationTask:
         landmarks: of the scan, in its own frame; None where it has none.
         mirrored: whether `scan` and `landmarks` are the mirror image of what is in the file.
         sides: whether the scan is compared with its mirror image: never, by its landmarks alone, by the scores of the
-            pose search (nothing is registered), or by scores and registrations where the scores are about equal.
+            pose search (nothing is registered), or by scores and registrations where the scores are about equal; or
+            whether poses alone are compared, and nothing is registered.
         pose: poses that are searched; for mirror images and comparisons of scores all.
+        other_pose: from which the scan is registered too; None if there is no other one.
     """
 
     index: int
@@ -91,13 +107,15 @@ class RegistrationTask:
     mirrored: bool = False
     sides: Comparison = "as given"
     pose: PoseRange = "search"
+    other_pose: Similarity | None = None
 
     def reflected(self) -> RegistrationTask:
         """Return the same task for the mirror image of its scan, at an unknown pose."""
         landmarks = None if self.landmarks is None else self.landmarks.reflected()
         return replace(
-            self, scan=mirror_image(self.scan), landmarks=landmarks, mirrored=not self.mirrored, T_scan_template=None
-        )
+            self, scan=mirror_image(self.scan), landmarks=landmarks, mirrored=not self.mirrored, T_scan_template=None,
+            other_pose=None,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,8 +133,7 @@ class ScanRegistration:
         reason: why the registration failed; empty where it did not. The arrays of a failed one are the template's.
         alternatives: the registrations from other poses that are about as likely.
         mirrored: whether it is that of the mirror image of the scan.
-        scores: of the pose search, of the scan of the task and of its mirror image, shares of the template's size;
-            not-a-number where they were not compared.
+        scores: of the pose search, shares of the template's size; not-a-number where nothing was compared.
         posed_by_landmarks: whether the landmarks determine the pose.
     """
 
@@ -130,7 +147,7 @@ class ScanRegistration:
     reason: str = ""
     alternatives: tuple[ScanRegistration, ...] = ()
     mirrored: bool = False
-    scores: tuple[float, float] = (np.nan, np.nan)
+    scores: PoseScores = field(default_factory=lambda: PoseScores(np.nan, np.nan, np.nan))
     posed_by_landmarks: bool = False
 
 
@@ -188,7 +205,7 @@ class RoundContext:
     # Which pose
 
     def _register(self, task: RegistrationTask) -> ScanRegistration:
-        if task.landmarks is not None and task.sides != "scores":
+        if task.landmarks is not None and task.sides not in ("pose", "scores"):
             try:
                 pose = task.landmarks.pose(self.mesh.vertices)
             except MirroredLandmarksError:
@@ -198,15 +215,13 @@ class RoundContext:
                 pose = None if task.landmarks is None else task.landmarks.pose(self.mesh.vertices)
             if pose is not None:
                 return self._register_by_landmarks(task, pose)
+        if task.sides in ("pose", "scores"):
+            return self._compare(task)
         start = self._search(task)
         if task.sides in ("one", "as given"):
             return self._register_side(task, start)
         other = task.reflected()
         mirrored = self._search(other)
-        size = rms_size(self.pose_models[task.pose_model].model.mean_vertices)
-        scores = (start.score_mm / size, mirrored.score_mm / size)
-        if task.sides == "scores":
-            return replace(self.failed(task.index, "only compared"), scores=scores)
         likely = [
             (one, at)
             for one, at in ((task, start), (other, mirrored))
@@ -216,12 +231,40 @@ class RoundContext:
         if not registered:
             raise FitError(_UNREACHED)
         first, *others = registered
+        size = rms_size(self.pose_models[task.pose_model].model.mean_vertices)
+        scores = PoseScores(start.score_mm / size, start.runner_up_score_mm / size, mirrored.score_mm / size)
         return replace(first, alternatives=(*first.alternatives, *others), scores=scores)
 
+    def _compare(self, task: RegistrationTask) -> ScanRegistration:
+        """Return the pose of a scan, and as alternatives the best other one and that of its mirror image, with scores.
+
+        Nothing is registered.
+        """
+        model, T = self.pose_models[task.pose_model], task.T_scan_template or Similarity.identity()
+        size = rms_size(model.model.mean_vertices)
+        posed = T.inverse().apply(task.scan.vertices)
+        best = model.search(posed, self.seed, quick=True)
+        own, others = [best], [*best.alternatives]
+        if task.T_scan_template is not None:
+            poses, identity = [best, *best.alternatives], Similarity.identity()
+            own = [one for one in poses if _is_same_rotation(one.T_scan_model, identity)]
+            others = [one for one in poses if one not in own]
+            own = own or [model.search(posed, self.seed, pose="as-given")]
+        poses = [min(some, key=lambda one: one.score_mm) for some in (own, others) if some]
+        compared = self.failed(task.index, "only compared")
+        alternatives = [replace(compared, T_scan_template=T @ one.T_scan_model) for one in poses]
+        scores = PoseScores(poses[0].score_mm / size, poses[1].score_mm / size if others else np.inf, np.inf)
+        if task.sides == "scores":
+            image = model.search(np.array(task.reflected().scan.vertices), self.seed, quick=True)
+            scores = scores._replace(mirrored=image.score_mm / size)
+            alternatives.append(replace(compared, T_scan_template=image.T_scan_model, mirrored=not task.mirrored))
+        first, *others_found = alternatives
+        return replace(first, alternatives=tuple(others_found), scores=scores)
+
     def _search(self, task: RegistrationTask) -> Start:
-        vertices, quick = np.array(task.scan.vertices), task.sides == "scores"
-        model, pose = self.pose_models[task.pose_model], "search" if quick or task.mirrored else task.pose
-        start = model.search(vertices, self.seed, quick=quick, pose=pose)
+        vertices = np.array(task.scan.vertices)
+        model, pose = self.pose_models[task.pose_model], "search" if task.mirrored else task.pose
+        start = model.search(vertices, self.seed, pose=pose)
         if pose != "search" and len(self.pose_models) > 1:  # with the modes of the other scans, scores are reliable
             best = model.search(vertices, self.seed, quick=True)
             if best.score_mm < _OTHER_FRAME * start.score_mm:
@@ -254,14 +297,17 @@ class RoundContext:
             return None
 
     def _register_near(self, task: RegistrationTask, T: Similarity, start: Start) -> ScanRegistration:
-        """Register from the known pose `T`; a much likelier pose of the search is an alternative."""
+        """Register from the known pose `T`; a much likelier pose of the search and the other pose are alternatives."""
         registration = self._register_at(task, T)
-        if start.score_mm > _BETTER_POSE * start.runner_up_score_mm or _is_same_rotation(T, start.T_scan_model):
-            return registration
-        if self._landmark_distance(task, start.T_scan_model) > _CONTRADICTED * self._landmark_distance(task, T):
-            return registration
-        alternative = self._try(replace(task, expected=None), start)
-        return registration if alternative is None else replace(registration, alternatives=(alternative,))
+        others = [] if start.score_mm > _BETTER_POSE * start.runner_up_score_mm else [start]
+        others += [] if task.other_pose is None else [Start(task.other_pose, "given", np.nan)]
+        tried = [
+            self._try(replace(task, expected=None), one)
+            for one in others
+            if not _is_same_rotation(T, one.T_scan_model)
+            and self._landmark_distance(task, one.T_scan_model) <= _CONTRADICTED * self._landmark_distance(task, T)
+        ]
+        return replace(registration, alternatives=tuple(one for one in tried if one is not None))
 
     def _register_from_search(self, task: RegistrationTask, start: Start) -> ScanRegistration:
         """Register from each likely pose of the search; those that cover about as much are alternatives."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from shapespace.errors import InputError
@@ -31,12 +31,14 @@ class SurfaceFiles:
         files: in the order given.
         unit_ratios: of files in another unit than most of their folder, as of `CorrespondRecord`.
         mirrored: files of surfaces that are mirror images of the majority of their folder.
+        doubtful: files of surfaces that are doubtful.
         notes: what the user should know.
     """
 
     files: tuple[Path, ...]
     unit_ratios: Mapping[Path, float]
     mirrored: frozenset[Path]
+    doubtful: frozenset[Path]
     notes: tuple[str, ...]
 
     def mesh(self, file: Path) -> Mesh:
@@ -48,6 +50,31 @@ class SurfaceFiles:
         mesh, ratio = mesh_at(file), self.unit_ratios.get(file, 1.0)
         mesh = mirror_image(mesh) if file in self.mirrored else mesh
         return mesh if ratio == 1.0 else mesh.with_vertices(mesh.vertices / ratio)
+
+    def without_doubtful(self, option: str) -> SurfaceFiles:
+        """Return the files without doubtful surfaces of a correspondence, with a note; `option` includes them.
+
+        Raises:
+            InputError: all are doubtful.
+        """
+        if not self.doubtful:
+            return self
+        left = tuple(file for file in self.files if file not in self.doubtful)
+        named = first_names([file.name for file in self.files if file in self.doubtful], _NAMED)
+        if not left:
+            raise InputError(f"All surfaces are doubtful ({named}); inspect them, and use {option} to include them.")
+        note = (
+            f"{len(self.doubtful)} of {len(self.files)} surfaces are doubtful and left out ({named}); {option} "
+            "includes them."
+        )
+        return replace(
+            self,
+            files=left,
+            unit_ratios={file: ratio for file, ratio in self.unit_ratios.items() if file not in self.doubtful},
+            mirrored=self.mirrored - self.doubtful,
+            doubtful=frozenset(),
+            notes=(*self.notes, note),
+        )
 
     def unit_note(self, unit: str) -> str:
         """Return in a sentence which files are in another unit, and that they are brought to that of most."""
@@ -101,17 +128,19 @@ def surface_files(paths: Sequence[Path], *, recursive: bool = False) -> SurfaceF
                 notes.append(f"{path}: without {len(summary.set_aside)} excluded scans ({names}).")
     ratios: dict[Path, float] = {}
     mirrored: set[Path] = set()
+    doubtful: set[Path] = set()
     for folder in dict.fromkeys(file.parent for file in files if file.name.endswith(SURFACE)):
         if (summary := _summary_of(folder)) is not None:
             other_units = {folder / f"{name}{SURFACE}": ratio for name, ratio in summary.other_units.items()}
             ratios |= {file: other_units[file] for file in files if file in other_units}
             reflected = {folder / f"{name}{SURFACE}" for name in summary.mirrored}
             mirrored |= reflected.intersection(files)
+            doubtful |= {folder / f"{name}{SURFACE}" for name in summary.doubtful}.intersection(files)
     if mirrored:
         of = "mesh is a mirror image" if len(mirrored) == 1 else "meshes are mirror images"
         names = first_names([file.name for file in files if file in mirrored], _NAMED)
         notes.append(f"{len(mirrored)} of {len(files)} {of} of the others ({names}) and reflected.")
-    return SurfaceFiles(tuple(files), ratios, frozenset(mirrored), tuple(notes))
+    return SurfaceFiles(tuple(files), ratios, frozenset(mirrored), frozenset(doubtful), tuple(notes))
 
 
 def _summary_of(folder: Path) -> CorrespondenceRecord | None:

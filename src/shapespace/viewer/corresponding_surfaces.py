@@ -27,7 +27,7 @@ MAX_MARKED = 100
 
 _PAGE, _PAGE_BYTES = 11, 24 * 2**20  # surfaces on a page, and bytes that a page may send
 _BYTES_PER_VERTEX = 6  # bytes; three coordinates of 16 bits
-_STATUS_ORDER = ("unreadable", "set aside", "look", "corresponding")
+_STATUS_ORDER = ("unreadable", "excluded", "doubtful", "look", "converged")
 
 
 class Surfaces:
@@ -120,7 +120,7 @@ class Surfaces:
             FileFormatError: it is damaged.
             KeyError: there is no such scan in correspondence.
         """
-        if self._corresponded.records[name].status != "corresponding":
+        if self._corresponded.records[name].is_excluded:
             raise KeyError(name)
         with self._lock:
             self._corresponded.population()

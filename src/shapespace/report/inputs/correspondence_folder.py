@@ -118,12 +118,12 @@ class Corresponded:
     @property
     def corresponding(self) -> list[CorrespondRecord]:
         """The records of scans in correspondence."""
-        return [record for record in self.records.values() if record.status == "corresponding"]
+        return [record for record in self.records.values() if not record.is_excluded]
 
     @property
     def set_aside(self) -> list[CorrespondRecord]:
         """Records of excluded scans."""
-        return [record for record in self.records.values() if record.status != "corresponding"]
+        return [record for record in self.records.values() if record.is_excluded]
 
     def surface(self, name: str) -> Mesh:
         """Return the surface of the scan `name` in its own frame and unit, NaN where it is not observed.

@@ -12,6 +12,7 @@ from shapespace.report.blocks.wording import DASH, percent, plain
 from shapespace.report.inputs.correspondence_folder import Corresponded
 from shapespace.schemas import CorrespondRecord
 
+_DOUBTFUL_WEIGHT = 1e6  # before all that stands out
 _STANDS_OUT = 4.0
 """How many times the usual spread above the middle makes a scan one to look at."""
 _LEAST_SPREAD = 0.25  # share of the median that counts as usual variation, where all scans are alike
@@ -70,6 +71,9 @@ def concerns_of(folder: Corresponded) -> dict[str, Concern]:
                 over = max(over, _STANDS_OUT * value / measure.always)
             if over > _STANDS_OUT and value > measure.at_least:
                 reasons.append((over, measure.describe(value)))
+    for reasons, record in zip(reasons_by_record, records, strict=True):
+        if record.doubt:
+            reasons.append((_DOUBTFUL_WEIGHT, record.doubt))
     ordered = [sorted(reasons, reverse=True) for reasons in reasons_by_record]
     return {
         record.name: Concern(reasons[0][0] if reasons else 0.0, tuple(reason for _, reason in reasons))
@@ -154,8 +158,10 @@ def sentence(text: str) -> str:
 
 
 def scan_status(record: CorrespondRecord, concerns: Mapping[str, Concern]) -> str:
-    """Return `corresponding`, `look` for an unusual scan, `set aside`, or `unreadable`."""
-    if record.status != "corresponding":
-        return "set aside"
+    """Return `converged`, `look` for an unusual scan, `doubtful`, `excluded`, or `unreadable`."""
+    if record.is_excluded:
+        return "excluded"
     concern = concerns.get(record.name)
-    return "unreadable" if concern is None else "look" if concern.reasons else "corresponding"
+    if concern is None:
+        return "unreadable"
+    return "doubtful" if record.status == "doubtful" else "look" if concern.reasons else "converged"

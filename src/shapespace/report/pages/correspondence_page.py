@@ -58,9 +58,10 @@ _MOST_NAMED = 12  # items of a list; the table has all
 _HARDLY_SEEN, _WHOLE_SHARE = 0.5, 0.9
 _STATUS = {
     "unreadable": ("unreadable", "failed"),
-    "set aside": ("excluded", "failed"),
+    "excluded": ("excluded", "failed"),
+    "doubtful": ("doubtful", "doubtful"),
     "look": ("to be looked at", "doubtful"),
-    "corresponding": ("in correspondence", "converged"),
+    "converged": ("converged", "converged"),
 }
 _TRIANGLES_DRAWN = 400_000  # triangles; more are smaller than a pixel of the pictures
 

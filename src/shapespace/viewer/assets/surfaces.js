@@ -4,8 +4,8 @@
 
   const Viewer = window.ShapespaceViewer;
   const { $, h, save, alertUser, ask, guarded, json, binary } = Viewer;
-  const WORDS = { unreadable: "unreadable", "set aside": "excluded", look: "to be looked at", corresponding: "in correspondence" };
-  const DOTS = { unreadable: "unreadable", "set aside": "failed", look: "doubtful", corresponding: "converged" };
+  const WORDS = { unreadable: "unreadable", excluded: "excluded", doubtful: "doubtful", look: "to be looked at", converged: "converged" };
+  const DOTS = { unreadable: "unreadable", excluded: "failed", doubtful: "doubtful", look: "doubtful", converged: "converged" };
 
   window.shapespaceReady = false;
 
@@ -122,14 +122,14 @@
 
   // Scans -----------------------------------------------------------------------------------------------------------
 
-  const pictured = (row) => row.status === "corresponding" || row.status === "look";
+  const pictured = (row) => row.status !== "unreadable" && row.status !== "excluded";
 
   function filterRows() {
     const asked = $("filter").value.trim().toLowerCase();
     const found = rows.filter((row) => `${row.name} ${WORDS[row.status]} ${row.reason}`.toLowerCase().includes(asked));
     wanted = found.filter(pictured);
     $("list").replaceChildren(...found.slice(0, 500).map((row) => h("p", { class: DOTS[row.status], "data-testid": `row-${row.name}` },
-      h("span", { class: "dot" }), h("span", {}, h("strong", {}, row.name), ` ${WORDS[row.status]}`, row.status === "corresponding" ? null : h("small", {}, row.reason)))));
+      h("span", { class: "dot" }), h("span", {}, h("strong", {}, row.name), ` ${WORDS[row.status]}`, row.status === "converged" ? null : h("small", {}, row.reason)))));
     showPage(0);
   }
 

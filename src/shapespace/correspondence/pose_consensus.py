@@ -1,0 +1,110 @@
+"""Poses on which the comparisons between scans agree, so that no single ambiguous template turns a specimen over (C32).
+
+Each scan is compared with some scans and the template, the anchors, by a pose search. A wrong comparison contradicts
+others: the poses a -> b, b -> c and c -> a do not close. The poses of the scans are those that agree with most
+comparisons.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from shapespace.geometry.mirror_plane import FLIP
+from shapespace.types import FloatArray, Similarity
+
+TEMPLATE = -1
+"""Number of the template among the anchors."""
+SAME_POSE_DEG = 35.0
+"""Rotation up to which two poses agree."""
+_STEPS = 10  # passes over all scans at most; poses stop changing after two or three
+
+
+@dataclass(frozen=True, eq=False)
+class PoseComparison:
+    """The pose of a scan in relation to an anchor, by a pose search.
+
+    Args:
+        anchor: number of the anchor among the scans, or `TEMPLATE`.
+        scan: number of the scan.
+        T_scan_anchor: from the frame of the anchor to that of the scan.
+        T_image_anchor: to the frame of the scan's mirror image; None where that was not compared.
+    """
+
+    anchor: int
+    scan: int
+    T_scan_anchor: Similarity
+    T_image_anchor: Similarity | None
+
+    def between_sides(self, mirrored: Mapping[int, bool]) -> Similarity | None:
+        """Return the pose from the anchor to the scan, each reflected where it is `mirrored`."""
+        reflected = mirrored[self.anchor]
+        T = self.T_scan_anchor if mirrored[self.scan] == reflected else self.T_image_anchor
+        return T if T is None or not reflected else _conjugated(T)
+
+
+def angle_deg(a: Similarity, b: Similarity) -> float:
+    """Return the rotation between two poses, degrees."""
+    cosine = (np.trace(a.rotation @ b.rotation.T) - 1) / 2
+    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+
+
+def consensus_poses(comparisons: Sequence[PoseComparison], mirrored: Mapping[int, bool]) -> dict[int, Similarity]:
+    """Return for each scan the pose of the template in it that agrees with most comparisons (C32).
+
+    Args:
+        comparisons: of scans with anchors, the template among them.
+        mirrored: which scans are reflected, by their number; of the template whether it was reflected after the
+            comparisons. Poses are those of the reflected scans and template.
+    """
+    edges: dict[int, list[tuple[int, Similarity]]] = {TEMPLATE: []}
+    for one in comparisons:
+        T = one.between_sides(mirrored)
+        if T is not None and one.anchor != one.scan:
+            edges.setdefault(one.scan, []).append((one.anchor, T))
+            edges.setdefault(one.anchor, []).append((one.scan, T.inverse()))
+    anchors = sorted({one.anchor for one in comparisons} & edges.keys())
+    order = [*anchors, *sorted(edges.keys() - set(anchors))]
+    solutions = [_poses_from(root, order, edges) for root in anchors]
+    if not solutions:
+        return {}
+    poses = max(solutions, key=lambda poses: sum(_agreement(poses, edges, i)[2] for i in order))
+    gauge = poses.pop(TEMPLATE).inverse()
+    return {i: T @ gauge for i, T in poses.items()}
+
+
+def _poses_from(
+    root: int, order: Sequence[int], edges: Mapping[int, Sequence[tuple[int, Similarity]]]
+) -> dict[int, Similarity]:
+    """Return poses that begin with the comparisons with one anchor; each becomes the one that most others support."""
+    poses = {root: Similarity.identity()} | dict(edges[root])
+    for _ in range(_STEPS):
+        is_changed = False
+        for i in order:
+            support, proposed, own = _agreement(poses, edges, i)
+            if i != root and len(support) and support.max() > own:
+                poses[i] = proposed[int(support.argmax())]
+                is_changed = True
+        if not is_changed:
+            break
+    return poses
+
+
+def _agreement(
+    poses: Mapping[int, Similarity], edges: Mapping[int, Sequence[tuple[int, Similarity]]], i: int
+) -> tuple[FloatArray, list[Similarity], float]:
+    """Return how many neighbours support each of the poses that they propose for `i`, these, and support of its own."""
+    proposed = [T @ poses[j] for j, T in edges[i] if j in poses]
+    if not proposed:
+        return np.zeros(0), [], 0.0
+    rotations = np.stack([T.rotation for T in proposed]).reshape(len(proposed), 9)
+    limit = 1 + 2 * np.cos(np.radians(SAME_POSE_DEG))
+    own = float((rotations @ poses[i].rotation.ravel() > limit).sum()) if i in poses else -1.0
+    return (rotations @ rotations.T > limit).sum(axis=1).astype(np.float64), proposed, own
+
+
+def _conjugated(T: Similarity) -> Similarity:
+    """Return the pose between the mirror images of what `T` is between."""
+    return Similarity(T.scale, FLIP[:, None] * T.rotation * FLIP, T.translation * FLIP)
