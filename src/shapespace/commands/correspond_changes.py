@@ -330,7 +330,13 @@ def _registered(
         surfaces = [marks.onto(surface, path) for surface, path in zip(surfaces, paths, strict=True)]
     mirrored = [name in finished.summary.mirrored for name in kept]
     start = FinishedCorrespondence(
-        finished.mean, landmarks, surfaces, raw, mirrored, sides_decided=finished.summary.sides_decided
+        finished.mean,
+        landmarks,
+        surfaces,
+        raw,
+        mirrored,
+        finished.summary.sides_decided,
+        finished.summary.usual_ratios or (np.nan, np.nan),
     )
     return add_scans(start, added, config, run=rounds)
 
@@ -385,6 +391,7 @@ def _publish(
     write_results(made, records, change)
     if updated:
         write_mean(made, change)
+        summary = structs.replace(summary, usual_ratios=made.usual_ratios)
     summary = structs.replace(summary, results_hash=results_hash_of(summary, change, folder))
     write_text(change / SUMMARY, json_text(summary))
     complete_change(folder)

@@ -72,6 +72,7 @@ class Correspondence:
             and where they were not compared.
         groups: names of the scans in correspondence, then of those of each other kind of object; empty where all are of
             one kind.
+        usual_ratios: medians of the ratios of scores that `ScanEvidence` has.
     """
 
     template: Mesh
@@ -81,6 +82,7 @@ class Correspondence:
     landmarks: SurfaceLandmarks = field(default_factory=SurfaceLandmarks)
     sides_decided: bool = False
     groups: tuple[tuple[str, ...], ...] = ()
+    usual_ratios: tuple[float, float] = (np.nan, np.nan)
 
     __repr__ = short_repr
 

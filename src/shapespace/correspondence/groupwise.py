@@ -49,7 +49,6 @@ ENOUGH_TO_JUDGE, _ENOUGH_TO_PREDICT = 6, 4
 """Scans: fewer do not determine the normal range of shapes; fewer do not predict another one."""
 _JUDGES = 40  # finished scans, at most, that an added one is compared with: time grows with their square
 _LEAST_SCORE = 1e-6  # share of the size: scores of copies are 0
-_REFERENCES = 9  # finished surfaces whose scores are the usual ones for an added scan
 _PARTS = 4  # folds of the shapes: the pose model of a scan is built without it
 _WHOLE, _LEAST_SPREAD, _SIZE_UNSEEN = 0.9, 0.01, 0.3
 """Scans that observe more than this share of the template determine the usual size; the least standard deviation of
@@ -214,6 +213,8 @@ def _with_sides(problem: _Problem, run: Runner, *, may_reflect: bool) -> tuple[_
     """
     count = len(problem.names)
     sides = Sides(np.zeros(count, np.bool_), np.zeros(count), decided=False)
+    if problem.config.mirror == "never" and problem.config.pose != "search":  # the files are trusted
+        return problem, sides
     context, scores = _context(problem, _initial_state(problem, sides)), np.zeros((0, count, 2))
     anchors: list[int] = []
     for i, pose_model in ((TEMPLATE, context.pose_models[0]), *_anchors(problem)):
@@ -297,14 +298,14 @@ def _task(problem: _Problem, state: RegistrationState, i: int) -> RegistrationTa
         mirrored=mirrored,
         sides=_comparison(problem, state, i),
         pose=config.pose,
-        other_pose=_other_pose(problem, state, i),
+        other_pose=_other_pose(state, i),
     )
 
 
-def _other_pose(problem: _Problem, state: RegistrationState, i: int) -> Similarity | None:
+def _other_pose(state: RegistrationState, i: int) -> Similarity | None:
     """Return the pose of scan `i` on which the comparisons agree, if it is known and another one than its own."""
     T = state.consensus.get(i)
-    if T is None or i not in state.registrations or problem.config.pose != "search":
+    if T is None or i not in state.registrations:
         return None
     return T if angle_deg(T, state.registrations[i].T_scan_template) > SAME_POSE_DEG else None
 
@@ -478,12 +479,12 @@ def _evidence(problem: _Problem, state: RegistrationState, run: Runner) -> dict[
     evidence = {
         i: _scan_evidence(state, compared[i], distance) for i, distance in zip(order, distances.tolist(), strict=True)
     }
-    return _with_usual_ratios(evidence, list(evidence.values()))
+    return _with_usual_ratios(evidence, usual_ratios(list(evidence.values())))
 
 
-def _with_usual_ratios(evidence: Mapping[int, ScanEvidence], others: Sequence[ScanEvidence]) -> dict[int, ScanEvidence]:
-    """Return the evidence in relation to that on `others`."""
-    other_pose, mirrored = usual_ratios(others)
+def _with_usual_ratios(evidence: Mapping[int, ScanEvidence], usual: tuple[float, float]) -> dict[int, ScanEvidence]:
+    """Return the evidence in relation to the usual ratios."""
+    other_pose, mirrored = usual
     return {
         i: replace(one, usual_other_pose_ratio=other_pose, usual_mirrored_ratio=mirrored) for i, one in evidence.items()
     }
@@ -546,11 +547,14 @@ def _update_template(
         sides=state.sides,
         rounds=(*state.rounds, record),
         other_kinds=state.other_kinds,
-        consensus=consensus_poses(
-            problem.comparisons,
-            {TEMPLATE: problem.reflected} | {i: state.is_mirrored(i) for i in range(len(problem.names))},
-        ),
+        consensus=_consensus(problem, state),
     )
+
+
+def _consensus(problem: _Problem, state: RegistrationState) -> dict[int, Similarity]:
+    """Return the poses of the scans on which the comparisons agree (C32); none where the frames of files are used."""
+    mirrored = {TEMPLATE: problem.reflected} | {i: state.is_mirrored(i) for i in range(len(problem.names))}
+    return consensus_poses(problem.comparisons, mirrored) if problem.config.pose == "search" else {}
 
 
 def _squared_movement(previous: RegistrationState, i: int, shape: FloatArray) -> float:
@@ -585,7 +589,7 @@ class FinishedCorrespondence:
             scans are reflected. Their landmarks are used if the mean has none.
         scans: the raw scans of the surfaces; empty if the mean and the surfaces stay.
         mirrored: which of the scans are mirrored; empty if none is.
-        sides_decided: as of `Correspondence`.
+        sides_decided, usual_ratios: as of `Correspondence`.
     """
 
     mean: Mesh
@@ -594,6 +598,7 @@ class FinishedCorrespondence:
     scans: Sequence[Mesh] = ()
     mirrored: Sequence[bool] = ()
     sides_decided: bool = False
+    usual_ratios: tuple[float, float] = (np.nan, np.nan)
 
 
 def add_scans(
@@ -634,7 +639,7 @@ def add_scans(
     problem = _Problem.of(names, first, config)
     start = _finished_state(problem, finished)
     states = _added_states(problem, start, [i for i in raw if i >= kept], run)
-    evidence = {} if finished.scans else _added_evidence(problem, start, states, finished.surfaces, run)
+    evidence = {} if finished.scans else _added_evidence(problem, start, states, finished.usual_ratios, run)
     if finished.scans:
         state = _merged(start, states)
         state = replace(_update_template(problem, state, state, {}), rounds=())
@@ -656,31 +661,17 @@ def _added_evidence(
     problem: _Problem,
     start: RegistrationState,
     states: Mapping[int, RegistrationState],
-    surfaces: Sequence[Mesh],
+    usual: tuple[float, float],
     run: Runner,
 ) -> dict[int, ScanEvidence]:
-    """Return the evidence on each added scan that is registered, in relation to scores of some finished surfaces."""
+    """Return the evidence on each added scan that is registered; `usual` are the ratios of the finished scans."""
     added = {i: state for i, state in states.items() if i in state.registrations}
     if not added:
         return {}
-    compared_with = _some(sorted(start.registrations), _REFERENCES)
-    problem = replace(
-        problem,
-        first=replace(problem.first, repaired={**problem.first.repaired, **{
-            i: mirror_image(surfaces[i]) if start.is_mirrored(i) else surfaces[i] for i in compared_with
-        }}),
-    )  # fmt: skip
-    tasks = [_pose_task(problem, start, i) for i in compared_with]
-    tasks += [_pose_task(problem, state, i) for i, state in added.items()]
+    tasks = [_pose_task(problem, state, i) for i, state in added.items()]
     compared = {one.index: one for one in run(_context(problem, start), tasks)}
-    usual = [_scan_evidence(start, compared[i], 1.0) for i in compared_with]
     evidence = {i: _scan_evidence(state, compared[i], _distance_from_finished(state, i)) for i, state in added.items()}
     return _with_usual_ratios(evidence, usual)
-
-
-def _some(numbers: Sequence[int], most: int) -> Sequence[int]:
-    """Return up to `most` of some numbers, evenly spread."""
-    return numbers[:: -(-len(numbers) // most)]
 
 
 def _finished_state(problem: _Problem, finished: FinishedCorrespondence) -> RegistrationState:
@@ -774,7 +765,8 @@ def _judged_by_finished(problem: _Problem, state: RegistrationState, i: int) -> 
 
 def _distance_from_finished(state: RegistrationState, i: int) -> float:
     """Return the distance of an added scan from its prediction by finished ones (C14); 1 where these are too few."""
-    judges = _some(sorted(state.registrations.keys() - {i}), _JUDGES)
+    kept = sorted(state.registrations.keys() - {i})
+    judges = kept[:: -(-len(kept) // _JUDGES)]
     if len(judges) < ENOUGH_TO_JUDGE - 1:
         return 1.0
     collection = Collection.of(*state.shapes([*judges, i]), state.template.vertices)
@@ -814,6 +806,7 @@ def _result(problem: _Problem, state: RegistrationState, evidence: Mapping[int, 
     return Correspondence(
         template, tuple(scans), problem.first.origin, moved, landmarks, sides_decided=state.sides.decided,
         groups=tuple(tuple(problem.names[i] for i in group) for group in groups),
+        usual_ratios=usual_ratios(list(evidence.values())),
     )  # fmt: skip
 
 

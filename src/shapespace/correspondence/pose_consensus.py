@@ -19,6 +19,7 @@ TEMPLATE = -1
 """Number of the template among the anchors."""
 SAME_POSE_DEG = 35.0
 """Rotation up to which two poses agree."""
+_EQUAL = 1e-9  # difference of supports that is rounding
 _STEPS = 10  # passes over all scans at most; poses stop changing after two or three
 
 
@@ -84,7 +85,7 @@ def _poses_from(
         is_changed = False
         for i in order:
             support, proposed, own = _agreement(poses, edges, i)
-            if i != root and len(support) and support.max() > own:
+            if i != root and len(support) and support.max() > own + _EQUAL:
                 poses[i] = proposed[int(support.argmax())]
                 is_changed = True
         if not is_changed:
@@ -95,14 +96,19 @@ def _poses_from(
 def _agreement(
     poses: Mapping[int, Similarity], edges: Mapping[int, Sequence[tuple[int, Similarity]]], i: int
 ) -> tuple[FloatArray, list[Similarity], float]:
-    """Return how many neighbours support each of the poses that they propose for `i`, these, and support of its own."""
+    """Return the support of each pose that neighbours propose for `i`, these poses, and the support of its own."""
     proposed = [T @ poses[j] for j, T in edges[i] if j in poses]
     if not proposed:
         return np.zeros(0), [], 0.0
     rotations = np.stack([T.rotation for T in proposed]).reshape(len(proposed), 9)
+    own = _support(rotations @ poses[i].rotation.ravel()).sum() if i in poses else -1.0
+    return _support(rotations @ rotations.T).sum(axis=1), proposed, float(own)
+
+
+def _support(trace: FloatArray) -> FloatArray:
+    """Return how much poses support each other, from 1 if they are equal to 0 where they do not agree."""
     limit = 1 + 2 * np.cos(np.radians(SAME_POSE_DEG))
-    own = float((rotations @ poses[i].rotation.ravel() > limit).sum()) if i in poses else -1.0
-    return (rotations @ rotations.T > limit).sum(axis=1).astype(np.float64), proposed, own
+    return np.clip((trace - limit) / (3 - limit), 0.0, 1.0)
 
 
 def _conjugated(T: Similarity) -> Similarity:

@@ -34,7 +34,8 @@ class ScanEvidence:
         mirrored_ratio: score of the best pose of its mirror image, in scores of its own.
         distance_ratio: distance from its prediction by the others (C14), in medians of all scans.
         consensus_deg: rotation between its pose and the one on which the comparisons with anchors agree (C32).
-        usual_other_pose_ratio, usual_mirrored_ratio: medians of the scans.
+        usual_other_pose_ratio, usual_mirrored_ratio: medians of the scans; not-a-number if unknown, and the ratios are
+            no evidence then.
     """
 
     other_pose_ratio: float
@@ -88,7 +89,7 @@ def judge(evidence: ScanEvidence) -> Judgement:
 
 def _shortfall(ratio: float, usual: float) -> float:
     """Return by how much a ratio of scores is below the usual one, as a logarithm."""
-    return float(np.log(max(usual / min(ratio, _LARGEST_RATIO), 1.0)))
+    return 0.0 if np.isnan(usual) else float(np.log(max(usual / min(ratio, _LARGEST_RATIO), 1.0)))
 
 
 def _doubt(feature: str, evidence: ScanEvidence) -> str:
