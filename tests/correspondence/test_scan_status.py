@@ -1,0 +1,90 @@
+"""The status of scans in correspondence: surfaces that the shapes of the others contradict are doubtful."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import shapespace as ss
+from raw_blobs import raw_blob
+from shapespace.cli import main
+from shapespace.correspondence.groupwise import FinishedCorrespondence, add_scans, correspond
+from shapespace.correspondence.register import ElasticSettings
+from shapespace.correspondence.scan_status import ScanEvidence, judge, usual_ratios
+from shapespace.correspondence.settings import CorrespondConfig
+from shapespace.geometry.mirror_plane import mirror_image
+from shapespace.io.meshes.mesh_io import write_mesh
+
+QUICK = ElasticSettings(harmonics=60, points=500, iterations=10)
+CONFIG = CorrespondConfig(vertices=300, rounds=2, mirror="never", first=QUICK, next=QUICK)
+BLOBS = [raw_blob(k, points=700) for k in range(8)]
+MIRRORED = 2
+TRUSTED = [mirror_image(one.scan) if k == MIRRORED else one.scan for k, one in enumerate(BLOBS)]
+SURE = ScanEvidence(
+    other_pose_ratio=2.5, other_pose_deg=170.0, mirrored_ratio=2.0, distance_ratio=1.0, consensus_deg=3.0,
+    usual_other_pose_ratio=2.5, usual_mirrored_ratio=2.0,
+)  # fmt: skip
+
+
+def test_a_surface_that_nothing_contradicts_has_converged() -> None:
+    judgement = judge(SURE)
+    assert judgement.status == "converged" and judgement.doubt == "" and judgement.probability > 0.98
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"consensus_deg": 178.0, "other_pose_ratio": 2.0}, "rotated by 178 degrees"),
+        ({"other_pose_ratio": 0.9}, "rotated by 170 degrees is only 0.90 times"),
+        ({"mirrored_ratio": 0.1}, "its mirror image is only 0.10 times"),
+        ({"distance_ratio": 2.4}, "2.4 times as far as usual"),
+    ],
+)
+def test_each_kind_of_evidence_makes_a_surface_doubtful_and_is_named(change: dict[str, float], words: str) -> None:
+    judgement = judge(replace(SURE, **change))
+    assert judgement.status == "doubtful" and judgement.probability < 0.8
+    assert words in judgement.doubt
+
+
+def test_what_all_scans_have_in_common_does_not_make_them_doubtful() -> None:
+    symmetric = replace(SURE, mirrored_ratio=1.0, other_pose_ratio=1.05)
+    other_pose, mirrored = usual_ratios([symmetric] * 5)
+    usual = replace(symmetric, usual_other_pose_ratio=other_pose, usual_mirrored_ratio=mirrored)
+    assert judge(usual).status == "converged"
+
+
+def test_a_mirrored_scan_whose_file_is_trusted_is_doubtful_and_no_other() -> None:
+    made = correspond(TRUSTED, CONFIG)
+    assert [scan.status == "doubtful" for scan in made.scans] == [k == MIRRORED for k in range(8)]
+    assert made.scans[MIRRORED].probability < 0.8 < min(s.probability for s in made.scans if s.status == "converged")
+
+
+def test_an_added_scan_has_a_status_of_its_own() -> None:
+    made = correspond([one.scan for one in BLOBS[:6]], CONFIG)
+    finished = FinishedCorrespondence(made.template, made.landmarks, made.meshes(), usual_ratios=made.usual_ratios)
+    right, mirrored = add_scans(finished, [BLOBS[6].scan, mirror_image(BLOBS[7].scan)], CONFIG).scans
+    assert right.status == "converged"
+    assert mirrored.status == "doubtful" or mirrored.reason
+
+
+def test_build_leaves_doubtful_surfaces_out_with_a_note_and_includes_them_on_request(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "scans").mkdir()
+    for scan in TRUSTED:
+        write_mesh(tmp_path / "scans" / f"{scan.name}.ply", scan)
+    same = str(tmp_path / "same")
+    given = ["--vertices", "300", "--rounds", "2", "--jobs", "1", "--quiet", "--mirror", "never"]
+    assert main(["correspond", str(tmp_path / "scans"), "-o", same, *given]) == 0
+    output = capsys.readouterr()
+    assert "blob2 is doubtful: " in output.err + output.out and "(1 doubtful)" in output.out
+    summary = json.loads((tmp_path / "same" / "correspondence.json").read_text())
+    record = json.loads((tmp_path / "same" / "blob2.correspond.json").read_text())
+    assert summary["doubtful"] == ["blob2"] and "blob2" in summary["corresponding"]
+    assert record["status"] == "doubtful" and record["doubt"] and 0.0 <= record["probability"] < 0.8
+    assert main(["build", same, "-o", str(tmp_path / "m.h5"), "--quiet"]) == 0
+    assert "1 of 8 surfaces are doubtful and left out (blob2.corresponding.ply)" in capsys.readouterr().err
+    assert ss.ShapeModel.load(tmp_path / "m.h5").n_training == 7
+    assert main(["build", same, "-o", str(tmp_path / "all.h5"), "--quiet", "--with-doubtful"]) == 0
+    assert ss.ShapeModel.load(tmp_path / "all.h5").n_training == 8
