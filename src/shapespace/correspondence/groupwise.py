@@ -156,6 +156,7 @@ class RegistrationState:
         sides: of all scans, by the comparisons before the first round.
         rounds: one record for each round so far.
         other_kinds: of the scans that were in another group than the largest, the first scan of their group.
+        bent: the scans whose next registration begins at their own surface, since no other scan predicts it.
     """
 
     template: Mesh
@@ -166,6 +167,7 @@ class RegistrationState:
     sides: Sides
     rounds: tuple[RoundRecord, ...]
     other_kinds: Mapping[int, int] = field(default_factory=dict[int, int])
+    bent: frozenset[int] = frozenset()
 
     def is_mirrored(self, i: int) -> bool:
         """Return whether scan `i` is a mirror image of the majority, as far as is known."""
@@ -271,6 +273,7 @@ def _task(problem: _Problem, state: RegistrationState, i: int) -> RegistrationTa
         mirrored=mirrored,
         sides=_comparison(problem, state, i),
         pose=config.pose,
+        bent=i in state.bent and known,
     )
 
 
@@ -444,6 +447,10 @@ def _update_template(
         predicted = predict_leave_one_out(shapes, observed, problem.config.noise_share)
         predictions = dict(zip(order, predicted, strict=True))
     template = Mesh(mean, state.template.faces, name=state.template.name)
+    bent = frozenset(i for i in order if registrations[i].bent)
+    if 2 * len(bent) >= len(order):  # a mean of poses is no shape, and no pose is predicted by others
+        bent, template = frozenset(order), state.template
+    predictions = {**predictions, **{i: registrations[i].vertices for i in bent}}
     record = RoundRecord(
         moved=float(np.sqrt(np.mean(list(squares.values())))) / SIZE,  # C17
         scan_moved={i: float(np.sqrt(square)) / SIZE for i, square in squares.items()},
@@ -458,6 +465,7 @@ def _update_template(
         sides=state.sides,
         rounds=(*state.rounds, record),
         other_kinds=state.other_kinds,
+        bent=bent,
     )
 
 

@@ -16,6 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from shapespace.correspondence.generic import generic_model
 from shapespace.correspondence.harmonics import Harmonics
+from shapespace.correspondence.isometry import IntrinsicShape, bent_shape
 from shapespace.correspondence.landmark_guide import MirroredLandmarksError, ScanLandmarks
 from shapespace.correspondence.register import ElasticSettings, Template, register
 from shapespace.correspondence.settings import PoseRange
@@ -27,8 +28,10 @@ from shapespace.fit.robust.robust_settings import DenseSettings
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.search.initialisation import Start
 from shapespace.geometry.closest import ClosestPoints, build_engine, on_boundary
+from shapespace.geometry.distortion import edge_stretch
 from shapespace.geometry.mirror_plane import mirror_image
 from shapespace.geometry.normals import boundary_edges, boundary_vertices, rms_size, vertex_normals
+from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
 
@@ -52,6 +55,10 @@ _SAME_TURN_TRACE = 1 + 2 * np.cos(np.radians(40.0))
 _EITHER_SIDE = 1.05
 """Ratio of the scores of a scan and its mirror image up to which both are registered: it was 1.01 or more for 26 molars
 of the majority, against the mean of all, and 0.98 or less for 13 mirrored ones."""
+_LEFT_DISTANCE, _LEFT_STRETCH = 0.01, 0.25
+"""Mean distance from the scan, share of the size, and RMS log stretch of edges beyond which a surface may lack limbs."""
+_STRAIGHTENED = 0.7
+"""Ratio of distance times stretch below which a registration from the map along the surface replaces another one."""
 _UNREACHED = "surface not reached: too little of the scan matches the template from any pose"
 _BULGING = 0.2
 """How far the normals of a sheet point away from its middle, 0 to 1, when it is clear which way it bulges."""
@@ -79,6 +86,7 @@ class RegistrationTask:
         sides: whether the scan is compared with its mirror image: never, by its landmarks alone, by the scores of the
             pose search (nothing is registered), or by scores and registrations where the scores are about equal.
         pose: poses that are searched; for mirror images and comparisons of scores all.
+        bent: whether `expected` is the scan's own surface of the last round, so that no pose is searched.
     """
 
     index: int
@@ -91,6 +99,7 @@ class RegistrationTask:
     mirrored: bool = False
     sides: Comparison = "as given"
     pose: PoseRange = "search"
+    bent: bool = False
 
     def reflected(self) -> RegistrationTask:
         """Return the same task for the mirror image of its scan, at an unknown pose."""
@@ -118,6 +127,8 @@ class ScanRegistration:
         scores: of the pose search, of the scan of the task and of its mirror image, shares of the template's size;
             not-a-number where they were not compared.
         posed_by_landmarks: whether the landmarks determine the pose.
+        stretch: RMS log ratio of its edges to those of the template, the change of size removed.
+        bent: whether it began at a map along the surface, as of an object whose limbs have moved.
     """
 
     index: int
@@ -132,6 +143,13 @@ class ScanRegistration:
     mirrored: bool = False
     scores: tuple[float, float] = (np.nan, np.nan)
     posed_by_landmarks: bool = False
+    stretch: float = 0.0
+    bent: bool = False
+
+    @property
+    def strain(self) -> float:
+        """Distance from the scan times stretch of the edges: large if a limb was not reached, or another one was."""
+        return self.distance[0] * self.stretch
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,12 +180,17 @@ class RoundContext:
         """The template as a shape model, of which the dense stage uses the mean alone."""
         return generic_model(self.mesh, self.harmonics.slowest(_FEW_HARMONICS))
 
+    @cached_property
+    def intrinsic(self) -> IntrinsicShape:
+        """The template by quantities that bending does not change."""
+        return IntrinsicShape.of(self.mesh, self.harmonics)
+
     def register(self, task: RegistrationTask) -> ScanRegistration:
         """Register the template to the task's scan; a scan that cannot be registered has a reason."""
         begun = time.process_time()
         try:
             with threadpool_limits(limits=1, user_api="blas"):
-                registration = self._register(task)
+                registration = self._register_bent(task, None if task.bent else self._register(task))
         except ShapespaceError as error:
             registration = self.failed(task.index, str(error))
         return replace(registration, cpu_s=time.process_time() - begun)
@@ -217,6 +240,28 @@ class RoundContext:
             raise FitError(_UNREACHED)
         first, *others = registered
         return replace(first, alternatives=(*first.alternatives, *others), scores=scores)
+
+    def _register_bent(self, task: RegistrationTask, registration: ScanRegistration | None) -> ScanRegistration:
+        """Return `registration`, or that from a map along the surface if it leaves more of the scan or stretches more."""
+        if registration is None:
+            assert task.T_scan_template is not None
+            return replace(self._register_at(task, task.T_scan_template), bent=True)
+        far = registration.distance[0] > _LEFT_DISTANCE * self.template.size_mm
+        if task.sides == "scores" or task.pose != "search" or not (far or registration.stretch > _LEFT_STRETCH):
+            return registration
+        task = task.reflected() if registration.mirrored != task.mirrored else task
+        try:
+            shape = bent_shape(self.intrinsic, IntrinsicShape.of_scan(task.scan), self.seed)
+            if shape is None:
+                return registration
+            T = fit_similarity(self.mesh.vertices, shape)
+            bent = self._register_at(replace(task, expected=T.inverse().apply(shape)), T)
+        except ShapespaceError:
+            return registration
+        least = (registration.covered - _LEFT_OVER, registration.observed.mean() - _LEFT_OVER)
+        if bent.covered < least[0] or bent.observed.mean() < least[1]:
+            return registration
+        return replace(bent, bent=True) if bent.strain < _STRAIGHTENED * registration.strain else registration
 
     def _search(self, task: RegistrationTask) -> Start:
         vertices, quick = np.array(task.scan.vertices), task.sides == "scores"
@@ -326,15 +371,17 @@ class RoundContext:
         covered, distance = self._quality(dense.vertices_scan_mm, nearest.distance[observed], target)
         T_template_scan = elastic.T_scan_template.inverse()
         mean, p95, p99, largest = (T_template_scan.scale * length for length in distance)
+        vertices = T_template_scan.apply(dense.vertices_scan_mm)
         return ScanRegistration(
             index=task.index,
-            vertices=T_template_scan.apply(dense.vertices_scan_mm),
+            vertices=vertices,
             T_scan_template=T @ elastic.T_scan_template,
             observed=observed,
             covered=covered,
             distance=(mean, p95, p99, largest),
             cpu_s=0.0,
             mirrored=task.mirrored,
+            stretch=edge_stretch(vertices, self.mesh),
         )
 
     def _observed(self, dense: DenseSurface, nearest: ClosestPoints, target: ScanTarget, cosine: float) -> BoolArray:
