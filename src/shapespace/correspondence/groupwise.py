@@ -26,6 +26,7 @@ from shapespace.correspondence.mirrored_scans import Sides, solve_sides
 from shapespace.correspondence.registration import Comparison, RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.scan_set import unit_ratios
 from shapespace.correspondence.settings import FEWEST, SIZE, CorrespondConfig
+from shapespace.correspondence.subject_tree import subject_levels
 from shapespace.correspondence.template import PoseModel, clean_scan
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.geometry.landmark_placement import place_landmarks
@@ -45,6 +46,7 @@ _WHOLE, _LEAST_SPREAD, _SIZE_UNSEEN = 0.9, 0.01, 0.3
 """Scans that observe more than this share of the template determine the usual size; the least standard deviation of
 log sizes; and that of a scan's own log size for each share that is missing."""
 _CLEARLY_WORSE = 1.1  # ratio of the scores of the other side and a scan's own: beyond it the side is settled
+_AS_NEAR = 1.1  # ratio of distances up to which a registration from another scan of the subject is used
 _ANCHORS = 2  # scans that all others are compared with, beside the template
 
 
@@ -68,6 +70,7 @@ def correspond(
     template: Mesh | None = None,
     model: ShapeModel | None = None,
     first: FirstTemplate | None = None,
+    subjects: Sequence[str] = (),
     run: Runner = run_here,
 ) -> Correspondence:
     """Bring raw `scans` into correspondence: any pose, size and triangles, holes allowed, no landmarks.
@@ -78,6 +81,7 @@ def correspond(
         template: the surface of the first round, used as it is; None chooses a scan and meshes it evenly.
         model: of such objects; its mean is the template, and the first round begins at its fit to each scan.
         first: the result of `first_template` for these scans, where it was called already.
+        subjects: of the scans; scans of one subject are then registered from each other. Empty if unknown.
         run: does the tasks of a round.
 
     Raises:
@@ -87,12 +91,16 @@ def correspond(
     scans = list(as_meshes(scans, "correspond"))
     config = config or CorrespondConfig()
     first = first or first_template(scans, template, config, model)
-    problem = _Problem.of([scan.name for scan in scans], first, config)
+    if subjects and len(subjects) != len(scans):
+        raise InputError(f"There are {len(subjects)} subjects for {len(scans)} scans; give one for each scan.")
+    problem = replace(_Problem.of([scan.name for scan in scans], first, config), subjects=tuple(subjects))
     problem, sides = _with_sides(problem, run, may_reflect=template is None and model is None)
     state = _initial_state(problem, sides)
     for _ in range(config.rounds):
         registrations = run(_context(problem, state), [_task(problem, state, i) for i in problem.first.repaired])
-        state = _next_state(problem, state, registrations)
+        previous, state = state, _next_state(problem, state, registrations)
+        if subjects and not previous.rounds:
+            state = _registered_by_subject(problem, previous, state, run)
         if state.rounds[-1].moved < config.settled:  # C17
             break
     return _result(problem, state)
@@ -107,12 +115,14 @@ class _Problem:
         first: the first template, and the scans that can be used.
         config: of the correspondence.
         harmonics: of the first template, used on every later one.
+        subjects: of all scans, or empty.
     """
 
     names: Sequence[str]
     first: FirstTemplate
     config: CorrespondConfig
     harmonics: Harmonics
+    subjects: tuple[str, ...] = ()
 
     @staticmethod
     def of(names: Sequence[str], first: FirstTemplate, config: CorrespondConfig) -> _Problem:
@@ -328,6 +338,32 @@ def _next_state(
     return _update_template(problem, previous, state, {one.index: one.cpu_s for one in ended})
 
 
+def _registered_by_subject(
+    problem: _Problem, previous: RegistrationState, state: RegistrationState, run: Runner
+) -> RegistrationState:
+    """Return the state of the first round with each scan registered from the surface of another one of its subject."""
+    order = sorted(state.registrations)
+    levels = subject_levels(state.shapes(order)[0], state.template.vertices, [problem.subjects[i] for i in order])
+    context, registrations = _context(problem, state), dict(state.registrations)
+    cpu_s = dict(state.rounds[-1].cpu_s)
+    for level in levels:
+        tasks: list[RegistrationTask] = []
+        for i, parent in ((order[child], order[parent]) for child, parent in level):
+            start = registrations[parent].vertices
+            T = registrations[i].T_scan_template @ fit_similarity(start, registrations[i].vertices)
+            task = replace(_task(problem, state, i), T_scan_template=T, expected=start, bent=True)
+            tasks.append(replace(task, settings=problem.config.first))
+        for registration in run(context, tasks):
+            i = registration.index
+            own, cpu_s[i] = registrations[i], cpu_s[i] + registration.cpu_s
+            if not _exclusion_reason(problem.config, registration) and (
+                registration.distance[0] < _AS_NEAR * own.distance[0]
+            ):
+                registrations[i] = replace(registration, bent=own.bent, scores=own.scores)
+    state = replace(state, registrations=registrations, rounds=previous.rounds)
+    return _update_template(problem, previous, state, cpu_s)
+
+
 # Which registrations are used
 
 
@@ -365,6 +401,8 @@ def _wrong_names(registration: ScanRegistration) -> str:
 
 def _exclude_other_kinds(problem: _Problem, state: RegistrationState, order: Sequence[int]) -> RegistrationState:
     """Exclude the scans in `order` that are another kind of object than the largest group, or are like no other."""
+    if problem.subjects:  # scans of one subject predict each other, and are no kind of object
+        order = list({problem.subjects[i]: i for i in sorted(order, reverse=True)}.values())
     if len(order) < ENOUGH_TO_JUDGE:
         return state
     order, config = sorted(order), problem.config
