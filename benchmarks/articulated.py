@@ -3,10 +3,10 @@
     python benchmarks/articulated.py                            5 bodies in 10 poses each, about an hour
     python benchmarks/articulated.py --bodies 1 --vertices 2000
 
-Simple figures (capsules with feet, thumbs and a nose) by linear blend skinning: bodies differ in the lengths and widths of
-their bones, poses in the rotations of their joints. Each figure has its own triangles and any pose in space. Points
-of a scan are carried to every other scan by the surfaces in correspondence. The error is the distance from the true place,
-100 x share of the square root of the area. A scan is wrong if its mean error from the others is above `WRONG`.
+Simple figures (capsules with feet, thumbs and a nose) by linear blend skinning: bodies differ in the lengths and widths
+of their bones, poses in the rotations of their joints. Each figure has its own triangles and any pose in space. Points
+of a scan are carried to every other scan by the surfaces in correspondence. The error is the distance from the true
+place, 100 x share of the square root of the area. A scan is wrong if its mean error from the others is above `WRONG`.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import argparse
 import json
 import tempfile
 import time
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,14 +29,16 @@ from shapespace.correspondence.groupwise import correspond, run_here
 from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.datasets.simulated_scan import random_similarity, simulate_scan
 from shapespace.geometry.closest import build_engine
-from shapespace.geometry.normals import face_areas
+from shapespace.geometry.normals import face_areas, faces_of
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 
 VOXEL_MM = 15.0
 WRONG = 5.0
 """Mean error of a scan over its pairs, 100 x share of the square root of the area, above which it is wrong."""
 POINTS = 1000  # vertices that errors are measured at
-APART_MM = 60.0  # limbs of a pose lie at least this far from each other and from the trunk, as if the scans had no contact
+APART_MM = (
+    60.0  # limbs of a pose lie at least this far from each other and from the trunk, as if the scans had no contact
+)
 LIMBS = {
     "trunk": (None, (0, 1000, 0), (0, 1350, 0), 130, 145),
     "pelvis": ("trunk", (0, 1000, 0), (0, 930, -15), 130, 125),
@@ -59,8 +62,9 @@ BUMPS = (
     ("pelvis", (-60, 960, -60), (-60, 930, -90), 90, 85),
 )
 """Nose, thumbs and seat, each a part of a bone."""
-TURNS_DEG = {"arm": (55, 45, 60), "forearm": (10, 75, 10), "hand": (20, 20, 20), "thigh": (50, 15, 22), "shin": (40, 5, 0),
-             "foot": (15, 10, 5), "head": (15, 30, 12), "pelvis": (12, 15, 8), "trunk": (0, 0, 0)}  # fmt: skip
+TURNS_DEG = {"arm": (55, 45, 60), "forearm": (10, 75, 10), "hand": (20, 20, 20), "thigh": (50, 15, 22),
+             "shin": (40, 5, 0), "foot": (15, 10, 5), "head": (15, 30, 12), "pelvis": (12, 15, 8),
+             "trunk": (0, 0, 0)}  # fmt: skip
 """Largest rotation of each bone against its parent about x, y and z, either way."""
 BLEND_MM = 28.0  # width of the transition of skinning weights
 
@@ -74,7 +78,9 @@ def _distance(points: FloatArray, a: FloatArray, b: FloatArray, radius_a: float,
 
 def _distances(points: FloatArray) -> dict[str, FloatArray]:
     """Return the distances of points from each bone, with its bumps."""
-    ends = {name: _distance(points, np.array(a, float), np.array(b, float), r, s) for name, (_, a, b, r, s) in LIMBS.items()}
+    ends = {
+        name: _distance(points, np.array(a, float), np.array(b, float), r, s) for name, (_, a, b, r, s) in LIMBS.items()
+    }
     for name, a, b, r, s in BUMPS:
         ends[name] = np.minimum(ends[name], _distance(points, np.array(a, float), np.array(b, float), r, s))
     return ends
@@ -107,7 +113,9 @@ def rest_figure() -> Mesh:
         numbers = np.moveaxis(number, (axis, u, v), (0, 1, 2))
         crossed = first[:-1, 1:-1, 1:-1] != first[1:, 1:-1, 1:-1]
         i, j, k = np.nonzero(crossed)
-        quad = np.stack([numbers[i, j, k], numbers[i, j + 1, k], numbers[i, j + 1, k + 1], numbers[i, j, k + 1]], axis=1)
+        quad = np.stack(
+            [numbers[i, j, k], numbers[i, j + 1, k], numbers[i, j + 1, k + 1], numbers[i, j, k + 1]], axis=1
+        )
         quad = np.where(first[i, j + 1, k + 1][:, None], quad, quad[:, ::-1])
         faces += [quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]]
     for _ in range(8):
@@ -137,7 +145,10 @@ class Body:
         """Return a random body, alike on both sides."""
         names = [name.split()[-1] for name in LIMBS]
         tall, wide = 1 + 0.07 * rng.standard_normal(), 1 + 0.1 * rng.standard_normal()
-        own = {name: (tall + 0.06 * rng.standard_normal(), wide + 0.08 * rng.standard_normal()) for name in dict.fromkeys(names)}
+        own = {
+            name: (tall + 0.06 * rng.standard_normal(), wide + 0.08 * rng.standard_normal())
+            for name in dict.fromkeys(names)
+        }
         return Body(*(np.clip([own[name][k] for name in names], 0.75, 1.3) for k in (0, 1)))
 
 
@@ -176,7 +187,12 @@ def skinned(rest: FloatArray, weights: FloatArray, body: Body, pose: dict[str, R
 
 
 def _place(
-    names: list[str], joints: dict[str, FloatArray], turned: dict[str, FloatArray], body: Body, bone: str, point: FloatArray
+    names: list[str],
+    joints: dict[str, FloatArray],
+    turned: dict[str, FloatArray],
+    body: Body,
+    bone: str,
+    point: FloatArray,
 ) -> FloatArray:
     """Return where a point of a bone at rest is."""
     _, a, b, _, _ = LIMBS[bone]
@@ -196,7 +212,7 @@ def _is_free(x: FloatArray, weights: FloatArray) -> bool:
     far = np.isin(own, ["forearm", "hand", "shin", "foot"])
     for limb in np.unique(part[far]):
         tips, others = x[(part == limb) & far], x[part != limb]
-        if cKDTree(others).query(tips)[0].min() < APART_MM:
+        if np.min(cKDTree(others).query(tips)[0]) < APART_MM:
             return False
     return True
 
@@ -251,10 +267,10 @@ def pair_errors(made: Correspondence, known: list[Figure], faces: IntArray) -> F
         if one.vertices is None:
             continue
         near = build_engine(Mesh(one.vertices, made.template.faces)).query(np.ascontiguousarray(truth.truth[points]))
-        corners = made.template.faces[near.triangle]
+        corners = faces_of(made.template)[near.triangle]
         for j, (other, goal) in enumerate(zip(made.scans, known, strict=True)):
             if other.vertices is not None and i != j:
-                place = np.einsum("pc,pcd->pd", near.barycentric, other.vertices[corners])
+                place = np.einsum("pc,pcd->pd", np.asarray(near.barycentric), other.vertices[corners])
                 root = np.sqrt(face_areas(Mesh(goal.truth, faces)).sum())
                 errors[i, j] = 100 * np.linalg.norm(place - goal.truth[points], axis=1) / root
     return errors
@@ -263,10 +279,13 @@ def pair_errors(made: Correspondence, known: list[Figure], faces: IntArray) -> F
 def report_of(made: Correspondence, known: list[Figure], faces: IntArray) -> dict[str, object]:
     """Return the figures of a correspondence."""
     errors = pair_errors(made, known, faces)
-    pairs = np.nanmean(errors, axis=2, where=np.isfinite(errors))
-    scan = np.array([np.nanmedian(np.concatenate([pairs[i], pairs[:, i]])) for i in range(len(known))])
+    pairs = errors.mean(axis=2)
+    with warnings.catch_warnings():  # excluded scans have no pairs
+        warnings.simplefilter("ignore", RuntimeWarning)
+        scan = np.nanmedian(np.hstack([pairs, pairs.T]), axis=1)
     return {
-        "mean": float(np.nanmean(errors)), "median": float(np.nanmedian(errors)), "p95": float(np.nanquantile(errors, 0.95)),
+        "mean": float(np.nanmean(errors)), "median": float(np.nanmedian(errors)),
+        "p95": float(np.nanquantile(errors, 0.95)),
         "worst_pair": float(np.nanmax(pairs)), "pairs_above_5": float((pairs[np.isfinite(pairs)] > WRONG).mean()),
         "wrong_accepted": [one.name for one, error in zip(known, scan, strict=True) if error > WRONG],
         "excluded": {one.name: one.reason for one in made.scans if one.vertices is None},
@@ -292,7 +311,9 @@ def main() -> None:
         made = correspond([one.scan for one in known], config, run=run_here if arguments.jobs < 2 else kept)
     faces = rest_figure().faces
     assert faces is not None
-    print(json.dumps({**vars(arguments), **report_of(made, known, faces), "cpu_s": time.process_time() - begun}, indent=1))
+    print(
+        json.dumps({**vars(arguments), **report_of(made, known, faces), "cpu_s": time.process_time() - begun}, indent=1)
+    )
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from shapespace.types import FloatArray, IntArray, Mesh
 _VERTICES = 2000  # of the coarse mesh of a scan, and at most of the template's that are mapped: cost grows with them
 _DISTANCE_FUNCTIONS = 60  # of the distances along the surface; the weight of the last one is below 0.001
 _COARSEST, _FINEST, _STEPS = 20, 80, 18
-"""Functions of the map in the first and the last refinement. From 8 on, 2 of 10 figures had front and back exchanged."""
+"""Functions of the map in the first and the last refinement. From 8 on, 2 of 10 figures had front and back swapped."""
 _FAR_APART = 0.35  # least distance of two extremities, share of the RMS distance along the surface
 _OWN_ENDS, _SCAN_ENDS, _FEWEST_ENDS = 6, 8, 3
 """Extremities of the template and of the scan, at most, and at least: fewer leave rotations open."""
@@ -30,7 +30,9 @@ _TRIED = 6  # assignments of extremities: each costs about 0.2 CPU s
 _SENSE = 0.8
 """Share of the area of the map, less that of the rest, that is not turned inside out: it was 0.89 or more in the right
 maps of 10 figures, and -0.9 where left and right were exchanged."""
-_JACOBIANS = 3.0  # RMS of the determinants in the first map, in which distances have about 2; 2 and 4 give the same maps
+_JACOBIANS = (
+    3.0  # RMS of the determinants in the first map, in which distances have about 2; 2 and 4 give the same maps
+)
 _SMOOTH = 0.05  # range over which the determinants are averaged, share of the square root of the area
 
 
@@ -108,7 +110,7 @@ def bent_shape(template: IntrinsicShape, scan: IntrinsicShape, seed: int) -> Flo
         None if there are too few extremities, or if no map keeps the orientation.
     """
     rng = np.random.default_rng(seed)
-    drawn = np.sort(rng.permutation(len(template.functions))[: _VERTICES // 2])
+    drawn = np.sort(rng.permutation(len(template.functions))[: _VERTICES // 2]).astype(np.int32)
     best, least = None, np.inf
     for ends in _assignments(template, scan):
         own, theirs = template.distances(template.ends[: len(ends)]), scan.distances(ends)
@@ -160,7 +162,7 @@ def _assignments(template: IntrinsicShape, scan: IntrinsicShape) -> Iterator[Int
 def _refined(template: IntrinsicShape, scan: IntrinsicShape, start: IntArray, drawn: IntArray) -> IntArray:
     """Return (V,) the vertex of the scan for each of the template, from that (M,) of the vertices `drawn`."""
     area = template.area[drawn] / template.area[drawn].sum()
-    mapped = start
+    mapped, own, theirs, C = start, template.functions, scan.functions, np.eye(0)
     for count in np.unique(np.geomspace(_COARSEST, _FINEST, _STEPS).round().astype(int)).tolist():
         own, theirs = template.functions[:, :count], scan.functions[:, :count]
         C = own[drawn].T @ (area[:, None] * theirs[mapped])  # C53
@@ -177,7 +179,7 @@ def _orientation(faces: IntArray, scan: IntrinsicShape, mapped: IntArray) -> flo
 
 
 def _nearest(queries: FloatArray, points: FloatArray) -> IntArray:
-    """Return (M,) the nearest of `points` (P, D) to each of `queries` (M, D); there are too many dimensions for a tree."""
+    """Return (M,) the nearest of `points` (P, D) to each of `queries` (M, D); D is too large for a tree."""
     half = 0.5 * (points**2).sum(axis=1)
     parts = np.array_split(queries, max(1, len(queries) * len(points) // 4_000_000))
     return np.concatenate([(half - part @ points.T).argmin(axis=1) for part in parts]).astype(np.int32)

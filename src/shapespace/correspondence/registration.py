@@ -57,8 +57,8 @@ _EITHER_SIDE = 1.05
 of the majority, against the mean of all, and 0.98 or less for 13 mirrored ones."""
 _STRAINED = 0.0009
 """Mean distance from the scan, share of the size, times RMS log stretch of edges, beyond which limbs may be missing or
-exchanged: of 66 faces, femora, molars, spleens and blobs, whole or damaged, 3 had more, of 50 figures with moving limbs
-all 15 wrong ones of those that distances below 0.01 had hidden, and no right one."""
+exchanged: 3 of 59 faces, femora, molars, spleens and blobs, whole or damaged, had more (two cut femora and a blob), and
+13 of 50 figures with moving limbs, of which the others had at most 0.0007."""
 _STRAIGHTENED = 0.7
 """Ratio of this strain below which a registration from the map along the surface replaces another one."""
 _UNREACHED = "surface not reached: too little of the scan matches the template from any pose"
@@ -246,7 +246,7 @@ class RoundContext:
         return replace(first, alternatives=(*first.alternatives, *others), scores=scores)
 
     def _register_bent(self, task: RegistrationTask, registration: ScanRegistration) -> ScanRegistration:
-        """Return `registration`, or that from a map along the surface if it leaves less of the scan or stretches less."""
+        """Return `registration`, or that from a map along the surface if that one is less strained."""
         strained = registration.strain > _STRAINED * self.template.size_mm
         if task.sides == "scores" or task.pose != "search" or not strained:
             return registration

@@ -12,9 +12,7 @@ from shapespace.types import FloatArray
 _LEAST = 1e-9  # share of the largest distance, so that equal shapes are connected
 
 
-def subject_levels(
-    shapes: FloatArray, mean: FloatArray, subjects: Sequence[Hashable]
-) -> list[list[tuple[int, int]]]:
+def subject_levels(shapes: FloatArray, mean: FloatArray, subjects: Sequence[Hashable]) -> list[list[tuple[int, int]]]:
     """Return pairs of shape and parent; those of a level have parents in the levels before, or roots.
 
     The shapes of a subject are the nodes of a minimum spanning tree of their RMS distances. Its root is the shape
@@ -36,7 +34,7 @@ def subject_levels(
         tree = minimum_spanning_tree(distances + _LEAST * max(float(distances.max()), 1.0))
         order, parents = breadth_first_order(tree, root, directed=False)
         depth = {root: 0}
-        for child in order[1:].tolist():
+        for child in map(int, order[1:]):
             parent = int(parents[child])
             depth[child] = depth[parent] + 1
             levels.setdefault(depth[child], []).append((own[child], own[parent]))

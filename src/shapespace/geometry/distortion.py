@@ -61,9 +61,10 @@ def edge_stretch(vertices: FloatArray, rest: Mesh) -> float:
     """
     faces = faces_of(rest)
     first, second = faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel()
-    now, before = (np.linalg.norm(x[first] - x[second], axis=1) for x in (vertices, rest.vertices))
+    now: FloatArray = np.linalg.norm(vertices[first] - vertices[second], axis=1)
+    before: FloatArray = np.linalg.norm(rest.vertices[first] - rest.vertices[second], axis=1)
     known = (now > 0) & (before > 0)
-    logs = np.log(now[known] / before[known])
+    logs = np.asarray(np.log(now[known] / before[known]), dtype=np.float64)
     return float(np.sqrt(np.mean((logs - np.median(logs)) ** 2))) if len(logs) else 0.0
 
 
