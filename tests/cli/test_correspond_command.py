@@ -108,15 +108,17 @@ def test_subjects_are_a_column_without_missing_values(run: Run, raw: Path, tmp_p
     rows = [f"{raw / f'blob{k}.ply'},{'anna' if k < 2 else ''}" for k in range(SCANS)]
     (tmp_path / "list.csv").write_text("\n".join(["file,person", *rows]), "utf-8")
     command = ("correspond", str(tmp_path / "list.csv"), "-o", str(tmp_path / "out"), *QUICK, "--subjects")
-    code, _, error = run(*command, "subject")
-    assert code == 2 and "column subject" in error and "person" in error
-    code, _, error = run(*command, "person")
-    assert code == 2 and "2 of 4 scans (blob2, blob3)" in error
-    code, _, error = run(*command, "person", "--groups")
-    assert code == 2 and "--groups" in error
+    outcome = run(*command, "subject")
+    assert outcome.code == 2 and "column subject" in outcome.err and "person" in outcome.err
+    outcome = run(*command, "person")
+    assert outcome.code == 2 and "2 of 4 scans (blob2, blob3)" in outcome.err
+    outcome = run(*command, "person", "--groups")
+    assert outcome.code == 2 and "--groups" in outcome.err
     text = (tmp_path / "list.csv").read_text("utf-8")
-    (tmp_path / "list.csv").write_text("\n".join(line if line[-1] != "," else f"{line}ben" for line in text.split("\n")))
-    assert run(*command, "person")[0] == 0
+    (tmp_path / "list.csv").write_text(
+        "\n".join(line if line[-1] != "," else f"{line}ben" for line in text.split("\n"))
+    )
+    assert run(*command, "person").code == 0
 
 
 def test_a_later_run_leaves_no_surface_of_another_template(run: Run, raw: Path, tmp_path: Path) -> None:

@@ -60,7 +60,8 @@ _STRAINED = 0.0009
 exchanged: 3 of 59 faces, femora, molars, spleens and blobs, whole or damaged, had more (two cut femora and a blob), and
 13 of 50 figures with moving limbs, of which the others had at most 0.0007."""
 _STRAIGHTENED = 0.7
-"""Ratio of this strain below which a registration from the map along the surface replaces another one."""
+"""Ratio of this strain below which a registration from the map along the surface replaces another one; 1 for an object
+that is known to bend."""
 _UNREACHED = "surface not reached: too little of the scan matches the template from any pose"
 _BULGING = 0.2
 """How far the normals of a sheet point away from its middle, 0 to 1, when it is clear which way it bulges."""
@@ -247,9 +248,10 @@ class RoundContext:
 
     def _register_bent(self, task: RegistrationTask, registration: ScanRegistration) -> ScanRegistration:
         """Return `registration`, or that from a map along the surface if that one is less strained."""
-        strained = registration.strain > _STRAINED * self.template.size_mm
+        strained = task.bent or registration.strain > _STRAINED * self.template.size_mm
         if task.sides == "scores" or task.pose != "search" or not strained:
             return registration
+        limit = registration.strain * (1.0 if task.bent else _STRAIGHTENED)
         task = task.reflected() if registration.mirrored != task.mirrored else task
         try:
             shape = bent_shape(self.intrinsic, IntrinsicShape.of_scan(task.scan), self.seed)
@@ -262,7 +264,7 @@ class RoundContext:
         least = (registration.covered - _LEFT_OVER, registration.observed.mean() - _LEFT_OVER)
         if bent.covered < least[0] or bent.observed.mean() < least[1]:
             return registration
-        return replace(bent, bent=True) if bent.strain < _STRAIGHTENED * registration.strain else registration
+        return replace(bent, bent=True) if bent.strain < limit else registration
 
     def _search(self, task: RegistrationTask) -> Start:
         vertices, quick = np.array(task.scan.vertices), task.sides == "scores"
