@@ -114,10 +114,8 @@ def test_subjects_are_a_column_without_missing_values(run: Run, raw: Path, tmp_p
     assert outcome.code == 2 and "2 of 4 scans (blob2, blob3)" in outcome.err
     outcome = run(*command, "person", "--groups")
     assert outcome.code == 2 and "--groups" in outcome.err
-    text = (tmp_path / "list.csv").read_text("utf-8")
-    (tmp_path / "list.csv").write_text(
-        "\n".join(line if line[-1] != "," else f"{line}ben" for line in text.split("\n"))
-    )
+    complete = [f"{row}ben" if row.endswith(",") else row for row in rows]
+    (tmp_path / "list.csv").write_text("\n".join(["file,person", *complete]), "utf-8")
     assert run(*command, "person").code == 0
 
 
