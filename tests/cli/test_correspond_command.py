@@ -104,6 +104,21 @@ def test_bad_input_is_one_sentence(run: Run, raw: Path, tmp_path: Path) -> None:
     assert gone.code == 2 and "no.ply" in gone.sentence()
 
 
+def test_subjects_are_a_column_without_missing_values(run: Run, raw: Path, tmp_path: Path) -> None:
+    rows = [f"{raw / f'blob{k}.ply'},{'anna' if k < 2 else ''}" for k in range(SCANS)]
+    (tmp_path / "list.csv").write_text("\n".join(["file,person", *rows]), "utf-8")
+    command = ("correspond", str(tmp_path / "list.csv"), "-o", str(tmp_path / "out"), *QUICK, "--subjects")
+    outcome = run(*command, "subject")
+    assert outcome.code == 2 and "column subject" in outcome.err and "person" in outcome.err
+    outcome = run(*command, "person")
+    assert outcome.code == 2 and "2 of 4 scans (blob2, blob3)" in outcome.err
+    outcome = run(*command, "person", "--groups")
+    assert outcome.code == 2 and "--groups" in outcome.err
+    complete = [f"{row}ben" if row.endswith(",") else row for row in rows]
+    (tmp_path / "list.csv").write_text("\n".join(["file,person", *complete]), "utf-8")
+    assert run(*command, "person").code == 0
+
+
 def test_a_later_run_leaves_no_surface_of_another_template(run: Run, raw: Path, tmp_path: Path) -> None:
     scans = [raw / f"blob{k}.ply" for k in range(3)]
     assert run("correspond", *scans, "-o", tmp_path, *QUICK).code == 0

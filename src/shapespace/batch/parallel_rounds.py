@@ -103,12 +103,14 @@ class _FileTask:
     mirrored: bool
     sides: Comparison
     pose: PoseRange
+    bent: bool
 
     @staticmethod
     def of(task: RegistrationTask, file: Path) -> _FileTask:
         return _FileTask(
-            file, _task_arrays(task), task.index, task.pose_model, task.settings, task.mirrored, task.sides, task.pose
-        )
+            file, _task_arrays(task), task.index, task.pose_model, task.settings, task.mirrored, task.sides, task.pose,
+            task.bent,
+        )  # fmt: skip
 
     def task(self) -> RegistrationTask:
         arrays = self.arrays
@@ -126,6 +128,7 @@ class _FileTask:
             sides=self.sides,
             pose=self.pose,
             other_pose=_pose_of(arrays, "other_") if "other_scale" in arrays else None,
+            bent=self.bent,
         )
 
 
@@ -256,7 +259,7 @@ def _shared_hash(context: RoundContext, pose_model: PoseModel) -> str:
 
 
 def _key(task: RegistrationTask, shared: str) -> str:
-    settings = f"{task.settings} {task.mirrored} {task.sides} {task.pose}"
+    settings = f"{task.settings} {task.mirrored} {task.sides} {task.pose} {task.bent}"
     return content_hash(_task_arrays(task), {"shared": shared, "settings": settings, "version": __version__})
 
 
@@ -267,7 +270,8 @@ def _write(file: Path, placed: ScanRegistration) -> None:
             "vertices": one.vertices, "observed": one.observed, "covered": np.array(one.covered),
             "distance": np.array(one.distance), "cpu_s": np.array(one.cpu_s), "reason": np.array(one.reason),
             "mirrored": np.array(one.mirrored), "scores": np.array(one.scores),
-            "posed_by_landmarks": np.array(one.posed_by_landmarks),
+            "posed_by_landmarks": np.array(one.posed_by_landmarks), "stretch": np.array(one.stretch),
+            "bent": np.array(one.bent),
             **_pose_arrays(one.T_scan_template),
         }  # fmt: skip
         arrays |= {f"{name}_{number}": array for name, array in result.items()}
@@ -303,4 +307,6 @@ def _read_one(stored: Mapping[str, npt.NDArray[Any]], number: int, index: int) -
         mirrored=bool(of("mirrored")),
         scores=PoseScores(*(float(score) for score in of("scores"))),
         posed_by_landmarks=bool(of("posed_by_landmarks")),
+        stretch=float(of("stretch")),
+        bent=bool(of("bent")),
     )

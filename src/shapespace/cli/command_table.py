@@ -308,6 +308,8 @@ COMMANDS: tuple[Command, ...] = (
             advanced("--model",
                      "MODEL.h5", "shape model of such objects: its mean is the template, and its fit to a scan "
                      "initialises the first round", parse=Path),
+            advanced("--subjects", "COLUMN", "column of the list of scans that names the subjects: each scan is then "
+                     "registered from the subject's other scans, the most usual one first"),
             advanced("--mirror", source=CORRESPOND),
             advanced("--groups", help="bring each kind of object into correspondence, in folders group_1 (the largest "
                      "group), group_2, ... of the output folder (default: the largest group only)"),

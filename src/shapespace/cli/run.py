@@ -206,11 +206,15 @@ def correspond(arguments: argparse.Namespace) -> int:
         execution=_execution_config(arguments),
         recursive=arguments.recursive,
         strict=arguments.strict,
+        subjects=arguments.subjects,
     )
     change = Change(**given(arguments, Change))
     folder, quiet = arguments.output, arguments.quiet
     if change and arguments.groups:
         raise InputError(f"--groups cannot be combined with {change.option}; leave one of them out.")
+    if files.subjects and (change or arguments.groups):
+        other = change.option if change else "--groups"
+        raise InputError(f"--subjects cannot be combined with {other}; leave one of them out.")
     if not (change or files.scans):
         raise InputError("Give scans, or a change of a finished correspondence by --redo, --remove or --update.")
     if change:

@@ -29,7 +29,7 @@ from shapespace.correspondence.landmark_guide import stray_landmarks, without_st
 from shapespace.correspondence.registration import RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.scan_set import copies, unit_ratios
 from shapespace.correspondence.settings import CorrespondConfig
-from shapespace.errors import ShapespaceError
+from shapespace.errors import InputError, ShapespaceError
 from shapespace.geometry.distortion import Distortion
 from shapespace.geometry.doctor import NON_FINITE, repair
 from shapespace.geometry.landmark_placement import far_landmarks, place_landmarks
@@ -75,6 +75,7 @@ class CorrespondFiles:
         where: scans are registered.
         recursive: take scans in folders below those given too.
         strict: exclude scans with triangles that use vertices with non-finite coordinates.
+        subjects: column of the list of scans that names the subjects, or None.
     """
 
     scans: Sequence[str | Path]
@@ -84,6 +85,7 @@ class CorrespondFiles:
     execution: ExecutionConfig = field(default_factory=ExecutionConfig)
     recursive: bool = False
     strict: bool = False
+    subjects: str | None = None
 
 
 def correspond_files(
@@ -152,6 +154,7 @@ def _corresponding(
 ) -> tuple[CorrespondenceRecord, list[CorrespondRecord]]:
     marks = LandmarkFiles.of(files.landmarks)
     marks.refuse_shared([job.scan for job in jobs if job.landmarks is None])
+    subjects = _subjects_of(jobs, files.subjects)
     inputs_hash = inputs_hash_of(jobs, marks, files, config)
     if (finished := _finished(jobs, folder, inputs_hash)) is not None:
         say(f"{folder} already contains the results of these scans and settings; nothing is computed.")
@@ -169,7 +172,8 @@ def _corresponding(
     rounds = RoundsWithProgress(folder / ROUNDS_FOLDER, files.execution, quiet=quiet)
     with telling_of_compiling(quiet=quiet), waiting("choosing the template", quiet=quiet):
         first = first_template(list(scans.values()), template, config, model)
-    made = correspond(list(scans.values()), config, first=first, run=rounds)
+    of_scans = [subjects[name] for name in scans] if subjects else []
+    made = correspond(list(scans.values()), config, first=first, subjects=of_scans, run=rounds)
     note_copies(scans, notes)
     given = template.name if template is not None else "" if model is None else "The model's mean"
     if not given or made.moved[0] < _ANOTHER_SHAPE:
@@ -206,6 +210,26 @@ def _corresponding(
     return summary, records
 
 
+def _subjects_of(jobs: Sequence[Job], column: str | None) -> dict[str, str]:
+    """Return the subject of each scan by its name; empty if no column is given.
+
+    Raises:
+        InputError: no list of scans has the column, or scans have no value in it.
+    """
+    if column is None:
+        return {}
+    subjects = {job.name: job.metadata.get(column, "").strip() for job in jobs}
+    if not any(subjects.values()):
+        columns = first_names(sorted({name for job in jobs for name in job.metadata}), _LISTED) or "none"
+        raise InputError(f"No scan has a value in the column {column} of --subjects; the list of scans has: {columns}.")
+    if missing := [name for name, subject in subjects.items() if not subject]:
+        raise InputError(
+            f"The column {column} of --subjects has no value for {len(missing)} of {len(jobs)} scans "
+            f"({first_names(missing, _LISTED)}); fill it in, or leave these scans out."
+        )
+    return subjects
+
+
 def inputs_hash_of(
     jobs: Sequence[Job],
     marks: LandmarkFiles,
@@ -227,7 +251,7 @@ def inputs_hash_of(
         scans.append([job.name, content_hash_of(job), landmarks_hash(job.scan, job.landmarks), dict(job.metadata)])
     template = None if files.template is None else [file_hash(files.template), landmarks_hash(files.template, None)]
     model = None if files.model is None else file_hash(files.model)
-    inputs = [scans, template, model, asdict(config), files.strict, __version__, *change]
+    inputs = [scans, template, model, asdict(config), files.strict, files.subjects, __version__, *change]
     content = json.dumps(inputs, sort_keys=True, default=str)
     return hashlib.sha256(content.encode()).hexdigest()
 

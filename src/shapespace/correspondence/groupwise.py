@@ -34,6 +34,7 @@ from shapespace.correspondence.registration import Comparison, RegistrationTask,
 from shapespace.correspondence.scan_set import unit_ratios
 from shapespace.correspondence.scan_status import Judgement, ScanEvidence, judge, usual_ratios
 from shapespace.correspondence.settings import FEWEST, SIZE, CorrespondConfig
+from shapespace.correspondence.subject_tree import subject_levels
 from shapespace.correspondence.template import PoseModel, clean_scan
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.geometry.landmark_placement import place_landmarks
@@ -54,6 +55,7 @@ _WHOLE, _LEAST_SPREAD, _SIZE_UNSEEN = 0.9, 0.01, 0.3
 """Scans that observe more than this share of the template determine the usual size; the least standard deviation of
 log sizes; and that of a scan's own log size for each share that is missing."""
 _CLEARLY_WORSE = 1.1  # ratio of the scores of the other side and a scan's own: beyond it the side is settled
+_AS_NEAR = 1.1  # ratio of distances up to which a registration from another scan of the subject is used
 _ANCHORS, _MOST_ANCHORS = 2, 6
 """Scans that all others are compared with, in addition to the template; at most, until the sides are decided."""
 
@@ -78,6 +80,7 @@ def correspond(
     template: Mesh | None = None,
     model: ShapeModel | None = None,
     first: FirstTemplate | None = None,
+    subjects: Sequence[str] = (),
     run: Runner = run_here,
 ) -> Correspondence:
     """Bring raw `scans` into correspondence: any pose, size and triangles, holes allowed, no landmarks.
@@ -88,6 +91,7 @@ def correspond(
         template: the surface of the first round, used as it is; None chooses a scan and meshes it evenly.
         model: of such objects; its mean is the template, and the first round begins at its fit to each scan.
         first: the result of `first_template` for these scans, where it was called already.
+        subjects: of the scans; scans of one subject are then registered from each other. Empty if unknown.
         run: does the tasks of a round.
 
     Raises:
@@ -97,12 +101,16 @@ def correspond(
     scans = list(as_meshes(scans, "correspond"))
     config = config or CorrespondConfig()
     first = first or first_template(scans, template, config, model)
-    problem = _Problem.of([scan.name for scan in scans], first, config)
+    if subjects and len(subjects) != len(scans):
+        raise InputError(f"There are {len(subjects)} subjects for {len(scans)} scans; give one for each scan.")
+    problem = replace(_Problem.of([scan.name for scan in scans], first, config), subjects=tuple(subjects))
     problem, sides = _with_sides(problem, run, may_reflect=template is None and model is None)
     state = _initial_state(problem, sides)
     for _ in range(config.rounds):
         registrations = run(_context(problem, state), [_task(problem, state, i) for i in problem.first.repaired])
-        state = _next_state(problem, state, registrations)
+        previous, state = state, _next_state(problem, state, registrations)
+        if subjects and not previous.rounds:
+            state = _registered_by_subject(problem, previous, state, run)
         if state.rounds[-1].moved < config.settled:  # C17
             break
     return _result(problem, state, _evidence(problem, state, run))
@@ -119,6 +127,7 @@ class _Problem:
         harmonics: of the first template, used on every later one.
         comparisons: poses of scans in relation to the anchors.
         reflected: whether the first template was reflected after the comparisons.
+        subjects: of all scans, or empty.
     """
 
     names: Sequence[str]
@@ -127,6 +136,7 @@ class _Problem:
     harmonics: Harmonics
     comparisons: tuple[PoseComparison, ...] = ()
     reflected: bool = False
+    subjects: tuple[str, ...] = ()
 
     @staticmethod
     def of(names: Sequence[str], first: FirstTemplate, config: CorrespondConfig) -> _Problem:
@@ -171,6 +181,7 @@ class RegistrationState:
         rounds: one record for each round so far.
         other_kinds: of the scans that were in another group than the largest, the first scan of their group.
         consensus: poses of the scans, or of their mirror images, on which the comparisons with anchors agree (C32).
+        bent: the scans whose next registration begins at their own surface, since no other scan predicts it.
     """
 
     template: Mesh
@@ -182,6 +193,7 @@ class RegistrationState:
     rounds: tuple[RoundRecord, ...]
     other_kinds: Mapping[int, int] = field(default_factory=dict[int, int])
     consensus: Mapping[int, Similarity] = field(default_factory=dict[int, Similarity])
+    bent: frozenset[int] = frozenset()
 
     def is_mirrored(self, i: int) -> bool:
         """Return whether scan `i` is a mirror image of the majority, as far as is known."""
@@ -299,6 +311,7 @@ def _task(problem: _Problem, state: RegistrationState, i: int) -> RegistrationTa
         sides=_comparison(problem, state, i),
         pose=config.pose,
         other_pose=_other_pose(state, i),
+        bent=i in state.bent and known,
     )
 
 
@@ -369,6 +382,33 @@ def _next_state(
     return _update_template(problem, previous, state, {one.index: one.cpu_s for one in ended})
 
 
+def _registered_by_subject(
+    problem: _Problem, previous: RegistrationState, state: RegistrationState, run: Runner
+) -> RegistrationState:
+    """Return the state of the first round with each scan registered from the surface of another one of its subject."""
+    order = sorted(state.registrations)
+    levels = subject_levels(state.shapes(order)[0], state.template.vertices, [problem.subjects[i] for i in order])
+    context, registrations = _context(problem, state), dict(state.registrations)
+    cpu_s = dict(state.rounds[-1].cpu_s)
+    for level in levels:
+        tasks: list[RegistrationTask] = []
+        for i, parent in ((order[child], order[parent]) for child, parent in level):
+            start = registrations[parent].vertices
+            T = registrations[i].T_scan_template @ fit_similarity(start, registrations[i].vertices)
+            task = replace(_task(problem, state, i), T_scan_template=T, expected=start, bent=True)
+            # A task with a known frame tries no map along the surface.
+            tasks.append(replace(task, settings=problem.config.first, pose="near"))
+        for registration in run(context, tasks):
+            i = registration.index
+            own, cpu_s[i] = registrations[i], cpu_s[i] + registration.cpu_s
+            if not _exclusion_reason(problem.config, registration) and (
+                registration.distance[0] < _AS_NEAR * own.distance[0]
+            ):
+                registrations[i] = replace(registration, bent=own.bent, scores=own.scores)
+    state = replace(state, registrations=registrations, rounds=previous.rounds)
+    return _update_template(problem, previous, state, cpu_s)
+
+
 # Which registrations are used
 
 
@@ -406,6 +446,8 @@ def _wrong_names(registration: ScanRegistration) -> str:
 
 def _exclude_other_kinds(problem: _Problem, state: RegistrationState, order: Sequence[int]) -> RegistrationState:
     """Exclude the scans in `order` that are another kind of object than the largest group, or are like no other."""
+    if problem.subjects:  # scans of one subject predict each other, and are no kind of object
+        order = list({problem.subjects[i]: i for i in sorted(order, reverse=True)}.values())
     if len(order) < ENOUGH_TO_JUDGE:
         return state
     order, config = sorted(order), problem.config
@@ -493,8 +535,8 @@ def _with_usual_ratios(evidence: Mapping[int, ScanEvidence], usual: tuple[float,
 def _pose_task(problem: _Problem, state: RegistrationState, i: int) -> RegistrationTask:
     """Return the task that compares the pose of a registered scan with other ones."""
     T = state.registrations[i].T_scan_template
-    task = replace(_task(problem, state, i), T_scan_template=T, expected=None, landmarks=None, other_pose=None)
-    return replace(task, sides="scores")
+    task = replace(_task(problem, state, i), T_scan_template=T, expected=None, landmarks=None)
+    return replace(task, sides="scores", other_pose=None, bent=False)
 
 
 def _scan_evidence(state: RegistrationState, compared: ScanRegistration, distance: float) -> ScanEvidence:
@@ -533,6 +575,10 @@ def _update_template(
         predicted = predict_leave_one_out(shapes, observed, problem.config.noise_share)
         predictions = dict(zip(order, predicted, strict=True))
     template = Mesh(mean, state.template.faces, name=state.template.name)
+    bent = frozenset(i for i in order if registrations[i].bent)
+    if 2 * len(bent) >= len(order):  # a mean of poses is no shape, and no pose is predicted by others
+        bent, template = frozenset(order), state.template
+    predictions = {**predictions, **{i: registrations[i].vertices for i in bent}}
     record = RoundRecord(
         moved=float(np.sqrt(np.mean(list(squares.values())))) / SIZE,  # C17
         scan_moved={i: float(np.sqrt(square)) / SIZE for i, square in squares.items()},
@@ -548,6 +594,7 @@ def _update_template(
         rounds=(*state.rounds, record),
         other_kinds=state.other_kinds,
         consensus=_consensus(problem, state),
+        bent=bent,
     )
 
 

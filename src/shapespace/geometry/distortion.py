@@ -54,6 +54,20 @@ class Distortion:
         return float(np.exp(np.quantile(np.abs(known), 0.95))) if len(known) else float("nan")
 
 
+def edge_stretch(vertices: FloatArray, rest: Mesh) -> float:
+    """Return the RMS log ratio of the edges of a surface `vertices` (V, 3) and of `rest`, the change of size removed.
+
+    It is 0 where the surface is only bent. Edges without length in either are left out.
+    """
+    faces = faces_of(rest)
+    first, second = faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel()
+    now: FloatArray = np.linalg.norm(vertices[first] - vertices[second], axis=1)
+    before: FloatArray = np.linalg.norm(rest.vertices[first] - rest.vertices[second], axis=1)
+    known = (now > 0) & (before > 0)
+    logs = np.asarray(np.log(now[known] / before[known]), dtype=np.float64)
+    return float(np.sqrt(np.mean((logs - np.median(logs)) ** 2))) if len(logs) else 0.0
+
+
 def _turned_back(vectors: FloatArray, faces: IntArray, vertices: int) -> BoolArray:
     """Return (F,) whether a triangle's normal points against the mean normal of all that touch it."""
     there = np.where(np.isfinite(vectors), vectors, 0.0)
