@@ -27,6 +27,7 @@ from shapespace.correspondence.registration import Comparison, RegistrationTask,
 from shapespace.correspondence.scan_set import unit_ratios
 from shapespace.correspondence.settings import FEWEST, SIZE, CorrespondConfig
 from shapespace.correspondence.template import PoseModel, clean_scan
+from shapespace.correspondence.vertex_confidence import estimate_position_std
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.geometry.landmark_placement import place_landmarks
 from shapespace.geometry.mirror_plane import FLIP, mirror_image
@@ -714,6 +715,9 @@ def _scan_result(problem: _Problem, state: RegistrationState, i: int, complete: 
     vertices = T.apply(complete)
     landmarks = problem.landmarks(state.landmarks, problem.scan(i, mirrored=registration.mirrored))
     mean, p95, p99, largest = (T.scale * length for length in registration.distance)
+    position_std = estimate_position_std(
+        complete, registration.observed, state.template, problem.harmonics, len(state.registrations)
+    )
     return Corresponding(
         name=problem.names[i],
         reason="",
@@ -727,4 +731,5 @@ def _scan_result(problem: _Problem, state: RegistrationState, i: int, complete: 
         landmarks=np.nan if landmarks is None else landmarks.rms_distance(vertices),
         observed=registration.observed,
         mirrored=registration.mirrored,
+        position_std=T.scale * position_std,
     )

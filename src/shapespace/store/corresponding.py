@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from shapespace.errors import InputError
@@ -47,7 +47,10 @@ class SurfaceFiles:
         """
         mesh, ratio = mesh_at(file), self.unit_ratios.get(file, 1.0)
         mesh = mirror_image(mesh) if file in self.mirrored else mesh
-        return mesh if ratio == 1.0 else mesh.with_vertices(mesh.vertices / ratio)
+        if ratio == 1.0:
+            return mesh
+        std = None if mesh.position_std is None else mesh.position_std / ratio
+        return replace(mesh, vertices=mesh.vertices / ratio, position_std=std)
 
     def unit_note(self, unit: str) -> str:
         """Return in a sentence which files are in another unit, and that they are brought to that of most."""
