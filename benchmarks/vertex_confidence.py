@@ -5,9 +5,9 @@
 
 The error of a vertex of a scan is the distance, on the mean, of its true place from the median place of the same vertex
 on all scans, as in `correspondence.py`; of molars (SHAPESPACE_DATA), that of the 16 landmarks of observers. A region
-contains it if it is within 2.146 times `position_std`. All in percent of the RMS size. `rank` is the rank correlation of
-error and `position_std` within a scan (molars: over all), `deciles` the mean error of the least certain tenth divided by
-that of the most certain tenth.
+contains it if it is within 2.146 times `position_std`. All in percent of the RMS size. `rank` is the rank correlation
+of error and `position_std` within a scan (molars: over all), `deciles` the mean error of the least certain tenth
+divided by that of the most certain tenth.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from landmark_transfer import molar_landmarks
 from mirrored import molars
 from scipy.stats import spearmanr
 
 from correspondence import Set, faces, femora
-from landmark_transfer import molar_landmarks
 from shapespace.correspondence.correspondence_result import Correspondence
 from shapespace.correspondence.groupwise import correspond
 from shapespace.correspondence.settings import CorrespondConfig

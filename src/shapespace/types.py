@@ -172,7 +172,7 @@ class Mesh:
         self.__init__(**state)  # type: ignore[misc]
 
     def with_vertices(self, vertices: npt.ArrayLike, landmarks: Mapping[str, FloatArray] | None = None) -> Mesh:
-        """Return the same mesh with other `vertices` (V, 3); landmarks are dropped unless given, `position_std` always."""
+        """Return the mesh with other `vertices` (V, 3), without `position_std`, and landmarks only where given."""
         positions = np.asarray(vertices, dtype=np.float64)
         return Mesh(
             vertices=positions,

@@ -128,9 +128,9 @@ class Surfaces:
         with self._lock:
             self._corresponded.population()
         placed = self._corresponded.placed(name)
-        arrays = {"positions": quantise(placed.vertices, coded=True)}
+        arrays: dict[str, Any] = {"positions": quantise(placed.vertices, coded=True)}
         if placed.position_std is not None:
-            arrays["std"] = (100 * placed.position_std).astype(np.float32)
+            arrays["std"] = 100 * placed.position_std
         return pack(arrays, {"name": name})
 
     def positions_csv(self, vertices: Sequence[int]) -> str:

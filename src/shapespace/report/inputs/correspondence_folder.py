@@ -65,7 +65,8 @@ class Population:
         seen_count: (V,) how many of them show each vertex.
         sizes: (N,) RMS distance of the surfaces from their middle, in the scans' own units.
         unread: name to the reason, of those that cannot be read.
-        position_std: (V,) RMS of `PlacedSurface.position_std` over the scans; None where a file has none.
+        position_std: (V,) RMS of `PlacedSurface.position_std` over the scans that show a vertex; None if a file has
+            none.
     """
 
     names: tuple[str, ...]
@@ -216,12 +217,12 @@ class Corresponded:
                     if on_scan is not None:
                         on_scan(record.name)
                 counts += placed.seen
-                squares += np.nan if placed.position_std is None else placed.position_std**2
+                squares += np.nan if placed.position_std is None else placed.seen * placed.position_std**2
                 names.append(record.name)
                 sizes.append(placed.T_scan_mean.scale * size)
                 turns.append(placed.T_scan_mean.rotation)
             self.turn = upright(self._mean, turns)
-            std = np.sqrt(squares / max(len(names), 1)) if names and np.isfinite(squares).all() else None
+            std = np.sqrt(squares / np.maximum(counts, 1)) if names and np.isfinite(squares).all() else None
             self._population = Population(tuple(names), counts, np.array(sizes), unread, std)
         return self._population
 

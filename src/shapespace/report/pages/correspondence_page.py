@@ -322,9 +322,9 @@ class CorrespondencePage:
             return []
         caption = (
             f"The position of the median vertex has a standard deviation of {percent_of(float(np.median(std)))} of the "
-            "size in any direction along the surface (RMS over the scans); 90 % of the positions are within 2.15 times "
-            "it. It is large where the surface is flat or of constant curvature, so that no feature determines the "
-            "position, and where scans do not show it. Single surfaces are in the viewer."
+            "size in any direction along the surface (RMS over the scans that show it); 90 % of the positions are "
+            "within 2.15 times it. It is large where the surface is flat or of constant curvature, so that no feature "
+            "determines the position. Single surfaces are in the viewer."
         )
         alt = "Standard deviation of the position of each vertex along the surface, on the mean shape from four sides"
         figure = figures.position_std_figure(self.mean, std, self.all.position_std_limit)
