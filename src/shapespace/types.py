@@ -100,6 +100,8 @@ class Mesh:
         notes: what was left out as it was read, a sentence each.
         observed: (V,) bool, False for vertices whose positions are estimates because the scan does not show them;
             None if all are observed.
+        position_std: (V,) standard deviation of each vertex's position in any direction along the surface, in the unit
+            of `vertices`; None where not known.
 
     Raises:
         MeshError: arrays of the wrong shape, or faces that index past the end of the vertices.
@@ -112,6 +114,7 @@ class Mesh:
     colours: ByteArray | None = None
     notes: tuple[str, ...] = ()
     observed: BoolArray | None = None
+    position_std: FloatArray | None = None
 
     __repr__ = short_repr
 
@@ -154,6 +157,11 @@ class Mesh:
             flags = np.ascontiguousarray(mask).view()
             flags.setflags(write=False)
             object.__setattr__(self, "observed", None if flags.all() else flags)
+        if self.position_std is not None:
+            std = read_only(self.position_std)
+            if std.shape != vertices.shape[:1]:
+                raise MeshError(f"{self.name}: position_std must have the shape (V,), not {std.shape}.")
+            object.__setattr__(self, "position_std", std)
 
     def __getstate__(self) -> dict[str, Any]:
         # For copies, other processes and skops, none of which takes read-only mappings.
@@ -164,7 +172,7 @@ class Mesh:
         self.__init__(**state)  # type: ignore[misc]
 
     def with_vertices(self, vertices: npt.ArrayLike, landmarks: Mapping[str, FloatArray] | None = None) -> Mesh:
-        """Return the same mesh with other `vertices` (V, 3); landmarks are dropped unless given."""
+        """Return the mesh with other `vertices` (V, 3), without `position_std`, and landmarks only where given."""
         positions = np.asarray(vertices, dtype=np.float64)
         return Mesh(
             vertices=positions,

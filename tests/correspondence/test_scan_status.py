@@ -35,7 +35,7 @@ def test_a_surface_that_nothing_contradicts_has_converged() -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"consensus_deg": 178.0, "other_pose_ratio": 1.6}, "rotated by 178 degrees"),
+        ({"consensus_deg": 178.0, "other_pose_ratio": 1.9}, "rotated by 178 degrees"),
         ({"other_pose_ratio": 0.9}, "rotated by 170 degrees is only 0.90 times"),
         ({"mirrored_ratio": 0.1}, "its mirror image is only 0.10 times"),
         ({"distance_ratio": 2.4}, "2.4 times as far as usual"),

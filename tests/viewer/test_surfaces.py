@@ -153,7 +153,7 @@ def test_few_surfaces_are_held_however_many_there_are(template: Path, tmp_path: 
     for k in range(40):
         shown.packed_surface(f"more{k}")
     assert shown.packed_surface.cache_info().currsize <= 2 * shown.about()["page"] < 40
-    monkeypatch.setattr(module, "_PAGE_BYTES", 3 * 6 * VERTICES)
+    monkeypatch.setattr(module, "_PAGE_BYTES", 3 * module._BYTES_PER_VERTEX * VERTICES)
     assert shown.about()["page"] == 3
 
 

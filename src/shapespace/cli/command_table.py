@@ -629,6 +629,7 @@ COMMANDS: tuple[Command, ...] = (
             advanced("--level", "P", source=COMPARE, field="alpha"),
             advanced("--unequal-variances", source=COMPARE),
             advanced("--effect-size", source=COMPARE),
+            advanced("--weights", source=COMPARE),
             advanced("--no-maps", help="skip the tests of each vertex", source=COMPARE),
             advanced("--bumps", "MM", source=COMPARE, field="bump_width_mm"),
             advanced("--drop-missing", source=COMPARE),

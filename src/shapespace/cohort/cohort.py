@@ -138,6 +138,8 @@ class Cohort:
         observed: (N, V) bool, False for vertices that are estimates; None if all are observed.
         analysed: (V,) bool, False for vertices that too few shapes observe: there all shapes have one position, and
             nothing varies. None if all are analysed.
+        position_std: (V,) RMS over the shapes read of `Mesh.position_std`, in the size of `reference`; None if a shape
+            has none.
     """
 
     names: tuple[str, ...]
@@ -155,6 +157,7 @@ class Cohort:
     unit: LengthUnit = "mm"
     observed: BoolArray | None = None
     analysed: BoolArray | None = None
+    position_std: FloatArray | None = None
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -394,7 +397,13 @@ class Cohort:
         cohort = Cohort.of_shapes(
             shapes, {}, names=names, faces=first.faces, gauge=gauge, onto=onto, least=least, observed=observed
         )
-        return replace(cohort, table=table)
+        stds = [mesh.position_std for mesh in meshes if mesh.position_std is not None]
+        if len(stds) < len(meshes):
+            return replace(cohort, table=table)
+        sizes = np.array([centroid_size(shape) for shape in shapes])
+        scale = np.ones(len(meshes)) if gauge == "form" else centroid_size(cohort.reference) / sizes
+        squares = (scale[:, None] * np.stack(stds)) ** 2
+        return replace(cohort, table=table, position_std=read_only(np.sqrt(squares.mean(axis=0))))
 
     @staticmethod
     def of_fits(

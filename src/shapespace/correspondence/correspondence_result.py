@@ -36,6 +36,8 @@ class Corresponding:
         landmarks: RMS distance of the scan's landmarks from their places on the surface, in the scan's unit;
             not-a-number where it has none.
         observed: (V,) bool, False where `vertices` are estimates; None if excluded.
+        position_std: (V,) standard deviation of each vertex's position in any direction along the surface, in the
+            scan's unit: with 90 % probability the position is within 2.15 times it; None if excluded.
     """
 
     name: str
@@ -54,6 +56,7 @@ class Corresponding:
     probability: float = np.nan
     doubt: str = ""
     evidence: ScanEvidence | None = None
+    position_std: FloatArray | None = None
 
     __repr__ = short_repr
 
@@ -104,4 +107,7 @@ class Correspondence:
     def _mesh(self, scan: Corresponding, vertices: FloatArray) -> Mesh:
         observed = np.ones(len(vertices), dtype=np.bool_) if scan.observed is None else scan.observed
         landmarks = self.landmarks.within(observed).positions(vertices)
-        return Mesh(vertices, self.template.faces, landmarks, scan.name, observed=scan.observed)
+        return Mesh(
+            vertices, self.template.faces, landmarks, scan.name,
+            observed=scan.observed, position_std=scan.position_std,
+        )  # fmt: skip

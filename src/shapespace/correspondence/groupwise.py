@@ -36,6 +36,7 @@ from shapespace.correspondence.scan_status import Judgement, ScanEvidence, judge
 from shapespace.correspondence.settings import FEWEST, SIZE, CorrespondConfig
 from shapespace.correspondence.subject_tree import subject_levels
 from shapespace.correspondence.template import PoseModel, clean_scan
+from shapespace.correspondence.vertex_confidence import estimate_position_std
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.geometry.landmark_placement import place_landmarks
 from shapespace.geometry.mirror_plane import FLIP, mirror_image
@@ -891,6 +892,9 @@ def _scan_result(
     vertices = T.apply(complete)
     landmarks = problem.landmarks(state.landmarks, problem.scan(i, mirrored=registration.mirrored))
     mean, p95, p99, largest = (T.scale * length for length in registration.distance)
+    position_std = estimate_position_std(
+        complete, registration.observed, state.template, problem.harmonics, len(state.registrations)
+    )
     return Corresponding(
         name=problem.names[i],
         reason="",
@@ -908,4 +912,5 @@ def _scan_result(
         probability=judgement.probability,
         doubt=judgement.doubt,
         evidence=evidence,
+        position_std=T.scale * position_std,
     )

@@ -38,7 +38,8 @@ def part_of(mesh: Mesh, keep: BoolArray) -> Mesh:
         vertices, faces = without_vertices(mesh.vertices, faces, keep)
     colours = None if mesh.colours is None else mesh.colours[keep]
     observed = None if mesh.observed is None else mesh.observed[keep]
-    return replace(mesh, vertices=vertices, faces=faces, colours=colours, observed=observed)
+    std = None if mesh.position_std is None else mesh.position_std[keep]
+    return replace(mesh, vertices=vertices, faces=faces, colours=colours, observed=observed, position_std=std)
 
 
 def without_estimates(mesh: Mesh) -> Mesh:

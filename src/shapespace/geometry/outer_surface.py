@@ -13,7 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from shapespace.compiled import compiled
-from shapespace.geometry.normals import face_vectors, faces_of
+from shapespace.geometry.normals import face_vectors, faces_of, part_of
 from shapespace.geometry.remesh import LongArray
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
 
@@ -39,9 +39,7 @@ def outer_surface(mesh: Mesh) -> Mesh:
         return mesh
     used, faces = np.unique(mesh.faces[is_outer], return_inverse=True)
     faces = faces.reshape(-1, 3).astype(np.int32)
-    observed = None if mesh.observed is None else mesh.observed[used]
-    colours = None if mesh.colours is None else mesh.colours[used]
-    return replace(mesh, vertices=mesh.vertices[used], faces=faces, observed=observed, colours=colours)
+    return replace(part_of(mesh, np.isin(np.arange(len(mesh.vertices)), used)), faces=faces)
 
 
 def hidden_share(mesh: Mesh) -> float:

@@ -185,6 +185,7 @@ def mesh_of(
     colours: ByteArray | None = None,
     notes: tuple[str, ...] = (),
     observed: BoolArray | None = None,
+    position_std: FloatArray | None = None,
 ) -> Mesh:
     """Return the mesh read from `path`: (V, 3) float64 and (F, 3) int64, which `Mesh` checks and narrows.
 
@@ -198,6 +199,7 @@ def mesh_of(
         colours=colours,
         notes=notes,
         observed=observed,
+        position_std=position_std,
     )
 
 

@@ -43,8 +43,13 @@ SquaresType: TypeAlias = Literal["I", "II", "III"]
 TYPES: tuple[SquaresType, ...] = ("I", "II", "III")
 """Of sums of squares: of a term after those before it, after all that do not contain it, or after all others."""
 
+VertexWeights: TypeAlias = Literal["confidence", "none"]
 _RANK = 1e-9  # ratio of singular values; below is float64 rounding
 _TIE = 1e-9  # relative; statistics nearer than float64 sums are accurate count as equal
+_WEIGHTED_NOTE = (
+    "Vertices have weights in the sums of squares by the standard deviation of their position along the surface; "
+    "--weights none gives all the same weight."
+)
 MOST_LEVELS = 6
 """Largest number of classes of a variable whose pairs are compared."""
 
@@ -71,6 +76,9 @@ class CompareConfig:
             residuals.
         effect_size: transformation of F in the effect size Z: `box-cox`, as in RRPP from version 0.6, or `log`, as
             before.
+        weights: of the vertices in the sums of squares: `confidence`, smaller where the position along the surface is
+            uncertain, if all surfaces are from a correspondence that has estimated this; `none`: all are equal, as
+            always with unequal variances.
     """
 
     anova_type: SquaresType = "II"
@@ -84,6 +92,7 @@ class CompareConfig:
     random: str | None = None
     unequal_variances: bool = False
     effect_size: EffectSize = "box-cox"
+    weights: VertexWeights = "confidence"
 
     def __post_init__(self) -> None:
         if self.anova_type not in TYPES:
@@ -300,10 +309,14 @@ def compare(
     design = design_of(formula, cohort.table)
     subjects = None if config.blocks is None else cohort.table.texts(config.blocks)
     repeated = subjects is not None and len(set(subjects)) < len(subjects)
-    made = strata_of(
-        cohort.coefficients, design, subjects if repeated else None, config.blocks or "", config.anova_type, random
+    root = _weight_root(cohort) if config.weights == "confidence" and not config.unequal_variances else None
+    made, weighted = (
+        strata_of(shapes, design, subjects if repeated else None, config.blocks or "", config.anova_type, random)
+        for shapes in (cohort.coefficients, cohort.coefficients if root is None else cohort.coefficients @ root)
     )
-    strata = made.every
+    if root is not None:
+        cohort = replace(cohort, notes=(*cohort.notes, _WEIGHTED_NOTE))
+    strata = weighted.every
     families = [_weighted(cohort, design, family) for family in _families(design, made)]
     total = len(design.terms) + len(families) * (1 + config.maps)
     step = StepCounter(total, progress).add
@@ -318,11 +331,11 @@ def compare(
     effects = tuple(
         replace(effect, exploratory=_is_exploratory(effect, design, tests, config))
         for family in families
-        for effect in _effects(cohort, family, design, owners, config, step)
+        for effect in _effects(cohort, family, design, owners, config, root, step)
     )
     dispersions = tuple(
         test
-        for stratum in strata
+        for stratum in made.every
         if is_between_units(stratum)
         for test in units_of(stratum, design, owners).dispersions(cohort.n_vertices, config.permutations, config.seed)
     )
@@ -350,6 +363,20 @@ def _random(config: CompareConfig, cohort: Cohort) -> tuple[tuple[frozenset[str]
     if config.blocks not in (None, column):
         raise InputError(f"Blocks of {config.blocks!r} and random terms of {column!r} differ; give one of the two.")
     return effects, replace(config, blocks=column)
+
+
+def _weight_root(cohort: Cohort) -> FloatArray | None:
+    """Return L (K, K), so that coefficients C have the sums of squares of C L with vertices weighted by confidence.
+
+    The weight is v / (v + s^2), with the variance v of a coordinate, mean over the vertices, and `position_std` s. It
+    does not depend on the table, so that rows stay exchangeable. None where `position_std` is not known.
+    """
+    if cohort.position_std is None:
+        return None
+    centred = cohort.coefficients - cohort.coefficients.mean(axis=0)
+    variance = float((centred**2).sum()) / (len(cohort) * cohort.basis.shape[1])
+    weight = np.repeat(variance / (variance + cohort.position_std**2), 3)  # S15
+    return np.asarray(np.linalg.cholesky((cohort.basis * weight) @ cohort.basis.T), dtype=np.float64)
 
 
 def _with_sizes(cohort: Cohort) -> Cohort:
@@ -597,10 +624,11 @@ def _effects(
     design: Design,
     subjects: Sequence[str] | None,
     config: CompareConfig,
+    root: FloatArray | None,
     step: Callable[[], None],
 ) -> Iterator[ShapeEffect]:
     parts = [list(own) for _, own in itertools.groupby(family.ends, key=lambda ends: id(ends.stratum))]
-    made = [_tested_together(cohort, own, design, subjects, config) for own in parts]
+    made = [_tested_together(cohort, own, design, subjects, config, root) for own in parts]
     largest = np.max([f for f, _, _ in made for f in f], axis=0)
     mean = cohort.coefficients.mean(axis=0)
     step()
@@ -633,8 +661,9 @@ def _tested_together(
     design: Design,
     subjects: Sequence[str] | None,
     config: CompareConfig,
+    root: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray, Sequence[EffectMap | None]]:
-    """Return F (E, P), changes (E, K) in mm and maps of E contrasts of one stratum."""
+    """Return F (E, P), weighted by `root`, changes (E, K) in mm and maps of E contrasts of one stratum."""
     stratum, reduced = family[0].stratum, family[0].reduced
     if config.unequal_variances:
         return _tested_unequal(cohort, family, units_of(stratum, design, subjects), config)
@@ -643,8 +672,9 @@ def _tested_together(
     lengths = np.maximum(np.linalg.norm(directions, axis=1), 1e-300)
     along = (directions / lengths[:, None]) @ stratum.basis
     products = stratum.products(stratum.basis, residual, config.permutations, config.seed, flips=flips)
-    error = ((residual**2).sum() - (products**2).sum(axis=(1, 2))) / stratum.df_error
-    f = np.stack([_ratio((np.einsum("m,pmk->pk", a, products) ** 2).sum(axis=1), error) for a in along])
+    left, drawn = (residual, products) if root is None else (residual @ root, products @ root)
+    error = ((left**2).sum() - (drawn**2).sum(axis=(1, 2))) / stratum.df_error
+    f = np.stack([_ratio((np.einsum("m,pmk->pk", a, drawn) ** 2).sum(axis=1), error) for a in along])
     changes = directions @ stratum.shapes
     if not config.maps:
         return f, changes, [None] * len(family)

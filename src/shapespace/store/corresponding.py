@@ -49,7 +49,10 @@ class SurfaceFiles:
         """
         mesh, ratio = mesh_at(file), self.unit_ratios.get(file, 1.0)
         mesh = mirror_image(mesh) if file in self.mirrored else mesh
-        return mesh if ratio == 1.0 else mesh.with_vertices(mesh.vertices / ratio)
+        if ratio == 1.0:
+            return mesh
+        std = None if mesh.position_std is None else mesh.position_std / ratio
+        return replace(mesh, vertices=mesh.vertices / ratio, position_std=std)
 
     def without_doubtful(self, option: str) -> SurfaceFiles:
         """Return the files without doubtful surfaces of a correspondence, with a note; `option` includes them.

@@ -26,7 +26,7 @@ MAX_MARKED = 100
 """Vertices whose positions can be asked for at a time."""
 
 _PAGE, _PAGE_BYTES = 11, 24 * 2**20  # surfaces on a page, and bytes that a page may send
-_BYTES_PER_VERTEX = 6  # bytes; three coordinates of 16 bits
+_BYTES_PER_VERTEX = 10  # bytes; three coordinates of 16 bits, one number of 32
 _STATUS_ORDER = ("unreadable", "excluded", "doubtful", "look", "converged")
 
 
@@ -68,7 +68,8 @@ class Surfaces:
         }
 
     def packed_mean(self) -> bytes:
-        """Return the mean shape, upright, its checkerboard, and the number of scans that show each vertex."""
+        """Return the mean shape, upright, its checkerboard, the number of scans that show each vertex, and the RMS
+        standard deviation of its position along the surface, percent of the size, where files have it."""
         with self._lock:
             if self._packed_mean is None:
                 self._packed_mean = self._pack_mean()
@@ -84,7 +85,9 @@ class Surfaces:
             "places": np.stack([along, across], axis=1),
             "seen": population.seen_count.astype(np.int32),
         }
-        return pack(arrays, {"scans": len(population.names)})
+        if population.position_std is not None:
+            arrays["std"] = 100 * population.position_std
+        return pack(arrays, {"scans": len(population.names), "std_limit": population.position_std_limit})
 
     def rows(self) -> list[dict[str, Any]]:
         """Return the list of scans, those with concerns first."""
@@ -124,8 +127,11 @@ class Surfaces:
             raise KeyError(name)
         with self._lock:
             self._corresponded.population()
-        vertices = self._corresponded.placed(name).vertices
-        return pack({"positions": quantise(vertices, coded=True)}, {"name": name})
+        placed = self._corresponded.placed(name)
+        arrays: dict[str, Any] = {"positions": quantise(placed.vertices, coded=True)}
+        if placed.position_std is not None:
+            arrays["std"] = 100 * placed.position_std
+        return pack(arrays, {"name": name})
 
     def positions_csv(self, vertices: Sequence[int]) -> str:
         """Return a CSV of the positions of `vertices` on every scan, in its own frame and unit; empty where missing.

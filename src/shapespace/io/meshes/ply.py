@@ -40,8 +40,8 @@ _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _MAX_HEADER = 1 << 20  # bytes (1 MiB)
 _FIRST_LINES = 512  # bytes that hold the comment
 _COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
-_OBSERVED = "observed"
-"""Vertex property of surfaces in correspondence: 0 where the position is an estimate."""
+_OBSERVED, _POSITION_STD = "observed", "position_std"
+"""Vertex properties of surfaces in correspondence: 0 where the position is an estimate; `Mesh.position_std`."""
 _INDEX_LISTS = ("vertex_indices", "vertex_index")
 
 
@@ -143,6 +143,7 @@ def read_ply(data: bytes, path: Path) -> Mesh:
     vertices: FloatArray | None = None
     colours: ByteArray | None = None
     observed: BoolArray | None = None
+    std: FloatArray | None = None
     faces: IndexArray | None = None
     words = _Words(data, offset)
     for element in elements:
@@ -166,12 +167,12 @@ def read_ply(data: bytes, path: Path) -> Mesh:
                 _refuse_without_xyz(element, path)
             if order == "":
                 if positions:
-                    vertices, colours, observed = _ascii_vertices(words, element, path)
+                    vertices, colours, observed, std = _ascii_vertices(words, element, path)
                 else:
                     words.skip(element.count * len(element.properties))
             else:
                 if positions:
-                    vertices, colours, observed = _binary_vertices(data, offset, element, order)
+                    vertices, colours, observed, std = _binary_vertices(data, offset, element, order)
                 offset += element.count * element.least_bytes(False)
             continue
         if element.name == "vertex":
@@ -182,7 +183,7 @@ def read_ply(data: bytes, path: Path) -> Mesh:
             faces = fan_triangles(counts, corners)
     if vertices is None:
         raise damage_error(path, "its header declares no vertices")
-    return mesh_of(vertices, faces, path, colours, observed=observed)
+    return mesh_of(vertices, faces, path, colours, observed=observed, position_std=std)
 
 
 def probe_ply(head: bytes, size: int, path: Path) -> None:
@@ -268,14 +269,21 @@ def _colours(element: _Element, columns: dict[str, npt.NDArray[Any]]) -> ByteArr
     return bytes_of_colours(values)
 
 
-_Vertices: TypeAlias = tuple[FloatArray, ByteArray | None, BoolArray | None]
-"""Positions (V, 3), colours (V, 3) and mask (V,) of observed vertices."""
+_Vertices: TypeAlias = tuple[FloatArray, ByteArray | None, BoolArray | None, FloatArray | None]
+"""Positions (V, 3), colours (V, 3), mask (V,) of observed vertices, and `Mesh.position_std` (V,)."""
 
 
 def _is_observed(element: _Element, column: npt.NDArray[Any] | None) -> BoolArray | None:
     """Return the mask (V,) of observed vertices; None unless the property holds whole numbers."""
     kinds = {p.item[0] for p in element.properties if p.name == _OBSERVED}
     return None if column is None or "f" in kinds else np.asarray(column != 0)
+
+
+def _position_std(element: _Element, column: npt.NDArray[Any] | None) -> FloatArray | None:
+    """Return standard deviations (V,) of positions; None unless the property has finite lengths."""
+    kinds = {p.item[0] for p in element.properties if p.name == _POSITION_STD}
+    is_length = column is not None and "f" in kinds and np.isfinite(column).all() and (column >= 0).all()
+    return np.asarray(column, dtype=np.float64) if is_length else None
 
 
 def _binary_vertices(data: bytes, offset: int, element: _Element, order: str) -> _Vertices:
@@ -286,14 +294,14 @@ def _binary_vertices(data: bytes, offset: int, element: _Element, order: str) ->
     for axis, name in enumerate("xyz"):
         out[:, axis] = table[f"p{names.index(name)}"]
     colours = _colours(element, {name: table[f"p{names.index(name)}"] for name in _colour_names(names)})
-    mask = table[f"p{names.index(_OBSERVED)}"] if _OBSERVED in names else None
-    return out, colours, _is_observed(element, mask)
+    mask, std = (table[f"p{names.index(n)}"] if n in names else None for n in (_OBSERVED, _POSITION_STD))
+    return out, colours, _is_observed(element, mask), _position_std(element, std)
 
 
 def _ascii_vertices(words: _Words, element: _Element, path: Path) -> _Vertices:
     names = [p.name for p in element.properties]
     width = len(names)
-    flags = (_OBSERVED,) if _OBSERVED in names else ()
+    flags = [name for name in (_OBSERVED, _POSITION_STD) if name in names]
     columns: dict[str, list[FloatArray]] = {name: [] for name in ("x", "y", "z", *_colour_names(names), *flags)}
     n_read = 0
     for part in words.take(element.count * width):
@@ -305,7 +313,8 @@ def _ascii_vertices(words: _Words, element: _Element, path: Path) -> _Vertices:
         raise _truncation_error(element, path)
     arrays = {name: join_parts(parts, np.float64) for name, parts in columns.items()}
     positions = np.stack([arrays[axis] for axis in "xyz"], axis=1)
-    return positions, _colours(element, arrays), _is_observed(element, arrays.get(_OBSERVED))
+    mask, std = _is_observed(element, arrays.get(_OBSERVED)), _position_std(element, arrays.get(_POSITION_STD))
+    return positions, _colours(element, arrays), mask, std
 
 
 def _truncation_error(element: _Element, path: Path) -> FileFormatError:
@@ -450,7 +459,7 @@ def _indices(values: npt.NDArray[Any]) -> IndexArray:
 def write_ply(mesh: Mesh, comment: str = "") -> bytes:
     """Return `mesh` as binary little-endian PLY with double coordinates; reading it back is exact.
 
-    Colours and the mask of observed vertices are vertex properties of type uchar.
+    Colours and the mask of observed vertices are vertex properties of type uchar, `position_std` is a float.
 
     Args:
         mesh: vertices in whatever unit they are in.
@@ -467,6 +476,9 @@ def write_ply(mesh: Mesh, comment: str = "") -> bytes:
     if mesh.observed is not None:
         lines.append(f"property uchar {_OBSERVED}")
         columns.append((_OBSERVED, "u1", (), mesh.observed))
+    if mesh.position_std is not None:
+        lines.append(f"property float {_POSITION_STD}")
+        columns.append((_POSITION_STD, "<f4", (), mesh.position_std))
     rows = np.empty(len(mesh.vertices), dtype=[column[:3] for column in columns])
     for name, _, _, values in columns:
         rows[name] = values

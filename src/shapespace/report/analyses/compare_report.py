@@ -77,6 +77,7 @@ def compare_report(result: CompareResult) -> AnalysisReport:
             "level": result.config.alpha,
             "unequal_variances": result.config.unequal_variances,
             "effect_size": result.config.effect_size,
+            "weights": result.config.weights,
             "gauge": result.cohort.gauge,
             "shapes": len(result.cohort),
             "subjects": result.n_subjects,

@@ -19,6 +19,7 @@ from shapespace.report.figures.correspondence_figures import (
     missing_figure,
     movement_figure,
     nearness_figure,
+    position_std_figure,
 )
 from shapespace.report.figures.draw import STAGE_WORDS, encode_webp
 from shapespace.report.figures.fit_figures import (
@@ -98,6 +99,7 @@ __all__ = [
     "over_time_figure",
     "overlay_figure",
     "portrait_figure",
+    "position_std_figure",
     "quality_figure",
     "regions_figure",
     "save_figure",

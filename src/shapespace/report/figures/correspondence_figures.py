@@ -79,10 +79,29 @@ def missing_figure(mean: Mesh, missing_share: FloatArray, *, title: str = "") ->
         missing_share: (V,) 0 to 1.
         title: above the figure.
     """
-    sides = (("front", 0.0), ("one side", 90.0), ("back", 180.0), ("other side", 270.0))
     largest_share = float(missing_share.max(initial=0.0))
     top = next(limit for limit in (0.05, 0.1, 0.25, 0.5, 1.0) if largest_share <= limit)
-    layer = Layer(mean, scalars=100 * missing_share, colormap=SEQUENTIAL, vmax=100 * top)
+    scale = Scale("scans that do not show the vertex (%)", SEQUENTIAL, 0.0, 100 * top)
+    return _from_four_sides(mean, 100 * missing_share, scale, title or "Where vertices are missing")
+
+
+def position_std_figure(mean: Mesh, position_std: FloatArray, limit: float, *, title: str = "") -> Figure:
+    """Draw the standard deviation of the position of each vertex along the surface, on the mean shape from four sides.
+
+    Args:
+        mean: the mean shape, upright.
+        position_std: (V,) shares of the size.
+        limit: end of the scale, percent.
+        title: above the figure.
+    """
+    scale = Scale("standard deviation along the surface (% of the size)", SEQUENTIAL, 0.0, limit, "high")
+    return _from_four_sides(mean, 100 * position_std, scale, title or "How sure the position of each vertex is")
+
+
+def _from_four_sides(mean: Mesh, values: FloatArray, scale: Scale, title: str) -> Figure:
+    """Draw `values` (V,) on the mean shape from four sides."""
+    sides = (("front", 0.0), ("one side", 90.0), ("back", 180.0), ("other side", 270.0))
+    layer = Layer(mean, scalars=values, colormap=SEQUENTIAL, vmax=scale.high)
     front = view(mean.vertices, len(sides))
     height = max(view(mean.vertices, len(sides), yaw_deg=yaw).camera.height_mm for _, yaw in sides)
     panels: list[Image] = []
@@ -90,8 +109,7 @@ def missing_figure(mean: Mesh, missing_share: FloatArray, *, title: str = "") ->
         view_camera = view(mean.vertices, len(sides), yaw_deg=yaw).camera
         camera = Camera(view_camera.centre, height, yaw, 0.0, view_camera.distance_mm)
         panels.append(render(layer, camera=camera, size=front.size))
-    scale = Scale("scans that do not show the vertex (%)", SEQUENTIAL, 0.0, 100 * top)
-    return grid([Row(panels, [name for name, _ in sides])], title=title or "Where vertices are missing", scale=scale)
+    return grid([Row(panels, [name for name, _ in sides])], title=title, scale=scale)
 
 
 def nearness_figure(distances: FloatArray, *, title: str = "") -> Figure:

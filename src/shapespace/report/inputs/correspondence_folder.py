@@ -26,6 +26,7 @@ from shapespace.io.files import read_error, sha256_of_file
 from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.report.blocks.wording import printable, without_folders
 from shapespace.report.inputs.saved_fits import Folder
+from shapespace.report.inputs.staged_fit import nice_ceiling
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, read
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
 
@@ -42,10 +43,12 @@ class PlacedSurface:
     Args:
         vertices: (V, 3) in the frame of `Corresponded.mean`, size divided out; not-a-number where missing.
         T_scan_mean: from that frame to the scan's own.
+        position_std: (V,) `Mesh.position_std` as a share of the object's size; None where the file has none.
     """
 
     vertices: FloatArray
     T_scan_mean: Similarity
+    position_std: FloatArray | None
 
     @property
     def seen(self) -> BoolArray:
@@ -62,12 +65,20 @@ class Population:
         seen_count: (V,) how many of them show each vertex.
         sizes: (N,) RMS distance of the surfaces from their middle, in the scans' own units.
         unread: name to the reason, of those that cannot be read.
+        position_std: (V,) RMS of `PlacedSurface.position_std` over the scans that show a vertex; None if a file has
+            none.
     """
 
     names: tuple[str, ...]
     seen_count: npt.NDArray[np.int64]
     sizes: FloatArray
     unread: dict[str, str]
+    position_std: FloatArray | None
+
+    @property
+    def position_std_limit(self) -> float:
+        """End of a scale of `position_std`, percent: 98 % of the vertices are below it."""
+        return 1.0 if self.position_std is None else nice_ceiling(100 * float(np.quantile(self.position_std, 0.98)))
 
 
 class Corresponded:
@@ -153,7 +164,8 @@ class Corresponded:
             FileError: it cannot be read.
             FileFormatError: it is damaged, or not on the template of this folder.
         """
-        vertices = self.surface(name).vertices
+        surface = self.surface(name)
+        vertices, std = surface.vertices, surface.position_std
         is_observed = observed_mask(vertices)
         try:
             T = fit_similarity(self.mean.vertices[is_observed], vertices[is_observed])
@@ -161,7 +173,8 @@ class Corresponded:
             raise FileFormatError(
                 f"{name}{CorrespondRecord.SURFACE} cannot be laid onto the mean shape; {CORRESPOND_AGAIN}."
             ) from error
-        return PlacedSurface(np.where(is_observed[:, None], T.inverse().apply(vertices), np.nan), T)
+        share = None if std is None else std / (T.scale * rms_size(self._mean.vertices))
+        return PlacedSurface(np.where(is_observed[:, None], T.inverse().apply(vertices), np.nan), T, share)
 
     def raw_scan(self, record: CorrespondRecord) -> Mesh:
         """Return the scan of a record, reflected if it is mirrored, if it is in the same place with the same content.
@@ -193,7 +206,7 @@ class Corresponded:
             sizes: list[float] = []
             turns: list[FloatArray] = []
             unread: dict[str, str] = {}
-            size = rms_size(self._mean.vertices)
+            size, squares = rms_size(self._mean.vertices), np.zeros(len(counts))
             for record in self.corresponding:
                 try:
                     placed = self.placed(record.name)
@@ -204,11 +217,13 @@ class Corresponded:
                     if on_scan is not None:
                         on_scan(record.name)
                 counts += placed.seen
+                squares += np.nan if placed.position_std is None else placed.seen * placed.position_std**2
                 names.append(record.name)
                 sizes.append(placed.T_scan_mean.scale * size)
                 turns.append(placed.T_scan_mean.rotation)
             self.turn = upright(self._mean, turns)
-            self._population = Population(tuple(names), counts, np.array(sizes), unread)
+            std = np.sqrt(squares / np.maximum(counts, 1)) if names and np.isfinite(squares).all() else None
+            self._population = Population(tuple(names), counts, np.array(sizes), unread, std)
         return self._population
 
     @property

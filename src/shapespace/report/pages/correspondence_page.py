@@ -311,7 +311,25 @@ class CorrespondencePage:
                     alt="Share of scans that do not show each vertex, on the mean shape from four sides",
                 ),
             ),
+            *self._confidence(),
         ]
+
+    def _confidence(self) -> list[Block]:
+        """Return how sure the position of each vertex along the surface is; nothing for surfaces of older versions."""
+        from shapespace.report import figures
+
+        std = self.all.position_std
+        if std is None:
+            return []
+        caption = (
+            f"The position of the median vertex has a standard deviation of {percent_of(float(np.median(std)))} of the "
+            "size in any direction along the surface (RMS over the scans that show it); 90 % of the positions are "
+            "within 2.15 times it. It is large where the surface is flat or of constant curvature, so that no feature "
+            "determines the position. Single surfaces are in the viewer."
+        )
+        alt = "Standard deviation of the position of each vertex along the surface, on the mean shape from four sides"
+        figure = figures.position_std_figure(self.mean, std, self.all.position_std_limit)
+        return [self.page.figure(figure, caption, alt=alt)]
 
     # The scans
 

@@ -28,7 +28,7 @@
       const name = h("strong", {}), note = h("span", { class: "note", "data-testid": `note-${k}` });
       const box = h("div", { class: "cell", "data-testid": `cell-${k}` }, canvas, note, h("p", {}, name));
       $("grid").append(box);
-      const cell = { box, name, note, positions: null, view: new Shapespace.View(canvas, { label: "A surface in 3-D" }) };
+      const cell = { box, name, note, positions: null, std: null, view: new Shapespace.View(canvas, { label: "A surface in 3-D" }) };
       cell.view.on("click", (event) => {
         const hit = cell.view.pick(event.clientX, event.clientY, ["surface"]);
         if (hit) addMark(hit.vertex);
@@ -37,8 +37,9 @@
     }
   }
 
-  function put(cell, name, positions) {
+  function put(cell, name, { positions, std }) {
     cell.positions = positions;
+    cell.std = std;
     cell.name.textContent = name;
     cell.view.label = `${name} in 3-D`;
     cell.view.setSurface("surface", { positions, faces: mean.faces, colour: about.clay });
@@ -50,17 +51,17 @@
     if (!cell.positions) return;
     if (colour === "plain") cell.view.paint("surface", null);
     else if (colour === "squares") cell.view.paint("surface", mean.places, { squares: about.squares });
+    else if (colour === "std") cell.view.paint("surface", cell.std || null, { map: about.sequential, range: [0, stdLimit] });
     else cell.view.paint("surface", missing, { map: about.sequential, range: [0, most()] });
   }
 
-  let missing;
+  let missing, stdLimit;
   const most = () => [5, 10, 25, 50, 100].find((limit) => missing.every((value) => value <= limit));
 
   function drawBar() {
-    $("scale").hidden = colour !== "missing";
-    if (colour === "missing") {
-      Shapespace.colourBar($("scale"), { map: about.sequential, range: [0, most()], unit: "%", title: "Scans that do not show the vertex" });
-    }
+    const title = { missing: "Scans that do not show the vertex", std: "Standard deviation along the surface, of the size" }[colour];
+    $("scale").hidden = !title;
+    if (title) Shapespace.colourBar($("scale"), { map: about.sequential, range: [0, colour === "std" ? stdLimit : most()], unit: "%", title });
   }
 
   // Marks -----------------------------------------------------------------------------------------------------------
@@ -144,14 +145,14 @@
     const problems = [];
     for (let k = 0; k < shown.length; k++) {
       const cell = cells[k + 1];
-      let positions = null;
+      let arrays = null;
       try {
-        positions = (await binary(`/api/surfaces/${encodeURIComponent(shown[k].name)}`)).arrays.positions;
+        arrays = (await binary(`/api/surfaces/${encodeURIComponent(shown[k].name)}`)).arrays;
       } catch (error) {
         problems.push(error.message);
       }
       if (mine !== turn) return;
-      if (positions) put(cell, shown[k].name, positions);
+      if (arrays) put(cell, shown[k].name, arrays);
       else cell.box.hidden = true;
     }
     for (const cell of cells.slice(1 + shown.length)) {
@@ -188,7 +189,9 @@
     scans = unpacked.facts.scans;
     missing = Float32Array.from(mean.seen, (count) => (100 * (scans - count)) / Math.max(scans, 1));
     makeCells();
-    put(cells[0], "Mean shape", mean.positions);
+    stdLimit = unpacked.facts.std_limit;
+    $("colours").querySelector("[data-colour=std]").hidden = !mean.std;
+    put(cells[0], "Mean shape", mean);
     cells[0].view.frame(["surface"], 1.06);
     for (const cell of cells.slice(1)) cells[0].view.link(cell.view);
     Viewer.startTheme(() => cells.forEach((cell) => cell.view.request()));
