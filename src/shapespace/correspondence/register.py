@@ -10,6 +10,7 @@ docs/correspondence.md.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,6 +47,9 @@ class ElasticSettings:
         borders: whether what is matched with a border counts.
         floor: share of full weight below which nothing is seen, and the average fades.
         turn: length that a difference of the normals by a radian, or so, counts as much as.
+        tangential: forces along the surface are averaged over this range at least: over shorter ones they are noise of
+            the triangles, and move points away from the correct places that they had.
+        tangential_gain: factor of these forces below that range, as so wide an average makes them smaller.
     """
 
     harmonics: int = 400
@@ -59,6 +63,8 @@ class ElasticSettings:
     borders: bool = False
     floor: float = 0.05
     turn: float = 0.1
+    tangential: float = 0.2
+    tangential_gain: float = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +175,7 @@ def _step(problem: _Problem, state: ElasticState, range_share: float, rng: np.ra
     own, surface, scan = _samples(problem, state, range_share > settings.fine * settings.widest, rng)
     force, weight = _forces(surface, scan, settings, size_mm)
     weight = weight * _inlier_probability(force, weight, settings.inliers, size_mm)
-    x = x + _averaged(harmonics, own, force, weight, range_mm, settings.floor)
+    x = x + _averaged(harmonics, own, _parts(force, surface.normals, range_share, settings), weight, settings, size_mm)
     pose = fit_similarity(problem.base, x)
     T, x = T @ pose, pose.inverse().apply(x)
     x = problem.base + harmonics.diffused(x - problem.base, range_mm)  # C7
@@ -244,13 +250,32 @@ def _inlier_probability(force: FloatArray, weight: FloatArray, inliers: float, s
     return probability
 
 
+def _parts(
+    force: FloatArray, normals: FloatArray, range_share: float, settings: ElasticSettings
+) -> list[tuple[float, FloatArray]]:
+    """Return the parts of the forces that are averaged over different ranges, shares of the size."""
+    if range_share >= settings.tangential:
+        return [(range_share, force)]
+    normal = np.einsum("md,md->m", force, normals)[:, None] * normals
+    return [(range_share, normal), (settings.tangential, settings.tangential_gain * (force - normal))]
+
+
 def _averaged(
-    harmonics: Harmonics, own: IntArray, force: FloatArray, weight: FloatArray, range_mm: float, floor: float
+    harmonics: Harmonics,
+    own: IntArray,
+    parts: Sequence[tuple[float, FloatArray]],
+    weight: FloatArray,
+    settings: ElasticSettings,
+    size_mm: float,
 ) -> FloatArray:
-    """Return (V, 3) the average (C6) of forces at the vertices `own`, everywhere."""
+    """Return (V, 3) the average (C6) of forces at the vertices `own`, everywhere: each part over its range."""
     functions, area = harmonics.functions[own], harmonics.area[own]
     area = area * (harmonics.area.sum() / area.sum())
-    weighted = np.column_stack([weight[:, None] * force, weight])
-    attenuation = harmonics.attenuation(range_mm)[:, None]
-    diffused = harmonics.functions @ (attenuation * (functions.T @ (area[:, None] * weighted)))
-    return diffused[:, :3] / np.maximum(diffused[:, 3:], floor)  # C6
+    columns = [np.column_stack([weight[:, None] * force, weight]) for _, force in parts]
+    coefficients = np.split(functions.T @ (area[:, None] * np.hstack(columns)), len(parts), axis=1)
+    smooth = [
+        harmonics.attenuation(range_share * size_mm)[:, None] * own_coefficients
+        for (range_share, _), own_coefficients in zip(parts, coefficients, strict=True)
+    ]
+    diffused = np.split(harmonics.functions @ np.hstack(smooth), len(parts), axis=1)
+    return np.sum([one[:, :3] / np.maximum(one[:, 3:], settings.floor) for one in diffused], axis=0)  # C6
