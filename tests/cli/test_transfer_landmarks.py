@@ -53,7 +53,7 @@ def test_each_scan_gets_the_landmarks_in_all_formats_with_triangle_region_and_st
             np.testing.assert_allclose(weights @ scan.vertices[corners], places(same, name)[row["name"]], atol=1e-3)
             given = name in ("able", "cable")
             assert row["status"] == ("marked" if given else "converged")
-            assert row["radius_90_mm"] == "" if given else 0 < float(row["radius_90_mm"]) < 20
+            assert row["radius_90"] == "" if given else 0 < float(row["radius_90"]) < 20
     lines = (out / "landmarks.tps").read_text().splitlines()
     assert [line for line in lines if "=" in line] == [x for name in NAMES for x in ("LM3=3", f"ID={name}")]
     np.testing.assert_allclose(np.array(lines[6].split(), dtype=float), places(same, "baker")["a"], atol=1e-3)

@@ -37,6 +37,7 @@ FACES = Source("commands.data", "write_simulated_faces")
 ORGANS = Source("commands.data", "write_simulated_organs")
 BONES = Source("commands.data", "write_simulated_bones")
 SURFACE = Source("commands.surface", "write_surfaces")
+LANDMARKS_TRANSFER = Source("commands.landmarks", "transfer_landmarks")
 LANDMARKS = Source("commands.landmarks", "suggest_specimens")
 TRAIN = Source("commands.recognise", "recognise_train")
 STUDY = Source("commands.recognise", "recognise_study")
@@ -496,11 +497,13 @@ COMMANDS: tuple[Command, ...] = (
         "landmarks transfer", "transfer landmarks from a few marked specimens to all scans in correspondence",
         ("shapespace correspond scans -o same", "shapespace landmarks transfer marked same -o landmarks"),
         run.landmarks_transfer,
-        (_MARKED, _SAME, _OUTPUT),
+        (_MARKED, _SAME, _OUTPUT, basic("--semilandmarks", "FILE.csv", source=LANDMARKS_TRANSFER, parse=Path)),
         (
             "Writes the landmarks of each scan, in its frame and unit: NAME.landmarks.csv (position, triangle with "
             "barycentric weights, radius of the 90 % region, status), NAME.landmarks.mrk.json and NAME.landmarks.fcsv, "
-            "and landmarks.tps with all scans. Landmarks of marked specimens stay as they are.",
+            "and landmarks.tps with all scans. Landmarks of marked specimens stay as they are. With --semilandmarks, "
+            "curveslide.csv and surfslide.csv contain the numbers of the semilandmarks in landmarks.tps, as geomorph "
+            "reads them.",
         ),
     ),
     Command(

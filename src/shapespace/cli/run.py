@@ -380,7 +380,10 @@ def landmarks_transfer(arguments: argparse.Namespace) -> int:
     from shapespace.commands.landmarks import TPS, transfer_landmarks
 
     folder = arguments.output
-    records = transfer_landmarks(arguments.marked, arguments.scans, folder, quiet=arguments.quiet, say=warn)
+    options = given(arguments, transfer_landmarks)
+    records = transfer_landmarks(
+        arguments.marked, arguments.scans, folder, **options, quiet=arguments.quiet, say=warn
+    )
     if arguments.json:
         show_json({"folder": str(folder), "records": records})
         return 0

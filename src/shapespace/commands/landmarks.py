@@ -15,16 +15,18 @@ from shapespace.batch.fit_work import Job
 from shapespace.batch.progress import progress
 from shapespace.commands.inputs import Given
 from shapespace.commands.landmark_files import LandmarkFiles
-from shapespace.correspondence.landmark_transfer import LandmarkCheck, MarkedSpecimens
-from shapespace.errors import InputError, ShapespaceError
+from shapespace.correspondence.landmark_transfer import LandmarkCheck, MarkedSpecimens, TransferredLandmarks
+from shapespace.correspondence.semilandmarks import SemilandmarkSet, Semilandmarks
+from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.geometry.landmark_placement import place_landmarks
 from shapespace.geometry.normals import rms_size
-from shapespace.io.files import make_folder, write_text
+from shapespace.io.files import make_folder, read_bytes, write_text
 from shapespace.io.landmarks.fiducials import point_texts
 from shapespace.io.landmarks.landmark_io import read_landmarks, surface_landmark_cells, tps_text
 from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.io.remote import is_address
-from shapespace.io.tables.table_io import table_text, write_rows
+from shapespace.io.read_limits import LARGEST_LANDMARK_FILE_BYTES
+from shapespace.io.tables.table_io import table_rows, table_text, write_rows
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, read
 from shapespace.store.corresponding import RECORD, SUMMARY, json_of, surface_files, surface_stem
 from shapespace.store.results import mesh_at
@@ -32,6 +34,10 @@ from shapespace.types import FloatArray, Mesh, SurfaceLandmarks
 
 TPS = "landmarks.tps"
 """File in the output folder with the landmarks of all scans."""
+CURVE_SLIDERS, SURFACE_SLIDERS = "curveslide.csv", "surfslide.csv"
+"""Files with the numbers of semilandmarks in `TPS` from 1, as geomorph reads them: before, slide, after; and surface."""
+_SET_COLUMNS, _THEN = ("name", "kind", "along", "points"), ">"
+"""Columns of a table of curves and patches, and the character between the names along one."""
 _SAME_MARK = 0.01
 """Share of the specimen's size: two files with landmarks of one specimen that differ more contradict each other."""
 Say = Callable[[str], None]
@@ -48,16 +54,20 @@ class _Correspondence:
 
 
 def transfer_landmarks(
-    marked: Path, scans: Path, folder: Path, *, quiet: bool = False, say: Say
+    marked: Path, scans: Path, folder: Path, semilandmarks: Path | None = None, *, quiet: bool = False, say: Say
 ) -> list[dict[str, Any]]:
     """Write the landmarks of all scans of a correspondence, predicted from those of marked specimens.
 
-    Each scan gets NAME.landmarks.csv, .mrk.json and .fcsv; `TPS` has those of all.
+    Each scan gets NAME.landmarks.csv, .mrk.json and .fcsv; `TPS` has those of all, `CURVE_SLIDERS` and
+    `SURFACE_SLIDERS` which of them are semilandmarks.
 
     Args:
         marked: folder of landmark files with the names of the scans.
         scans: folder that `correspond` wrote.
         folder: output folder.
+        semilandmarks: table of curves and patches for evenly spaced semilandmarks: name, kind (curve or patch), along
+            (names of landmarks along the curve, with > between them; of landmarks and curves around the patch, which
+            end where they begin), points
         quiet: show no progress.
         say: called with each message.
 
@@ -69,17 +79,19 @@ def transfer_landmarks(
         FileError: something cannot be read or written.
     """
     same = _open(scans, marked, say)
+    sets = [] if semilandmarks is None else _read_sets(semilandmarks)
+    planned = Semilandmarks.of(same.specimens, sets) if sets else None
     if len(same.given) > 1:
         for one in same.specimens.check():
             if one.finding:
                 say(f"{_sentence(one)} See shapespace landmarks check.")
     records: list[dict[str, Any]] = []
-    names, all_points = same.specimens.names, dict[str, FloatArray]()
+    names, all_points = [*same.specimens.names, *(planned.names if planned else ())], dict[str, FloatArray]()
     make_folder(folder)
     with progress(len(same.specimens.surfaces), "landmarks on", "scan", quiet=quiet) as bar:
         for surface in same.specimens.surfaces:
             scan = _scan(same, surface, say)
-            record, texts = _transferred(same, surface, scan)
+            record, texts = _transferred(same, surface, scan, planned)
             for ending, text in texts.items():
                 write_text(folder / f"{surface.name}{ending}", text)
             points = {row["name"]: np.array(row["position"]) for row in record["landmarks"]}
@@ -87,7 +99,37 @@ def transfer_landmarks(
             records.append(record)
             bar.update()
     write_text(folder / TPS, tps_text(all_points))
+    if planned:
+        number = {name: k for k, name in enumerate(names, start=1)}
+        curves = [[number[name] for name in row] for row in planned.sliders()]
+        write_rows(folder / CURVE_SLIDERS, ("before", "slide", "after"), curves)
+        surface_rows = [[number[name]] for one in sets if one.kind == "patch" for name in one.names]
+        write_rows(folder / SURFACE_SLIDERS, ("surface",), surface_rows)
     return records
+
+
+def _read_sets(file: Path) -> list[SemilandmarkSet]:
+    """Read a table of curves and patches.
+
+    Raises:
+        FileError: it cannot be read.
+        FileFormatError: it is no such table.
+    """
+    try:
+        header, *rows = table_rows(read_bytes(file, LARGEST_LANDMARK_FILE_BYTES))
+    except ValueError as error:
+        raise FileFormatError(f"{file} {error}; correct the table.") from error
+    if not rows or not set(_SET_COLUMNS) <= set(header):
+        raise FileFormatError(f"{file} needs the columns {', '.join(_SET_COLUMNS)} and a row for each curve or patch.")
+    sets: list[SemilandmarkSet] = []
+    for row in rows:
+        name, kind, along, points = (row[header.index(column)].strip() for column in _SET_COLUMNS)
+        if kind not in ("curve", "patch") or not name or not points.isdecimal():
+            raise FileFormatError(
+                f"{file}: the row {', '.join(row)!r} needs a name, the kind curve or patch, and a whole number of points."
+            )
+        sets.append(SemilandmarkSet(name, kind, tuple(part.strip() for part in along.split(_THEN)), int(points)))
+    return sets
 
 
 def check_landmarks(marked: Path, scans: Path, output: Path | None = None, *, say: Say) -> list[LandmarkCheck]:
@@ -201,40 +243,50 @@ def _scan(same: _Correspondence, surface: Mesh, say: Say) -> Mesh | None:
         return None
 
 
-def _transferred(same: _Correspondence, surface: Mesh, scan: Mesh | None) -> tuple[dict[str, Any], dict[str, str]]:
+def _transferred(
+    same: _Correspondence, surface: Mesh, scan: Mesh | None, semilandmarks: Semilandmarks | None
+) -> tuple[dict[str, Any], dict[str, str]]:
     """Return the record of one scan, and ending -> text of its files; given landmarks stay where they are."""
     mesh, own = scan or surface, same.given.get(surface.name, {})
     placed = place_landmarks(Mesh(mesh.vertices, mesh.faces, name=surface.name), own) if own else SurfaceLandmarks()
-    rows = [(name, "marked", "", None, point) for name, point in own.items()]
-    status = "marked"
+    rows: list[dict[str, Any]] = [
+        {"name": name, "status": "marked", "reason": "", "radius_90": None, "position": point.tolist()}
+        for name, point in own.items()
+    ]
+
+    def add(found: TransferredLandmarks) -> None:
+        nonlocal placed
+        new = [k for k, name in enumerate(found.names) if name not in own]
+        placed = placed.joined(found.on_scan.select([found.names[k] for k in new]))
+        for k in new:
+            radius, status = float(found.radius_90[k]), "doubtful" if found.reasons[k] else "converged"
+            rows.append(
+                {"name": found.names[k], "status": status, "reason": found.reasons[k],
+                 "radius_90": radius if np.isfinite(radius) else None, "position": found.positions[k].tolist()}
+            )  # fmt: skip
+
     if len(same.given) > bool(own):
-        predicted = same.specimens.transfer(surface.name, scan)
-        new = [k for k, name in enumerate(predicted.names) if name not in own]
-        placed = placed.joined(predicted.on_scan.select([predicted.names[k] for k in new]))
-        states = ["doubtful" if reason else "converged" for reason in predicted.reasons]
-        rows += [
-            (predicted.names[k], states[k], predicted.reasons[k], float(predicted.radius_90[k]), predicted.positions[k])
-            for k in new
-        ]
-        status = status if own else predicted.status
-    header = ["name", "x", "y", "z", "radius_90_mm", "status", "reason"]
+        add(same.specimens.transfer(surface.name, scan))
+    if semilandmarks is not None:
+        at = {row["name"]: np.array(row["position"]) for row in rows}
+        add(semilandmarks.place(surface, at, {row["name"]: row["radius_90"] for row in rows if row["radius_90"]}, scan))
     columns, cells = surface_landmark_cells(placed)
     table = [
-        [name, *map(float, point), "" if radius is None else radius, state, reason, *cell]
-        for (name, state, reason, radius, point), cell in zip(rows, cells, strict=True)
+        [row["name"], *row["position"], row["radius_90"], row["status"], row["reason"], *cell]
+        for row, cell in zip(rows, cells, strict=True)
     ]
     descriptions = {
-        name: state if radius is None else f"90 % within {radius:.3g} mm; {state} {reason}".rstrip()
-        for name, state, reason, radius, _ in rows
+        row["name"]: f"90 % within {row['radius_90']:.3g}; {row['status']} {row['reason']}".rstrip()
+        if row["radius_90"]
+        else row["status"]
+        for row in rows
     }
-    texts = point_texts(
-        {row[0]: np.asarray(row[4]) for row in rows}, descriptions, table_text([*header, *columns], table)
-    )
-    landmarks = [
-        {"name": name, "status": state, "reason": reason, "radius_90_mm": radius, "position": list(map(float, point))}
-        for name, state, reason, radius, point in rows
-    ]
-    return {"name": surface.name, "status": status, "landmarks": landmarks}, texts
+    header = ["name", "x", "y", "z", "radius_90", "status", "reason", *columns]
+    points = {row["name"]: np.array(row["position"]) for row in rows}
+    doubtful = any(row["reason"] for row in rows)
+    status = "marked" if own else "doubtful" if doubtful else "converged"
+    record = {"name": surface.name, "status": status, "landmarks": rows}
+    return record, point_texts(points, descriptions, table_text(header, table))
 
 
 def _sentence(one: LandmarkCheck) -> str:

@@ -47,7 +47,8 @@ class TransferredLandmarks:
         specimen: its name.
         names: of the L landmarks.
         positions: (L, 3) on the scan, or on the corresponding surface where no scan was given.
-        radius_90: (L,) radius of the region on the surface that contains the true position with 90 % probability.
+        radius_90: (L,) radius of the region on the surface that contains the true position with 90 % probability, in the
+            unit of the surface; not-a-number where none is known.
         on_scan: the same positions in triangles of the scan; `distance_mm` is how far the corresponding surface is.
         reasons: (L,) empty, or why the landmark is doubtful: `unobserved`, `off_scan` or `wide_region`.
     """
@@ -58,6 +59,23 @@ class TransferredLandmarks:
     radius_90: FloatArray
     on_scan: SurfaceLandmarks
     reasons: tuple[str, ...]
+
+    @staticmethod
+    def on(
+        surface: Mesh, scan: Mesh | None, points: Mapping[str, FloatArray], radius_90: FloatArray, observed: FloatArray
+    ) -> TransferredLandmarks:
+        """Return `points` near a corresponding surface on its scan, or on itself.
+
+        `observed` (L,) is the share of the place of each that the scan shows.
+        """
+        mesh, size = scan or surface, rms_size(surface.vertices)
+        on_scan = place_landmarks(Mesh(mesh.vertices, mesh.faces, name=surface.name), points)
+        reasons = tuple(
+            "unobserved" if seen < 0.5 else "off_scan" if off > _OFF_SCAN * size else "wide_region" if wide else ""
+            for seen, off, wide in zip(observed, on_scan.distance_mm, radius_90 > _WIDE * size, strict=True)
+        )
+        at = on_scan.interpolate(mesh.vertices)
+        return TransferredLandmarks(surface.name, tuple(points), at, radius_90, on_scan, reasons)
 
     @property
     def status(self) -> str:
@@ -179,15 +197,7 @@ class MarkedSpecimens:
             # The 90 % quantile of F with 2 and `degrees` degrees of freedom, for an isotropic error on the surface.
             quantile = 0.5 * degrees[row] * (0.1 ** (-2.0 / degrees[row]) - 1.0)
             radius[row] = size * np.sqrt(variance * quantile)
-        on_scan = place_landmarks(
-            scan or Mesh(surface.vertices, surface.faces), dict(zip(names, positions, strict=True))
-        )
-        reasons = tuple(
-            "unobserved" if seen < 0.5 else "off_scan" if off > _OFF_SCAN * size else "wide_region" if wide else ""
-            for seen, off, wide in zip(observed, on_scan.distance_mm, radius > _WIDE * size, strict=True)
-        )
-        at = on_scan.interpolate((scan or surface).vertices)
-        return TransferredLandmarks(specimen, tuple(names), at, radius, on_scan, reasons)
+        return TransferredLandmarks.on(surface, scan, dict(zip(names, positions, strict=True)), radius, observed)
 
     def check(self) -> list[LandmarkCheck]:
         """Predict each marked specimen from the others, and name the given landmarks that contradict the prediction.
