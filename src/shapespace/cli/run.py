@@ -381,9 +381,7 @@ def landmarks_transfer(arguments: argparse.Namespace) -> int:
 
     folder = arguments.output
     options = given(arguments, transfer_landmarks)
-    records = transfer_landmarks(
-        arguments.marked, arguments.scans, folder, **options, quiet=arguments.quiet, say=warn
-    )
+    records = transfer_landmarks(arguments.marked, arguments.scans, folder, **options, quiet=arguments.quiet, say=warn)
     if arguments.json:
         show_json({"folder": str(folder), "records": records})
         return 0

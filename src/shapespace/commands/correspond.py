@@ -173,7 +173,9 @@ def _corresponding(
     with telling_of_compiling(quiet=quiet), waiting("choosing the template", quiet=quiet):
         first = first_template(list(scans.values()), template, config, model)
     of_scans = [subjects[name] for name in scans] if subjects else []
-    made = correspond(list(scans.values()), config, first=first, subjects=of_scans, run=rounds)
+    made = correspond(
+        list(scans.values()), config, template=template, model=model, first=first, subjects=of_scans, run=rounds
+    )
     note_copies(scans, notes)
     given = template.name if template is not None else "" if model is None else "The model's mean"
     if not given or made.moved[0] < _ANOTHER_SHAPE:
@@ -473,8 +475,8 @@ def say_notes(records: Sequence[CorrespondRecord], made: Correspondence, given: 
         named = first_names(mirrored, _LISTED)
         of = "scan is a mirror image" if len(mirrored) == 1 else "scans are mirror images"
         say(
-            f"{len(mirrored)} {of} of the others ({named}) and reflected for the correspondence; surfaces are in the "
-            "frames of their scans."
+            f"{len(mirrored)} {of} of {given or 'the others'} ({named}) and reflected for the correspondence; surfaces "
+            "are in the frames of their scans."
         )
     if made.groups:
         say(describe_groups(made.groups))

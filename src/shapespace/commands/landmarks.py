@@ -16,7 +16,7 @@ from shapespace.batch.progress import progress
 from shapespace.commands.inputs import Given
 from shapespace.commands.landmark_files import LandmarkFiles
 from shapespace.correspondence.landmark_transfer import LandmarkCheck, MarkedSpecimens, TransferredLandmarks
-from shapespace.correspondence.semilandmarks import SemilandmarkSet, Semilandmarks
+from shapespace.correspondence.semilandmarks import Semilandmarks, SemilandmarkSet
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.geometry.landmark_placement import place_landmarks
 from shapespace.geometry.normals import rms_size
@@ -24,8 +24,8 @@ from shapespace.io.files import make_folder, read_bytes, write_text
 from shapespace.io.landmarks.fiducials import point_texts
 from shapespace.io.landmarks.landmark_io import read_landmarks, surface_landmark_cells, tps_text
 from shapespace.io.meshes.mesh_io import read_mesh
-from shapespace.io.remote import is_address
 from shapespace.io.read_limits import LARGEST_LANDMARK_FILE_BYTES
+from shapespace.io.remote import is_address
 from shapespace.io.tables.table_io import table_rows, table_text, write_rows
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, read
 from shapespace.store.corresponding import RECORD, SUMMARY, json_of, surface_files, surface_stem
@@ -35,7 +35,7 @@ from shapespace.types import FloatArray, Mesh, SurfaceLandmarks
 TPS = "landmarks.tps"
 """File in the output folder with the landmarks of all scans."""
 CURVE_SLIDERS, SURFACE_SLIDERS = "curveslide.csv", "surfslide.csv"
-"""Files with the numbers of semilandmarks in `TPS` from 1, as geomorph reads them: before, slide, after; and surface."""
+"""Files with the numbers of semilandmarks in `TPS`, from 1, as geomorph reads them: before, slide, after; surface."""
 _SET_COLUMNS, _THEN = ("name", "kind", "along", "points"), ">"
 """Columns of a table of curves and patches, and the character between the names along one."""
 _SAME_MARK = 0.01
@@ -126,7 +126,7 @@ def _read_sets(file: Path) -> list[SemilandmarkSet]:
         name, kind, along, points = (row[header.index(column)].strip() for column in _SET_COLUMNS)
         if kind not in ("curve", "patch") or not name or not points.isdecimal():
             raise FileFormatError(
-                f"{file}: the row {', '.join(row)!r} needs a name, the kind curve or patch, and a whole number of points."
+                f"{file}: the row {', '.join(row)!r} needs a name, the kind curve or patch, and a number of points."
             )
         sets.append(SemilandmarkSet(name, kind, tuple(part.strip() for part in along.split(_THEN)), int(points)))
     return sets

@@ -47,8 +47,8 @@ class TransferredLandmarks:
         specimen: its name.
         names: of the L landmarks.
         positions: (L, 3) on the scan, or on the corresponding surface where no scan was given.
-        radius_90: (L,) radius of the region on the surface that contains the true position with 90 % probability, in the
-            unit of the surface; not-a-number where none is known.
+        radius_90: (L,) radius of the region on the surface that contains the true position with 90 % probability, in
+            the unit of the surface; not-a-number where none is known.
         on_scan: the same positions in triangles of the scan; `distance_mm` is how far the corresponding surface is.
         reasons: (L,) empty, or why the landmark is doubtful: `unobserved`, `off_scan` or `wide_region`.
     """

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -181,7 +182,7 @@ class _MeanSurface:
             raise InputError(
                 f"{label}: no marked specimen has a landmark named {unknown[0]!r}; correct the name, or mark it."
             )
-        if len(chain) < 2 or any(a == b for a, b in zip(chain, chain[1:], strict=False)):
+        if len(chain) < 2 or any(a == b for a, b in pairwise(chain)):
             raise InputError(f"{label} needs two or more landmarks, neighbours different; add landmarks to it.")
         if one.kind == "patch" and chain[0] != chain[-1]:
             raise InputError(
@@ -190,7 +191,7 @@ class _MeanSurface:
             )
         if one.points < 1:
             raise InputError(f"{label} has {one.points} points; give 1 or more.")
-        segments = [self._path(a, b, label) for a, b in zip(chain, chain[1:], strict=False)]
+        segments = [self._path(a, b, label) for a, b in pairwise(chain)]
         path = np.concatenate([*(segment[:-1] for segment in segments), segments[-1][-1:]])
         path = _resampled(path, max(len(path), _PER_GAP * (one.points + 1)))
         if one.kind == "patch":
@@ -236,7 +237,8 @@ class _MeanSurface:
         """Return (M, 3) random points, evenly dense, on the smaller side of a closed path."""
         loop = loop[:-1]
         tree, engine = cKDTree(loop), self._engine.query(loop)
-        across = np.cross(vertex_normals(self.mesh)[engine.vertex], np.roll(loop, -1, axis=0) - np.roll(loop, 1, axis=0))
+        along = np.roll(loop, -1, axis=0) - np.roll(loop, 1, axis=0)
+        across = np.cross(vertex_normals(self.mesh)[engine.vertex], along)
 
         def side(points: FloatArray) -> tuple[FloatArray, BoolArray]:
             distance, nearest = tree.query(points)
