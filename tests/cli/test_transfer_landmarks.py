@@ -8,6 +8,7 @@ import pytest
 
 from conftest import Run
 from same_blobs import ASIDE, write_same
+from shapespace.geometry.closest import build_engine
 from shapespace.io.landmarks.fiducials import FIDUCIAL_ENDINGS
 from shapespace.io.landmarks.landmark_io import read_landmarks, write_landmarks
 from shapespace.io.meshes.mesh_io import read_mesh
@@ -120,3 +121,48 @@ def test_bad_input_ends_with_one_sentence_that_names_it(run: Run, same: Path) ->
     assert "all marked specimens are excluded" in refusal(marked, same)
     (marked / f"{ASIDE}.csv").rename(marked / "unknown.csv")
     assert "is named as one of the scans" in refusal(marked, same)
+
+
+def semilandmarks(same: Path, *rows: str) -> Path:
+    file = same.parent / "sets.csv"
+    file.write_text("\n".join(("name,kind,along,points", *rows)) + "\n")
+    return file
+
+
+def test_semilandmarks_are_evenly_spaced_on_the_scan_and_named_as_sliders(run: Run, same: Path) -> None:
+    out, marked = same.parent / "out", mark(same, "able")
+    sets = semilandmarks(same, "ridge,curve,a > b,7", "cap,patch,a > b > c > a,12")
+    assert run("landmarks", "transfer", marked, same, "-o", out, "--semilandmarks", sets, "--quiet").code == 0
+    for name in NAMES:
+        found = read_landmarks(out / f"{name}.landmarks.csv")
+        scan = read_mesh(same.parent / "scans" / f"{name}.ply")
+        chain = np.array([found[key] for key in ("a", *(f"ridge_{k + 1}" for k in range(7)), "b")])
+        gaps = np.linalg.norm(np.diff(chain, axis=0), axis=1)
+        assert gaps.std() < 0.05 * gaps.mean()
+        patch = np.array([found[f"cap_{k + 1}"] for k in range(12)])
+        assert build_engine(scan).query(np.concatenate([chain[1:-1], patch])).distance.max() < 1e-6 * np.ptp(patch)
+        nearest = np.sort(np.linalg.norm(patch[:, None] - patch, axis=2), axis=1)[:, 1]
+        assert nearest.min() > 0.4 * nearest.max()
+    with (out / "curveslide.csv").open(newline="") as stream:
+        rows = [tuple(row.values()) for row in csv.DictReader(stream)]
+    assert len(rows) == 7 and rows[0] == ("1", "4", "5") and rows[-1][2] == "2"
+    assert (out / "surfslide.csv").read_text().split()[1:] == [str(k) for k in range(11, 23)]
+
+
+@pytest.mark.parametrize(
+    ("row", "words"),
+    [
+        ("ridge,curve,a > nose,5", "no marked specimen has a landmark named 'nose'"),
+        ("ridge,curve,a,5", "needs two or more landmarks"),
+        ("ridge,curve,a > b,0", "has 0 points; give 1 or more"),
+        ("cap,patch,a > b > c,9", "patch cap"),
+        ("a,curve,a > b,5", "is the name of another point"),
+        ("ridge,line,a > b,5", "the kind curve or patch"),
+    ],
+)
+def test_unusable_semilandmarks_are_refused_with_a_sentence(run: Run, same: Path, row: str, words: str) -> None:
+    sets = semilandmarks(same, row)
+    outcome = run(
+        "landmarks", "transfer", mark(same, "able"), same, "-o", same.parent / "out", "--semilandmarks", sets, "--quiet"
+    )
+    assert outcome.code == 2 and words in outcome.err and "Traceback" not in outcome.err

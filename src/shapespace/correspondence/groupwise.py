@@ -59,6 +59,9 @@ _CLEARLY_WORSE = 1.1  # ratio of the scores of the other side and a scan's own: 
 _AS_NEAR = 1.1  # ratio of distances up to which a registration from another scan of the subject is used
 _ANCHORS, _MOST_ANCHORS = 2, 6
 """Scans that all others are compared with, in addition to the template; at most, until the sides are decided."""
+_ASYMMETRIC = 0.05
+"""Median log ratio of scores below which no more anchors are used: it was 0.03 for faces, and above 0.1 for blobs whose
+sides needed five anchors."""
 
 
 class Runner(Protocol):
@@ -231,8 +234,8 @@ def _with_sides(problem: _Problem, run: Runner, *, may_reflect: bool) -> tuple[_
     context, scores = _context(problem, _initial_state(problem, sides)), np.zeros((0, count, 2))
     anchors: list[int] = []
     for i, pose_model in ((TEMPLATE, context.pose_models[0]), *_anchors(problem)):
-        enough = 1 + (_ANCHORS if sides.decided or problem.config.mirror == "never" else _MOST_ANCHORS)
-        if len(anchors) >= enough:
+        is_unsure = not sides.decided and sides.asymmetry > _ASYMMETRIC
+        if len(anchors) > (_MOST_ANCHORS if is_unsure else _ANCHORS):
             break
         anchors.append(i)
         problem, row = _compared_with(problem, replace(context, pose_models=(pose_model,)), i, run)

@@ -31,11 +31,13 @@ class Sides:
         mirrored: (N,) which scans are mirror images of the majority.
         margin: (N,) mean log ratio of scores by which the side was decided; 0 where nothing was compared.
         decided: whether the scores of different anchors agree; False for a symmetric object or too few comparisons.
+        asymmetry: median absolute log ratio of scores.
     """
 
     mirrored: BoolArray
     margin: FloatArray
     decided: bool
+    asymmetry: float = 0.0
 
 
 def solve_sides(scores: FloatArray, anchors: Sequence[int], seed: int) -> Sides:
@@ -53,6 +55,7 @@ def solve_sides(scores: FloatArray, anchors: Sequence[int], seed: int) -> Sides:
     for a, i in enumerate(anchors):
         if i >= 0:
             evidence[a, i] = 0.0  # a scan agrees with itself whatever its side
+    asymmetry = float(np.median(np.abs(evidence[evidence != 0]))) if evidence.any() else 0.0
     signs, agreement = _best_signs(evidence, anchors)
     rng = np.random.default_rng(seed)
     drawn = [_best_signs(evidence * rng.choice([-1.0, 1.0], evidence.shape), anchors)[1] for _ in range(_DRAWS)]
@@ -63,7 +66,7 @@ def solve_sides(scores: FloatArray, anchors: Sequence[int], seed: int) -> Sides:
     for a, i in enumerate(anchors):
         if decided and i >= 0:
             mirrored[i] = signs[a] < 0
-    return Sides(np.asarray(mirrored), np.abs(margin), bool(decided))
+    return Sides(np.asarray(mirrored), np.abs(margin), bool(decided), asymmetry)
 
 
 def _best_signs(evidence: FloatArray, anchors: Sequence[int]) -> tuple[FloatArray, float]:

@@ -211,7 +211,7 @@ class _MeanSurface:
         start, end = sorted((a, b))
         if (start, end) not in self._paths:
             ends = np.stack([self._landmarks[start], self._landmarks[end]])
-            first, last = cKDTree(self.mesh.vertices).query(ends)[1]
+            first, last = np.asarray(cKDTree(self.mesh.vertices).query(ends)[1]).tolist()
             ahead: Any = self._graph(self._edges)
             near = ahead
             for _ in range(_RINGS - 1):
@@ -220,9 +220,9 @@ class _MeanSurface:
             before = dijkstra(self._graph(pairs), indices=first, return_predecessors=True)[1]
             if first != last and before[last] < 0:
                 raise InputError(f"{label}: no path on the surface leads from {a!r} to {b!r}; choose other landmarks.")
-            vertices = [last]
+            vertices: list[int] = [last]
             while vertices[-1] != first:
-                vertices.append(before[vertices[-1]])
+                vertices.append(int(before[vertices[-1]]))
             path = np.concatenate([ends[:1], self.mesh.vertices[vertices[::-1]], ends[1:]])
             edges = np.linalg.norm(np.diff(path, axis=0), axis=1).sum() / self._edge
             for per_edge in _PER_EDGE:
@@ -241,7 +241,7 @@ class _MeanSurface:
         across = np.cross(vertex_normals(self.mesh)[engine.vertex], along)
 
         def side(points: FloatArray) -> tuple[FloatArray, BoolArray]:
-            distance, nearest = tree.query(points)
+            distance, nearest = map(np.asarray, tree.query(points))
             return distance, np.einsum("ij,ij->i", points - loop[nearest], across[nearest]) > 0
 
         distance, left = side(self.mesh.vertices)
@@ -304,19 +304,19 @@ def _boundary(one: SemilandmarkSet, curves: Mapping[str, Sequence[str]]) -> list
 def _resampled(path: FloatArray, count: int) -> FloatArray:
     """Return `count` evenly spaced points of a polyline (M, 3), ends included."""
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
-    at = np.linspace(0.0, length[-1], count)
+    at: FloatArray = np.linspace(0.0, float(length[-1]), count)
     return np.stack([np.interp(at, length, path[:, axis]) for axis in range(3)], axis=1)
 
 
 def _evenly_spaced(path: FloatArray, count: int, engine: ClosestPointEngine) -> FloatArray:
     """Return `count` points of a path on a surface, without its ends, at equal distances from each other."""
     path = engine.query(path).points
-    place, at = np.linspace(0.0, 1.0, len(path)), np.linspace(0.0, 1.0, count + 2)
-    points = path
+    place, points = np.linspace(0.0, 1.0, len(path)), path
+    at: FloatArray = np.linspace(0.0, 1.0, count + 2)
     for _ in range(_SPACING_STEPS):
         points = engine.query(np.stack([np.interp(at, place, path[:, axis]) for axis in range(3)], axis=1)).points
         length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-        at = np.interp(np.linspace(0.0, length[-1], count + 2), length, at)
+        at = np.asarray(np.interp(np.linspace(0.0, float(length[-1]), count + 2), length, at), dtype=np.float64)
     return points[1:-1]
 
 
