@@ -61,7 +61,7 @@ def write_same(home: Path, names: Sequence[str] = NAMES, *, aside: bool = True) 
         changed, times = Distortion.of(mesh, mean), 10.0 if name == FAR else 1.0 + 0.01 * number
         record = CorrespondRecord(
             name=name, path=f"../scans/{name}.ply", hash=sha256_of_file(scans / f"{name}.ply"),
-            status="corresponding", seen_share=float(there.mean()), covered_share=1.0, area_share=0.99,
+            status="converged", seen_share=float(there.mean()), covered_share=1.0, area_share=0.99,
             distance_mean=0.2 * times, distance_p95=0.5 * times, distance_p99=times, distance_max=3 * times, scale=1.0,
             folded_share=changed.folded_share, area_factor=changed.area_factor, moved_share=[0.05, 0.012],
             cpu_s=[2.0, 1.0 + number],
@@ -70,7 +70,7 @@ def write_same(home: Path, names: Sequence[str] = NAMES, *, aside: bool = True) 
     if aside:
         write_mesh(scans / f"{ASIDE}.ply", mean.with_vertices(mean.vertices * [1.0, 3.0, 0.3]))
         record = CorrespondRecord(
-            name=ASIDE, path=f"../scans/{ASIDE}.ply", hash=sha256_of_file(scans / f"{ASIDE}.ply"), status="set aside",
+            name=ASIDE, path=f"../scans/{ASIDE}.ply", hash=sha256_of_file(scans / f"{ASIDE}.ply"), status="excluded",
             reason=f"another object {EVIL}, as in /home/somebody/scans/{ASIDE}.ply",
         )  # fmt: skip
         write_text(folder / f"{ASIDE}{CorrespondRecord.ENDING}", json_text(record))

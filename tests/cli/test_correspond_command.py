@@ -45,12 +45,12 @@ def test_each_scan_has_a_surface_and_a_record_and_a_bad_one_a_reason(same: Path)
     first = read_mesh(same / "blob0.corresponding.ply")
     for k in range(SCANS):
         record = json.loads((same / f"blob{k}.correspond.json").read_text("utf-8"))
-        assert record["status"] == "corresponding" and 0.9 < record["covered_share"] <= 1.0
+        assert record["status"] == "converged" and 0.9 < record["covered_share"] <= 1.0
         assert 0.5 < record["scale"] < 2.0 and len(record["moved_share"]) == 1
         assert 0 <= record["folded_share"] < 0.05 and 1 < record["area_factor"] < 4 and 0.8 < record["area_share"] < 1.2
         surface = read_mesh(same / f"blob{k}.corresponding.ply")
         np.testing.assert_array_equal(surface.faces, first.faces)
-    assert json.loads((same / "torn.correspond.json").read_text("utf-8"))["status"] == "set aside"
+    assert json.loads((same / "torn.correspond.json").read_text("utf-8"))["status"] == "excluded"
     assert not (same / "torn.corresponding.ply").exists() and not (same / ".rounds").exists()
     np.testing.assert_array_equal(read_mesh(same / "template" / "mean.ply").faces, first.faces)
 
@@ -78,7 +78,7 @@ def test_scans_come_by_address_and_list_and_what_is_known_of_them_is_kept(
         np.testing.assert_array_equal(*surfaces)
         assert any("landmarks" in note for note in record["notes"]) is (k == 0)
     torn = json.loads((out / "torn.correspond.json").read_text("utf-8"))
-    assert torn["status"] == "set aside" and torn["metadata"] == {"age": "1"}
+    assert torn["status"] == "excluded" and torn["metadata"] == {"age": "1"}
     assert run("report", out, "--no-open").code == 0
 
 

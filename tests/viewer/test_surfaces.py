@@ -65,7 +65,7 @@ def test_a_surface_lies_on_the_mean_shape_and_misses_what_its_scan_does(client: 
 def test_scans_are_listed_with_what_speaks_against_them_first(client: httpx.Client) -> None:
     rows = client.get("/api/surfaces").json()
     assert rows[0]["name"] == ASIDE and {row["name"] for row in rows[1:4]} == {FAR, FOLDED, HIDDEN}
-    assert [row["status"] for row in rows] == ["set aside", *["look"] * 3, *["corresponding"] * 3]
+    assert [row["status"] for row in rows] == ["excluded", *["look"] * 3, *["converged"] * 3]
     assert "/home/somebody" not in client.get("/api/surfaces").text
     assert all(row["reason"].endswith(".") for row in rows)
 

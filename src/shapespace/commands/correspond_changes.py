@@ -336,7 +336,7 @@ def _registered(
         raw,
         mirrored,
         finished.summary.sides_decided,
-        finished.summary.usual_ratios or (np.nan, np.nan),
+        finished.summary.usual_ratios,
     )
     return add_scans(start, added, config, run=rounds)
 

@@ -229,7 +229,8 @@ def _with_sides(problem: _Problem, run: Runner, *, may_reflect: bool) -> tuple[_
     """
     count = len(problem.names)
     sides = Sides(np.zeros(count, np.bool_), np.zeros(count), decided=False)
-    if problem.config.mirror == "never" and problem.config.pose != "search":  # the files are trusted
+    is_enough = len(problem.first.repaired) >= ENOUGH_TO_JUDGE
+    if problem.config.mirror == "never" and (problem.config.pose != "search" or not is_enough):  # nothing is compared
         return problem, sides
     context, scores = _context(problem, _initial_state(problem, sides)), np.zeros((0, count, 2))
     anchors: list[int] = []
@@ -516,12 +517,15 @@ def _exclude_mirrored(problem: _Problem, state: RegistrationState) -> Registrati
 
 
 def _evidence(problem: _Problem, state: RegistrationState, run: Runner) -> dict[int, ScanEvidence]:
-    """Return the evidence on each registered scan, by comparisons of its poses with the modes of the others."""
+    """Return the evidence on each registered scan, by comparisons of its poses with the modes of the others.
+
+    Too few scans do not determine what is usual, so there is none.
+    """
     order = sorted(state.registrations)
+    if len(order) < ENOUGH_TO_JUDGE:
+        return {}
     compared = {one.index: one for one in run(_context(problem, state), [_pose_task(problem, state, i) for i in order])}
-    distances = np.ones(len(order))
-    if len(order) >= ENOUGH_TO_JUDGE:
-        distances = find_kinds(*state.shapes(order), state.template.vertices).distance
+    distances = find_kinds(*state.shapes(order), state.template.vertices).distance
     evidence = {
         i: _scan_evidence(state, compared[i], distance) for i, distance in zip(order, distances.tolist(), strict=True)
     }
@@ -603,9 +607,11 @@ def _update_template(
 
 
 def _consensus(problem: _Problem, state: RegistrationState) -> dict[int, Similarity]:
-    """Return the poses of the scans on which the comparisons agree (C32); none where the frames of files are used."""
+    """Return the poses on which the comparisons agree (C32); none for few scans, and where frames of files are used."""
+    if problem.config.pose != "search" or len(problem.first.repaired) < ENOUGH_TO_JUDGE:
+        return {}
     mirrored = {TEMPLATE: problem.reflected} | {i: state.is_mirrored(i) for i in range(len(problem.names))}
-    return consensus_poses(problem.comparisons, mirrored) if problem.config.pose == "search" else {}
+    return consensus_poses(problem.comparisons, mirrored)
 
 
 def _squared_movement(previous: RegistrationState, i: int, shape: FloatArray) -> float:
@@ -649,7 +655,7 @@ class FinishedCorrespondence:
     scans: Sequence[Mesh] = ()
     mirrored: Sequence[bool] = ()
     sides_decided: bool = False
-    usual_ratios: tuple[float, float] = (np.nan, np.nan)
+    usual_ratios: tuple[float, float] | None = None
 
 
 def add_scans(
@@ -712,17 +718,17 @@ def _added_evidence(
     problem: _Problem,
     start: RegistrationState,
     states: Mapping[int, RegistrationState],
-    usual: tuple[float, float],
+    usual: tuple[float, float] | None,
     run: Runner,
 ) -> dict[int, ScanEvidence]:
     """Return the evidence on each added scan that is registered; `usual` are the ratios of the finished scans."""
     added = {i: state for i, state in states.items() if i in state.registrations}
-    if not added:
+    if not added or len(start.registrations) < ENOUGH_TO_JUDGE:
         return {}
     tasks = [_pose_task(problem, state, i) for i, state in added.items()]
     compared = {one.index: one for one in run(_context(problem, start), tasks)}
     evidence = {i: _scan_evidence(state, compared[i], _distance_from_finished(state, i)) for i, state in added.items()}
-    return _with_usual_ratios(evidence, usual)
+    return _with_usual_ratios(evidence, usual or (np.nan, np.nan))
 
 
 def _finished_state(problem: _Problem, finished: FinishedCorrespondence) -> RegistrationState:
@@ -857,7 +863,7 @@ def _result(problem: _Problem, state: RegistrationState, evidence: Mapping[int, 
     return Correspondence(
         template, tuple(scans), problem.first.origin, moved, landmarks, sides_decided=state.sides.decided,
         groups=tuple(tuple(problem.names[i] for i in group) for group in groups),
-        usual_ratios=usual_ratios(list(evidence.values())),
+        usual_ratios=usual_ratios(list(evidence.values())) if evidence else None,
     )  # fmt: skip
 
 

@@ -63,8 +63,8 @@ class ElasticSettings:
     borders: bool = False
     floor: float = 0.05
     turn: float = 0.1
-    tangential: float = 0.2
-    tangential_gain: float = 2.0
+    tangential: float = 0.1
+    tangential_gain: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
