@@ -18,7 +18,8 @@ ScanStatus: TypeAlias = Literal["converged", "doubtful", "excluded"]
 _INTERCEPT = -4.03
 _WEIGHTS: Mapping[str, float] = {"pose": 4.23, "mirrored": 1.33, "distance": 4.95, "consensus": 1.69}
 """Logistic model of the log odds that a surface is wrong, trained on 402 surfaces of 30 collections, 44 of them wrong:
-simulated kinds of objects with mirrored and foreign scans, molars, femora and faces, as in benchmarks/scan_status.py."""
+simulated kinds of objects with mirrored and foreign scans, molars, femora and faces, as in
+benchmarks/scan_status.py."""
 _LARGEST_RATIO = 3.0
 """Ratio of scores that counts at most: a pose or side that is so much worse is ruled out."""
 _ASYMMETRIC = 1.15
