@@ -21,8 +21,8 @@ _ROTATION, _SHARE_AROUND, _LEAST = 0.3, 0.1, 1e-3
 """Prior precision of the rotation of a patch, weight of the information of its surroundings, and the least information
 on a position, in units of the information of a patch whose normals are all parallel along their direction."""
 _POWER, _FACTOR = 0.85, 0.071
-"""Exponent and factor of (C42). All constants are values for which 85 to 95 % of the true positions are in the 90 %
-regions of faces, damaged faces, femora, cut femora, molars and blobs (benchmarks/vertex_confidence.py)."""
+"""Exponent and factor of (C42). All constants are values for which 86 to 95 % of the true positions are in the 90 %
+regions of faces, damaged faces, femora, cut femora, molars and blobs; 84 % of other femora (docs/correspondence.md)."""
 
 
 def estimate_position_std(
