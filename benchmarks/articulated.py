@@ -36,9 +36,8 @@ VOXEL_MM = 15.0
 WRONG = 5.0
 """Mean error of a scan over its pairs, 100 x share of the square root of the area, above which it is wrong."""
 POINTS = 1000  # vertices that errors are measured at
-APART_MM = (
-    60.0  # limbs of a pose lie at least this far from each other and from the trunk, as if the scans had no contact
-)
+APART_MM = 60.0
+"""Limbs of a pose lie at least this far from each other and from the trunk, as if the scans had no contact."""
 LIMBS = {
     "trunk": (None, (0, 1000, 0), (0, 1350, 0), 130, 145),
     "pelvis": ("trunk", (0, 1000, 0), (0, 930, -15), 130, 125),

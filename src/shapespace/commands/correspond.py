@@ -164,7 +164,7 @@ def _corresponding(
     read = read_scans(jobs, marks, strict=files.strict, outer=config.outer, quiet=quiet, say=say)
     say_excluded(read.unread, len(jobs), say)
     scans, notes = read.scans, read.notes
-    marks.tell(say)
+    marks.report_unused(say)
     if template is not None:
         for sentence in _stray_landmarks_note(template):
             say(f"{template.name}: {sentence}")

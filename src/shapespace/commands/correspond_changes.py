@@ -221,7 +221,7 @@ def _changed(
     read = read_scans(jobs, marks, strict=files.strict, outer=config.outer, quiet=quiet, say=say)
     _refuse_changed(finished, read, files, kept if change.update else [])
     say_excluded(read.unread, len(jobs), say)
-    marks.tell(say)
+    marks.report_unused(say)
     rounds = RoundsWithProgress(folder / ROUNDS_FOLDER, files.execution, quiet=quiet)
     with telling_of_compiling(quiet=quiet):
         made = _registered(finished, kept, read, marks, replace(config, outer=False), rounds, update=change.update)

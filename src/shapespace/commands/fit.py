@@ -96,7 +96,7 @@ def fit_scans(
     write_bytes(folder / ".writable", b"")
     remove_file(folder / ".writable")
     work = list({job.name: job for job in _jobs(given, one, many, folder)}.values())
-    many.tell(say)
+    many.report_unused(say)
     if len(work) < len(given):
         say(f"Scans given more than once are fitted once: {len(work)} of {len(given)}.")
     stored = settings.store or len(work) >= STORE_FROM or read_manifest(folder) is not None

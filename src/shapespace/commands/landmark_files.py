@@ -96,11 +96,11 @@ class LandmarkFiles:
             self.unread.append(f"{path.name} goes without landmarks: {error}")
             return mesh
 
-    def tell(self, say: Callable[[str], None]) -> None:
-        """Say which files are of no use.
+    def report_unused(self, say: Callable[[str], None]) -> None:
+        """Print which files belong to no scan.
 
         Raises:
-            InputError: none is of any.
+            InputError: all files belong to none.
         """
         if self.folder is None:
             return

@@ -210,7 +210,7 @@ def _read_marks(
                     f"{file.name} and {other.name} give different positions for landmark {off[0]!r} of {name}; remove "
                     "one of the files."
                 )
-    marks.tell(say)
+    marks.report_unused(say)
     if not given:
         raise InputError(f"{folder}: all marked specimens are excluded from the correspondence; mark others.")
     _say_names(given, say)

@@ -164,7 +164,7 @@ def _refuse_unlike(targets: Sequence[_Target]) -> None:
 
 def _meshes(folder: Path, notes: list[str], gauge: Gauge, *, quiet: bool) -> tuple[list[Mesh], dict[str, float]]:
     """Return the meshes of a folder in the unit of most of them, and the ratios of those that were in another."""
-    listed = surface_files([folder]).without_doubtful("shapespace build --with-doubtful")
+    listed = surface_files([folder]).without_doubtful()
     notes += listed.notes
     if gauge == "form":
         listed.refuse_mixed_units()

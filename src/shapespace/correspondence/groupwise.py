@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Protocol
 
 import numpy as np
@@ -234,15 +235,15 @@ def _with_sides(problem: _Problem, run: Runner, *, may_reflect: bool) -> tuple[_
         return problem, sides
     context, scores = _context(problem, _initial_state(problem, sides)), np.zeros((0, count, 2))
     anchors: list[int] = []
-    for i, pose_model in ((TEMPLATE, context.pose_models[0]), *_anchors(problem)):
-        is_unsure = not sides.decided and sides.asymmetry > _ASYMMETRIC
-        if len(anchors) > (_MOST_ANCHORS if is_unsure else _ANCHORS):
-            break
+    for i, pose_model in chain([(TEMPLATE, context.pose_models[0])], _anchors(problem)):
         anchors.append(i)
         problem, row = _compared_with(problem, replace(context, pose_models=(pose_model,)), i, run)
         scores = np.concatenate([scores, row[None]])
         if len(anchors) > _ANCHORS and problem.config.mirror != "never":
             sides = solve_sides(scores, anchors, problem.config.seed)
+        is_unsure = not sides.decided and sides.asymmetry > _ASYMMETRIC
+        if len(anchors) > (_MOST_ANCHORS if is_unsure else _ANCHORS):
+            break
     if may_reflect and sides.decided and sides.mirrored.sum() > len(problem.first.repaired) / 2:
         if problem.config.pose != "search":  # the frame of a reflected template is that of no file
             raise InputError(

@@ -30,9 +30,8 @@ _TRIED = 6  # assignments of extremities: each costs about 0.2 CPU s
 _SENSE = 0.8
 """Share of the area of the map, less that of the rest, that is not turned inside out: it was 0.89 or more in the right
 maps of 10 figures, and -0.9 where left and right were exchanged."""
-_JACOBIANS = (
-    3.0  # RMS of the determinants in the first map, in which distances have about 2; 2 and 4 give the same maps
-)
+_JACOBIANS = 3.0
+"""RMS of the determinants in the first map, in which distances have about 2; 2 and 4 give the same maps."""
 _SMOOTH = 0.05  # range over which the determinants are averaged, share of the square root of the area
 
 
@@ -99,7 +98,7 @@ def bent_shape(template: IntrinsicShape, scan: IntrinsicShape, seed: int) -> Flo
     """Return the template's vertices (V, 3) on `scan`, by the map that changes distances along the surface least.
 
     Extremities are assigned by their distances from each other; each likely assignment gives a map, which is refined
-    (ZoomOut; Melzi et al. 2019). It must not turn the surface inside out, which tells left from right.
+    (ZoomOut; Melzi et al. 2019). It must not turn the surface inside out, which distinguishes left from right.
 
     Args:
         template: the surface that is mapped.

@@ -49,7 +49,6 @@ class ElasticSettings:
         turn: length that a difference of the normals by a radian, or so, counts as much as.
         tangential: forces along the surface are averaged over this range at least: over shorter ones they are noise of
             the triangles, and move points away from the correct places that they had.
-        tangential_gain: factor of these forces below that range, as so wide an average makes them smaller.
     """
 
     harmonics: int = 400
@@ -64,7 +63,6 @@ class ElasticSettings:
     floor: float = 0.05
     turn: float = 0.1
     tangential: float = 0.1
-    tangential_gain: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,7 +255,7 @@ def _parts(
     if range_share >= settings.tangential:
         return [(range_share, force)]
     normal = np.einsum("md,md->m", force, normals)[:, None] * normals
-    return [(range_share, normal), (settings.tangential, settings.tangential_gain * (force - normal))]
+    return [(range_share, normal), (settings.tangential, force - normal)]
 
 
 def _averaged(

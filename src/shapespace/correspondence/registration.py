@@ -18,6 +18,7 @@ from shapespace.correspondence.generic import generic_model
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.isometry import IntrinsicShape, bent_shape
 from shapespace.correspondence.landmark_guide import MirroredLandmarksError, ScanLandmarks
+from shapespace.correspondence.pose_consensus import angle_deg
 from shapespace.correspondence.register import ElasticSettings, Template, register
 from shapespace.correspondence.settings import PoseRange
 from shapespace.correspondence.template import PoseModel
@@ -210,7 +211,10 @@ class RoundContext:
         begun = time.process_time()
         try:
             with threadpool_limits(limits=1, user_api="blas"):
-                registration = self._register_bent(task, self._register(task))
+                if task.sides in ("pose", "scores"):
+                    registration = self._compare(task)
+                else:
+                    registration = self._register_bent(task, self._register(task))
         except ShapespaceError as error:
             registration = self.failed(task.index, str(error))
         return replace(registration, cpu_s=time.process_time() - begun)
@@ -231,8 +235,6 @@ class RoundContext:
     # Which pose
 
     def _register(self, task: RegistrationTask) -> ScanRegistration:
-        if task.sides in ("pose", "scores"):
-            return self._compare(task)
         if task.bent and task.T_scan_template is not None:
             return replace(self._register_at(task, task.T_scan_template), bent=True)
         if task.landmarks is not None:
@@ -292,7 +294,7 @@ class RoundContext:
     def _register_bent(self, task: RegistrationTask, registration: ScanRegistration) -> ScanRegistration:
         """Return `registration`, or that from a map along the surface if that one is less strained."""
         strained = task.bent or registration.strain > _STRAINED * self.template.size_mm
-        if task.sides in ("pose", "scores") or task.pose != "search" or not strained:
+        if task.pose != "search" or not strained:
             return registration
         limit = registration.strain * (1.0 if task.bent else _STRAIGHTENED)
         task = task.reflected() if registration.mirrored != task.mirrored else task
@@ -316,7 +318,7 @@ class RoundContext:
         if pose != "search" and len(self.pose_models) > 1:  # with the modes of the other scans, scores are reliable
             best = model.search(vertices, self.seed, quick=True)
             if best.score_mm < _OTHER_FRAME * start.score_mm:
-                degrees = np.degrees(np.arccos(np.clip((np.trace(best.T_scan_model.rotation) - 1) / 2, -1, 1)))
+                degrees = angle_deg(best.T_scan_model, Similarity.identity())
                 raise FitError(
                     f"the frame of its file is rotated by about {degrees:.0f} degrees from those of the others; rotate "
                     "it, or leave --pose out"

@@ -251,8 +251,8 @@ class _MeanSurface:
         crosses = (left[a] != left[b]) & (np.maximum(distance[a], distance[b]) <= self._lengths(self._edges) + gap)
         part = np.asarray(connected_components(self._graph(self._edges[~crosses]), directed=False)[1])
         area = np.bincount(part, vertex_areas(self.mesh))
-        beside = np.unique(part[self._edges[crosses]])
-        order = beside[np.argsort(-area[beside])]
+        adjacent = np.unique(part[self._edges[crosses]])
+        order = adjacent[np.argsort(-area[adjacent])]
         inside = part == order[1] if len(order) > 1 else np.zeros(len(part), np.bool_)
         faces = faces_of(self.mesh)
         candidates = np.flatnonzero(inside[faces].any(axis=1))

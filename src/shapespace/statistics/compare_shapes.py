@@ -310,17 +310,19 @@ def compare(
     subjects = None if config.blocks is None else cohort.table.texts(config.blocks)
     repeated = subjects is not None and len(set(subjects)) < len(subjects)
     root = _weight_root(cohort) if config.weights == "confidence" and not config.unequal_variances else None
-    made, weighted = (
-        strata_of(shapes, design, subjects if repeated else None, config.blocks or "", config.anova_type, random)
-        for shapes in (cohort.coefficients, cohort.coefficients if root is None else cohort.coefficients @ root)
-    )
+    owners = subjects if repeated else None
+
+    def strata_from(coefficients: FloatArray) -> ModelStrata:
+        return strata_of(coefficients, design, owners, config.blocks or "", config.anova_type, random)
+
+    made = strata_from(cohort.coefficients)
+    strata = made.every
     if root is not None:
         cohort = replace(cohort, notes=(*cohort.notes, _WEIGHTED_NOTE))
-    strata = weighted.every
+        strata = strata_from(cohort.coefficients @ root).every
     families = [_weighted(cohort, design, family) for family in _families(design, made)]
     total = len(design.terms) + len(families) * (1 + config.maps)
     step = StepCounter(total, progress).add
-    owners = subjects if repeated else None
     tests = tuple(
         test
         for stratum in strata

@@ -54,8 +54,8 @@ class SurfaceFiles:
         std = None if mesh.position_std is None else mesh.position_std / ratio
         return replace(mesh, vertices=mesh.vertices / ratio, position_std=std)
 
-    def without_doubtful(self, option: str) -> SurfaceFiles:
-        """Return the files without doubtful surfaces of a correspondence, with a note; `option` includes them.
+    def without_doubtful(self, option: str = "") -> SurfaceFiles:
+        """Return the files without doubtful surfaces of a correspondence, with a note; `option`, if any, includes them.
 
         Raises:
             InputError: all are doubtful.
@@ -65,11 +65,10 @@ class SurfaceFiles:
         left = tuple(file for file in self.files if file not in self.doubtful)
         named = first_names([file.name for file in self.files if file in self.doubtful], _NAMED)
         if not left:
-            raise InputError(f"All surfaces are doubtful ({named}); inspect them, and use {option} to include them.")
-        note = (
-            f"{len(self.doubtful)} of {len(self.files)} surfaces are doubtful and left out ({named}); {option} "
-            "includes them."
-        )
+            advice = f", and use {option} to include them" if option else " and run shapespace correspond again"
+            raise InputError(f"All surfaces are doubtful ({named}); inspect them{advice}.")
+        included = f"; {option} includes them" if option else ""
+        note = f"{len(self.doubtful)} of {len(self.files)} surfaces are doubtful and left out ({named}){included}."
         return replace(
             self,
             files=left,
