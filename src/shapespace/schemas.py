@@ -493,7 +493,6 @@ class CorrespondenceRecord(Struct, frozen=True, kw_only=True):
         corresponding: NAMEs in correspondence.
         set_aside: NAME to reason of the others.
         doubtful: NAMEs in correspondence whose surfaces are probably wrong.
-        usual_ratios: median scores of the best other pose and of the mirror image, in scores of a scan's own pose.
         other_units: NAME to `unit_ratio` of those that are in another unit than most.
         mirrored: NAMEs of those that are mirror images of the majority.
         sides_decided: whether scans could be distinguished from their mirror images.
@@ -527,7 +526,6 @@ class CorrespondenceRecord(Struct, frozen=True, kw_only=True):
     results_hash: str = ""
     added: list[str] = []
     doubtful: list[str] = []
-    usual_ratios: tuple[float, float] | None = None
     format: str = FORMAT
     format_version: int = VERSION
 

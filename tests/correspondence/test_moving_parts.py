@@ -7,7 +7,7 @@ import pytest
 
 from shapespace.correspondence.groupwise import correspond
 from shapespace.correspondence.harmonics import Harmonics
-from shapespace.correspondence.isometry import IntrinsicShape, bent_shape
+from shapespace.correspondence.isometry import IntrinsicShape, bent_shapes
 from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.correspondence.subject_tree import subject_levels
 from shapespace.correspondence.template import resample
@@ -61,18 +61,17 @@ def template() -> Mesh:
 def test_a_limb_is_followed_along_the_surface(template: Mesh) -> None:
     truth = bent(template)
     scan = resample(Mesh(truth, template.faces, name="scan"), 1500)
-    shape = bent_shape(IntrinsicShape.of(template, Harmonics.of(template, 100)), IntrinsicShape.of_scan(scan), 0)
-    assert shape is not None
+    shapes = bent_shapes(IntrinsicShape.of(template, Harmonics.of(template, 100)), IntrinsicShape.of_scan(scan), 0)
     moved = np.linalg.norm(truth - template.vertices, axis=1).max()
-    error = np.linalg.norm(shape - truth, axis=1)
+    errors = [np.linalg.norm(shape - truth, axis=1).mean() for shape in shapes]
     assert moved > 100
-    assert error.mean() < 0.05 * moved
+    assert min(errors) < 0.05 * moved
 
 
 def test_a_map_does_not_turn_the_surface_inside_out(template: Mesh) -> None:
     scan = IntrinsicShape.of_scan(mirror_image(Mesh(bent(template), template.faces, name="scan")))
-    shape = bent_shape(IntrinsicShape.of(template, Harmonics.of(template, 100)), scan, 0)
-    assert shape is None or volume(shape, template) > 0
+    shapes = bent_shapes(IntrinsicShape.of(template, Harmonics.of(template, 100)), scan, 0)
+    assert all(volume(shape, template) > 0 for shape in shapes)
     assert volume(mirror_image(template).vertices, template) < 0
 
 
@@ -89,8 +88,8 @@ def test_a_rigid_motion_stretches_no_edge(template: Mesh) -> None:
 
 def test_two_extremities_leave_the_map_open(template: Mesh) -> None:
     shape = IntrinsicShape.of(template, Harmonics.of(template, 100))
-    assert bent_shape(shape, shape, 0) is not None
-    assert bent_shape(replace(shape, ends=shape.ends[:2]), shape, 0) is None
+    assert bent_shapes(shape, shape, 0)
+    assert not bent_shapes(replace(shape, ends=shape.ends[:2]), shape, 0)
 
 
 def test_extreme_shapes_of_a_subject_follow_through_intermediate_ones() -> None:

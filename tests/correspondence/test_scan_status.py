@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from test_published_correspondence import bone, drawn
 
 import shapespace as ss
 from raw_blobs import raw_blob
@@ -12,7 +13,7 @@ from shapespace.cli import main
 from shapespace.correspondence import groupwise
 from shapespace.correspondence.groupwise import FinishedCorrespondence, add_scans, correspond
 from shapespace.correspondence.register import ElasticSettings
-from shapespace.correspondence.scan_status import Judgement, ScanEvidence, judge, usual_ratios
+from shapespace.correspondence.scan_status import Judgement, ScanEvidence, judge
 from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.geometry.mirror_plane import mirror_image
 from shapespace.io.meshes.mesh_io import write_mesh
@@ -21,11 +22,8 @@ QUICK = ElasticSettings(harmonics=60, points=500, iterations=10)
 CONFIG = CorrespondConfig(vertices=300, rounds=2, mirror="never", first=QUICK, next=QUICK)
 BLOBS = [raw_blob(k, points=700) for k in range(8)]
 MIRRORED = 2
-TRUSTED = [mirror_image(one.scan) if k == MIRRORED else one.scan for k, one in enumerate(BLOBS)]
-SURE = ScanEvidence(
-    other_pose_ratio=2.5, other_pose_deg=170.0, mirrored_ratio=2.0, distance_ratio=1.0, consensus_deg=3.0,
-    usual_other_pose_ratio=2.5, usual_mirrored_ratio=2.0,
-)  # fmt: skip
+DOUBTED = 0.9  # probability of a right surface below which it is doubtful
+SURE = ScanEvidence(relief_agreement=1.3, usual_relief_agreement=1.3, consensus_deg=3.0)
 
 
 def test_a_surface_that_nothing_contradicts_has_converged() -> None:
@@ -36,35 +34,32 @@ def test_a_surface_that_nothing_contradicts_has_converged() -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"consensus_deg": 178.0, "other_pose_ratio": 1.9}, "rotated by 178 degrees"),
-        ({"other_pose_ratio": 0.9}, "rotated by 170 degrees is only 0.90 times"),
-        ({"mirrored_ratio": 0.1}, "its mirror image is only 0.10 times"),
-        ({"distance_ratio": 2.4}, "2.4 times as far as usual"),
+        ({"consensus_deg": 178.0, "relief_agreement": 1.2}, "rotated by 178 degrees"),
+        ({"relief_agreement": 0.5}, "correlate with those of the others by 0.46 (usual: 0.86)"),
     ],
 )
 def test_each_kind_of_evidence_makes_a_surface_doubtful_and_is_named(change: dict[str, float], words: str) -> None:
     judgement = judge(replace(SURE, **change))
-    assert judgement.status == "doubtful" and judgement.probability < 0.8
+    assert judgement.status == "doubtful" and judgement.probability < DOUBTED
     assert words in judgement.doubt
 
 
 def test_what_all_scans_have_in_common_does_not_make_them_doubtful() -> None:
-    symmetric = replace(SURE, mirrored_ratio=1.0, other_pose_ratio=1.05)
-    other_pose, mirrored = usual_ratios([symmetric] * 5)
-    usual = replace(symmetric, usual_other_pose_ratio=other_pose, usual_mirrored_ratio=mirrored)
-    assert judge(usual).status == "converged"
+    assert judge(replace(SURE, relief_agreement=0.2, usual_relief_agreement=0.2)).status == "converged"
 
 
 def test_a_mirrored_scan_whose_file_is_trusted_is_doubtful_and_no_other() -> None:
-    made = correspond(TRUSTED, CONFIG)
-    assert [scan.status == "doubtful" for scan in made.scans] == [k == MIRRORED for k in range(8)]
-    assert made.scans[MIRRORED].probability < 0.8 < min(s.probability for s in made.scans if s.status == "converged")
+    bones = drawn(bone, 5).scans
+    made = correspond([mirror_image(one) if k == MIRRORED else one for k, one in enumerate(bones)], CONFIG)
+    assert [scan.status == "doubtful" for scan in made.scans] == [k == MIRRORED for k in range(len(bones))]
+    assert made.scans[MIRRORED].probability < 0.1
 
 
 def test_an_added_scan_has_a_status_of_its_own() -> None:
-    made = correspond([one.scan for one in BLOBS[:6]], CONFIG)
-    finished = FinishedCorrespondence(made.template, made.landmarks, made.meshes(), usual_ratios=made.usual_ratios)
-    right, mirrored = add_scans(finished, [BLOBS[6].scan, mirror_image(BLOBS[7].scan)], CONFIG).scans
+    made = correspond(drawn(bone, 5).scans, CONFIG)
+    finished = FinishedCorrespondence(made.template, made.landmarks, made.meshes())
+    new = drawn(bone, 8).scans
+    right, mirrored = add_scans(finished, [new[0], mirror_image(new[1])], CONFIG).scans
     assert right.status == "converged"
     assert mirrored.status == "doubtful" or mirrored.reason
 
@@ -77,7 +72,7 @@ def test_build_leaves_doubtful_surfaces_out_with_a_note_and_includes_them_on_req
 
     def judge_one(evidence: ScanEvidence) -> Judgement:
         seen.append(evidence)
-        return judge(replace(SURE, distance_ratio=2.4)) if len(seen) == MIRRORED + 1 else judge(SURE)
+        return judge(replace(SURE, relief_agreement=0.3)) if len(seen) == MIRRORED + 1 else judge(SURE)
 
     monkeypatch.setattr(groupwise, "judge", judge_one)
     (tmp_path / "scans").mkdir()
@@ -93,7 +88,7 @@ def test_build_leaves_doubtful_surfaces_out_with_a_note_and_includes_them_on_req
     assert f"({len(doubtful)} doubtful)" in output.out
     for scan in (one.scan for one in BLOBS):
         record = json.loads((tmp_path / "same" / f"{scan.name}.correspond.json").read_text())
-        assert (record["status"] == "doubtful") == (scan.name in doubtful) == (record["probability"] < 0.8)
+        assert (record["status"] == "doubtful") == (scan.name in doubtful) == (record["probability"] < DOUBTED)
         assert (f"{scan.name} is doubtful: {record['doubt']}" in output.err + output.out) == (scan.name in doubtful)
     assert main(["build", same, "-o", str(tmp_path / "m.h5"), "--quiet"]) == 0
     assert f"{len(doubtful)} of 8 surfaces are doubtful and left out ({doubtful[0]}" in capsys.readouterr().err

@@ -204,7 +204,6 @@ def _corresponding(
         groups=[list(group) for group in made.groups],
         inputs_hash=inputs_hash,
         doubtful=[record.name for record in records if record.doubt],
-        usual_ratios=made.usual_ratios,
     )
     summary = structs.replace(summary, results_hash=results_hash_of(summary, folder))
     write_text(folder / SUMMARY, json_text(summary))

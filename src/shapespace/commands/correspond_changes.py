@@ -329,15 +329,7 @@ def _registered(
         paths = [Path(finished.records[name].path) for name in kept]
         surfaces = [marks.onto(surface, path) for surface, path in zip(surfaces, paths, strict=True)]
     mirrored = [name in finished.summary.mirrored for name in kept]
-    start = FinishedCorrespondence(
-        finished.mean,
-        landmarks,
-        surfaces,
-        raw,
-        mirrored,
-        finished.summary.sides_decided,
-        finished.summary.usual_ratios,
-    )
+    start = FinishedCorrespondence(finished.mean, landmarks, surfaces, raw, mirrored, finished.summary.sides_decided)
     return add_scans(start, added, config, run=rounds)
 
 
@@ -391,7 +383,6 @@ def _publish(
     write_results(made, records, change)
     if updated:
         write_mean(made, change)
-        summary = structs.replace(summary, usual_ratios=made.usual_ratios)
     summary = structs.replace(summary, results_hash=results_hash_of(summary, change, folder))
     write_text(change / SUMMARY, json_text(summary))
     complete_change(folder)

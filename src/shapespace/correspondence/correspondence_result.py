@@ -75,7 +75,6 @@ class Correspondence:
             and where they were not compared.
         groups: names of the scans in correspondence, then of those of each other kind of object; empty where all are of
             one kind.
-        usual_ratios: medians of the ratios of scores that `ScanEvidence` has; None of fewer than six scans.
     """
 
     template: Mesh
@@ -85,7 +84,6 @@ class Correspondence:
     landmarks: SurfaceLandmarks = field(default_factory=SurfaceLandmarks)
     sides_decided: bool = False
     groups: tuple[tuple[str, ...], ...] = ()
-    usual_ratios: tuple[float, float] | None = None
 
     __repr__ = short_repr
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from shapespace.correspondence.landmark_guide import contradicts_most, without_stray_landmarks
 from shapespace.correspondence.scan_set import copies
@@ -104,6 +105,8 @@ def _chosen_scan(scans: Mapping[int, Mesh], config: CorrespondConfig) -> tuple[M
         f"{chosen.name} is the first template: of {np.isfinite(choice.nearness).sum()} candidates it lies nearest "
         f"to the others, {100 * choice.nearness[choice.index]:.1f} % of its size off after a smooth change."
     )
+    if chosen.colours is not None:
+        mesh = replace(mesh, colours=chosen.colours[cKDTree(chosen.vertices).query(mesh.vertices)[1]])
     return mesh.with_vertices(mesh.vertices, chosen.landmarks), origin
 
 

@@ -21,9 +21,9 @@ from shapespace.correspondence.correspondence_result import Correspondence, Corr
 from shapespace.correspondence.first_template import FirstTemplate, first_template, repaired_scans
 from shapespace.correspondence.guide import ShapePredictor, predict_leave_one_out
 from shapespace.correspondence.harmonics import Harmonics
-from shapespace.correspondence.kinds import Collection, find_kinds
+from shapespace.correspondence.kinds import Collection, find_kinds, is_outlier
 from shapespace.correspondence.landmark_guide import ScanLandmarks, consensus_landmarks
-from shapespace.correspondence.mirrored_scans import Sides, solve_sides
+from shapespace.correspondence.mirrored_scans import ASYMMETRIC, Sides, solve_sides
 from shapespace.correspondence.pose_consensus import (
     SAME_POSE_DEG,
     TEMPLATE,
@@ -31,9 +31,16 @@ from shapespace.correspondence.pose_consensus import (
     angle_deg,
     consensus_poses,
 )
-from shapespace.correspondence.registration import Comparison, RegistrationTask, RoundContext, ScanRegistration
+from shapespace.correspondence.registration import (
+    CLEARLY_LESS_STRAINED,
+    Comparison,
+    RegistrationTask,
+    RoundContext,
+    ScanRegistration,
+)
+from shapespace.correspondence.relief import Reliefs, agreement, relief
 from shapespace.correspondence.scan_set import unit_ratios
-from shapespace.correspondence.scan_status import Judgement, ScanEvidence, judge, usual_ratios
+from shapespace.correspondence.scan_status import Judgement, ScanEvidence, judge
 from shapespace.correspondence.settings import FEWEST, SIZE, CorrespondConfig
 from shapespace.correspondence.subject_tree import subject_levels
 from shapespace.correspondence.template import PoseModel, clean_scan
@@ -46,23 +53,24 @@ from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.interop import as_meshes
 from shapespace.model.missing import with_estimates
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import FloatArray, Mesh, Similarity, SurfaceLandmarks
+from shapespace.types import ByteArray, FloatArray, Mesh, Similarity, SurfaceLandmarks
 
 ENOUGH_TO_JUDGE, _ENOUGH_TO_PREDICT = 6, 4
 """Scans: fewer do not determine the normal range of shapes; fewer do not predict another one."""
 _JUDGES = 40  # finished scans, at most, that an added one is compared with: time grows with their square
-_LEAST_SCORE = 1e-6  # share of the size: scores of copies are 0
 _PARTS = 4  # folds of the shapes: the pose model of a scan is built without it
 _WHOLE, _LEAST_SPREAD, _SIZE_UNSEEN = 0.9, 0.01, 0.3
 """Scans that observe more than this share of the template determine the usual size; the least standard deviation of
 log sizes; and that of a scan's own log size for each share that is missing."""
 _CLEARLY_WORSE = 1.1  # ratio of the scores of the other side and a scan's own: beyond it the side is settled
+_RELIEF = 0.4
+"""Log ratio of distances that an agreement of reliefs counts as: 0 left a scan of a simulated kind in a wrong pose, and
+with 1 the scans of another kind were no longer a group."""
+_FALLS_SHORT = 0.3  # agreement of a relief below the usual one, from which other poses and sides are registered too
 _AS_NEAR = 1.1  # ratio of distances up to which a registration from another scan of the subject is used
+_BENDS = 0.15  # share of bent scans from which the object is one that bends
 _ANCHORS, _MOST_ANCHORS = 2, 6
 """Scans that all others are compared with, in addition to the template; at most, until the sides are decided."""
-_ASYMMETRIC = 0.05
-"""Median log ratio of scores below which no more anchors are used: it was 0.03 for faces, and above 0.1 for blobs whose
-sides needed five anchors."""
 
 
 class Runner(Protocol):
@@ -114,11 +122,13 @@ def correspond(
     for _ in range(config.rounds):
         registrations = run(_context(problem, state), [_task(problem, state, i) for i in problem.first.repaired])
         previous, state = state, _next_state(problem, state, registrations)
+        if not previous.rounds and state.bends:
+            state = _with_sides_by_strain(problem, previous, state, run)
         if subjects and not previous.rounds:
             state = _registered_by_subject(problem, previous, state, run)
         if state.rounds[-1].moved < config.settled:  # C17
             break
-    return _result(problem, state, _evidence(problem, state, run))
+    return _result(problem, state, _evidence(problem, state))
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,6 +197,7 @@ class RegistrationState:
         other_kinds: of the scans that were in another group than the largest, the first scan of their group.
         consensus: poses of the scans, or of their mirror images, on which the comparisons with anchors agree (C32).
         bent: the scans whose next registration begins at their own surface, since no other scan predicts it.
+        doubted: the scans whose relief agrees clearly less than usual with those of the others.
     """
 
     template: Mesh
@@ -199,6 +210,13 @@ class RegistrationState:
     other_kinds: Mapping[int, int] = field(default_factory=dict[int, int])
     consensus: Mapping[int, Similarity] = field(default_factory=dict[int, Similarity])
     bent: frozenset[int] = frozenset()
+    doubted: frozenset[int] = frozenset()
+
+    @property
+    def bends(self) -> bool:
+        """Whether the object bends: several scans are less strained if they begin at a map along the surface."""
+        bent = [one.bent for one in self.registrations.values()]
+        return sum(bent) >= max(2.0, _BENDS * len(bent))
 
     def is_mirrored(self, i: int) -> bool:
         """Return whether scan `i` is a mirror image of the majority, as far as is known."""
@@ -241,7 +259,7 @@ def _with_sides(problem: _Problem, run: Runner, *, may_reflect: bool) -> tuple[_
         scores = np.concatenate([scores, row[None]])
         if len(anchors) > _ANCHORS and problem.config.mirror != "never":
             sides = solve_sides(scores, anchors, problem.config.seed)
-        is_unsure = not sides.decided and sides.asymmetry > _ASYMMETRIC
+        is_unsure = not sides.decided and sides.asymmetry > ASYMMETRIC
         if len(anchors) > (_MOST_ANCHORS if is_unsure else _ANCHORS):
             break
     if may_reflect and sides.decided and sides.mirrored.sum() > len(problem.first.repaired) / 2:
@@ -318,6 +336,7 @@ def _task(problem: _Problem, state: RegistrationState, i: int) -> RegistrationTa
         pose=config.pose,
         other_pose=_other_pose(state, i),
         bent=i in state.bent and known,
+        doubted=i in state.doubted and known,
     )
 
 
@@ -335,8 +354,10 @@ def _comparison(problem: _Problem, state: RegistrationState, i: int) -> Comparis
         return "as given"
     if not (state.sides.decided and state.registrations):
         return "one"
-    is_settled = i in state.registrations and state.registrations[i].scores.mirrored > (
-        _CLEARLY_WORSE * state.registrations[i].scores.pose
+    is_settled = (
+        i in state.registrations
+        and i not in state.doubted
+        and state.registrations[i].scores.mirrored > _CLEARLY_WORSE * state.registrations[i].scores.pose
     )
     return "one" if is_settled else "both"
 
@@ -386,6 +407,35 @@ def _next_state(
             f"Only {len(state.registrations)} of {len(problem.names)} scans could be registered: {reasons}."
         )
     return _update_template(problem, previous, state, {one.index: one.cpu_s for one in ended})
+
+
+def _with_sides_by_strain(
+    problem: _Problem, previous: RegistrationState, state: RegistrationState, run: Runner
+) -> RegistrationState:
+    """Return the state of the first round with the sides of an object that bends.
+
+    Scores of rigid poses do not show the side of limbs that have moved. A scan stays reflected only where its mirror
+    image is clearly less strained than the scan as it is.
+    """
+    reflected = [i for i, one in state.registrations.items() if one.mirrored]
+    if not reflected:
+        return state
+    as_given = replace(previous, sides=replace(previous.sides, mirrored=np.zeros(len(problem.names), np.bool_)))
+    tasks = [replace(_task(problem, as_given, i), sides="as given") for i in reflected]
+    registrations, cpu_s = dict(state.registrations), dict(state.rounds[-1].cpu_s)
+    mirrored = np.array(as_given.sides.mirrored)
+    for registration in run(_context(problem, as_given), tasks):
+        i = registration.index
+        cpu_s[i] += registration.cpu_s
+        if _exclusion_reason(problem.config, registration) or (
+            registrations[i].strain < CLEARLY_LESS_STRAINED * registration.strain
+        ):
+            mirrored[i] = True
+        else:
+            registrations[i] = registration
+    sides = replace(previous.sides, mirrored=mirrored, decided=False)
+    state = replace(state, registrations=registrations, sides=sides, rounds=previous.rounds)
+    return _update_template(problem, previous, state, cpu_s)
 
 
 def _registered_by_subject(
@@ -454,14 +504,16 @@ def _exclude_other_kinds(problem: _Problem, state: RegistrationState, order: Seq
     """Exclude the scans in `order` that are another kind of object than the largest group, or are like no other."""
     if problem.subjects:  # scans of one subject predict each other, and are no kind of object
         order = list({problem.subjects[i]: i for i in sorted(order, reverse=True)}.values())
-    if len(order) < ENOUGH_TO_JUDGE:
+    if len(order) < ENOUGH_TO_JUDGE or state.bends:  # poses are no kinds
         return state
     order, config = sorted(order), problem.config
     shapes, observed = state.shapes(order)
-    kinds = find_kinds(shapes, observed, state.template.vertices)
+    reliefs = Reliefs.of(shapes, observed, state.template, problem.harmonics)
+    kinds = find_kinds(shapes, observed, state.template.vertices, reliefs)
+    outliers = is_outlier(kinds.distance, kinds.relief_agreement, config.outlier_threshold)
     reasons = {
         order[k]: _outlier_reason(state.registrations[order[k]], float(kinds.distance[k]))
-        for k in np.flatnonzero(kinds.distance > config.outlier_threshold).tolist()  # C14
+        for k in np.flatnonzero(outliers).tolist()
     }
     other_kinds = dict(state.other_kinds)
     for group in kinds.groups[1:]:
@@ -492,14 +544,17 @@ def _resolve_alternatives(problem: _Problem, state: RegistrationState) -> Regist
     shapes, observed = state.shapes(sure)
     shapes, _ = align_to_weighted_mean(shapes, observed, state.template.vertices)
     predictor = ShapePredictor.of(shapes, problem.config.noise_share)
+    middle = Reliefs.of(shapes, observed, state.template, problem.harmonics).median()
+
+    def unlikelihood(one: ScanRegistration) -> float:
+        distance = predictor.distance(one.vertices, one.observed.astype(np.float64))
+        own = relief(one.vertices, state.template, problem.harmonics)
+        return float(np.log(distance)) - _RELIEF * agreement(own, middle, problem.harmonics.area * one.observed)  # C15
 
     def best(registration: ScanRegistration) -> ScanRegistration:
         if not registration.alternatives:
             return registration
-        return min(
-            (registration, *registration.alternatives),
-            key=lambda one: predictor.distance(one.vertices, one.observed.astype(np.float64)),  # C15
-        )
+        return min((registration, *registration.alternatives), key=unlikelihood)
 
     return replace(state, registrations={i: best(one) for i, one in state.registrations.items()})
 
@@ -517,49 +572,26 @@ def _exclude_mirrored(problem: _Problem, state: RegistrationState) -> Registrati
 # Evidence
 
 
-def _evidence(problem: _Problem, state: RegistrationState, run: Runner) -> dict[int, ScanEvidence]:
-    """Return the evidence on each registered scan, by comparisons of its poses with the modes of the others.
-
-    Too few scans do not determine what is usual, so there is none.
-    """
+def _evidence(problem: _Problem, state: RegistrationState) -> dict[int, ScanEvidence]:
+    """Return the evidence on each registered scan; none if there are too few to determine what is usual."""
     order = sorted(state.registrations)
     if len(order) < ENOUGH_TO_JUDGE:
         return {}
-    compared = {one.index: one for one in run(_context(problem, state), [_pose_task(problem, state, i) for i in order])}
-    distances = find_kinds(*state.shapes(order), state.template.vertices).distance
-    evidence = {
-        i: _scan_evidence(state, compared[i], distance) for i, distance in zip(order, distances.tolist(), strict=True)
-    }
-    return _with_usual_ratios(evidence, usual_ratios(list(evidence.values())))
-
-
-def _with_usual_ratios(evidence: Mapping[int, ScanEvidence], usual: tuple[float, float]) -> dict[int, ScanEvidence]:
-    """Return the evidence in relation to the usual ratios."""
-    other_pose, mirrored = usual
+    shapes, observed = state.shapes(order)
+    agreements = Reliefs.of(shapes, observed, state.template, problem.harmonics).agreements()
+    usual = float(np.median(agreements))
     return {
-        i: replace(one, usual_other_pose_ratio=other_pose, usual_mirrored_ratio=mirrored) for i, one in evidence.items()
-    }
+        i: ScanEvidence(
+            relief_agreement=own, usual_relief_agreement=usual, consensus_deg=_consensus_deg(state, i)
+        )
+        for i, own in zip(order, agreements.tolist(), strict=True)
+    }  # fmt: skip
 
 
-def _pose_task(problem: _Problem, state: RegistrationState, i: int) -> RegistrationTask:
-    """Return the task that compares the pose of a registered scan with other ones."""
-    T = state.registrations[i].T_scan_template
-    task = replace(_task(problem, state, i), T_scan_template=T, expected=None, landmarks=None)
-    return replace(task, sides="scores", other_pose=None, bent=False)
-
-
-def _scan_evidence(state: RegistrationState, compared: ScanRegistration, distance: float) -> ScanEvidence:
-    """Return the evidence on one scan; `distance` is that from its prediction, relative to the usual one (C14)."""
-    T, scores = state.registrations[compared.index].T_scan_template, compared.scores
-    others = [angle_deg(T, one.T_scan_template) for one in compared.alternatives if not one.mirrored]
-    consensus, own = state.consensus.get(compared.index), max(scores.pose, _LEAST_SCORE)
-    return ScanEvidence(
-        other_pose_ratio=scores.other_pose / own,
-        other_pose_deg=others[0] if others else 0.0,
-        mirrored_ratio=scores.mirrored / own,
-        distance_ratio=distance,
-        consensus_deg=0.0 if consensus is None else angle_deg(T, consensus),
-    )
+def _consensus_deg(state: RegistrationState, i: int) -> float:
+    """Return the rotation between the pose of a scan and the one on which the comparisons agree (C32); 0 if unknown."""
+    T = None if state.bends else state.consensus.get(i)
+    return 0.0 if T is None else angle_deg(T, state.registrations[i].T_scan_template)
 
 
 # The mean of a round
@@ -583,9 +615,9 @@ def _update_template(
     if problem.config.guided and len(order) >= _ENOUGH_TO_PREDICT:
         predicted = predict_leave_one_out(shapes, observed, problem.config.noise_share)
         predictions = dict(zip(order, predicted, strict=True))
-    template = Mesh(mean, state.template.faces, name=state.template.name)
+    template = Mesh(mean, state.template.faces, name=state.template.name, colours=_median_colours(registrations))
     bent = frozenset(i for i in order if registrations[i].bent)
-    if 2 * len(bent) >= len(order):  # a mean of poses is no shape, and no pose is predicted by others
+    if state.bends:  # a mean of poses is no shape, and no pose is predicted by others
         bent, template = frozenset(order), state.template
     predictions = {**predictions, **{i: registrations[i].vertices for i in bent}}
     record = RoundRecord(
@@ -604,7 +636,30 @@ def _update_template(
         other_kinds=state.other_kinds,
         consensus=_consensus(problem, state),
         bent=bent,
+        doubted=_doubted(problem, registrations, template),
     )
+
+
+def _doubted(problem: _Problem, registrations: Mapping[int, ScanRegistration], template: Mesh) -> frozenset[int]:
+    """Return the scans whose relief agrees clearly less than usual with those of the others."""
+    if len(registrations) < ENOUGH_TO_JUDGE:
+        return frozenset()
+    shapes = np.stack([one.vertices for one in registrations.values()])
+    observed = np.stack([one.observed for one in registrations.values()]).astype(np.float64)
+    agreements = Reliefs.of(shapes, observed, template, problem.harmonics).agreements()
+    falls_short = agreements < np.median(agreements) - _FALLS_SHORT
+    return frozenset(i for i, is_short in zip(registrations, falls_short.tolist(), strict=True) if is_short)
+
+
+def _median_colours(registrations: Mapping[int, ScanRegistration]) -> ByteArray | None:
+    """Return the colours of the template: at each vertex the median of the scans that have colours and observe it."""
+    coloured = [one for one in registrations.values() if one.colours is not None]
+    if not coloured:
+        return None
+    seen = np.stack([one.observed for one in coloured])
+    seen |= ~seen.any(axis=0)
+    colours = np.where(seen[:, :, None], np.stack([one.colours for one in coloured if one.colours is not None]), np.nan)
+    return np.nanmedian(colours, axis=0).astype(np.uint8)
 
 
 def _consensus(problem: _Problem, state: RegistrationState) -> dict[int, Similarity]:
@@ -612,7 +667,10 @@ def _consensus(problem: _Problem, state: RegistrationState) -> dict[int, Similar
     if problem.config.pose != "search" or len(problem.first.repaired) < ENOUGH_TO_JUDGE:
         return {}
     mirrored = {TEMPLATE: problem.reflected} | {i: state.is_mirrored(i) for i in range(len(problem.names))}
-    return consensus_poses(problem.comparisons, mirrored)
+    poses = consensus_poses(problem.comparisons, mirrored)
+    angles = [angle_deg(poses[i], one.T_scan_template) for i, one in state.registrations.items() if i in poses]
+    # Where most contradict it, the comparisons with the template are wrong and not the scans.
+    return poses if angles and np.median(angles) < SAME_POSE_DEG else {}
 
 
 def _squared_movement(previous: RegistrationState, i: int, shape: FloatArray) -> float:
@@ -647,7 +705,7 @@ class FinishedCorrespondence:
             scans are reflected. Their landmarks are used if the mean has none.
         scans: the raw scans of the surfaces; empty if the mean and the surfaces stay.
         mirrored: which of the scans are mirrored; empty if none is.
-        sides_decided, usual_ratios: as of `Correspondence`.
+        sides_decided: as of `Correspondence`.
     """
 
     mean: Mesh
@@ -656,7 +714,6 @@ class FinishedCorrespondence:
     scans: Sequence[Mesh] = ()
     mirrored: Sequence[bool] = ()
     sides_decided: bool = False
-    usual_ratios: tuple[float, float] | None = None
 
 
 def add_scans(
@@ -697,39 +754,22 @@ def add_scans(
     problem = _Problem.of(names, first, config)
     start = _finished_state(problem, finished)
     states = _added_states(problem, start, [i for i in raw if i >= kept], run)
-    evidence = {} if finished.scans else _added_evidence(problem, start, states, finished.usual_ratios, run)
     if finished.scans:
         state = _merged(start, states)
         state = replace(_update_template(problem, state, state, {}), rounds=())
         registrations = run(_context(problem, state), [_task(problem, state, i) for i in raw])
         state = _next_state(problem, state, registrations)
-        return _result(problem, state, _evidence(problem, state, run))
-    results = [_added_result(problem, states.get(i, start), i, evidence.get(i)) for i in range(kept, len(names))]
+        return _result(problem, state, _evidence(problem, state))
+    results = [_added_result(problem, states.get(i, start), i) for i in range(kept, len(names))]
     return Correspondence(finished.mean, tuple(results), first.origin, (), start.landmarks)
 
 
-def _added_result(problem: _Problem, state: RegistrationState, i: int, evidence: ScanEvidence | None) -> Corresponding:
+def _added_result(problem: _Problem, state: RegistrationState, i: int) -> Corresponding:
     own = state.registrations.get(i)
+    evidence = None if own is None else _evidence_by_finished(problem, state, i)
     if own is None or own.observed.all():  # estimates take long where there are many scans
         return _scan_result(problem, state, i, None if own is None else own.vertices, evidence)
     return _scan_result(problem, state, i, _complete_shapes(problem, state)[i], evidence)
-
-
-def _added_evidence(
-    problem: _Problem,
-    start: RegistrationState,
-    states: Mapping[int, RegistrationState],
-    usual: tuple[float, float] | None,
-    run: Runner,
-) -> dict[int, ScanEvidence]:
-    """Return the evidence on each added scan that is registered; `usual` are the ratios of the finished scans."""
-    added = {i: state for i, state in states.items() if i in state.registrations}
-    if not added or len(start.registrations) < ENOUGH_TO_JUDGE:
-        return {}
-    tasks = [_pose_task(problem, state, i) for i, state in added.items()]
-    compared = {one.index: one for one in run(_context(problem, start), tasks)}
-    evidence = {i: _scan_evidence(state, compared[i], _distance_from_finished(state, i)) for i, state in added.items()}
-    return _with_usual_ratios(evidence, usual or (np.nan, np.nan))
 
 
 def _finished_state(problem: _Problem, finished: FinishedCorrespondence) -> RegistrationState:
@@ -811,24 +851,31 @@ def _next_added_state(
 
 def _judged_by_finished(problem: _Problem, state: RegistrationState, i: int) -> RegistrationState:
     """Return the state of an added scan after its last round, without it if it is an outlier among the others."""
-    if i not in state.registrations:
+    if i not in state.registrations or len(judges := _judges(state, i)) < ENOUGH_TO_JUDGE - 1:
         return state
-    distance = _distance_from_finished(state, i)
-    if distance <= problem.config.outlier_threshold:  # C14
+    shapes, observed = state.shapes([*judges, i])
+    finished = np.arange(len(judges))
+    distance = Collection.of(shapes, observed, state.template.vertices).distances(finished)[-1]
+    reliefs = Reliefs.of(shapes, observed, state.template, problem.harmonics)
+    if not is_outlier(distance, reliefs.agreements(finished.astype(np.int32))[-1], problem.config.outlier_threshold):
         return state
-    excluded = {i: _outlier_reason(state.registrations[i], distance)}
+    excluded = {i: _outlier_reason(state.registrations[i], float(distance))}
     kept = {j: one for j, one in state.registrations.items() if j != i}
     return replace(state, registrations=kept, excluded=excluded)
 
 
-def _distance_from_finished(state: RegistrationState, i: int) -> float:
-    """Return the distance of an added scan from its prediction by finished ones (C14); 1 where these are too few."""
+def _judges(state: RegistrationState, i: int) -> list[int]:
+    """Return the finished scans that the added scan `i` is compared with."""
     kept = sorted(state.registrations.keys() - {i})
-    judges = kept[:: -(-len(kept) // _JUDGES)]
-    if len(judges) < ENOUGH_TO_JUDGE - 1:
-        return 1.0
-    collection = Collection.of(*state.shapes([*judges, i]), state.template.vertices)
-    return float(collection.distances(np.arange(len(judges)))[-1])
+    return kept[:: -(-len(kept) // _JUDGES)]
+
+
+def _evidence_by_finished(problem: _Problem, state: RegistrationState, i: int) -> ScanEvidence | None:
+    """Return the evidence on an added scan by finished ones; None where these are too few."""
+    if len(judges := _judges(state, i)) < ENOUGH_TO_JUDGE - 1:
+        return None
+    *others, own = Reliefs.of(*state.shapes([*judges, i]), state.template, problem.harmonics).agreements().tolist()
+    return ScanEvidence(relief_agreement=own, usual_relief_agreement=float(np.median(others)))
 
 
 def _merged(start: RegistrationState, states: Mapping[int, RegistrationState]) -> RegistrationState:
@@ -864,7 +911,6 @@ def _result(problem: _Problem, state: RegistrationState, evidence: Mapping[int, 
     return Correspondence(
         template, tuple(scans), problem.first.origin, moved, landmarks, sides_decided=state.sides.decided,
         groups=tuple(tuple(problem.names[i] for i in group) for group in groups),
-        usual_ratios=usual_ratios(list(evidence.values())) if evidence else None,
     )  # fmt: skip
 
 

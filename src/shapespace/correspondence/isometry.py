@@ -16,7 +16,7 @@ import numpy as np
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.template import clean_scan, resample
 from shapespace.geometry.distortion import edge_stretch
-from shapespace.geometry.normals import face_vectors, faces_of, vertex_normals
+from shapespace.geometry.normals import face_vectors, faces_of, rms_size, vertex_normals
 from shapespace.types import FloatArray, IntArray, Mesh
 
 _VERTICES = 2000  # of the coarse mesh of a scan, and at most of the template's that are mapped: cost grows with them
@@ -26,10 +26,13 @@ _COARSEST, _FINEST, _STEPS = 20, 80, 18
 _FAR_APART = 0.35  # least distance of two extremities, share of the RMS distance along the surface
 _OWN_ENDS, _SCAN_ENDS, _FEWEST_ENDS = 6, 8, 3
 """Extremities of the template and of the scan, at most, and at least: fewer leave rotations open."""
-_TRIED = 6  # assignments of extremities: each costs about 0.2 CPU s
-_SENSE = 0.8
-"""Share of the area of the map, less that of the rest, that is not turned inside out: it was 0.89 or more in the right
-maps of 10 figures, and -0.9 where left and right were exchanged."""
+_TRIED = 10  # assignments of extremities: each costs about 0.2 CPU s
+_SENSE = 0.75
+"""Share of the area of the map, less that of the rest, that is not turned inside out: it was 0.87 or more in the right
+maps of 9 figures, and negative where left and right were exchanged."""
+_MAPS, _DISTINCT = 3, 0.05
+"""Maps to be registered, at most, and the least median distance of two of them, share of the size: by stretch alone,
+figures with front and back exchanged cannot be told from right ones."""
 _JACOBIANS = 3.0
 """RMS of the determinants in the first map, in which distances have about 2; 2 and 4 give the same maps."""
 _SMOOTH = 0.05  # range over which the determinants are averaged, share of the square root of the area
@@ -94,8 +97,8 @@ class IntrinsicShape:
         return self.harmonics.diffused(sums / self.area[:, None], smooth_mm)
 
 
-def bent_shape(template: IntrinsicShape, scan: IntrinsicShape, seed: int) -> FloatArray | None:
-    """Return the template's vertices (V, 3) on `scan`, by the map that changes distances along the surface least.
+def bent_shapes(template: IntrinsicShape, scan: IntrinsicShape, seed: int) -> list[FloatArray]:
+    """Return the template's vertices (V, 3) on `scan`, by the maps that change distances along the surface least.
 
     Extremities are assigned by their distances from each other; each likely assignment gives a map, which is refined
     (ZoomOut; Melzi et al. 2019). It must not turn the surface inside out, which distinguishes left from right.
@@ -106,11 +109,13 @@ def bent_shape(template: IntrinsicShape, scan: IntrinsicShape, seed: int) -> Flo
         seed: of the vertices of the template that are mapped.
 
     Returns:
-        None if there are too few extremities, or if no map keeps the orientation.
+        The distinct ones, at most `_MAPS`, least stretched first; none if there are too few extremities, or if no map
+        keeps the orientation.
     """
     rng = np.random.default_rng(seed)
     drawn = np.sort(rng.permutation(len(template.functions))[: _VERTICES // 2]).astype(np.int32)
-    best, least = None, np.inf
+    faces, limit = faces_of(template.mesh), _DISTINCT * rms_size(scan.mesh.vertices)
+    shapes: list[FloatArray] = []
     for ends in _assignments(template, scan):
         own, theirs = template.distances(template.ends[: len(ends)]), scan.distances(ends)
         turns = template.determinants(own)
@@ -118,14 +123,16 @@ def bent_shape(template: IntrinsicShape, scan: IntrinsicShape, seed: int) -> Flo
         features = np.hstack([own, scale * turns])[drawn]
         start = _nearest(features, np.hstack([theirs, scale * scan.determinants(theirs)]))
         mapped = _refined(template, scan, start, drawn)
-        if _orientation(faces_of(template.mesh), scan, mapped) < _SENSE:
-            continue
         weighted = template.area[:, None] * scan.mesh.vertices[mapped]
         shape = template.functions @ (template.functions.T @ weighted)
-        stretch = edge_stretch(shape, template.mesh)
-        if stretch < least:
-            best, least = shape, stretch
-    return best
+        if _orientation(shape, faces, vertex_normals(scan.mesh)[mapped]) >= _SENSE:
+            shapes.append(shape)
+    shapes.sort(key=lambda shape: edge_stretch(shape, template.mesh))
+    distinct: list[FloatArray] = []
+    for shape in shapes:
+        if all(np.median(np.linalg.norm(shape - other, axis=1)) > limit for other in distinct):
+            distinct.append(shape)
+    return distinct[:_MAPS]
 
 
 def _extremities(embedding: FloatArray, faces: IntArray, most: int) -> IntArray:
@@ -169,12 +176,18 @@ def _refined(template: IntrinsicShape, scan: IntrinsicShape, start: IntArray, dr
     return _nearest(own, theirs @ C.T)
 
 
-def _orientation(faces: IntArray, scan: IntrinsicShape, mapped: IntArray) -> float:
-    """Return the share of the mapped area that faces as the scan does, less that of the rest."""
-    vectors = face_vectors(scan.mesh.vertices[mapped], faces)
-    normals = vertex_normals(scan.mesh)[mapped[faces]].sum(axis=1)
+def _orientation(shape: FloatArray, faces: IntArray, normals: FloatArray) -> float:
+    """Return the share of the area of `shape` that faces as the scan does, less that of the rest.
+
+    Args:
+        shape: (V, 3) on the scan.
+        faces: of the shape.
+        normals: (V, 3) of the scan at its vertices.
+    """
+    vectors = face_vectors(shape, faces)
     areas = np.linalg.norm(vectors, axis=1)
-    return float((areas * np.sign(np.einsum("fd,fd->f", vectors, normals))).sum() / max(float(areas.sum()), 1e-12))
+    alike = np.sign(np.einsum("fd,fd->f", vectors, normals[faces].sum(axis=1)))
+    return float((areas * alike).sum() / max(float(areas.sum()), 1e-12))
 
 
 def _nearest(queries: FloatArray, points: FloatArray) -> IntArray:

@@ -2,7 +2,8 @@
 
 A leave-one-out prediction from all shapes does not show a second kind that is frequent, since it is a part of the
 training set. Here a core of shapes grows from a few similar ones: it predicts all shapes, and takes those that it
-predicts about as well as its own.
+predicts about as well as its own. Scans of one person also predict each other best; another person is no other kind of
+object, since the reliefs agree (C35).
 """
 
 from __future__ import annotations
@@ -14,9 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.correspondence.guide import ShapePredictor, predict_leave_one_out
+from shapespace.correspondence.relief import Reliefs
 from shapespace.geometry.normals import rms_size
 from shapespace.geometry.procrustes import align_to_weighted_mean
-from shapespace.types import FloatArray
+from shapespace.types import BoolArray, FloatArray
 
 _Indices: TypeAlias = npt.NDArray[np.int_]
 SAME_KIND = 2.0
@@ -26,6 +28,9 @@ SAME_KIND = 2.0
 ANOTHER_KIND = 2.2
 """Median distance of a group from the largest one, beyond which it is another kind: it was at least 2.4 in mixed
 collections."""
+SAME_RELIEF = 0.87
+"""Agreement of a relief with the median of a group (a correlation of 0.7), above which the shape is no other kind: the
+correlation was 0.85 or more for faces of other people with expressions, and 0.45 or less in groups of other kinds."""
 _NOISE_SHARE = 0.1
 """Noise of predictions (C13). With 1, shapes of few modes are shrunk so much that their extremes look like others: 15
 of 20 simulated collections of 80 shapes with three modes were split, with 0.1 none of 8 of 40 shapes."""
@@ -45,19 +50,22 @@ class Kinds:
     Args:
         groups: indices of the shapes that are alike, largest group first; those in no group are missing.
         distance: (N,) from the prediction by the largest group, in medians of its own.
+        relief_agreement: (N,) with the median relief of the largest group (C35); not-a-number if unknown.
     """
 
     groups: tuple[_Indices, ...]
     distance: FloatArray
+    relief_agreement: FloatArray
 
 
-def find_kinds(shapes: FloatArray, observed: FloatArray, template: FloatArray) -> Kinds:
-    """Return the groups of `shapes` that predict each other.
+def find_kinds(shapes: FloatArray, observed: FloatArray, template: FloatArray, reliefs: Reliefs | None = None) -> Kinds:
+    """Return the groups of `shapes` that predict each other and whose reliefs agree.
 
     Args:
         shapes: (N, V, 3) in correspondence.
         observed: (N, V) weights, 1 where a vertex is observed.
         template: (V, 3) that shapes are aligned to.
+        reliefs: of the shapes; None if unknown.
     """
     collection = Collection.of(shapes, observed, template)
     groups: list[_Indices] = []
@@ -70,9 +78,24 @@ def find_kinds(shapes: FloatArray, observed: FloatArray, template: FloatArray) -
         rest = np.setdiff1d(rest, core)
     groups.sort(key=len, reverse=True)
     groups = groups or [np.arange(len(shapes))]
+    agreement = np.full(len(shapes), np.nan)
+    if reliefs is not None:
+        agreement = reliefs.agreements(groups[0].astype(np.int32))
+        same = [np.median(agreement[group]) > SAME_RELIEF for group in groups[1:]]
+        joined = [group for group, is_same in zip(groups[1:], same, strict=True) if is_same]
+        others = [group for group, is_same in zip(groups[1:], same, strict=True) if not is_same]
+        groups = [np.sort(np.concatenate([groups[0], *joined])), *others]
     distance = collection.distances(groups[0])
     others = [group for group in groups[1:] if np.median(distance[group]) > ANOTHER_KIND]
-    return Kinds((groups[0], *others), distance)
+    return Kinds((groups[0], *others), distance, agreement)
+
+
+def is_outlier(distance: FloatArray, relief_agreement: FloatArray, threshold: float) -> BoolArray:
+    """Return which shapes are far from their prediction by a group (C14), and have another relief (C35).
+
+    Another relief alone is no reason, as that of smooth objects is noise; their status shows it.
+    """
+    return (distance > threshold) & ~(relief_agreement > SAME_RELIEF)
 
 
 @dataclass(frozen=True, eq=False)

@@ -47,6 +47,8 @@ class ElasticSettings:
         borders: whether what is matched with a border counts.
         floor: share of full weight below which nothing is seen, and the average fades.
         turn: length that a difference of the normals by a radian, or so, counts as much as.
+        colour: length that a difference between black and a full red, green or blue counts as much as, where template
+            and scan have colours; 0 ignores them.
         tangential: forces along the surface are averaged over this range at least: over shorter ones they are noise of
             the triangles, and move points away from the correct places that they had.
     """
@@ -62,6 +64,7 @@ class ElasticSettings:
     borders: bool = False
     floor: float = 0.05
     turn: float = 0.1
+    colour: float = 0.1
     tangential: float = 0.1
 
 
@@ -111,6 +114,7 @@ class _Problem:
         base: (V, 3) the shape without movement, in the template's frame.
         landmarks: of the scan, in its mm frame.
         settings: of the registration.
+        colours: (V, 3) of the template and (S, 3) of the scan, lengths in mm about their medians; None without.
     """
 
     template: Template
@@ -118,6 +122,7 @@ class _Problem:
     base: FloatArray
     landmarks: ScanLandmarks | None
     settings: ElasticSettings
+    colours: tuple[FloatArray, FloatArray] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,11 +133,13 @@ class _Samples:
         points: (M, 3) mm.
         normals: (M, 3), zero where the surface has no triangles.
         on_border: (M,) whether they are on the border of the surface.
+        colours: (M, 3), as lengths in mm; (M, 0) where the surface or the other one has none.
     """
 
     points: FloatArray
     normals: FloatArray
     on_border: BoolArray
+    colours: FloatArray
 
 
 def register(
@@ -157,7 +164,8 @@ def register(
         seed: of the points that are matched.
     """
     base = np.array(template.mesh.vertices if expected is None else expected)
-    problem = _Problem(template, target, base, landmarks, settings)
+    colours = _colours(template, target, settings)
+    problem = _Problem(template, target, base, landmarks, settings, colours)
     state, rng = ElasticState(base, T_scan_template), np.random.default_rng(seed)
     for range_share in np.geomspace(settings.widest, settings.narrowest, settings.iterations):
         state = _step(problem, state, float(range_share), rng)
@@ -182,6 +190,15 @@ def _step(problem: _Problem, state: ElasticState, range_share: float, rng: np.ra
     return ElasticState(x, T)
 
 
+def _colours(template: Template, target: ScanTarget, settings: ElasticSettings) -> tuple[FloatArray, FloatArray] | None:
+    """Return the colours as lengths, without what a whole surface has in common, such as its light."""
+    own, scan = template.mesh.colours, target.mesh.colours
+    if own is None or scan is None or not settings.colour:
+        return None
+    scale = settings.colour * template.size_mm / 255.0
+    return scale * (own - np.median(own, axis=0)), scale * (scan - np.median(scan, axis=0))
+
+
 def _samples(
     problem: _Problem, state: ElasticState, coarse: bool, rng: np.random.Generator
 ) -> tuple[IntArray, _Samples, _Samples]:
@@ -194,9 +211,12 @@ def _samples(
     T = state.T_scan_template
     normals = np.empty_like(state.vertices)
     normals_into(state.vertices, topology.faces, normals)
-    surface = _Samples(state.vertices[own], normals[own], topology.rim[own])
+    none = (np.empty((len(normals), 0)), np.empty((len(target.mesh.vertices), 0)))
+    own_colours, scan_colours = problem.colours or none
+    surface = _Samples(state.vertices[own], normals[own], topology.rim[own], own_colours[own])
     points = T.inverse().apply(target.mesh.vertices[chosen])
-    return own, surface, _Samples(points, target.normals[chosen] @ T.rotation, target.rim[chosen])
+    scan = _Samples(points, target.normals[chosen] @ T.rotation, target.rim[chosen], scan_colours[chosen])
+    return own, surface, scan
 
 
 def _forces(
@@ -205,9 +225,9 @@ def _forces(
     """Return forces (M, 3), mm, on the points of the surface, and their weights (M,): 1 for each side that is sure."""
     x, y, count = surface.points, scan.points, len(surface.points)
     is_cloud = not scan.normals.any()
-    turn = settings.turn * size_mm
-    surface_features = x if is_cloud else np.hstack([x, turn * surface.normals])
-    scan_features = y if is_cloud else np.hstack([y, turn * scan.normals])
+    turn = 0.0 if is_cloud else settings.turn * size_mm
+    surface_features = np.hstack([x, turn * surface.normals, surface.colours])
+    scan_features = np.hstack([y, turn * scan.normals, scan.colours])
     near, share = _soft_matches(scan_features, surface_features)
     to_scan = np.einsum("mk,mkd->md", share, y[near]) - x
     cosine = np.einsum("md,mkd,mk->m", surface.normals, scan.normals[near], share)

@@ -16,10 +16,11 @@ from threadpoolctl import threadpool_limits
 
 from shapespace.correspondence.generic import generic_model
 from shapespace.correspondence.harmonics import Harmonics
-from shapespace.correspondence.isometry import IntrinsicShape, bent_shape
+from shapespace.correspondence.isometry import IntrinsicShape, bent_shapes
 from shapespace.correspondence.landmark_guide import MirroredLandmarksError, ScanLandmarks
 from shapespace.correspondence.pose_consensus import angle_deg
 from shapespace.correspondence.register import ElasticSettings, Template, register
+from shapespace.correspondence.relief import agreement, relief
 from shapespace.correspondence.settings import PoseRange
 from shapespace.correspondence.template import PoseModel
 from shapespace.errors import FitError, InputError, ShapespaceError
@@ -34,7 +35,7 @@ from shapespace.geometry.mirror_plane import mirror_image
 from shapespace.geometry.normals import boundary_edges, boundary_vertices, rms_size, vertex_normals
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
+from shapespace.types import BoolArray, ByteArray, FloatArray, Mesh, Similarity
 
 REACHED = 0.03
 """A scan's point is covered when the surface is this near, as a share of the size."""
@@ -60,7 +61,7 @@ _STRAINED = 0.0009
 """Mean distance from the scan, share of the size, times RMS log stretch of edges, beyond which limbs may be missing or
 exchanged: 3 of 59 faces, femora, molars, spleens and blobs, whole or damaged, had more (two cut femora and a blob), and
 13 of 50 figures with moving limbs, of which the others had at most 0.0007."""
-_STRAIGHTENED = 0.7
+CLEARLY_LESS_STRAINED = 0.7
 """Ratio of this strain below which a registration from the map along the surface replaces another one; 1 for an object
 that is known to bend."""
 _UNREACHED = "surface not reached: too little of the scan matches the template from any pose"
@@ -79,12 +80,10 @@ class PoseScores(NamedTuple):
 
     Args:
         pose: of its pose.
-        other_pose: of the best pose that is another one; infinite where all others are clearly worse.
         mirrored: of the best pose of its mirror image.
     """
 
     pose: float
-    other_pose: float
     mirrored: float
 
 
@@ -107,6 +106,7 @@ class RegistrationTask:
         pose: poses that are searched; for mirror images and comparisons of scores all.
         other_pose: from which the scan is registered too; None if there is no other one.
         bent: whether `expected` is the scan's own surface of the last round, so that no pose is searched.
+        doubted: whether it is registered from all likely poses, and where sides are compared also as its mirror image.
     """
 
     index: int
@@ -121,6 +121,7 @@ class RegistrationTask:
     pose: PoseRange = "search"
     other_pose: Similarity | None = None
     bent: bool = False
+    doubted: bool = False
 
     def reflected(self) -> RegistrationTask:
         """Return the same task for the mirror image of its scan, at an unknown pose."""
@@ -150,6 +151,7 @@ class ScanRegistration:
         posed_by_landmarks: whether the landmarks determine the pose.
         stretch: RMS log ratio of its edges to those of the template, the change of size removed.
         bent: whether it began at a map along the surface, as of an object whose limbs have moved.
+        colours: (V, 3) uint8 of the scan at the vertices; None where it has none.
     """
 
     index: int
@@ -162,10 +164,11 @@ class ScanRegistration:
     reason: str = ""
     alternatives: tuple[ScanRegistration, ...] = ()
     mirrored: bool = False
-    scores: PoseScores = field(default_factory=lambda: PoseScores(np.nan, np.nan, np.nan))
+    scores: PoseScores = field(default_factory=lambda: PoseScores(np.nan, np.nan))
     posed_by_landmarks: bool = False
     stretch: float = 0.0
     bent: bool = False
+    colours: ByteArray | None = None
 
     @property
     def strain(self) -> float:
@@ -205,6 +208,11 @@ class RoundContext:
     def intrinsic(self) -> IntrinsicShape:
         """The template by quantities that bending does not change."""
         return IntrinsicShape.of(self.mesh, self.harmonics)
+
+    @cached_property
+    def template_relief(self) -> FloatArray:
+        """(V,) the relief of the template."""
+        return relief(self.mesh.vertices, self.mesh, self.harmonics)
 
     def register(self, task: RegistrationTask) -> ScanRegistration:
         """Register the template to the task's scan; a scan that cannot be registered has a reason."""
@@ -255,61 +263,65 @@ class RoundContext:
         likely = [
             (one, at)
             for one, at in ((task, start), (other, mirrored))
-            if at.score_mm <= _EITHER_SIDE * min(start.score_mm, mirrored.score_mm) or one.T_scan_template is not None
+            if task.doubted
+            or one.T_scan_template is not None
+            or at.score_mm <= _EITHER_SIDE * min(start.score_mm, mirrored.score_mm)
         ]
         registered = [one for one in (self._try_side(*side) for side in likely) if one is not None]
         if not registered:
             raise FitError(_UNREACHED)
         first, *others = registered
         size = rms_size(self.pose_models[task.pose_model].model.mean_vertices)
-        scores = PoseScores(start.score_mm / size, start.runner_up_score_mm / size, mirrored.score_mm / size)
+        scores = PoseScores(start.score_mm / size, mirrored.score_mm / size)
         return replace(first, alternatives=(*first.alternatives, *others), scores=scores)
 
     def _compare(self, task: RegistrationTask) -> ScanRegistration:
-        """Return the pose of a scan, and as alternatives the best other one and that of its mirror image, with scores.
+        """Return the pose of a scan, and as an alternative that of its mirror image, with scores.
 
         Nothing is registered.
         """
-        model, T = self.pose_models[task.pose_model], task.T_scan_template or Similarity.identity()
+        model = self.pose_models[task.pose_model]
         size = rms_size(model.model.mean_vertices)
-        posed = T.inverse().apply(task.scan.vertices)
-        best = model.search(posed, self.seed, quick=True)
-        own, others = [best], [*best.alternatives]
-        if task.T_scan_template is not None:
-            poses, identity = [best, *best.alternatives], Similarity.identity()
-            own = [one for one in poses if _is_same_rotation(one.T_scan_model, identity)]
-            others = [one for one in poses if one not in own]
-            own = own or [model.search(posed, self.seed, pose="as-given")]
-        poses = [min(some, key=lambda one: one.score_mm) for some in (own, others) if some]
-        compared = self.failed(task.index, "only compared")
-        alternatives = [replace(compared, T_scan_template=T @ one.T_scan_model) for one in poses]
-        scores = PoseScores(poses[0].score_mm / size, poses[1].score_mm / size if others else np.inf, np.inf)
-        if task.sides == "scores":
-            image = model.search(np.array(task.reflected().scan.vertices), self.seed, quick=True)
-            scores = scores._replace(mirrored=image.score_mm / size)
-            alternatives.append(replace(compared, T_scan_template=image.T_scan_model, mirrored=not task.mirrored))
-        first, *others_found = alternatives
-        return replace(first, alternatives=tuple(others_found), scores=scores)
+        found = model.search(np.array(task.scan.vertices), self.seed, quick=True)
+        compared = replace(self.failed(task.index, "only compared"), T_scan_template=found.T_scan_model)
+        if task.sides == "pose":
+            return replace(compared, scores=PoseScores(found.score_mm / size, np.inf))
+        image = model.search(np.array(task.reflected().scan.vertices), self.seed, quick=True)
+        other = replace(compared, T_scan_template=image.T_scan_model, mirrored=not task.mirrored)
+        return replace(compared, alternatives=(other,), scores=PoseScores(found.score_mm / size, image.score_mm / size))
 
     def _register_bent(self, task: RegistrationTask, registration: ScanRegistration) -> ScanRegistration:
-        """Return `registration`, or that from a map along the surface if that one is less strained."""
+        """Return `registration`, or one from a map along the surface whose strain is clearly less.
+
+        Of several maps, that whose relief agrees best with the template's is used.
+        """
         strained = task.bent or registration.strain > _STRAINED * self.template.size_mm
-        if task.pose != "search" or not strained:
+        if task.pose != "search" or registration.posed_by_landmarks or not strained:
             return registration
-        limit = registration.strain * (1.0 if task.bent else _STRAIGHTENED)
+        limit = registration.strain * (1.0 if task.bent else CLEARLY_LESS_STRAINED)
         task = task.reflected() if registration.mirrored != task.mirrored else task
-        try:
-            shape = bent_shape(self.intrinsic, IntrinsicShape.of_scan(task.scan), self.seed)
-            if shape is None:
-                return registration
-            T = fit_similarity(self.mesh.vertices, shape)
-            bent = self._register_at(replace(task, expected=T.inverse().apply(shape)), T)
-        except ShapespaceError:
-            return registration
         least = (registration.covered - _LEFT_OVER, registration.observed.mean() - _LEFT_OVER)
-        if bent.covered < least[0] or bent.observed.mean() < least[1]:
-            return registration
-        return replace(bent, bent=True) if bent.strain < limit else registration
+        candidates = [replace(registration, bent=True)] if task.bent else []
+        for shape in self._shapes_by_map(task):
+            T = fit_similarity(self.mesh.vertices, shape)
+            try:
+                bent = self._register_at(replace(task, expected=T.inverse().apply(shape)), T)
+            except ShapespaceError:
+                continue
+            if bent.covered >= least[0] and bent.observed.mean() >= least[1] and bent.strain < limit:
+                candidates.append(replace(bent, bent=True))
+        return max(candidates, key=self._relief_agreement, default=registration)
+
+    def _relief_agreement(self, registration: ScanRegistration) -> float:
+        """Return how well the relief of a surface agrees with that of the template (C35)."""
+        own = relief(registration.vertices, self.mesh, self.harmonics)
+        return agreement(own, self.template_relief, self.harmonics.area * registration.observed)
+
+    def _shapes_by_map(self, task: RegistrationTask) -> list[FloatArray]:
+        try:
+            return bent_shapes(self.intrinsic, IntrinsicShape.of_scan(task.scan), self.seed)
+        except ShapespaceError:  # no sheet of triangles
+            return []
 
     def _search(self, task: RegistrationTask) -> Start:
         vertices = np.array(task.scan.vertices)
@@ -349,7 +361,8 @@ class RoundContext:
     def _register_near(self, task: RegistrationTask, T: Similarity, start: Start) -> ScanRegistration:
         """Register from the known pose `T`; a much likelier pose of the search and the other pose are alternatives."""
         registration = self._register_at(task, T)
-        others = [] if start.score_mm > _BETTER_POSE * start.runner_up_score_mm else [start]
+        others = [start] if start.score_mm <= _BETTER_POSE * start.runner_up_score_mm else []
+        others = likely_starts(start) if task.doubted else others
         others += [] if task.other_pose is None else [Start(task.other_pose, "given", np.nan)]
         tried = [
             self._try(replace(task, expected=None), one)
@@ -433,6 +446,7 @@ class RoundContext:
             cpu_s=0.0,
             mirrored=task.mirrored,
             stretch=edge_stretch(vertices, self.mesh),
+            colours=None if target.mesh.colours is None else target.mesh.colours[nearest.vertex],
         )
 
     def _observed(self, dense: DenseSurface, nearest: ClosestPoints, target: ScanTarget, cosine: float) -> BoolArray:
@@ -485,7 +499,7 @@ def _facing_like(scan: Mesh, surface: Mesh) -> Mesh:
         return scan
     nearest = cKDTree(surface.vertices).query(scan.vertices)[1]
     agree = np.einsum("vd,vd->v", normals, vertex_normals(surface)[nearest])
-    return scan if np.median(agree) >= 0 else Mesh(scan.vertices, scan.faces[:, ::-1], name=scan.name)
+    return scan if np.median(agree) >= 0 else replace(scan, faces=scan.faces[:, ::-1])
 
 
 def _is_same_rotation(a: Similarity, b: Similarity) -> bool:
