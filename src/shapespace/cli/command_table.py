@@ -316,6 +316,7 @@ COMMANDS: tuple[Command, ...] = (
                      "group), group_2, ... of the output folder (default: the largest group only)"),
             advanced("--pose", source=CORRESPOND),
             advanced("--outer", source=CORRESPOND),
+            advanced("--ignore-colours", source=CORRESPOND),
             advanced("--landmark-std", "SHARE", source=CORRESPOND, field="landmark_uncertainty", parse=values.share,
                      formerly="--landmark-error"),
             advanced("--rounds", "N", source=CORRESPOND, parse=values.positive),

@@ -57,7 +57,7 @@ from shapespace.store.corresponding import LANDMARKS, MEAN, RECORD, SUMMARY, SUR
 from shapespace.types import Mesh, SurfaceLandmarks
 
 _OPTIONS = {
-    "vertices": "--vertices", "rounds": "--rounds", "outer": "--outer",
+    "vertices": "--vertices", "rounds": "--rounds", "outer": "--outer", "ignore_colours": "--ignore-colours",
     "mirror": "--mirror", "pose": "--pose", "landmark_uncertainty": "--landmark-std", "seed": "--seed",
 }  # fmt: skip
 """Options of the settings that a change takes from the finished correspondence, by their fields."""

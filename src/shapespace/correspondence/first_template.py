@@ -57,7 +57,7 @@ def first_template(
         raise InputError(f"Landmarks have an uncertainty above 0, not {config.landmark_uncertainty}; give another.")
     if template is not None and model is not None:
         raise InputError("Both a template and a model are given, and the model's mean is a template; leave one out.")
-    repaired, broken = repaired_scans(scans, outer=config.outer)
+    repaired, broken = repaired_scans(scans, config)
     if len(repaired) < FEWEST:
         raise InputError(f"Hardly any of the scans can be used: {'; '.join(broken.values())}")
     if len(copies(list(repaired.values()))) == len(repaired) - 1:
@@ -78,15 +78,17 @@ def first_template(
     return FirstTemplate(mesh, origin, repaired, broken, None if model is None else _transformed(model, T))
 
 
-def repaired_scans(scans: Sequence[Mesh], *, outer: bool) -> tuple[dict[int, Mesh], dict[int, str]]:
-    """Return the scans that can be used, by number, and why the others cannot; `outer` removes inner surfaces."""
+def repaired_scans(scans: Sequence[Mesh], config: CorrespondConfig) -> tuple[dict[int, Mesh], dict[int, str]]:
+    """Return the scans that can be used, by number, and why the others cannot."""
     repaired: dict[int, Mesh] = {}
     broken: dict[int, str] = {}
     for i, scan in enumerate(scans):
         try:
-            repaired[i] = without_stray_landmarks(repair(outer_surface(scan) if outer else scan)[0])
+            repaired[i] = without_stray_landmarks(repair(outer_surface(scan) if config.outer else scan)[0])
         except MeshError as error:
             broken[i] = f"broken: {error}"
+    if config.ignore_colours:
+        repaired = {i: replace(scan, colours=None) for i, scan in repaired.items()}
     return repaired, broken
 
 

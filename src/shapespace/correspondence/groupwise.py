@@ -743,8 +743,8 @@ def add_scans(
     config = config or CorrespondConfig()
     kept = len(finished.surfaces)
     scans = list(as_meshes(scans, "add_scans"))
-    repaired, broken = repaired_scans(scans, outer=config.outer)
-    raw, unusable = repaired_scans(finished.scans, outer=config.outer)
+    repaired, broken = repaired_scans(scans, config)
+    raw, unusable = repaired_scans(finished.scans, config)
     if unusable:
         raise InputError(f"A scan of the finished correspondence is {next(iter(unusable.values()))}")
     raw |= {kept + i: scan for i, scan in repaired.items()}

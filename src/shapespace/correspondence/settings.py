@@ -40,6 +40,8 @@ class CorrespondConfig:
             whose frame is another one is excluded from the second round on, if there are six scans or more.
         outer: remove inner surfaces first, such as marrow cavities and trabeculae of CT scans, which are hardly visible
             from outside.
+        ignore_colours: match points by place and normal alone, also where scans have colours; for colours that are not
+            those of the surface.
         landmark_uncertainty: standard deviation of the landmarks, as a share of the object's size (RMS distance from
             its centre).
         seed: random seed.
@@ -58,5 +60,6 @@ class CorrespondConfig:
     mirror: Literal["auto", "ask", "never"] = "auto"
     pose: PoseRange = "search"
     outer: bool = False
+    ignore_colours: bool = False
     landmark_uncertainty: float = 0.02
     seed: int = 0
