@@ -64,7 +64,7 @@ class ElasticSettings:
     borders: bool = False
     floor: float = 0.05
     turn: float = 0.1
-    colour: float = 0.2
+    colour: float = 0.1
     tangential: float = 0.1
 
 
