@@ -23,7 +23,8 @@ def turn(degrees: float) -> FloatArray:
 def painted(turn_deg: float, name: str) -> Mesh:
     """Return an object with rotational symmetry and a pattern without, rotated about its axis."""
     directions, faces = sphere(1200, 0.3)
-    shape = directions * [60.0, 60.0, 30.0 + 0.1 * abs(turn_deg)] + 15 * np.exp((directions[:, 2:] - 1) / 0.2) * [0.0, 0.0, 1.0]
+    shape = directions * [60.0, 60.0, 30.0 + 0.1 * abs(turn_deg)]
+    shape[:, 2] += 15 * np.exp((directions[:, 2] - 1) / 0.2)
     angle = np.arctan2(directions[:, 1], directions[:, 0])
     stripes = np.column_stack([np.sin(3 * angle), np.cos(3 * angle), np.sin(2 * angle)]) > 0
     colours = (255 * stripes).astype(np.uint8)

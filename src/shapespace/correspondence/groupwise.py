@@ -451,9 +451,8 @@ def _registered_by_subject(
         for i, parent in ((order[child], order[parent]) for child, parent in level):
             start = registrations[parent].vertices
             T = registrations[i].T_scan_template @ fit_similarity(start, registrations[i].vertices)
-            task = replace(_task(problem, state, i), T_scan_template=T, expected=start, bent=True)
-            # A task with a known frame tries no map along the surface.
-            tasks.append(replace(task, settings=problem.config.first, pose="near"))
+            task = replace(_task(problem, state, i), T_scan_template=T, expected=start, is_start_known=True)
+            tasks.append(replace(task, settings=problem.config.first))
         for registration in run(context, tasks):
             i = registration.index
             own, cpu_s[i] = registrations[i], cpu_s[i] + registration.cpu_s

@@ -106,6 +106,7 @@ class RegistrationTask:
         pose: poses that are searched; for mirror images and comparisons of scores all.
         other_pose: from which the scan is registered too; None if there is no other one.
         bent: whether `expected` is the scan's own surface of the last round, so that no pose is searched.
+        is_start_known: whether it is registered from `T_scan_template` and `expected` alone.
         doubted: whether it is registered from all likely poses, and where sides are compared also as its mirror image.
     """
 
@@ -121,6 +122,7 @@ class RegistrationTask:
     pose: PoseRange = "search"
     other_pose: Similarity | None = None
     bent: bool = False
+    is_start_known: bool = False
     doubted: bool = False
 
     def reflected(self) -> RegistrationTask:
@@ -221,6 +223,8 @@ class RoundContext:
             with threadpool_limits(limits=1, user_api="blas"):
                 if task.sides in ("pose", "scores"):
                     registration = self._compare(task)
+                elif task.is_start_known and task.T_scan_template is not None:
+                    registration = self._register_at(task, task.T_scan_template)
                 else:
                     registration = self._register_bent(task, self._register(task))
         except ShapespaceError as error:
