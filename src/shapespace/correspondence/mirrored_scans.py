@@ -18,10 +18,10 @@ _LARGEST_EVIDENCE = 0.3
 """Log ratio of scores beyond which a comparison counts no more: among 39 molars that were alike it was at most 0.2."""
 _DRAWS, _P_VALUE = 1000, 0.01
 """Draws of random signs, and the share of them that may agree as well: beyond it the object is taken as symmetric."""
-ASYMMETRIC = 0.05
-"""Median log ratio of scores up to which an object is taken as symmetric: it was at most 0.04 for faces, whose missing
-parts and expressions can agree on wrong sides, 0.07 for spleens, and 0.12 or more for molars, femora and 11 simulated
-kinds."""
+ASYMMETRIC = 0.08
+"""Median log ratio of scores up to which an object is taken as symmetric: it was at most 0.06 for faces, whose missing
+parts and expressions can agree on wrong sides, 0.07 for spleens, 0.12 or more for molars, and 0.19 or more for femora
+and 11 simulated kinds."""
 _ALONE = np.log(0.85)
 """Log ratio of scores of a scan and its mirror image below which one comparison decides: of 60 faces, femora and
 spleens that were not mirrored none had less than log 0.88."""
