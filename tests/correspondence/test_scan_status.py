@@ -95,3 +95,9 @@ def test_build_leaves_doubtful_surfaces_out_with_a_note_and_includes_them_on_req
     assert ss.ShapeModel.load(tmp_path / "m.h5").n_training == 8 - len(doubtful)
     assert main(["build", same, "-o", str(tmp_path / "all.h5"), "--quiet", "--with-doubtful"]) == 0
     assert ss.ShapeModel.load(tmp_path / "all.h5").n_training == 8
+
+
+def test_limbs_that_can_be_assigned_otherwise_make_a_surface_doubtful() -> None:
+    assert judge(replace(SURE, relief_gap=0.5)).status == "converged"
+    judgement = judge(replace(SURE, relief_gap=0.1))
+    assert judgement.status == "doubtful" and "limbs may be exchanged" in judgement.doubt

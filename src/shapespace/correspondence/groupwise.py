@@ -476,7 +476,8 @@ def _accept(problem: _Problem, previous: RegistrationState, ended: Sequence[Scan
         if reason := _exclusion_reason(problem.config, registration):
             excluded[i] = reason
         else:
-            registrations[i] = registration
+            last = previous.registrations.get(i, registration)
+            registrations[i] = replace(registration, relief_gap=min(registration.relief_gap, last.relief_gap))
     return replace(previous, registrations=registrations, excluded=excluded)
 
 
@@ -581,7 +582,8 @@ def _evidence(problem: _Problem, state: RegistrationState) -> dict[int, ScanEvid
     usual = float(np.median(agreements))
     return {
         i: ScanEvidence(
-            relief_agreement=own, usual_relief_agreement=usual, consensus_deg=_consensus_deg(state, i)
+            relief_agreement=own, usual_relief_agreement=usual, consensus_deg=_consensus_deg(state, i),
+            relief_gap=state.registrations[i].relief_gap,
         )
         for i, own in zip(order, agreements.tolist(), strict=True)
     }  # fmt: skip

@@ -30,7 +30,7 @@ _TRIED = 10  # assignments of extremities: each costs about 0.2 CPU s
 _SENSE = 0.75
 """Share of the area of the map, less that of the rest, that is not turned inside out: it was 0.87 or more in the right
 maps of 9 figures, and negative where left and right were exchanged."""
-_MAPS, _DISTINCT = 3, 0.05
+_MAPS, DISTINCT = 3, 0.05
 """Maps to be registered, at most, and the least median distance of two of them, share of the size: by stretch alone,
 figures with front and back exchanged cannot be told from right ones."""
 _JACOBIANS = 3.0
@@ -114,7 +114,7 @@ def bent_shapes(template: IntrinsicShape, scan: IntrinsicShape, seed: int) -> li
     """
     rng = np.random.default_rng(seed)
     drawn = np.sort(rng.permutation(len(template.functions))[: _VERTICES // 2]).astype(np.int32)
-    faces, limit = faces_of(template.mesh), _DISTINCT * rms_size(scan.mesh.vertices)
+    faces, limit = faces_of(template.mesh), DISTINCT * rms_size(scan.mesh.vertices)
     shapes: list[FloatArray] = []
     for ends in _assignments(template, scan):
         own, theirs = template.distances(template.ends[: len(ends)]), scan.distances(ends)

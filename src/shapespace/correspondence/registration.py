@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from shapespace.correspondence.generic import generic_model
 from shapespace.correspondence.harmonics import Harmonics
-from shapespace.correspondence.isometry import IntrinsicShape, bent_shapes
+from shapespace.correspondence.isometry import DISTINCT, IntrinsicShape, bent_shapes
 from shapespace.correspondence.landmark_guide import MirroredLandmarksError, ScanLandmarks
 from shapespace.correspondence.pose_consensus import angle_deg
 from shapespace.correspondence.register import ElasticSettings, Template, register
@@ -154,6 +154,8 @@ class ScanRegistration:
         stretch: RMS log ratio of its edges to those of the template, the change of size removed.
         bent: whether it began at a map along the surface, as of an object whose limbs have moved.
         colours: (V, 3) uint8 of the scan at the vertices; None where it has none.
+        relief_gap: by how much its relief agrees better with the template's than that from any other map along the
+            surface; infinite where there is none.
     """
 
     index: int
@@ -171,6 +173,7 @@ class ScanRegistration:
     stretch: float = 0.0
     bent: bool = False
     colours: ByteArray | None = None
+    relief_gap: float = np.inf
 
     @property
     def strain(self) -> float:
@@ -314,7 +317,18 @@ class RoundContext:
                 continue
             if bent.covered >= least[0] and bent.observed.mean() >= least[1] and bent.strain < limit:
                 candidates.append(replace(bent, bent=True))
-        return max(candidates, key=self._relief_agreement, default=registration)
+        if not candidates:
+            return registration
+        best = max(candidates, key=self._relief_agreement)
+        agreement = self._relief_agreement(best)
+        others = [self._relief_agreement(one) for one in candidates if self._is_apart(one, best)]
+        return replace(best, relief_gap=min((agreement - other for other in others), default=np.inf))
+
+    def _is_apart(self, one: ScanRegistration, other: ScanRegistration) -> bool:
+        """Return whether two surfaces of a scan have most vertices in other places."""
+        T = other.T_scan_template.inverse() @ one.T_scan_template
+        moved = np.linalg.norm(T.apply(one.vertices) - other.vertices, axis=1)
+        return float(np.median(moved)) > DISTINCT * self.template.size_mm
 
     def _relief_agreement(self, registration: ScanRegistration) -> float:
         """Return how well the relief of a surface agrees with that of the template (C35)."""
