@@ -153,9 +153,9 @@ def molar_errors(made: Correspondence) -> FloatArray:
 def rows_of(name: str, made: Correspondence, error: FloatArray, known: list[Known]) -> list[Row]:
     """Return a row for each surface; the side that most scans have is right."""
     found = np.array([one.mirrored for one in made.scans])
-    wrong = found != np.array([one.mirrored for one in known]) if known else np.zeros(len(found), np.bool_)
+    wrong = found != np.array([one.mirrored for one in known])
     wrong = ~wrong if wrong.mean() > 0.5 else wrong
-    wrong |= np.array([one.foreign for one in known]) if known else False
+    wrong |= np.array([one.foreign for one in known])
     return [
         Row(name, max(float(e), WRONG * float(w)), one.evidence.features(), one.status == "doubtful")
         for one, e, w in zip(made.scans, error, wrong, strict=True)

@@ -67,7 +67,7 @@ def test_an_added_scan_has_a_status_of_its_own() -> None:
 def test_build_leaves_doubtful_surfaces_out_with_a_note_and_includes_them_on_request(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Which surfaces are doubtful is tested above; here it is one whatever the last digits of the platform.
+    # Rounding differs between platforms, so the status is set here; how it is determined is tested above.
     seen: list[ScanEvidence] = []
 
     def judge_one(evidence: ScanEvidence) -> Judgement:

@@ -128,7 +128,7 @@ def correspond(
             state = _registered_by_subject(problem, previous, state, run)
         if state.rounds[-1].moved < config.settled:  # C17
             break
-    return _result(problem, state, _evidence(problem, state))
+    return _result(problem, state, _evidence(state))
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +197,7 @@ class RegistrationState:
         other_kinds: of the scans that were in another group than the largest, the first scan of their group.
         consensus: poses of the scans, or of their mirror images, on which the comparisons with anchors agree (C32).
         bent: the scans whose next registration begins at their own surface, since no other scan predicts it.
-        doubted: the scans whose relief agrees clearly less than usual with those of the others.
+        relief_agreement: of each registered scan with the median relief (C35); empty for few scans.
     """
 
     template: Mesh
@@ -210,13 +210,18 @@ class RegistrationState:
     other_kinds: Mapping[int, int] = field(default_factory=dict[int, int])
     consensus: Mapping[int, Similarity] = field(default_factory=dict[int, Similarity])
     bent: frozenset[int] = frozenset()
-    doubted: frozenset[int] = frozenset()
+    relief_agreement: Mapping[int, float] = field(default_factory=dict[int, float])
 
     @property
     def bends(self) -> bool:
         """Whether the object bends: several scans are less strained if they begin at a map along the surface."""
         bent = [one.bent for one in self.registrations.values()]
         return sum(bent) >= max(2.0, _BENDS * len(bent))
+
+    def falls_short(self, i: int) -> bool:
+        """Return whether the relief of scan `i` agrees clearly less than usual with those of the others."""
+        usual = np.median(list(self.relief_agreement.values())) if i in self.relief_agreement else -np.inf
+        return bool(self.relief_agreement.get(i, 0.0) < usual - _FALLS_SHORT)
 
     def is_mirrored(self, i: int) -> bool:
         """Return whether scan `i` is a mirror image of the majority, as far as is known."""
@@ -336,7 +341,7 @@ def _task(problem: _Problem, state: RegistrationState, i: int) -> RegistrationTa
         pose=config.pose,
         other_pose=_other_pose(state, i),
         bent=i in state.bent and known,
-        doubted=i in state.doubted and known,
+        from_all_poses=known and state.falls_short(i),
     )
 
 
@@ -356,7 +361,7 @@ def _comparison(problem: _Problem, state: RegistrationState, i: int) -> Comparis
         return "one"
     is_settled = (
         i in state.registrations
-        and i not in state.doubted
+        and not state.falls_short(i)
         and state.registrations[i].scores.mirrored > _CLEARLY_WORSE * state.registrations[i].scores.pose
     )
     return "one" if is_settled else "both"
@@ -504,7 +509,7 @@ def _exclude_other_kinds(problem: _Problem, state: RegistrationState, order: Seq
     """Exclude the scans in `order` that are another kind of object than the largest group, or are like no other."""
     if problem.subjects:  # scans of one subject predict each other, and are no kind of object
         order = list({problem.subjects[i]: i for i in sorted(order, reverse=True)}.values())
-    if len(order) < ENOUGH_TO_JUDGE or state.bends:  # poses are no kinds
+    if len(order) < ENOUGH_TO_JUDGE or state.bends:  # other poses are no other kinds
         return state
     order, config = sorted(order), problem.config
     shapes, observed = state.shapes(order)
@@ -539,7 +544,7 @@ def _outlier_reason(registration: ScanRegistration, distance: float) -> str:
 def _resolve_alternatives(problem: _Problem, state: RegistrationState) -> RegistrationState:
     """Where several poses are about as likely, use the one whose shape the scans of sure pose predict best."""
     sure = [i for i, registration in state.registrations.items() if not registration.alternatives]
-    if len(sure) < _ENOUGH_TO_PREDICT:
+    if not _ENOUGH_TO_PREDICT <= len(sure) < len(state.registrations):
         return state
     shapes, observed = state.shapes(sure)
     shapes, _ = align_to_weighted_mean(shapes, observed, state.template.vertices)
@@ -572,20 +577,17 @@ def _exclude_mirrored(problem: _Problem, state: RegistrationState) -> Registrati
 # Evidence
 
 
-def _evidence(problem: _Problem, state: RegistrationState) -> dict[int, ScanEvidence]:
+def _evidence(state: RegistrationState) -> dict[int, ScanEvidence]:
     """Return the evidence on each registered scan; none if there are too few to determine what is usual."""
-    order = sorted(state.registrations)
-    if len(order) < ENOUGH_TO_JUDGE:
+    if not state.relief_agreement:
         return {}
-    shapes, observed = state.shapes(order)
-    agreements = Reliefs.of(shapes, observed, state.template, problem.harmonics).agreements()
-    usual = float(np.median(agreements))
+    usual = float(np.median(list(state.relief_agreement.values())))
     return {
         i: ScanEvidence(
             relief_agreement=own, usual_relief_agreement=usual, consensus_deg=_consensus_deg(state, i),
             relief_gap=state.registrations[i].relief_gap,
         )
-        for i, own in zip(order, agreements.tolist(), strict=True)
+        for i, own in state.relief_agreement.items()
     }  # fmt: skip
 
 
@@ -621,6 +623,10 @@ def _update_template(
     if state.bends:  # a mean of poses is no shape, and no pose is predicted by others
         bent, template = frozenset(order), state.template
     predictions = {**predictions, **{i: registrations[i].vertices for i in bent}}
+    agreements: dict[int, float] = {}
+    if len(order) >= ENOUGH_TO_JUDGE:
+        reliefs = Reliefs.of(shapes, observed, template, problem.harmonics)
+        agreements = dict(zip(order, reliefs.agreements().tolist(), strict=True))
     record = RoundRecord(
         moved=float(np.sqrt(np.mean(list(squares.values())))) / SIZE,  # C17
         scan_moved={i: float(np.sqrt(square)) / SIZE for i, square in squares.items()},
@@ -637,19 +643,8 @@ def _update_template(
         other_kinds=state.other_kinds,
         consensus=_consensus(problem, state),
         bent=bent,
-        doubted=_doubted(problem, registrations, template),
+        relief_agreement=agreements,
     )
-
-
-def _doubted(problem: _Problem, registrations: Mapping[int, ScanRegistration], template: Mesh) -> frozenset[int]:
-    """Return the scans whose relief agrees clearly less than usual with those of the others."""
-    if len(registrations) < ENOUGH_TO_JUDGE:
-        return frozenset()
-    shapes = np.stack([one.vertices for one in registrations.values()])
-    observed = np.stack([one.observed for one in registrations.values()]).astype(np.float64)
-    agreements = Reliefs.of(shapes, observed, template, problem.harmonics).agreements()
-    falls_short = agreements < np.median(agreements) - _FALLS_SHORT
-    return frozenset(i for i, is_short in zip(registrations, falls_short.tolist(), strict=True) if is_short)
 
 
 def _median_colours(registrations: Mapping[int, ScanRegistration]) -> ByteArray | None:
@@ -760,7 +755,7 @@ def add_scans(
         state = replace(_update_template(problem, state, state, {}), rounds=())
         registrations = run(_context(problem, state), [_task(problem, state, i) for i in raw])
         state = _next_state(problem, state, registrations)
-        return _result(problem, state, _evidence(problem, state))
+        return _result(problem, state, _evidence(state))
     results = [_added_result(problem, states.get(i, start), i) for i in range(kept, len(names))]
     return Correspondence(finished.mean, tuple(results), first.origin, (), start.landmarks)
 
@@ -858,7 +853,7 @@ def _judged_by_finished(problem: _Problem, state: RegistrationState, i: int) -> 
     finished = np.arange(len(judges))
     distance = Collection.of(shapes, observed, state.template.vertices).distances(finished)[-1]
     reliefs = Reliefs.of(shapes, observed, state.template, problem.harmonics)
-    if not is_outlier(distance, reliefs.agreements(finished.astype(np.int32))[-1], problem.config.outlier_threshold):
+    if not is_outlier(distance, reliefs.agreements(finished)[-1], problem.config.outlier_threshold):
         return state
     excluded = {i: _outlier_reason(state.registrations[i], float(distance))}
     kept = {j: one for j, one in state.registrations.items() if j != i}

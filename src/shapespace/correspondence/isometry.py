@@ -31,8 +31,8 @@ _SENSE = 0.75
 """Share of the area of the map, less that of the rest, that is not turned inside out: it was 0.87 or more in the right
 maps of 9 figures, and negative where left and right were exchanged."""
 _MAPS, DISTINCT = 3, 0.05
-"""Maps to be registered, at most, and the least median distance of two of them, share of the size: by stretch alone,
-figures with front and back exchanged cannot be told from right ones."""
+"""Maps to be registered, at most, and the least median distance of two of them, share of the size: stretch does not
+distinguish correct maps from those with front and back exchanged."""
 _JACOBIANS = 3.0
 """RMS of the determinants in the first map, in which distances have about 2; 2 and 4 give the same maps."""
 _SMOOTH = 0.05  # range over which the determinants are averaged, share of the square root of the area

@@ -80,11 +80,10 @@ def find_kinds(shapes: FloatArray, observed: FloatArray, template: FloatArray, r
     groups = groups or [np.arange(len(shapes))]
     agreement = np.full(len(shapes), np.nan)
     if reliefs is not None:
-        agreement = reliefs.agreements(groups[0].astype(np.int32))
-        same = [np.median(agreement[group]) > SAME_RELIEF for group in groups[1:]]
-        joined = [group for group, is_same in zip(groups[1:], same, strict=True) if is_same]
-        others = [group for group, is_same in zip(groups[1:], same, strict=True) if not is_same]
-        groups = [np.sort(np.concatenate([groups[0], *joined])), *others]
+        agreement = reliefs.agreements(groups[0])
+        same = [group for group in groups[1:] if np.median(agreement[group]) > SAME_RELIEF]
+        others = [group for group in groups[1:] if not np.median(agreement[group]) > SAME_RELIEF]
+        groups = [np.sort(np.concatenate([groups[0], *same])), *others]
     distance = collection.distances(groups[0])
     others = [group for group in groups[1:] if np.median(distance[group]) > ANOTHER_KIND]
     return Kinds((groups[0], *others), distance, agreement)

@@ -114,7 +114,8 @@ class _Problem:
         base: (V, 3) the shape without movement, in the template's frame.
         landmarks: of the scan, in its mm frame.
         settings: of the registration.
-        colours: (V, 3) of the template and (S, 3) of the scan, lengths in mm about their medians; None without.
+        colours: (V, 3) of the template and (S, 3) of the scan, lengths in mm about their medians; without columns where
+            either has none.
     """
 
     template: Template
@@ -122,7 +123,7 @@ class _Problem:
     base: FloatArray
     landmarks: ScanLandmarks | None
     settings: ElasticSettings
-    colours: tuple[FloatArray, FloatArray] | None
+    colours: tuple[FloatArray, FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,11 +191,11 @@ def _step(problem: _Problem, state: ElasticState, range_share: float, rng: np.ra
     return ElasticState(x, T)
 
 
-def _colours(template: Template, target: ScanTarget, settings: ElasticSettings) -> tuple[FloatArray, FloatArray] | None:
+def _colours(template: Template, target: ScanTarget, settings: ElasticSettings) -> tuple[FloatArray, FloatArray]:
     """Return the colours as lengths, without what a whole surface has in common, such as its light."""
     own, scan = template.mesh.colours, target.mesh.colours
     if own is None or scan is None or not settings.colour:
-        return None
+        return np.empty((len(template.mesh.vertices), 0)), np.empty((len(target.mesh.vertices), 0))
     scale = settings.colour * template.size_mm / 255.0
     return scale * (own - np.median(own, axis=0)), scale * (scan - np.median(scan, axis=0))
 
@@ -211,8 +212,7 @@ def _samples(
     T = state.T_scan_template
     normals = np.empty_like(state.vertices)
     normals_into(state.vertices, topology.faces, normals)
-    none = (np.empty((len(normals), 0)), np.empty((len(target.mesh.vertices), 0)))
-    own_colours, scan_colours = problem.colours or none
+    own_colours, scan_colours = problem.colours
     surface = _Samples(state.vertices[own], normals[own], topology.rim[own], own_colours[own])
     points = T.inverse().apply(target.mesh.vertices[chosen])
     scan = _Samples(points, target.normals[chosen] @ T.rotation, target.rim[chosen], scan_colours[chosen])
@@ -225,9 +225,9 @@ def _forces(
     """Return forces (M, 3), mm, on the points of the surface, and their weights (M,): 1 for each side that is sure."""
     x, y, count = surface.points, scan.points, len(surface.points)
     is_cloud = not scan.normals.any()
-    turn = 0.0 if is_cloud else settings.turn * size_mm
-    surface_features = np.hstack([x, turn * surface.normals, surface.colours])
-    scan_features = np.hstack([y, turn * scan.normals, scan.colours])
+    turn = settings.turn * size_mm
+    surface_features = np.hstack([x, surface.colours] if is_cloud else [x, turn * surface.normals, surface.colours])
+    scan_features = np.hstack([y, scan.colours] if is_cloud else [y, turn * scan.normals, scan.colours])
     near, share = _soft_matches(scan_features, surface_features)
     to_scan = np.einsum("mk,mkd->md", share, y[near]) - x
     cosine = np.einsum("md,mkd,mk->m", surface.normals, scan.normals[near], share)

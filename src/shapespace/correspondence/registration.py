@@ -107,7 +107,8 @@ class RegistrationTask:
         other_pose: from which the scan is registered too; None if there is no other one.
         bent: whether `expected` is the scan's own surface of the last round, so that no pose is searched.
         is_start_known: whether it is registered from `T_scan_template` and `expected` alone.
-        doubted: whether it is registered from all likely poses, and where sides are compared also as its mirror image.
+        from_all_poses: whether it is registered from all likely poses, and where sides are compared also as its mirror
+            image.
     """
 
     index: int
@@ -123,7 +124,7 @@ class RegistrationTask:
     other_pose: Similarity | None = None
     bent: bool = False
     is_start_known: bool = False
-    doubted: bool = False
+    from_all_poses: bool = False
 
     def reflected(self) -> RegistrationTask:
         """Return the same task for the mirror image of its scan, at an unknown pose."""
@@ -270,7 +271,7 @@ class RoundContext:
         likely = [
             (one, at)
             for one, at in ((task, start), (other, mirrored))
-            if task.doubted
+            if task.from_all_poses
             or one.T_scan_template is not None
             or at.score_mm <= _EITHER_SIDE * min(start.score_mm, mirrored.score_mm)
         ]
@@ -319,10 +320,11 @@ class RoundContext:
                 candidates.append(replace(bent, bent=True))
         if not candidates:
             return registration
-        best = max(candidates, key=self._relief_agreement)
-        agreement = self._relief_agreement(best)
-        others = [self._relief_agreement(one) for one in candidates if self._is_apart(one, best)]
-        return replace(best, relief_gap=min((agreement - other for other in others), default=np.inf))
+        agreements = [self._relief_agreement(one) for one in candidates]
+        highest = max(agreements)
+        best = candidates[agreements.index(highest)]
+        gaps = [highest - own for one, own in zip(candidates, agreements, strict=True) if self._is_apart(one, best)]
+        return replace(best, relief_gap=min(gaps, default=np.inf))
 
     def _is_apart(self, one: ScanRegistration, other: ScanRegistration) -> bool:
         """Return whether two surfaces of a scan have most vertices in other places."""
@@ -380,7 +382,7 @@ class RoundContext:
         """Register from the known pose `T`; a much likelier pose of the search and the other pose are alternatives."""
         registration = self._register_at(task, T)
         others = [start] if start.score_mm <= _BETTER_POSE * start.runner_up_score_mm else []
-        others = likely_starts(start) if task.doubted else others
+        others = likely_starts(start) if task.from_all_poses else others
         others += [] if task.other_pose is None else [Start(task.other_pose, "given", np.nan)]
         tried = [
             self._try(replace(task, expected=None), one)

@@ -9,10 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.geometry.normals import vertex_normals
-from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
+from shapespace.types import BoolArray, FloatArray, Mesh
 
 _RANGE = 0.05
 """Of the smoothing, share of the square root of the area: of 0.03, 0.05, 0.1 and 0.2 it separated right and wrong
@@ -22,7 +23,7 @@ _LARGEST = 0.9999  # correlation of copies, so that their agreement is finite
 
 
 def relief(vertices: FloatArray, template: Mesh, harmonics: Harmonics) -> FloatArray:
-    """Return (V,) the height of a surface above itself when smooth, along its normals (C34).
+    """Return (V,) the height of a surface above its smoothed version, along its normals (C34).
 
     Args:
         vertices: (V, 3) in correspondence with `template`.
@@ -62,15 +63,15 @@ class Reliefs:
         heights = np.stack([relief(shape, template, harmonics) for shape in shapes])
         return Reliefs(heights, observed > 0, harmonics.area)
 
-    def median(self, core: IntArray | None = None) -> FloatArray:
+    def median(self, core: npt.NDArray[np.integer] | None = None) -> FloatArray:
         """Return (V,) the median of all or of `core`, at most `_ENOUGH` of them, where they are observed."""
-        core = np.arange(len(self.heights), dtype=np.int32) if core is None else core
+        core = np.arange(len(self.heights)) if core is None else core
         some = core[:: -(-len(core) // _ENOUGH)]
         seen = self.observed[some]
         seen = seen | ~seen.any(axis=0)
         return np.nanmedian(np.where(seen, self.heights[some], np.nan), axis=0)
 
-    def agreements(self, core: IntArray | None = None) -> FloatArray:
+    def agreements(self, core: npt.NDArray[np.integer] | None = None) -> FloatArray:
         """Return (N,) how well each relief agrees with the median of all or of `core` (C35)."""
         middle = self.median(core)
         return np.array(
