@@ -1,7 +1,7 @@
 """Rounds of correspondence on disk: nothing is done twice, and it does not matter where it is done."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +13,15 @@ from shapespace.batch.parallel_rounds import RoundRunner
 from shapespace.correspondence.groupwise import correspond
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.register import ElasticSettings
-from shapespace.correspondence.registration import RegistrationTask, RoundContext, ScanRegistration
+from shapespace.correspondence.registration import (
+    PoseScores,
+    RegistrationTask,
+    RoundContext,
+    ScanRegistration,
+)
 from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.correspondence.template import PoseModel, resample
-from shapespace.types import Mesh
+from shapespace.types import Mesh, Similarity
 from synthetic_shapes import blob_model
 
 QUICK = ElasticSettings(harmonics=60, points=500, iterations=10)
@@ -119,3 +124,44 @@ def test_a_model_and_landmarks_guide_in_other_processes_as_in_this_one(tmp_path:
     elsewhere = correspond(scans, SETTINGS, model=model, run=kept(tmp_path / "elsewhere", jobs=2))
     for one, other in zip(here.scans, elsewhere.scans, strict=True):
         np.testing.assert_array_equal(one.vertices, other.vertices)
+
+
+def test_no_field_of_a_result_is_lost(scans: list[Mesh], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    mesh = resample(scans[0], 400)
+    count, T = len(mesh.vertices), Similarity(1.5, np.eye(3), np.ones(3))
+    stored = ScanRegistration(
+        index=3, vertices=np.array(mesh.vertices), T_scan_template=T, observed=np.ones(count, np.bool_), covered=0.9,
+        distance=(1.0, 2.0, 3.0, 4.0), cpu_s=5.0, reason="why", mirrored=True, scores=PoseScores(0.1, 0.2),
+        posed_by_landmarks=True, stretch=0.3, bent=True, colours=np.full((count, 3), 8, np.uint8), relief_gap=0.4,
+    )  # fmt: skip
+    usual = {field.name: field.default for field in fields(ScanRegistration)}
+    assert not [name for name in usual if name != "alternatives" and getattr(stored, name) is usual[name]]
+    monkeypatch.setattr(RoundContext, "register", lambda *_: replace(stored, alternatives=(stored, stored)))
+    context = RoundContext(mesh, Harmonics.of(mesh, 60), (PoseModel.of(mesh),), 0)
+    task = RegistrationTask(3, scans[1], None, None, QUICK)
+    for _ in range(2):  # computed, and read again
+        [read] = kept(tmp_path)(context, [task])
+        for one in (read, *read.alternatives):
+            for name in usual.keys() - {"alternatives", "T_scan_template"}:
+                np.testing.assert_array_equal(getattr(one, name), getattr(stored, name), err_msg=name)
+            np.testing.assert_array_equal(one.T_scan_template.apply(np.eye(3)), T.apply(np.eye(3)))
+
+
+def test_each_field_of_a_task_is_part_of_its_key(scans: list[Mesh], placed: list[int], tmp_path: Path) -> None:
+    mesh, task = resample(scans[0], 400), RegistrationTask(0, scans[1], Similarity.identity(), None, QUICK)
+    context = RoundContext(mesh, Harmonics.of(mesh, 60), (PoseModel.of(mesh),), 0)
+    colours = np.zeros((len(scans[1].vertices), 3), np.uint8)
+    known = replace(task, is_start_known=True)
+    others = [known, replace(known, scan=replace(scans[1], colours=colours)), replace(known, bent=True)]
+    others += [replace(known, from_all_poses=True), replace(known, other_pose=Similarity.identity())]
+    for one in others * 2:
+        list(kept(tmp_path)(context, [one]))
+    assert len(placed) == len(others)
+
+
+def test_colours_and_subjects_reach_other_processes(scans: list[Mesh], tmp_path: Path) -> None:
+    painted = [replace(scan, colours=np.uint8(255) * (scan.vertices > scan.vertices.mean(axis=0))) for scan in scans]
+    here = correspond(painted, SETTINGS, subjects=["a", "a", "b"])
+    elsewhere = correspond(painted, SETTINGS, subjects=["a", "a", "b"], run=kept(tmp_path / "there", jobs=2))
+    for one, other in zip(here.scans, elsewhere.scans, strict=True):
+        np.testing.assert_allclose(one.vertices, other.vertices, atol=1e-9)

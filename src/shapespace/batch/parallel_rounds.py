@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -13,16 +13,12 @@ import numpy.typing as npt
 from shapespace.batch.execution import ExecutionConfig
 from shapespace.batch.executors import Serial
 from shapespace.correspondence.harmonics import Harmonics
-from shapespace.correspondence.landmark_guide import ScanLandmarks
-from shapespace.correspondence.register import ElasticSettings
 from shapespace.correspondence.registration import (
-    Comparison,
     PoseScores,
     RegistrationTask,
     RoundContext,
     ScanRegistration,
 )
-from shapespace.correspondence.settings import PoseRange
 from shapespace.correspondence.template import PoseModel
 from shapespace.errors import FileError
 from shapespace.io.containers.archives import read_arrays
@@ -31,7 +27,7 @@ from shapespace.io.containers.hdf5 import content_hash
 from shapespace.io.files import make_folder
 from shapespace.io.memory_cache import LatestValue
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import Mesh, Similarity, SurfaceLandmarks
+from shapespace.types import Mesh, Similarity
 from shapespace.version import __version__
 
 Arrays = dict[str, npt.NDArray[Any]]
@@ -64,7 +60,7 @@ class RoundRunner:
         shared = [_shared_hash(context, pose_model) for pose_model in context.pose_models]
         remaining: list[_FileTask] = []
         for task in tasks:
-            file_task = _FileTask.of(task, self.folder / f"{_key(task, shared[task.pose_model])}.npz")
+            file_task = _FileTask(self.folder / f"{_key(task, shared[task.pose_model])}.npz", task)
             placed = _read(file_task.file, task.index)
             if placed is None:
                 remaining.append(file_task)
@@ -85,51 +81,18 @@ class RoundRunner:
 
 
 def _read_again(task: _FileTask) -> ScanRegistration:
-    placed = _read(task.file, task.index)
+    placed = _read(task.file, task.task.index)
     if placed is None:
         raise FileError(f"Cannot read {task.file}, which this run wrote; run again.")
     return placed
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _FileTask:
-    """A task as arrays, which can be sent to any process, and the file of its result."""
+    """A task and the file of its result."""
 
     file: Path
-    arrays: Arrays
-    index: int
-    pose_model: int
-    settings: ElasticSettings
-    mirrored: bool
-    sides: Comparison
-    pose: PoseRange
-    bent: bool
-
-    @staticmethod
-    def of(task: RegistrationTask, file: Path) -> _FileTask:
-        return _FileTask(
-            file, _task_arrays(task), task.index, task.pose_model, task.settings, task.mirrored, task.sides, task.pose,
-            task.bent,
-        )  # fmt: skip
-
-    def task(self) -> RegistrationTask:
-        arrays = self.arrays
-        T = _pose_of(arrays) if "scale" in arrays else None
-        scan = Mesh(arrays["vertices"], arrays.get("faces"), name=str(arrays["name"]))
-        return RegistrationTask(
-            index=self.index,
-            scan=scan,
-            T_scan_template=T,
-            expected=arrays.get("expected"),
-            settings=self.settings,
-            pose_model=self.pose_model,
-            landmarks=_landmarks_of(arrays),
-            mirrored=self.mirrored,
-            sides=self.sides,
-            pose=self.pose,
-            other_pose=_pose_of(arrays, "other_") if "other_scale" in arrays else None,
-            bent=self.bent,
-        )
+    task: RegistrationTask
 
 
 @dataclass(frozen=True)
@@ -150,8 +113,8 @@ class RoundWork:
         Raises:
             FileError: it cannot be written.
         """
-        if _read(task.file, task.index) is None:
-            _write(task.file, _context.get(self.file, self._load).register(task.task()))
+        if _read(task.file, task.task.index) is None:
+            _write(task.file, _context.get(self.file, self._load).register(task.task))
 
     def give_up(self, task: _FileTask, reason: str) -> None:
         """Write the result that excludes a scan whose workers were lost.
@@ -159,7 +122,7 @@ class RoundWork:
         Raises:
             FileError: it cannot be written.
         """
-        _write(task.file, _context.get(self.file, self._load).failed(task.index, reason))
+        _write(task.file, _context.get(self.file, self._load).failed(task.task.index, reason))
 
     def save(self, context: RoundContext) -> None:
         """Write the round context for other processes, if an earlier run has not.
@@ -182,7 +145,7 @@ class RoundWork:
             parts.setdefault(part, {})[name] = array
         arrays = parts.pop("context")
         guide = parts.pop("guide", None)
-        mesh = Mesh(arrays["vertices"], arrays["faces"])
+        mesh = Mesh(arrays["vertices"], arrays["faces"], colours=arrays.get("colours"))
         harmonics = Harmonics(arrays["functions"], arrays["squared_frequency"], arrays["area"])
         pose_models = tuple(PoseModel(_model_of(parts[f"pose_model_{number}"])) for number in range(len(parts)))
         return RoundContext(mesh, harmonics, pose_models, self.seed, None if guide is None else _model_of(guide))
@@ -207,106 +170,74 @@ def _model_of(arrays: Arrays) -> ShapeModel:
 
 
 def _context_arrays(context: RoundContext) -> Arrays:
-    h = context.harmonics
-    return {
-        "vertices": np.array(context.mesh.vertices), "faces": np.array(context.mesh.faces), "functions": h.functions,
+    h, mesh = context.harmonics, context.mesh
+    colours: Arrays = {} if mesh.colours is None else {"colours": mesh.colours}
+    return colours | {
+        "vertices": np.array(mesh.vertices), "faces": np.array(mesh.faces), "functions": h.functions,
         "squared_frequency": h.squared_frequency, "area": h.area,
     }  # fmt: skip
 
 
-def _task_arrays(task: RegistrationTask) -> Arrays:
-    arrays: Arrays = {"vertices": np.array(task.scan.vertices), "name": np.array(task.scan.name)}
-    if task.scan.faces is not None:
-        arrays["faces"] = np.array(task.scan.faces)
-    if task.T_scan_template is not None:
-        arrays |= _pose_arrays(task.T_scan_template)
-    if task.other_pose is not None:
-        arrays |= {f"other_{name}": array for name, array in _pose_arrays(task.other_pose).items()}
-    if task.expected is not None:
-        arrays["expected"] = task.expected
-    if (landmarks := task.landmarks) is not None:
-        arrays |= {
-            "landmarks": landmarks.points, "landmark_names": np.array(landmarks.places.names),
-            "landmark_corners": landmarks.places.corners, "landmark_weights": landmarks.places.barycentric,
-            "landmark_uncertainty": np.array(landmarks.uncertainty),
-        }  # fmt: skip
-    return arrays
-
-
-def _landmarks_of(arrays: Arrays) -> ScanLandmarks | None:
-    if "landmarks" not in arrays:
-        return None
-    places = SurfaceLandmarks(
-        tuple(map(str, arrays["landmark_names"])), arrays["landmark_corners"], arrays["landmark_weights"]
-    )
-    return ScanLandmarks(places, arrays["landmarks"], float(arrays["landmark_uncertainty"]))
-
-
-def _pose_arrays(T: Similarity) -> Arrays:
-    return {"scale": np.array(T.scale), "rotation": np.array(T.rotation), "translation": np.array(T.translation)}
-
-
-def _pose_of(arrays: Mapping[str, npt.NDArray[Any]], prefix: str = "") -> Similarity:
-    scale, rotation, translation = (arrays[f"{prefix}{name}"] for name in ("scale", "rotation", "translation"))
-    return Similarity(float(scale), rotation, translation)
-
-
 def _shared_hash(context: RoundContext, pose_model: PoseModel) -> str:
     """Return the hash of what the tasks that use `pose_model` share."""
-    template = {"template": np.array(context.mesh.vertices), "triangles": np.array(context.mesh.faces)}
     guide = "" if context.guide is None else context.guide.content_hash
-    return content_hash(_model_arrays(pose_model.model) | template, {"seed": context.seed, "guide": guide})
+    return content_hash(
+        _model_arrays(pose_model.model) | _context_arrays(context), {"seed": context.seed, "guide": guide}
+    )
 
 
 def _key(task: RegistrationTask, shared: str) -> str:
-    settings = f"{task.settings} {task.mirrored} {task.sides} {task.pose} {task.bent}"
-    return content_hash(_task_arrays(task), {"shared": shared, "settings": settings, "version": __version__})
+    anywhere = replace(task, index=0, pose_model=0)  # a scan has the same result wherever it is in the list
+    return content_hash(dict(_flat(anywhere, "task")), {"shared": shared, "version": __version__})
+
+
+def _flat(value: object, name: str) -> Iterator[tuple[str, npt.NDArray[Any]]]:
+    """Yield all that `value` contains as arrays, whatever its fields are, so that none is forgotten."""
+    if isinstance(value, np.ndarray):
+        yield name, cast(npt.NDArray[Any], value)
+    elif is_dataclass(value):
+        for field in fields(value):
+            yield from _flat(getattr(value, field.name), f"{name}.{field.name}")
+    elif isinstance(value, Mapping):
+        for key, one in cast(Mapping[str, object], value).items():
+            yield from _flat(one, f"{name}.{key}")
+    elif isinstance(value, tuple):
+        for number, one in enumerate(cast(tuple[object, ...], value)):
+            yield from _flat(one, f"{name}.{number}")
+    elif value is not None:
+        yield name, np.array(value)
 
 
 def _write(file: Path, placed: ScanRegistration) -> None:
-    arrays: Arrays = {}
-    for number, one in enumerate((placed, *placed.alternatives)):
-        result: Arrays = {
-            "vertices": one.vertices, "observed": one.observed, "covered": np.array(one.covered),
-            "distance": np.array(one.distance), "cpu_s": np.array(one.cpu_s), "reason": np.array(one.reason),
-            "mirrored": np.array(one.mirrored), "scores": np.array(one.scores),
-            "posed_by_landmarks": np.array(one.posed_by_landmarks), "stretch": np.array(one.stretch),
-            "bent": np.array(one.bent),
-            **_pose_arrays(one.T_scan_template),
-        }  # fmt: skip
-        arrays |= {f"{name}_{number}": array for name, array in result.items()}
-    write_arrays(file, arrays)
+    several = (placed, *placed.alternatives)
+    write_arrays(file, dict(_flat(tuple(replace(one, alternatives=()) for one in several), "")))
 
 
 def _read(file: Path, index: int) -> ScanRegistration | None:
-    """Return the stored result, or None if there is none or it is damaged."""
+    """Return the stored result for scan `index`, or None if there is none or it is damaged."""
     try:
-        stored = read_arrays(file, "run again")
-        count = sum(name.startswith("vertices_") for name in stored)
-        first, *alternatives = [_read_one(stored, number, index) for number in range(count)]
-    except (FileError, ValueError, KeyError):
+        stored: dict[str, Arrays] = {}
+        for key, array in read_arrays(file, "run again").items():
+            _, number, name = key.split(".", 2)
+            stored.setdefault(number, {})[name] = array
+        first, *alternatives = [replace(_registration(stored[n]), index=index) for n in sorted(stored, key=int)]
+    except (FileError, ValueError, KeyError, TypeError):
         return None
     return replace(first, alternatives=tuple(alternatives))
 
 
-def _read_one(stored: Mapping[str, npt.NDArray[Any]], number: int, index: int) -> ScanRegistration:
-    def of(name: str) -> npt.NDArray[Any]:
-        return stored[f"{name}_{number}"]
-
-    T = Similarity(float(of("scale")), of("rotation"), of("translation"))
-    mean, p95, p99, largest = (float(length) for length in of("distance"))
-    return ScanRegistration(
-        index=index,
-        vertices=np.asarray(of("vertices"), dtype=np.float64),
-        T_scan_template=T,
-        observed=np.asarray(of("observed"), dtype=np.bool_),
-        covered=float(of("covered")),
-        distance=(mean, p95, p99, largest),
-        cpu_s=float(of("cpu_s")),
-        reason=str(of("reason")),
-        mirrored=bool(of("mirrored")),
-        scores=PoseScores(*(float(score) for score in of("scores"))),
-        posed_by_landmarks=bool(of("posed_by_landmarks")),
-        stretch=float(of("stretch")),
-        bent=bool(of("bent")),
-    )
+def _registration(stored: Arrays) -> ScanRegistration:
+    """Return the registration that `_flat` made arrays of; arrays without axes are numbers and texts."""
+    parts: dict[str, dict[str, Any]] = {}
+    values: dict[str, Any] = {}
+    for key, array in stored.items():
+        name, _, part = key.partition(".")
+        value = array if array.ndim else array.item()
+        if part:
+            parts.setdefault(name, {})[part] = value
+        else:
+            values[name] = value
+    values["T_scan_template"] = Similarity(**parts["T_scan_template"])
+    values["distance"] = tuple(parts["distance"][number] for number in sorted(parts["distance"]))
+    values["scores"] = PoseScores(*(parts["scores"][number] for number in sorted(parts["scores"])))
+    return ScanRegistration(**values)
