@@ -286,7 +286,13 @@ def report_of(made: Correspondence, known: list[Figure], faces: IntArray) -> dic
         "mean": float(np.nanmean(errors)), "median": float(np.nanmedian(errors)),
         "p95": float(np.nanquantile(errors, 0.95)),
         "worst_pair": float(np.nanmax(pairs)), "pairs_above_5": float((pairs[np.isfinite(pairs)] > WRONG).mean()),
-        "wrong_accepted": [one.name for one, error in zip(known, scan, strict=True) if error > WRONG],
+        "wrong": [one.name for one, error in zip(known, scan, strict=True) if error > WRONG],
+        "wrong_converged": [
+            one.name for one, error in zip(made.scans, scan, strict=True) if error > WRONG and one.status == "converged"
+        ],
+        "right_doubtful": [
+            one.name for one, error in zip(made.scans, scan, strict=True) if error <= WRONG and one.status == "doubtful"
+        ],
         "excluded": {one.name: one.reason for one in made.scans if one.vertices is None},
         "scan_errors": {one.name: round(float(error), 2) for one, error in zip(known, scan, strict=True)},
     }  # fmt: skip

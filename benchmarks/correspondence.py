@@ -109,34 +109,34 @@ def damaged(mesh: Mesh, rng: np.random.Generator, triangles: int, name: str, mid
     return Known(made.scan.with_vertices(vertices + off), made.truth_vertices, T)
 
 
-def dispersion(made: Correspondence, of: Set) -> dict[str, float]:
-    """Return dispersion in mm on the mean, over the vertices that lie near those counted, and to the true surface."""
-    places, gaps = [], []
+def dispersion(made: Correspondence, of: Set) -> dict[str, float | None]:
+    """Return dispersion in mm on the mean, over the vertices that lie near those counted, and to the true surface.
+
+    Distances to the true surface are those of observed vertices; estimated ones have a figure of their own.
+    """
+    places, gaps, shown = [], [], []
     for one, truth in zip(made.scans, of.known[: len(made.scans)], strict=True):
         if one.vertices is None:
             continue
-        there = np.isfinite(one.vertices).all(axis=1)
-        near = build_engine(Mesh(truth.truth, of.mean.faces)).query(np.ascontiguousarray(one.vertices[there]))
-        place, gap = np.full(one.vertices.shape, np.nan), np.full(len(there), np.nan)
-        place[there] = np.einsum("mc,mcd->md", near.barycentric, of.mean.vertices[of.mean.faces[near.triangle]])
-        gap[there] = near.distance / truth.T_scan_model.scale
-        places.append(place)
-        gaps.append(gap)
-    place, gap = np.array(places), np.array(gaps)
-    observed = np.isfinite(place[:, :, 0]).any(axis=0)
-    place, gap = place[:, observed], gap[:, observed]
-    middle = np.nanmedian(place, axis=0)
+        near = build_engine(Mesh(truth.truth, of.mean.faces)).query(np.ascontiguousarray(one.vertices))
+        places.append(np.einsum("mc,mcd->md", near.barycentric, of.mean.vertices[of.mean.faces[near.triangle]]))
+        gaps.append(near.distance / truth.T_scan_model.scale)
+        shown.append(np.ones(len(one.vertices), np.bool_) if one.observed is None else one.observed)
+    place = np.array(places)
+    middle = np.median(place, axis=0)
     inside = of.counted[build_engine(of.mean).query(middle).vertex]
     apart = np.linalg.norm(place - middle, axis=2)[:, inside]
+    gap, observed = np.array(gaps)[:, inside], np.array(shown)[:, inside]
     return {
-        "mean_mm": float(np.nanmean(apart)),
-        "median_mm": float(np.nanmedian(apart)),
-        "p95_mm": float(np.nanquantile(apart, 0.95)),
-        "worst_scan_mm": float(np.nanmean(apart, axis=1).max()),
-        "last_scans_mm": float(np.nanmean(apart[-ADDED:])),
-        "to_true_surface_mm": float(np.nanmean(gap[:, inside])),
-        "seen": float(np.isfinite(place[:, :, 0]).mean()),
-        "mean_share_of_length": float(np.nanmean(apart)) / of.length_mm,
+        "mean_mm": float(apart.mean()),
+        "median_mm": float(np.median(apart)),
+        "p95_mm": float(np.quantile(apart, 0.95)),
+        "worst_scan_mm": float(apart.mean(axis=1).max()),
+        "last_scans_mm": float(apart[-ADDED:].mean()),
+        "to_true_surface_mm": float(gap[observed].mean()),
+        "estimated_to_true_surface_mm": float(gap[~observed].mean()) if not observed.all() else None,
+        "observed": float(observed.mean()),
+        "mean_share_of_length": float(apart.mean()) / of.length_mm,
     }
 
 

@@ -133,6 +133,7 @@ def test_no_field_of_a_result_is_lost(scans: list[Mesh], monkeypatch: pytest.Mon
         index=3, vertices=np.array(mesh.vertices), T_scan_template=T, observed=np.ones(count, np.bool_), covered=0.9,
         distance=(1.0, 2.0, 3.0, 4.0), cpu_s=5.0, reason="why", mirrored=True, scores=PoseScores(0.1, 0.2),
         posed_by_landmarks=True, stretch=0.3, bent=True, colours=np.full((count, 3), 8, np.uint8), relief_gap=0.4,
+        symmetries=np.zeros((2, count), np.int32),
     )  # fmt: skip
     usual = {field.name: field.default for field in fields(ScanRegistration)}
     assert not [name for name in usual if name != "alternatives" and getattr(stored, name) is usual[name]]

@@ -7,7 +7,7 @@ import pytest
 
 from shapespace.correspondence.groupwise import correspond
 from shapespace.correspondence.harmonics import Harmonics
-from shapespace.correspondence.isometry import IntrinsicShape, bent_shapes
+from shapespace.correspondence.isometry import IntrinsicShape, bent_shapes, common_symmetries
 from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.correspondence.subject_tree import subject_levels
 from shapespace.correspondence.template import resample
@@ -111,3 +111,18 @@ def test_a_limb_that_moved_comes_into_correspondence(template: Mesh) -> None:
 def test_each_scan_needs_a_subject(template: Mesh) -> None:
     with pytest.raises(InputError, match="1 subjects for 2 scans"):
         correspond([template, Mesh(bent(template), template.faces)], subjects=["a"])
+
+
+def test_the_symmetries_that_most_scans_have_are_found_once() -> None:
+    corners = np.array([[x, y, z] for x in (-2.0, 2.0) for y in (-1.5, 1.5) for z in (-1.0, 1.0)])
+    box = Mesh(corners, np.array([[0, 1, 2]]))
+
+    def exchanged(*signs: float) -> list[int]:
+        return [int(np.flatnonzero((corners == corner * signs).all(axis=1))[0]) for corner in corners]
+
+    x, y, both = exchanged(-1, 1, 1), exchanged(1, -1, 1), exchanged(-1, -1, 1)
+    maps = [np.array(rows, np.int32) for rows in ([both, x], [x, y], [y, x], [list(range(8))])]
+    found = common_symmetries(maps, box)
+    assert found is not None
+    assert found.tolist() == [x, y, both]
+    assert common_symmetries(maps[3:], box) is None

@@ -21,6 +21,7 @@ from shapespace.correspondence.correspondence_result import Correspondence, Corr
 from shapespace.correspondence.first_template import FirstTemplate, first_template, repaired_scans
 from shapespace.correspondence.guide import ShapePredictor, predict_leave_one_out
 from shapespace.correspondence.harmonics import Harmonics
+from shapespace.correspondence.isometry import common_symmetries
 from shapespace.correspondence.kinds import Collection, find_kinds, is_outlier
 from shapespace.correspondence.landmark_guide import ScanLandmarks, consensus_landmarks
 from shapespace.correspondence.mirrored_scans import ASYMMETRIC, Sides, solve_sides
@@ -53,7 +54,7 @@ from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.interop import as_meshes
 from shapespace.model.missing import with_estimates
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import ByteArray, FloatArray, Mesh, Similarity, SurfaceLandmarks
+from shapespace.types import ByteArray, FloatArray, IntArray, Mesh, Similarity, SurfaceLandmarks
 
 ENOUGH_TO_JUDGE, _ENOUGH_TO_PREDICT = 6, 4
 """Scans: fewer do not determine the normal range of shapes; fewer do not predict another one."""
@@ -198,6 +199,7 @@ class RegistrationState:
         consensus: poses of the scans, or of their mirror images, on which the comparisons with anchors agree (C32).
         bent: the scans whose next registration begins at their own surface, since no other scan predicts it.
         relief_agreement: of each registered scan with the median relief (C35); empty for few scans.
+        symmetries: (S, V) near symmetries of an object that bends; None if there are none.
     """
 
     template: Mesh
@@ -211,6 +213,7 @@ class RegistrationState:
     consensus: Mapping[int, Similarity] = field(default_factory=dict[int, Similarity])
     bent: frozenset[int] = frozenset()
     relief_agreement: Mapping[int, float] = field(default_factory=dict[int, float])
+    symmetries: IntArray | None = None
 
     @property
     def bends(self) -> bool:
@@ -218,10 +221,10 @@ class RegistrationState:
         bent = [one.bent for one in self.registrations.values()]
         return sum(bent) >= max(2.0, _BENDS * len(bent))
 
-    def falls_short(self, i: int) -> bool:
-        """Return whether the relief of scan `i` agrees clearly less than usual with those of the others."""
+    def agrees_less_than_usual(self, i: int, by: float = 0.0) -> bool:
+        """Return whether the relief of scan `i` agrees less than usual with those of the others, by more than `by`."""
         usual = np.median(list(self.relief_agreement.values())) if i in self.relief_agreement else -np.inf
-        return bool(self.relief_agreement.get(i, 0.0) < usual - _FALLS_SHORT)
+        return bool(self.relief_agreement.get(i, 0.0) < usual - by)
 
     def is_mirrored(self, i: int) -> bool:
         """Return whether scan `i` is a mirror image of the majority, as far as is known."""
@@ -341,7 +344,8 @@ def _task(problem: _Problem, state: RegistrationState, i: int) -> RegistrationTa
         pose=config.pose,
         other_pose=_other_pose(state, i),
         bent=i in state.bent and known,
-        from_all_poses=known and state.falls_short(i),
+        from_all_poses=known and state.agrees_less_than_usual(i, _FALLS_SHORT),
+        symmetries=state.symmetries if state.agrees_less_than_usual(i) else None,
     )
 
 
@@ -361,7 +365,7 @@ def _comparison(problem: _Problem, state: RegistrationState, i: int) -> Comparis
         return "one"
     is_settled = (
         i in state.registrations
-        and not state.falls_short(i)
+        and not state.agrees_less_than_usual(i, _FALLS_SHORT)
         and state.registrations[i].scores.mirrored > _CLEARLY_WORSE * state.registrations[i].scores.pose
     )
     return "one" if is_settled else "both"
@@ -482,7 +486,8 @@ def _accept(problem: _Problem, previous: RegistrationState, ended: Sequence[Scan
             excluded[i] = reason
         else:
             last = previous.registrations.get(i, registration)
-            registrations[i] = replace(registration, relief_gap=min(registration.relief_gap, last.relief_gap))
+            is_compared = np.isfinite(registration.relief_gap)
+            registrations[i] = registration if is_compared else replace(registration, relief_gap=last.relief_gap)
     return replace(previous, registrations=registrations, excluded=excluded)
 
 
@@ -623,6 +628,7 @@ def _update_template(
     if state.bends:  # a mean of poses is no shape, and no pose is predicted by others
         bent, template = frozenset(order), state.template
     predictions = {**predictions, **{i: registrations[i].vertices for i in bent}}
+    maps = [one.symmetries for one in registrations.values() if one.symmetries is not None]
     agreements: dict[int, float] = {}
     if len(order) >= ENOUGH_TO_JUDGE:
         reliefs = Reliefs.of(shapes, observed, template, problem.harmonics)
@@ -644,6 +650,7 @@ def _update_template(
         consensus=_consensus(problem, state),
         bent=bent,
         relief_agreement=agreements,
+        symmetries=common_symmetries(maps, template) if state.bends else None,
     )
 
 

@@ -7,7 +7,7 @@ docs/correspondence.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import permutations
 
@@ -30,7 +30,7 @@ _TRIED = 10  # assignments of extremities: each costs about 0.2 CPU s
 _SENSE = 0.75
 """Share of the area of the map, less that of the rest, that is not turned inside out: it was 0.87 or more in the right
 maps of 9 figures, and negative where left and right were exchanged."""
-_MAPS, DISTINCT = 3, 0.05
+_MAPS, _DISTINCT = 3, 0.05
 """Maps to be registered, at most, and the least median distance of two of them, share of the size: stretch does not
 distinguish correct maps from those with front and back exchanged."""
 _JACOBIANS = 3.0
@@ -83,6 +83,10 @@ class IntrinsicShape:
         """Return (V, E) the distance of each vertex from each of `ends`."""
         return np.linalg.norm(self.embedding[:, None] - self.embedding[ends], axis=2)
 
+    def smooth(self, values: FloatArray) -> FloatArray:
+        """Return the component of `values` (V, C) in the functions."""
+        return self.functions @ (self.functions.T @ (self.area[:, None] * values))
+
     def determinants(self, fields: FloatArray) -> FloatArray:
         """Return (V, E (E - 1) / 2) the Jacobian determinant of each pair of `fields` (V, E), averaged (C51).
 
@@ -114,7 +118,7 @@ def bent_shapes(template: IntrinsicShape, scan: IntrinsicShape, seed: int) -> li
     """
     rng = np.random.default_rng(seed)
     drawn = np.sort(rng.permutation(len(template.functions))[: _VERTICES // 2]).astype(np.int32)
-    faces, limit = faces_of(template.mesh), DISTINCT * rms_size(scan.mesh.vertices)
+    faces = faces_of(template.mesh)
     shapes: list[FloatArray] = []
     for ends in _assignments(template, scan):
         own, theirs = template.distances(template.ends[: len(ends)]), scan.distances(ends)
@@ -123,16 +127,45 @@ def bent_shapes(template: IntrinsicShape, scan: IntrinsicShape, seed: int) -> li
         features = np.hstack([own, scale * turns])[drawn]
         start = _nearest(features, np.hstack([theirs, scale * scan.determinants(theirs)]))
         mapped = _refined(template, scan, start, drawn)
-        weighted = template.area[:, None] * scan.mesh.vertices[mapped]
-        shape = template.functions @ (template.functions.T @ weighted)
+        shape = template.smooth(scan.mesh.vertices[mapped])
         if _orientation(shape, faces, vertex_normals(scan.mesh)[mapped]) >= _SENSE:
             shapes.append(shape)
     shapes.sort(key=lambda shape: edge_stretch(shape, template.mesh))
-    distinct: list[FloatArray] = []
+    return distinct(shapes, rms_size(scan.mesh.vertices))[:_MAPS]
+
+
+def distinct(shapes: Iterable[FloatArray], size_mm: float, known: Sequence[FloatArray] = ()) -> list[FloatArray]:
+    """Return those of `shapes` (V, 3) that are apart from the ones before, and from those that are known."""
+    found: list[FloatArray] = []
     for shape in shapes:
-        if all(np.median(np.linalg.norm(shape - other, axis=1)) > limit for other in distinct):
-            distinct.append(shape)
-    return distinct[:_MAPS]
+        if all(is_apart(shape, other, size_mm) for other in (*known, *found)):
+            found.append(shape)
+    return found
+
+
+def is_apart(shape: FloatArray, other: FloatArray, size_mm: float) -> bool:
+    """Return whether two shapes (V, 3) on an object of that RMS size have most vertices in other places."""
+    return float(np.median(np.linalg.norm(shape - other, axis=1))) > _DISTINCT * size_mm
+
+
+def common_symmetries(maps: Iterable[IntArray], template: Mesh) -> IntArray | None:
+    """Return the distinct near symmetries (S, V) that most scans have, at most `_MAPS`; None if there are none.
+
+    Args:
+        maps: (S, V) of each scan, as `ScanRegistration.symmetries`.
+        template: whose vertices they permute.
+    """
+    vertices, size_mm = template.vertices, rms_size(template.vertices)
+
+    groups = [[np.arange(len(vertices), dtype=np.int32)]]  # the first one is no symmetry
+    for row in (row for rows in maps for row in rows):
+        alike = [group for group in groups if not is_apart(vertices[row], vertices[group[0]], size_mm)]
+        if alike:
+            alike[0].append(row)
+        else:
+            groups.append([row])
+    common = [group[0] for group in sorted(groups[1:], key=len, reverse=True)[:_MAPS]]
+    return np.stack(common) if common else None
 
 
 def _extremities(embedding: FloatArray, faces: IntArray, most: int) -> IntArray:

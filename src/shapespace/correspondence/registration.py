@@ -6,6 +6,7 @@ Equations Cn are those of docs/correspondence.md.
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, NamedTuple, TypeAlias
@@ -16,7 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from shapespace.correspondence.generic import generic_model
 from shapespace.correspondence.harmonics import Harmonics
-from shapespace.correspondence.isometry import DISTINCT, IntrinsicShape, bent_shapes
+from shapespace.correspondence.isometry import IntrinsicShape, bent_shapes, distinct, is_apart
 from shapespace.correspondence.landmark_guide import MirroredLandmarksError, ScanLandmarks
 from shapespace.correspondence.pose_consensus import angle_deg
 from shapespace.correspondence.register import ElasticSettings, Template, register
@@ -35,7 +36,7 @@ from shapespace.geometry.mirror_plane import mirror_image
 from shapespace.geometry.normals import boundary_edges, boundary_vertices, rms_size, vertex_normals
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import BoolArray, ByteArray, FloatArray, Mesh, Similarity
+from shapespace.types import BoolArray, ByteArray, FloatArray, IntArray, Mesh, Similarity
 
 REACHED = 0.03
 """A scan's point is covered when the surface is this near, as a share of the size."""
@@ -62,8 +63,8 @@ _STRAINED = 0.0009
 exchanged: 3 of 59 faces, femora, molars, spleens and blobs, whole or damaged, had more (two cut femora and a blob), and
 13 of 50 figures with moving limbs, of which the others had at most 0.0007."""
 CLEARLY_LESS_STRAINED = 0.7
-"""Ratio of this strain below which a registration from the map along the surface replaces another one; 1 for an object
-that is known to bend."""
+"""Ratio of this strain below which a registration from a map along the surface replaces another one. Of an object that
+is known to bend, relief alone chooses: the registration from its own surface of the last round has the least strain."""
 _UNREACHED = "surface not reached: too little of the scan matches the template from any pose"
 _BULGING = 0.2
 """How far the normals of a sheet point away from its middle, 0 to 1, when it is clear which way it bulges."""
@@ -109,6 +110,8 @@ class RegistrationTask:
         is_start_known: whether it is registered from `T_scan_template` and `expected` alone.
         from_all_poses: whether it is registered from all likely poses, and where sides are compared also as its mirror
             image.
+        symmetries: (S, V) near symmetries of the object, as `ScanRegistration.symmetries` has them: a bent scan is
+            registered from its own surface after each of them, too.
     """
 
     index: int
@@ -125,6 +128,7 @@ class RegistrationTask:
     bent: bool = False
     is_start_known: bool = False
     from_all_poses: bool = False
+    symmetries: IntArray | None = None
 
     def reflected(self) -> RegistrationTask:
         """Return the same task for the mirror image of its scan, at an unknown pose."""
@@ -157,6 +161,8 @@ class ScanRegistration:
         colours: (V, 3) uint8 of the scan at the vertices; None where it has none.
         relief_gap: by how much its relief agrees better with the template's than that from any other map along the
             surface; infinite where there is none.
+        symmetries: (S, V) for each other map along the surface, where it has each vertex: the number of the vertex that
+            this surface has there; None where there is no other map.
     """
 
     index: int
@@ -175,6 +181,12 @@ class ScanRegistration:
     bent: bool = False
     colours: ByteArray | None = None
     relief_gap: float = np.inf
+    symmetries: IntArray | None = None
+
+    @property
+    def vertices_on_scan(self) -> FloatArray:
+        """(V, 3) the vertices in the scan's own frame."""
+        return self.T_scan_template.apply(self.vertices)
 
     @property
     def strain(self) -> float:
@@ -306,11 +318,11 @@ class RoundContext:
         strained = task.bent or registration.strain > _STRAINED * self.template.size_mm
         if task.pose != "search" or registration.posed_by_landmarks or not strained:
             return registration
-        limit = registration.strain * (1.0 if task.bent else CLEARLY_LESS_STRAINED)
+        limit = np.inf if task.bent else CLEARLY_LESS_STRAINED * registration.strain
         task = task.reflected() if registration.mirrored != task.mirrored else task
         least = (registration.covered - _LEFT_OVER, registration.observed.mean() - _LEFT_OVER)
         candidates = [replace(registration, bent=True)] if task.bent else []
-        for shape in self._shapes_by_map(task):
+        for shape in self._shapes_by_map(task, registration):
             T = fit_similarity(self.mesh.vertices, shape)
             try:
                 bent = self._register_at(replace(task, expected=T.inverse().apply(shape)), T)
@@ -323,25 +335,35 @@ class RoundContext:
         agreements = [self._relief_agreement(one) for one in candidates]
         highest = max(agreements)
         best = candidates[agreements.index(highest)]
-        gaps = [highest - own for one, own in zip(candidates, agreements, strict=True) if self._is_apart(one, best)]
-        return replace(best, relief_gap=min(gaps, default=np.inf))
+        own, size_mm = best.vertices_on_scan, rms_size(task.scan.vertices)
+        others = [
+            (highest - value, one.vertices_on_scan)
+            for one, value in zip(candidates, agreements, strict=True)
+            if is_apart(one.vertices_on_scan, own, size_mm)
+        ]
+        if not others:
+            return best
+        nearest = cKDTree(own)
+        symmetries = np.stack([np.asarray(nearest.query(shape)[1], dtype=np.int32) for _, shape in others])  # C54
+        return replace(best, relief_gap=min(gap for gap, _ in others), symmetries=symmetries)
 
-    def _is_apart(self, one: ScanRegistration, other: ScanRegistration) -> bool:
-        """Return whether two surfaces of a scan have most vertices in other places."""
-        T = other.T_scan_template.inverse() @ one.T_scan_template
-        moved = np.linalg.norm(T.apply(one.vertices) - other.vertices, axis=1)
-        return float(np.median(moved)) > DISTINCT * self.template.size_mm
+    def _shapes_by_map(self, task: RegistrationTask, registration: ScanRegistration) -> list[FloatArray]:
+        """Return the distinct shapes (V, 3) in the scan's frame by maps along the surface.
+
+        Of an object that is known to bend, they include its own surface after each near symmetry.
+        """
+        own = registration.vertices_on_scan
+        symmetries = task.symmetries if task.bent and task.symmetries is not None else ()
+        shapes = [self.intrinsic.smooth(own[symmetry]) for symmetry in symmetries]
+        with suppress(ShapespaceError):  # no sheet of triangles
+            shapes += bent_shapes(self.intrinsic, IntrinsicShape.of_scan(task.scan), self.seed)
+        known = [own] if task.bent else []
+        return distinct(shapes, rms_size(task.scan.vertices), known)
 
     def _relief_agreement(self, registration: ScanRegistration) -> float:
         """Return how well the relief of a surface agrees with that of the template (C35)."""
         own = relief(registration.vertices, self.mesh, self.harmonics)
         return agreement(own, self.template_relief, self.harmonics.area * registration.observed)
-
-    def _shapes_by_map(self, task: RegistrationTask) -> list[FloatArray]:
-        try:
-            return bent_shapes(self.intrinsic, IntrinsicShape.of_scan(task.scan), self.seed)
-        except ShapespaceError:  # no sheet of triangles
-            return []
 
     def _search(self, task: RegistrationTask) -> Start:
         vertices = np.array(task.scan.vertices)
