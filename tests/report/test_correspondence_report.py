@@ -13,6 +13,7 @@ from report_page import Page, edit
 from same_blobs import ASIDE, EVIL, FAR, FOLDED, HIDDEN, NAMES, VERTICES, mean_blob, surface, write_same
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
+from shapespace.report.figures import correspondence_figures
 from shapespace.report.inputs.correspondence_folder import Corresponded, upright
 from shapespace.report.inputs.triage import concerns_of
 from shapespace.report.pages import correspondence_page
@@ -121,6 +122,21 @@ def test_a_surface_is_laid_onto_the_mean_shape_with_its_holes(template: Path) ->
     np.testing.assert_allclose(placed.T_scan_mean.apply(placed.vertices)[seen], own[seen], atol=1e-3)
     off = np.linalg.norm(placed.vertices[seen] - at.mean.vertices[seen], axis=1)
     assert off.mean() < 6
+
+
+def test_no_surface_is_cut_by_the_edge_of_its_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[np.ndarray] = []
+
+    def kept(layer: Layer, **options: object) -> np.ndarray:
+        drawn.append(render(layer, **options))
+        return drawn[-1]
+
+    monkeypatch.setattr(correspondence_figures, "render", kept)
+    mean = mean_blob()
+    correspondence_figures.checkerboard_figure(mean, [mean.vertices * [1.0, 1.7, 1.0], mean.vertices * 0.5], ["a", "b"])
+    for picture in drawn:
+        edge = np.concatenate([picture[0], picture[-1], picture[:, 0], picture[:, -1]])
+        assert len(np.unique(edge.reshape(len(edge), -1), axis=0)) == 1  # the background alone
 
 
 def test_the_checkerboard_is_carried_by_the_vertices() -> None:

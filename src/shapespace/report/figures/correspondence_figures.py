@@ -52,10 +52,12 @@ def checkerboard_figure(
         raise InputError(f"{len(surfaces)} surfaces with {len(labels)} labels cannot be drawn in one figure.")
     places = checker_places(mean, yaw_deg)
     columns = 4
-    mean_view = view(mean.vertices, columns, yaw_deg=yaw_deg, margin=0.08)
+    shapes = (mean.vertices, *surfaces)
+    drawn = np.concatenate([shape[np.isfinite(shape).all(axis=1)] for shape in shapes])
+    panel = view(drawn, columns, yaw_deg=yaw_deg)
     images = [
-        render(checker_layer(mean.with_vertices(vertices), places), camera=mean_view.camera, size=mean_view.size)
-        for vertices in (mean.vertices, *surfaces)
+        render(checker_layer(mean.with_vertices(shape), places), camera=panel.camera, size=panel.size)
+        for shape in shapes
     ]
     names = ["mean shape", *_distinct_labels(labels)]
     rows = [Row(i, t) for i, t in zip(in_rows(images, columns), in_rows(names, columns), strict=True)]
