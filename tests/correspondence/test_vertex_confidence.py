@@ -12,7 +12,7 @@ from shapespace.correspondence.groupwise import correspond
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.register import ElasticSettings
 from shapespace.correspondence.settings import CorrespondConfig
-from shapespace.correspondence.vertex_confidence import estimate_position_std
+from shapespace.correspondence.vertex_confidence import VertexConfidence
 from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.types import FloatArray, Mesh
 from synthetic_shapes import blob, sphere
@@ -31,7 +31,7 @@ def made() -> Correspondence:
 
 def stds(mesh: Mesh, vertices: FloatArray, observed: FloatArray | None = None) -> FloatArray:
     shown = np.ones(len(vertices), np.bool_) if observed is None else observed > 0
-    return estimate_position_std(vertices, shown, mesh, Harmonics.of(mesh, 150), 10)
+    return VertexConfidence.of(mesh, Harmonics.of(mesh, 150)).position_std(vertices, shown, 10)
 
 
 def test_positions_are_more_certain_at_a_bump_than_on_a_smooth_surface() -> None:
@@ -42,6 +42,15 @@ def test_positions_are_more_certain_at_a_bump_than_on_a_smooth_surface() -> None
     std = stds(mean, slid)
     near, away = bump > 0.1, np.abs(directions[:, 2]) < 0.3
     assert std[near].mean() < 0.5 * std[away].mean()
+
+
+def test_uncertainty_changes_gradually_over_a_rough_surface() -> None:
+    directions, faces = sphere(6000)
+    rng = np.random.default_rng(0)
+    mean = Mesh(blob(directions, np.zeros(5)) + 0.2 * rng.standard_normal((6000, 3)), faces)
+    std = stds(mean, blob(directions, np.array([0.5, -0.5, 1.0, 0.3, 1.0])))
+    ratio = np.log(std[faces[:, 0]] / std[faces[:, 1]])
+    assert np.quantile(np.abs(ratio), 0.95) < 0.1
 
 
 def test_positions_are_less_certain_where_the_scan_shows_nothing() -> None:

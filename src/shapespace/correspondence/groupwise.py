@@ -45,7 +45,7 @@ from shapespace.correspondence.scan_status import Judgement, ScanEvidence, judge
 from shapespace.correspondence.settings import FEWEST, SIZE, CorrespondConfig
 from shapespace.correspondence.subject_tree import subject_levels
 from shapespace.correspondence.template import PoseModel, clean_scan
-from shapespace.correspondence.vertex_confidence import estimate_position_std
+from shapespace.correspondence.vertex_confidence import VertexConfidence
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.geometry.landmark_placement import place_landmarks
 from shapespace.geometry.mirror_plane import FLIP, mirror_image
@@ -763,16 +763,17 @@ def add_scans(
         registrations = run(_context(problem, state), [_task(problem, state, i) for i in raw])
         state = _next_state(problem, state, registrations)
         return _result(problem, state, _evidence(state))
-    results = [_added_result(problem, states.get(i, start), i) for i in range(kept, len(names))]
+    confidence = VertexConfidence.of(finished.mean, problem.harmonics)
+    results = [_added_result(problem, states.get(i, start), i, confidence) for i in range(kept, len(names))]
     return Correspondence(finished.mean, tuple(results), first.origin, (), start.landmarks)
 
 
-def _added_result(problem: _Problem, state: RegistrationState, i: int) -> Corresponding:
+def _added_result(problem: _Problem, state: RegistrationState, i: int, confidence: VertexConfidence) -> Corresponding:
     own = state.registrations.get(i)
     evidence = None if own is None else _evidence_by_finished(problem, state, i)
     if own is None or own.observed.all():  # estimates take long where there are many scans
-        return _scan_result(problem, state, i, None if own is None else own.vertices, evidence)
-    return _scan_result(problem, state, i, _complete_shapes(problem, state)[i], evidence)
+        return _scan_result(problem, state, i, None if own is None else own.vertices, evidence, confidence)
+    return _scan_result(problem, state, i, _complete_shapes(problem, state)[i], evidence, confidence)
 
 
 def _finished_state(problem: _Problem, finished: FinishedCorrespondence) -> RegistrationState:
@@ -906,7 +907,10 @@ def _result(problem: _Problem, state: RegistrationState, evidence: Mapping[int, 
     # A scan of another kind is tried again in each round, and can end with a reason that names no kind.
     kinds = {i: _another_kind(len(group), len(groups[0])) for group in groups[1:] for i in group}
     state = replace(state, excluded={**state.excluded, **kinds})
-    scans = [_scan_result(problem, state, i, complete.get(i), evidence.get(i)) for i in range(len(problem.names))]
+    confidence = VertexConfidence.of(state.template, problem.harmonics)
+    scans = [
+        _scan_result(problem, state, i, complete.get(i), evidence.get(i), confidence) for i in range(len(problem.names))
+    ]
     points = state.landmarks.positions(state.template.vertices)
     template = state.template.with_vertices(state.template.vertices, points)
     landmarks = replace(state.landmarks, distance_mm=np.empty(0))  # places on a mean have no given point
@@ -938,7 +942,8 @@ def _scan_result(
     state: RegistrationState,
     i: int,
     complete: FloatArray | None,
-    evidence: ScanEvidence | None = None,
+    evidence: ScanEvidence | None,
+    confidence: VertexConfidence,
 ) -> Corresponding:
     """Return the result of scan `i`; `complete` are its vertices (V, 3) in the template's frame, None if excluded."""
     moved = tuple(record.scan_moved[i] for record in state.rounds if i in record.scan_moved)
@@ -951,9 +956,7 @@ def _scan_result(
     vertices = T.apply(complete)
     landmarks = problem.landmarks(state.landmarks, problem.scan(i, mirrored=registration.mirrored))
     mean, p95, p99, largest = (T.scale * length for length in registration.distance)
-    position_std = estimate_position_std(
-        complete, registration.observed, state.template, problem.harmonics, len(state.registrations)
-    )
+    position_std = confidence.position_std(complete, registration.observed, len(state.registrations))
     return Corresponding(
         name=problem.names[i],
         reason="",

@@ -96,7 +96,14 @@ class Surfaces:
         concerns = concerns_of(self._corresponded)
         sizes = dict(zip(population.names, population.sizes.tolist(), strict=True))
         rows: list[dict[str, Any]] = [
-            {"name": name, "status": "unreadable", "reason": self.public(reason), "weight": 0.0, "distance": None}
+            {
+                "name": name,
+                "status": "unreadable",
+                "reason": self.public(reason),
+                "weight": 0.0,
+                "distance": None,
+                "mirrored": False,
+            }
             for name, reason in self._corresponded.unread.items()
         ]
         for name, record in self._corresponded.records.items():
@@ -111,6 +118,7 @@ class Surfaces:
                     "weight": concerns.get(name, Concern()).weight,
                     "distance": share if math.isfinite(share) else None,
                     "seen": record.seen_share,
+                    "mirrored": record.mirrored,
                 }
             )
         return sorted(rows, key=lambda row: (_STATUS_ORDER.index(row["status"]), -row["weight"], row["name"]))

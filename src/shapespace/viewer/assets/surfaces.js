@@ -123,14 +123,15 @@
 
   // Scans -----------------------------------------------------------------------------------------------------------
 
+  const words = (row) => `${WORDS[row.status]}${row.mirrored ? ", mirrored" : ""}`;
   const pictured = (row) => row.status !== "unreadable" && row.status !== "excluded";
 
   function filterRows() {
     const asked = $("filter").value.trim().toLowerCase();
-    const found = rows.filter((row) => `${row.name} ${WORDS[row.status]} ${row.reason}`.toLowerCase().includes(asked));
+    const found = rows.filter((row) => `${row.name} ${words(row)} ${row.reason}`.toLowerCase().includes(asked));
     wanted = found.filter(pictured);
     $("list").replaceChildren(...found.slice(0, 500).map((row) => h("p", { class: DOTS[row.status], "data-testid": `row-${row.name}` },
-      h("span", { class: "dot" }), h("span", {}, h("strong", {}, row.name), ` ${WORDS[row.status]}`, row.status === "converged" ? null : h("small", {}, row.reason)))));
+      h("span", { class: "dot" }), h("span", {}, h("strong", {}, row.name), ` ${words(row)}`, row.status === "converged" ? null : h("small", {}, row.reason)))));
     showPage(0);
   }
 
@@ -192,7 +193,7 @@
     stdLimit = unpacked.facts.std_limit;
     $("colours").querySelector("[data-colour=std]").hidden = !mean.std;
     put(cells[0], "Mean shape", mean);
-    cells[0].view.frame(["surface"], 1.06);
+    cells[0].view.frame(["surface"], 1.2); // scans are larger than the mean shape in some directions
     for (const cell of cells.slice(1)) cells[0].view.link(cell.view);
     Viewer.startTheme(() => cells.forEach((cell) => cell.view.request()));
     Viewer.startMessages();
