@@ -757,20 +757,22 @@ def add_scans(
     problem = _Problem.of(names, first, config)
     start = _finished_state(problem, finished)
     states = _added_states(problem, start, [i for i in raw if i >= kept], run)
+    judged = {i: _judged_by_finished(problem, state, i) for i, state in states.items()}
     if finished.scans:
-        state = _merged(start, states)
+        state = _merged(start, {i: state for i, (state, _) in judged.items()})
         state = replace(_update_template(problem, state, state, {}), rounds=())
         registrations = run(_context(problem, state), [_task(problem, state, i) for i in raw])
         state = _next_state(problem, state, registrations)
         return _result(problem, state, _evidence(state))
     confidence = VertexConfidence.of(finished.mean, problem.harmonics)
-    results = [_added_result(problem, states.get(i, start), i, confidence) for i in range(kept, len(names))]
+    results = [_added_result(problem, *judged.get(i, (start, None)), i, confidence) for i in range(kept, len(names))]
     return Correspondence(finished.mean, tuple(results), first.origin, (), start.landmarks)
 
 
-def _added_result(problem: _Problem, state: RegistrationState, i: int, confidence: VertexConfidence) -> Corresponding:
+def _added_result(
+    problem: _Problem, state: RegistrationState, evidence: ScanEvidence | None, i: int, confidence: VertexConfidence
+) -> Corresponding:
     own = state.registrations.get(i)
-    evidence = None if own is None else _evidence_by_finished(problem, state, i)
     if own is None or own.observed.all():  # estimates take long where there are many scans
         return _scan_result(problem, state, i, None if own is None else own.vertices, evidence, confidence)
     return _scan_result(problem, state, i, _complete_shapes(problem, state)[i], evidence, confidence)
@@ -821,7 +823,7 @@ def _added_states(
             states[i] = _next_added_state(problem, start, states[i], registration, predictor)
         # The mean stays, so an excluded scan would be excluded again.
         left = [i for i in left if states[i].rounds and states[i].rounds[-1].moved >= problem.config.settled]
-    return {i: _judged_by_finished(problem, state, i) for i, state in states.items()}
+    return states
 
 
 def _next_added_state(
@@ -853,33 +855,26 @@ def _next_added_state(
     return replace(start, registrations={**kept, i: own}, predictions=predicted, rounds=rounds)
 
 
-def _judged_by_finished(problem: _Problem, state: RegistrationState, i: int) -> RegistrationState:
-    """Return the state of an added scan after its last round, without it if it is an outlier among the others."""
-    if i not in state.registrations or len(judges := _judges(state, i)) < ENOUGH_TO_JUDGE - 1:
-        return state
+def _judged_by_finished(
+    problem: _Problem, state: RegistrationState, i: int
+) -> tuple[RegistrationState, ScanEvidence | None]:
+    """Return the state of an added scan, without it if it is an outlier among the finished ones, and their evidence.
+
+    There is no evidence where they are too few.
+    """
+    kept = sorted(state.registrations.keys() - {i})
+    judges = kept[:: -(-len(kept) // _JUDGES)]
+    if i not in state.registrations or len(judges) < ENOUGH_TO_JUDGE - 1:
+        return state, None
     shapes, observed = state.shapes([*judges, i])
     finished = np.arange(len(judges))
     distance = Collection.of(shapes, observed, state.template.vertices).distances(finished)[-1]
-    reliefs = Reliefs.of(shapes, observed, state.template, problem.harmonics)
-    if not is_outlier(distance, reliefs.agreements(finished)[-1], problem.config.outlier_threshold):
-        return state
-    excluded = {i: _outlier_reason(state.registrations[i], float(distance))}
-    kept = {j: one for j, one in state.registrations.items() if j != i}
-    return replace(state, registrations=kept, excluded=excluded)
-
-
-def _judges(state: RegistrationState, i: int) -> list[int]:
-    """Return the finished scans that the added scan `i` is compared with."""
-    kept = sorted(state.registrations.keys() - {i})
-    return kept[:: -(-len(kept) // _JUDGES)]
-
-
-def _evidence_by_finished(problem: _Problem, state: RegistrationState, i: int) -> ScanEvidence | None:
-    """Return the evidence on an added scan by finished ones; None where these are too few."""
-    if len(judges := _judges(state, i)) < ENOUGH_TO_JUDGE - 1:
-        return None
-    *others, own = Reliefs.of(*state.shapes([*judges, i]), state.template, problem.harmonics).agreements().tolist()
-    return ScanEvidence(relief_agreement=own, usual_relief_agreement=float(np.median(others)))
+    *others, own = Reliefs.of(shapes, observed, state.template, problem.harmonics).agreements(finished).tolist()
+    if is_outlier(distance, own, problem.config.outlier_threshold):
+        excluded = {i: _outlier_reason(state.registrations[i], float(distance))}
+        registrations = {j: one for j, one in state.registrations.items() if j != i}
+        return replace(state, registrations=registrations, excluded=excluded), None
+    return state, ScanEvidence(relief_agreement=own, usual_relief_agreement=float(np.median(others)))
 
 
 def _merged(start: RegistrationState, states: Mapping[int, RegistrationState]) -> RegistrationState:
