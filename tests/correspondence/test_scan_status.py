@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from test_published_correspondence import bone, drawn
 
@@ -101,3 +102,9 @@ def test_limbs_that_can_be_assigned_otherwise_make_a_surface_doubtful() -> None:
     assert judge(replace(SURE, relief_gap=0.5)).status == "converged"
     judgement = judge(replace(SURE, relief_gap=0.1))
     assert judgement.status == "doubtful" and "limbs may be exchanged" in judgement.doubt
+
+
+def test_a_relief_that_agrees_well_is_no_doubt_where_others_agree_even_better() -> None:
+    usual, well, less = np.arctanh([0.97, 0.92, 0.8]).tolist()
+    assert judge(ScanEvidence(relief_agreement=well, usual_relief_agreement=usual)).status == "converged"
+    assert judge(ScanEvidence(relief_agreement=less, usual_relief_agreement=usual)).status == "doubtful"

@@ -24,6 +24,10 @@ _AMBIGUOUS, _GAP = 4.0, 0.2
 _DOUBTED = 0.14
 """Probability that a surface is wrong from which it is doubtful."""
 
+_CLEAR = 1.3
+"""Agreement of reliefs (a correlation of 0.86) from which nothing is lacking: 33 wrong surfaces of 18 collections had
+at most 1.21. Without this limit 10 instead of 5 of 174 right ones were doubtful, since the usual one can be above 1.8."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ScanEvidence:
@@ -44,7 +48,8 @@ class ScanEvidence:
 
     def features(self) -> tuple[float, float]:
         """Return what speaks against the surface, 0 where nothing does: consensus, and what its relief lacks."""
-        return float(self.consensus_deg > SAME_POSE_DEG), max(self.usual_relief_agreement - self.relief_agreement, 0.0)
+        lacking = max(self.usual_relief_agreement - self.relief_agreement, 0.0)
+        return float(self.consensus_deg > SAME_POSE_DEG), lacking if self.relief_agreement < _CLEAR else 0.0
 
 
 @dataclass(frozen=True)
