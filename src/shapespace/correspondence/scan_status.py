@@ -26,7 +26,7 @@ _DOUBTED = 0.14
 
 _CLEAR = 1.3
 """Agreement of reliefs (a correlation of 0.86) from which nothing is lacking: 33 wrong surfaces of 18 collections had
-at most 1.21. Without this limit 10 instead of 5 of 174 right ones were doubtful, since the usual one can be above 1.8."""
+at most 1.21. Without this limit 10 instead of 5 of 174 right ones were doubtful, as the usual one can be above 1.8."""
 
 
 @dataclass(frozen=True, kw_only=True)
