@@ -114,19 +114,19 @@ def dispersion(made: Correspondence, of: Set) -> dict[str, float | None]:
 
     Distances to the true surface are those of observed vertices; estimated ones have a figure of their own.
     """
-    places, gaps, shown = [], [], []
+    places, gaps, observations = [], [], []
     for one, truth in zip(made.scans, of.known[: len(made.scans)], strict=True):
         if one.vertices is None:
             continue
         near = build_engine(Mesh(truth.truth, of.mean.faces)).query(np.ascontiguousarray(one.vertices))
         places.append(np.einsum("mc,mcd->md", near.barycentric, of.mean.vertices[of.mean.faces[near.triangle]]))
         gaps.append(near.distance / truth.T_scan_model.scale)
-        shown.append(np.ones(len(one.vertices), np.bool_) if one.observed is None else one.observed)
+        observations.append(np.ones(len(one.vertices), np.bool_) if one.observed is None else one.observed)
     place = np.array(places)
     middle = np.median(place, axis=0)
     inside = of.counted[build_engine(of.mean).query(middle).vertex]
     apart = np.linalg.norm(place - middle, axis=2)[:, inside]
-    gap, observed = np.array(gaps)[:, inside], np.array(shown)[:, inside]
+    gap, observed = np.array(gaps)[:, inside], np.array(observations)[:, inside]
     return {
         "mean_mm": float(apart.mean()),
         "median_mm": float(np.median(apart)),

@@ -81,7 +81,7 @@ class RoundRunner:
 
 
 def _read_again(task: _FileTask) -> ScanRegistration:
-    placed = _read(task.file, task.task.index)
+    placed = _read(task.file, task.registration.index)
     if placed is None:
         raise FileError(f"Cannot read {task.file}, which this run wrote; run again.")
     return placed
@@ -92,7 +92,7 @@ class _FileTask:
     """A task and the file of its result."""
 
     file: Path
-    task: RegistrationTask
+    registration: RegistrationTask
 
 
 @dataclass(frozen=True)
@@ -113,8 +113,8 @@ class RoundWork:
         Raises:
             FileError: it cannot be written.
         """
-        if _read(task.file, task.task.index) is None:
-            _write(task.file, _context.get(self.file, self._load).register(task.task))
+        if _read(task.file, task.registration.index) is None:
+            _write(task.file, _context.get(self.file, self._load).register(task.registration))
 
     def give_up(self, task: _FileTask, reason: str) -> None:
         """Write the result that excludes a scan whose workers were lost.
@@ -122,7 +122,7 @@ class RoundWork:
         Raises:
             FileError: it cannot be written.
         """
-        _write(task.file, _context.get(self.file, self._load).failed(task.task.index, reason))
+        _write(task.file, _context.get(self.file, self._load).failed(task.registration.index, reason))
 
     def save(self, context: RoundContext) -> None:
         """Write the round context for other processes, if an earlier run has not.

@@ -156,7 +156,6 @@ def common_symmetries(maps: Iterable[IntArray], template: Mesh) -> IntArray | No
         template: whose vertices they permute.
     """
     vertices, size_mm = template.vertices, rms_size(template.vertices)
-
     groups = [[np.arange(len(vertices), dtype=np.int32)]]  # the first one is no symmetry
     for row in (row for rows in maps for row in rows):
         alike = [group for group in groups if not is_apart(vertices[row], vertices[group[0]], size_mm)]

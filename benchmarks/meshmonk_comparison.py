@@ -1,10 +1,11 @@
-"""How large is the error of a correspondence beside that of meshmonk 0.3, with the same template and the pose given?
+"""Compare the errors of `correspond` and of meshmonk 0.3, with the same template and the pose given to meshmonk.
 
-    python benchmarks/beside_meshmonk.py                          all sets
-    python benchmarks/beside_meshmonk.py faces femora --scans 12
+    python benchmarks/meshmonk_comparison.py                          all sets
+    python benchmarks/meshmonk_comparison.py faces femora --scans 12
 
-meshmonk gets what `correspond` had to find: the first template, the side and the pose of each scan; one pyramid with
-its defaults. Errors: the dispersion (faces, femora), the distance of landmarks carried between all pairs (molars).
+meshmonk starts from the first template of `correspond`, and from the side and the pose that it found for each scan; one
+pyramid with its defaults. Errors: the dispersion (faces, femora), the distance of landmarks carried between all pairs
+(molars).
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from shapespace.geometry.similarity import fit_similarity
 from shapespace.types import Mesh
 
 
-def by_meshmonk(made: Correspondence, template: Mesh, scans: list[Mesh]) -> tuple[Correspondence, float]:
+def register_with_meshmonk(made: Correspondence, template: Mesh, scans: list[Mesh]) -> tuple[Correspondence, float]:
     """Return `made` with the surfaces of meshmonk in place of its own, and the CPU s for each."""
     # The template was reflected if most scans are its mirror images.
     sides = (template, mirror_image(template))
@@ -41,8 +42,10 @@ def by_meshmonk(made: Correspondence, template: Mesh, scans: list[Mesh]) -> tupl
             surfaces.append(one)
             continue
         T = one.T_scan_template
-        seen = mirror_image(scan) if one.mirrored else scan
-        posed = seen.with_vertices(T.inverse().apply(seen.vertices))  # of one size and unit, as its settings expect
+        reflected = mirror_image(scan) if one.mirrored else scan
+        posed = reflected.with_vertices(
+            T.inverse().apply(reflected.vertices)
+        )  # of one size and unit, as its settings expect
         vertices, cpu_s = fit(template, None, posed, T)
         placed = T.apply(vertices)
         surfaces.append(replace(one, vertices=placed * FLIP if one.mirrored else placed))
@@ -93,7 +96,7 @@ def main() -> None:
 
         first = first_template(scans, None, config, None)
         made = correspond(scans, config, first=first)
-        other, seconds = by_meshmonk(made, first.mesh, scans)
+        other, seconds = register_with_meshmonk(made, first.mesh, scans)
         ours, theirs = error(made), error(other)
         own = float(np.mean([np.sum(one.seconds) for one in made.scans]))
         print(
