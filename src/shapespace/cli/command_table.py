@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from shapespace.cli import run, values
-from shapespace.cli.answers import asymmetry, change, compare, identity, regress, score
+from shapespace.cli.answers import asymmetry, change, compare, identity, regress, score, shape_tests
 from shapespace.cli.options import Option, Source, advanced, basic
+from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS, ShapeTest
 
 # The classes and functions that options are read from.
 COHORT = Source("cohort.read", "CohortConfig")
@@ -53,6 +54,7 @@ _GOES_ON: Mapping[str, Any] = {"goes_on": "; the same command goes on from there
 GROUPS: Mapping[str, str] = {
     "data": "open data sets, simulated faces, organs and bones",
     "landmarks": "transfer landmarks from a few marked specimens to all scans in correspondence, and check them",
+    "test": "tests of shape beyond linear models: disparity, covariation, phylogeny, equivalence",
     "recognise": "classify scans (for example, facial expressions) by fitted coefficients",
 }
 """Commands that have commands."""
@@ -180,6 +182,27 @@ def _identity() -> tuple[Option, ...]:
         advanced("--drop-missing", source=IDENTITY),
         advanced("--seed", "S", source=IDENTITY),
     )
+
+
+def _shape_test(test: ShapeTest) -> Command:
+    """Return the command of a test of shape."""
+    source = Source(f"statistics.shape_tests.{test.module}", test.function)
+    own = tuple(
+        basic(f"--{field.replace('_', '-')}", metavar, source=source, field=field, required=field in test.required)
+        for field, metavar in test.options.items()
+    )
+    return Command(
+        f"test {test.name}", test.summary, (test.example,), shape_tests.run,
+        (
+            *_cohort(),
+            *own,
+            basic("--permutations", "N", source=source, parse=values.positive),
+            advanced("--drop-missing", source=source),
+            advanced("--seed", "S", source=source),
+            *_gauge(),
+        ),
+        defaults={"shape_test": test},
+    )  # fmt: skip
 
 
 COMMANDS: tuple[Command, ...] = (
@@ -641,6 +664,7 @@ COMMANDS: tuple[Command, ...] = (
             *_gauge(),
         ),
     ),
+    *(_shape_test(test) for test in SHAPE_TESTS),
     Command(
         "change", "measure change between visits of the same subjects, in mm, and its noise",
         ("shapespace change visits.csv -o change --order before,after",), change.run,

@@ -31,8 +31,9 @@ SUBJECT = "subject"
 
 LengthUnit: TypeAlias = Literal["mm", ""]
 """Unit of the lengths of a cohort; empty for coordinates without a unit."""
-ShapeKind: TypeAlias = Literal["coefficients", "fitted", "dense", "corresponding", "surfaces"]
-"""Kinds of shapes: model coefficients or surfaces of fits, surfaces written by `correspond`, or any other surfaces."""
+ShapeKind: TypeAlias = Literal["coefficients", "fitted", "dense", "corresponding", "surfaces", "landmarks"]
+"""Kinds of shapes: model coefficients or surfaces of fits, surfaces written by `correspond`, any other surfaces, or
+landmarks."""
 
 _TRUNCATED: tuple[ShapeKind, ...] = ("coefficients", "fitted")
 _UNIT_SIZE = 1e-2
@@ -195,6 +196,15 @@ class Cohort:
     def n_vertices(self) -> int:
         """Number of vertices, V."""
         return len(self.reference)
+
+    @cached_property
+    def dimensions(self) -> Literal[2, 3]:
+        """Dimensions of the coordinates: 2 if z is the same everywhere, as of planar landmarks."""
+        rounding = _SAME * centroid_size(self.reference)
+        if float(np.ptp(self.reference[:, 2])) > rounding:
+            return 3
+        z = self.basis.reshape(len(self.basis), -1, 3)[:, :, 2]
+        return 2 if float(np.abs(self.coefficients @ z).max(initial=0.0)) <= rounding else 3
 
     @property
     def observed_share(self) -> FloatArray:

@@ -91,6 +91,7 @@ class AnalysisReport:
         settings: all that the result depends on, seeds among it.
         model_hashes: of the models of the fits.
         methods: sample sizes, tests and assumptions, as in the last parts; None for predictions.
+        citations: of the methods, for methods.txt.
     """
 
     question: str
@@ -107,6 +108,7 @@ class AnalysisReport:
     settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
     model_hashes: tuple[str, ...] = ()
     methods: Methods | None = None
+    citations: tuple[str, ...] = ()
 
     __repr__ = short_repr
 

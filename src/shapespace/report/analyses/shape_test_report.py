@@ -1,0 +1,105 @@
+"""Report of a test of shape: the same for all of them, from the table of tests."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+import numpy as np
+
+from shapespace.report.analyses.analysis_report import AnalysisReport, Rows
+from shapespace.report.analyses.methods_section import methods_parts
+from shapespace.report.analyses.shape_data import add_shape_data, model_hashes
+from shapespace.schemas import Counts, HistogramPart, Part, TableColumn, TablePart
+from shapespace.statistics.shape_tests.shape_test_result import ShapeTestResult, Statistic
+
+_BINS = 40  # bins of a histogram of thousands of permutations
+_MOST_SENTENCES = 10
+"""Statistics with a sentence; the table has all."""
+_MOST_HISTOGRAMS = 3
+"""Histograms of the first statistics; more of them fill the page."""
+
+
+def shape_test_report(result: ShapeTestResult) -> AnalysisReport:
+    """Return the report of a test of shape."""
+    methods = result.methods
+    summary = result.test.summary
+    report = AnalysisReport(
+        question=f"test {result.test.name}",
+        title=f"{summary[:1].upper()}{summary[1:]}",
+        summary=tuple(_sentences(result)),
+        parts=(_statistics_table(result), *result.tables, *result.figures, *_histograms(result),
+               *methods_parts(methods)),
+        tables={"statistics.csv": _rows(result), **{_file_name(one): _cells(one) for one in result.tables}},
+        arrays=result.arrays,
+        notes=result.cohort.notes,
+        settings={**result.settings, "shapes": len(result.cohort)},
+        model_hashes=model_hashes(result.cohort),
+        methods=methods,
+        citations=result.test.references,
+    )  # fmt: skip
+    return add_shape_data(report, result.cohort)
+
+
+def _sentences(result: ShapeTestResult) -> Iterator[str]:
+    for one in result.statistics[:_MOST_SENTENCES]:
+        yield f"{_sentence(one, result.level)}."
+    if len(result.statistics) > _MOST_SENTENCES:
+        yield f"{len(result.statistics) - _MOST_SENTENCES} further statistics are in the table."
+    counts = [len(one.arrangements) for one in result.statistics if len(one.arrangements)]
+    if counts:
+        yield f"{len(result.cohort)} shapes, {max(counts)} permutations, the observed data among them."
+
+
+def _sentence(one: Statistic, level: float) -> str:
+    figures = [f"{one.name} {one.value:.4g}"]
+    if one.low is not None and one.high is not None:
+        figures.append(f"interval {one.low:.4g} to {one.high:.4g}")
+    if one.z is not None:
+        figures.append(f"Z {one.z:.2f}")
+    if one.p is not None:
+        figures.append(f"p {one.p:.3g}")
+        figures.append("significant" if one.p <= level else "not significant")
+    text = ", ".join(figures)
+    return f"{one.tested}: {text}" if one.tested else f"{text[:1].upper()}{text[1:]}"
+
+
+def _statistics_table(result: ShapeTestResult) -> TablePart:
+    return TablePart(
+        title="Statistics",
+        level=2,
+        note=f"{result.test.statistics[:1].upper()}{result.test.statistics[1:]}.",
+        columns=(
+            TableColumn(name="statistic"), TableColumn(name="tested"), TableColumn(name="value", kind="number"),
+            TableColumn(name="Z", kind="number"), TableColumn(name="p", kind="p"),
+        ),
+        rows=tuple((one.name, one.tested, one.value, one.z, one.p) for one in result.statistics),
+    )  # fmt: skip
+
+
+def _histograms(result: ShapeTestResult) -> Iterator[Part]:
+    for one in [each for each in result.statistics if len(each.arrangements) > 1][:_MOST_HISTOGRAMS]:
+        finite = one.arrangements[np.isfinite(one.arrangements)]
+        counts, edges = np.histogram(finite, bins=_BINS)
+        yield HistogramPart(
+            title=f"{one.label} among its permutations",
+            edges=tuple(map(float, edges)),
+            series=(Counts(counts=tuple(map(float, counts)), label="permutations"),),
+            x=one.name,
+            observed=one.value,
+            observed_label="observed",
+        )
+
+
+def _rows(result: ShapeTestResult) -> Rows:
+    header = ("statistic", "tested", "value", "z", "p", "low", "high")
+    return header, [(s.name, s.tested, s.value, s.z, s.p, s.low, s.high) for s in result.statistics]
+
+
+def _file_name(table: TablePart) -> str:
+    words = re.sub(r"[^a-z0-9]+", "_", (table.title or "table").lower()).strip("_")
+    return f"{words}.csv"
+
+
+def _cells(table: TablePart) -> Rows:
+    return tuple(column.name for column in table.columns), table.rows

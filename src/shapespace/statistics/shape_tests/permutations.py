@@ -1,0 +1,96 @@
+"""Permutations that tests of shape share: orders of rows, residuals of a reduced model, and groups of the table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.cohort.cohort import Cohort
+from shapespace.errors import InputError
+from shapespace.types import FloatArray
+
+_BATCH = 50
+"""Permutations that are drawn from one seed."""
+_STREAM = 22  # separates these permutations from those of other tests with the same seed
+Orders = npt.NDArray[np.intp]
+
+
+def orders(n: int, permutations: int, seed: int) -> Iterator[tuple[slice, Orders]]:
+    """Yield (part of the permutations, (b, n) orders of n rows) in batches; the first order is as observed.
+
+    They are the same on each call, and do not depend on how many are drawn.
+
+    Raises:
+        InputError: a number of permutations below 1, or a negative seed.
+    """
+    if permutations < 1 or seed < 0:
+        raise InputError(f"There must be 1 or more permutations, and a seed from 0, not {permutations} and {seed}.")
+    for start in range(0, permutations, _BATCH):
+        count = min(_BATCH, permutations - start)
+        rows = np.argsort(np.random.default_rng([seed, _STREAM, start]).random((_BATCH, n)), axis=1)[:count]
+        if start == 0:
+            rows[0] = np.arange(n)
+        yield slice(start, start + count), rows
+
+
+@dataclass(frozen=True, eq=False)
+class Groups:
+    """Groups of the shapes of a cohort.
+
+    Args:
+        names: of the groups, in alphabetical order.
+        codes: (N,) the group of each shape.
+    """
+
+    names: tuple[str, ...]
+    codes: Orders
+
+    @property
+    def counts(self) -> Orders:
+        """(G,) number of shapes of each."""
+        return np.bincount(self.codes, minlength=len(self.names))
+
+    @property
+    def indicator(self) -> FloatArray:
+        """(N, G) 1 where a shape is of a group."""
+        return (self.codes[:, None] == np.arange(len(self.names))).astype(np.float64)
+
+    @property
+    def pairs(self) -> list[tuple[int, int]]:
+        """Pairs of groups by number."""
+        return [(a, b) for a in range(len(self.names)) for b in range(a + 1, len(self.names))]
+
+    @staticmethod
+    def of(cohort: Cohort, columns: Sequence[str], *, least: int = 1, why: str = "") -> Groups:
+        """Return the groups by the classes of one column, or of several combined as `a.b`.
+
+        Args:
+            cohort: with a table in which nothing of these columns is missing.
+            columns: of the table.
+            least: smallest number of shapes of a group.
+            why: what needs that many, for the message.
+
+        Raises:
+            InputError: no such column, fewer than two groups, or a group with too few shapes.
+        """
+        texts = [cohort.table.texts(column) for column in columns]
+        cells = [".".join(parts) for parts in zip(*texts, strict=True)]
+        names = tuple(sorted(set(cells)))
+        label = " × ".join(columns)
+        if len(names) < 2:
+            raise InputError(
+                f"{cohort.table.where}: {label} is {names[0][:40]!r} for all {len(cells)} shapes; groups need two "
+                "different values."
+            )
+        number = {name: k for k, name in enumerate(names)}
+        groups = Groups(names, np.array([number[cell] for cell in cells], dtype=np.intp))
+        small = int(groups.counts.argmin())
+        if groups.counts[small] < least:
+            raise InputError(
+                f"{cohort.table.where}: the group {names[small]!r} of {label} has {groups.counts[small]} shapes, and "
+                f"{why or 'this test'} needs {least} or more; leave it out, or combine groups."
+            )
+        return groups
