@@ -50,7 +50,7 @@ SHAPE_TESTS: tuple[ShapeTest, ...] = (
         statistics="Procrustes variance of each group, and the absolute difference of each pair",
         permuted="shape",
         references=(
-            "Zelditch, Swiderski and Sheets (2012) Geometric Morphometrics for Biologists, 2nd edition, Academic Press.",
+            "Zelditch, Swiderski and Sheets (2012) Geometric Morphometrics for Biologists, 2nd edition, Academic.",
         ),
         example="shapespace test disparity people.csv --group species -o disparity",
         options={"group": "COLUMN", "formula": "FORMULA", "partial": ""},
