@@ -1,4 +1,6 @@
-"""Equations have the same numbers on pages and in code: P paper, R robust, C correspondence, S statistics, M morphometrics.
+"""Equations have the same numbers on pages and in code.
+
+P paper, R robust, C correspondence, S statistics, M morphometrics.
 
 On a page a number is the tag of an equation, in the code it stands in a comment or a docstring.
 """

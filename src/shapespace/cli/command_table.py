@@ -37,6 +37,7 @@ DEMO = Source("demo", "run_demo")
 FACES = Source("commands.data", "write_simulated_faces")
 ORGANS = Source("commands.data", "write_simulated_organs")
 BONES = Source("commands.data", "write_simulated_bones")
+SKULLS = Source("commands.data", "write_simulated_landmarks")
 SURFACE = Source("commands.surface", "write_surfaces")
 LANDMARKS_TRANSFER = Source("commands.landmarks", "transfer_landmarks")
 LANDMARKS = Source("commands.landmarks", "suggest_specimens")
@@ -52,7 +53,7 @@ _REPRESENTATIONS = ("vertices", "bspline", "bspline-detail")
 _GOES_ON: Mapping[str, Any] = {"goes_on": "; the same command goes on from there"}
 
 GROUPS: Mapping[str, str] = {
-    "data": "open data sets, simulated faces, organs and bones",
+    "data": "open data sets, and simulated faces, organs, bones and landmarks",
     "landmarks": "transfer landmarks from a few marked specimens to all scans in correspondence, and check them",
     "test": "tests of shape beyond linear models: disparity, covariation, phylogeny, equivalence",
     "recognise": "classify scans (for example, facial expressions) by fitted coefficients",
@@ -274,6 +275,19 @@ COMMANDS: tuple[Command, ...] = (
         (
             "The bones are small skulls, in mm, each with its own triangles and pose; every third scan has a hole. "
             "bones.csv has the columns file and group.",
+        ),
+    ),
+    Command(
+        "data landmarks", "write simulated landmarks of skulls (TPS, 2-D) of two species, and their table skulls.csv",
+        ("shapespace data landmarks -o skulls",), run.data_landmarks,
+        (
+            _OUTPUT,
+            basic("--count", "N", source=SKULLS, parse=values.positive),
+            basic("--seed", "S", source=SKULLS),
+        ),
+        (
+            "skulls.tps has 12 landmarks per specimen in pixels with its scale in mm per pixel; links.csv has the lines "
+            "between landmarks of an outline.",
         ),
     ),
     Command(

@@ -107,6 +107,14 @@ def data_bones(arguments: argparse.Namespace) -> int:
     return _show_written(arguments, "bone", arguments.count)
 
 
+def data_landmarks(arguments: argparse.Namespace) -> int:
+    """Write simulated landmarks of skulls."""
+    from shapespace.commands.data import write_simulated_landmarks
+
+    write_simulated_landmarks(arguments.output, **given(arguments, write_simulated_landmarks))
+    return _show_written(arguments, "skull", arguments.count)
+
+
 def _show_written(arguments: argparse.Namespace, noun: str, count: int) -> int:
     """Print how many simulated shapes were written, and where."""
     if arguments.json:

@@ -125,6 +125,25 @@ def write_simulated_bones(
     write_about(folder, f"{count} simulated bones of shapespace in two groups, seed {seed}", LICENSE)
 
 
+def write_simulated_landmarks(folder: Path, *, count: int = 40, seed: int = 0) -> None:
+    """Write simulated landmarks of skulls of two species at two sites (TPS, 2-D), and their table.
+
+    Args:
+        folder: output folder.
+        count: number of skulls; species and sites alternate.
+        seed: random seed; skull k of a seed is the same for every count.
+
+    Raises:
+        InputError: a count out of range.
+        FileError: the folder cannot be written.
+    """
+    from shapespace.datasets.faces import LICENSE
+    from shapespace.datasets.skull_landmarks import write_skull_landmarks
+
+    write_skull_landmarks(folder, count=count, seed=seed)
+    write_about(folder, f"landmarks of {count} simulated skulls of shapespace, seed {seed}", LICENSE)
+
+
 def write_simulated_organs(
     folder: Path, *, count: int = 40, seed: int = 0, volumes: bool = False, quiet: bool = False
 ) -> None:
