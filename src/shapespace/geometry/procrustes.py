@@ -13,14 +13,13 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from shapespace.errors import InputError
-from shapespace.geometry.similarity import fit_similarity
+from shapespace.geometry.similarity import fit_rotations, fit_similarity
 from shapespace.types import FloatArray, IntArray, Similarity
 
 # limit of iterations to the tangent space, and the relative change that ends them, near float64 rounding
 _TANGENT_ROUNDS, _IN_TANGENT = 20, 1e-13
 # relative change of the mean that ends the alignment, and the limit of its iterations
 _TOLERANCE, _MOST_ROUNDS = 1e-10, 100
-_ON_A_LINE = 1e-9  # ratio of singular values; points nearer to a line than rounding determine no rotation
 _WEIGHTED_ROUNDS = 6  # iterations of a weighted alignment, which starts from the unweighted one
 _LEAST_WEIGHT = 1e-3
 """So that a vertex that no shape observes has a mean."""
@@ -249,7 +248,7 @@ def align_streamed(
         def turned(
             start: int, products: FloatArray, centres: FloatArray, centre: FloatArray = centre
         ) -> tuple[FloatArray, FloatArray]:
-            linear = _rotations(products)
+            linear = fit_rotations(products, refuse_lines=True)
             if with_scale:
                 linear *= (size / shapes.sizes[start : start + len(linear)])[:, None, None]
             moved = np.einsum("nab,nb->na", linear, centres)
@@ -333,16 +332,3 @@ def _pass(
     return np.asarray(
         (out + template @ poses.linear.sum(axis=0).T + poses.offset.sum(axis=0)) / shapes.count, dtype=np.float64
     )
-
-
-def _rotations(products: FloatArray) -> FloatArray:
-    """Return the rotations (n, 3, 3) of `fit_similarity`, P13-P16, from products (n, 3, 3) of centred points."""
-    U, D, Vt = np.linalg.svd(products)
-    if (D[:, 1] <= _ON_A_LINE * D[:, 0]).any():
-        raise InputError(
-            "The matched points lie on a line or coincide, so they determine no rotation; use more points."
-        )
-    V, Ut = Vt.transpose(0, 2, 1), U.transpose(0, 2, 1)
-    Z = np.ones((len(products), 3))
-    Z[:, 2] = np.sign(np.linalg.det(V @ Ut))
-    return np.asarray((V * Z[:, None]) @ Ut, dtype=np.float64)

@@ -12,6 +12,8 @@ from shapespace.errors import InputError
 from shapespace.types import FloatArray, Similarity
 
 _RANK_TOLERANCE = 1e-9  # ratio of singular values; points nearer to a line than rounding determine no rotation
+_PLANAR = 1e-13  # ratio of products; points nearer to the plane z = 0 than float64 rounding lie in it
+_NO_ROTATION = "The matched points lie on a line or coincide, so they determine no rotation; use more points."
 
 POSE = 7
 """Pose parameters come before the coefficients: rotation, translation, scale."""
@@ -55,18 +57,44 @@ def fit_similarity(
     if not (np.isfinite(spread) and np.isfinite(H).all()):
         raise InputError("The points of a similarity must be finite.")
 
-    U, D, Vt = np.linalg.svd(H)  # P13
-    if spread <= 0 or D[1] <= _RANK_TOLERANCE * max(D[0], np.finfo(float).tiny):
-        raise InputError(
-            "The matched points lie on a line or coincide, so they determine no rotation; use more points."
-        )
-    Z = np.array([1.0, 1.0, np.sign(np.linalg.det(Vt.T @ U.T))])  # P16: the reflection guard
-    R = (Vt.T * Z) @ U.T  # P14, P15, as corrected
-    s = float((D * Z).sum() / spread) if with_scale else 1.0  # P18, as corrected
+    if spread <= 0:
+        raise InputError(_NO_ROTATION)
+    R = fit_rotations(H[None], refuse_lines=True)[0]
+    s = float(np.vdot(R.T, H) / spread) if with_scale else 1.0  # P18, as corrected
     if s <= 0:
         raise InputError("The matched points are so far from similar that no positive scale fits; check the matches.")
     T = mean_target - s * R @ mean_source  # P17, as corrected
     return Similarity(s, R, T)
+
+
+def fit_rotations(products: FloatArray, *, refuse_lines: bool = False) -> FloatArray:
+    """Return the rotations R (n, D, D) that maximise trace(R H) for products H = q^T q' (n, D, D) of centred points.
+
+    Points in the plane z = 0, as of planar landmarks that are padded with zeros, are rotated within the plane: rotation
+    about an axis of the plane would reflect them.
+
+    Args:
+        products: of points (row vectors) and their targets, with D 2 or 3.
+        refuse_lines: refuse products of points on a line.
+
+    Raises:
+        InputError: points on a line, or that coincide, with `refuse_lines`.
+    """
+    D = products.shape[1]
+    largest = np.abs(products).max(axis=(1, 2), initial=0.0)
+    off_plane = np.maximum(np.abs(products[:, 2:]).max(axis=(1, 2), initial=0.0),
+                           np.abs(products[:, :, 2:]).max(axis=(1, 2), initial=0.0))  # fmt: skip
+    if D == 3 and (off_plane <= _PLANAR * largest).all():
+        out = np.zeros_like(products)
+        out[:, :2, :2], out[:, 2, 2] = fit_rotations(products[:, :2, :2], refuse_lines=refuse_lines), 1.0
+        return out
+    U, values, Vt = np.linalg.svd(products)  # P13
+    if refuse_lines and (values[:, 1] <= _RANK_TOLERANCE * np.maximum(values[:, 0], np.finfo(float).tiny)).any():
+        raise InputError(_NO_ROTATION)
+    V, Ut = Vt.transpose(0, 2, 1), U.transpose(0, 2, 1)
+    Z = np.ones((len(products), D))
+    Z[:, -1] = np.sign(np.linalg.det(V @ Ut))  # P16: the reflection guard
+    return np.asarray((V * Z[:, None]) @ Ut, dtype=np.float64)  # P14, P15, as corrected
 
 
 def small_poses(x: FloatArray) -> FloatArray:

@@ -1,0 +1,505 @@
+"""Generalised Procrustes analysis of landmarks in 2-D and 3-D, with sliding semilandmarks and missing landmarks.
+
+Rohlf and Slice, Syst. Zool. 39(1), 1990; Gunz, Mitteroecker and Bookstein, in Modern Morphometrics in Physical
+Anthropology, 2005; Gunz et al., J. Hum. Evol. 57(1), 2009. The order of the steps, the criterion that ends them and the
+orientation are those of `gpagen` in geomorph 4.0, except that the set is never reflected. Equations Mn are those of
+docs/morphometrics.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
+
+import numpy as np
+
+from shapespace.errors import InputError
+from shapespace.geometry.procrustes import Gauge
+from shapespace.geometry.similarity import fit_rotations
+from shapespace.geometry.thin_plate_spline import ThinPlateSpline, bending_energy_matrix
+from shapespace.reprs import list_briefly, short_repr
+from shapespace.types import BoolArray, FloatArray, IntArray, read_only
+
+if TYPE_CHECKING:
+    from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations
+
+SlidingCriterion: TypeAlias = Literal["bending-energy", "procrustes"]
+MissingMethod: TypeAlias = Literal["tps", "regression", "refuse"]
+
+_ITERATIONS, _SLIDING_ITERATIONS = 5, 10
+"""Largest numbers of iterations without and with semilandmarks, those of `gpagen`."""
+_NEIGHBOURS = 5  # landmarks, the sliding one among them, whose principal axes span the tangent plane; as in `gpagen`
+_FLAT = 1e-9  # ratio of singular values; landmarks nearer to a line than rounding
+_MOST_MISSING = 0.5  # share of the specimens that may lack a landmark
+_AXIS_SPECIMENS = 10  # complete specimens for each PLS axis of a regression, the usual rule for regressors
+_OUTLIER = 3.5  # robust standard scores of outliers (Iglewicz and Hoaglin, How to Detect and Handle Outliers, 1993)
+_MAD = 1.4826  # standard deviations of a normal distribution in a median absolute deviation
+_MIRRORED, _SWAPPED = 0.5, 0.6
+"""A specimen is mirrored, or has swapped landmarks, if reflection or exchange reduces its Procrustes distance to this
+share; no specimen of the published sets in tests reaches 0.8 by chance."""
+_SWAP_CANDIDATES = 5  # pairs of landmarks whose exchange is superimposed exactly
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlignConfig:
+    """Options of the alignment of landmarks.
+
+    Args:
+        gauge: `shape` scales each specimen to unit centroid size; `form` keeps its size.
+        tangent: project shapes orthogonally onto the tangent space at their mean.
+        slide_by: criterion that sliding semilandmarks minimise: `bending-energy` of the thin-plate spline from the
+            mean, or `procrustes`, the distance from the mean.
+        missing: estimation of missing landmarks from complete specimens: by thin-plate spline of their mean (`tps`), by
+            `regression` on the scores of partial least squares, or `refuse`.
+        structures: structure of each landmark; structures are aligned separately, and combined at their relative
+            centroid sizes. None for one structure.
+        tolerance: change of the summed squared distances from the mean, in units of the squared centroid size, that
+            ends the alignment.
+        iterations: largest number of iterations (default: 5, or 10 with semilandmarks, as in geomorph).
+    """
+
+    gauge: Gauge = "shape"
+    tangent: bool = True
+    slide_by: SlidingCriterion = "bending-energy"
+    missing: MissingMethod = "tps"
+    structures: Mapping[str, str] | None = None
+    tolerance: float = 1e-4
+    iterations: int | None = None
+
+    def __post_init__(self) -> None:
+        for name, value, choices in (
+            ("gauge", self.gauge, get_args(Gauge)),
+            ("slide_by", self.slide_by, get_args(SlidingCriterion)),
+            ("missing", self.missing, get_args(MissingMethod)),
+        ):
+            if value not in choices:
+                raise InputError(f"AlignConfig: there is no {name} {value!r}; choose one of {', '.join(choices)}.")
+        if not self.tolerance >= 0 or (self.iterations is not None and self.iterations < 1):
+            raise InputError("AlignConfig: the tolerance must be 0 or more, and the iterations 1 or more.")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AlignedLandmarks:
+    """Landmarks of N specimens after generalised Procrustes analysis.
+
+    Args:
+        names: N specimens.
+        landmarks: L names.
+        coords: (N, L, D) aligned coordinates with D 2 or 3.
+        sizes: (N,) centroid sizes in the unit of the file.
+        columns: name -> N cells of covariates.
+        estimated: (N, L) True for missing landmarks, whose positions are estimates.
+        gauge: `shape` or `form`.
+        unit: of `sizes`, and of `coords` in the gauge `form`: `mm`, or empty for none.
+        iterations: number of iterations; with separate structures the largest.
+        converged: False if the iterations ended before the criterion was met.
+        where: what the data are called in messages.
+        notes: a sentence each.
+    """
+
+    names: tuple[str, ...]
+    landmarks: tuple[str, ...]
+    coords: FloatArray
+    sizes: FloatArray
+    estimated: BoolArray
+    columns: Mapping[str, tuple[str, ...]] = field(default_factory=dict[str, tuple[str, ...]])
+    gauge: Gauge = "shape"
+    unit: str = ""
+    iterations: int = 0
+    converged: bool = True
+    where: str = "The landmarks"
+    notes: tuple[str, ...] = ()
+
+    __repr__ = short_repr
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def dimensions(self) -> int:
+        """2 or 3."""
+        return int(self.coords.shape[2])
+
+    @property
+    def mean(self) -> FloatArray:
+        """(L, D) mean of the aligned coordinates."""
+        return self.coords.mean(axis=0)
+
+
+@dataclass(frozen=True)
+class LandmarkFinding:
+    """A specimen to check.
+
+    Args:
+        specimen: its name.
+        reason: `outlier`, `swapped` (landmarks) or `mirrored`.
+        value: robust standard score of its Procrustes distance from the mean; or the share to which this distance falls
+            by exchange or reflection.
+        landmarks: the two swapped ones.
+    """
+
+    specimen: str
+    reason: Literal["outlier", "swapped", "mirrored"]
+    value: float
+    landmarks: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        if self.reason == "outlier":
+            return (
+                f"{self.specimen} is an outlier: its Procrustes distance from the mean is {self.value:.1f} robust "
+                "standard deviations above the median; check its landmarks."
+            )
+        fall = f"reduces its Procrustes distance from the mean to {100 * self.value:.0f} %"
+        if self.reason == "mirrored":
+            return f"{self.specimen} is mirrored: reflection {fall}; reflect it, or leave it out."
+        return f"{self.specimen}: exchange of the landmarks {' and '.join(self.landmarks)} {fall}; check their order."
+
+
+def align_landmarks(configurations: LandmarkConfigurations, config: AlignConfig | None = None) -> AlignedLandmarks:
+    """Return landmarks after generalised Procrustes analysis, missing ones estimated before it.
+
+    Args:
+        configurations: of two or more specimens.
+        config: None for the defaults.
+
+    Raises:
+        InputError: one specimen, fewer than three landmarks, landmarks on a line, too many missing ones, sliders that
+            cannot be, or structures that do not name each landmark.
+    """
+    config = config or AlignConfig()
+    points, notes = _complete(configurations, config)
+    _refuse_sliders(configurations)
+    chosen = _structures(configurations, config)
+    parts: list[Superimposition] = []
+    sizes = np.zeros((len(chosen), len(points)))
+    for row, members in enumerate(chosen):
+        part = points[:, members]
+        _refuse_degenerate(part, configurations)
+        own = np.full(points.shape[1], -1, dtype=np.int32)
+        own[members] = np.arange(len(members))
+        curves = own[configurations.curve_sliders]
+        curves = curves[curves[:, 1] >= 0]
+        surface = own[configurations.surface_sliders]
+        sizes[row] = np.linalg.norm(part - part.mean(axis=1, keepdims=True), axis=(1, 2))  # M1
+        parts.append(superimpose(part, config, curves, surface[surface >= 0]))
+    total = np.sqrt((sizes**2).sum(axis=0))
+    coords = np.empty_like(points)
+    for members, part, size in zip(chosen, parts, sizes, strict=True):
+        relative = size / total if config.gauge == "shape" and len(parts) > 1 else np.ones(len(points))
+        coords[:, members] = part.coords * relative[:, None, None]  # M10
+    iterations, converged = max(part.iterations for part in parts), all(part.converged for part in parts)
+    if not converged:
+        notes.append(
+            f"The alignment ended after {iterations} iterations, before the summed squared distances changed by less "
+            f"than {config.tolerance:g}, as gpagen of geomorph ends it; allow more with --iterations."
+        )
+    return AlignedLandmarks(
+        names=configurations.names,
+        landmarks=configurations.landmarks,
+        coords=read_only(coords),
+        sizes=read_only(total),
+        estimated=~configurations.observed,
+        columns=configurations.columns,
+        gauge=config.gauge,
+        unit=configurations.unit,
+        iterations=iterations,
+        converged=converged,
+        where=configurations.where,
+        notes=(*configurations.notes, *notes),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Superimposition:
+    """Coordinates (N, L, D) after generalised Procrustes analysis, and how it ended."""
+
+    coords: FloatArray
+    iterations: int
+    converged: bool
+
+
+def superimpose(
+    points: FloatArray, config: AlignConfig, curves: IntArray | None = None, surface: IntArray | None = None
+) -> Superimposition:
+    """Superimpose complete landmarks (N, L, D) by rotations, with semilandmarks that slide.
+
+    The axes are the principal axes of the mean, each with a positive component on the original axis of its number; the
+    last axis is reversed where the set would be reflected otherwise.
+
+    Args:
+        points: in any poses and sizes.
+        config: of the alignment.
+        curves: (M, 3) landmarks before, sliding and after.
+        surface: (S,) landmarks that slide in tangent planes.
+    """
+    n = len(points)
+    curves = np.zeros((0, 3), np.int32) if curves is None else curves
+    surface = np.zeros(0, np.int32) if surface is None else surface
+    slides = len(curves) + len(surface) > 0
+    centred = points - points.mean(axis=1, keepdims=True)
+    size = np.linalg.norm(centred, axis=(1, 2))  # M1
+    unit = np.sqrt((size**2).mean()) if config.gauge == "form" and not slides else size
+    coords = centred / np.reshape(unit, (-1, 1, 1))
+    coords = _rotated(coords, coords[0])
+    mean = coords.mean(axis=0)
+    most = config.iterations or (_SLIDING_ITERATIONS if slides else _ITERATIONS)
+    squares, iterations = n * float((mean**2).sum()), 1
+    converged = not slides and n - squares <= config.tolerance
+    while not converged and iterations < most:
+        iterations += 1
+        if slides:
+            B = bending_energy_matrix(mean) if config.slide_by == "bending-energy" else None
+            slid = np.stack([_slid(x, mean, curves, surface, B) for x in coords])
+            previous, squares = squares, n * float((slid.mean(axis=0) ** 2).sum())
+            coords = _rotated(slid, mean)
+            mean = coords.mean(axis=0)
+            mean = mean / np.linalg.norm(mean - mean.mean(axis=0))
+        else:
+            coords = _rotated(coords, mean)
+            mean = coords.mean(axis=0)
+            previous, squares = squares, n * float((mean**2).sum())
+        converged = abs(previous - squares) <= config.tolerance  # M3
+    if config.gauge == "form" and slides:
+        rigid = superimpose(coords * size[:, None, None], replace(config, iterations=most))
+        return Superimposition(rigid.coords, iterations, converged and rigid.converged)
+    axes = np.linalg.svd(mean - mean.mean(axis=0))[2].T
+    axes = axes * np.where(np.diag(axes) < 0, -1.0, 1.0)
+    axes[:, -1] *= np.sign(np.linalg.det(axes))
+    coords = coords @ axes
+    if config.gauge == "form":
+        return Superimposition(coords * unit, iterations, converged)
+    return Superimposition(project_to_tangent(coords) if config.tangent else coords, iterations, converged)
+
+
+def project_to_tangent(coords: FloatArray, mean: FloatArray | None = None) -> FloatArray:
+    """Return shapes (N, L, D) of unit centroid size projected orthogonally onto the tangent space at their mean.
+
+    Args:
+        coords: aligned.
+        mean: (L, D) of another set; None for that of `coords`.
+    """
+    mean = coords.mean(axis=0) if mean is None else mean
+    mean = mean - mean.mean(axis=0)
+    mean = mean / np.linalg.norm(mean)
+    along = np.einsum("nld,ld->n", coords, mean)
+    return coords + (1.0 - along)[:, None, None] * mean  # M4
+
+
+def _rotated(coords: FloatArray, target: FloatArray) -> FloatArray:
+    """Return `coords` (N, L, D) rotated to `target` (L, D) by least squares."""
+    return coords @ fit_rotations(np.einsum("nli,lj->nij", coords, target)).transpose(0, 2, 1)  # M2
+
+
+def _slid(x: FloatArray, mean: FloatArray, curves: IntArray, surface: IntArray, B: FloatArray | None) -> FloatArray:
+    """Return a specimen (L, D) with its semilandmarks moved along its own tangents.
+
+    They minimise the bending energy, by its matrix `B` (L, L), or the Procrustes distance if that is None.
+    """
+    tangents = x[curves[:, 2]] - x[curves[:, 0]]
+    lengths = np.linalg.norm(tangents, axis=1, keepdims=True)
+    directions, sliding = [tangents / np.where(lengths > 0, lengths, 1.0)], [curves[:, 1]]
+    if len(surface):
+        squares = ((x[surface][:, None] - x) ** 2).sum(axis=2)
+        near = x[np.argsort(squares, axis=1, kind="stable")[:, :_NEIGHBOURS]]
+        planes = np.linalg.svd(near - near.mean(axis=1, keepdims=True))[2]
+        directions += [planes[:, 0], planes[:, 1]]
+        sliding += [surface, surface]
+    U, at = np.concatenate(directions), np.concatenate(sliding)
+    offset = x - mean
+    if B is None:
+        steps = (U * offset[at]).sum(axis=1)  # M7
+    else:
+        system, right = (U @ U.T) * B[np.ix_(at, at)], (U * (B @ offset)[at]).sum(axis=1)
+        try:
+            steps = np.linalg.solve(system, right)  # M6
+        except np.linalg.LinAlgError:
+            steps = np.linalg.lstsq(system, right)[0]
+    out = x.copy()
+    np.subtract.at(out, at, steps[:, None] * U)
+    return out
+
+
+def find_outliers(aligned: AlignedLandmarks) -> tuple[LandmarkFinding, ...]:
+    """Return the specimens that are mirrored, that have swapped landmarks, or that lie far from the mean.
+
+    Procrustes distances are from the median of the coordinates, which few specimens cannot move.
+
+    Args:
+        aligned: three or more specimens; with fewer nothing is found.
+    """
+    if len(aligned) < 3:
+        return ()
+    middle = np.median(aligned.coords, axis=0)
+    middle = (middle - middle.mean(axis=0)) / np.linalg.norm(middle - middle.mean(axis=0))
+    x = aligned.coords - aligned.coords.mean(axis=1, keepdims=True)
+    x = x / np.linalg.norm(x, axis=(1, 2))[:, None, None]
+
+    def distances(shapes: FloatArray) -> FloatArray:
+        return np.linalg.norm(_rotated(shapes, middle) - middle, axis=(1, 2))
+
+    own = distances(x)
+    mirrored = distances(x * np.append(-1.0, np.ones(aligned.dimensions - 1)))
+    deviation = max(_MAD * float(np.median(np.abs(own - np.median(own)))), 1e-300)
+    scores = (own - np.median(own)) / deviation  # M11
+    findings: list[LandmarkFinding] = []
+    for k, name in enumerate(aligned.names):
+        if mirrored[k] <= _MIRRORED * own[k]:
+            findings.append(LandmarkFinding(name, "mirrored", float(mirrored[k] / own[k])))
+            continue
+        swaps = _swaps(x[k], middle)
+        after = distances(np.stack([x[k][order] for order in swaps]))
+        best = int(np.argmin(after))
+        if after[best] <= _SWAPPED * own[k]:
+            moved = np.flatnonzero(swaps[best] != np.arange(len(middle)))
+            pair = tuple(aligned.landmarks[int(i)] for i in moved)
+            findings.append(LandmarkFinding(name, "swapped", float(after[best] / own[k]), pair))
+        elif scores[k] > _OUTLIER:
+            findings.append(LandmarkFinding(name, "outlier", float(scores[k])))
+    return tuple(findings)
+
+
+def _swaps(x: FloatArray, middle: FloatArray) -> list[IntArray]:
+    """Return orders (L,) of the landmarks with the pairs exchanged that reduce the squared distance most."""
+    cross = x @ middle.T
+    gain = np.triu(cross + cross.T - np.diag(cross)[:, None] - np.diag(cross), 1)
+    orders: list[IntArray] = []
+    for index in np.argsort(-gain, axis=None)[:_SWAP_CANDIDATES]:
+        a, b = divmod(int(index), len(x))
+        order = np.arange(len(x), dtype=np.int32)
+        order[[a, b]] = b, a
+        orders.append(order)
+    return orders
+
+
+def _complete(configurations: LandmarkConfigurations, config: AlignConfig) -> tuple[FloatArray, list[str]]:
+    """Return the points (N, L, D) with estimates of missing landmarks, and notes on them."""
+    points, where = configurations.points, configurations.where
+    observed, (n, L, D) = configurations.observed, configurations.points.shape
+    if n < 2:
+        raise InputError(f"{where}: one specimen cannot be aligned; give two or more.")
+    if L < 3:
+        raise InputError(f"{where}: {L} landmarks have no shape; three are the least.")
+    if np.isinf(points).any():
+        raise InputError(f"{where}: a coordinate is infinite; correct it, or leave it empty if the landmark is missing.")
+    missing = ~observed
+    if not missing.any():
+        return points, []
+    incomplete = np.flatnonzero(missing.any(axis=1))
+    first = configurations.names[int(incomplete[0])]
+    if config.missing == "refuse":
+        raise InputError(
+            f"{where}: landmarks of {len(incomplete)} specimens are missing (such as {first}); leave these out, or "
+            "estimate the landmarks with --missing tps."
+        )
+    few = np.flatnonzero(observed.sum(axis=1) < D + 1)
+    if len(few):
+        count, name = int(observed[few[0]].sum()), configurations.names[int(few[0])]
+        raise InputError(
+            f"{where}: {'no' if not count else count} landmark{'s are' if count != 1 else ' is'} observed of {name}, "
+            f"and {D + 1} are the least from which the others are estimated; leave it out."
+        )
+    share = missing.mean(axis=0)
+    worst = int(np.argmax(share))
+    complete = np.flatnonzero(~missing.any(axis=1))
+    if share[worst] > _MOST_MISSING or len(complete) < 2:
+        problem = "" if share[worst] > _MOST_MISSING else f", and {len(complete)} specimens have all landmarks"
+        raise InputError(
+            f"{where}: landmark {configurations.landmarks[worst]} is missing in {int(missing[:, worst].sum())} of {n} "
+            f"specimens{problem}; leave that landmark, or the specimens without it, out."
+        )
+    form = superimpose(points[complete], AlignConfig(tangent=True)).coords
+    form = form * np.linalg.norm(points[complete] - points[complete].mean(axis=1, keepdims=True), axis=(1, 2))[
+        :, None, None
+    ]
+    mean, out = form.mean(axis=0), points.copy()
+    for k in map(int, incomplete):
+        seen = observed[k]
+        try:
+            if config.missing == "tps":
+                out[k, ~seen] = ThinPlateSpline.fit(mean[seen], points[k, seen]).apply(mean[~seen])  # M8
+            else:
+                out[k, ~seen] = _regressed(form, points[k], seen)
+        except InputError as error:
+            raise InputError(
+                f"{where}: the observed landmarks of {configurations.names[k]} do not determine the others, since they "
+                "lie on a line or a plane; leave it out."
+            ) from error
+    count = int(missing.sum())
+    noun = "landmark is an estimate" if count == 1 else "landmarks are estimates"
+    names = list_briefly([configurations.names[int(k)] for k in incomplete])
+    return out, [f"{count} missing {noun} ({config.missing}, from {len(complete)} complete specimens): {names}."]
+
+
+def _regressed(form: FloatArray, points: FloatArray, seen: BoolArray) -> FloatArray:
+    """Return the missing landmarks (M, D) of a specimen by regression on PLS scores of the observed landmarks.
+
+    Args:
+        form: (n, L, D) complete specimens, aligned with their sizes.
+        points: (L, D) of the specimen.
+        seen: (L,) its observed landmarks.
+    """
+    n, _, D = form.shape
+    x, y = form[:, seen].reshape(n, -1), form[:, ~seen].reshape(n, -1)
+    x_mean, y_mean = x.mean(axis=0), y.mean(axis=0)
+    centre, target = points[seen].mean(axis=0), x_mean.reshape(-1, D).mean(axis=0)
+    own = points[seen] - centre
+    rotation = fit_rotations((own.T @ (x_mean.reshape(-1, D) - target))[None])[0]
+    axes = np.linalg.svd((x - x_mean).T @ (y - y_mean), full_matrices=False)[0][:, : max(1, n // _AXIS_SPECIMENS)]
+    slopes = np.linalg.lstsq((x - x_mean) @ axes, y - y_mean)[0]
+    scores = ((own @ rotation.T + target).ravel() - x_mean) @ axes
+    return ((y_mean + scores @ slopes).reshape(-1, D) - target) @ rotation + centre  # M9
+
+
+def _structures(configurations: LandmarkConfigurations, config: AlignConfig) -> list[IntArray]:
+    """Return the landmarks of each structure."""
+    names = configurations.landmarks
+    if config.structures is None:
+        return [np.arange(len(names), dtype=np.int32)]
+    where, given = configurations.where, config.structures
+    unknown = [name for name in given if name not in names] or [name for name in names if not given.get(name)]
+    if unknown:
+        raise InputError(
+            f"{where}: landmark {unknown[0]!r} "
+            + ("does not exist" if unknown[0] not in names else "has no structure")
+            + "; the table of --separate names each landmark once, and its structure."
+        )
+    structure = np.array([given[name] for name in names])
+    for row in configurations.curve_sliders:
+        if len(set(structure[row])) > 1:
+            raise InputError(f"{where}: landmark {names[row[1]]!r} slides between landmarks of different structures; "
+                             "correct the sliders.")  # fmt: skip
+    return [np.flatnonzero(structure == one).astype(np.int32) for one in dict.fromkeys(structure.tolist())]
+
+
+def _refuse_sliders(configurations: LandmarkConfigurations) -> None:
+    curves, surface = configurations.curve_sliders, configurations.surface_sliders
+    where, L = configurations.where, len(configurations.landmarks)
+    every = np.concatenate([curves.ravel(), surface])
+    outside = every[(every < 0) | (every >= L)]
+    if len(outside):
+        raise InputError(f"{where}: the sliders name landmark {int(outside[0]) + 1}, and there are {L}; correct them.")
+    sliding, counts = np.unique(np.concatenate([curves[:, 1], surface]), return_counts=True)
+    if (counts > 1).any():
+        name = configurations.landmarks[int(sliding[counts > 1][0])]
+        raise InputError(f"{where}: landmark {name} slides twice; name it once in the sliders.")
+    beside = curves[(curves[:, 0] == curves[:, 1]) | (curves[:, 2] == curves[:, 1]) | (curves[:, 0] == curves[:, 2])]
+    if len(beside):
+        name = configurations.landmarks[int(beside[0, 1])]
+        raise InputError(f"{where}: landmark {name} needs two other landmarks, before and after, to slide between.")
+    if len(surface) and configurations.dimensions == 2:
+        raise InputError(f"{where}: semilandmarks slide on surfaces in 3-D only; name curves for planar landmarks.")
+
+
+def _refuse_degenerate(points: FloatArray, configurations: LandmarkConfigurations) -> None:
+    if points.shape[1] < 3:
+        raise InputError(f"{configurations.where}: a structure of {points.shape[1]} landmarks has no shape; three are "
+                         "the least.")  # fmt: skip
+    spread = np.linalg.svd(points - points.mean(axis=1, keepdims=True), compute_uv=False)
+    flat = np.flatnonzero(spread[:, 1] <= _FLAT * spread[:, 0])
+    if len(flat):
+        k = int(flat[0])
+        place = "lie on a line" if spread[k, 0] > 0 else "coincide"
+        raise InputError(
+            f"{configurations.where}: all landmarks of {configurations.names[k]} {place}; correct them, or leave it out."
+        )
