@@ -22,7 +22,8 @@ from shapespace.geometry.landmark_placement import place_landmarks
 from shapespace.geometry.normals import rms_size
 from shapespace.io.files import make_folder, read_bytes, write_text
 from shapespace.io.landmarks.fiducials import point_texts
-from shapespace.io.landmarks.landmark_io import read_landmarks, surface_landmark_cells, tps_text
+from shapespace.io.landmarks.landmark_io import read_landmarks, surface_landmark_cells
+from shapespace.io.landmarks.tps_nts import tps_text
 from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.io.read_limits import LARGEST_LANDMARK_FILE_BYTES
 from shapespace.io.remote import is_address

@@ -18,10 +18,11 @@ from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.files import read_bytes, write_text
 from shapespace.io.parsing import damage_error, is_number, json_value, xml_root
 from shapespace.io.read_limits import LARGEST_LANDMARK_FILE_BYTES
-from shapespace.io.tables.table_io import rows_text, unescape_formula
+from shapespace.io.tables.table_io import MISSING, rows_text, unescape_formula
 from shapespace.types import FloatArray, SurfaceLandmarks
 
-Pairs = list[tuple[str, FloatArray]]
+Pairs = list[tuple[str, FloatArray | None]]
+"""Names and points (3,) in the order of a file; None for a landmark that is marked as absent."""
 # A label names each of its points, so a long one would be there as often as it has points.
 _LONGEST_LABEL = 256
 
@@ -41,7 +42,7 @@ class LandmarkFormat:
     write: Callable[[Mapping[str, FloatArray]], str]
 
 
-def read_landmarks(path: Path | str) -> dict[str, FloatArray]:
+def read_landmarks(path: Path | str, *, keep_absent: bool = False) -> dict[str, FloatArray]:
     """Read named points, in the file's own frame and unit; those marked as absent are left out.
 
     menpo `.ljson` names groups of points, not points: the points of a label with several are called `label_0`,
@@ -57,6 +58,7 @@ def read_landmarks(path: Path | str) -> dict[str, FloatArray]:
     Args:
         path: a file with one of the endings in `LANDMARK_FORMATS` or `READ_ONLY_LANDMARKS`; the kind of a
             `.json` is determined from its content.
+        keep_absent: return not-a-number for landmarks that are marked as absent.
 
     Returns:
         name -> (3,) float64, in the file's order.
@@ -69,17 +71,19 @@ def read_landmarks(path: Path | str) -> dict[str, FloatArray]:
     path = Path(path)
     read = READ_ONLY_LANDMARKS.get(path.suffix.lower()) or _format(path, "read").read
     pairs = read(_content(path), path)
-    if not pairs:
-        raise damage_error(path, "it holds no landmarks")
     landmarks: dict[str, FloatArray] = {}
     for name, point in pairs:
+        if point is None and not keep_absent:
+            continue
         if not name:
             raise damage_error(path, "it has a landmark without a name, so name them all")
         if name in landmarks:
             raise damage_error(path, f"it has two landmarks named '{name[:60]}', so rename one")
-        if not np.isfinite(point).all():
+        if point is not None and not np.isfinite(point).all():
             raise damage_error(path, f"landmark '{name[:60]}' has a coordinate that is not finite, so remove it")
-        landmarks[name] = point
+        landmarks[name] = np.full(3, np.nan) if point is None else point
+    if not landmarks:
+        raise damage_error(path, "it holds no landmarks")
     return landmarks
 
 
@@ -303,9 +307,8 @@ def _ljson_1(value: Any, path: Path) -> Pairs:
         points = [entry["point"] for entry in group["landmarks"]]
         label = _label(group["label"], path)
         for i, point in enumerate(points):
-            if not _is_missing(point):
-                name = label if len(points) == 1 else f"{label}_{i}"
-                out.append((name, _point(point, f"landmark '{name[:60]}'", path)))
+            name = label if len(points) == 1 else f"{label}_{i}"
+            out.append((name, None if _is_missing(point) else _point(point, f"landmark '{name[:60]}'", path)))
     return out
 
 
@@ -323,8 +326,7 @@ def _ljson_group(group: Any, prefix: str, path: Path) -> Pairs:
     out: Pairs = []
     for i in ordered:
         name = names.get(i, f"{prefix}point_{i}")
-        if not _is_missing(points[i]):
-            out.append((name, _point(points[i], f"landmark '{name[:60]}'", path)))
+        out.append((name, None if _is_missing(points[i]) else _point(points[i], f"landmark '{name[:60]}'", path)))
     return out
 
 
@@ -356,18 +358,19 @@ def _slicer(value: Any, path: Path) -> Pairs:
             raise damage_error(path, f"its coordinate system is '{system[:20]}', neither LPS nor RAS")
         sign = np.array([-1.0, -1.0, 1.0]) if system == "RAS" else np.ones(3)
         for entry in markup["controlPoints"]:
-            if entry.get("positionStatus", "defined") != "defined":
-                continue
             name = str(entry.get("label") or entry.get("id") or "").strip()
-            out.append((name, sign * _point(entry["position"], f"landmark '{name[:60]}'", path) + 0.0))
+            is_absent = entry.get("positionStatus", "defined") != "defined"
+            point = None if is_absent else sign * _point(entry["position"], f"landmark '{name[:60]}'", path) + 0.0
+            out.append((name, point))
     return out
 
 
 def _write_slicer(landmarks: Mapping[str, FloatArray]) -> str:
     points = [
-        {"id": str(i), "label": name, "position": _numbers(point), "positionStatus": "defined"}
+        {"id": str(i), "label": name, "position": _numbers(np.nan_to_num(point)),
+         "positionStatus": "undefined" if np.isnan(point).any() else "defined"}
         for i, (name, point) in enumerate(landmarks.items(), start=1)
-    ]
+    ]  # fmt: skip
     schema = (
         "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/"
         "markups-schema-v1.0.3.json#"
@@ -405,9 +408,10 @@ def _read_pp(data: bytes, path: Path) -> Pairs:
         raise damage_error(path, "it is not a MeshLab file of picked points")
     out: Pairs = []
     for entry in root.iter("point"):
-        if entry.get("active", "1").strip().lower() not in ("0", "false"):
-            name = (entry.get("name") or "").strip()
-            out.append((name, _point((entry.get(axis) for axis in "xyz"), f"landmark '{name[:60]}'", path)))
+        name = (entry.get("name") or "").strip()
+        is_absent = entry.get("active", "1").strip().lower() in ("0", "false")
+        xyz = (entry.get(axis) for axis in "xyz")
+        out.append((name, None if is_absent else _point(xyz, f"landmark '{name[:60]}'", path)))
     return out
 
 
@@ -451,12 +455,14 @@ def _read_csv(data: bytes, path: Path) -> Pairs:
     for row in rows:
         if len(row) <= max(columns):
             raise damage_error(path, f"landmark '{row[0][:60]}' has fewer than 3 coordinates")
-        out.append((row[0], _point((row[c] for c in columns), f"landmark '{row[0][:60]}'", path)))
+        is_absent = all(row[c].lower() in MISSING for c in columns)
+        xyz = (row[c] for c in columns)
+        out.append((row[0], None if is_absent else _point(xyz, f"landmark '{row[0][:60]}'", path)))
     return out
 
 
 def _write_csv(landmarks: Mapping[str, FloatArray]) -> str:
-    rows = [[name, *map(repr, _numbers(point))] for name, point in landmarks.items()]
+    rows = [[name, *(["NA"] * 3 if np.isnan(p).any() else map(repr, _numbers(p)))] for name, p in landmarks.items()]
     return rows_text([["name", "x", "y", "z"], *rows])
 
 
@@ -542,20 +548,10 @@ def _read_tps(data: bytes, path: Path) -> Pairs:
             path, f"it says {head[2]} landmarks, but {len(points)} rows follow; it is damaged or cut short"
         )
     return [
-        (f"point_{i}", _point(line.split(), f"point_{i}", path))
+        # NA is the value of geomorph and of tps programs.
+        (f"point_{i}", None if "NA" in line.upper().split() else _point(line.split(), f"point_{i}", path))
         for i, line in enumerate(points)
-        # As geomorph and tps programs have a point that is not there.
-        if "NA" not in line.upper().split()
     ]
-
-
-def tps_text(specimens: Mapping[str, FloatArray]) -> str:
-    """Return a TPS file of several specimens, as geomorph reads it: name -> (L, 3), rows of not-a-number as NA."""
-    blocks: list[str] = []
-    for name, points in specimens.items():
-        rows = [" ".join(map(repr, _numbers(p))) if np.isfinite(p).all() else "NA NA NA" for p in points]
-        blocks.append("\n".join([f"LM3={len(points)}", *rows, f"ID={name}"]))
-    return "\n".join(blocks) + "\n"
 
 
 def _read_tlms(data: bytes, path: Path) -> Pairs:
@@ -564,8 +560,7 @@ def _read_tlms(data: bytes, path: Path) -> Pairs:
         words = line.split()
         if len(words) != 5 or words[1] not in ("0", "1"):
             raise damage_error(path, "it has a line other than 'name visible x y z', so it is not scalismo's .tlms")
-        if words[1] == "1":
-            out.append((words[0], _point(words[2:], f"landmark '{words[0][:60]}'", path)))
+        out.append((words[0], _point(words[2:], f"landmark '{words[0][:60]}'", path) if words[1] == "1" else None))
     return out
 
 

@@ -1,0 +1,280 @@
+"""Readers and writers of the landmarks of many specimens, in files of morphometrics programs and in folders."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+from shapespace.errors import FileFormatError, InputError, ShapespaceError
+from shapespace.io.files import make_folder, read_bytes, write_text
+from shapespace.io.landmarks.configuration_tables import (
+    CLASSIFIERS,
+    header_kind,
+    long_text,
+    morphoj_texts,
+    parse_table,
+    wide_text,
+)
+from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations, slider_numbers
+from shapespace.io.landmarks.landmark_io import LANDMARK_FORMATS, READ_ONLY_LANDMARKS, read_landmarks
+from shapespace.io.landmarks.r_arrays import R_ENDINGS, parse_r
+from shapespace.io.landmarks.tps_nts import nts_text, parse_nts, parse_tps, tps_text
+from shapespace.io.parsing import damage_error, is_number
+from shapespace.io.read_limits import LARGEST_CONFIGURATIONS_FILE_BYTES
+from shapespace.io.tables.table_io import decoded_text, table_rows, table_text
+from shapespace.reprs import first_names
+from shapespace.types import IntArray
+
+_TEXTS: Mapping[str, Callable[[str, Path], LandmarkConfigurations]] = {".tps": parse_tps, ".nts": parse_nts}
+_TABLES = (".csv", ".txt", ".tsv", ".xlsx")
+_SINGLE = tuple(sorted({*LANDMARK_FORMATS, *READ_ONLY_LANDMARKS} - {".tps"}, key=len, reverse=True))
+_MILLIMETRES = (".mrk.json", ".fcsv")
+_TPS_KEYS = ("image", "comment")
+"""Columns that TPS has keys for."""
+_SLIDER_COLUMNS = 3
+_NAMED = 3  # names in a sentence
+
+CONFIGURATION_FORMATS: Mapping[str, str] = MappingProxyType(
+    {"tps": ".tps", "nts": ".nts", "morphoj": ".txt", "csv": ".csv", "long": ".csv"}
+)
+"""Format -> ending of files of all specimens; `csv` is wide, a row for each specimen."""
+FOLDER_FORMATS: Mapping[str, str] = MappingProxyType({"mrk.json": ".mrk.json", "fcsv": ".fcsv", "csv-folder": ".csv"})
+"""Format -> ending of folders with a file for each specimen."""
+
+
+def read_configurations(path: Path | str, *, name: str | None = None) -> LandmarkConfigurations:
+    """Read the landmarks of many specimens, missing ones as not-a-number.
+
+    Formats: TPS with curves and scale, NTS, wide and long tables (CSV, Excel), MorphoJ tables (.txt, with the columns
+    of NAME.classifiers.txt), arrays of R (.rda, .RData, .rds), and folders with a file for each specimen in any format
+    of `read_landmarks`, TPS or NTS. Values that are scaled, left out or taken as missing are in the notes.
+
+    Args:
+        path: the file or folder.
+        name: of the array, for R files with several.
+
+    Raises:
+        FileError: it cannot be read, or is too long.
+        FileFormatError: it is damaged, is in none of the formats, or its specimens have other landmarks.
+        InputError: two specimens have one name.
+        ShapespaceError: the extra `r`, which R files need, is not installed.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return _read_folder(path)
+    suffix = path.suffix.lower()
+    single = next((ending for ending in _SINGLE if path.name.lower().endswith(ending)), None)
+    if not (suffix in (*_TEXTS, *_TABLES, *R_ENDINGS) or single):
+        endings = ", ".join(dict.fromkeys((*_TEXTS, *_TABLES, *R_ENDINGS, *_SINGLE)))
+        raise damage_error(path, f"the ending {suffix!r} is none of landmark files ({endings})")
+    data = read_bytes(path, LARGEST_CONFIGURATIONS_FILE_BYTES)
+    if not data.strip():
+        raise damage_error(path, "it is empty; export or copy it again")
+    if name is not None and suffix not in R_ENDINGS:
+        raise InputError(f"{path} is no file of R, whose arrays have names; leave --object out.")
+    if suffix in R_ENDINGS:
+        return parse_r(data, path, name)
+    if suffix in _TEXTS or re.match(rb"\s*LM3?\s*=", data, re.IGNORECASE):
+        return _TEXTS.get(suffix, parse_tps)(_text(data, path), path)
+    kind = _header_kind(data) if suffix in _TABLES else "single"
+    if single is None or kind in ("wide", "long") or (suffix == ".csv" and kind != "single"):
+        return parse_table(data, path)
+    return _of_files([path], single)
+
+
+def is_configurations(path: Path | str) -> bool:
+    """Return whether a path is landmarks of many specimens by its ending, header, or the files in a folder."""
+    path = Path(path)
+    if path.is_dir():
+        names = [file.name.lower() for file in path.iterdir()]
+        return any(n.endswith((*_TEXTS, *_SINGLE)) for n in names) and not any(n.endswith(".fit.json") for n in names)
+    suffix = path.suffix.lower()
+    if suffix not in _TABLES:
+        return path.is_file() and suffix in (*_TEXTS, *R_ENDINGS)
+    try:
+        return _header_kind(read_bytes(path, LARGEST_CONFIGURATIONS_FILE_BYTES)) in ("wide", "long")
+    except ShapespaceError:
+        return False
+
+
+def _header_kind(data: bytes) -> str:
+    try:
+        return header_kind(next(table_rows(data), list[str]()))
+    except ValueError:
+        return ""
+
+
+def _text(data: bytes, path: Path) -> str:
+    try:
+        return decoded_text(data)
+    except ValueError as error:
+        raise FileFormatError(f"{path} {error}; export it again.") from error
+
+
+def _read_folder(folder: Path) -> LandmarkConfigurations:
+    endings = (*_TEXTS, *_SINGLE)
+    files: dict[str, list[Path]] = {}
+    for file in sorted(folder.iterdir()):
+        ending = next((ending for ending in endings if file.name.lower().endswith(ending)), None)
+        if ending is not None and file.is_file():
+            files.setdefault(ending, []).append(file)
+    if not files:
+        raise damage_error(folder, f"it has no landmark files, which end with {', '.join(endings)}")
+    # Slicer's markups first among equally many: they mark missing landmarks.
+    ending = max(files, key=lambda one: (len(files[one]), one == ".mrk.json"))
+    others = [file.name for other, listed in files.items() if other != ending for file in listed]
+    notes = [f"{len(others)} files without {ending} are left out ({first_names(others, _NAMED)})."] if others else []
+    found = _of_files(files[ending], ending)
+    return replace(found, where=str(folder), notes=(*notes, *found.notes))
+
+
+def _of_files(files: Sequence[Path], ending: str) -> LandmarkConfigurations:
+    """Return the landmarks of files of one specimen each, in the order of the first, or of TPS and NTS files."""
+    if ending in _TEXTS:
+        return _joined([read_configurations(file) for file in files])
+    marks = [read_landmarks(file, keep_absent=True) for file in files]
+    labels = tuple(marks[0])
+    for file, found in zip(files, marks, strict=True):
+        if found.keys() != marks[0].keys():
+            other = first_names(sorted(found.keys() ^ marks[0].keys()), _NAMED)
+            raise damage_error(
+                file, f"it has {len(found)} landmarks and {files[0].name} has {len(labels)} ({other} in one of them "
+                "alone); name the same landmarks in all files, with NA or as undefined where one is missing"
+            )  # fmt: skip
+    names = tuple(file.name[: -len(ending)].removesuffix(".landmarks") for file in files)
+    plain = all(re.fullmatch(r"point_\d+", label) for label in labels)
+    return LandmarkConfigurations(
+        names=names,
+        points=np.array([[found[label] for label in labels] for found in marks]),
+        landmarks=() if plain else labels,
+        unit="mm" if ending in _MILLIMETRES else "",
+        where=str(files[0]),
+    )
+
+
+def _joined(parts: Sequence[LandmarkConfigurations]) -> LandmarkConfigurations:
+    first = parts[0]
+    for part in parts:
+        if part.points.shape[1:] != first.points.shape[1:]:
+            shapes = [f"{one.points.shape[1]} landmarks of {one.dimensions} dimensions" for one in (part, first)]
+            raise FileFormatError(f"{part.where} has {shapes[0]} and {first.where} {shapes[1]}; give the same to all.")
+    keys = dict.fromkeys(key for part in parts for key in part.columns)
+    return replace(
+        first,
+        names=tuple(name for part in parts for name in part.names),
+        points=np.concatenate([part.points for part in parts]),
+        columns={key: tuple(c for p in parts for c in p.columns.get(key, [""] * len(p))) for key in keys},
+        notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
+    )
+
+
+def read_sliders(path: Path | str, landmarks: int) -> IntArray:
+    """Read the numbers of semilandmarks from CSV as geomorph has them: before, slide, after; or surface alone.
+
+    Args:
+        path: the file, with a header or without; landmarks count from 1.
+        landmarks: their number.
+
+    Returns:
+        (M, 3) of curves or (S,) on the surface, from 0.
+
+    Raises:
+        FileError: it cannot be read.
+        FileFormatError: another number of columns, or numbers that are no landmarks.
+    """
+    path = Path(path)
+    text = _text(read_bytes(path, LARGEST_CONFIGURATIONS_FILE_BYTES), path)
+    rows = [re.split(r"[,;\t]", line.replace('"', "")) for line in text.splitlines() if line.strip()]
+    rows = [[cell.strip() for cell in row] for row in rows]
+    if rows and not all(map(is_number, rows[0])):
+        # R writes row names in a first column without a name.
+        rows = [row[1:] if rows[0][0] == "" and len(rows[0]) > 1 else row for row in rows][1:]
+    width = len(rows[0]) if rows else 0
+    if width not in (1, _SLIDER_COLUMNS) or any(len(row) != width or not all(map(is_number, row)) for row in rows):
+        raise damage_error(path, "it needs rows of before, slide, after, or of one surface landmark, as numbers from 1")
+    numbers = np.array(rows, dtype=np.float64)
+    return slider_numbers(numbers if width > 1 else numbers.ravel(), landmarks, path)
+
+
+def slider_texts(configurations: LandmarkConfigurations) -> dict[str, str]:
+    """Return file name -> CSV of the sliders as geomorph reads them; empty without sliders."""
+    tables = {
+        "curveslide.csv": (("before", "slide", "after"), (configurations.curve_sliders + 1).tolist()),
+        "surfslide.csv": (("surface",), (configurations.surface_sliders[:, None] + 1).tolist()),
+    }
+    return {name: table_text(header, rows) for name, (header, rows) in tables.items() if rows}
+
+
+def write_configurations(
+    path: Path | str, configurations: LandmarkConfigurations, format: str | None = None
+) -> tuple[str, ...]:
+    """Write the landmarks of many specimens, and return sentences on what the format cannot hold.
+
+    Args:
+        path: the file; a folder for the formats of `FOLDER_FORMATS`.
+        configurations: the landmarks; sliders are not written.
+        format: a key of `CONFIGURATION_FORMATS` or `FOLDER_FORMATS`; None for that of the ending of `path`.
+
+    Raises:
+        InputError: an unknown format, or one that cannot hold these landmarks.
+        FileError: it cannot be written.
+    """
+    path = Path(path)
+    if format is None:
+        format = next((key for key, ending in CONFIGURATION_FORMATS.items() if path.suffix.lower() == ending), None)
+    if format not in {**CONFIGURATION_FORMATS, **FOLDER_FORMATS}:
+        known = ", ".join((*CONFIGURATION_FORMATS, *FOLDER_FORMATS))
+        problem = f"the ending {path.suffix!r} has no format" if format is None else f"there is no format {format!r}"
+        raise InputError(f"Cannot write {path}: {problem}; give one of {known} with --to.")
+    if format in FOLDER_FORMATS:
+        return _write_folder(path, configurations, format)
+    columns, notes = configurations.columns, list[str]()
+    plain = configurations.landmarks == tuple(map(str, range(1, len(configurations.landmarks) + 1)))
+    if format == "tps":
+        named = dict(zip(configurations.names, configurations.points, strict=True))
+        # A line break would end the value.
+        values = {k.upper(): [" ".join(c.split()) for c in cells] for k, cells in columns.items() if k in _TPS_KEYS}
+        text, columns = tps_text(named, values), {key: cells for key, cells in columns.items() if key not in _TPS_KEYS}
+    elif format == "nts":
+        text = nts_text(configurations)
+    elif format == "morphoj":
+        text, classifiers = morphoj_texts(configurations)
+        if classifiers:
+            beside = path.with_name(f"{path.name.removesuffix(path.suffix)}{CLASSIFIERS}")
+            write_text(beside, classifiers)
+            notes.append(f"The columns {', '.join(columns)} are in {beside.name}; import it as classifier variables.")
+    else:
+        text = wide_text(configurations) if format == "csv" else long_text(configurations)
+    write_text(path, text)
+    if columns and format in ("tps", "nts"):
+        notes.append(f"The columns {', '.join(columns)} are left out, which {format.upper()} has no place for.")
+    if not plain and format in ("tps", "nts", "morphoj"):
+        notes.append("The landmarks are numbered in their order, because the format has no names of landmarks.")
+    return tuple(notes)
+
+
+def _write_folder(folder: Path, configurations: LandmarkConfigurations, format: str) -> tuple[str, ...]:
+    ending = FOLDER_FORMATS[format]
+    if configurations.dimensions != 3:
+        raise InputError(f"{configurations.where}: {ending} files cannot hold 2-D landmarks; write tps, nts or csv.")
+    if format == "fcsv" and not configurations.observed.all():
+        raise InputError(f"{configurations.where}: .fcsv files cannot hold missing landmarks; write mrk.json.")
+    stems = [re.sub(r'[/\\:*?"<>|\x00-\x1f]', "_", name) for name in configurations.names]
+    same = next((stem for stem, count in Counter(stems).items() if count > 1), None)
+    if same is not None:
+        raise InputError(f"{configurations.where}: two specimens would be in {same[:60]}{ending}; rename one of them.")
+    make_folder(folder)
+    for stem, points in zip(stems, configurations.points, strict=True):
+        named = dict(zip(configurations.landmarks, points, strict=True))
+        write_text(folder / f"{stem}{ending}", LANDMARK_FORMATS[ending].write(named))
+    changed = [stem for stem, name in zip(stems, configurations.names, strict=True) if stem != name]
+    notes = [f"{len(changed)} names are changed for file names ({first_names(changed, _NAMED)})."] if changed else []
+    if configurations.columns:
+        notes.append(f"The columns {', '.join(configurations.columns)} are left out.")
+    return tuple(notes)

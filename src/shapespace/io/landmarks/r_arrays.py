@@ -1,0 +1,158 @@
+"""Landmark arrays of R (geomorph): p landmarks x k dimensions x n specimens in .rda, .RData and .rds files."""
+
+from __future__ import annotations
+
+import bz2
+import contextlib
+import lzma
+import warnings
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations, marked_missing, slider_numbers
+from shapespace.io.parsing import damage_error
+from shapespace.io.read_limits import LARGEST_CONFIGURATIONS_FILE_BYTES
+from shapespace.lazy import require_package
+from shapespace.reprs import first_names
+from shapespace.types import FloatArray
+
+R_ENDINGS = (".rda", ".rdata", ".rds")
+"""Endings, in lower case, of files of R objects."""
+_CURVES = ("curvepts", "curves", "curveslide", "curvslide")
+_SURFACES = ("surfslide", "surfaces", "surfpts")
+"""Parts of geomorph's data sets with the numbers of semilandmarks."""
+_LISTED = 8  # arrays in a sentence
+_XZ_BYTES = 2**28  # memory of unpacking; xz -9 takes a quarter of it
+_DEEPEST = 2  # lists in lists that arrays are looked for in
+
+
+def parse_r(data: bytes, path: Path, name: str | None = None) -> LandmarkConfigurations:
+    """Return the landmarks of the only array of an R file, or of the array `name`, such as `plethodon$land`.
+
+    Factors and vectors beside the array, with a value for each specimen, become columns; `curvepts`, `curveslide` and
+    `surfslide` beside it are sliders.
+
+    Raises:
+        ShapespaceError: the extra `r` is not installed.
+        FileFormatError: it is no R file, or has no such array or several.
+    """
+    rdata = require_package("rdata", f"Reading {path}", "'shapespace[r]'")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            content = rdata.parser.parse_data(_unpacked(data), altrep_constructor_dict=_expansions(rdata))
+            found = dict(_arrays(_objects(content.object, rdata), ""))
+    # The parser raises many kinds of errors on damaged files.
+    except Exception as error:
+        reason = " ".join(str(error).split())[:60] or type(error).__name__
+        raise damage_error(path, f"it is no R data file, or is damaged ({reason})") from error
+    chosen = {key: one for key, one in found.items() if name is None or name in (key, key.rpartition("$")[2])}
+    listed = first_names([key or "(unnamed)" for key in found], _LISTED)
+    if not found:
+        raise damage_error(path, "it has no array of landmarks x 2 or 3 dimensions x specimens")
+    if len(chosen) != 1:
+        problem = "several arrays" if name is None or chosen else f"no array {name[:40]!r}"
+        raise damage_error(path, f"it has {problem}; name one of {listed} with --object")
+    [(key, (points, labels, names, beside))] = chosen.items()
+    notes = [f"The landmarks are those of {key}."] if key else []
+    names = names or tuple(f"specimen {k}" for k in range(1, len(points) + 1))
+    columns = {part: cells for part, one in beside.items() if len(cells := _cells(one)) == len(points)}
+    sliders = {3: np.zeros((0, 3), dtype=np.int32), 1: np.zeros(0, dtype=np.int32)}
+    for part, one in beside.items():
+        width = 3 if part.lower() in _CURVES else 1
+        if part.lower() in (*_CURVES, *_SURFACES) and getattr(one, "size", 0) and one.size % width == 0:
+            numbers = np.asarray(one, dtype=np.float64)
+            sliders[width] = slider_numbers(numbers.reshape(-1, 3) if width > 1 else numbers.ravel(), len(labels), path)
+            columns.pop(part, None)
+            notes.append(f"The sliders are those of {part}.")
+    points, coded = marked_missing(points, names)
+    return LandmarkConfigurations(
+        names=names,
+        points=points,
+        landmarks=labels,
+        columns=columns,
+        curve_sliders=sliders[3],
+        surface_sliders=sliders[1],
+        where=str(path),
+        notes=(*notes, *coded),
+    )
+
+
+def _unpacked(data: bytes) -> bytes:
+    """Return data without compression, up to the limit of a file, so that a small one cannot fill the memory."""
+    limit = LARGEST_CONFIGURATIONS_FILE_BYTES
+    if data.startswith(b"\x1f\x8b"):
+        gzip = zlib.decompressobj(wbits=31)
+        out, is_cut = gzip.decompress(data, limit), bool(gzip.unconsumed_tail)
+    elif data.startswith((b"BZh", b"\xfd7zXZ")):
+        other = bz2.BZ2Decompressor() if data.startswith(b"BZh") else lzma.LZMADecompressor(memlimit=_XZ_BYTES)
+        out = other.decompress(data, limit)
+        is_cut = not other.eof and not other.needs_input
+    else:
+        return data
+    if is_cut:
+        raise ValueError(f"it unpacks to more than {limit >> 20} MiB")
+    return out
+
+
+def _expansions(rdata: Any) -> dict[bytes, Any]:
+    """Return what expands compact vectors of R, which refuses sequences longer than any file's."""
+    known = dict(rdata.parser.DEFAULT_ALTREP_MAP)
+
+    def bounded(name: bytes) -> Any:
+        def expand(state: Any) -> Any:
+            if not 0 <= state.value[0] <= LARGEST_CONFIGURATIONS_FILE_BYTES // 8:
+                raise ValueError("it has a sequence that would fill the memory")
+            return known[name](state)
+
+        return expand
+
+    return {**known, **{name: bounded(name) for name in (b"compact_intseq", b"compact_realseq")}}
+
+
+def _objects(content: Any, rdata: Any) -> dict[str, Any]:
+    """Return the objects of a file by name, without functions and others that cannot be converted."""
+    objects: dict[str, Any] = {}
+    while content.info.type.name == "LIST":
+        tag = content.tag.referenced_object or content.tag
+        # Functions and environments are no data.
+        with contextlib.suppress(AssertionError, NotImplementedError):
+            objects[tag.value.value.decode()] = rdata.conversion.convert(content.value[0])
+        content = content.value[1]
+    return objects or {"": rdata.conversion.convert(content)}
+
+
+def _arrays(
+    objects: Mapping[str, Any], prefix: str, depth: int = 0
+) -> Iterator[tuple[str, tuple[FloatArray, tuple[str, ...], tuple[str, ...], Mapping[str, Any]]]]:
+    """Yield name -> points (n, p, k), names of landmarks and specimens, and the objects beside, of each array."""
+    objects = {str(name): one for name, one in objects.items()}
+    for name, one in objects.items():
+        shape = getattr(one, "shape", ())
+        if len(shape) == 3 and shape[1] in (2, 3) and 0 not in shape and np.asarray(one).dtype.kind in "fi":
+            coords = getattr(one, "coords", {})
+            labels, names = (tuple(map(str, coords[axis].values)) if axis in coords else () for axis in _AXES)
+            points = np.moveaxis(np.ma.filled(np.ma.asarray(one).astype(np.float64), np.nan), 2, 0)
+            yield f"{prefix}{name}", (points, labels or _numbered(shape[0]), names, objects)
+        elif isinstance(one, Mapping) and depth < _DEEPEST:
+            yield from _arrays(cast(Mapping[str, Any], one), f"{prefix}{name}$" if name else prefix, depth + 1)
+
+
+_AXES = ("dim_0", "dim_2")
+"""Of the names of landmarks and specimens, as rdata calls them."""
+
+
+def _numbered(count: int) -> tuple[str, ...]:
+    return tuple(map(str, range(1, count + 1)))
+
+
+def _cells(one: Any) -> tuple[str, ...]:
+    """Return the values of a factor or a vector as text; missing ones are empty."""
+    if len(getattr(one, "shape", ())) != 1:
+        return ()
+    values: list[Any] = np.ma.filled(np.ma.asarray(one).astype(object), None).tolist()
+    return tuple("" if value is None or value != value else str(value) for value in values)
