@@ -663,7 +663,10 @@ class LearningCurvePart(Part, frozen=True, kw_only=True, tag="learning_curve"):
 
 
 class Series(Struct, frozen=True, kw_only=True):
-    """One line of a curve, with a band around it where there is one; `points` are dots without a line."""
+    """One line of a curve, with a band around it where there is one; `points` are dots without a line.
+
+    Series with the same `group`, a number from 0, have the same colour and marker.
+    """
 
     x: tuple[float, ...]
     y: tuple[float, ...]
@@ -671,6 +674,7 @@ class Series(Struct, frozen=True, kw_only=True):
     low: tuple[float | None, ...] | None = None
     high: tuple[float | None, ...] | None = None
     points: bool = False
+    group: int | None = None
 
 
 class CurvePart(Part, frozen=True, kw_only=True, tag="curve"):
@@ -733,6 +737,54 @@ class MorphPart(Part, frozen=True, kw_only=True, tag="morph"):
     times: float = 1.0
 
 
+class DeformationPart(Part, frozen=True, kw_only=True, tag="deformation"):
+    """Two configurations of landmarks in an .npz file: a deformation grid, or a vector for each landmark.
+
+    Args:
+        arrays: the file; the next two are names of arrays in it.
+        low: (L, 3); z is 0 for planar landmarks.
+        high: (L, 3).
+        low_label: what `low` is.
+        high_label: what `high` is.
+        times: factor of the difference in both, as of a morph.
+        drawing: `grid` for a thin-plate spline of planar landmarks, `vectors` for any.
+    """
+
+    arrays: str
+    low: str = "low"
+    high: str = "high"
+    low_label: str = "low"
+    high_label: str = "high"
+    times: float = 1.0
+    drawing: Literal["grid", "vectors"] = "vectors"
+
+
+class MorphospacePart(Part, frozen=True, kw_only=True, tag="morphospace"):
+    """Shapes as points in the plane of two axes of an ordination; a click draws the shape there beside the mean.
+
+    Args:
+        arrays: an .npz file with `scores` (N, A), `mean` (V, 3), `shape_axes` (A, V, 3), the change of shape per unit
+            of score, and `faces` (F, 3), empty for landmarks; perhaps with `groups` (N,) codes, `cross_validated`
+            (N, A) scores, and `nodes` (M, A) and `edges` (E, 2) of a phylogeny, whose tips are the shapes.
+        names: of the N shapes.
+        axes: names of the A axes.
+        shares: (A,) share of the variance of each axis.
+        first: numbers of the axes drawn across and up, from 0.
+        groups: names of the groups.
+        variable: whose classes they are.
+        unit: of the scores; empty for none.
+    """
+
+    arrays: str
+    names: tuple[str, ...]
+    axes: tuple[str, ...]
+    shares: tuple[float, ...]
+    first: tuple[int, int] = (0, 1)
+    groups: tuple[str, ...] = ()
+    variable: str = ""
+    unit: str = ""
+
+
 class Counts(Struct, frozen=True, kw_only=True):
     """How many values fall between each pair of `edges` of a histogram."""
 
@@ -752,7 +804,7 @@ class HistogramPart(Part, frozen=True, kw_only=True, tag="histogram"):
 
 _PARTS = (
     TextPart | TablePart | ConfusionPart | CalibrationPart | LearningCurvePart | CurvePart | SurfaceMapPart | MorphPart
-    | HistogramPart
+    | HistogramPart | MorphospacePart | DeformationPart
 )  # fmt: skip
 PARTS: Mapping[str, type[Part]] = {str(kind.__struct_config__.tag): kind for kind in get_args(_PARTS)}
 """What a part is, by its kind."""
@@ -917,6 +969,34 @@ class Methods(Struct, frozen=True, kw_only=True):
     assumptions: tuple[str, ...] = ()
 
 
+class NamedView(Struct, frozen=True, kw_only=True):
+    """A view of an object, in the frame of its mean shape.
+
+    Args:
+        name: such as `dorsal`.
+        toward_viewer: direction from the object to the viewer.
+        up: direction that points up in the figure.
+    """
+
+    name: str
+    toward_viewer: tuple[float, float, float]
+    up: tuple[float, float, float]
+
+
+class Orientation(Struct, frozen=True, kw_only=True):
+    """An orientation.json: how the figures of an object are drawn.
+
+    Args:
+        views: named views in the order of the figures; empty for views that are chosen by the form of the object.
+        links: pairs of landmarks, numbers from 1, between which figures have a line.
+    """
+
+    FILE: ClassVar = "orientation.json"
+
+    views: tuple[NamedView, ...] = ()
+    links: tuple[tuple[int, int], ...] = ()
+
+
 class Analysis(Recognition, frozen=True, kw_only=True):
     """An analysis.json: an answer about a cohort, by the command in `question`, as parts like those of a study."""
 
@@ -929,6 +1009,8 @@ class Analysis(Recognition, frozen=True, kw_only=True):
     question: str = ""
     notes: tuple[str, ...] = ()
     methods: Methods | None = None
+    citations: tuple[str, ...] = ()
+    orientation: Orientation | None = None
 
     @classmethod
     def from_json(cls, content: object, where: str = "analysis.json", again: str = ANALYSIS_AGAIN) -> Self:

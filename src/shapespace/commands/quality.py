@@ -294,6 +294,4 @@ def _draw(result: Quality, output: Path, notes: list[str]) -> None:
         return
     from shapespace.report import figures
 
-    figure = figures.quality_figure(result)
-    for ending in ("png", "svg"):
-        figures.save_figure(figure, output / f"quality.{ending}")
+    figures.save_figure(figures.quality_figure(result), output / "quality", ("png", "svg"))

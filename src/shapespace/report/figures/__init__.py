@@ -11,7 +11,13 @@ Pictures of one row share camera and light, one figure has one scale, and the ma
 readers. Importing this package needs the extra `report`.
 """
 
-from shapespace.report.figures.analysis_figures import histogram_figure, morph_figure, surface_map_figure, upright_views
+from shapespace.report.figures.analysis_figures import (
+    histogram_figure,
+    morph_figure,
+    oriented,
+    surface_map_figure,
+    upright_views,
+)
 from shapespace.report.figures.coefficient_figures import Coefficients, b_plane, b_space, scatter_matrix
 from shapespace.report.figures.correspondence_figures import (
     SIDE_DEG,
@@ -21,6 +27,7 @@ from shapespace.report.figures.correspondence_figures import (
     nearness_figure,
     position_std_figure,
 )
+from shapespace.report.figures.deformation_figures import deformation_grid_figure, landmark_vectors_figure
 from shapespace.report.figures.draw import STAGE_WORDS, encode_webp
 from shapespace.report.figures.fit_figures import (
     THRESHOLDS_MM,
@@ -45,9 +52,9 @@ from shapespace.report.figures.model_figures import (
     mode_animation,
     modes_figure,
     quality_figure,
-    save_figure,
     spectrum_figure,
 )
+from shapespace.report.figures.morphospace_figures import Morphospace, morphospace_figure
 from shapespace.report.figures.population_figures import (
     coefficients_spread,
     density_figure,
@@ -55,6 +62,7 @@ from shapespace.report.figures.population_figures import (
     levels_figure,
     over_time_figure,
 )
+from shapespace.report.figures.publication import publication_style, save_figure
 from shapespace.report.figures.recognition_figures import (
     calibration_figure,
     confusion_figure,
@@ -68,6 +76,7 @@ __all__ = [
     "STAGE_WORDS",
     "THRESHOLDS_MM",
     "Coefficients",
+    "Morphospace",
     "StagedFit",
     "aligned_grid",
     "b_plane",
@@ -78,6 +87,7 @@ __all__ = [
     "coefficients_spread",
     "confusion_figure",
     "curve_figure",
+    "deformation_grid_figure",
     "density_figure",
     "distance_histograms",
     "distance_maps",
@@ -87,6 +97,7 @@ __all__ = [
     "faces_grid",
     "histogram_figure",
     "history_figure",
+    "landmark_vectors_figure",
     "learning_curve_figure",
     "levels_figure",
     "mean_figure",
@@ -94,12 +105,15 @@ __all__ = [
     "mode_animation",
     "modes_figure",
     "morph_figure",
+    "morphospace_figure",
     "movement_figure",
     "nearness_figure",
+    "oriented",
     "over_time_figure",
     "overlay_figure",
     "portrait_figure",
     "position_std_figure",
+    "publication_style",
     "quality_figure",
     "regions_figure",
     "save_figure",

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 
 import numpy as np
 import numpy.typing as npt
@@ -12,24 +14,25 @@ from shapespace.errors import InputError
 from shapespace.geometry.normals import face_vectors, faces_of
 from shapespace.report.figures.draw import (
     INK,
-    TEXT,
-    WIDTH,
     Row,
     Scale,
+    axis_label,
     chart,
     escaped,
     finish,
     grid,
+    in_rows,
     legend,
     plain,
     short,
     view,
-    wrap,
 )
 from shapespace.report.inputs.correspondence_folder import upright
+from shapespace.report.inputs.orientation import view_rotation
 from shapespace.report.inputs.staged_fit import nice_ceiling
 from shapespace.report.render.palette import CATEGORIES, DIVERGING, SEQUENTIAL
 from shapespace.report.render.renderer import Camera, Image, Layer, render, visible_triangles
+from shapespace.schemas import Orientation
 from shapespace.types import BoolArray, FloatArray, Mesh
 
 _CLOSED = (("front", 0.0), ("one side", 90.0), ("back", 180.0), ("other side", 270.0))
@@ -39,14 +42,44 @@ _OPEN_SHARE, _AS_IT_STANDS = 0.15, 0.7
 _PALE = 0.72  # share of white outside the mask
 _FARTHEST_MM = 1e7  # mm (10 km); single precision cannot draw beyond it
 _MOST_SERIES = 12  # colours that can be distinguished
+_MOST_COLUMNS = 4  # views in a row: legible in print
 _MOST_BINS = 2000  # above the pixels of a figure nothing is gained
+_NO_VIEWS = Orientation()
+_ORIENTATION: ContextVar[Orientation] = ContextVar("orientation", default=_NO_VIEWS)
+
+
+@contextmanager
+def oriented(orientation: Orientation | None) -> Generator[None]:
+    """Return a context in which figures have the named views and links of an orientation; None for none."""
+    token = _ORIENTATION.set(orientation or _NO_VIEWS)
+    try:
+        yield
+    finally:
+        _ORIENTATION.reset(token)
+
+
+def current_orientation() -> Orientation:
+    """Return the named views and links of the figures that are drawn."""
+    return _ORIENTATION.get()
+
+
+def views_of(mesh: Mesh) -> list[tuple[str, FloatArray, float]]:
+    """Return the views of a mesh, those of the orientation first of all: name, rotation (3, 3), and yaw after it.
+
+    Raises:
+        InputError: as of `upright_views`.
+    """
+    turn, sides = upright_views(mesh)
+    named = [(one.name, view_rotation(one), 0.0) for one in current_orientation().views]
+    return named or [(name, turn, yaw) for name, yaw in sides]
 
 
 def upright_views(mesh: Mesh) -> tuple[FloatArray, Sequence[tuple[str, float]]]:
     """Return the rotation (3, 3) that brings `mesh` upright, and names of views with their yaw, degrees.
 
-    It stays as it stands where that is upright with its front along +z, as faces are; otherwise its principal axes
-    turn it. A surface that is open to one side is seen from the other alone.
+    The first view of the orientation is upright. Without one, the mesh stays as it stands where that is upright with
+    its front along +z, as faces are; otherwise its principal axes turn it. A surface that is open to one side is seen
+    from the other alone.
 
     Raises:
         InputError: it has no extent, or one beyond all measure.
@@ -54,6 +87,8 @@ def upright_views(mesh: Mesh) -> tuple[FloatArray, Sequence[tuple[str, float]]]:
     vertices = mesh.vertices
     if not np.abs(vertices).max(initial=0.0) < _FARTHEST_MM or not np.ptp(vertices, axis=0).max(initial=0.0) > 0:
         raise InputError("There is no surface to draw in vertices without extent, or beyond 10 km.")
+    if views := current_orientation().views:
+        return view_rotation(views[0]), _CLOSED
     if mesh.faces is None:
         return np.eye(3), _CLOSED
     vectors = face_vectors(vertices, faces_of(mesh))
@@ -64,9 +99,11 @@ def upright_views(mesh: Mesh) -> tuple[FloatArray, Sequence[tuple[str, float]]]:
     return np.eye(3) if is_standing else upright(mesh), _OPEN if is_open else _CLOSED
 
 
-def _views(points: FloatArray, yaws: Sequence[float], columns: int) -> tuple[list[Camera], tuple[int, int]]:
-    """Return cameras with one scale for all of `yaws`, and the size of their images."""
-    views = [view(points, columns, yaw_deg=yaw) for yaw in yaws]
+def _views(
+    points: FloatArray, sides: Sequence[tuple[str, FloatArray, float]], columns: int
+) -> tuple[list[Camera], tuple[int, int]]:
+    """Return cameras with one scale for all views (`views_of`) of `points`, and the size of their images."""
+    views = [view(points @ turn.T, columns, yaw_deg=yaw) for _, turn, yaw in sides]
     width, height = views[0].size
     tall = max(item.camera.height_mm for item in views)
     across = max(item.camera.height_mm * item.size[0] / item.size[1] for item in views)
@@ -112,17 +149,18 @@ def surface_map_figure(
     if limit is not None and not 0 < limit < np.inf:
         raise InputError(f"The colours of a map cannot end at {limit}.")
     end = nice_ceiling(float(np.quantile(magnitudes, 0.98)) or float(magnitudes.max())) if limit is None else limit
-    turn, sides = upright_views(mesh)
-    turned_mesh = mesh.with_vertices(mesh.vertices @ turn.T)
+    sides = views_of(mesh)
     scalars = np.clip(values, -4 * end, 4 * end)
     low, colours = (-end, DIVERGING) if signed else (0.0, SEQUENTIAL)
-    full = Layer(turned_mesh, scalars=scalars, colormap=colours, vmin=low, vmax=end)
-    faint = Layer(turned_mesh, scalars=scalars, colormap=_PALE + (1 - _PALE) * colours, vmin=low, vmax=end)
-    cameras, size = _views(turned_mesh.vertices, [yaw for _, yaw in sides], len(sides))
+    faint_colours = _PALE + (1 - _PALE) * colours
+    cameras, size = _views(mesh.vertices, sides, min(len(sides), _MOST_COLUMNS))
     panels: list[Image] = []
-    for camera in cameras:
+    for camera, (_, turn, _) in zip(cameras, sides, strict=True):
+        turned_mesh = mesh.with_vertices(mesh.vertices @ turn.T)
+        full = Layer(turned_mesh, scalars=scalars, colormap=colours, vmin=low, vmax=end)
         image = render(full, camera=camera, size=size)
         if mask is not None and not mask.all():
+            faint = Layer(turned_mesh, scalars=scalars, colormap=faint_colours, vmin=low, vmax=end)
             image = _blend(image, render(faint, camera=camera, size=size), _inside(turned_mesh, mask, camera, size))
         panels.append(image)
     extend_words = {(True, True): "both", (True, False): "low", (False, True): "high"}
@@ -130,7 +168,10 @@ def surface_map_figure(
     notes = ["Grey: no value."] if not known.all() else []
     notes += ["Pale: outside of what is marked."] if mask is not None and not mask.all() else []
     return grid(
-        [Row(panels, [name for name, _ in sides])],
+        [
+            Row([panel for panel, _ in row], [name for _, (name, _, _) in row])
+            for row in in_rows(list(zip(panels, sides, strict=True)), _MOST_COLUMNS)
+        ],
         title=None if title is None else title or f"{plain(unit)} on the surface",
         scale=Scale(short(unit, 70), colours, low, end, extend),
         note=" ".join(notes),
@@ -165,14 +206,18 @@ def morph_figure(low: Mesh, high: Mesh, labels: tuple[str, str], *, title: str |
     Raises:
         InputError: no extent, or one beyond all measure.
     """
-    turn, sides = upright_views(low)
-    end_meshes = [mesh.with_vertices(mesh.vertices @ turn.T) for mesh in (low, high)]
+    turn, yaws = upright_views(low)
     # Half from the side, where a change of depth is seen too.
-    yaws = [0.0, 40.0 if sides is _OPEN else 90.0]
-    points = np.concatenate([mesh.vertices for mesh in end_meshes])
-    cameras, size = _views(points, yaws, 4)
-    panels = [render(Layer(mesh), camera=camera, size=size) for mesh in end_meshes for camera in cameras]
-    names = [short(label, 30) for label in labels for _ in yaws]
+    sides = views_of(low)[:2] if current_orientation().views else [
+        ("", turn, 0.0), ("", turn, 40.0 if yaws is _OPEN else 90.0)
+    ]  # fmt: skip
+    cameras, size = _views(np.concatenate([low.vertices, high.vertices]), sides, 2 * len(sides))
+    panels = [
+        render(Layer(mesh.with_vertices(mesh.vertices @ side[1].T)), camera=camera, size=size)
+        for mesh in (low, high)
+        for camera, side in zip(cameras, sides, strict=True)
+    ]
+    names = [f"{short(label, 30)} {name}".strip() for label in labels for name, _, _ in sides]
     both_named = f"{plain(labels[0])}, and {plain(labels[1])}"
     return grid([Row(panels, names)], title=None if title is None else title or both_named)
 
@@ -219,7 +264,7 @@ def histogram_figure(
         axes.axvline(observed, color=INK, lw=2.0, ls=(0, (4, 2)), label=escaped(short(observed_label, 40)) or None)
         low, high = min(low, observed), max(high, observed)
     room = 0.02 * (high - low)
-    axes.set(xlim=(low - room, high + room), xlabel=escaped(wrap(x, 0.8 * WIDTH, TEXT)), ylabel="count")
+    axes.set(xlim=(low - room, high + room), xlabel=axis_label(x), ylabel="count")
     axes.set_ylim(bottom=0)
     if any(name for name, _ in series) or (observed is not None and observed_label):
         legend(axes, loc="best")

@@ -12,6 +12,7 @@ import warnings
 from bisect import bisect_left
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, TypeVar, cast
@@ -62,6 +63,40 @@ _MOST_LINES = 4  # layout: lines of a caption
 # steps between tick labels, and how many labels fit beside each other
 _STEPS, _MOST_NUMBERS = (1, 5, 10, 20, 50, 100, 200, 500), 22
 _Item = TypeVar("_Item")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Size and style of figures: for a page, or for print.
+
+    Args:
+        chart_width: of charts, pixels of `DPI`.
+        row_width: of rows of pictures, pixels of `DPI`.
+        scale: factor of type sizes, line widths, marker sizes, and heights of charts.
+        panel_scale: pixels of a rendered picture for one pixel of `DPI`.
+        has_titles: whether figures have a title; in print it is in the caption.
+    """
+
+    chart_width: int = WIDTH
+    row_width: int = WIDTH
+    scale: float = 1.0
+    panel_scale: float = 1.0
+    has_titles: bool = True
+
+
+PAGE = Layout()
+LAYOUT: ContextVar[Layout] = ContextVar("layout", default=PAGE)
+"""The current layout; `publication.publication_style` sets that for print."""
+
+
+def type_size(size: float) -> float:
+    """Return a type size of a page (points) in the current layout."""
+    return size * LAYOUT.get().scale
+
+
+def axis_label(text: str, share: float = 0.8) -> str:
+    """Return the label of an axis, wrapped to a share of the width of a chart."""
+    return escaped(wrap(text, share * LAYOUT.get().chart_width, type_size(TEXT)))
 
 
 class DisplayedFigure(Figure):
@@ -116,9 +151,10 @@ class Scale:
     open_ends: str = "neither"
 
 
-def view(points: FloatArray, columns: int, *, yaw_deg: float = 0.0, width: int = WIDTH, margin: float = 0.04) -> View:
+def view(points: FloatArray, columns: int, *, yaw_deg: float = 0.0, width: int = 0, margin: float = 0.04) -> View:
     """Return a camera that contains all `points` (N, 3), in panels of which `columns` fill the figure."""
-    across = (width - (columns - 1) * _GAP) // columns
+    layout = LAYOUT.get()
+    across = int(((width or layout.row_width) - (columns - 1) * _GAP) // columns * layout.panel_scale)
     flat = Camera.framing(points, yaw_deg=yaw_deg, aspect=1e-3, margin=0.0, perspective=False)
     tall = Camera.framing(points, yaw_deg=yaw_deg, aspect=1e3, margin=0.0, perspective=False)
     aspect = min(max(1e-3 * flat.height_mm / tall.height_mm, 0.68), 1.5)
@@ -163,26 +199,28 @@ def grid(
     """
     if not rows or not rows[0].panels:
         raise InputError(f"{plain(title or 'The figure')}: there is nothing to draw.")
+    layout = LAYOUT.get()
     columns = max(len(row.panels) for row in rows)
-    widest = max(row.panels[0].shape[1] for row in rows)
-    total_w = max(WIDTH, columns * widest + (columns - 1) * _GAP)
+    widest = max(row.panels[0].shape[1] for row in rows) / layout.panel_scale
+    total_w = max(layout.row_width, int(columns * widest + (columns - 1) * _GAP))
     texts: list[tuple[float, float, str, dict[str, Any]]] = []
-    pictures: list[tuple[int, float, Image]] = []
+    pictures: list[tuple[float, float, Image]] = []
     y = 6.0
 
     def write(x: float, text: str, width: float, size: float, **style: Any) -> float:
         """Put wrapped `text` at the height `y` and return the height that it takes."""
+        size = type_size(size)
         wrapped = wrap(text, width, size, bold=style.get("fontweight") == "bold")
         for k, line in enumerate(wrapped.split("\n")):
             texts.append((x, y + baseline(k, size), line, {"fontsize": size, "va": "baseline", **style}))
         return height_of(wrapped, size)
 
-    if title is not None:
+    if title is not None and layout.has_titles:
         y += write(_EDGE, title, total_w - 2 * _EDGE, TITLE, fontweight="bold", color=INK) + 8
     for r, row in enumerate(rows):
         y += 10 if r and any(row.captions) and not row.heading else 0
         panels = without_empty_rows(row.panels)
-        high, wide = panels[0].shape[:2]
+        high, wide = (side / layout.panel_scale for side in panels[0].shape[:2])
         left = (total_w - len(row.panels) * wide - (len(row.panels) - 1) * _GAP) // 2 if len(rows) == 1 else 0
         if row.heading:
             y += 8 + write(_EDGE, row.heading, total_w - 2 * _EDGE, TEXT, fontweight="bold", color=INK)
@@ -199,7 +237,7 @@ def grid(
         y += _place_keys(texts, keys, y, total_w)
     bar_at = y + 10
     if scale is not None:
-        y = bar_at + 24 + 2.5 * line_height(TEXT)
+        y = bar_at + 24 + 2.5 * line_height(type_size(TEXT))
     if note:
         y += 4 + write(_EDGE, note, total_w - 2 * _EDGE, SMALL, color=GREY)
     total_h = int(np.ceil(y + 6))
@@ -210,7 +248,7 @@ def grid(
 
 
 def _compose(
-    pictures: Sequence[tuple[int, float, Image]],
+    pictures: Sequence[tuple[float, float, Image]],
     texts: Sequence[tuple[float, float, str, dict[str, Any]]],
     total_w: int,
     total_h: int,
@@ -218,7 +256,7 @@ def _compose(
     """Return a figure of this size in pixels with pictures and lines of text at their places, from the upper left."""
     figure = DisplayedFigure(figsize=(total_w / DPI, total_h / DPI), dpi=DPI, facecolor="white")
     for x, top, image in pictures:
-        high, wide = image.shape[:2]
+        high, wide = (side / LAYOUT.get().panel_scale for side in image.shape[:2])
         axes = figure.add_axes((x / total_w, 1 - (round(top) + high) / total_h, wide / total_w, high / total_h))
         axes.imshow(image, interpolation="nearest", aspect="auto")
         axes.set_axis_off()
@@ -231,20 +269,21 @@ def _place_keys(
     texts: list[tuple[float, float, str, dict[str, Any]]], keys: Sequence[tuple[str, Colour]], y: float, total_w: int
 ) -> float:
     """Draw legend entries in centred lines, and return their height."""
-    square, between = measured("■ ", TEXT + 2), 28.0
+    size = type_size(TEXT)
+    square, between = measured("■ ", size + 2), 28.0
     lines: list[list[tuple[str, Colour, float]]] = [[]]
     for name, colour in keys:
-        width = square + measured(name, TEXT) + between
+        width = square + measured(name, size) + between
         if lines[-1] and sum(item[2] for item in lines[-1]) + width > total_w:
             lines.append([])
         lines[-1].append((name, colour, width))
-    step = 1.25 * line_height(TEXT)
+    step = 1.25 * line_height(size)
     for k, line in enumerate(lines):
         x = (total_w - sum(item[2] for item in line) + between) / 2
         middle = y + (k + 0.5) * step
         for name, colour, width in line:
-            texts.append((x, middle, "■", {"color": colour, "fontsize": TEXT + 2, "va": "center_baseline"}))
-            texts.append((x + square, middle, name, {"color": INK, "fontsize": TEXT, "va": "center_baseline"}))
+            texts.append((x, middle, "■", {"color": colour, "fontsize": size + 2, "va": "center_baseline"}))
+            texts.append((x + square, middle, name, {"color": INK, "fontsize": size, "va": "center_baseline"}))
             x += width
     return step * len(lines)
 
@@ -258,11 +297,11 @@ def _colour_bar(figure: Figure, scale: Scale, top: float, total_w: int, total_h:
         extend={"low": "min", "high": "max", "both": "both"}.get(scale.open_ends, "neither"),
         extendfrac=0.04,
     )
-    bar.ax.tick_params(labelsize=SMALL, colors=INK, length=3, pad=2)
+    bar.ax.tick_params(labelsize=type_size(SMALL), colors=INK, length=3, pad=2)
     bar.ax.xaxis.set_major_formatter(lambda value, _: f"{value:g}".replace("-", "−"))
     cast(Any, bar).outline.set_visible(False)
-    up = 1 - (top + 24 + 1.05 * line_height(SMALL) + baseline(0, TEXT)) / total_h
-    figure.text(0.5, up, escaped(scale.label), ha="center", va="baseline", fontsize=TEXT, color=INK)
+    up = 1 - (top + 24 + 1.05 * line_height(type_size(SMALL)) + baseline(0, type_size(TEXT))) / total_h
+    figure.text(0.5, up, escaped(scale.label), ha="center", va="baseline", fontsize=type_size(TEXT), color=INK)
 
 
 def without_empty_rows(panels: Sequence[Image]) -> list[Image]:
@@ -284,22 +323,24 @@ def chart(title: str, *, height: float, note: str = "") -> tuple[Figure, Axes]:
 
 def charts(title: str, heights: Sequence[float], *, note: str = "", columns: int = 1) -> tuple[Figure, list[Axes]]:
     """Return a figure with rows of plots of `heights` in inches, and the plots row by row."""
-    wrapped = wrap(title, WIDTH - 2 * _EDGE, TITLE, bold=True)
-    note_lines = wrap(note, WIDTH - 2 * _EDGE, SMALL) if note else ""
-    top = (height_of(wrapped, TITLE) + 14) / DPI
-    bottom = (height_of(note_lines, SMALL) + 12) / DPI if note_lines else 0.03
-    total = sum(heights) + top + bottom
-    figure = DisplayedFigure(figsize=(WIDTH / DPI, total), dpi=DPI, facecolor="white")
+    layout, small = LAYOUT.get(), type_size(SMALL)
+    width = layout.chart_width if columns == 1 else layout.row_width
+    wrapped = wrap(title, width - 2 * _EDGE, TITLE, bold=True) if layout.has_titles else ""
+    note_lines = wrap(note, width - 2 * _EDGE, small) if note else ""
+    top = (height_of(wrapped, TITLE) + 14) / DPI if wrapped else 0.03
+    bottom = (height_of(note_lines, small) + 12) / DPI if note_lines else 0.03
+    total = layout.scale * sum(heights) + top + bottom
+    figure = DisplayedFigure(figsize=(width / DPI, total), dpi=DPI, facecolor="white")
     places = figure.add_gridspec(len(heights), columns, height_ratios=list(heights))
     axes = [figure.add_subplot(places[r, c]) for r in range(len(heights)) for c in range(columns)]
-    start = total * DPI - height_of(note_lines, SMALL) - 2
+    start = total * DPI - height_of(note_lines, small) - 2
     for text, first, size, text_style in (
         (wrapped, 6.0, TITLE, {"color": INK, "fontweight": "bold"}),
-        (note_lines, start, SMALL, {"color": GREY}),
+        (note_lines, start, small, {"color": GREY}),
     ):
         for k, line in enumerate(text.split("\n")):
             up = 1 - (first + baseline(k, size)) / DPI / total
-            figure.text(_EDGE / WIDTH, up, escaped(line), in_layout=False, fontsize=size, **cast(Any, text_style))
+            figure.text(_EDGE / width, up, escaped(line), in_layout=False, fontsize=size, **cast(Any, text_style))
     # Where the plots may stand, for `finish`.
     cast(Any, figure).plots_within = (0.0, bottom / total, 1.0, 1 - top / total)
     return figure, axes
@@ -310,25 +351,39 @@ def finish(figure: Figure, **spaces: float) -> Figure:
     for axes in figure.axes:
         if axes.name != "3d" and axes.axison:
             style(axes)
+        _scale_marks(axes, LAYOUT.get().scale)
     with without_glyph_warnings():
         figure.tight_layout(rect=cast(Any, figure).plots_within, pad=0.4, **spaces)
     return figure
+
+
+def _scale_marks(axes: Axes, factor: float) -> None:
+    """Scale the widths of lines and the sizes of markers of a plot and of its legend."""
+    legend: Any = axes.get_legend()
+    marks: list[Any] = [*axes.lines, *axes.collections, *axes.patches, *(legend.legend_handles if legend else ())]
+    for mark in marks if factor != 1 else ():
+        mark.set_linewidth(np.multiply(mark.get_linewidth(), factor))
+        if hasattr(mark, "set_markersize"):
+            mark.set_markersize(factor * mark.get_markersize())
+        if hasattr(mark, "set_sizes"):
+            mark.set_sizes(factor**2 * np.asarray(mark.get_sizes()))
 
 
 def style(axes: Axes) -> None:
     """Give a plot the type and the quiet lines of all of them."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color("#9a9da3")
-    axes.tick_params(which="both", colors=INK, labelsize=SMALL, color="#9a9da3")
-    axes.xaxis.label.set(fontsize=TEXT, color=INK)
-    axes.yaxis.label.set(fontsize=TEXT, color=INK)
+    axes.tick_params(which="both", colors=INK, labelsize=type_size(SMALL), color="#9a9da3")
+    axes.xaxis.label.set(fontsize=type_size(TEXT), color=INK)
+    axes.yaxis.label.set(fontsize=type_size(TEXT), color=INK)
     axes.grid(True, color=RULE, lw=0.8)
     axes.set_axisbelow(True)
 
 
 def legend(axes: Axes, **options: Any) -> None:
     """Add the legend of a plot."""
-    box = cast(Any, axes).legend(fontsize=SMALL, labelcolor=INK, framealpha=0.9, **{"handlelength": 1.5, **options})
+    style = {"fontsize": type_size(SMALL), "labelcolor": INK, "framealpha": 0.9, "handlelength": 1.5}
+    box = cast(Any, axes).legend(**{**style, **options})
     box.get_frame().set_linewidth(0.0)
 
 

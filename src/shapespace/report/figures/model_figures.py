@@ -16,7 +16,6 @@ from PIL import Image as PillowImage
 from PIL import ImageDraw, ImageFont
 
 from shapespace.errors import FileFormatError, InputError
-from shapespace.io.files import write_bytes
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report.figures.draw import (
     BACKWARD,
@@ -391,17 +390,3 @@ def _measured(key: str, value: Measured | tuple[float, ...]) -> _Line:
     if not len(mean) or any(len(part) != len(mean) for part in curves):
         raise InputError(f"The {key} of a model must be a list of numbers, one a number of modes.")
     return modes, mean, low, high
-
-
-def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG or SVG, by the ending of `path`, whole or not at all.
-
-    Raises:
-        FileError: the folder cannot be written, or the disk is full.
-    """
-    stream = io.BytesIO()
-    # Neither date nor random names: the same figure is the same file.
-    with matplotlib.rc_context({"svg.hashsalt": "shapespace", "svg.fonttype": "none"}):
-        kind = path.suffix.removeprefix(".")
-        figure.savefig(stream, format=kind, metadata={"Date": None} if kind == "svg" else {})
-    write_bytes(path, stream.getvalue())

@@ -18,8 +18,8 @@ from shapespace.report.figures.draw import (
     GREY,
     INK,
     SMALL,
-    TEXT,
     WIDTH,
+    axis_label,
     chart,
     charts,
     counted,
@@ -30,7 +30,6 @@ from shapespace.report.figures.draw import (
     percent,
     plain,
     short,
-    wrap,
 )
 from shapespace.report.render.palette import CATEGORIES, SEQUENTIAL, oklab
 from shapespace.types import FloatArray
@@ -44,6 +43,7 @@ CurveScale: TypeAlias = Literal["linear", "log", "probit"]
 
 _BARS = "#a9c9e2"
 _MOST_CLASSES_IN_FULL, _MOST_CLASSES = 12, 40  # classes with numbers, and without: legible at the figure's size
+_MARKERS = "os^Dvp"  # of groups, so that print without colour can be read
 _MOST_SERIES, _MOST_TICKS = 60, 9  # curves and tick labels: legible at the figure's size
 _LEAST_SHARE, _PROBIT_ROOM = 1e-6, 0.12  # ends of a probit axis, which cannot show 0, and its margin in probits
 _SHARES = (
@@ -253,6 +253,7 @@ def curve_figure(
     dots: Sequence[bool] = (),
     scales: tuple[CurveScale, CurveScale] = ("linear", "linear"),
     diagonal: bool = False,
+    groups: Sequence[int | None] = (),
 ) -> Figure:
     """Draw one measure against another, one line per series.
 
@@ -267,6 +268,7 @@ def curve_figure(
         scales: of places and values; on `probit` shares stand at their normal deviates, and those of 0 and 1 at the
             edge. What is not positive has no place on `log`.
         diagonal: draw where both are the same.
+        groups: for each series the number of its group, which chooses colour and marker; None for its own number.
 
     Raises:
         InputError: no series or too many, one whose lists are empty or of different lengths, or numbers that have no
@@ -286,7 +288,8 @@ def curve_figure(
             raise InputError(
                 f"The band of the curve {short(name)!r} needs {len(x_values)} lower and {len(x_values)} upper ends."
             )
-        curves.append(_Curve(name, x_values, y_values, ends, k < len(dots) and dots[k]))
+        group = groups[k] if k < len(groups) else None
+        curves.append(_Curve(name, x_values, y_values, ends, k < len(dots) and dots[k], k if group is None else group))
     limits = (
         _scale_ends(scales[0], [curve.x for curve in curves]),
         _scale_ends(scales[1], [values for curve in curves for values in (curve.y, *curve.ends)]),
@@ -295,7 +298,9 @@ def curve_figure(
     figure, axes = chart(
         title or f"{plain(y)[:1].upper()}{plain(y)[1:]} against {plain(x)}", height=4.6 if square else 3.3
     )
-    for k, curve in enumerate(curves):
+    has_groups = any(group is not None for group in groups)
+    for curve in curves:
+        k, marker = curve.group, _MARKERS[curve.group % len(_MARKERS)] if has_groups else "o"
         x_values, y_values, *ends = (
             _to_scale(values, scales[axis], limits[axis])
             for axis, values in ((0, curve.x), (1, curve.y), *((1, end) for end in curve.ends))
@@ -304,7 +309,10 @@ def curve_figure(
         if ends:
             axes.fill_between(x_values, ends[0], ends[1], color=colour, alpha=0.2, lw=0)
         if curve.dots:
-            axes.scatter(x_values, y_values, s=16, color=colour, alpha=0.6, linewidths=0, label=label)
+            axes.scatter(
+                x_values, y_values, s=22 if has_groups else 16, marker=marker, color=colour, alpha=0.6, linewidths=0,
+                label=label,
+            )  # fmt: skip
             continue
         dashes = "-" if k < len(CATEGORIES) else (0, (4, 2))
         axes.plot(
@@ -314,7 +322,7 @@ def curve_figure(
             ls=dashes,
             lw=2,
             ms=4,
-            marker="o" if len(x_values) < 40 else "",
+            marker="o" if 2 < len(x_values) < 40 else "",
             label=label,
         )
     axes.margins(y=0.12)
@@ -327,7 +335,7 @@ def curve_figure(
         high = min(axes.get_xlim()[1], axes.get_ylim()[1])
         if low < high:
             axes.plot([low, high], [low, high], color=GREY, ls=(0, (4, 3)), lw=1.3, scalex=False, scaley=False)
-    axes.set(xlabel=escaped(short(x, 70)), ylabel=escaped(wrap(y, 2.4 * DPI, TEXT)))
+    axes.set(xlabel=axis_label(x), ylabel=axis_label(y, 0.4))
     if any(curve.name for curve in curves):
         legend(axes, loc="best")
     return finish(figure)
@@ -340,6 +348,7 @@ class _Curve:
     y: FloatArray
     ends: Sequence[FloatArray]
     dots: bool
+    group: int
 
 
 def _scale_ends(kind: CurveScale, values: Sequence[FloatArray]) -> tuple[float, float]:

@@ -106,11 +106,15 @@ class Page:
 
     def figure(self, figure: Drawing, caption: str, *, alt: str, chart: bool = False) -> Figure:
         """Return a drawing with its caption; `alt` says what is seen in it."""
+        still = self.still(figure, alt, lossless=chart)
+        self.step(caption)
+        return Figure(still, caption, "chart" if chart else "drawing")
+
+    def still(self, figure: Drawing, alt: str, *, lossless: bool = False) -> Image:
+        """Return a drawing as an image of this page, such as the still of something that turns."""
         from shapespace.report.figures import encode_webp
 
-        still = encode_webp(figure, lossless=chart)
-        self.step(caption)
-        return Figure(self.image(still, alt), caption, "chart" if chart else "drawing")
+        return self.image(encode_webp(figure, lossless=lossless), alt)
 
     def image(self, still: Still, alt: str) -> Image:
         """Return a picture as an image of this page."""
@@ -119,7 +123,7 @@ class Page:
 
     def turning(
         self,
-        widget: Literal["modes", "morph", "fit", "scatter"],
+        widget: Literal["modes", "morph", "fit", "scatter", "morphospace"],
         payload: bytes,
         poster: Image,
         caption: str,

@@ -38,7 +38,7 @@ from shapespace.report.pages.study_parts import (
     StudyParts,
     paragraphs,
 )
-from shapespace.schemas import Target, check_format, read, read_part
+from shapespace.schemas import Orientation, Target, check_format, read, read_part
 from shapespace.version import __version__
 
 SECTION_BYTES = 1_500_000
@@ -318,7 +318,12 @@ class _Study:
 
     def part(self, part: object) -> list[Block]:
         """Return a part by its kind."""
-        return self.kinds.blocks(read_part(part, self.parts_file.file, self.parts_file.again), _title(part))
+        from shapespace.report.figures import oriented
+
+        one = read_part(part, self.parts_file.file, self.parts_file.again)
+        known = self.content.get("orientation") is not None
+        with oriented(self._read("orientation", Orientation) if known else None):
+            return self.kinds.blocks(one, _title(part))
 
     def settings(self) -> list[Block]:
         """Return with what the study was made."""

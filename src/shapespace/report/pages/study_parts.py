@@ -23,8 +23,10 @@ from shapespace.schemas import (
     CalibrationPart,
     ConfusionPart,
     CurvePart,
+    DeformationPart,
     HistogramPart,
     LearningCurvePart,
+    MorphospacePart,
     MorphPart,
     Part,
     Recognition,
@@ -96,6 +98,8 @@ TITLES = {
     "surface_map": "Map",
     "morph": "From one shape to the other",
     "histogram": "Spread",
+    "morphospace": "Morphospace",
+    "deformation": "Deformation",
     "text": "Notes",
 }
 """Of parts without one, by kind."""
@@ -224,6 +228,7 @@ class StudyParts:
             [(one.label, one.x, one.y) for one in part.series], x=x, y=y,
             bands=[None if low is None or high is None else (_known(low), _known(high)) for low, high in ends],
             dots=[one.points for one in part.series], scales=(part.x_scale, part.y_scale), diagonal=part.diagonal,
+            groups=[one.group for one in part.series],
         )  # fmt: skip
         ranges = [
             f"{one.label or y} from {one.y[0]:.3g} at {one.x[0]:g} to {one.y[-1]:.3g} at {one.x[-1]:g}"
@@ -270,17 +275,34 @@ class StudyParts:
         turn, _ = figures.upright_views(first)
         both = first.with_vertices(first.vertices @ turn.T), last.with_vertices(last.vertices @ turn.T)
         labels = part.low_label or "low", part.high_label or "high"
-        still = figures.encode_webp(figures.morph_figure(*both, labels, title=None))
         alt = f"{title}: {labels[0]}, and {labels[1]}"
-        times = ""
-        if part.times != 1:
-            times = f" The difference is drawn {part.times:g} times as large as it is."
+        still = self.page.still(figures.morph_figure(first, last, labels, title=None), alt)
         turning = self.page.turning(
-            "morph", pack_morph(*both, labels), self.page.image(still, alt),
-            f"{note or f'From {labels[0]} to {labels[1]}.'}{times}",
+            "morph", pack_morph(*both, labels), still,
+            f"{note or f'From {labels[0]} to {labels[1]}.'}{_times_sentence(part.times)}",
             label=alt, still="The still shows both, from the front and from the side.",
         )  # fmt: skip
         return [turning]
+
+    def deformation(self, part: DeformationPart, title: str, note: str) -> list[Block]:
+        """Return two configurations of landmarks as deformation grids, or as vectors."""
+        from shapespace.report import figures
+
+        low, high = (
+            self._mesh(one, np.zeros((0, 3), np.intp)).vertices
+            for one in self._arrays(part.arrays, (part.low, part.high))
+        )
+        if low.shape != high.shape:
+            raise self.parts_file.damaged("two configurations have different numbers of landmarks")
+        labels = part.low_label or "low", part.high_label or "high"
+        if part.drawing == "grid":
+            figure = figures.deformation_grid_figure(low, high, labels)
+            about = f"Thin-plate splines from the mean of both to {labels[0]} and to {labels[1]}."
+        else:
+            figure = figures.landmark_vectors_figure(low, high, labels)
+            about = f"Each arrow leads from a landmark of {labels[0]} to its place in {labels[1]}."
+        caption = f"{note} {about}{_times_sentence(part.times)}".strip()
+        return [self.page.figure(figure, caption, alt=f"{title}: {about}", chart=True)]
 
     def histogram(self, part: HistogramPart, title: str, note: str) -> list[Block]:
         """Return a histogram."""
@@ -296,6 +318,23 @@ class StudyParts:
             about += f" Dashed line: {part.observed_label or 'observed'}, {part.observed:.3g}."
         alt = f"Histogram of {part.x} from {part.edges[0]:.3g} to {part.edges[-1]:.3g}. {about}"
         return [self.drawn((figure, about, alt), note)]
+
+    def morphospace(self, part: MorphospacePart, title: str, note: str) -> list[Block]:
+        """Return the plane of two axes of an ordination, in which a click draws the shape at that place."""
+        from shapespace.report import figures
+        from shapespace.report.render.scene import pack_morphospace
+
+        space = figures.Morphospace.of(part, self.folder.arrays(part.arrays), self.parts_file.damaged)
+        across, up = (space.labels[k] for k in part.first)
+        groups = f" in {counted(len(part.groups), 'group')} of {part.variable}" if part.groups else ""
+        alt = f"{title}: {counted(len(part.names), 'shape')}{groups} on {across} and {up}"
+        still = self.page.still(figures.morphospace_figure(space), alt, lossless=True)
+        turning = self.page.turning(
+            "morphospace", pack_morphospace(space), still,
+            note or "Shapes in the plane of two axes; choose a place to draw the shape there beside the mean.",
+            label=alt, still="The still shows the mean and the shapes at the ends of both axes.",
+        )  # fmt: skip
+        return [turning]
 
     def _arrays(self, name: str, names: Sequence[str]) -> list[npt.NDArray[Any]]:
         """Return arrays of a file by their names."""
@@ -322,6 +361,10 @@ _MAKERS: Mapping[type[Part], Callable[[StudyParts, Any, str, str], list[Block]]]
 def paragraphs(text: str | tuple[str, ...]) -> list[Block]:
     """Return sentences as paragraphs."""
     return [Text(sentence) for sentence in ((text,) if isinstance(text, str) else text)[:MOST_ROWS]]
+
+
+def _times_sentence(times: float) -> str:
+    return "" if times == 1 else f" The difference is drawn {times:g} times as large as it is."
 
 
 def _known(values: Sequence[float | None]) -> list[float]:

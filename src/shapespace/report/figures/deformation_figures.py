@@ -1,0 +1,139 @@
+"""Figures of the difference of two configurations of landmarks: deformation grids and vectors."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+
+from shapespace.errors import InputError
+from shapespace.geometry.thin_plate_spline import ThinPlateSpline
+from shapespace.report.figures.analysis_figures import current_orientation
+from shapespace.report.figures.draw import DPI, INK, LAYOUT, TEXT, charts, escaped, finish, short, type_size
+from shapespace.report.inputs.orientation import view_rotation
+from shapespace.report.render.palette import CATEGORIES
+from shapespace.types import FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_CELLS = 20  # cells of a grid along its longer side: deformations of a tenth of the shape are seen
+_POINTS_OF_CELL = 5  # points of a grid line in each cell, so that bent lines look smooth
+_MARGIN = 0.12  # of the longer side, around the landmarks
+_GRID = "#8d96a3"  # lines of a grid and links, paler than landmarks
+_MOST_INCHES = 4.0  # of the height of a panel
+_THREE_SIDES = (
+    ("front", np.eye(3)),
+    ("side", np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])),
+    ("top", np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])),
+)
+
+
+def deformation_grid_figure(low: FloatArray, high: FloatArray, labels: tuple[str, str]) -> Figure:
+    """Draw two planar configurations as thin-plate splines of a square grid on their mean.
+
+    Args:
+        low: (L, 2 or 3) one configuration; of three coordinates the third is the same everywhere.
+        high: (L, 2 or 3) the other.
+        labels: what they are.
+
+    Raises:
+        InputError: landmarks that are not planar, or that lie on a line.
+    """
+    if low.shape[1] == 3 and np.ptp(np.stack([low, high])[:, :, 2]) > 0:
+        raise InputError("A deformation grid needs planar landmarks; draw vectors of three-dimensional ones.")
+    low, high = (_turned(ends, _first_rotation())[:, :2] for ends in (low, high))
+    mean = (low + high) / 2
+    lines = _grid_lines(mean)
+    panels = [
+        (short(label, 30), ThinPlateSpline.fit(mean, end), end) for label, end in zip(labels, (low, high), strict=True)
+    ]
+    warped = [spline.apply(lines.reshape(-1, 2)).reshape(lines.shape) for _, spline, _ in panels]
+    figure, plots = _panels([label for label, _, _ in panels], np.concatenate([one.reshape(-1, 2) for one in warped]))
+    for axes, grid, (_, _, end) in zip(plots, warped, panels, strict=True):
+        axes.add_collection(LineCollection(list(grid), colors=_GRID, linewidths=0.9, zorder=1))
+        _draw_links(axes, end, INK)
+        axes.scatter(*end.T, s=30, color=INK, linewidths=0, zorder=3)
+    return finish(figure, w_pad=0.6)
+
+
+def landmark_vectors_figure(low: FloatArray, high: FloatArray, labels: tuple[str, str]) -> Figure:
+    """Draw each landmark of one configuration with an arrow to its place in the other.
+
+    Three-dimensional landmarks are drawn in the named views of the orientation, or from the front, the side and the
+    top.
+
+    Args:
+        low: (L, 2 or 3) where the arrows start.
+        high: (L, 2 or 3) where they end.
+        labels: what the configurations are.
+    """
+    both = np.stack([low, high])
+    is_planar = both.shape[2] == 2 or np.ptp(both[:, :, 2]) == 0
+    named = [(one.name, view_rotation(one)) for one in current_orientation().views]
+    views = [(" → ".join(map(short, labels)), _first_rotation())] if is_planar else named[:4] or list(_THREE_SIDES)
+    placed = [np.stack([_turned(end, turn)[:, :2] for end in both]) for _, turn in views]
+    centred = [one - (one.reshape(-1, 2).max(axis=0) + one.reshape(-1, 2).min(axis=0)) / 2 for one in placed]
+    figure, plots = _panels([name for name, _ in views], np.concatenate([one.reshape(-1, 2) for one in centred]))
+    for axes, (start, end) in zip(plots, centred, strict=True):
+        _draw_links(axes, start, _GRID)
+        axes.scatter(*start.T, s=24, color=CATEGORIES[0], linewidths=0, zorder=2)
+        axes.quiver(
+            *start.T, *(end - start).T, angles="xy", scale_units="xy", scale=1, color=CATEGORIES[1], zorder=3,
+            width=0.02 * LAYOUT.get().scale, units="inches", headwidth=4.5, headlength=5, headaxislength=4.5,
+        )  # fmt: skip
+    return finish(figure, w_pad=0.6)
+
+
+def _first_rotation() -> FloatArray:
+    views = current_orientation().views
+    return view_rotation(views[0]) if views else np.eye(3)
+
+
+def _turned(points: FloatArray, rotation: FloatArray) -> FloatArray:
+    size = points.shape[1]
+    return points @ rotation[:size, :size].T
+
+
+def _grid_lines(points: FloatArray) -> FloatArray:
+    """Return the lines (n, m, 2) of a square grid around points (L, 2), each a row of m points."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    longest = float((high - low).max())
+    low, high = low - _MARGIN * longest, high + _MARGIN * longest
+    step = float((high - low).max()) / _CELLS
+    counts = np.maximum(np.rint((high - low) / step), 1).astype(int)
+    centre, m = (low + high) / 2, _CELLS * _POINTS_OF_CELL + 1
+    lines: list[FloatArray] = []
+    for axis in (0, 1):
+        half = counts * step / 2
+        for place in np.linspace(-half[axis], half[axis], counts[axis] + 1):
+            line = np.empty((m, 2))
+            line[:, axis], line[:, 1 - axis] = place, np.linspace(-half[1 - axis], half[1 - axis], m)
+            lines.append(centre + line)
+    return np.stack(lines)
+
+
+def _panels(names: list[str], points: FloatArray) -> tuple[Figure, list[Axes]]:
+    """Return a figure with a panel for each name, all of them with one scale, in which points (n, 2) fit."""
+    layout, columns = LAYOUT.get(), len(names)
+    low, high = points.min(axis=0), points.max(axis=0)
+    room = 0.04 * float((high - low).max())
+    width = (layout.chart_width if columns == 1 else layout.row_width) / columns / DPI
+    aspect = float(high[1] - low[1] + 2 * room) / float(high[0] - low[0] + 2 * room)
+    height = min(width * aspect, _MOST_INCHES * layout.scale) + 1.6 * type_size(TEXT) / 72 * any(names)
+    figure, plots = charts("", [height / layout.scale], columns=columns)
+    for axes, name in zip(plots, names, strict=True):
+        axes.set(xlim=(low[0] - room, high[0] + room), ylim=(low[1] - room, high[1] + room), aspect="equal")
+        axes.set_axis_off()
+        if name:
+            axes.set_title(escaped(name), fontsize=type_size(TEXT), color=INK, pad=3)
+    return figure, plots
+
+
+def _draw_links(axes: Axes, points: FloatArray, colour: str) -> None:
+    links = np.array(current_orientation().links, dtype=int).reshape(-1, 2) - 1
+    if links.max(initial=-1) >= len(points):
+        raise InputError(f"A link of the orientation has landmark {links.max() + 1}, but there are {len(points)}.")
+    axes.add_collection(LineCollection(list(points[links]), colors=colour, linewidths=1.6, zorder=2))
