@@ -165,7 +165,7 @@ class Turning:
         still: what the still shows, printed with it alone.
     """
 
-    widget: Literal["modes", "morph", "fit", "scatter"]
+    widget: Literal["modes", "morph", "fit", "scatter", "morphospace"]
     payload: str
     poster: Image
     caption: str

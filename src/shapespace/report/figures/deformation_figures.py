@@ -46,7 +46,7 @@ def deformation_grid_figure(low: FloatArray, high: FloatArray, labels: tuple[str
         raise InputError("A deformation grid needs planar landmarks; draw vectors of three-dimensional ones.")
     low, high = (_turned(ends, _first_rotation())[:, :2] for ends in (low, high))
     mean = (low + high) / 2
-    lines = _grid_lines(mean)
+    lines = grid_lines(mean)
     panels = [
         (short(label, 30), ThinPlateSpline.fit(mean, end), end) for label, end in zip(labels, (low, high), strict=True)
     ]
@@ -54,7 +54,7 @@ def deformation_grid_figure(low: FloatArray, high: FloatArray, labels: tuple[str
     figure, plots = _panels([label for label, _, _ in panels], np.concatenate([one.reshape(-1, 2) for one in warped]))
     for axes, grid, (_, _, end) in zip(plots, warped, panels, strict=True):
         axes.add_collection(LineCollection(list(grid), colors=_GRID, linewidths=0.9, zorder=1))
-        _draw_links(axes, end, INK)
+        draw_links(axes, end, INK)
         axes.scatter(*end.T, s=30, color=INK, linewidths=0, zorder=3)
     return finish(figure, w_pad=0.6)
 
@@ -78,7 +78,7 @@ def landmark_vectors_figure(low: FloatArray, high: FloatArray, labels: tuple[str
     centred = [one - (one.reshape(-1, 2).max(axis=0) + one.reshape(-1, 2).min(axis=0)) / 2 for one in placed]
     figure, plots = _panels([name for name, _ in views], np.concatenate([one.reshape(-1, 2) for one in centred]))
     for axes, (start, end) in zip(plots, centred, strict=True):
-        _draw_links(axes, start, _GRID)
+        draw_links(axes, start, _GRID)
         axes.scatter(*start.T, s=24, color=CATEGORIES[0], linewidths=0, zorder=2)
         axes.quiver(
             *start.T, *(end - start).T, angles="xy", scale_units="xy", scale=1, color=CATEGORIES[1], zorder=3,
@@ -97,7 +97,7 @@ def _turned(points: FloatArray, rotation: FloatArray) -> FloatArray:
     return points @ rotation[:size, :size].T
 
 
-def _grid_lines(points: FloatArray) -> FloatArray:
+def grid_lines(points: FloatArray) -> FloatArray:
     """Return the lines (n, m, 2) of a square grid around points (L, 2), each a row of m points."""
     low, high = points.min(axis=0), points.max(axis=0)
     longest = float((high - low).max())
@@ -132,7 +132,12 @@ def _panels(names: list[str], points: FloatArray) -> tuple[Figure, list[Axes]]:
     return figure, plots
 
 
-def _draw_links(axes: Axes, points: FloatArray, colour: str) -> None:
+def draw_links(axes: Axes, points: FloatArray, colour: str) -> None:
+    """Draw the links of the orientation between landmarks (L, 2).
+
+    Raises:
+        InputError: a link of a landmark that does not exist.
+    """
     links = np.array(current_orientation().links, dtype=int).reshape(-1, 2) - 1
     if links.max(initial=-1) >= len(points):
         raise InputError(f"A link of the orientation has landmark {links.max() + 1}, but there are {len(points)}.")

@@ -28,6 +28,7 @@ from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 
 if TYPE_CHECKING:
     from shapespace.model.shape_model import ShapeModel
+    from shapespace.report.figures.morphospace_figures import Morphospace
 
 SCRIPTS = ("vendor/three.min.js", "scene.js", "widgets.js")
 """The scripts of `assets` that a page with scenes needs, in this order; the colours come before the last."""
@@ -198,6 +199,39 @@ def pack_morph(low: Mesh, high: Mesh, labels: tuple[str, str], *, largest: int =
     if mesh.faces is not None:
         arrays["faces"] = _indices(mesh.faces, len(mesh.vertices), coded=True)
     return pack(arrays, {"kind": "morph", "low": labels[0], "high": labels[1]})
+
+
+def pack_morphospace(space: Morphospace, *, largest: int = 12_000) -> bytes:
+    """Return the data of the morphospace widget: a shape model whose modes are the axes, and the scores of shapes.
+
+    Arrays: `mean` (V, 3); `faces`, absent for landmarks; `modes` (A, V, 3) quantised, change per unit of score;
+    `scores` (N, A), perhaps `cross_validated` (N, A); `codes` (N,) of groups; `nodes` (M, A) and `edges` (E, 2).
+
+    Args:
+        space: the plot.
+        largest: how many triangles of a surface are kept.
+    """
+    from shapespace.report.figures.analysis_figures import current_orientation
+
+    part, mesh, rows = space.part, Mesh(space.mean, space.faces), np.arange(len(space.mean))
+    if space.faces is not None:
+        mesh, rows = _decimate(mesh, largest)
+    extent = float(np.ptp(mesh.vertices, axis=0).max())
+    arrays: dict[str, npt.NDArray[Any] | Steps] = {
+        "mean": quantise(mesh.vertices, step=extent / 16000, coded=True),
+        "modes": quantise(space.shape_axes[:, rows], by_row=True, coded=True),
+        "scores": space.scores, "codes": space.codes.astype(np.int32), "nodes": space.nodes, "edges": space.edges,
+    }  # fmt: skip
+    if mesh.faces is not None:
+        arrays["faces"] = _indices(mesh.faces, len(mesh.vertices), coded=True)
+    if space.cross_validated is not None:
+        arrays["cross_validated"] = space.cross_validated
+    return pack(arrays, {
+        "kind": "morphospace", "names": part.names, "axes": part.axes, "labels": space.labels, "first": part.first,
+        "groups": part.groups, "variable": part.variable, "radii": space.radii.tolist(), "planar": space.is_planar,
+        "grid": space.grid, "landmarks": space.n_landmarks, "unit": part.unit,
+        "links": [[a - 1, b - 1] for a, b in current_orientation().links if max(a, b) <= space.n_landmarks],
+    })  # fmt: skip
 
 
 def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: int | None = None) -> bytes:

@@ -1,0 +1,356 @@
+"""Ordination of shapes: principal components, between-group and phylogenetic components, canonical variates.
+
+Equations Mn are those of docs/morphometrics.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.cohort.cohort import Cohort
+from shapespace.errors import InputError
+from shapespace.reprs import short_repr
+from shapespace.statistics.shape_tests.permutations import Groups
+from shapespace.types import FloatArray, IntArray
+
+OrdinationMethod: TypeAlias = Literal["pca", "between-groups", "cva", "phylogenetic-pca", "paca"]
+AXIS_NAMES = {"pca": "PC", "between-groups": "bgPC", "cva": "CV", "phylogenetic-pca": "pPC", "paca": "PAC"}
+"""Prefix of the number of an axis, by method."""
+_RANK = 1e-9  # relative to the largest singular value: smaller ones are rounding
+_MOST_VARIANCE = 0.95
+"""Share of the variance that the default number of components keeps where the within-group covariance is singular."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Ordination:
+    """Shapes as scores on the axes of an ordination.
+
+    Args:
+        method: how the axes were chosen.
+        cohort: the shapes that were used.
+        axes: (A, K) scores are (coefficients - centre) axes^T.
+        shape_axes: (A, K) change of the coefficients per unit of score; equal to `axes` where these are orthonormal.
+        centre: (K,) coefficients of the shape at the origin.
+        scores: (N, A).
+        eigenvalues: (A,) variance of the scores of principal components; variance of the group means of between-group
+            components; F of canonical variates; squared standard deviation of phylogenetic axes.
+        groups: of the shapes; None without a variable.
+        variable: name of that variable.
+        cross_validated: (N, A) scores of each shape on the axes of the others; None without.
+        predicted: (N,) group of each shape by the axes of the others; None without.
+        components: principal components that canonical variates are combinations of; None if all are used.
+        ancestors: (M, A) scores of the internal nodes of a tree; None without.
+        edges: (E, 2) parent and child of each branch: shapes from 0, internal nodes from N; None without.
+        notes: sentences on the method.
+    """
+
+    method: OrdinationMethod
+    cohort: Cohort
+    axes: FloatArray
+    shape_axes: FloatArray
+    centre: FloatArray
+    scores: FloatArray
+    eigenvalues: FloatArray
+    groups: Groups | None = None
+    variable: str = ""
+    cross_validated: FloatArray | None = None
+    predicted: IntArray | None = None
+    components: int | None = None
+    ancestors: FloatArray | None = None
+    edges: IntArray | None = None
+    notes: tuple[str, ...] = ()
+
+    __repr__ = short_repr
+
+    @property
+    def explained_variance_ratio(self) -> FloatArray:
+        """(A,) share of each eigenvalue in their sum."""
+        return self.eigenvalues / self.eigenvalues.sum()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the A axes."""
+        return tuple(f"{AXIS_NAMES[self.method]}{k + 1}" for k in range(len(self.axes)))
+
+    def group_share(self, scores: FloatArray) -> float:
+        """Return the share of the variance of scores (N, A) that lies between the groups (R²).
+
+        Raises:
+            InputError: there are no groups.
+        """
+        if self.groups is None:
+            raise InputError("There are no groups, so there is no share of variance between them; give a column.")
+        centred = scores - scores.mean(axis=0)
+        means = group_means(centred, self.groups)
+        return float(self.groups.counts @ (means**2).sum(axis=1) / (centred**2).sum())
+
+
+_Make: TypeAlias = Callable[..., Ordination]
+
+
+def ordinate(
+    cohort: Cohort,
+    *,
+    method: OrdinationMethod = "pca",
+    group: tuple[str, ...] = (),
+    tree: Path | None = None,
+    components: int | None = None,
+    drop_missing: bool = False,
+) -> Ordination:
+    """Compute an ordination of shapes.
+
+    Args:
+        cohort: the shapes.
+        method: `pca`: principal components; `between-groups`: principal components of the group means; `cva`:
+            canonical variates; `phylogenetic-pca`: principal components about the phylogenetic mean; `paca`:
+            phylogenetically aligned components.
+        group: columns whose classes, or combinations of classes, are the groups.
+        tree: phylogeny (Newick or Nexus) whose tips are the shapes; drawn into the plot of principal components.
+        components: number of principal components that cva uses (default: all, or where there are too many of them
+            for the shapes, those of 95 % of the variance, at most half of the shapes minus the groups).
+        drop_missing: exclude shapes with missing values in the table (default: an error).
+
+    Raises:
+        InputError: no groups or no tree for a method that needs them, fewer than three shapes, shapes that do not
+            differ, or a within-group covariance that is singular.
+    """
+    cohort = cohort.complete(group, drop_missing=drop_missing)
+    if len(cohort) < 3:
+        raise InputError(f"An ordination needs three or more shapes, not {len(cohort)}; add shapes.")
+    needs_groups = method in ("between-groups", "cva")
+    if needs_groups and not group:
+        raise InputError(f"The method {method} needs groups; name a column of the table with --group.")
+    if method in ("phylogenetic-pca", "paca") and tree is None:
+        raise InputError(f"The method {method} needs a phylogeny; name a Newick or Nexus file with --tree.")
+    if components is not None and method != "cva":
+        raise InputError("A number of components applies to the method cva alone; leave out --components.")
+    groups = Groups.of(cohort, group, least=2 if needs_groups else 1, why=method) if group else None
+    make: _Make = partial(Ordination, method=method, cohort=cohort, groups=groups, variable=" × ".join(group))
+    if tree is not None:
+        if needs_groups:
+            raise InputError(f"A phylogeny is not drawn into {method}; leave out --tree, or take the method pca.")
+        return _phylogenetic(cohort, tree, method, make)
+    if method == "between-groups" and groups is not None:
+        return _between_groups(cohort.coefficients, groups, make)
+    if method == "cva" and groups is not None:
+        return _canonical(cohort.coefficients, groups, components, make)
+    centre, axes, values = principal_components(cohort.coefficients)
+    scores = (cohort.coefficients - centre) @ axes.T
+    return make(axes=axes, shape_axes=axes, centre=centre, scores=scores, eigenvalues=values)
+
+
+def principal_components(coefficients: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the mean (K,), the orthonormal axes (A, K) and the variances (A,) of coefficients (N, K).
+
+    The sign of each axis makes the score of largest magnitude positive.
+
+    Raises:
+        InputError: the shapes do not differ.
+    """
+    # M13
+    centre = coefficients.mean(axis=0)
+    u, s, vt = np.linalg.svd(coefficients - centre, full_matrices=False)
+    known = s > _RANK * max(s[0], np.finfo(np.float64).tiny)
+    if not known.any():
+        raise InputError("All shapes are equal, so there are no principal components; check the data.")
+    return centre, _signed(u[:, known] * s[known], vt[known]), s[known] ** 2 / (len(coefficients) - 1)
+
+
+def group_means(values: FloatArray, groups: Groups) -> FloatArray:
+    """Return the (G, K) means of values (N, K)."""
+    return (groups.indicator / groups.counts).T @ values
+
+
+def _between_axes(means: FloatArray, counts: npt.NDArray[np.intp]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the centre (K,), axes (A, K) and sums of squares (A,) of group means (G, K), weighted by group size."""
+    # M14
+    centre = counts @ means / counts.sum()
+    _, s, vt = np.linalg.svd(np.sqrt(counts)[:, None] * (means - centre), full_matrices=False)
+    n_axes = min(len(counts) - 1, len(s))
+    return centre, vt[:n_axes], s[:n_axes] ** 2
+
+
+def _between_groups(coefficients: FloatArray, groups: Groups, make: _Make) -> Ordination:
+    n, counts, codes = len(coefficients), groups.counts, groups.codes
+    means = group_means(coefficients, groups)
+    centre, axes, squares = _between_axes(means, counts)
+    if squares[0] <= (_RANK**2) * float(((coefficients - centre) ** 2).sum()):
+        raise InputError("The means of the groups are equal, so there are no between-group components.")
+    axes = axes[squares > _RANK**2 * squares[0]]
+    axes, squares = _signed((coefficients - centre) @ axes.T, axes), squares[: len(axes)]
+    validated = np.empty((n, len(axes)))
+    predicted = np.empty(n, dtype=np.int32)
+    # M15
+    for k, (shape, code) in enumerate(zip(coefficients, codes, strict=True)):
+        others, sizes = means.copy(), counts.copy()
+        sizes[code] -= 1
+        others[code] = (counts[code] * means[code] - shape) / sizes[code]
+        middle, own, _ = _between_axes(others, sizes)
+        validated[k] = (shape - middle) @ own.T @ _rotation(own @ axes.T)
+        predicted[k] = np.linalg.norm((others - shape) @ own.T, axis=1).argmin()
+    return make(
+        axes=axes, shape_axes=axes, centre=centre, scores=(coefficients - centre) @ axes.T,
+        eigenvalues=squares / (n - 1), cross_validated=validated, predicted=predicted,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class CanonicalVariates:
+    """Canonical variates of groups, as `lda` of the R package MASS.
+
+    Args:
+        weights: (K, A) scores are (coefficients - centre) weights; their pooled within-group covariance, with the
+            divisor N - G, is the identity.
+        shape_axes: (A, K) change of the coefficients per unit of score: covariance within groups times `weights`.
+        centre: (K,) mean of all shapes.
+        eigenvalues: (A,) variance between groups (divisor G - 1) of the scores, whose variance within groups is 1.
+        whitened: (N, P) coefficients with the identity as pooled within-group covariance.
+        means: (G, P) means of the groups in these.
+        rotation: (P, A) whitened coefficients, centred, to scores.
+        n_components: number of principal components used, P.
+        is_reduced: whether there are more.
+    """
+
+    weights: FloatArray
+    shape_axes: FloatArray
+    centre: FloatArray
+    eigenvalues: FloatArray
+    whitened: FloatArray
+    means: FloatArray
+    rotation: FloatArray
+    n_components: int
+    is_reduced: bool
+
+
+def canonical_variates(coefficients: FloatArray, groups: Groups, components: int | None = None) -> CanonicalVariates:
+    """Return the canonical variates of groups of shapes.
+
+    Args:
+        coefficients: (N, K) of the shapes.
+        groups: two or more shapes of each.
+        components: number of principal components; None for all, or where the covariance within groups would be
+            singular, for those of 95 % of the variance, at most half of N - G.
+
+    Raises:
+        InputError: more components than the shapes have or N - G - 1, which leaves the covariance within groups
+            singular for the cross-validation, or no variation within groups.
+    """
+    n, n_groups = len(coefficients), len(groups.names)
+    centre, axes, variances = principal_components(coefficients)
+    most = n - n_groups - 1
+    if components is None:
+        components = len(axes)
+        if components > most:
+            share = np.cumsum(variances) / variances.sum()
+            components = min(int(np.searchsorted(share, _MOST_VARIANCE)) + 1, max((n - n_groups) // 2, 1))
+    if not 1 <= components <= min(len(axes), most):
+        raise InputError(
+            f"The covariance within groups of {n} shapes in {n_groups} groups is singular with {components} principal "
+            f"components; take 1 to {min(len(axes), most)}, or add shapes."
+            if most >= 1 else f"Canonical variates of {n_groups} groups need more than {n_groups + 1} shapes, not {n}."
+        )  # fmt: skip
+    axes = axes[:components]
+    values = (coefficients - centre) @ axes.T
+    residual = values - group_means(values, groups)[groups.codes]
+    # M16
+    _, s, vt = np.linalg.svd(residual, full_matrices=False)
+    if s[-1] <= _RANK * s[0] or s[0] <= _RANK * np.linalg.norm(values):
+        raise InputError(
+            f"The covariance within groups is singular: in some direction of the {components} principal components "
+            "the shapes of each group are equal; take fewer with --components."
+        )
+    spread = s / np.sqrt(n - n_groups)
+    whitening = vt.T / spread
+    whitened = values @ whitening
+    means = group_means(whitened, groups)
+    _, rotation, squares = _between_axes(means, groups.counts)
+    rotation = _signed(whitened @ rotation.T, rotation).T
+    return CanonicalVariates(
+        weights=axes.T @ whitening @ rotation, shape_axes=(rotation.T * spread) @ vt @ axes, centre=centre,
+        eigenvalues=squares / (n_groups - 1), whitened=whitened, means=means, rotation=rotation,
+        n_components=components, is_reduced=components < len(variances),
+    )  # fmt: skip
+
+
+def leave_one_out_classes(variates: CanonicalVariates, groups: Groups) -> IntArray:
+    """Return the (N,) group of each shape by the linear discriminants of the other shapes.
+
+    The prior probabilities are the group sizes, as of `lda(CV = TRUE)` of the R package MASS. Principal components,
+    which do not depend on the groups, are those of all shapes.
+    """
+    # M17
+    n, n_groups = len(variates.whitened), len(groups.names)
+    residual = variates.whitened - variates.means[groups.codes]
+    counts = groups.counts[groups.codes]
+    factor = counts / ((counts - 1) * (n - n_groups))
+    gain = factor / (1 - factor * (residual**2).sum(axis=1))
+    distances = np.empty((n, n_groups))
+    for g in range(n_groups):
+        own = groups.codes == g
+        away = np.where(
+            own[:, None], residual * (counts / (counts - 1))[:, None], variates.whitened - variates.means[g]
+        )
+        distances[:, g] = (away**2).sum(axis=1) + gain * (away * residual).sum(axis=1) ** 2
+    distances *= (n - 1 - n_groups) / (n - n_groups)
+    return (np.log(groups.counts / n) - distances / 2).argmax(axis=1).astype(np.int32)
+
+
+def _canonical(coefficients: FloatArray, groups: Groups, components: int | None, make: _Make) -> Ordination:
+    variates = canonical_variates(coefficients, groups, components)
+    n, n_groups, whitened = len(coefficients), len(groups.names), variates.whitened
+    validated = np.empty((n, len(variates.eigenvalues)))
+    for k, code in enumerate(groups.codes):
+        sizes, others = groups.counts.copy(), variates.means.copy()
+        sizes[code] -= 1
+        residual = whitened[k] - others[code]
+        others[code] -= residual / sizes[code]
+        # Whitening by the covariance within groups without this shape, a change of rank one.
+        length = residual @ residual
+        lost = length * groups.counts[code] / (sizes[code] * (n - n_groups))
+        scale = np.sqrt((n - 1 - n_groups) / (n - n_groups))
+        change = (1 / np.sqrt(1 - lost) - 1) / max(length, np.finfo(np.float64).tiny)
+        rows = np.vstack([others, whitened[k]])
+        rows = scale * (rows + change * np.outer(rows @ residual, residual))
+        middle, own, _ = _between_axes(rows[:-1], sizes)
+        validated[k] = (rows[-1] - middle) @ own.T @ _rotation(own @ variates.rotation)
+    note = (
+        f"Canonical variates are of the first {variates.n_components} principal components, since the covariance "
+        "within groups is singular with all of them." if variates.is_reduced and components is None else ""
+    )  # fmt: skip
+    return make(
+        axes=variates.weights.T, shape_axes=variates.shape_axes, centre=variates.centre,
+        scores=(coefficients - variates.centre) @ variates.weights, eigenvalues=variates.eigenvalues,
+        cross_validated=validated, predicted=leave_one_out_classes(variates, groups),
+        components=variates.n_components if variates.is_reduced else None, notes=(note,) if note else (),
+    )  # fmt: skip
+
+
+def _phylogenetic(cohort: Cohort, path: Path, method: str, make: _Make) -> Ordination:
+    from shapespace.io.trees import read_tree
+    from shapespace.statistics.shape_tests.phylogenetic import PhylogeneticMethod, phylogenetic_axes
+
+    kinds: dict[str, PhylogeneticMethod] = {"pca": "phylomorphospace", "phylogenetic-pca": "ppca", "paca": "paca"}
+    found = phylogenetic_axes(cohort, read_tree(path), kinds[method])
+    return make(
+        axes=found.directions.T, shape_axes=found.directions.T, centre=found.mean, scores=found.scores,
+        eigenvalues=found.deviations**2, ancestors=found.ancestors, edges=found.tree.edges, notes=found.tree.notes,
+    )  # fmt: skip
+
+
+def _signed(scores: FloatArray, axes: FloatArray) -> FloatArray:
+    """Return axes (A, K) whose score (N, A) of largest magnitude is positive."""
+    largest = scores[np.abs(scores).argmax(axis=0), np.arange(len(axes))]
+    return np.where(largest < 0, -1.0, 1.0)[:, None] * axes
+
+
+def _rotation(overlap: FloatArray) -> FloatArray:
+    """Return the rotation (A', A) of axes onto others, from their products (A', A)."""
+    u, _, vt = np.linalg.svd(overlap, full_matrices=False)
+    return u @ vt
