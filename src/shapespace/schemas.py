@@ -928,9 +928,11 @@ class Methods(Struct, frozen=True, kw_only=True):
     Args:
         subjects: number of subjects.
         shapes: number of shapes.
-        vertices: number of vertices of a shape.
+        vertices: number of vertices, or landmarks, of a shape.
+        coordinates: of a vertex: 2 or 3.
         gauge: `shape` divides size out, `form` keeps it.
-        source: of the shapes: coefficients, fitted, dense, corresponding, or other surfaces.
+        tangent: whether the shapes lie in the tangent space at their mean.
+        source: of the shapes: coefficients, fitted, dense, corresponding, other surfaces, or landmarks.
         modes: of the model that the shapes are combinations of; None where they are not limited to modes.
         explained_variance_ratio: share of the model's training variance in these modes; None as for `modes`.
         dimensions: of the space that is analysed; None where maps of vertices are.
@@ -951,7 +953,9 @@ class Methods(Struct, frozen=True, kw_only=True):
     subjects: int
     shapes: int
     vertices: int
+    coordinates: Literal[2, 3] = 3
     gauge: str = "shape"
+    tangent: bool = False
     source: str = "surfaces"
     modes: int | None = None
     explained_variance_ratio: float | None = None
@@ -995,6 +999,49 @@ class Orientation(Struct, frozen=True, kw_only=True):
 
     views: tuple[NamedView, ...] = ()
     links: tuple[tuple[int, int], ...] = ()
+
+
+class AlignFinding(Struct, frozen=True, kw_only=True):
+    """A specimen to check after the alignment of landmarks; the fields are those of `LandmarkFinding`."""
+
+    specimen: str
+    reason: Literal["outlier", "swapped", "mirrored"]
+    value: float
+    landmarks: tuple[str, ...] = ()
+
+
+class AlignRecord(Struct, frozen=True, kw_only=True):
+    """An align.json: the alignment of landmarks whose coordinates are in aligned.csv beside it.
+
+    Args:
+        source: the landmark file or folder.
+        specimens: their number.
+        landmarks: their number.
+        dimensions: 2 or 3.
+        unit: of centroid sizes: `mm`, or empty.
+        gauge: `shape` (unit centroid size) or `form`.
+        settings: further options, and the numbers of semilandmarks.
+        estimated: number of landmarks that are estimates.
+        iterations: of generalised Procrustes analysis.
+        converged: whether its criterion was met.
+        findings: specimens to check.
+        notes: a sentence each.
+        version: of shapespace.
+    """
+
+    source: str = ""
+    specimens: int
+    landmarks: int
+    dimensions: Literal[2, 3]
+    unit: Literal["mm", ""] = ""
+    gauge: Literal["form", "shape"]
+    settings: Mapping[str, Any] = {}
+    estimated: int = 0
+    iterations: int = 0
+    converged: bool = True
+    findings: tuple[AlignFinding, ...] = ()
+    notes: tuple[str, ...] = ()
+    version: str = ""
 
 
 class Analysis(Recognition, frozen=True, kw_only=True):

@@ -12,12 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from shapespace.cli import run, values
-from shapespace.cli.answers import asymmetry, change, compare, identity, regress, score, shape_tests
+from shapespace.cli.answers import align, asymmetry, change, compare, identity, morphospace, regress, score, shape_tests
 from shapespace.cli.options import Option, Source, advanced, basic
 from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS, ShapeTest
 
 # The classes and functions that options are read from.
 COHORT = Source("cohort.read", "CohortConfig")
+ALIGN = Source("geometry.landmark_alignment", "AlignConfig")
+ALIGN_FILES = Source("commands.align", "align")
 EXECUTION = Source("batch.execution", "ExecutionConfig")
 CORRESPOND = Source("correspondence.settings", "CorrespondConfig")
 CHANGE_CORRESPONDENCE = Source("commands.correspond_changes", "Change")
@@ -28,7 +30,9 @@ QUALITY_TARGETS = Source("commands.quality", "QualityOptions")
 FIT = Source("fit.fit_scan", "FitConfig")
 PAPER = Source("fit.paper.paper_method", "Paper")
 IDENTITY = Source("statistics.identity.trial", "IdentityConfig")
+FIGURES = Source("commands.answers", "FigureConfig")
 COMPARE = Source("statistics.compare_shapes", "CompareConfig")
+MORPHOSPACE = Source("statistics.shape_tests.ordination", "ordinate")
 CHANGE = Source("statistics.change_result", "ChangeConfig")
 ASYMMETRY = Source("statistics.asymmetry", "measure_asymmetry")
 REGRESS = Source("statistics.regression", "regress")
@@ -41,10 +45,13 @@ SKULLS = Source("commands.data", "write_simulated_landmarks")
 SURFACE = Source("commands.surface", "write_surfaces")
 LANDMARKS_TRANSFER = Source("commands.landmarks", "transfer_landmarks")
 LANDMARKS = Source("commands.landmarks", "suggest_specimens")
+LANDMARKS_CONVERT = Source("commands.landmark_data", "convert_landmarks")
+LANDMARKS_PLOT = Source("commands.landmark_data", "plot_configurations")
 TRAIN = Source("commands.recognise", "recognise_train")
 STUDY = Source("commands.recognise", "recognise_study")
 VIEW = Source("viewer.serve", "serve")
 EXPORT = Source("commands.export", "export")
+EXPORT_COHORT = Source("commands.export", "export_cohort")
 CONVERT = Source("commands.convert", "convert")
 
 _UNITS = ("um", "mm", "cm", "inch", "m")
@@ -54,7 +61,7 @@ _GOES_ON: Mapping[str, Any] = {"goes_on": "; the same command goes on from there
 
 GROUPS: Mapping[str, str] = {
     "data": "open data sets, and simulated faces, organs, bones and landmarks",
-    "landmarks": "transfer landmarks from a few marked specimens to all scans in correspondence, and check them",
+    "landmarks": "convert, check and plot landmarks; transfer them from marked specimens to scans in correspondence",
     "test": "tests of shape beyond linear models: disparity, covariation, phylogeny, equivalence",
     "recognise": "classify scans (for example, facial expressions) by fitted coefficients",
 }
@@ -93,11 +100,12 @@ class Command:
     @property
     def usage(self) -> str:
         """The command line, with what must be given."""
-        endings = {"+": "...", "*": "...]"}
+        endings = {"+": "...", "*": "...]", "?": "]"}
         words = ["shapespace", self.name]
         for option in self.options:
             if option.is_positional:
-                words.append(f"{'[' * (option.nargs == '*')}{option.metavar}{endings.get(option.nargs or '', '')}")
+                start = "[" if option.nargs in ("*", "?") else ""
+                words.append(f"{start}{option.metavar}{endings.get(option.nargs or '', '')}")
         needed: dict[str, list[str]] = {}
         for option in self.options:
             if option.required:
@@ -111,6 +119,8 @@ _JSON = basic("--json", help="print the results as JSON")
 _OUTPUT = basic("-o --output", "DIR", "output folder", parse=Path, required=True)
 _MARKED = basic("marked", "MARKED", "folder of landmark files with the names of the scans, in any landmark format",
                 parse=Path)  # fmt: skip
+_LANDMARK_DATA = basic("data", "DATA", "file or folder with the landmarks of many specimens", parse=Path)
+_SLIDERS = basic("--sliders", "FILE.csv", source=LANDMARKS_CONVERT, parse=Path, repeat=True, default=[])
 _SAME = basic("scans", "SAME", "folder that correspond wrote", parse=Path)
 _RECURSIVE = advanced("--recursive", help="also search subfolders of the given folders")
 _STRICT_HELP = (
@@ -148,13 +158,25 @@ def _cohort(surfaces: str = "auto") -> tuple[Option, ...]:
     return (
         basic("data",
               "DATA", "a table (CSV or .xlsx) with one row per shape, named in the column file, scan, specimen, "
-              "name or id; or a folder of fits, whose metadata are the table", parse=Path),
+              "name or id; a folder of fits, whose metadata are the table; a folder that align wrote; or a landmark "
+              "file", parse=Path),
         _OUTPUT,
-        basic("--shapes", "DIR", source=COHORT),
+        basic("--shapes", "DIR|FILE", source=COHORT),
         advanced("--model", "MODEL.h5", source=COHORT),
         advanced("--surfaces", source=COHORT, default=surfaces),
         advanced("--doubtful", source=COHORT),
+        advanced("--geometry", source=COHORT),
+        *_figures(),
     )  # fmt: skip
+
+
+def _figures() -> tuple[Option, ...]:
+    """Return the options of the figures of an analysis."""
+    return (
+        basic("--format", "LIST", source=FIGURES, field="formats"),
+        advanced("--dpi", "N", source=FIGURES, parse=values.positive),
+        advanced("--orientation", "FILE", source=FIGURES),
+    )
 
 
 def _gauge(default: str = "shape") -> tuple[Option, ...]:
@@ -545,11 +567,50 @@ COMMANDS: tuple[Command, ...] = (
         ),
     ),
     Command(
-        "landmarks check", "compare the landmarks of each marked specimen with their prediction from the others",
-        ("shapespace landmarks check marked same -o check.csv",), run.landmarks_check,
-        (_MARKED, _SAME,
-         basic("-o --output", "FILE.csv", "table of the error of each landmark and specimen", parse=Path)),
-        ("The exit code is 1 if an outlier or landmarks with exchanged names are found.",),
+        "landmarks convert", "convert landmarks of many specimens between TPS, NTS, MorphoJ, CSV, R and Slicer files",
+        ("shapespace landmarks convert skulls.tps skulls.csv",
+         "shapespace landmarks convert plethodon.rda morphoj.txt"), run.landmarks_convert,
+        (
+            _LANDMARK_DATA,
+            basic("output", "OUT", "file; a folder for formats with a file for each specimen", parse=Path),
+            basic("--to", "FORMAT", source=LANDMARKS_CONVERT),
+            _SLIDERS,
+            basic("--object", "NAME", source=LANDMARKS_CONVERT, field="object_name"),
+        ),
+        (
+            "Coordinates are exact. Prints what was scaled, taken as missing or left out. Sliders are written beside "
+            "OUT as geomorph reads them. Files of R need the extra r.",
+        ),
+    ),
+    Command(
+        "landmarks check", "check landmark data, or compare landmarks of marked specimens with their prediction",
+        ("shapespace landmarks check skulls.tps", "shapespace landmarks check marked same -o check.csv"),
+        run.landmarks_check,
+        (
+            basic("marked", "DATA", "file or folder with the landmarks of many specimens; with SAME, a folder of "
+                  "landmark files with the names of the scans", parse=Path),
+            basic("scans", "SAME", "folder that correspond wrote", parse=Path, nargs="?"),
+            basic("-o --output", "FILE.csv", "with SAME: table of the error of each landmark and specimen",
+                  parse=Path),
+            _SLIDERS,
+        ),
+        (
+            "Without SAME: numbers of specimens and landmarks, missing landmarks, duplicates, specimens of another "
+            "scale, mirrored specimens, swapped landmarks and outliers after superimposition. With SAME, the landmarks "
+            "of each marked specimen are compared with their prediction from the others. The exit code is 1 if "
+            "something is to be checked.",
+        ),
+    ),
+    Command(
+        "landmarks plot", "draw landmarks of all specimens, superimposed around their mean",
+        ("shapespace landmarks plot skulls.tps -o skulls.pdf --links links.csv",), run.landmarks_plot,
+        (
+            _LANDMARK_DATA,
+            basic("-o --output", "FILE", "figure: .svg, .pdf or .png", parse=Path, required=True),
+            basic("--links", "FILE.csv", source=LANDMARKS_PLOT, parse=Path),
+            _SLIDERS,
+        ),
+        ("Needs the extra report.",),
     ),
     Command(
         "landmarks suggest", "name the specimens to mark next",
@@ -558,6 +619,32 @@ COMMANDS: tuple[Command, ...] = (
             _SAME,
             basic("--marked", "DIR", source=LANDMARKS, parse=Path),
             basic("--count", "N", source=LANDMARKS, parse=values.positive),
+        ),
+    ),
+    Command(
+        "align", "align landmarks by generalised Procrustes analysis, and name specimens to check",
+        ("shapespace align skulls.tps --table skulls.csv -o aligned",
+         "shapespace compare aligned --formula '~ sex' -o sex"), align.run,
+        (
+            basic("data", "DATA", "a landmark file (TPS, NTS, MorphoJ, CSV, .rda), or a folder of landmark files",
+                  parse=Path),
+            _OUTPUT,
+            basic("--table", "TABLE", source=ALIGN_FILES, parse=Path),
+            basic("--sliders", "FILE", "semilandmarks, numbered from 1: rows of before, slide, after for curves, or "
+                  "one column for surfaces; can be repeated", parse=Path, repeat=True),
+            basic("--slide-by", source=ALIGN),
+            basic("--missing", source=ALIGN),
+            basic("--separate", "FILE", source=ALIGN_FILES, parse=Path),
+            basic("--gauge", source=ALIGN),
+            advanced("--no-tangent", help="do not project shapes onto the tangent space", source=ALIGN),
+            advanced("--tolerance", "T", source=ALIGN),
+            advanced("--iterations", "N", source=ALIGN, parse=values.positive),
+        ),
+        (
+            "Writes aligned.csv (name, covariates, coordinates, centroid size), mean.csv, estimated.csv (landmarks that "
+            "are estimates) and align.json. The commands about cohorts, such as compare, take the folder. Conventions "
+            "are those of gpagen in geomorph, but the set is never reflected. Specimens that are outliers, mirrored or "
+            "have swapped landmarks are named.",
         ),
     ),
     Command(
@@ -666,6 +753,11 @@ COMMANDS: tuple[Command, ...] = (
             basic("--blocks", "COLUMN", source=COMPARE),
             basic("--permutations", "N", source=COMPARE, parse=values.integer),
             advanced("--random", "TERMS", source=COMPARE),
+            advanced("--error", "TERM=ERROR", "error term of a term, over whose mean square its F is computed, such as "
+                     "genus=genus:species; can be repeated (default: the residuals)", parse=values.error_term,
+                     repeat=True),
+            advanced("--error-permutation", source=COMPARE),
+            advanced("--coding", source=COMPARE),
             advanced("--type", source=COMPARE, field="anova_type", dest="anova_type"),
             advanced("--level", "P", source=COMPARE, field="alpha"),
             advanced("--unequal-variances", source=COMPARE),
@@ -676,6 +768,24 @@ COMMANDS: tuple[Command, ...] = (
             advanced("--drop-missing", source=COMPARE),
             advanced("--seed", "S", source=COMPARE, parse=values.integer),
             *_gauge(),
+        ),
+    ),
+    Command(
+        "morphospace", "draw shapes on the axes of an ordination: principal components, canonical variates, phylogenetic",
+        ("shapespace morphospace people.csv --group sex -o morphospace",), morphospace.run,
+        (
+            *_cohort(),
+            basic("--method", source=MORPHOSPACE),
+            basic("--group", "COLUMN", source=MORPHOSPACE),
+            basic("--tree", "FILE", source=MORPHOSPACE),
+            basic("--axes", "A,B", "numbers of the axes drawn across and up", parse=values.axes, default=(1, 2)),
+            advanced("--components", "N", source=MORPHOSPACE, parse=values.positive),
+            advanced("--drop-missing", source=MORPHOSPACE),
+            *_gauge(),
+        ),
+        (
+            "In the plot of the report a click, or the arrow keys, choose a place; the shape there is drawn beside the "
+            "mean. Scores, loadings (change of each coordinate per unit of score) and eigenvalues are CSV tables.",
         ),
     ),
     *(_shape_test(test) for test in SHAPE_TESTS),
@@ -753,16 +863,24 @@ COMMANDS: tuple[Command, ...] = (
         ),
     ),
     Command(
-        "export", "export the fits of a store as single files, or as one table",
-        ("shapespace export out anna ben -o single", "shapespace export out --table fits.csv"), run.export,
+        "export", "export fits as single files or one table, or any cohort to geomorph, MorphoJ, TPS or CSV",
+        ("shapespace export out anna ben -o single", "shapespace export out --table fits.csv",
+         "shapespace export aligned --to geomorph --formula '~ sex' -o r"), run.export,
         (
-            basic("store", "STORE", "a folder that shapespace fit wrote", parse=Path),
+            basic("store", "DATA", "a folder that shapespace fit wrote; with --to, any data of compare", parse=Path),
             basic("names", "NAME", "names of the fits", nargs="*"),
-            basic("-o --output", "DIR", "output folder", parse=Path, default=Path("exported")),
+            basic("-o --output", "OUT", "output folder; with --to also a file", parse=Path, default=Path("exported")),
             basic("--all", help="export all fits"),
             basic("--table", "FILE", source=EXPORT),
+            basic("--to", source=EXPORT_COHORT),
+            basic("--formula", "FORMULA", source=EXPORT_COHORT),
+            *(option for option in _cohort() if option.source is COHORT),
+            *_gauge(),
         ),
         (
+            "With --to, the aligned coordinates, the table and the sizes of a cohort are written. For geomorph, "
+            "shapespace.R reads them and tests the formula with procD.lm; without geomorph it computes the sums of "
+            "squares alone, in anova.csv.",
             "NAME.fit.json is that of fit to the byte, surfaces are exact to 6e-8 of their half extent. The table has "
             "the columns of coefficients.csv, the rows of each shard in turn; in MATLAB it is a struct fits with b, "
             "z, b_stddev, scan and so on. The exit code is 1 if some of the fits cannot be read, 2 if none can.",

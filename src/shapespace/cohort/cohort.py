@@ -18,6 +18,7 @@ from shapespace.cohort.classes import class_notes
 from shapespace.cohort.incomplete import complete_by_population, completed_shapes
 from shapespace.cohort.table import Table, list_names, numbers_as_text
 from shapespace.errors import CorrespondenceError, InputError
+from shapespace.geometry.landmark_alignment import AlignedLandmarks, project_to_tangent
 from shapespace.geometry.procrustes import Gauge, align_in_place, centroid_size, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.lazy import lazy_import
@@ -48,7 +49,7 @@ class ShapeSource:
     """Source of the shapes of a cohort, and the share of shape variance that it can represent.
 
     Args:
-        kind: coefficients, fitted or dense surfaces of fits, corresponding surfaces, or other surfaces.
+        kind: coefficients, fitted or dense surfaces of fits, corresponding surfaces, other surfaces, or landmarks.
         modes: number of model modes that the shapes are combinations of; None if the shapes are not limited to modes.
         explained_variance_ratio: share of the model's training variance in these modes, 0 to 1; None as for `modes`.
     """
@@ -59,7 +60,7 @@ class ShapeSource:
 
     def __str__(self) -> str:
         if self.modes is None or self.explained_variance_ratio is None:
-            return f"{self.kind} surfaces" if self.kind != "surfaces" else "surfaces"
+            return self.kind if self.kind in ("surfaces", "landmarks") else f"{self.kind} surfaces"
         return f"{self.kind}, {self.modes} modes, {100 * self.explained_variance_ratio:.0f} % of the variance"
 
 
@@ -182,10 +183,11 @@ class Cohort:
         return len(self.names)
 
     def __repr__(self) -> str:
-        noun = "surfaces" if self.fitted is None else "fits"
+        noun = "specimens" if self.source.kind == "landmarks" else "surfaces" if self.fitted is None else "fits"
+        points = "landmarks" if self.source.kind == "landmarks" else "vertices"
         columns = list_briefly(list(self.table.columns)) or "no columns"
         return (
-            f"<Cohort of {len(self)} {noun} with {self.n_vertices:,} vertices, gauge {self.gauge}; "
+            f"<Cohort of {len(self)} {noun} with {self.n_vertices:,} {points}, gauge {self.gauge}; "
             f"{len(self.basis)} coefficients each; columns: {columns}>"
         )
 
@@ -379,6 +381,43 @@ class Cohort:
         return cohort
 
     @staticmethod
+    def of_landmarks(aligned: AlignedLandmarks, table: Table | None = None, *, gauge: Gauge | None = None) -> Cohort:
+        """Return the cohort of aligned landmarks; planar ones have z = 0.
+
+        Args:
+            aligned: as `align_landmarks` returns them.
+            table: N rows; None for the columns of the landmark file.
+            gauge: `form` multiplies shapes by their centroid sizes, `shape` divides forms by them; None for that of the
+                alignment.
+
+        Raises:
+            InputError: two specimens that are the same.
+        """
+        coords, gauge = aligned.coords, gauge or aligned.gauge
+        sizes = aligned.sizes[:, None, None]
+        if gauge != aligned.gauge:
+            coords = coords * sizes if gauge == "form" else project_to_tangent(coords / sizes)
+        shapes = padded(coords)
+        reference = shapes.mean(axis=0)
+        basis, coefficients = _orthonormal((shapes - reference).reshape(len(shapes), -1))
+        cohort = Cohort(
+            names=aligned.names,
+            reference=read_only(reference),
+            basis=basis,
+            coefficients=coefficients,
+            sizes_mm=aligned.sizes,
+            table=Table(aligned.columns, aligned.names, aligned.where) if table is None else table,
+            gauge=gauge,
+            landmarks=SurfaceLandmarks.of({name: k for k, name in enumerate(aligned.landmarks)}),
+            notes=aligned.notes,
+            source=ShapeSource("landmarks"),
+            unit="mm" if gauge == "form" and aligned.unit == "mm" else "",
+            observed=~aligned.estimated if aligned.estimated.any() else None,
+        )
+        refuse_twice(cohort)
+        return cohort
+
+    @staticmethod
     def of_meshes(
         meshes: Sequence[Mesh],
         table: Table,
@@ -484,7 +523,11 @@ def _align_to(shapes: FloatArray, onto: Cohort) -> None:
         if centroid_size(shape) <= 0:
             raise InputError("All vertices of a shape coincide, so it cannot be aligned; leave it out.")
         aligned = fit_similarity(shape, mean, with_scale=onto.gauge == "shape").apply(shape)
-        if onto.gauge == "shape":
+        if onto.gauge == "shape" and onto.source.kind == "landmarks":
+            # Landmarks are projected orthogonally, as in their alignment.
+            unit = (aligned - aligned.mean(axis=0)) / centroid_size(aligned)
+            aligned = mean.mean(axis=0) + project_to_tangent(unit[None], mean)[0]
+        elif onto.gauge == "shape":
             along = float(np.sum(aligned * middle)) / float(np.sum(middle**2))
             aligned = mean.mean(axis=0) + (aligned - aligned.mean(axis=0)) / along
         shapes[k] = mean_shape
@@ -548,10 +591,21 @@ def with_columns(cohort: Cohort, columns: Mapping[str, FloatArray]) -> Cohort:
     return replace(cohort, table=table)
 
 
+def padded(coords: FloatArray) -> FloatArray:
+    """Return coordinates (N, L, 3); planar ones (N, L, 2) get z = 0."""
+    return np.pad(coords, ((0, 0), (0, 0), (0, 3 - coords.shape[2])))
+
+
 def _orthonormal(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return an orthonormal basis (K, D) of `rows` (N, D), and their coefficients (N, K) in it."""
-    q, r = np.linalg.qr(rows.T)
-    return read_only(q.T), read_only(r.T)
+    """Return an orthonormal basis (K, D) of `rows` (N, D), and their coefficients (N, K) in it.
+
+    Coordinates that are 0 in all rows, such as z of planar landmarks, are 0 in the basis, without rounding.
+    """
+    varying = rows.any(axis=0)
+    q, r = np.linalg.qr(rows[:, varying].T)
+    basis = np.zeros((q.shape[1], rows.shape[1]))
+    basis[:, varying] = q.T
+    return read_only(basis), read_only(r.T)
 
 
 def _in_basis(rows: FloatArray, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -12,9 +12,11 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 
 from shapespace.cohort.cohort import Cohort, Fitted, ShapeSource
+from shapespace.cohort.landmark_cohort import has_landmarks, landmark_cohort, read_landmark_cohort
 from shapespace.cohort.table import Table, list_names, read_table
 from shapespace.errors import InputError
 from shapespace.geometry.procrustes import Gauge
+from shapespace.io.landmarks.landmark_io import read_surface_landmarks
 from shapespace.io.meshes.mesh_io import stem_of
 from shapespace.model.additive import AdditiveModel, load_model
 from shapespace.model.shape_model import ShapeModel
@@ -23,11 +25,14 @@ from shapespace.store.results import Results, modes_of
 from shapespace.store.rows import META
 from shapespace.types import FloatArray, Mesh, read_only
 
+Geometry: TypeAlias = Literal["surface", "landmarks"]
 Surfaces: TypeAlias = Literal["auto", "coefficients", "fitted", "dense"]
 SURFACES: tuple[Surfaces, ...] = ("auto", "coefficients", "fitted", "dense")
 """Shapes of fits: the model's coefficients, or a surface stored with the record. `auto` is dense where all have one."""
 
 _USED = ("converged", "max_iterations")
+_LANDMARKS = "landmarks.csv"
+"""Landmarks that all meshes of a folder carry, as `correspond` writes them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,12 +40,14 @@ class CohortConfig:
     """Options for the selection and comparison of shapes.
 
     Args:
-        shapes: folder of results of fits, or of meshes in correspondence (default: the folder of the table).
+        shapes: folder of results of fits, or of meshes in correspondence, that align wrote, or a landmark file
+            (default: the folder of the table).
         model: model file of the fits, if it was moved.
         surfaces: shapes of fits: `coefficients` of the model, its `fitted` surface, or the `dense` surface on the scan;
             `auto` uses dense surfaces if all fits have one, otherwise coefficients.
         gauge: `form` keeps size, `shape` divides size out.
         doubtful: include doubtful fits and corresponding surfaces (default: excluded, and counted).
+        geometry: what is analysed of surfaces with landmarks: the `surface`, or the `landmarks` alone.
         least: shapes that there must be; one will do where it is compared with what is known already.
     """
 
@@ -49,13 +56,18 @@ class CohortConfig:
     surfaces: Surfaces = "auto"
     gauge: Gauge = "shape"
     doubtful: bool = False
+    geometry: Geometry = "surface"
     least: int = 2
 
     def __post_init__(self) -> None:
         for name, path in (("shapes", self.shapes), ("model", self.model)):
             if path is not None and not isinstance(path, str | PathLike):  # pyright: ignore[reportUnnecessaryIsInstance]
                 raise InputError(f"CohortConfig: {name} is a path, not {type(path).__name__}; give a str or a Path.")
-        for name, value, choices in (("surfaces", self.surfaces, SURFACES), ("gauge", self.gauge, get_args(Gauge))):
+        for name, value, choices in (
+            ("surfaces", self.surfaces, SURFACES),
+            ("gauge", self.gauge, get_args(Gauge)),
+            ("geometry", self.geometry, get_args(Geometry)),
+        ):
             if value not in choices:
                 raise InputError(f"CohortConfig: there is no {name} {value!r}; choose one of {', '.join(choices)}.")
 
@@ -69,12 +81,14 @@ def read_cohort(
 ) -> Cohort:
     """Return the shapes of the rows of a table, or of all fits in a folder with the metadata of their records.
 
+    Landmarks are read from a folder that `align` wrote, or from a landmark file, and are then aligned by its defaults.
+
     Doubtful and failed fits are left out, counted and said in the notes, as are rows without a shape and shapes
     without a row.
 
     Args:
         data: a table whose column `file`, `scan`, `specimen`, `name` or `id` names a shape in each row
-            (coefficients.csv is one), or a folder of results of fits, whose metadata are the table.
+            (coefficients.csv is one); a folder of results of fits, whose metadata are the table; or landmarks.
         config: which shapes; None for the defaults.
         onto: a cohort that these shapes, of which there may be one alone, are to be compared with.
         on_shape: called with (done, total) as surfaces are read.
@@ -86,13 +100,24 @@ def read_cohort(
         CorrespondenceError: meshes that are not in correspondence.
     """
     data, config = Path(data), config or CohortConfig()
+    source = Path(config.shapes) if config.shapes else data
+    results = Results(source) if source.is_dir() else None
+    if source.exists() and not (results is not None and len(results)) and has_landmarks(source):
+        table = data if config.shapes and source != data else None
+        return read_landmark_cohort(source, table, config.gauge, onto, config.least)
+    if config.geometry == "landmarks":
+        least = 1 if onto is not None else config.least
+        surfaces = read_cohort(data, replace(config, geometry="surface", least=least), on_shape=on_shape)
+        if surfaces.landmarks is None and (source / _LANDMARKS).is_file():
+            surfaces = replace(surfaces, landmarks=read_surface_landmarks(source / _LANDMARKS))
+        return landmark_cohort(surfaces, onto)
     table, keys = (None, ()) if data.is_dir() else read_table(data)
     folder = Path(config.shapes) if config.shapes else (data if table is None else data.parent)
     if not folder.is_dir():
         raise InputError(
             f"{folder} is no folder; give the results of fits, or meshes in correspondence, with --shapes."
         )
-    results = Results(folder)
+    results = Results(folder) if folder != source or results is None else results
     if len(results):
         return _of_results(results, table, keys, config, onto, on_shape)
     if table is None:

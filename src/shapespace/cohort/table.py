@@ -115,8 +115,8 @@ class Table:
         return Table(chosen, tuple(self.rows[row] for row in rows), self.where)
 
 
-def read_table(path: Path) -> tuple[Table, tuple[str, ...]]:
-    """Return a table, and the name of the shape of each row, without folder and ending.
+def read_table(path: Path, *, as_files: bool = True) -> tuple[Table, tuple[str, ...]]:
+    """Return a table, and the name of the shape of each row, without folder and ending unless `as_files` is False.
 
     The table is what `io.tables.table_rows` reads. The first of the columns `file`, `scan`, `specimen`, `name` and `id`
     that it has, in any case, names the shapes. Columns of a coefficients.csv that came with the list of its scans lose
@@ -142,6 +142,7 @@ def read_table(path: Path) -> tuple[Table, tuple[str, ...]]:
     # Scans of one name in different folders are called by their folders too, as their fits are.
     repeated = {stem for stem, count in Counter(stem_of(scan) for scan in places).items() if count > 1}
     keys = tuple(_with_folders(scan) if stem_of(scan) in repeated else stem_of(scan) for scan in places)
+    keys = keys if as_files else tuple(row[key] for row in rows)
     if "" in keys:
         raise FileFormatError(
             f"{path} has no {names} in row {keys.index('') + 1}; name the shape, or leave the row out."

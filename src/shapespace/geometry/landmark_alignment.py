@@ -8,7 +8,7 @@ docs/morphometrics.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
@@ -125,6 +125,17 @@ class AlignedLandmarks:
     def mean(self) -> FloatArray:
         """(L, D) mean of the aligned coordinates."""
         return self.coords.mean(axis=0)
+
+    def take(self, rows: Sequence[int]) -> AlignedLandmarks:
+        """Return some specimens, in their order, in the same alignment."""
+        return replace(
+            self,
+            names=tuple(self.names[row] for row in rows),
+            coords=self.coords[list(rows)],
+            sizes=self.sizes[list(rows)],
+            estimated=self.estimated[list(rows)],
+            columns={name: tuple(cells[row] for row in rows) for name, cells in self.columns.items()},
+        )
 
 
 @dataclass(frozen=True)
@@ -279,11 +290,10 @@ def project_to_tangent(coords: FloatArray, mean: FloatArray | None = None) -> Fl
         coords: aligned.
         mean: (L, D) of another set; None for that of `coords`.
     """
-    mean = coords.mean(axis=0) if mean is None else mean
-    mean = mean - mean.mean(axis=0)
-    mean = mean / np.linalg.norm(mean)
-    along = np.einsum("nld,ld->n", coords, mean)
-    return coords + (1.0 - along)[:, None, None] * mean  # M4
+    middle: FloatArray = coords.mean(axis=0) if mean is None else mean
+    middle = (middle - middle.mean(axis=0)) / np.linalg.norm(middle - middle.mean(axis=0))
+    along: FloatArray = (coords * middle).sum(axis=(1, 2))
+    return coords + (1.0 - along)[:, None, None] * middle  # M4
 
 
 def _rotated(coords: FloatArray, target: FloatArray) -> FloatArray:
@@ -307,14 +317,13 @@ def _slid(x: FloatArray, mean: FloatArray, curves: IntArray, surface: IntArray, 
         sliding += [surface, surface]
     U, at = np.concatenate(directions), np.concatenate(sliding)
     offset = x - mean
-    if B is None:
-        steps = (U * offset[at]).sum(axis=1)  # M7
-    else:
-        system, right = (U @ U.T) * B[np.ix_(at, at)], (U * (B @ offset)[at]).sum(axis=1)
+    steps: FloatArray = (U * (offset if B is None else B @ offset)[at]).sum(axis=1)  # M7
+    if B is not None:
+        system: FloatArray = (U @ U.T) * B[np.ix_(at, at)]
         try:
-            steps = np.linalg.solve(system, right)  # M6
+            steps = np.asarray(np.linalg.solve(system, steps), dtype=np.float64)  # M6
         except np.linalg.LinAlgError:
-            steps = np.linalg.lstsq(system, right)[0]
+            steps = np.asarray(np.linalg.lstsq(system, steps)[0], dtype=np.float64)
     out = x.copy()
     np.subtract.at(out, at, steps[:, None] * U)
     return out
@@ -381,7 +390,7 @@ def _complete(configurations: LandmarkConfigurations, config: AlignConfig) -> tu
     if L < 3:
         raise InputError(f"{where}: {L} landmarks have no shape; three are the least.")
     if np.isinf(points).any():
-        raise InputError(f"{where}: a coordinate is infinite; correct it, or leave it empty if the landmark is missing.")
+        raise InputError(f"{where}: a coordinate is infinite; correct it, or leave it empty if it is missing.")
     missing = ~observed
     if not missing.any():
         return points, []
@@ -396,7 +405,7 @@ def _complete(configurations: LandmarkConfigurations, config: AlignConfig) -> tu
     if len(few):
         count, name = int(observed[few[0]].sum()), configurations.names[int(few[0])]
         raise InputError(
-            f"{where}: {'no' if not count else count} landmark{'s are' if count != 1 else ' is'} observed of {name}, "
+            f"{where}: {count or 'no'} landmark{'s are' if count != 1 else ' is'} observed of {name}, "
             f"and {D + 1} are the least from which the others are estimated; leave it out."
         )
     share = missing.mean(axis=0)
@@ -408,10 +417,8 @@ def _complete(configurations: LandmarkConfigurations, config: AlignConfig) -> tu
             f"{where}: landmark {configurations.landmarks[worst]} is missing in {int(missing[:, worst].sum())} of {n} "
             f"specimens{problem}; leave that landmark, or the specimens without it, out."
         )
-    form = superimpose(points[complete], AlignConfig(tangent=True)).coords
-    form = form * np.linalg.norm(points[complete] - points[complete].mean(axis=1, keepdims=True), axis=(1, 2))[
-        :, None, None
-    ]
+    centred = points[complete] - points[complete].mean(axis=1, keepdims=True)
+    form = superimpose(centred, AlignConfig()).coords * np.linalg.norm(centred, axis=(1, 2))[:, None, None]
     mean, out = form.mean(axis=0), points.copy()
     for k in map(int, incomplete):
         seen = observed[k]
@@ -446,7 +453,7 @@ def _regressed(form: FloatArray, points: FloatArray, seen: BoolArray) -> FloatAr
     own = points[seen] - centre
     rotation = fit_rotations((own.T @ (x_mean.reshape(-1, D) - target))[None])[0]
     axes = np.linalg.svd((x - x_mean).T @ (y - y_mean), full_matrices=False)[0][:, : max(1, n // _AXIS_SPECIMENS)]
-    slopes = np.linalg.lstsq((x - x_mean) @ axes, y - y_mean)[0]
+    slopes = np.asarray(np.linalg.lstsq((x - x_mean) @ axes, y - y_mean)[0], dtype=np.float64)
     scores = ((own @ rotation.T + target).ravel() - x_mean) @ axes
     return ((y_mean + scores @ slopes).reshape(-1, D) - target) @ rotation + centre  # M9
 
@@ -501,5 +508,6 @@ def _refuse_degenerate(points: FloatArray, configurations: LandmarkConfiguration
         k = int(flat[0])
         place = "lie on a line" if spread[k, 0] > 0 else "coincide"
         raise InputError(
-            f"{configurations.where}: all landmarks of {configurations.names[k]} {place}; correct them, or leave it out."
+            f"{configurations.where}: all landmarks of {configurations.names[k]} {place}; correct them, or leave it "
+            "out."
         )

@@ -60,7 +60,7 @@ def fit_similarity(
     if spread <= 0:
         raise InputError(_NO_ROTATION)
     R = fit_rotations(H[None], refuse_lines=True)[0]
-    s = float(np.vdot(R.T, H) / spread) if with_scale else 1.0  # P18, as corrected
+    s = float((R * H.T).sum() / spread) if with_scale else 1.0  # P18, as corrected
     if s <= 0:
         raise InputError("The matched points are so far from similar that no positive scale fits; check the matches.")
     T = mean_target - s * R @ mean_source  # P17, as corrected
@@ -82,9 +82,9 @@ def fit_rotations(products: FloatArray, *, refuse_lines: bool = False) -> FloatA
     """
     D = products.shape[1]
     largest = np.abs(products).max(axis=(1, 2), initial=0.0)
-    off_plane = np.maximum(np.abs(products[:, 2:]).max(axis=(1, 2), initial=0.0),
-                           np.abs(products[:, :, 2:]).max(axis=(1, 2), initial=0.0))  # fmt: skip
-    if D == 3 and (off_plane <= _PLANAR * largest).all():
+    across, down = np.abs(products[:, 2:]), np.abs(products[:, :, 2:])
+    off_plane = np.maximum(across.max(axis=(1, 2), initial=0.0), down.max(axis=(1, 2), initial=0.0))
+    if D == 3 and bool((off_plane <= _PLANAR * largest).all()):
         out = np.zeros_like(products)
         out[:, :2, :2], out[:, 2, 2] = fit_rotations(products[:, :2, :2], refuse_lines=refuse_lines), 1.0
         return out

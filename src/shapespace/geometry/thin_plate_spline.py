@@ -16,7 +16,7 @@ from shapespace.types import FloatArray, read_only
 
 _RANK = 1e-9  # ratio of singular values; landmarks nearer to a line or a plane than rounding determine no affine map
 _SAME = 1e-12  # of the size; landmarks nearer to each other coincide up to float64 rounding
-_PSEUDO = 1.5e-8  # of the largest singular value, below which a singular system is cut off: the root of float64 rounding
+_PSEUDO = 1.5e-8  # of the largest singular value; smaller ones of a singular system are 0: the root of float64 rounding
 _ROWS = 2**22  # kernel values in memory at once, 32 MiB
 
 
@@ -79,7 +79,7 @@ def bending_energy_matrix(reference: FloatArray) -> FloatArray:
     L = len(reference)
     if pdist(reference).min(initial=np.inf) < _SAME * size:
         return np.asarray(np.linalg.pinv(system, rcond=_PSEUDO, hermitian=True)[:L, :L], dtype=np.float64)
-    return np.linalg.inv(system)[:L, :L]  # M5
+    return np.asarray(np.linalg.inv(system)[:L, :L], dtype=np.float64)  # M5
 
 
 def _kernel(points: FloatArray, source: FloatArray) -> FloatArray:

@@ -34,7 +34,8 @@ def header_kind(header: Sequence[str]) -> str:
         if key_column(header, _LANDMARK) is None:
             return "single" if key_column(header) == 0 and "z" in lower else ""
         return "long"
-    return "wide" if len(_landmark_columns(header)) > 1 else ""
+    # Tables of coefficients have columns z1, z2, ... alone.
+    return "wide" if sum({"x", "y"} <= set(axes) for axes in _landmark_columns(header).values()) > 1 else ""
 
 
 def _landmark_columns(header: Sequence[str]) -> dict[str, dict[str, int]]:

@@ -1,0 +1,29 @@
+"""`shapespace align`: generalised Procrustes analysis of landmarks."""
+
+from __future__ import annotations
+
+import argparse
+
+from shapespace.cli.options import given
+from shapespace.cli.printing import say, show, show_json
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Align landmarks, and name the specimens to check."""
+    from shapespace.commands.align import align
+    from shapespace.geometry.landmark_alignment import AlignConfig
+    from shapespace.schemas import to_json
+
+    config = AlignConfig(**given(arguments, AlignConfig))
+    files = {"table": arguments.table, "sliders": arguments.sliders, "separate": arguments.separate}
+    _, record = align(arguments.data, arguments.output, config, **files)
+    for note in record.notes:
+        say(note)
+    if arguments.json:
+        show_json({"folder": str(arguments.output), **to_json(record)})
+    else:
+        show(
+            f"{record.specimens} specimens with {record.landmarks} landmarks ({record.dimensions}-D) aligned in "
+            f"{record.iterations} iterations, {len(record.findings)} to check: {arguments.output}"
+        )
+    return 0

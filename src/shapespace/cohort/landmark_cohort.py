@@ -1,0 +1,222 @@
+"""Cohorts of landmarks: read from landmark files and folders that `align` wrote, or taken from surfaces."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from shapespace.cohort.cohort import Cohort, padded
+from shapespace.cohort.table import Table, list_names, numbers_as_text, read_table
+from shapespace.errors import FileFormatError, InputError
+from shapespace.geometry.landmark_alignment import AlignConfig, AlignedLandmarks, align_landmarks
+from shapespace.geometry.procrustes import Gauge, centroid_size
+from shapespace.io.containers.json_files import read_json
+from shapespace.io.files import make_folder, read_bytes, write_text
+from shapespace.io.landmarks.configuration_io import is_configurations, read_configurations, write_configurations
+from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations
+from shapespace.io.meshes.mesh_io import MESH_ENDINGS, ending_of, stem_of
+from shapespace.io.tables.table_io import table_rows, write_rows
+from shapespace.schemas import AlignRecord, json_text, read
+from shapespace.types import FloatArray
+
+ALIGNED, RECORD, MEAN, ESTIMATED = "aligned.csv", "align.json", "mean.csv", "estimated.csv"
+"""Files of a folder that `align` wrote: coordinates, settings, mean, and the landmarks that are estimates."""
+SIZE = "centroid_size"
+"""Column of `ALIGNED` with centroid sizes in the unit of the file."""
+_AGAIN = "run shapespace align again"
+
+
+def has_landmarks(path: Path) -> bool:
+    """Return whether a path is a landmark file, a folder of such files without meshes, or one that `align` wrote."""
+    if not path.is_dir() or (path / RECORD).is_file():
+        return path.is_dir() or is_configurations(path)
+    return is_configurations(path) and not any(ending_of(file) in MESH_ENDINGS for file in path.iterdir())
+
+
+def write_aligned(folder: Path, aligned: AlignedLandmarks, record: AlignRecord) -> None:
+    """Write aligned landmarks to a folder, `RECORD` last.
+
+    Raises:
+        FileError: the folder cannot be written.
+    """
+    make_folder(folder)
+    columns = {**aligned.columns, SIZE: numbers_as_text(aligned.sizes)}
+    table = LandmarkConfigurations(
+        names=aligned.names, points=aligned.coords, landmarks=aligned.landmarks, columns=columns
+    )
+    write_configurations(folder / ALIGNED, table, "csv")
+    axes = ("x", "y", "z")[: aligned.dimensions]
+    mean = [(name, *map(float, row)) for name, row in zip(aligned.landmarks, aligned.mean, strict=True)]
+    write_rows(folder / MEAN, ("landmark", *axes), mean)
+    estimates = [(aligned.names[i], aligned.landmarks[j]) for i, j in np.argwhere(aligned.estimated).tolist()]
+    write_rows(folder / ESTIMATED, ("specimen", "landmark"), estimates)
+    write_text(folder / RECORD, json_text(record))
+
+
+def read_aligned(folder: Path) -> AlignedLandmarks:
+    """Return aligned landmarks from a folder that `align` wrote.
+
+    Raises:
+        FileError: a file cannot be read.
+        FileFormatError: a file is damaged.
+    """
+    record = read(AlignRecord, read_json(folder / RECORD, _AGAIN), str(folder / RECORD), _AGAIN)
+    table = read_configurations(folder / ALIGNED)
+    sizes = Table(table.columns, table.names, str(folder / ALIGNED)).numbers(SIZE)
+    row = {name: k for k, name in enumerate(table.names)}
+    column = {name: k for k, name in enumerate(table.landmarks)}
+    estimated = np.zeros(table.points.shape[:2], dtype=np.bool_)
+    try:
+        for specimen, landmark in list(table_rows(read_bytes(folder / ESTIMATED)))[1:]:
+            if specimen in row:
+                estimated[row[specimen], column[landmark]] = True
+    except (ValueError, KeyError) as error:
+        raise FileFormatError(f"{folder / ESTIMATED} is damaged; {_AGAIN}.") from error
+    if np.isnan(table.points).any() or np.isnan(sizes).any():
+        raise FileFormatError(f"{folder / ALIGNED} lacks coordinates or sizes; {_AGAIN}.")
+    return AlignedLandmarks(
+        names=table.names,
+        landmarks=table.landmarks,
+        coords=table.points,
+        sizes=sizes,
+        estimated=estimated,
+        columns={name: cells for name, cells in table.columns.items() if name != SIZE},
+        gauge=record.gauge,
+        unit=record.unit,
+        iterations=record.iterations,
+        converged=record.converged,
+        where=str(folder),
+        notes=record.notes,
+    )
+
+
+def read_landmark_cohort(
+    path: Path, table: Path | None, gauge: Gauge, onto: Cohort | None = None, least: int = 2
+) -> Cohort:
+    """Return the cohort of a landmark file, aligned by default options, or of a folder that `align` wrote.
+
+    Args:
+        path: the file or folder.
+        table: of covariates, whose key column names the specimens; None for the columns of the file.
+        gauge: `shape` or `form`.
+        onto: brings the specimens, of which there may be one alone, to the mean of this cohort.
+        least: how many specimens there must be, where `onto` is None.
+
+    Raises:
+        FileError: something cannot be read.
+        FileFormatError: something is damaged.
+        InputError: specimens that cannot be aligned, or too few of them in the table.
+    """
+    aligned = read_aligned(path) if (path / RECORD).is_file() else None
+    raw = None if aligned is not None else read_configurations(path)
+    source = aligned or raw
+    assert source is not None
+    rows, covariates, notes = _matched(source.names, source.columns, table, str(path))
+    least = least if onto is None else 1
+    if len(rows) < least:
+        raise InputError(f"{path}: landmarks of {len(rows)} specimens can be used, and {least} are the least.")
+    if raw is not None:
+        raw = replace(raw, names=covariates.rows, points=raw.points[rows], columns={})
+        if onto is None:
+            aligned = align_landmarks(raw, AlignConfig(gauge=gauge))
+            notes = [*notes, "The landmarks are aligned by generalised Procrustes analysis with default options."]
+    elif aligned is not None:
+        aligned = aligned.take(rows)
+    if onto is None and aligned is not None:
+        cohort = Cohort.of_landmarks(aligned, covariates, gauge=gauge)
+    else:
+        coords = raw.points if raw is not None else aligned.coords if aligned is not None else np.empty(0)
+        coords = coords if aligned is None else np.where(aligned.estimated[..., None], np.nan, coords)
+        assert onto is not None
+        cohort = _onto(coords, covariates, onto, None if aligned is None else aligned.sizes)
+    return replace(cohort, notes=(*(raw.notes if raw is not None and onto is not None else ()), *notes, *cohort.notes))
+
+
+def _onto(coords: FloatArray, table: Table, onto: Cohort, sizes: FloatArray | None = None) -> Cohort:
+    """Return the cohort of landmarks (N, L, D) in the pose and gauge of the mean of another."""
+    if coords.shape[2] != onto.dimensions:
+        raise InputError(
+            f"{table.where}: {coords.shape[2]}-D landmarks cannot be compared with {onto.dimensions}-D ones."
+        )
+    cohort = Cohort.of_shapes(padded(coords), {}, names=table.rows, onto=onto, unit=onto.unit)
+    return replace(
+        cohort,
+        table=table,
+        source=onto.source,
+        landmarks=onto.landmarks,
+        sizes_mm=cohort.sizes_mm if sizes is None else sizes,
+    )
+
+
+def landmark_cohort(cohort: Cohort, onto: Cohort | None = None) -> Cohort:
+    """Return the cohort of the landmarks that the surfaces of a cohort carry, aligned by themselves.
+
+    Args:
+        cohort: of surfaces with `landmarks`; landmarks between unobserved vertices are marked as estimated.
+        onto: a cohort of landmarks, to whose mean they are brought; None aligns them.
+
+    Raises:
+        InputError: surfaces without landmarks, or with fewer than three.
+    """
+    marks = cohort.landmarks
+    if cohort.source.kind == "landmarks":
+        return cohort
+    if marks is None or not len(marks):
+        raise InputError(
+            f"{cohort.table.where}: no landmarks are known on these surfaces; use a model with landmarks, or a folder "
+            "with the landmarks.csv of correspond."
+        )
+    coords = np.stack([marks.interpolate(cohort.vertices(k)) for k in range(len(cohort))])
+    surface = np.array([centroid_size(cohort.vertices(k)) for k in range(len(cohort))])
+    scale = np.where(np.isfinite(cohort.sizes_mm), cohort.sizes_mm / surface, 1.0)
+    coords = coords * scale[:, None, None]
+    if onto is not None:
+        return replace(_onto(coords, cohort.table, onto), notes=cohort.notes)
+    names = tuple(marks.names)
+    configurations = LandmarkConfigurations(
+        names=cohort.names, points=coords, landmarks=names, unit=cohort.unit, where=cohort.table.where
+    )
+    aligned = align_landmarks(configurations, AlignConfig(gauge=cohort.gauge))
+    if cohort.observed is not None:
+        unseen = np.logical_and(~cohort.observed[:, marks.corners], marks.barycentric > 0).any(axis=2)
+        aligned = replace(aligned, estimated=unseen)
+    note = f"The analysis is of {len(names)} landmarks that the surfaces carry, aligned by themselves."
+    return replace(Cohort.of_landmarks(aligned, cohort.table), notes=(*cohort.notes, note))
+
+
+def _matched(
+    names: Sequence[str], columns: Mapping[str, tuple[str, ...]], table: Path | None, where: str
+) -> tuple[list[int], Table, list[str]]:
+    """Return the specimens that have a row, the table of covariates in their order, and notes on the others.
+
+    Raises:
+        InputError: no row is of a specimen.
+    """
+    own = Table(columns, tuple(names), where)
+    if table is None:
+        return list(range(len(names))), own, []
+    given, keys = read_table(table, as_files=False)
+    stems = {stem_of(name): k for k, name in enumerate(names)}
+    number = stems | {name: k for k, name in enumerate(names)}
+    found = [(number[key], row) for row, key in enumerate(keys) if key in number]
+    if not found:
+        raise InputError(
+            f"{where} holds no specimen of {given.where} (such as {list_names(keys)}; there is {list_names(names)}); "
+            "name the specimens alike."
+        )
+    unknown = [key for key in keys if key not in number]
+    left = [name for k, name in enumerate(names) if k not in {specimen for specimen, _ in found}]
+    notes = [
+        f"{len(some)} {what} ({list_names(some)})."
+        for some, what in (
+            (unknown, f"of {len(keys)} rows of {given.where} are left out, whose landmarks are not in {where}"),
+            (left, f"of {len(names)} specimens in {where} have no row in {given.where} and are left out"),
+        )
+        if some
+    ]
+    rows = [specimen for specimen, _ in found]
+    joined = {**own.take(rows).columns, **given.take([row for _, row in found]).columns}
+    return rows, Table(joined, tuple(names[k] for k in rows), given.where), notes

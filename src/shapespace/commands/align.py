@@ -1,0 +1,107 @@
+"""What `align` does: landmarks of many specimens aligned, checked and written."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+
+from shapespace.cohort.landmark_cohort import SIZE, write_aligned
+from shapespace.cohort.table import list_names, read_table
+from shapespace.errors import FileFormatError, InputError
+from shapespace.geometry.landmark_alignment import AlignConfig, AlignedLandmarks, align_landmarks, find_outliers
+from shapespace.io.files import read_bytes
+from shapespace.io.landmarks.configuration_io import read_configurations, read_sliders
+from shapespace.io.tables.table_io import key_column, table_rows
+from shapespace.schemas import AlignFinding, AlignRecord, to_json
+from shapespace.version import __version__
+
+
+def align(
+    data: Path,
+    folder: Path,
+    config: AlignConfig | None = None,
+    *,
+    table: Path | None = None,
+    sliders: Sequence[Path] = (),
+    separate: Path | None = None,
+) -> tuple[AlignedLandmarks, AlignRecord]:
+    """Align the landmarks of many specimens, name specimens to check, and write all to a folder.
+
+    Args:
+        data: landmark file, or folder of them.
+        folder: output folder.
+        config: options; None for the defaults.
+        table: covariates, with a row for each specimen.
+        sliders: files of semilandmarks: rows of before, slide, after for curves; a single column for surfaces.
+        separate: table of landmark and structure, for structures that are aligned separately.
+
+    Raises:
+        FileError: something cannot be read or written.
+        FileFormatError: something is damaged.
+        InputError: landmarks that cannot be aligned.
+    """
+    config = config or AlignConfig()
+    raw = read_configurations(data)
+    for file in sliders:
+        numbers = read_sliders(file, len(raw.landmarks))
+        raw = replace(raw, **{"curve_sliders" if numbers.ndim == 2 else "surface_sliders": numbers})
+    if separate is not None:
+        config = replace(config, structures=_structures(separate))
+    aligned = align_landmarks(raw, config)
+    if table is not None:
+        columns, notes = _covariates(table, aligned)
+        aligned = replace(aligned, columns=columns, notes=(*aligned.notes, *notes))
+    findings = find_outliers(aligned)
+    record = AlignRecord(
+        source=str(data),
+        specimens=len(aligned),
+        landmarks=len(aligned.landmarks),
+        dimensions=2 if aligned.dimensions == 2 else 3,
+        unit="mm" if aligned.unit == "mm" else "",
+        gauge=aligned.gauge,
+        settings=to_json({**asdict(config), "curve_semilandmarks": len(raw.curve_sliders),
+                          "surface_semilandmarks": len(raw.surface_sliders)}),
+        estimated=int(aligned.estimated.sum()),
+        iterations=aligned.iterations,
+        converged=aligned.converged,
+        findings=tuple(AlignFinding(**asdict(finding)) for finding in findings),
+        notes=(*aligned.notes, *map(str, findings)),
+        version=__version__,
+    )  # fmt: skip
+    write_aligned(folder, aligned, record)
+    return aligned, record
+
+
+def _covariates(path: Path, aligned: AlignedLandmarks) -> tuple[dict[str, tuple[str, ...]], list[str]]:
+    """Return the columns of the landmark file and of a table, in the order of the specimens, and notes."""
+    given, keys = read_table(path, as_files=False)
+    row = {key: k for k, key in enumerate(keys)}
+    missing = [name for name in aligned.names if name not in row]
+    if len(missing) == len(aligned):
+        raise InputError(
+            f"{path} has no row of a specimen (such as {list_names(keys)}; there is {list_names(aligned.names)}); name "
+            "the specimens alike."
+        )
+    columns = {
+        name: tuple(cells[row[one]] if one in row else "" for one in aligned.names)
+        for name, cells in given.columns.items()
+        if name != SIZE
+    }
+    note = f"{len(missing)} of {len(aligned)} specimens have no row in {path} ({list_names(missing)})."
+    return {**aligned.columns, **columns}, [note] if missing else []
+
+
+def _structures(path: Path) -> dict[str, str]:
+    try:
+        header, *rows = table_rows(read_bytes(path))
+    except ValueError as error:
+        raise FileFormatError(f"{path} {error}; write the columns landmark and structure.") from error
+    landmark, structure = key_column(header, ("landmark",)), key_column(header, ("structure",))
+    if landmark is None or structure is None:
+        raise FileFormatError(f"{path} has no columns landmark and structure; write one row for each landmark.")
+    names = [row[landmark] for row in rows]
+    repeated = [name for name in names if names.count(name) > 1]
+    if repeated:
+        raise FileFormatError(f"{path} has two rows of landmark {repeated[0]!r}; keep one for each.")
+    return {row[landmark]: row[structure] for row in rows}
