@@ -408,6 +408,8 @@ def landmarks_check(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
     from statistics import fmean
 
+    if arguments.scans is None:
+        return _check_landmark_data(arguments)
     from shapespace.commands.landmarks import check_landmarks
 
     checks = check_landmarks(arguments.marked, arguments.scans, arguments.output, say=warn)
@@ -424,6 +426,60 @@ def landmarks_check(arguments: argparse.Namespace) -> int:
         show(f"mean leave-one-out error by {kind}, largest first, of the size: {listed}")
     show(f"{len(checks)} landmarks compared, {findings} with a finding")
     return 1 if findings else 0
+
+
+def _check_landmark_data(arguments: argparse.Namespace) -> int:
+    from shapespace.commands.landmark_data import check_configurations
+    from shapespace.schemas import to_json
+
+    if arguments.output is not None:
+        raise InputError("-o goes with SAME, the folder that correspond wrote; leave it out.")
+    found = check_configurations(arguments.marked, arguments.sliders)
+    if arguments.json:
+        show_json(to_json(found))
+        return 1 if found.findings else 0
+    for note in (*found.notes, *found.findings):
+        say(note)
+    sliding = f", {found.semilandmarks} of them semilandmarks" if found.semilandmarks else ""
+    show(f"{found.specimens} specimens with {found.landmarks} landmarks ({found.dimensions}-D){sliding}")
+    if found.columns:
+        show(f"columns: {', '.join(found.columns)}")
+    for kind, missing in (("specimen", found.missing_by_specimen), ("landmark", found.missing_by_landmark)):
+        listed = sorted(missing.items(), key=lambda one: -one[1])
+        if listed:
+            counts = ", ".join(f"{name} {count}" for name, count in listed[:_LISTED])
+            show(f"missing by {kind}: {counts}{', ...' if len(listed) > _LISTED else ''}")
+    show(f"{sum(found.missing_by_specimen.values())} landmarks are missing, {len(found.findings)} findings")
+    return 1 if found.findings else 0
+
+
+def landmarks_convert(arguments: argparse.Namespace) -> int:
+    """Convert landmarks of many specimens."""
+    from shapespace.commands.landmark_data import convert_landmarks
+
+    found, notes = convert_landmarks(arguments.data, arguments.output, **given(arguments, convert_landmarks))
+    for note in notes:
+        say(note)
+    if arguments.json:
+        show_json({"output": str(arguments.output), "specimens": len(found), "landmarks": len(found.landmarks),
+                   "dimensions": found.dimensions, "notes": notes})  # fmt: skip
+    else:
+        show(f"{len(found)} specimens with {len(found.landmarks)} landmarks in {arguments.output}")
+    return 0
+
+
+def landmarks_plot(arguments: argparse.Namespace) -> int:
+    """Draw superimposed landmarks."""
+    from shapespace.commands.landmark_data import plot_configurations
+
+    notes = plot_configurations(arguments.data, arguments.output, arguments.links, arguments.sliders)
+    for note in notes:
+        say(note)
+    if arguments.json:
+        show_json({"figure": str(arguments.output), "notes": notes})
+    else:
+        show(f"The figure is {arguments.output}")
+    return 0
 
 
 def landmarks_suggest(arguments: argparse.Namespace) -> int:
@@ -544,6 +600,8 @@ def export(arguments: argparse.Namespace) -> int:
     """Write fits of a store as single files, or all of them as a table."""
     from shapespace.commands.export import export
 
+    if arguments.to is not None or arguments.formula is not None:
+        return _export_cohort(arguments)
     written, failed = export(
         arguments.store,
         arguments.names,
@@ -562,6 +620,26 @@ def export(arguments: argparse.Namespace) -> int:
         if arguments.table is not None:
             show(f"The table is {arguments.table}")
     return 0 if not failed else 1 if written else 2
+
+
+def _export_cohort(arguments: argparse.Namespace) -> int:
+    from shapespace.cli.answers.common import cohort_of
+    from shapespace.commands.export import export_cohort
+
+    if arguments.names or arguments.all or arguments.table is not None:
+        raise InputError("--to exports all shapes of DATA; leave out names, --all and --table.")
+    if arguments.formula is not None and arguments.to != "geomorph":
+        raise InputError("--formula is the model of the script for geomorph; give --to geomorph too.")
+    arguments.data = arguments.store
+    cohort = cohort_of(arguments)
+    files, notes = export_cohort(cohort, arguments.output, **given(arguments, export_cohort))
+    for note in (*cohort.notes, *notes):
+        say(note)
+    if arguments.json:
+        show_json({"files": [str(file) for file in files], "shapes": len(cohort), "notes": notes})
+    else:
+        show(f"{len(cohort)} shapes in {', '.join(map(str, files))}")
+    return 0
 
 
 def cache(arguments: argparse.Namespace) -> int:

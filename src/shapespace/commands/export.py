@@ -1,28 +1,38 @@
-"""What `export` does: results of a store back as single files, and all of them as one table."""
+"""What `export` does: fits of a store as single files or as one table, and cohorts as files of other programs."""
 
 from __future__ import annotations
 
 import io
 import re
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from shapespace.batch.progress import progress
+from shapespace.cohort.cohort import Cohort
+from shapespace.cohort.table import numbers_as_text
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.io.files import atomic_path, make_folder, write_bytes, write_error, write_text
+from shapespace.io.landmarks.configuration_io import CONFIGURATION_FORMATS, write_configurations
 from shapespace.io.landmarks.fiducials import fiducial_texts
+from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations
 from shapespace.io.meshes.mesh_io import write_mesh
-from shapespace.io.tables.table_io import CHECKSUM, write_checked
+from shapespace.io.tables.table_io import CHECKSUM, write_checked, write_rows
 from shapespace.schemas import to_json
+from shapespace.statistics.compare_shapes import complete_cohort
 from shapespace.store.results import ENDING, ENDINGS, Results, modes_of
 from shapespace.store.rows import META, coefficient_columns, kind_of
 
 _MAT_HEADER, _MAT_HEADER_BYTES = b"MATLAB 5.0 MAT-file, written by shapespace", 116
 _LONGEST_IN_MATLAB = 63  # characters; MATLAB's namelengthmax
+Target: TypeAlias = Literal["geomorph", "morphoj", "tps", "csv"]
+"""Programs and formats that cohorts are exported to."""
+COORDINATES, COVARIATES, R_SCRIPT, R_TABLE = "coordinates.csv", "covariates.csv", "shapespace.R", "anova.csv"
+"""Files of an export to geomorph, and the table that the script writes."""
 
 
 def export(
@@ -172,3 +182,104 @@ def _rows(results: Results, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
     for rows in results.iter_rows(asked):
         for values in zip(*rows.values(), strict=True):
             yield dict(zip(asked, values, strict=True))
+
+
+def export_cohort(cohort: Cohort, output: Path, to: Target, formula: str | None = None) -> tuple[list[Path], list[str]]:
+    """Write the aligned coordinates of a cohort, its table and sizes; return the files, and sentences on the contents.
+
+    `geomorph` is a folder with coordinates, covariates, and a script in R of the linear model `formula`.
+
+    Args:
+        cohort: its coordinates are written as they are compared: aligned, and in the tangent space in the gauge shape.
+        output: the file; a folder for geomorph, or to write landmarks.ENDING into.
+        to: geomorph (a folder with a script in R), morphoj, tps or csv (default: fits of STORE as files)
+        formula: for geomorph, linear model of shape, such as '~ sex + age' (default: the mean alone)
+
+    Raises:
+        InputError: a formula that cannot be read, or missing values in its columns.
+        FileError: something cannot be written.
+    """
+    notes: list[str] = []
+    if formula is not None:
+        cohort = complete_cohort(cohort, (formula,), (), drop_missing=False)
+    if cohort.estimated_share.any():
+        notes.append("Missing landmarks or vertices are written at their estimated positions.")
+    known = cohort.landmarks.names if cohort.source.kind == "landmarks" and cohort.landmarks is not None else ()
+    shapes = np.stack([cohort.vertices(k) for k in range(len(cohort))])[:, :, : cohort.dimensions]
+    columns = {"size": numbers_as_text(cohort.sizes_mm), **cohort.table.columns}
+    found = LandmarkConfigurations(names=cohort.names, points=shapes, landmarks=known, columns=columns)
+    if to != "geomorph":
+        ending = CONFIGURATION_FORMATS[to]
+        if output.suffix.lower() != ending:
+            output = make_folder(output) / f"landmarks{ending}"
+        return [output], [*notes, *write_configurations(output, found, to)]
+    make_folder(output)
+    write_configurations(output / COORDINATES, replace(found, columns={}), "csv")
+    table = zip(cohort.names, *columns.values(), strict=True)
+    write_rows(output / COVARIATES, ("name", *columns), table)
+    write_text(output / R_SCRIPT, _r_script(cohort.dimensions, formula))
+    if cohort.position_std is not None:
+        notes.append("The script gives all vertices the same weight, as compare does with --weights none.")
+    return [output / name for name in (COORDINATES, COVARIATES, R_SCRIPT)], notes
+
+
+def _r_script(dimensions: int, formula: str | None) -> str:
+    right = "1" if formula is None else formula.strip().removeprefix("~").strip()
+    return _R.replace("@FORMULA", right).replace("@K", str(dimensions)).replace("@TABLE", R_TABLE)
+
+
+_R = """\
+# Linear model of the exported shapes. Run with: Rscript shapespace.R in this folder.
+# With geomorph installed, procD.lm tests it by permutation. The sums of squares are also computed without geomorph.
+model <- coords ~ @FORMULA
+ss_type <- "II"  # of the sums of squares: "I", "II" or "III"
+iterations <- 999
+
+covariates <- read.csv("covariates.csv", check.names = FALSE, stringsAsFactors = TRUE, na.strings = "")
+table <- read.csv("coordinates.csv", check.names = FALSE)
+stopifnot(identical(as.character(table$name), as.character(covariates$name)))
+coords <- as.matrix(table[, -1])
+rownames(coords) <- table$name
+
+# The functions of formulas of shapespace.
+C <- function(x) factor(x)
+center <- function(x) x - mean(x)
+bs <- splines::bs
+
+if (requireNamespace("geomorph", quietly = TRUE)) {
+  shapes <- geomorph::arrayspecs(coords, ncol(coords) / @K, @K)
+  data <- do.call(geomorph::geomorph.data.frame, c(list(coords = shapes), as.list(covariates)))
+  fit <- geomorph::procD.lm(model, data = data, iter = iterations, SS.type = ss_type, print.progress = FALSE)
+  print(summary(fit))
+}
+
+# Sums of squares by differences of residual sums of squares of nested models.
+right <- model[-2]
+options(contrasts = c("contr.sum", "contr.poly"))
+X <- model.matrix(right, covariates)
+term <- attr(X, "assign")
+labels <- attr(terms(right), "term.labels")
+contains <- function(outer, inner) {
+  factors <- attr(terms(right), "factors") > 0
+  all(factors[, outer] >= factors[, inner])
+}
+residual <- function(terms) {
+  qr <- qr(X[, term %in% c(0, terms), drop = FALSE])
+  c(SS = sum(qr.resid(qr, coords)^2), Df = nrow(X) - qr$rank)
+}
+all <- seq_along(labels)
+rows <- lapply(all, function(k) {
+  without <- switch(ss_type,
+    I = all[all < k],
+    II = Filter(function(other) !contains(other, k), all),
+    III = all[all != k])
+  residual(without) - residual(c(without, k))
+})
+rows <- do.call(rbind, c(rows, list(residual(all), residual(0))))
+anova <- data.frame(term = c(labels, "Residuals", "Total"), Df = rows[, "Df"], SS = rows[, "SS"])
+last <- length(labels) + 1
+anova$R2 <- anova$SS / anova$SS[last + 1]
+anova$F <- ifelse(seq_len(nrow(anova)) < last, (anova$SS / anova$Df) / (anova$SS[last] / anova$Df[last]), NA)
+print(anova, row.names = FALSE)
+write.csv(anova, "@TABLE", row.names = FALSE)
+"""

@@ -48,7 +48,9 @@ FOLDER_FORMATS: Mapping[str, str] = MappingProxyType({"mrk.json": ".mrk.json", "
 """Format -> ending of folders with a file for each specimen."""
 
 
-def read_configurations(path: Path | str, *, name: str | None = None) -> LandmarkConfigurations:
+def read_configurations(
+    path: Path | str, *, name: str | None = None, sliders: Sequence[Path] = ()
+) -> LandmarkConfigurations:
     """Read the landmarks of many specimens, missing ones as not-a-number.
 
     Formats: TPS with curves and scale, NTS, wide and long tables (CSV, Excel), MorphoJ tables (.txt, with the columns
@@ -58,6 +60,7 @@ def read_configurations(path: Path | str, *, name: str | None = None) -> Landmar
     Args:
         path: the file or folder.
         name: of the array, for R files with several.
+        sliders: files for `read_sliders`, in place of sliders in `path`.
 
     Raises:
         FileError: it cannot be read, or is too long.
@@ -65,9 +68,14 @@ def read_configurations(path: Path | str, *, name: str | None = None) -> Landmar
         InputError: two specimens have one name.
         ShapespaceError: the extra `r`, which R files need, is not installed.
     """
-    path = Path(path)
-    if path.is_dir():
-        return _read_folder(path)
+    found = _read_folder(Path(path)) if Path(path).is_dir() else _read_file(Path(path), name)
+    for file in sliders:
+        numbers = read_sliders(file, len(found.landmarks))
+        found = replace(found, **{"curve_sliders" if numbers.ndim > 1 else "surface_sliders": numbers})
+    return found
+
+
+def _read_file(path: Path, name: str | None) -> LandmarkConfigurations:
     suffix = path.suffix.lower()
     single = next((ending for ending in _SINGLE if path.name.lower().endswith(ending)), None)
     if not (suffix in (*_TEXTS, *_TABLES, *R_ENDINGS) or single):

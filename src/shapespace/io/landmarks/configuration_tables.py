@@ -154,7 +154,7 @@ def _long(header: Sequence[str], rows: Sequence[Sequence[str]], path: Path) -> L
         found[name, label] = [coordinate(row[axis], what, path) for axis in axes]
     names = list(dict.fromkeys(name for name, _ in found))
     labels = list(dict.fromkeys(label for _, label in found))
-    if len(names) * len(labels) > 2 * len(found) + len(labels):
+    if len(names) * len(labels) > 2 * len(found):
         raise damage_error(path, "most specimens lack most landmarks; give each specimen the same landmark names")
     nothing = [math.nan] * len(axes)
     points = np.array([[found.get((name, label), nothing) for label in labels] for name in names])

@@ -1,0 +1,187 @@
+"""What `landmarks convert`, `check` and `plot` do with the landmarks of many specimens."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from shapespace.errors import FileFormatError, InputError
+from shapespace.geometry.landmark_alignment import align_landmarks, find_outliers
+from shapespace.io.files import read_bytes, write_text
+from shapespace.io.landmarks.configuration_io import (
+    read_configurations,
+    slider_texts,
+    write_configurations,
+)
+from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations
+from shapespace.io.read_limits import LARGEST_LANDMARK_FILE_BYTES
+from shapespace.io.tables.table_io import table_rows
+from shapespace.lazy import require_package
+
+_OTHER_SCALE = 4.0
+"""Ratio to the median size of a specimen in another unit: units differ by 10 or more, individuals by less than 2."""
+
+
+def convert_landmarks(
+    source: Path, output: Path, *, to: str | None = None, sliders: Sequence[Path] = (), object_name: str | None = None
+) -> tuple[LandmarkConfigurations, tuple[str, ...]]:
+    """Write the landmarks of many specimens in another format; return them, and sentences on what changed.
+
+    Sliders are written beside the output as OUT.curveslide.csv and OUT.surfslide.csv.
+
+    Args:
+        source: file or folder with landmarks.
+        output: file, or folder for formats with a file for each specimen.
+        to: format: tps, nts, morphoj, csv (a row for each specimen), long (a row for each landmark), or a folder of
+            mrk.json, fcsv or csv-folder (default: by the ending of OUT)
+        sliders: CSV of the semilandmarks as geomorph has them: before, slide, after, or surface; can be repeated
+        object_name: array of an R file with several, such as plethodon$land
+
+    Raises:
+        FileError: something cannot be read or written.
+        InputError: an unknown format, or one that cannot hold the landmarks.
+    """
+    if source.resolve() == output.resolve():
+        raise InputError(f"{output} is the file to convert; give another name to write to.")
+    found = read_configurations(source, name=object_name, sliders=sliders)
+    notes = [*found.notes, *write_configurations(output, found, to)]
+    for name, text in slider_texts(found).items():
+        path = output.with_name(f"{output.name.removesuffix(output.suffix)}.{name}")
+        write_text(path, text)
+        notes.append(f"The sliders are in {path.name}.")
+    return found, tuple(notes)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LandmarkDataCheck:
+    """Contents and findings of landmark data.
+
+    Args:
+        specimens: their number.
+        landmarks: their number.
+        dimensions: 2 or 3.
+        semilandmarks: number of sliding ones.
+        columns: of covariates.
+        missing_by_specimen: name -> number of missing landmarks, where there are any.
+        missing_by_landmark: name -> number of specimens without it, where there are any.
+        findings: what is to be checked, a sentence each.
+        notes: of the reader.
+    """
+
+    specimens: int
+    landmarks: int
+    dimensions: int
+    semilandmarks: int
+    columns: tuple[str, ...]
+    missing_by_specimen: dict[str, int]
+    missing_by_landmark: dict[str, int]
+    findings: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def check_configurations(data: Path, sliders: Sequence[Path] = ()) -> LandmarkDataCheck:
+    """Return what landmark data contain, and specimens and landmarks that look wrong.
+
+    Args:
+        data: file or folder with the landmarks of many specimens.
+        sliders: CSV of the semilandmarks as geomorph has them.
+
+    Raises:
+        FileError: something cannot be read.
+    """
+    found = read_configurations(data, sliders=sliders)
+    absent = ~found.observed
+    findings = [*_duplicates(found), *_other_scales(found)]
+    if len(found) > 1:
+        try:
+            findings += map(str, find_outliers(align_landmarks(found)))
+        except InputError as error:
+            findings.append(f"The landmarks cannot be aligned: {error}")
+    return LandmarkDataCheck(
+        specimens=len(found),
+        landmarks=len(found.landmarks),
+        dimensions=found.dimensions,
+        semilandmarks=len(np.unique(found.curve_sliders[:, 1])) + len(np.unique(found.surface_sliders)),
+        columns=tuple(found.columns),
+        missing_by_specimen={found.names[k]: int(absent[k].sum()) for k in np.unique(np.nonzero(absent)[0])},
+        missing_by_landmark={found.landmarks[k]: int(absent[:, k].sum()) for k in np.unique(np.nonzero(absent)[1])},
+        findings=tuple(findings),
+        notes=found.notes,
+    )
+
+
+def _duplicates(found: LandmarkConfigurations) -> list[str]:
+    findings: list[str] = []
+    first: dict[bytes, str] = {}
+    together: Counter[tuple[str, str]] = Counter()
+    for name, points in zip(found.names, found.points, strict=True):
+        other = first.setdefault(points.tobytes(), name)
+        if other != name:
+            findings.append(f"{name} has the same coordinates as {other}; remove one of them.")
+        place: dict[bytes, str] = {}
+        for label, point in zip(found.landmarks, points, strict=True):
+            if not np.isnan(point).any() and (before := place.setdefault(point.tobytes(), label)) != label:
+                together[before, label] += 1
+    for (one, two), count in together.most_common():
+        findings.append(f"Landmarks {one} and {two} are at one place in {count} of {len(found)} specimens.")
+    return findings
+
+
+def _other_scales(found: LandmarkConfigurations) -> list[str]:
+    # Root mean squares, which missing landmarks hardly change.
+    known = [points[seen] for points, seen in zip(found.points, found.observed, strict=True)]
+    sizes = np.array([float(np.sqrt(np.var(one - one.mean(axis=0)))) if len(one) > 1 else np.nan for one in known])
+    ratios = sizes / np.nanmedian(sizes) if np.isfinite(sizes).any() else sizes
+    return [
+        f"{name} is {ratio:.3g} times the median size, so its unit or scale differs."
+        for name, ratio in zip(found.names, ratios.tolist(), strict=True)
+        if ratio > _OTHER_SCALE or ratio < 1 / _OTHER_SCALE
+    ]
+
+
+def plot_configurations(
+    data: Path, output: Path, links: Path | None = None, sliders: Sequence[Path] = ()
+) -> tuple[str, ...]:
+    """Draw all specimens superimposed around their mean with numbered landmarks; return the notes of the alignment.
+
+    Args:
+        data: file or folder with the landmarks of many specimens.
+        output: FILE.svg, FILE.pdf or FILE.png.
+        links: CSV of two columns of landmarks, by number or name, that lines connect on the mean
+        sliders: CSV of the semilandmarks as geomorph has them; can be repeated
+
+    Raises:
+        FileError: something cannot be read or written.
+        InputError: another format, fewer than two specimens, or landmarks that cannot be aligned.
+        ShapespaceError: the extra `report` is not installed.
+    """
+    require_package("matplotlib", "A plot", "'shapespace[report]'")
+    from shapespace.report.figures.landmark_figures import superimposed_landmarks
+    from shapespace.report.figures.publication import publication_style, save_figure
+
+    found = read_configurations(data, sliders=sliders)
+    aligned = align_landmarks(found)
+    pairs = [] if links is None else _read_links(links, found.landmarks)
+    with publication_style():
+        figure = superimposed_landmarks(aligned, pairs)
+        save_figure(figure, output.with_suffix(""), (output.suffix.lower().lstrip("."),))
+    return (*found.notes, *aligned.notes)
+
+
+def _read_links(file: Path, landmarks: Sequence[str]) -> list[tuple[int, int]]:
+    try:
+        rows = [[cell.strip() for cell in row] for row in table_rows(read_bytes(file, LARGEST_LANDMARK_FILE_BYTES))]
+    except ValueError as error:
+        raise FileFormatError(f"{file} {error}; correct the table.") from error
+    number = {**{str(k): k - 1 for k in range(1, len(landmarks) + 1)}, **{name: k for k, name in enumerate(landmarks)}}
+    if rows and not set(rows[0]) <= set(number):
+        rows = rows[1:]
+    bad = next((row for row in rows if len(row) != 2 or not set(row) <= set(number)), None)
+    if bad is not None or not rows:
+        row = f"the row {', '.join(bad)[:60]!r}" if bad else "no row"
+        raise FileFormatError(f"{file} has {row}; give two landmarks in each row, by number from 1 or by name.")
+    return [(number[one], number[two]) for one, two in rows]
