@@ -12,7 +12,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -49,6 +49,9 @@ _PLAIN = re.compile(r"""[\w\s+\-*:/^().,~="'`]*""")
 _POWER = re.compile(r"\*\*|\^")
 _ALLOWED = f"columns and {', '.join(FUNCTIONS)} are all that may stand there."
 _CONTEXT = {"sqrt": np.sqrt}
+Coding: TypeAlias = Literal["deviation", "treatment"]
+"""Coding of classes: deviations from their mean, or differences from the first class."""
+_CONTRASTS: Mapping[Coding, str] = {"deviation": "contr.sum", "treatment": "contr.treatment"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,8 +268,13 @@ def random_effects_of(random: str, table: Table) -> tuple[tuple[frozenset[str], 
     return tuple(frozenset(factor.text for factor in term) for term in _parsed(effects, table)), column
 
 
-def design_of(formula: str, table: Table) -> Design:
+def design_of(formula: str, table: Table, coding: Coding = "deviation") -> Design:
     """Return the columns of a linear model of the rows of a table, in which nothing that is named is missing.
+
+    Args:
+        formula: of the model.
+        table: with the columns that it names.
+        coding: of classes.
 
     Raises:
         InputError: the formula cannot be read, names something that is no column or calls something that is not in
@@ -295,7 +303,7 @@ def design_of(formula: str, table: Table) -> Design:
         own = [inside[factor.name, factor.holds_classes(table)] for factor in term]
         for factor, one in zip(term, own, strict=True):
             variable_of[factor.text] = one.column
-            codes[factor.text] = factor.written(one.column, classes=bool(one.levels))
+            codes[factor.text] = factor.written(one.column, coding, classes=bool(one.levels))
         written.append(":".join(codes[factor.text] for factor in term))
         labels.append(":".join(factor.text for factor in term))
         factors.append(frozenset(factor.text for factor in term))
@@ -356,10 +364,10 @@ class _Factor:
             )
         return text or self.call == "C"
 
-    def written(self, column: str, *, classes: bool) -> str:
+    def written(self, column: str, coding: Coding, *, classes: bool) -> str:
         """Return it with the column's name inside, which can be no code."""
         if classes:
-            return f"C({column}, contr.sum)"
+            return f"C({column}, {_CONTRASTS[coding]})"
         return column if self.tree is None else ast.unparse(_renamed(self.tree, column))
 
 

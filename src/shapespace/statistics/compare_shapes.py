@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, TypeAlias
 
@@ -21,6 +21,7 @@ from shapespace.reprs import list_briefly, short_repr
 from shapespace.schemas import Methods, TestScheme
 from shapespace.statistics.analysis_result import AnalysisResult
 from shapespace.statistics.compare_formula import (
+    Coding,
     Design,
     Term,
     Variable,
@@ -29,7 +30,7 @@ from shapespace.statistics.compare_formula import (
     random_effects_of,
 )
 from shapespace.statistics.compare_maps import EffectMap, effect_maps
-from shapespace.statistics.compare_strata import Stratum, less
+from shapespace.statistics.compare_strata import Stratum, is_nested, less, unit_stratum
 from shapespace.statistics.compare_unequal import Units, is_between_units, units_of
 from shapespace.statistics.compare_within import ModelStrata, RepeatedMeasures, WithinSubjects, strata_of
 from shapespace.statistics.dispersion import DispersionTest
@@ -44,6 +45,7 @@ TYPES: tuple[SquaresType, ...] = ("I", "II", "III")
 """Of sums of squares: of a term after those before it, after all that do not contain it, or after all others."""
 
 VertexWeights: TypeAlias = Literal["confidence", "none"]
+ErrorPermutation: TypeAlias = Literal["units", "residuals"]
 _RANK = 1e-9  # ratio of singular values; below is float64 rounding
 _TIE = 1e-9  # relative; statistics nearer than float64 sums are accurate count as equal
 _WEIGHTED_NOTE = (
@@ -79,6 +81,12 @@ class CompareConfig:
         weights: of the vertices in the sums of squares: `confidence`, smaller where the position along the surface is
             uncertain, if all surfaces are from a correspondence that has estimated this; `none`: all are equal, as
             always with unequal variances.
+        errors: term -> error term, over whose mean square its F is computed, such as `genus` -> `genus:species`
+            (default: the residuals).
+        error_permutation: of tests with an error term: `units` permutes the mean residuals of its classes, such as
+            species; `residuals` those of single shapes, as RRPP, whose level is wrong if the classes vary.
+        coding: of classes, on which tests of type III depend: `deviation` from their mean, or `treatment`, differences
+            from the first class, the default of R.
     """
 
     anova_type: SquaresType = "II"
@@ -93,6 +101,9 @@ class CompareConfig:
     unequal_variances: bool = False
     effect_size: EffectSize = "box-cox"
     weights: VertexWeights = "confidence"
+    errors: Mapping[str, str] = field(default_factory=dict[str, str])
+    error_permutation: ErrorPermutation = "units"
+    coding: Coding = "deviation"
 
     def __post_init__(self) -> None:
         if self.anova_type not in TYPES:
@@ -105,6 +116,10 @@ class CompareConfig:
             raise InputError("The seed must be 0 or more, and the level of significance between 0 and 1.")
         if self.effect_size not in EFFECT_SIZES:
             raise InputError(f"There is no effect size {self.effect_size!r}; choose one of {', '.join(EFFECT_SIZES)}.")
+        if self.errors and self.unequal_variances:
+            raise InputError("Tests with error terms assume equal variances; leave out one of the two.")
+        if self.coding == "treatment" and (self.errors or self.blocks or self.random):
+            raise InputError("Error terms, blocks and random terms need deviation coding; leave out the other coding.")
         if self.bump_width_mm is not None and not 0 < self.bump_width_mm < math.inf:
             raise InputError(f"The width of bumps must be millimetres above 0, not {self.bump_width_mm}.")
 
@@ -123,6 +138,7 @@ class TermTest:
         z: F in standard deviations above the mean of its arrangements, after `CompareConfig.effect_size`.
         p: share of arrangements with an F as large, the observed one among them.
         arrangements: (P,) F of each, the observed one first.
+        error: whose mean square F is divided by.
     """
 
     term: str
@@ -134,6 +150,7 @@ class TermTest:
     z: float
     p: float
     arrangements: FloatArray
+    error: str = "residuals"
 
     __repr__ = short_repr
 
@@ -295,18 +312,11 @@ def compare(
     require(formula, str, "compare", "write a formula such as '~ sex + age'")
     config = config or CompareConfig()
     require(config, CompareConfig, "compare", "give the options as CompareConfig(...)")
-    own = tuple(cohort.table.columns)
-    cohort = _with_sizes(cohort)
     random, config = _random(config, cohort)
-    named = columns_of(formula, cohort.table)
-    unknown = int(np.isnan(cohort.sizes_mm).sum())
-    if unknown and not config.drop_missing and {"size", "log_size"} & set(named) - set(own):
-        raise InputError(
-            f"The size of {unknown} of {len(cohort)} shapes is not known in mm; fit them with --unit, or leave them "
-            "out with --drop-missing."
-        )
-    cohort = cohort.complete([*named, *([config.blocks] if config.blocks else ())], drop_missing=config.drop_missing)
-    design = design_of(formula, cohort.table)
+    cohort = complete_cohort(
+        cohort, [formula], [config.blocks] if config.blocks else [], drop_missing=config.drop_missing
+    )
+    design = design_of(formula, cohort.table, config.coding)
     subjects = None if config.blocks is None else cohort.table.texts(config.blocks)
     repeated = subjects is not None and len(set(subjects)) < len(subjects)
     root = _weight_root(cohort) if config.weights == "confidence" and not config.unequal_variances else None
@@ -320,6 +330,9 @@ def compare(
     if root is not None:
         cohort = replace(cohort, notes=(*cohort.notes, _WEIGHTED_NOTE))
         strata = strata_from(cohort.coefficients @ root).every
+    errors = {name: _error_terms(strata, design, name, error) for name, error in config.errors.items()}
+    errors = {term.label: error for term, error in errors.values()}
+    made, among = _with_units(made, errors, design)
     families = [_weighted(cohort, design, family) for family in _families(design, made)]
     total = len(design.terms) + len(families) * (1 + config.maps)
     step = StepCounter(total, progress).add
@@ -327,7 +340,7 @@ def compare(
         test
         for stratum in strata
         for test in term_tests(
-            stratum, config, step, units_of(stratum, design, owners) if config.unequal_variances else None
+            stratum, config, step, units_of(stratum, design, owners) if config.unequal_variances else None, errors
         )
     )
     effects = tuple(
@@ -337,17 +350,17 @@ def compare(
     )
     dispersions = tuple(
         test
-        for stratum in made.every
+        for stratum in strata
         if is_between_units(stratum)
         for test in units_of(stratum, design, owners).dispersions(cohort.n_vertices, config.permutations, config.seed)
     )
-    methods = _methods(cohort, design, strata, subjects, dispersions, config)
+    methods = _methods(cohort, design, strata, subjects, dispersions, config, errors)
     return CompareResult(
         cohort=cohort,
         design=design,
         config=config,
         tests=tests,
-        strata=tuple(_summarise_stratum(stratum, config) for stratum in strata),
+        strata=tuple(_summarise_stratum(stratum, config, among if stratum is strata[0] else ()) for stratum in strata),
         effects=effects,
         angles=(*_parallel(design, made, config), *_between(effects)),
         n_subjects=len(set(subjects)) if subjects is not None else len(cohort),
@@ -355,6 +368,67 @@ def compare(
         methods=methods,
         repeated_measures=made.repeated_measures,
     )
+
+
+def complete_cohort(cohort: Cohort, formulas: Sequence[str], columns: Sequence[str], *, drop_missing: bool) -> Cohort:
+    """Return the shapes with values in all columns and formulas, with `size` and `log_size` in the table.
+
+    Raises:
+        InputError: no such column, missing values or sizes, or a formula that cannot be read.
+    """
+    own = set(cohort.table.columns)
+    sizes = {"size": cohort.sizes_mm, "log_size": np.log(cohort.sizes_mm)}
+    cohort = with_columns(cohort, {name: v for name, v in sizes.items() if name not in own})
+    named = [*(column for formula in formulas for column in columns_of(formula, cohort.table)), *columns]
+    unknown = int(np.isnan(cohort.sizes_mm).sum())
+    if unknown and not drop_missing and {"size", "log_size"} & set(named) - own:
+        raise InputError(
+            f"The size of {unknown} of {len(cohort)} shapes is not known in mm; fit them with --unit, or leave them "
+            "out with --drop-missing."
+        )
+    return cohort.complete(named, drop_missing=drop_missing)
+
+
+def _error_terms(strata: Sequence[Stratum], design: Design, name: str, error: str) -> tuple[Term, Term]:
+    """Return a term and its error term.
+
+    Raises:
+        InputError: they are not in the model or in one stratum, or the error is no group of the term's classes.
+    """
+    found: list[tuple[Term, Stratum]] = []
+    for one in (name, error):
+        wanted = sorted(one.replace(" ", "").split(":"))
+        own = [(t, s) for s in strata for t in s.terms if sorted(t.label.replace(" ", "").split(":")) == wanted]
+        if not own:
+            terms = ", ".join(term.label for term in design.terms)
+            raise InputError(f"There is no term {one[:60]!r} in {design.formula!r}; choose from {terms}.")
+        found += own[:1]
+    (term, stratum), (error_term, other) = found
+    if not term.factors < error_term.factors:
+        raise InputError(
+            f"The error term {error!r} must contain {name!r} and more, such as genus:species for genus in genus / "
+            "species."
+        )
+    if stratum is not other or stratum.scheme != "permute" or np.ptp(stratum.groups):
+        raise InputError(f"{name!r} and {error!r} are not tested between the same subjects; leave out one of them.")
+    if any(one.column in error_term.variables and not one.levels for one in design.variables):
+        raise InputError(f"The error term {error!r} contains a column of numbers; write C(column) for classes.")
+    return term, error_term
+
+
+def _with_units(
+    made: ModelStrata, errors: Mapping[str, Term], design: Design
+) -> tuple[ModelStrata, tuple[Stratum, ...]]:
+    """Return the strata of effects, in which those with an error term are tested on means of its units, and these."""
+    if not errors:
+        return made, ()
+    first = made.every[0]
+    own = {error: [term for term in first.terms if errors.get(term.label) is error] for error in errors.values()}
+    among = tuple(unit_stratum(first, error, terms, design) for error, terms in own.items())
+    left = [term for term in first.terms if term.label not in errors]
+    moved = [term for term in first.terms if term.label in errors]
+    rest = replace(first, terms=tuple(left), nuisance=(*first.nuisance, *moved))
+    return replace(made, every=(*among, rest, *made.every[1:])), among
 
 
 def _random(config: CompareConfig, cohort: Cohort) -> tuple[tuple[frozenset[str], ...] | None, CompareConfig]:
@@ -381,11 +455,6 @@ def _weight_root(cohort: Cohort) -> FloatArray | None:
     return np.asarray(np.linalg.cholesky((cohort.basis * weight) @ cohort.basis.T), dtype=np.float64)
 
 
-def _with_sizes(cohort: Cohort) -> Cohort:
-    sizes = {"size": cohort.sizes_mm, "log_size": np.log(cohort.sizes_mm)}
-    return with_columns(cohort, {name: v for name, v in sizes.items() if name not in cohort.table.columns})
-
-
 def _methods(
     cohort: Cohort,
     design: Design,
@@ -393,6 +462,7 @@ def _methods(
     subjects: Sequence[str] | None,
     dispersions: Sequence[DispersionTest],
     config: CompareConfig,
+    errors: Mapping[str, Term],
 ) -> Methods:
     """Return sample sizes, tests and assumptions of a comparison."""
     owners = cohort.names if subjects is None else subjects
@@ -402,13 +472,20 @@ def _methods(
         for term in stratum.terms:
             reduced = stratum.reduced(term, config.anova_type)
             flips = config.unequal_variances or stratum.flips(reduced)
+            own, error = unit if is_between_units(stratum) else f"difference within a {unit}", errors.get(term.label)
+            if error is not None and config.error_permutation == "units":
+                own, reduced = f"unit of {error.label}", [one for one in reduced if one is not error]
             schemes.append(
                 TestScheme(
                     tested=(term.label,),
-                    statistic="F, unequal variances" if config.unequal_variances else "F",
+                    statistic="F, unequal variances"
+                    if config.unequal_variances
+                    else "F"
+                    if error is None
+                    else f"F over {error.label}",
                     stratum=stratum.name,
                     resampling="sign flips" if flips else "permutation",
-                    unit=unit if is_between_units(stratum) else f"difference within a {unit}",
+                    unit=own,
                     reduced_model=tuple(other.label for other in reduced),
                     arrangements=config.permutations,
                     unequal_variances=config.unequal_variances,
@@ -444,6 +521,7 @@ def term_tests(
     config: CompareConfig,
     step: Callable[[], None] = lambda: None,
     units: Units | None = None,
+    errors: Mapping[str, Term] | None = None,
 ) -> Iterator[TermTest]:
     """Yield the tests of the terms of a stratum.
 
@@ -452,15 +530,17 @@ def term_tests(
         config: of the comparison.
         step: called after each term.
         units: of the stratum, to test with unequal variances; None assumes equal ones.
+        errors: error terms by the names of terms; None for the residuals.
 
     Raises:
-        InputError: unequal variances, and a unit that the model fits exactly.
+        InputError: unequal variances, and a unit that the model fits exactly, or an error term without degrees of
+            freedom.
     """
     total = float((stratum.shapes**2).sum())
     for term in stratum.terms:
         reduced = stratum.reduced(term, config.anova_type)
         residual = stratum.residual(reduced)
-        own = _span(less(stratum.matrix[:, stratum.columns_of([term])], stratum.matrix[:, stratum.columns_of(reduced)]))
+        own = _own_columns(stratum, term, config)
         rest = _span(stratum.matrix - own @ (own.T @ stratum.matrix), stratum.matrix.shape[1] - own.shape[1])
         count = config.permutations if units is None else 1
         products = stratum.products(np.hstack([own, rest]), residual, count, config.seed, flips=stratum.flips(reduced))
@@ -473,6 +553,9 @@ def term_tests(
             f = units.estimate(
                 units.own(term, reduced), [term], reduced, config.permutations, config.seed, term.label
             ).statistic()
+        error = (errors or {}).get(term.label)
+        if error is not None:
+            f = _error_f(stratum, term, error, config)
         yield TermTest(
             term=term.label,
             stratum=stratum.name,
@@ -483,11 +566,42 @@ def term_tests(
             z=effect_size(f, config.effect_size),
             p=_share(f),
             arrangements=read_only(f),
+            error="residuals" if error is None else error.label,
         )
         step()
 
 
-def _summarise_stratum(stratum: Stratum, config: CompareConfig) -> StratumSummary:
+def _own_columns(stratum: Stratum, term: Term, config: CompareConfig) -> FloatArray:
+    """Return (n, r) orthonormal columns that a term adds to its reduced model."""
+    reduced = stratum.columns_of(stratum.reduced(term, config.anova_type))
+    return _span(less(stratum.matrix[:, stratum.columns_of([term])], stratum.matrix[:, reduced]))
+
+
+def _error_f(stratum: Stratum, term: Term, error: Term, config: CompareConfig) -> FloatArray:
+    """Return the (P,) mean squares of a term divided by those of its error term (M35), the observed one first."""
+    own, noise = _own_columns(stratum, term, config), _own_columns(stratum, error, config)
+    reduced, count = stratum.reduced(term, config.anova_type), own.shape[1]
+    if config.error_permutation == "units":
+        left = [one for one in reduced if one is not error]
+        within = float((stratum.residual([*stratum.nuisance, *stratum.terms]) ** 2).sum()) / stratum.df_error
+        among = float(((noise.T @ stratum.shapes) ** 2).sum()) / noise.shape[1]
+        size = len(stratum.matrix) / (1 + int(stratum.error_units(error).max()))
+        drawn = stratum.unit_products(
+            np.hstack([own, noise]), left, error, config.permutations, config.seed,
+            ratio=max(among / max(within, 1e-300) - 1.0, 0.0) / size,
+        )  # fmt: skip
+        explained, left_over = drawn[:, :count], drawn[:, count:]
+    else:
+        # RRPP permutes the residuals of the reduced model of each of the two terms.
+        explained, left_over = (
+            stratum.products(columns, stratum.residual(model), config.permutations, config.seed)
+            for columns, model in ((own, reduced), (noise, stratum.reduced(error, config.anova_type)))
+        )
+    mean_squares = [(part**2).sum(axis=(1, 2)) / part.shape[1] for part in (explained, left_over)]
+    return _ratio(mean_squares[0], mean_squares[1])
+
+
+def _summarise_stratum(stratum: Stratum, config: CompareConfig, among: Sequence[Stratum]) -> StratumSummary:
     residual = stratum.residual(stratum.terms)
     return StratumSummary(
         stratum=stratum.name,
@@ -495,7 +609,7 @@ def _summarise_stratum(stratum: Stratum, config: CompareConfig) -> StratumSummar
         squares=float((residual**2).sum()),
         df_total=len(stratum.matrix) - stratum.removed,
         squares_total=float((stratum.shapes**2).sum()),
-        log_arrangements=stratum.fewest_log_arrangements(flips=config.unequal_variances),
+        log_arrangements=min(one.fewest_log_arrangements(flips=config.unequal_variances) for one in (stratum, *among)),
     )
 
 
@@ -530,7 +644,9 @@ def _families(design: Design, strata: ModelStrata) -> Iterator[_ContrastFamily]:
             yield _ContrastFamily(one.name, tuple(ends))
             continue
         for stratum in strata.every:
-            if any(term in stratum.terms for term in wanted):
+            own = [term for term in wanted if term in stratum.terms]
+            # Classes of a nested variable have no common mean of the others, such as species of different genera.
+            if own and (alone or all(len(stratum.columns_of([term])) == len(term.columns) for term in own)):
                 reduced = tuple(stratum.without(both))
                 ends = [
                     _Contrast(
@@ -569,7 +685,9 @@ def _weighted(cohort: Cohort, design: Design, family: _ContrastFamily) -> _Contr
             (low, high), values = _pairs(one)[0], _pairs(other)[0]
             first, second = (design.contrast(one.column, low, high, {other.column: value}) for value in values)
             contrasts = [second - first]
-    known = information(cohort, design.matrix, np.stack(contrasts))
+    # Nested terms have columns that are not independent, and contrasts average over their classes.
+    columns = [c for term in design.terms if not is_nested(term, design.terms) for c in term.columns]
+    known = information(cohort, design.matrix[:, columns], np.stack(contrasts)[:, columns]) if columns else None
     if known is None:
         return family
     weights = weights_of(known)
@@ -750,7 +868,7 @@ def _parallel(design: Design, strata: ModelStrata, config: CompareConfig) -> Ite
         words = [f"{_levels_text(one, *_pairs(one)[0])}, {other.describe(level)}" for level in levels]
         pairs = list(itertools.combinations(range(len(levels)), 2))
         for (first, second), drawn in zip(pairs, _changes_in_pairs(design, strata, one, other, config), strict=False):
-            angles = _angles(*drawn)
+            angles = angles_between(*drawn)
             # Their arrangements assume equal variances.
             p = None if config.unequal_variances else float((angles >= angles[0] - _TIE).mean())
             yield EffectAngle(words[first], words[second], float(angles[0]), p)
@@ -807,11 +925,11 @@ def _between(effects: Sequence[ShapeEffect]) -> Iterator[EffectAngle]:
     """Yield angles between the effects of different variables."""
     for one, other in itertools.combinations(effects, 2):
         if one.name != other.name and ":" not in one.name + other.name:
-            angle = float(_angles(one.change[None], other.change[None])[0])
+            angle = float(angles_between(one.change[None], other.change[None])[0])
             yield EffectAngle(one.label, other.label, angle, None)
 
 
-def _angles(one: FloatArray, other: FloatArray) -> FloatArray:
+def angles_between(one: FloatArray, other: FloatArray) -> FloatArray:
     """Return the (P,) angles in degrees of vectors (P, K) (S10)."""
     lengths = np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
     return np.degrees(np.arccos(np.clip((one * other).sum(axis=1) / np.maximum(lengths, 1e-300), -1, 1)))

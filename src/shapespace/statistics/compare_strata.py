@@ -127,6 +127,34 @@ class Stratum:
         own[tested] = contrast[self.columns[tested]]
         return np.linalg.pinv(self.matrix).T @ own
 
+    def error_units(self, error: Term) -> Rows:
+        """Return the (n,) unit of each row, from 0: the combination of classes of an error term."""
+        own = [term for term in (*self.nuisance, *self.terms) if term.factors <= error.factors]
+        cells = np.round(self.matrix[:, self.columns_of(own)], 9)
+        return np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
+
+    def unit_products(
+        self, basis: FloatArray, reduced: Sequence[Term], error: Term, permutations: int, seed: int, ratio: float
+    ) -> FloatArray:
+        """Return products as `products`, where the mean residuals of the units of an error term are permuted.
+
+        Args:
+            basis: (n, m), orthogonal to the reduced model.
+            reduced: terms of the reduced model.
+            error: whose classes are the units.
+            permutations: number of permutations, including the observed data.
+            seed: of these.
+            ratio: variance between units divided by that within, by which means are standardised before.
+        """
+        units, residual = self.error_units(error), self.residual(reduced)
+        means = means_of(residual, units)
+        counts = np.bincount(units)[:, None]
+        deviation = np.sqrt(ratio + 1.0 / counts)
+        sums = means_of(basis, units) * counts * deviation
+        among = replace(self, groups=np.zeros(len(means), dtype=np.intp), units=None, n_units=0)
+        drawn = among.products(sums, means / deviation, permutations, seed)
+        return basis.T @ (residual - means[units]) + drawn  # M34
+
     def flips(self, reduced: Sequence[Term]) -> bool:
         """Return whether the arrangements of the residuals of a reduced model are flips of signs.
 
@@ -198,9 +226,8 @@ def independent_stratum(shapes: FloatArray, design: Design) -> Stratum:
         InputError: more columns than rows, or a term that follows from the others.
     """
     n = len(shapes)
-    refuse_few(n - 1, design, "", n, "shapes", design.matrix.shape[1])
-    everything = design.matrix - design.matrix.mean(axis=0)
-    columns = np.arange(design.matrix.shape[1], dtype=np.intp)
+    everything, columns = independent_columns(design.matrix - design.matrix.mean(axis=0), design.terms)
+    refuse_few(n - 1, design, "", n, "shapes", len(columns))
     refuse_aliased(everything, columns, design.terms, design)
     rows = np.zeros(n, dtype=np.intp)
     return Stratum(
@@ -236,8 +263,7 @@ def between_stratum(
         InputError: more columns than subjects, or a term that follows from the others or from the conditions.
     """
     where = f"between {blocks}"
-    own = columns_of_terms(terms)
-    covariates = matrix[:, own] - matrix[:, own].mean(axis=0)
+    covariates, own = independent_columns(matrix - matrix.mean(axis=0), terms)
     n = len(means)
     refuse_few(n - 1, design, where, n, "blocks", len(own))
     refuse_aliased(covariates, own, terms, design, where)
@@ -284,6 +310,25 @@ def between_stratum(
         number=1,
         nuisance=tuple(nuisance),
     )
+
+
+def unit_stratum(stratum: Stratum, error: Term, terms: Sequence[Term], design: Design) -> Stratum:
+    """Return the stratum of the means of the units of an error term, where terms with this error are tested.
+
+    Raises:
+        InputError: no degrees of freedom, or terms that follow from others.
+    """
+    units = stratum.error_units(error)
+    means = means_of(stratum.matrix, units)
+    matrix = np.zeros((len(means), design.matrix.shape[1]))
+    own = stratum.columns < matrix.shape[1]
+    matrix[:, stratum.columns[own]] = means[:, own]
+    others = [
+        (term, means[:, stratum.columns_of([term])])
+        for term in (*stratum.nuisance, *stratum.terms)
+        if term not in terms and not error.factors <= term.factors
+    ]
+    return between_stratum(means_of(stratum.shapes, units), matrix, others, design, terms, error.label)
 
 
 def common_stratum(
@@ -353,6 +398,33 @@ def columns_of_terms(terms: Sequence[Term]) -> Rows:
     return np.array(sorted(column for term in terms for column in term.columns), dtype=np.intp)
 
 
+def is_nested(term: Term, terms: Sequence[Term]) -> bool:
+    """Return whether a factor of an interaction has no term of its own, as `species` in `genus / species`."""
+    single = {factor for other in terms if len(other.factors) == 1 for factor in other.factors}
+    return len(term.factors) > 1 and not term.factors <= single
+
+
+def independent_columns(matrix: FloatArray, terms: Sequence[Term]) -> tuple[FloatArray, Rows]:
+    """Return the columns of terms with their numbers in the design (n, P); those of nested terms are independent.
+
+    A nested term has columns for combinations that do not exist, such as a species in another genus. They are replaced
+    by an orthonormal basis of what the term adds to the terms that it contains.
+    """
+    matrix, columns = matrix.copy(), list[int]()
+    for term in terms:
+        own = list(term.columns)
+        if is_nested(term, terms):
+            inside = [c for other in terms if other.factors < term.factors for c in other.columns if c in columns]
+            u, s, _ = np.linalg.svd(less(matrix[:, own], matrix[:, inside]), full_matrices=False)
+            rank = int((s > _ALIASED * np.linalg.norm(matrix[:, own])).sum())
+            if 0 < rank < len(own):
+                own = own[:rank]
+                matrix[:, own] = u[:, :rank]
+        columns += own
+    columns.sort()
+    return matrix[:, columns], np.array(columns, dtype=np.intp)
+
+
 def means_of(rows: FloatArray, group: Rows) -> FloatArray:
     """Return the mean of the rows of each group, whose numbers `at` (n,) count from 0."""
     out = np.zeros((int(group.max()) + 1, rows.shape[1]))
@@ -393,8 +465,7 @@ def refuse_aliased(
     """
     known = np.empty((len(matrix), 0))
     for term in terms:
-        for column in term.columns:
-            index = int(np.searchsorted(columns, column))
+        for index in np.flatnonzero(np.isin(columns, term.columns)):
             values = matrix[:, index]
             length = float(np.linalg.norm(values) if scale is None else scale[index])
             rest = values - known @ (known.T @ values)

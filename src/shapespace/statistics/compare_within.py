@@ -22,6 +22,7 @@ from shapespace.statistics.compare_strata import (
     between_stratum,
     columns_of_terms,
     common_stratum,
+    independent_columns,
     independent_stratum,
     means_of,
     refuse_aliased,
@@ -357,10 +358,7 @@ def strata_of(
     if subjects is None:
         return ModelStrata((independent_stratum(shapes, design),))
     n = len(shapes)
-    refuse_aliased(
-        design.matrix - design.matrix.mean(axis=0), np.arange(design.matrix.shape[1], dtype=np.intp), design.terms,
-        design,
-    )  # fmt: skip
+    refuse_aliased(*independent_columns(design.matrix - design.matrix.mean(axis=0), design.terms), design.terms, design)
     names, who = np.unique(np.asarray(subjects), return_inverse=True)
     if len(names) == 1:
         raise InputError(f"All {n} shapes are of one {blocks}, {names[0]}; a comparison needs several.")

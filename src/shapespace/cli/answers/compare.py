@@ -14,7 +14,7 @@ def run(arguments: argparse.Namespace) -> int:
     from shapespace.report.analyses.compare_report import compare_report
     from shapespace.statistics.compare_shapes import CompareConfig, compare
 
-    config = CompareConfig(**given(arguments, CompareConfig))
+    config = CompareConfig(**given(arguments, CompareConfig, errors=dict(arguments.error)))
     cohort = cohort_of(arguments)
     with steps(None, "permuting", "step", quiet=arguments.quiet) as step:
         result = compare(cohort, arguments.formula, config, progress=step)

@@ -19,12 +19,11 @@ from shapespace.report.analyses.methods_section import (
     methods_parts,
     multiplicity_sentence,
 )
-from shapespace.report.analyses.shape_data import add_shape_data, blank_sentence, model_hashes
+from shapespace.report.analyses.shape_data import add_shape_data, blank_sentence, model_hashes, shape_change_parts
 from shapespace.schemas import (
     Counts,
     CurvePart,
     HistogramPart,
-    MorphPart,
     Part,
     Series,
     SurfaceMapPart,
@@ -78,6 +77,9 @@ def compare_report(result: CompareResult) -> AnalysisReport:
             "unequal_variances": result.config.unequal_variances,
             "effect_size": result.config.effect_size,
             "weights": result.config.weights,
+            "errors": dict(result.config.errors),
+            "error_permutation": result.config.error_permutation,
+            "coding": result.config.coding,
             "gauge": result.cohort.gauge,
             "shapes": len(result.cohort),
             "subjects": result.n_subjects,
@@ -295,6 +297,10 @@ def _term_parts(result: CompareResult) -> Iterator[Part]:
     if not strata:
         columns = (*columns[:1], *columns[2:])
         rows = [(*row[:1], *row[2:]) for row in rows]
+    if result.config.errors:
+        errors = {(test.term, test.stratum): test.error for test in result.tests}
+        columns = (*columns, _column("F over"))
+        rows = [(*row, errors.get((row[0], row[1] if strata else ""), "")) for row in rows]
     note = (
         f"Type {result.config.anova_type} sums of squares of Procrustes distances. {_f_sentence(result)} "
         f"{effect_size_sentence(result.config.effect_size)} R² is the share of the total of its stratum."
@@ -366,16 +372,10 @@ def _effect_parts(result: CompareResult, effect: ShapeEffect, number: int) -> It
                     unit=_lengths(result).of_map,
                     note=f"{_EXPLORATORY.capitalize().removesuffix(': ')}. {note}" if effect.exploratory else note,
                 )
-    if result.cohort.faces is not None:
-        times = _exaggeration(result, effect)
-        yield MorphPart(
-            title="From low to high",
-            note="" if times == 1 else f"Exaggerated {times} times.",
-            arrays=file,
-            low_label=effect.low,
-            high_label=effect.high,
-            times=float(times),
-        )
+    yield from shape_change_parts(
+        result.cohort, title="From low to high", arrays=file, low_label=effect.low, high_label=effect.high,
+        times=float(_exaggeration(result, effect)),
+    )  # fmt: skip
     yield from _score_parts(result, effect)
 
 
@@ -395,7 +395,8 @@ def _f_sentence(result: CompareResult) -> str:
             "F is the squared effect divided by its variance, with a variance for each subject (of two classes the "
             "squared Welch t), compared with sign flips of residuals."
         )
-    return "F is the mean square by that of the residuals, compared with its arrangements (see Methods)."
+    error = " or of an error term" if result.config.errors else ""
+    return f"F is the mean square by that of the residuals{error}, compared with its arrangements (see Methods)."
 
 
 def _score_parts(result: CompareResult, effect: ShapeEffect) -> Iterator[Part]:
@@ -466,14 +467,16 @@ def _meshes(result: CompareResult) -> Iterator[tuple[str, Mesh]]:
 
 
 def _tables(result: CompareResult) -> Mapping[str, Rows]:
-    terms: list[tuple[object, ...]] = [(t.term, t.stratum, t.df, t.squares, t.r2, t.f, t.z, t.p) for t in result.tests]
+    terms: list[tuple[object, ...]] = [
+        (t.term, t.stratum, t.df, t.squares, t.r2, t.f, t.z, t.p, t.error) for t in result.tests
+    ]
     for left in result.strata:
         share = left.squares / left.squares_total
-        terms.append(("residual", left.stratum, left.df, left.squares, share, "", "", ""))
-        terms.append(("total", left.stratum, left.df_total, left.squares_total, 1.0, "", "", ""))
+        terms.append(("residual", left.stratum, left.df, left.squares, share, "", "", "", ""))
+        terms.append(("total", left.stratum, left.df_total, left.squares_total, 1.0, "", "", "", ""))
     field = _lengths(result).field
     tables: dict[str, Rows] = {
-        "terms.csv": (("term", "stratum", "df", field("squares", "2"), "r2", "f", "z", "p"), terms),
+        "terms.csv": (("term", "stratum", "df", field("squares", "2"), "r2", "f", "z", "p", "error"), terms),
         "effects.csv": (
             (
                 "number",

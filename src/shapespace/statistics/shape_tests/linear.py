@@ -1,0 +1,498 @@
+"""Tests with linear models of shape: trajectories, pairs of groups, allometry and repeatability.
+
+Equations Mn are those of docs/morphometrics.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from shapespace.cohort.cohort import Cohort
+from shapespace.errors import InputError
+from shapespace.schemas import CurvePart, Part, Series, SurfaceMapPart, TableColumn, TablePart
+from shapespace.statistics.compare_formula import Design, design_of
+from shapespace.statistics.compare_shapes import CompareConfig, angles_between, complete_cohort, term_tests
+from shapespace.statistics.compare_strata import Stratum, independent_stratum, less, means_of
+from shapespace.statistics.methods import sample_sizes
+from shapespace.statistics.shape_tests.permutations import Groups, Orders, orders
+from shapespace.statistics.shape_tests.shape_test_result import ShapeTestResult, Statistic
+from shapespace.statistics.shape_tests.test_table import shape_test
+from shapespace.step_counter import StepCounter
+from shapespace.types import FloatArray
+
+Progress = Callable[[int, int], None]
+_LEVEL = 0.05
+_RANK = 1e-8  # relative length; columns below it follow from others, and estimates below it are equal
+_MOST_COORDINATES = 20_000_000
+"""Size-corrected coordinates that are written; more fill gigabytes, and the coefficients are written alone."""
+_BLOCK = 20_000  # vertices at a time; bounds memory
+
+
+def compare_trajectories(
+    cohort: Cohort,
+    *,
+    group: tuple[str, ...],
+    points: str,
+    order: tuple[str, ...] = (),
+    formula: str | None = None,
+    null: str | None = None,
+    permutations: int = 1000,
+    seed: int = 0,
+    drop_missing: bool = False,
+    progress: Progress | None = None,
+) -> ShapeTestResult:
+    """Compare the size, orientation and shape of trajectories, as `trajectory.analysis` of RRPP.
+
+    Args:
+        cohort: the shapes.
+        group: columns whose classes, or combinations of classes, each have a trajectory.
+        points: column whose classes are the points of each trajectory, such as age classes.
+        order: classes of the points in their order (default: numbers ascending, others alphabetically).
+        formula: linear model whose least-squares means are the points (default: group * points).
+        null: reduced model whose residuals are permuted, `1` for the mean shape (default: without the last term).
+        permutations: number of permutations, including the observed data.
+        seed: of the permutations.
+        drop_missing: exclude shapes with missing values in the table (default: an error).
+        progress: called with (done, total).
+
+    Raises:
+        InputError: no such column, a group without shapes at a point, fewer than two points, or models that are not
+            nested or leave no residuals.
+    """
+    if formula is None:
+        formula = " * ".join(f"C({c})" if cohort.table.kind(c) == "number" else f"`{c}`" for c in (*group, points))
+    cohort = _complete(cohort, [formula, null], [*group, points], drop_missing=drop_missing)
+    groups, texts = Groups.of(cohort, group), cohort.table.texts(points)
+    stages = order or tuple(sorted(set(texts), key=float if cohort.table.kind(points) == "number" else str))
+    if set(stages) != set(texts) or len(stages) < 2 or len(set(stages)) < len(stages):
+        raise InputError(
+            f"{cohort.table.where}: a trajectory needs two or more different points, each class of {points!r} once, "
+            f"not {', '.join(stages)[:80]}."
+        )
+    g, p = len(groups.names), len(stages)
+    cells = groups.codes * p + np.array([stages.index(text) for text in texts])
+    empty = np.flatnonzero(np.bincount(cells, minlength=g * p) == 0)
+    if len(empty):
+        raise InputError(
+            f"{cohort.table.where}: the group {groups.names[empty[0] // p]!r} has no shape with {points} "
+            f"{stages[empty[0] % p]!r}; leave out the group or the point."
+        )
+    design, reduced, labels = _models(cohort, formula, null)
+    estimator = _mean_estimator(design, np.eye(g * p)[cells])
+    columns: list[list[FloatArray]] = []
+    observed = np.zeros(0)
+    for means in _permuted(estimator, reduced, cohort, permutations, seed, progress):
+        paths = means.reshape(len(means), g, p, -1)
+        observed = observed if observed.size else paths[0]
+        length = np.linalg.norm(np.diff(paths, axis=2), axis=3).sum(axis=2)  # M31
+        centred = paths - paths.mean(axis=2, keepdims=True)
+        vectors = np.linalg.eigh(centred @ centred.swapaxes(2, 3))[1][..., -1]
+        axis = np.einsum("bgpk,bgp->bgk", centred, vectors)  # M32
+        axis *= np.where(((paths[:, :, -1] - paths[:, :, 0]) * axis).sum(axis=2) < 0, -1.0, 1.0)[:, :, None]
+        aligned = _aligned(centred) if p > 2 else None
+        for a, b in groups.pairs:
+            columns.append([np.abs(length[:, a] - length[:, b]), angles_between(axis[:, a], axis[:, b])])
+            if aligned is not None:
+                columns[-1].append(np.linalg.norm(aligned[:, a] - aligned[:, b], axis=(1, 2)))
+    names = ("difference of path length", "angle, degrees", "difference of trajectory shape")
+    center = observed.mean(axis=(0, 1))
+    axes = np.linalg.svd((observed - center).reshape(g * p, -1), full_matrices=False)[2][:2].T
+    scores, shown = (observed - center) @ axes, (cohort.coefficients - center) @ axes
+    figure = _curve(
+        "Trajectories", "principal component 1 of the points", "principal component 2",
+        [*(Series(x=_floats(one[:, 0]), y=_floats(one[:, 1]), label=name)
+           for name, one in zip(groups.names, scores, strict=True)),
+         Series(x=_floats(shown[:, 0]), y=_floats(shown[:, 1]), label="shapes", points=True)],
+    )  # fmt: skip
+    settings = {"group": list(group), "points": list(stages), "formula": formula, "null": null}
+    return _pairs_result(
+        "trajectory", cohort, groups, columns, names[: len(columns[0])], (*group, points), labels,
+        settings | {"permutations": permutations, "seed": seed}, (figure,),
+    )  # fmt: skip
+
+
+def _aligned(centred: FloatArray) -> FloatArray:
+    """Return trajectories (b, G, P, P) of size 1 rotated to their mean, in the coordinates of the mean (M33)."""
+    unit = centred / np.linalg.norm(centred, axis=(2, 3), keepdims=True)
+    mean = unit.mean(axis=1, keepdims=True)
+    own, target = (_root(one @ one.swapaxes(2, 3)) for one in (unit, mean))
+    u, _, vt = np.linalg.svd(target @ own)
+    return own @ (u @ vt).swapaxes(2, 3)
+
+
+def _root(gram: FloatArray) -> FloatArray:
+    values, vectors = np.linalg.eigh(gram)
+    return (vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]) @ vectors.swapaxes(-1, -2)
+
+
+def compare_pairs(
+    cohort: Cohort,
+    *,
+    formula: str,
+    group: tuple[str, ...],
+    covariate: str | None = None,
+    null: str | None = None,
+    permutations: int = 1000,
+    seed: int = 0,
+    drop_missing: bool = False,
+    progress: Progress | None = None,
+) -> ShapeTestResult:
+    """Compare each pair of groups by their least-squares means, or by their slopes, as `pairwise` of RRPP.
+
+    Args:
+        cohort: the shapes.
+        formula: linear model, such as `~ species * site`.
+        group: columns whose classes, or combinations of classes, are the groups.
+        covariate: column of numbers whose slopes are compared (default: means are, at the mean of all numbers).
+        null: reduced model whose residuals are permuted, `1` for the mean shape (default: without the last term).
+        permutations: number of permutations, including the observed data.
+        seed: of the permutations.
+        drop_missing: exclude shapes with missing values in the table (default: an error).
+        progress: called with (done, total).
+
+    Raises:
+        InputError: no such column, a covariate that is constant within a group, models that are not nested or leave no
+            residuals, or groups that are all the same in the model.
+    """
+    named = [*group, *([covariate] if covariate else [])]
+    cohort = _complete(cohort, [formula, null], named, drop_missing=drop_missing)
+    groups = Groups.of(cohort, group)
+    design, reduced, labels = _models(cohort, formula, null)
+    if covariate is None:
+        estimator, names = _mean_estimator(design, groups.indicator), ("distance",)
+    else:
+        lines = _lines(groups.indicator, cohort.table.numbers(covariate), covariate)
+        full = _with_constant(design.matrix)
+        estimator = np.linalg.pinv(lines)[len(groups.names) :] @ full @ np.linalg.pinv(full)
+        names = ("distance", "difference of vector length", "angle, degrees")
+    if float(np.ptp(estimator, axis=0).max()) <= _RANK * float(np.abs(estimator).max()):
+        raise InputError(
+            f"In {formula!r} all groups of {' × '.join(group)} have the same {'slope' if covariate else 'mean'}; add "
+            f"{'the interaction of the groups with the covariate' if covariate else 'the groups'}."
+        )
+    columns: list[list[FloatArray]] = []
+    for vectors in _permuted(estimator, reduced, cohort, permutations, seed, progress):
+        length = np.linalg.norm(vectors, axis=2)
+        for a, b in groups.pairs:
+            columns.append([np.linalg.norm(vectors[:, a] - vectors[:, b], axis=1)])
+            if covariate is not None:
+                columns[-1] += [np.abs(length[:, a] - length[:, b]), angles_between(vectors[:, a], vectors[:, b])]
+    settings = {"formula": formula, "group": list(group), "covariate": covariate, "null": null}
+    return _pairs_result(
+        "pairwise", cohort, groups, columns, names, group, labels,
+        settings | {"permutations": permutations, "seed": seed},
+    )  # fmt: skip
+
+
+def analyse_allometry(
+    cohort: Cohort,
+    *,
+    covariate: str = "log_size",
+    group: str | None = None,
+    separate: bool = False,
+    permutations: int = 1000,
+    seed: int = 0,
+    drop_missing: bool = False,
+    progress: Progress | None = None,
+) -> ShapeTestResult:
+    """Regress shape on size, test common slopes of groups, and correct shapes for size.
+
+    Args:
+        cohort: the shapes.
+        covariate: column of numbers, `size`, or `log_size`, the logarithm of centroid size.
+        group: column whose classes may differ in mean and slope.
+        separate: whether each group has its own slope in predicted lines and size-corrected shapes.
+        permutations: number of permutations, including the observed data.
+        seed: of the permutations.
+        drop_missing: exclude shapes with missing values in the table (default: an error).
+        progress: called with (done, total).
+
+    Raises:
+        InputError: no such column, a covariate that is constant, too few shapes, or separate slopes without groups.
+    """
+    if separate and group is None:
+        raise InputError("Separate slopes need groups; name their column with --group.")
+    formula = f"~ `{covariate}`"
+    if group is not None:
+        formula += f" * C(`{group}`)" if cohort.table.kind(group) == "number" else f" * `{group}`"
+    cohort = _complete(cohort, [formula], [], drop_missing=drop_missing)
+    step = StepCounter(3 if group else 1, progress)
+    stratum = independent_stratum(cohort.coefficients, design_of(formula, cohort.table))
+    tests = list(term_tests(stratum, CompareConfig(permutations=permutations, seed=seed, maps=False), step.add))
+    x, y = cohort.table.numbers(covariate), cohort.coefficients - cohort.coefficients.mean(axis=0)
+    classes = ["all"] * len(cohort) if group is None else list(cohort.table.texts(group))
+    names = sorted(set(classes))
+    indicator = np.array([[one == name for name in names] for one in classes], dtype=np.float64)
+    within = less(x[:, None], indicator)
+    model = _lines(indicator, x, covariate) if separate else np.hstack([indicator, x[:, None]])
+    coefficients = np.linalg.pinv(model) @ y
+    fitted, slopes = model @ coefficients, coefficients[len(names) :]
+    own = slopes[indicator.argmax(axis=1)] if separate else np.repeat(slopes, len(x), axis=0)
+    corrected = cohort.coefficients - (x - x.mean())[:, None] * own  # M38
+    directions = [(x - x.mean()) @ y, within[:, 0] @ y]
+    scores = [y @ one / max(float(np.linalg.norm(one)), 1e-300) for one in directions]  # M36, M37
+    line = np.linalg.svd(fitted - fitted.mean(axis=0), full_matrices=False)
+    predicted = line[0][:, 0] * line[1][0]
+    scores.append(predicted if predicted @ (x - x.mean()) >= 0 else -predicted)
+    titles = ("regression score", "common allometric component", "predicted line")
+    rows = zip(cohort.names, classes, *(_floats(one) for one in (x, *scores)), strict=True)
+    tables = (
+        _table("Analysis of variance", ("term", "df", "sum of squares", "R²", "F", "Z", "p"),
+               [(t.term, t.df, t.squares, t.r2, t.f, t.z, t.p) for t in tests]),
+        _table("Allometry scores", ("shape", "group", covariate, *titles), list(rows)),
+    )  # fmt: skip
+    figures = tuple(
+        _curve(title.capitalize(), covariate, title,
+               [Series(x=_floats(x[rows]), y=_floats(score[rows]), label=name, points=True)
+                for name, rows in ((name, indicator[:, k] > 0) for k, name in enumerate(names))])
+        for title, score in zip(titles, scores, strict=True)
+    )  # fmt: skip
+    arrays = {"names": np.array(cohort.names), "groups": np.array(names), "size_corrected_coefficients": corrected,
+              "slopes": (slopes @ cohort.basis).reshape(len(slopes), -1, 3)}  # fmt: skip
+    if len(cohort) * cohort.reference.size <= _MOST_COORDINATES:
+        arrays["size_corrected"] = cohort.reference + (corrected @ cohort.basis).reshape(len(cohort), -1, 3)
+    return ShapeTestResult(
+        test=shape_test("allometry"),
+        cohort=cohort,
+        statistics=tuple(Statistic.of("F", one.arrangements, one.term) for one in tests),
+        tables=tables,
+        figures=figures,
+        arrays={"allometry.npz": arrays},
+        settings={"covariate": covariate, "group": group, "separate": separate, "permutations": permutations,
+                  "seed": seed},
+        sizes=sample_sizes(cohort.names, [(group, classes)] if group else []),
+        reduced_model=(),
+    )  # fmt: skip
+
+
+def measure_repeatability(
+    cohort: Cohort,
+    *,
+    subject: str = "subject",
+    session: str | None = None,
+    permutations: int = 1000,
+    seed: int = 0,
+    drop_missing: bool = False,
+    progress: Progress | None = None,
+) -> ShapeTestResult:
+    """Measure repeatability and measurement error of replicates by Procrustes analysis of variance.
+
+    Args:
+        cohort: the shapes.
+        subject: column of the subjects or specimens that were measured repeatedly.
+        session: column of sessions or observers, a systematic factor; all subjects must have all of them.
+        permutations: number of permutations, including the observed data.
+        seed: of the permutations.
+        drop_missing: exclude shapes with missing values in the table (default: an error).
+        progress: called with (done, total).
+
+    Raises:
+        InputError: no such column, one subject, no replicates, or subjects without some sessions.
+    """
+    named = [subject, *([session] if session else [])]
+    cohort = cohort.complete(named, drop_missing=drop_missing)
+    groups = Groups.of(cohort, [subject])
+    n, s = len(cohort), len(groups.names)
+    if s < 3 or n == s:
+        raise InputError(
+            f"{cohort.table.where}: repeatability needs three or more subjects and replicates, and {subject!r} has {s} "
+            f"values for {n} shapes; name the column of the specimens."
+        )
+    occasions = None if session is None else Groups.of(cohort, [session])
+    if occasions is not None and np.ptp(groups.indicator.T @ occasions.indicator) > 0:
+        raise InputError(
+            f"{cohort.table.where}: the subjects of {subject!r} have different numbers of shapes of {session!r}; leave "
+            "out those without all sessions, or leave out --session."
+        )
+    sessions = np.zeros(n, dtype=np.intp) if occasions is None else occasions.codes
+    y = cohort.coefficients - cohort.coefficients.mean(axis=0)
+    squares, df, _ = _squares(y, groups.codes, sessions)
+    if df[2] < 1:
+        raise InputError(f"{cohort.table.where}: no degrees of freedom are left for measurement error; add replicates.")
+    # Sums of squares of subjects come from inner products of the residuals of sessions, permuted within sessions.
+    away = y - means_of(y, sessions)[sessions]
+    stratum = Stratum(name="", shapes=away, matrix=groups.indicator, columns=np.arange(s), terms=(), groups=sessions,
+                      removed=0, number=0)  # fmt: skip
+    first, second = np.nonzero(groups.indicator @ groups.indicator.T)
+    gram, weight, f = away @ away.T, 1.0 / groups.counts[groups.codes[first]], np.empty(permutations)
+    step = StepCounter(permutations, progress)
+    for start, rows, _ in stratum.arrangements(permutations, seed):
+        among = gram[rows[:, first], rows[:, second]] @ weight
+        f[start : start + len(rows)] = among / df[0] * df[2] / np.maximum(np.trace(gram) - among, 1e-300)
+        step.add(len(rows))
+    values = _repeatabilities(y, groups.codes, sessions)
+    parts = [groups.codes != k for k in range(s)]
+    left_out = [_repeatabilities(y[part], groups.codes[part], sessions[part]) for part in parts]
+    statistics = [_jackknifed(name, values[name], [one[name] for one in left_out]) for name in values]
+    statistics.append(Statistic.of("F", f, subject))
+    within = y - means_of(y, groups.codes)[groups.codes]
+    error = within - (means_of(within, sessions)[sessions] if df[1] else 0.0)
+    if occasions is not None:
+        blocks = np.linalg.qr(occasions.indicator - occasions.indicator.mean(axis=0))[0][:, : df[1]]
+        drawn = replace(stratum, groups=groups.codes).products(blocks, within, permutations, seed)
+        explained = (drawn**2).sum(axis=(1, 2))
+        left = np.maximum(squares[1] + squares[2] - explained, 1e-300)
+        statistics.append(Statistic.of("F", explained / df[1] * df[2] / left, session or ""))
+    sources = (subject, session or "", "measurement error")
+    rows = [(name, d, ss, ss / d) for name, d, ss in zip(sources, df, squares, strict=True) if d]
+    factor = np.linalg.qr(error)[1] / np.sqrt(df[2])
+    basis = cohort.basis.reshape(len(cohort.basis), -1, 3)
+    deviation = np.concatenate([
+        np.sqrt((np.tensordot(factor, basis[:, k : k + _BLOCK], axes=1) ** 2).sum(axis=(0, 2)))
+        for k in range(0, cohort.n_vertices, _BLOCK)
+    ])  # fmt: skip
+    faces = np.zeros((0, 3), dtype=np.int32) if cohort.faces is None else cohort.faces
+    return ShapeTestResult(
+        test=shape_test("repeatability"),
+        cohort=cohort,
+        statistics=tuple(statistics),
+        tables=(_table("Analysis of variance", ("source", "df", "sum of squares", "mean square"), rows),),
+        figures=(SurfaceMapPart(title="Standard deviation of measurement", arrays="measurement_error.npz",
+                                signed=False, unit=cohort.unit),),
+        arrays={"measurement_error.npz": {"vertices": cohort.reference, "faces": faces, "values": deviation}},
+        settings={"subject": subject, "session": session, "permutations": permutations, "seed": seed},
+        sizes=sample_sizes(cohort.table.texts(subject), [(session, cohort.table.texts(session))] if session else []),
+        reduced_model=(session,) if session else (),
+        n_subjects=s,
+    )  # fmt: skip
+
+
+def _squares(y: FloatArray, subjects: Orders, sessions: Orders) -> tuple[list[float], tuple[int, int, int], float]:
+    """Return sums of squares and degrees of freedom of subjects, sessions and error, and shapes of a subject (mean)."""
+    codes, counts = np.unique(subjects, return_inverse=True, return_counts=True)[1:]
+    n, s, m = len(y), len(counts), int(sessions.max())
+    y = y - y.mean(axis=0)
+    among, between = (float((means_of(y, own)[own] ** 2).sum()) for own in (codes, sessions))
+    squares = [among, between if m else 0.0, float((y**2).sum()) - among - (between if m else 0.0)]
+    return squares, (s - 1, m, n - s - m), (n - float((counts**2).sum()) / n) / (s - 1)
+
+
+def _repeatabilities(y: FloatArray, subjects: Orders, sessions: Orders) -> dict[str, tuple[float, float]]:
+    """Return intraclass correlations (M39) of shapes, each with the mean number of shapes of a subject."""
+    (among, between, left), (s, m, free), k = _squares(y, subjects, sessions)
+    ms, mw, me = among / s, (between + left) / (m + free), left / max(free, 1)
+    out = {"ICC": ((ms - mw) / (ms + (k - 1) * mw), k)}
+    if m:
+        systematic = k * (m + 1) / len(y) * (between / m - me)
+        out["ICC of agreement"] = ((ms - me) / (ms + (k - 1) * me + systematic), k)
+        out["ICC of consistency"] = ((ms - me) / (ms + (k - 1) * me), k)
+    return out
+
+
+def _jackknifed(name: str, value: tuple[float, float], left_out: Sequence[tuple[float, float]]) -> Statistic:
+    """Return an intraclass correlation with the jackknife interval of its Fisher transform."""
+    from scipy.stats import t  # loads much
+
+    def transform(r: float, k: float) -> float:
+        return 0.5 * float(np.log(max(1 + (k - 1) * r, 1e-12) / max(1 - r, 1e-12)))
+
+    s, center = len(left_out), transform(*value)
+    each = np.array([transform(*one) for one in left_out])
+    width = float(t.ppf(1 - _LEVEL / 2, s - 1) * np.sqrt((s - 1) / s * ((each - each.mean()) ** 2).sum()))
+    low, high = (
+        (ratio - 1) / (ratio + value[1] - 1) for ratio in np.exp(2 * np.array([center - width, center + width]))
+    )
+    return Statistic(name=name, value=value[0], low=float(low), high=float(high))
+
+
+def _complete(cohort: Cohort, formulas: Sequence[str | None], columns: Sequence[str], *, drop_missing: bool) -> Cohort:
+    given = [one for one in formulas if one is not None and one.strip(" ~") != "1"]
+    return complete_cohort(cohort, given, columns, drop_missing=drop_missing)
+
+
+def _with_constant(columns: FloatArray) -> FloatArray:
+    return np.column_stack([np.ones(len(columns)), columns])
+
+
+def _models(cohort: Cohort, formula: str, null: str | None) -> tuple[Design, FloatArray, tuple[str, ...]]:
+    """Return the design of the full model, the columns (N, q) of the reduced one, and the terms of that."""
+    design = design_of(formula, cohort.table)
+    full, terms = _with_constant(design.matrix), design.terms[:-1]
+    if null is None:
+        reduced = _with_constant(design.matrix[:, [c for term in terms for c in term.columns]])
+    elif null.strip(" ~") == "1":
+        reduced, terms = np.ones((len(cohort), 1)), ()
+    else:
+        small = design_of(null, cohort.table)
+        reduced, terms = _with_constant(small.matrix), small.terms
+    rank = int(np.linalg.matrix_rank(full))
+    if rank >= len(cohort):
+        raise InputError(f"{formula!r} has {rank} columns for {len(cohort)} shapes, which leaves no residuals.")
+    if np.linalg.norm(reduced - full @ (np.linalg.pinv(full) @ reduced)) > _RANK * np.linalg.norm(reduced):
+        raise InputError(f"The null model {null!r} must be nested in {formula!r}; leave out terms that this lacks.")
+    return design, reduced, tuple(term.label for term in terms)
+
+
+def _mean_estimator(design: Design, indicator: FloatArray) -> FloatArray:
+    """Return (G, N) that gives least-squares means of groups (N, G), with numbers at their mean (M30)."""
+    n = len(indicator)
+    values = {v.column: design.values[v.column] if v.levels else [v.middle] * n for v in design.variables}
+    rows = indicator.T @ _with_constant(design.rows(values)) / indicator.sum(axis=0)[:, None]
+    return rows @ np.linalg.pinv(_with_constant(design.matrix))
+
+
+def _lines(indicator: FloatArray, x: FloatArray, covariate: str) -> FloatArray:
+    """Return the columns (N, 2 G) of a line for each group."""
+    lines = np.hstack([indicator, indicator * x[:, None]])
+    if (np.linalg.norm(less(lines[:, len(indicator.T) :], indicator), axis=0) <= _RANK * np.linalg.norm(x)).any():
+        raise InputError(f"{covariate!r} is constant within a group, which has no slope; leave the group out.")
+    return lines
+
+
+def _permuted(
+    estimator: FloatArray, reduced: FloatArray, cohort: Cohort, permutations: int, seed: int, progress: Progress | None
+) -> Iterator[FloatArray]:
+    """Yield estimates (b, m, K) of batches, with the residuals of the reduced model permuted (M30)."""
+    residual = less(cohort.coefficients, reduced)
+    fixed, step = estimator @ (cohort.coefficients - residual), StepCounter(permutations, progress)
+    for _, rows in orders(len(cohort), permutations, seed):
+        placed = estimator.T[rows].transpose(0, 2, 1).reshape(-1, len(cohort)) @ residual
+        yield fixed + placed.reshape(len(rows), len(estimator), -1)
+        step.add(len(rows))
+
+
+def _pairs_result(
+    name: str, cohort: Cohort, groups: Groups, columns: Sequence[Sequence[FloatArray]], names: Sequence[str],
+    classes: Sequence[str], reduced_model: tuple[str, ...], settings: dict[str, Any], figures: tuple[Part, ...] = (),
+) -> ShapeTestResult:  # fmt: skip
+    """Return the result of statistics of pairs of groups, which `columns` has by batch and pair."""
+    labels = [f"{groups.names[a]} – {groups.names[b]}" for a, b in groups.pairs]
+    statistics = [
+        Statistic.of(one, np.concatenate([batch[k] for batch in columns[pair :: len(labels)]]), label)
+        for k, one in enumerate(names)
+        for pair, label in enumerate(labels)
+    ]
+    limits = [float(np.quantile(one.arrangements, 1 - _LEVEL)) for one in statistics]
+    rows = [(one.name, one.tested, one.value, limit, one.z, one.p)
+            for one, limit in zip(statistics, limits, strict=True)]  # fmt: skip
+    return ShapeTestResult(
+        test=shape_test(name),
+        cohort=cohort,
+        statistics=tuple(statistics),
+        tables=(_table("Pairs of groups", ("statistic", "groups", "value", "95 % limit", "Z", "p"), rows),),
+        figures=figures,
+        settings=settings,
+        sizes=sample_sizes(cohort.names, [(column, cohort.table.texts(column)) for column in classes]),
+        reduced_model=reduced_model,
+    )
+
+
+def _table(title: str, names: Sequence[str], rows: Sequence[tuple[Any, ...]]) -> TablePart:
+    kinds: Mapping[str, Any] = {"p": "p", "df": "count", "R²": "percent"}
+    columns = tuple(
+        TableColumn(name=name, kind="text" if isinstance(cell, str) else kinds.get(name, "number"))
+        for name, cell in zip(names, rows[0], strict=True)
+    )
+    return TablePart(title=title, columns=columns, rows=tuple(rows))
+
+
+def _curve(title: str, x: str, y: str, series: Sequence[Series]) -> CurvePart:
+    return CurvePart(title=title, x=x, y=y, series=tuple(series))
+
+
+def _floats(values: FloatArray) -> tuple[float, ...]:
+    return tuple(map(float, values))
