@@ -15,6 +15,11 @@ SCAN_OF_SUBJECT = "scan of a subject"
 """`TestScheme.unit` where values are permuted within subjects, and between subjects with the same number of scans."""
 
 
+_ALONG = 0.01
+"""Of the squared distance from the mean: shapes of one size vary along the mean by half of it, those in the tangent
+space at the mean by nothing."""
+
+
 def methods_of(cohort: Cohort, subjects: int, **known: Any) -> Methods:
     """Return the methods of an analysis of all coefficients of a cohort.
 
@@ -23,14 +28,20 @@ def methods_of(cohort: Cohort, subjects: int, **known: Any) -> Methods:
         subjects: number of subjects.
         **known: further fields of `Methods`, or others than those of the cohort.
     """
+    centred = cohort.coefficients - cohort.coefficients.mean(axis=0)
+    mean = cohort.vertices(cohort.coefficients.mean(axis=0))
+    middle = (mean - mean.mean(axis=0)).ravel()
+    along = np.abs(centred @ (cohort.basis @ middle)).max(initial=0.0)
     facts: dict[str, Any] = {
         "shapes": len(cohort),
         "vertices": cohort.n_vertices,
+        "coordinates": cohort.dimensions,
         "gauge": cohort.gauge,
+        "tangent": cohort.gauge == "shape" and bool(along <= _ALONG * (centred**2).sum(axis=1).max(initial=0.0)),
         "source": cohort.source.kind,
         "modes": cohort.source.modes,
         "explained_variance_ratio": cohort.source.explained_variance_ratio,
-        "dimensions": int(np.linalg.matrix_rank(cohort.coefficients - cohort.coefficients.mean(axis=0))),
+        "dimensions": int(np.linalg.matrix_rank(centred)),
         "unit": cohort.unit,
     }
     return Methods(subjects=subjects, **{**facts, **known})

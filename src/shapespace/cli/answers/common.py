@@ -11,8 +11,10 @@ from shapespace.cli.printing import say, show, show_json
 
 if TYPE_CHECKING:
     from shapespace.cohort.cohort import Cohort
+    from shapespace.commands.answers import FigureConfig
     from shapespace.geometry.procrustes import Gauge
     from shapespace.report.analyses.analysis_report import AnalysisReport
+    from shapespace.schemas import Orientation
 
 
 def cohort_of(
@@ -29,6 +31,7 @@ def cohort_of(
     from shapespace.batch.progress import steps
     from shapespace.cohort.read import CohortConfig, read_cohort
 
+    _figures(arguments)  # files and options that do not fit are refused before the analysis
     fixed = {} if gauge is None else {"gauge": gauge}
     config = CohortConfig(**given(arguments, CohortConfig, least=least, **fixed))
     with steps(None, "reading", "shape", quiet=arguments.quiet) as step:
@@ -36,12 +39,24 @@ def cohort_of(
     return replace(cohort, unit="") if getattr(arguments, "no_unit", False) else cohort
 
 
+def _figures(arguments: argparse.Namespace) -> tuple[FigureConfig, Orientation | None]:
+    """Return the formats of figures, and the named views of the shapes."""
+    from shapespace.commands.answers import FigureConfig
+    from shapespace.report.inputs.orientation import find_orientation
+
+    config = FigureConfig(**given(arguments, FigureConfig))
+    sources = [path for path in (getattr(arguments, "shapes", None), getattr(arguments, "data", None)) if path]
+    folders = [path if path.is_dir() else path.parent for path in sources]
+    return config, find_orientation(config.orientation, folders)
+
+
 def finish(report: AnalysisReport, arguments: argparse.Namespace) -> int:
     """Write a report to the output folder, and print its summary."""
     from shapespace.commands.answers import save_report
     from shapespace.schemas import to_json
 
-    page, notes = save_report(report, arguments.output, quiet=arguments.quiet)
+    figures, orientation = _figures(arguments)
+    page, notes = save_report(report, arguments.output, quiet=arguments.quiet, figures=figures, orientation=orientation)
     for note in notes:
         say(note)
     if arguments.json:

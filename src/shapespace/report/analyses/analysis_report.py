@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -15,8 +16,9 @@ from shapespace.io.containers.arrays import write_arrays
 from shapespace.io.files import make_folder, write_text
 from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.io.tables.table_io import write_rows
+from shapespace.report.analyses.methods_section import methods_text
 from shapespace.reprs import short_repr
-from shapespace.schemas import Analysis, Methods, Part, TableColumn, Target, json_text
+from shapespace.schemas import Analysis, Methods, Orientation, Part, TableColumn, Target, json_text
 from shapespace.types import Mesh
 from shapespace.version import __version__
 
@@ -24,6 +26,8 @@ Rows = tuple[Sequence[str], Sequence[Sequence[object]]]
 """The header of a table, and its rows."""
 
 
+METHODS_FILE = "methods.txt"
+"""A paragraph for the methods section of a paper, with references."""
 REDUCED_MORPH_NOTE = "Drawn smaller than it is, so that no triangle flips."
 """The note of a morph whose full size would flip triangles."""
 
@@ -91,7 +95,8 @@ class AnalysisReport:
         settings: all that the result depends on, seeds among it.
         model_hashes: of the models of the fits.
         methods: sample sizes, tests and assumptions, as in the last parts; None for predictions.
-        citations: of the methods, for methods.txt.
+        citations: of the methods, for methods.txt, besides those that follow from `methods`.
+        orientation: named views and links of the figures; None for views that are chosen by the form of the object.
     """
 
     question: str
@@ -109,6 +114,7 @@ class AnalysisReport:
     model_hashes: tuple[str, ...] = ()
     methods: Methods | None = None
     citations: tuple[str, ...] = ()
+    orientation: Orientation | None = None
 
     __repr__ = short_repr
 
@@ -124,9 +130,11 @@ class AnalysisReport:
             parts=self.parts,
             notes=self.notes,
             settings=self.settings,
-            versions={"shapespace": __version__, "numpy": np.__version__},
+            versions={"shapespace": __version__, "numpy": np.__version__, "python": platform.python_version()},
             model_hashes=self.model_hashes,
             methods=self.methods,
+            citations=self.citations,
+            orientation=self.orientation,
         )
 
     def save(self, folder: Path | str) -> Path:
@@ -143,6 +151,8 @@ class AnalysisReport:
             write_arrays(folder / name, arrays)
         for name, mesh in self.meshes.items():
             write_mesh(folder / name, mesh)
-        path = folder / Analysis.FILE
-        write_text(path, json_text(self.analysis()))
+        path, analysis = folder / Analysis.FILE, self.analysis()
+        if analysis.methods is not None:
+            write_text(folder / METHODS_FILE, methods_text(analysis))
+        write_text(path, json_text(analysis))
         return path

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from typing import cast
 
-from shapespace.schemas import Dispersion, Methods, Part, TableColumn, TablePart, TestScheme, TextPart
+from shapespace.schemas import Analysis, Dispersion, Methods, Part, TableColumn, TablePart, TestScheme, TextPart
 from shapespace.statistics.dispersion import FEWEST_OF_GROUP
 from shapespace.statistics.methods import SCAN_OF_SUBJECT
 
@@ -14,7 +15,126 @@ _SOURCES = {
     "dense": "dense surfaces of the fits",
     "corresponding": "surfaces in correspondence",
     "surfaces": "surfaces or landmarks in correspondence",
+    "landmarks": "landmarks",
 }
+_FITS = ("coefficients", "fitted", "dense")
+_STATED = frozenset((
+    "gauge", "shapes", "subjects", "vertices", "level", "effect_size", "unequal_variances", "permutations",
+    "uncertainty", "modes", "variance_share",
+))  # fmt: skip
+"""Settings that the record of the methods states, or that are results."""
+_SETTING_NAMES = {
+    "squares": "type of sums of squares", "folds": "folds of cross-validation", "draws": "bootstrap draws",
+    "bump_width_mm": "width of bumps, mm", "formula": "model",
+}  # fmt: skip
+_ALIGNMENT = (
+    "Gower J. C. (1975) Generalized Procrustes analysis. Psychometrika 40, 33-51.",
+    "Rohlf F. J., Slice D. (1990) Extensions of the Procrustes method for the optimal superimposition of landmarks. "
+    "Systematic Zoology 39, 40-59.",
+)
+_OF_FITS = (
+    "Quan W., Matuszewski B. J., Shark L.-K., Ait-Boudaoud D. Low Dimensional Surface Parameterisation with "
+    "Applications in Biometrics.",
+)
+_RESIDUALS = (
+    "Freedman D., Lane D. (1983) A nonstochastic interpretation of reported significance levels. Journal of Business & "
+    "Economic Statistics 1, 292-298.",
+    "Collyer M. L., Adams D. C. (2018) RRPP: an R package for fitting linear models to high-dimensional data using "
+    "residual randomization. Methods in Ecology and Evolution 9, 1772-1779.",
+)
+_SIGN_FLIPS = (
+    "Winkler A. M. et al. (2014) Permutation inference for the general linear model. NeuroImage 92, 381-397.",
+)
+_EFFECT_SIZE = (
+    "Collyer M. L., Sekora D. J., Adams D. C. (2015) A method for analysis of phenotypic change for phenotypes "
+    "described by high-dimensional data. Heredity 115, 357-365.",
+)
+_OF_QUESTION = {
+    "compare": ("Goodall C. (1991) Procrustes methods in the statistical analysis of shape. Journal of the Royal "
+                "Statistical Society B 53, 285-339.",),
+    "asymmetry": ("Klingenberg C. P., Barluenga M., Meyer A. (2002) Shape analysis of symmetric structures: "
+                  "quantifying variation among individuals and asymmetry. Evolution 56, 1909-1920.",),
+    "regress": ("Barber R. F., Candès E. J., Ramdas A., Tibshirani R. J. (2021) Predictive inference with the "
+                "jackknife+. Annals of Statistics 49, 486-507.",),
+    "change": ("Bland J. M., Altman D. G. (1986) Statistical methods for assessing agreement between two methods of "
+               "clinical measurement. Lancet 327, 307-310.",),
+    "recognise verify": ("Brümmer N., du Preez J. (2006) Application-independent evaluation of speaker detection. "
+                         "Computer Speech & Language 20, 230-275.",),
+}  # fmt: skip
+"""Citations of each analysis, by its command."""
+
+
+def points_word(methods: Methods) -> str:
+    """Return what the points of a shape are called."""
+    return "landmarks" if methods.source == "landmarks" else "vertices"
+
+
+def methods_text(analysis: Analysis) -> str:
+    """Return methods.txt: a paragraph for a methods section, and its references.
+
+    Args:
+        analysis: with the record of its methods.
+    """
+    methods = analysis.methods
+    if methods is None:
+        return ""
+    versions = ", ".join(f"{name} {version}" for name, version in analysis.versions.items())
+    sentences = [f"Shapes were analysed with the command {analysis.question} of shapespace ({versions})."]
+    data, *others = _sentences(methods)
+    sentences += [data, *_test_sentences(methods.tests), *others]
+    if methods.tests:
+        sentences.append(f"The level of significance is {methods.level:g}.")
+    chosen = [
+        f"{_SETTING_NAMES.get(key, key.replace('_', ' '))} {_value_text(value)}"
+        for key, value in analysis.settings.items()
+        if key not in _STATED
+        and not key.startswith(("shape_", "estimated_"))
+        and value is not None
+        and value is not False
+        and value not in ("", [], {}, ())
+    ]
+    sentences += [f"Settings: {'; '.join(chosen)}."] if chosen else []
+    references = "".join(f"{one}\n" for one in citations_of(analysis))
+    return f"{' '.join(sentences)}\n" + (f"\nReferences\n\n{references}" if references else "")
+
+
+def citations_of(analysis: Analysis) -> tuple[str, ...]:
+    """Return the citations of an analysis: those of its methods, and its own."""
+    methods = analysis.methods
+    if methods is None:
+        return analysis.citations
+    flips = any(test.resampling == "sign flips" for test in methods.tests)
+    residuals = any(test.resampling == "permutation" and test.reduced_model is not None for test in methods.tests)
+    groups = (
+        _OF_FITS if methods.source in _FITS else (),
+        _ALIGNMENT if methods.source != "coefficients" else (),
+        _OF_QUESTION.get(analysis.question, ()),
+        _RESIDUALS if residuals else (),
+        _SIGN_FLIPS if flips else (),
+        _EFFECT_SIZE if methods.effect_size else (),
+        analysis.citations,
+    )
+    return tuple(dict.fromkeys(one for group in groups for one in group))
+
+
+def _value_text(value: object) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} = {one}" for key, one in cast(Mapping[object, object], value).items())
+    if isinstance(value, list | tuple):
+        return ", ".join(map(str, cast(Sequence[object], value)))
+    return "yes" if value is True else f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _test_sentences(tests: Sequence[TestScheme]) -> Iterator[str]:
+    for count in dict.fromkeys(test.arrangements for test in tests):
+        details = [
+            f"of {', '.join(test.tested)}{f' in the stratum {test.stratum}' if test.stratum else ''}"
+            f"{f' ({test.statistic})' if test.statistic else ''} by {scheme_text(test)}"
+            for test in tests
+            if test.arrangements == count
+        ]
+        source = f"come from {count:,} arrangements, the observed data among them: " if count else "are "
+        yield f"p values {source}{'; '.join(details)}."
 
 
 def methods_parts(methods: Methods) -> tuple[Part, ...]:
@@ -69,7 +189,7 @@ def _parts(methods: Methods) -> Iterator[Part]:
 
 def _sentences(methods: Methods) -> Iterator[str]:
     shapes = f"{methods.shapes} shapes of {methods.subjects} subjects"
-    size = "size is divided out" if methods.gauge == "shape" else "size is kept"
+    points = points_word(methods)
     modes = (
         f" ({methods.modes} modes, {100 * methods.explained_variance_ratio:.0f} % of the variance of its training set)"
         if methods.modes is not None and methods.explained_variance_ratio is not None
@@ -79,11 +199,12 @@ def _sentences(methods: Methods) -> Iterator[str]:
         f" The analysis uses {methods.dimensions} dimensions, which contain "
         f"{100 * methods.analysed_variance_ratio:.3g} % of the variance of the shapes."
         if methods.dimensions is not None
-        else " The analysis uses displacements of vertices along their normals."
+        else f" The analysis uses displacements of {points} along their normals."
     )
+    source = "" if methods.source == "landmarks" else f" ({_SOURCES.get(methods.source, methods.source)}{modes})"
     yield (
-        f"Data: {shapes}, {methods.vertices} vertices each: {_SOURCES.get(methods.source, methods.source)}{modes}; "
-        f"{size} (gauge {methods.gauge}).{space} "
+        f"The data are {shapes}, with {methods.vertices} {points} in {methods.coordinates} dimensions each{source}. "
+        f"{_alignment_sentence(methods)}{space} "
         + ("Lengths are in mm." if methods.unit == "mm" else "The coordinates have no unit, so lengths have none.")
     )
     if any(test.resampling in ("permutation", "sign flips") for test in methods.tests):
@@ -102,6 +223,21 @@ def _sentences(methods: Methods) -> Iterator[str]:
     if methods.tests:
         yield multiplicity_sentence(methods)
     yield from methods.assumptions
+
+
+def _alignment_sentence(methods: Methods) -> str:
+    size = (
+        "with scaling, so that size is divided out"
+        if methods.gauge == "shape"
+        else "without scaling, so that size is kept"
+    )
+    tangent = ", and lie in the tangent space at their mean" if methods.tangent else ""
+    if methods.source == "coefficients":
+        size = "size is divided out" if methods.gauge == "shape" else "size is kept"
+        return (
+            f"They are in the frame of the shape model, in which pose is divided out; {size} (gauge {methods.gauge})."
+        )
+    return f"They were aligned by generalised Procrustes analysis {size} (gauge {methods.gauge}){tangent}."
 
 
 def _exchangeability(methods: Methods) -> str:

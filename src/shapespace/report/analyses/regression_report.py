@@ -9,8 +9,8 @@ import numpy as np
 from shapespace.cohort.cohort import Cohort, subjects_of
 from shapespace.report.analyses.analysis_report import AnalysisReport, LengthFormat, Rows
 from shapespace.report.analyses.methods_section import methods_parts
-from shapespace.report.analyses.shape_data import add_shape_data, model_hashes
-from shapespace.schemas import CurvePart, MorphPart, Part, Series, SurfaceMapPart, TableColumn, TablePart, TextPart
+from shapespace.report.analyses.shape_data import add_shape_data, model_hashes, shape_change_parts
+from shapespace.schemas import CurvePart, Part, Series, SurfaceMapPart, TableColumn, TablePart, TextPart
 from shapespace.statistics.observation_weights import blank_where, weights_of
 from shapespace.statistics.predictor import Predictions, Predictor
 from shapespace.statistics.regression import (
@@ -186,15 +186,16 @@ def _maps_and_morphs(result: RegressionResult) -> tuple[dict[str, Any], list[Par
     blank = weights_of(result.cohort.observed_share) == 0
     arrays: dict[str, Any] = {"low": low, "high": high, "vertices": (low + high) / 2.0}
     arrays["per_unit_mm"] = blank_where(result.map, blank)
+    ends = shape_change_parts(
+        result.cohort, title=f"The shape that goes with {result.target}", arrays=_FILE,
+        low_label=f"{result.target} {result.low_at:.3g}", high_label=f"{result.target} {result.high_at:.3g}",
+        note="The mean shape at the 5th and the 95th percentile, by regression of shape on the number.",
+    )  # fmt: skip
     if result.cohort.faces is None:
-        return arrays, []
+        return arrays, [*ends]
     arrays["faces"] = result.cohort.faces
     return arrays, [
-        MorphPart(
-            title=f"The shape that goes with {result.target}", arrays=_FILE,
-            low_label=f"{result.target} {result.low_at:.3g}", high_label=f"{result.target} {result.high_at:.3g}",
-            note="The mean shape at the 5th and the 95th percentile, by regression of shape on the number.",
-        ),
+        *ends,
         SurfaceMapPart(
             title=f"Change of shape for one unit of {result.target}", arrays=_FILE, values="per_unit_mm",
             unit=LengthFormat(result.cohort.unit).of_map,

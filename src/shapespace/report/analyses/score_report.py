@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from shapespace.report.analyses.analysis_report import AnalysisReport, LengthFormat, Rows
 from shapespace.report.analyses.methods_section import methods_parts
-from shapespace.report.analyses.shape_data import add_shape_data, model_hashes
-from shapespace.schemas import Counts, HistogramPart, MorphPart, Part, SurfaceMapPart, TableColumn, TablePart, TextPart
+from shapespace.report.analyses.shape_data import add_shape_data, model_hashes, shape_change_parts
+from shapespace.schemas import Counts, HistogramPart, Part, SurfaceMapPart, TableColumn, TablePart, TextPart
 from shapespace.statistics.score_subjects import SMALL, ScoreResult
 
 # maps, morphs, sentences and bins of the report: what can be looked through; files have all
@@ -166,14 +166,13 @@ def _maps_sentence(result: ScoreResult, order: list[int]) -> str:
 
 
 def _morphs(result: ScoreResult, order: list[int]) -> list[Part]:
-    if result.mean.faces is None:
-        return []
     return [
-        MorphPart(
-            title=f"From the reference's mean to {result.names[k]}", arrays=_FILE, low="vertices",
+        part
+        for k in order[:_MOST_MORPHS]
+        for part in shape_change_parts(
+            result.subjects, title=f"From the reference's mean to {result.names[k]}", arrays=_FILE, low="vertices",
             high=f"shape_{k + 1}", low_label="the reference's mean", high_label=result.names[k],
         )
-        for k in order[:_MOST_MORPHS]
     ]  # fmt: skip
 
 

@@ -5,13 +5,100 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from shapespace.cohort.cohort import Cohort
+import numpy as np
+from scipy.spatial.distance import pdist
+
+from shapespace.cohort.cohort import Cohort, subjects_of
 from shapespace.report.analyses.analysis_report import AnalysisReport, Rows
-from shapespace.schemas import TableColumn, TablePart
+from shapespace.schemas import CurvePart, DeformationPart, MorphPart, Series, TableColumn, TablePart
+from shapespace.statistics.methods import methods_of
 from shapespace.statistics.observation_weights import LEAST_INFORMATION
+from shapespace.types import FloatArray
 
 _FILE = "observed.csv"
 _MOST_ROWS = 10  # rows that fit one screen; files have all
+_MOST_LANDMARKS = 500  # vectors that can be distinguished in a figure
+_MOST_PAIRS = 1000  # dots of a figure: more cover each other
+_EQUAL = 1e-9  # relative difference of sizes that is rounding
+_BLOCK = 5000  # pairs of shapes in memory at once
+
+
+def shape_change_parts(cohort: Cohort, **known: Any) -> tuple[MorphPart | DeformationPart, ...]:
+    """Return the part that draws two shapes of a cohort: a morph of surfaces, a deformation grid of planar landmarks,
+    vectors of others; nothing for point clouds.
+
+    Args:
+        cohort: of the shapes.
+        **known: fields of both kinds of parts, such as `arrays`, `low`, `high`, `low_label`, `high_label`, `times`.
+    """
+    if cohort.faces is not None:
+        return (MorphPart(**known),)
+    if cohort.n_vertices > _MOST_LANDMARKS:
+        return ()
+    return (DeformationPart(**known, drawing="grid" if cohort.dimensions == 2 else "vectors"),)
+
+
+def scree_part(eigenvalues: FloatArray, *, axis: str = "principal component") -> CurvePart:
+    """Return the scree plot: the share of the variance of each axis.
+
+    Args:
+        eigenvalues: (K,) variances along the axes, in their order.
+        axis: what the axes are.
+    """
+    shares = 100 * eigenvalues / eigenvalues.sum()
+    numbers = tuple(map(float, range(1, len(shares) + 1)))
+    return CurvePart(
+        title="Scree plot", x=axis, y="share of the variance (%)", series=(Series(x=numbers, y=_floats(shares)),)
+    )
+
+
+def tangent_part(coords: FloatArray, *, projected: bool = False) -> CurvePart:
+    """Return a check of the tangent space: Euclidean against Procrustes distances of all pairs of shapes.
+
+    Args:
+        coords: (N, L, D) aligned coordinates as they are analysed, in the gauge `shape`; planar ones may have z = 0.
+        projected: whether they were projected orthogonally to the tangent space at their mean.
+    """
+    shapes = coords if np.ptp(coords[:, :, -1]) > 0 else coords[:, :, :2]
+    shapes = shapes - shapes.mean(axis=1, keepdims=True)
+    flat = shapes.reshape(len(shapes), -1)
+    sizes, mean = np.linalg.norm(flat, axis=1), flat.mean(axis=0)
+    # Shapes in a tangent plane differ in size, and touch the sphere at their mean.
+    flat = flat / (sizes.mean() if np.ptp(sizes) < _EQUAL * sizes.mean() else np.linalg.norm(mean))
+    if projected:
+        pole = mean / np.linalg.norm(mean)
+        part = flat - np.outer(flat @ pole, pole)
+        shapes = (part + np.outer(np.sqrt(1 - (part**2).sum(axis=1)), pole)).reshape(shapes.shape)
+    shapes = shapes / np.linalg.norm(shapes, axis=(1, 2), keepdims=True)
+    first, second = np.triu_indices(len(coords), 1)
+    cosines = np.empty(len(first))
+    for start in range(0, len(first), _BLOCK):
+        rows = slice(start, start + _BLOCK)
+        products = shapes[first[rows]].transpose(0, 2, 1) @ shapes[second[rows]]
+        values = np.linalg.svd(products, compute_uv=False)
+        values[:, -1] *= np.where(np.linalg.det(products) < 0, -1.0, 1.0)
+        cosines[rows] = values.sum(axis=1)
+    procrustes, euclidean = np.arccos(np.minimum(cosines, 1.0)), pdist(flat)
+    slope = float(euclidean @ procrustes / (procrustes @ procrustes))
+    r = float(euclidean @ procrustes / np.sqrt((euclidean @ euclidean) * (procrustes @ procrustes)))
+    order = procrustes.argsort()
+    order = order[np.unique(np.linspace(0, len(order) - 1, _MOST_PAIRS).round().astype(np.intp))]
+    ends = np.array([0.0, float(procrustes.max())])
+    return CurvePart(
+        title="Tangent space",
+        x="Procrustes distance",
+        y="distance in the tangent space",
+        note=f"Slope through the origin {slope:.6f}, uncentred correlation {r:.6f}; both are 1 where distances in the "
+        "tangent space represent those of shapes.",
+        series=(
+            Series(x=_floats(procrustes[order]), y=_floats(euclidean[order]), label="pairs of shapes", points=True),
+            Series(x=_floats(ends), y=_floats(ends), label="equal distances"),
+        ),
+    )
+
+
+def _floats(values: FloatArray) -> tuple[float, ...]:
+    return tuple(map(float, values))
 
 
 def blank_sentence(count: int, total: int) -> str:
@@ -72,10 +159,13 @@ def shape_settings(cohort: Cohort) -> dict[str, Any]:
 
 
 def add_shape_data(report: AnalysisReport, cohort: Cohort) -> AnalysisReport:
-    """Return a report with the source of its shapes and the share of estimated vertices of each shape."""
+    """Return a report with its methods, the source of its shapes and the share of estimated vertices of each shape."""
     share = cohort.estimated_share
     notes, settings = (*report.notes, *shape_notes(cohort)), {**report.settings, **shape_settings(cohort)}
-    report = replace(report, notes=notes, settings=settings)
+    methods = report.methods
+    if methods is None and len(cohort) > 1:
+        methods = methods_of(cohort, len(set(subjects_of(cohort, report.settings.get("subject")))))
+    report = replace(report, notes=notes, settings=settings, methods=methods)
     if not share.any():
         return report
     order = sorted(range(len(share)), key=lambda k: (-share[k], k))

@@ -27,7 +27,12 @@ from shapespace.report.figures.correspondence_figures import (
     nearness_figure,
     position_std_figure,
 )
-from shapespace.report.figures.deformation_figures import deformation_grid_figure, landmark_vectors_figure
+from shapespace.report.figures.deformation_figures import (
+    MOST_LANDMARKS,
+    deformation_grid_figure,
+    landmark_map_figure,
+    landmark_vectors_figure,
+)
 from shapespace.report.figures.draw import STAGE_WORDS, encode_webp
 from shapespace.report.figures.fit_figures import (
     THRESHOLDS_MM,
@@ -72,6 +77,7 @@ from shapespace.report.figures.recognition_figures import (
 from shapespace.report.inputs.staged_fit import StagedFit
 
 __all__ = [
+    "MOST_LANDMARKS",
     "SIDE_DEG",
     "STAGE_WORDS",
     "THRESHOLDS_MM",
@@ -97,6 +103,7 @@ __all__ = [
     "faces_grid",
     "histogram_figure",
     "history_figure",
+    "landmark_map_figure",
     "landmark_vectors_figure",
     "learning_curve_figure",
     "levels_figure",

@@ -9,6 +9,7 @@ from contextvars import ContextVar
 import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from shapespace.errors import InputError
 from shapespace.geometry.normals import face_vectors, faces_of
@@ -265,7 +266,9 @@ def histogram_figure(
         low, high = min(low, observed), max(high, observed)
     room = 0.02 * (high - low)
     axes.set(xlim=(low - room, high + room), xlabel=axis_label(x), ylabel="count")
-    axes.set_ylim(bottom=0)
+    # Room for the legend above the bars, on the side where the observed value is not.
+    axes.set_ylim(0, axes.get_ylim()[1] * 1.2)
+    axes.yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
     if any(name for name, _ in series) or (observed is not None and observed_label):
-        legend(axes, loc="best")
+        legend(axes, loc="upper left" if observed is not None and 2 * observed > low + high else "upper right")
     return finish(figure)

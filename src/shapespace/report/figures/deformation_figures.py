@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
+from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 
 from shapespace.errors import InputError
 from shapespace.geometry.thin_plate_spline import ThinPlateSpline
 from shapespace.report.figures.analysis_figures import current_orientation
-from shapespace.report.figures.draw import DPI, INK, LAYOUT, TEXT, charts, escaped, finish, short, type_size
+from shapespace.report.figures.draw import DPI, INK, LAYOUT, SMALL, TEXT, charts, escaped, finish, short, type_size
 from shapespace.report.inputs.orientation import view_rotation
-from shapespace.report.render.palette import CATEGORIES
-from shapespace.types import FloatArray
+from shapespace.report.inputs.staged_fit import nice_ceiling
+from shapespace.report.render.palette import CATEGORIES, DIVERGING, SEQUENTIAL, UNKNOWN_COLOUR
+from shapespace.types import BoolArray, FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+MOST_LANDMARKS = 500
+"""Points above which a shape without triangles is drawn as a point cloud, not as landmarks: they cover each other."""
 _CELLS = 20  # cells of a grid along its longer side: deformations of a tenth of the shape are seen
 _POINTS_OF_CELL = 5  # points of a grid line in each cell, so that bent lines look smooth
 _MARGIN = 0.12  # of the longer side, around the landmarks
@@ -70,14 +75,8 @@ def landmark_vectors_figure(low: FloatArray, high: FloatArray, labels: tuple[str
         high: (L, 2 or 3) where they end.
         labels: what the configurations are.
     """
-    both = np.stack([low, high])
-    is_planar = both.shape[2] == 2 or np.ptp(both[:, :, 2]) == 0
-    named = [(one.name, view_rotation(one)) for one in current_orientation().views]
-    views = [(" → ".join(map(short, labels)), _first_rotation())] if is_planar else named[:4] or list(_THREE_SIDES)
-    placed = [np.stack([_turned(end, turn)[:, :2] for end in both]) for _, turn in views]
-    centred = [one - (one.reshape(-1, 2).max(axis=0) + one.reshape(-1, 2).min(axis=0)) / 2 for one in placed]
-    figure, plots = _panels([name for name, _ in views], np.concatenate([one.reshape(-1, 2) for one in centred]))
-    for axes, (start, end) in zip(plots, centred, strict=True):
+    figure, plots, placed = _in_views(np.stack([low, high]), " → ".join(map(short, labels)))
+    for axes, (start, end) in zip(plots, placed, strict=True):
         draw_links(axes, start, _GRID)
         axes.scatter(*start.T, s=24, color=CATEGORIES[0], linewidths=0, zorder=2)
         axes.quiver(
@@ -85,6 +84,63 @@ def landmark_vectors_figure(low: FloatArray, high: FloatArray, labels: tuple[str
             width=0.02 * LAYOUT.get().scale, units="inches", headwidth=4.5, headlength=5, headaxislength=4.5,
         )  # fmt: skip
     return finish(figure, w_pad=0.6)
+
+
+def landmark_map_figure(
+    points: FloatArray,
+    values: FloatArray,
+    *,
+    unit: str,
+    signed: bool = True,
+    limit: float | None = None,
+    mask: BoolArray | None = None,
+) -> Figure:
+    """Draw a number for each landmark as its colour.
+
+    Args:
+        points: (L, 2 or 3) places.
+        values: (L,); not-a-number is drawn in grey.
+        unit: of the numbers.
+        signed: whether two colours part at zero.
+        limit: where the colours end; None for the largest number.
+        mask: (L,) outside which landmarks are small; None for none.
+
+    Raises:
+        InputError: another number of values or flags than of landmarks, or no finite value.
+    """
+    if values.shape != (len(points),) or (mask is not None and mask.shape != values.shape):
+        raise InputError(f"{len(points)} landmarks need one number each, not {values.shape}.")
+    known = np.isfinite(values)
+    if not known.any():
+        raise InputError("There is nothing to draw on landmarks without numbers.")
+    end = limit or nice_ceiling(float(np.abs(values[known]).max()))
+    norm, colours = Normalize(-end if signed else 0.0, end), ListedColormap(DIVERGING if signed else SEQUENTIAL)
+    figure, plots, placed = _in_views(points[None], "")
+    sizes = np.where(mask if mask is not None else True, 90.0, 30.0)
+    for axes, (place,) in zip(plots, placed, strict=True):
+        draw_links(axes, place, _GRID)
+        style: Any = {"edgecolors": INK, "linewidths": 0.8, "zorder": 3}
+        axes.scatter(*place[~known].T, s=sizes[~known], color=UNKNOWN_COLOUR, **style)
+        axes.scatter(*place[known].T, s=sizes[known], c=values[known], norm=norm, cmap=colours, **style)
+    bar = figure.colorbar(ScalarMappable(norm, colours), cax=plots[-1].inset_axes((1.06, 0.0, 0.05, 1.0)))
+    bar.ax.tick_params(labelsize=type_size(SMALL), colors=INK, length=3, pad=2)
+    bar.set_label(escaped(short(unit, 60)), fontsize=type_size(SMALL), color=INK)
+    cast(Any, bar).outline.set_visible(False)
+    return finish(figure, w_pad=0.6)
+
+
+def _in_views(shapes: FloatArray, label: str) -> tuple[Figure, list[Axes], list[FloatArray]]:
+    """Return a figure with the views of landmarks (n, L, 2 or 3), its panels, and the landmarks (n, L, 2) in each.
+
+    Planar landmarks have one view, with a label.
+    """
+    is_planar = shapes.shape[2] == 2 or np.ptp(shapes[:, :, 2]) == 0
+    named = [(one.name, view_rotation(one)) for one in current_orientation().views]
+    views = [(label, _first_rotation())] if is_planar else named[:4] or list(_THREE_SIDES)
+    placed = [np.stack([_turned(shape, turn)[:, :2] for shape in shapes]) for _, turn in views]
+    placed = [one - (one.max(axis=(0, 1)) + one.min(axis=(0, 1))) / 2 for one in placed]
+    figure, plots = _panels([name for name, _ in views], np.concatenate([one.reshape(-1, 2) for one in placed]))
+    return figure, plots, placed
 
 
 def _first_rotation() -> FloatArray:
@@ -108,7 +164,7 @@ def grid_lines(points: FloatArray) -> FloatArray:
     lines: list[FloatArray] = []
     for axis in (0, 1):
         half = counts * step / 2
-        for place in np.linspace(-half[axis], half[axis], counts[axis] + 1):
+        for place in np.linspace(-half[axis], half[axis], int(counts[axis]) + 1).tolist():
             line = np.empty((m, 2))
             line[:, axis], line[:, 1 - axis] = place, np.linspace(-half[1 - axis], half[1 - axis], m)
             lines.append(centre + line)

@@ -72,11 +72,13 @@ def save_figure(
         raise InputError(f"Figures cannot be written as {unknown[0]!r}; choose from {', '.join(FORMATS)}.")
     paths: list[Path] = []
     # Neither date nor random names: the same figure is the same file.
-    style: dict[str, Any] = {"svg.hashsalt": "shapespace", "svg.fonttype": "none", "pdf.fonttype": 42}
     undated: dict[str, dict[str, None]] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
     for kind in formats:
         stream = io.BytesIO()
-        with matplotlib.rc_context(style), without_glyph_warnings():
+        with (
+            matplotlib.rc_context({"svg.hashsalt": "shapespace", "svg.fonttype": "none", "pdf.fonttype": 42}),
+            without_glyph_warnings(),
+        ):
             figure.savefig(stream, format=kind, metadata=undated.get(kind, {}), dpi=dpi or "figure")
         data = stream.getvalue()
         paths.append(path.with_name(f"{path.name}.{kind}"))

@@ -252,9 +252,11 @@ class StudyParts:
         if values.dtype.kind not in "iuf" or (mask is not None and masks[0].dtype.kind not in "biu"):
             raise self.parts_file.damaged("the values of a map are no numbers, or its mask is none")
         values = values.astype(np.float64)
-        figure = figures.surface_map_figure(
-            mesh, values, unit=part.unit, signed=part.signed, limit=part.limit, mask=mask, title=None
-        )
+        style = {"unit": part.unit, "signed": part.signed, "limit": part.limit, "mask": mask}
+        if mesh.faces is None and len(mesh.vertices) <= figures.MOST_LANDMARKS:
+            figure = figures.landmark_map_figure(mesh.vertices, values, **style)
+        else:
+            figure = figures.surface_map_figure(mesh, values, title=None, **style)
         known = values[np.isfinite(values)]
         inside = "" if mask is None else f"; {percent(float(mask.mean()))} of the vertices are marked"
         alt = (

@@ -1,0 +1,105 @@
+"""Figures of an analysis as files for a paper: the drawings of its report, in the size of print."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from shapespace.errors import ShapespaceError
+from shapespace.io.files import make_folder, write_text
+from shapespace.report.blocks.blocks import Figure, Image
+from shapespace.report.blocks.wording import anchor
+from shapespace.report.inputs.saved_fits import Folder
+from shapespace.report.pages.page import Page
+from shapespace.report.pages.study_parts import ANALYSIS, TITLES, StudyParts
+from shapespace.schemas import Analysis, Part, TablePart, TextPart, read_part
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Drawing
+
+FOLDER = "figures"
+"""Folder of the figures in that of the analysis."""
+_LONGEST = 80  # characters of a file name, which file systems allow with any ending
+
+
+class _Drawings(Page):
+    """Collects the drawings that a page would have, and their captions."""
+
+    def __init__(self) -> None:
+        super().__init__(0)
+        self.drawings: list[Drawing] = []
+        self.captions: list[str] = []
+
+    def still(self, figure: Drawing, alt: str, *, lossless: bool = False) -> Image:
+        """Keep a drawing."""
+        self.drawings.append(figure)
+        return Image(b"", (1, 1), alt)
+
+    def step(self, name: str) -> None:
+        """Keep the caption of a drawing."""
+        self.captions.append(name)
+
+    def turning(self, widget: Any, payload: bytes, poster: Image, caption: str, *, label: str, still: str) -> Figure:
+        """Return the still of something that turns."""
+        self.step(caption)
+        return Figure(poster, caption)
+
+
+def write_figures(folder: Path, formats: Sequence[str], dpi: int = 300) -> tuple[tuple[Path, ...], tuple[str, ...]]:
+    """Write the figures of the analysis in a folder to `figures` in it, with captions.txt.
+
+    Args:
+        folder: with analysis.json.
+        formats: svg, pdf or png.
+        dpi: resolution of PNG, and of surfaces in SVG and PDF.
+
+    Returns:
+        The paths of the figures, and a sentence on each part that cannot be drawn.
+
+    Raises:
+        FileError: the folder cannot be read or written.
+        FileFormatError: analysis.json is damaged.
+        InputError: another format, or a resolution below 72 or above 1200.
+    """
+    from shapespace.report.figures import oriented, publication_style, save_figure
+
+    source = Folder(folder, ANALYSIS.again)
+    analysis = Analysis.from_json(source.json(Analysis.FILE))
+    page, output = _Drawings(), make_folder(folder / FOLDER)
+    paths: list[Path] = []
+    captions: list[str] = []
+    notes: list[str] = []
+    with oriented(analysis.orientation), publication_style(dpi):
+        for name, title, part in _named(read_part(one, Analysis.FILE, ANALYSIS.again) for one in analysis.parts):
+            try:
+                StudyParts(page, source, ANALYSIS).blocks(part, title)
+            except ShapespaceError as error:
+                notes.append(f"The figure {title!r} could not be drawn: {error}")
+            for drawing in page.drawings:
+                paths += save_figure(drawing, output / name, formats, dpi)
+                captions.append(f"{name}: {title}. {' '.join(page.captions)}".strip())
+            page.drawings.clear()
+            page.captions.clear()
+    write_text(output / "captions.txt", "".join(f"{caption}\n" for caption in captions))
+    return tuple(paths), tuple(notes)
+
+
+def _named(parts: Iterator[Part]) -> Iterator[tuple[str, str, Part]]:
+    """Yield the parts that are drawn with a file name of the title, and of the chapter where titles repeat."""
+    taken: set[str] = set()
+    chapter, titled = "", [(one.title or TITLES.get(str(one.__struct_config__.tag), "Figure"), one) for one in parts]
+    count = Counter(anchor(title) for title, one in titled if not isinstance(one, TextPart | TablePart))
+    for title, part in titled:
+        chapter = title if part.level == 2 else chapter
+        if isinstance(part, TextPart | TablePart):
+            continue
+        prefix = f"{anchor(chapter)[:_LONGEST]}-" if count[anchor(title)] > 1 and chapter != title else ""
+        name = base = f"{prefix}{anchor(title)[:_LONGEST]}".strip("-")
+        number = 1
+        while name in taken:
+            number += 1
+            name = f"{base}-{number}"
+        taken.add(name)
+        yield name, title, part
