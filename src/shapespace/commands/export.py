@@ -246,6 +246,7 @@ C <- function(x) factor(x)
 center <- function(x) x - mean(x)
 bs <- splines::bs
 
+options(contrasts = c("contr.sum", "contr.poly"))
 if (requireNamespace("geomorph", quietly = TRUE)) {
   shapes <- geomorph::arrayspecs(coords, ncol(coords) / @K, @K)
   data <- do.call(geomorph::geomorph.data.frame, c(list(coords = shapes), as.list(covariates)))
@@ -255,7 +256,6 @@ if (requireNamespace("geomorph", quietly = TRUE)) {
 
 # Sums of squares by differences of residual sums of squares of nested models.
 right <- model[-2]
-options(contrasts = c("contr.sum", "contr.poly"))
 X <- model.matrix(right, covariates)
 term <- attr(X, "assign")
 labels <- attr(terms(right), "term.labels")

@@ -113,4 +113,5 @@ def _subset(weight: int, letters: str) -> bytes:
     subsetter.subset(font)
     stream = io.BytesIO()
     subset.save_font(font, stream, options)
+    font.close()
     return stream.getvalue()
