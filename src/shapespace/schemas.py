@@ -1020,6 +1020,7 @@ class AlignRecord(Struct, frozen=True, kw_only=True):
         dimensions: 2 or 3.
         unit: of centroid sizes: `mm`, or empty.
         gauge: `shape` (unit centroid size) or `form`.
+        tangent: whether shapes are projected onto the tangent space at their mean, as one structure.
         settings: further options, and the numbers of semilandmarks.
         estimated: number of landmarks that are estimates.
         iterations: of generalised Procrustes analysis.
@@ -1035,6 +1036,7 @@ class AlignRecord(Struct, frozen=True, kw_only=True):
     dimensions: Literal[2, 3]
     unit: Literal["mm", ""] = ""
     gauge: Literal["form", "shape"]
+    tangent: bool = False
     settings: Mapping[str, Any] = {}
     estimated: int = 0
     iterations: int = 0

@@ -179,9 +179,11 @@ def _figures() -> tuple[Option, ...]:
     )
 
 
-def _gauge(default: str = "shape") -> tuple[Option, ...]:
+def _gauge(default: str | None = "shape") -> tuple[Option, ...]:
+    """Return the options of the gauge; without a default it is that of the data."""
+    by_data = "" if default else "form keeps size, shape divides size out (default: shape for landmarks, else form)"
     return (
-        advanced("--gauge", source=COHORT, default=default),
+        advanced("--gauge", help=by_data, source=COHORT, default=default),
         advanced("--no-unit",
                  help="the coordinates have no unit, as those of digitised landmarks: lengths are not written "
                  "in mm"),
@@ -635,6 +637,7 @@ COMMANDS: tuple[Command, ...] = (
             basic("--slide-by", source=ALIGN),
             basic("--missing", source=ALIGN),
             basic("--separate", "FILE", source=ALIGN_FILES, parse=Path),
+            basic("--reflect", "COLUMN=VALUE", "specimens that are reflected before the alignment, such as side=left"),
             basic("--gauge", source=ALIGN),
             advanced("--no-tangent", help="do not project shapes onto the tangent space", source=ALIGN),
             advanced("--tolerance", "T", source=ALIGN),
@@ -819,11 +822,14 @@ COMMANDS: tuple[Command, ...] = (
             basic("--reference", "COLUMN=VALUE", "group that scores are compared with (default: all)"),
             basic("--pairs",
                   "PAIRS.csv", "two columns of vertices or landmarks that mirror each other; one on the plane is "
-                  "paired with itself (default: found on the mean)", parse=Path),
+                  "paired with itself; landmarks of a landmark file count from 1 (default: found on the mean)",
+                  parse=Path),
+            basic("--side", "COLUMN", source=ASYMMETRY),
+            advanced("--degrees-of-freedom", source=ASYMMETRY),
             advanced("--permutations", "P", source=ASYMMETRY, parse=values.integer),
             advanced("--drop-missing", help="exclude shapes with missing values in the table (default: an error)"),
             advanced("--seed", "S", source=ASYMMETRY, parse=values.integer),
-            *_gauge("form"),
+            *_gauge(None),
         ),
     ),
     Command(

@@ -394,9 +394,9 @@ class Cohort:
             InputError: two specimens that are the same.
         """
         coords, gauge = aligned.coords, gauge or aligned.gauge
-        sizes = aligned.sizes[:, None, None]
         if gauge != aligned.gauge:
-            coords = coords * sizes if gauge == "form" else project_to_tangent(coords / sizes)
+            shapes = aligned.forms / aligned.sizes[:, None, None]
+            coords = aligned.forms if gauge == "form" else project_to_tangent(shapes)
         shapes = padded(coords)
         reference = shapes.mean(axis=0)
         basis, coefficients = _orthonormal((shapes - reference).reshape(len(shapes), -1))

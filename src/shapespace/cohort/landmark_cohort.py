@@ -85,6 +85,7 @@ def read_aligned(folder: Path) -> AlignedLandmarks:
         estimated=estimated,
         columns={name: cells for name, cells in table.columns.items() if name != SIZE},
         gauge=record.gauge,
+        tangent=record.tangent,
         unit=record.unit,
         iterations=record.iterations,
         converged=record.converged,
@@ -110,32 +111,28 @@ def read_landmark_cohort(
         FileFormatError: something is damaged.
         InputError: specimens that cannot be aligned, or too few of them in the table.
     """
-    aligned = read_aligned(path) if (path / RECORD).is_file() else None
-    raw = None if aligned is not None else read_configurations(path)
-    source = aligned or raw
-    assert source is not None
+    source = read_aligned(path) if (path / RECORD).is_file() else read_configurations(path)
     rows, covariates, notes = _matched(source.names, source.columns, table, str(path))
     least = least if onto is None else 1
     if len(rows) < least:
         raise InputError(f"{path}: landmarks of {len(rows)} specimens can be used, and {least} are the least.")
-    if raw is not None:
-        raw = replace(raw, names=covariates.rows, points=raw.points[rows], columns={})
-        if onto is None:
-            aligned = align_landmarks(raw, AlignConfig(gauge=gauge))
-            notes = [*notes, "The landmarks are aligned by generalised Procrustes analysis with default options."]
-    elif aligned is not None:
-        aligned = aligned.take(rows)
-    if onto is None and aligned is not None:
-        cohort = Cohort.of_landmarks(aligned, covariates, gauge=gauge)
-    else:
-        coords = raw.points if raw is not None else aligned.coords if aligned is not None else np.empty(0)
-        coords = coords if aligned is None else np.where(aligned.estimated[..., None], np.nan, coords)
-        assert onto is not None
-        cohort = _onto(coords, covariates, onto, None if aligned is None else aligned.sizes)
-    return replace(cohort, notes=(*(raw.notes if raw is not None and onto is not None else ()), *notes, *cohort.notes))
+    if isinstance(source, AlignedLandmarks):
+        if onto is not None:
+            coords = np.where(source.estimated[..., None], np.nan, source.forms)[rows]
+            return _onto(coords, covariates, onto, notes, source.sizes[rows])
+        cohort = Cohort.of_landmarks(source, gauge=gauge).take(rows)
+        return replace(cohort, table=covariates, notes=(*notes, *cohort.notes))
+    if onto is not None:
+        return _onto(source.points[rows], covariates, onto, [*source.notes, *notes])
+    raw = replace(source, names=covariates.rows, points=source.points[rows], columns={})
+    cohort = Cohort.of_landmarks(align_landmarks(raw, AlignConfig(gauge=gauge)), covariates)
+    note = "The landmarks are aligned by generalised Procrustes analysis with default options."
+    return replace(cohort, notes=(*notes, note, *cohort.notes))
 
 
-def _onto(coords: FloatArray, table: Table, onto: Cohort, sizes: FloatArray | None = None) -> Cohort:
+def _onto(
+    coords: FloatArray, table: Table, onto: Cohort, notes: Sequence[str], sizes: FloatArray | None = None
+) -> Cohort:
     """Return the cohort of landmarks (N, L, D) in the pose and gauge of the mean of another."""
     if coords.shape[2] != onto.dimensions:
         raise InputError(
@@ -148,6 +145,7 @@ def _onto(coords: FloatArray, table: Table, onto: Cohort, sizes: FloatArray | No
         source=onto.source,
         landmarks=onto.landmarks,
         sizes_mm=cohort.sizes_mm if sizes is None else sizes,
+        notes=(*notes, *cohort.notes),
     )
 
 
@@ -174,7 +172,7 @@ def landmark_cohort(cohort: Cohort, onto: Cohort | None = None) -> Cohort:
     scale = np.where(np.isfinite(cohort.sizes_mm), cohort.sizes_mm / surface, 1.0)
     coords = coords * scale[:, None, None]
     if onto is not None:
-        return replace(_onto(coords, cohort.table, onto), notes=cohort.notes)
+        return _onto(coords, cohort.table, onto, cohort.notes)
     names = tuple(marks.names)
     configurations = LandmarkConfigurations(
         names=cohort.names, points=coords, landmarks=names, unit=cohort.unit, where=cohort.table.where

@@ -7,12 +7,15 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from shapespace.cohort.landmark_cohort import SIZE, write_aligned
-from shapespace.cohort.table import list_names, read_table
+from shapespace.cohort.table import Table, list_names, read_table
 from shapespace.errors import FileFormatError, InputError
 from shapespace.geometry.landmark_alignment import AlignConfig, AlignedLandmarks, align_landmarks, find_outliers
-from shapespace.io.files import read_bytes
+from shapespace.io.files import make_folder, read_bytes, write_text
 from shapespace.io.landmarks.configuration_io import read_configurations, read_sliders
+from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations
 from shapespace.io.tables.table_io import key_column, table_rows
+from shapespace.report.analyses.analysis_report import METHODS_FILE
+from shapespace.report.analyses.methods_section import alignment_text
 from shapespace.schemas import AlignFinding, AlignRecord, to_json
 from shapespace.version import __version__
 
@@ -25,6 +28,7 @@ def align(
     table: Path | None = None,
     sliders: Sequence[Path] = (),
     separate: Path | None = None,
+    reflect: tuple[str, str] | None = None,
 ) -> tuple[AlignedLandmarks, AlignRecord]:
     """Align the landmarks of many specimens, name specimens to check, and write all to a folder.
 
@@ -35,6 +39,7 @@ def align(
         table: covariates, with a row for each specimen.
         sliders: files of semilandmarks: rows of before, slide, after for curves; a single column for surfaces.
         separate: table of landmark and structure, for structures that are aligned separately.
+        reflect: column and value of specimens that are reflected before the alignment, such as left sides.
 
     Raises:
         FileError: something cannot be read or written.
@@ -48,10 +53,12 @@ def align(
         raw = replace(raw, **{"curve_sliders" if numbers.ndim == 2 else "surface_sliders": numbers})
     if separate is not None:
         config = replace(config, structures=_structures(separate))
-    aligned = align_landmarks(raw, config)
     if table is not None:
-        columns, notes = _covariates(table, aligned)
-        aligned = replace(aligned, columns=columns, notes=(*aligned.notes, *notes))
+        columns, notes = _covariates(table, raw)
+        raw = replace(raw, columns=columns, notes=(*raw.notes, *notes))
+    if reflect is not None:
+        raw = _reflected(raw, *reflect)
+    aligned = align_landmarks(raw, config)
     findings = find_outliers(aligned)
     record = AlignRecord(
         source=str(data),
@@ -60,7 +67,8 @@ def align(
         dimensions=2 if aligned.dimensions == 2 else 3,
         unit="mm" if aligned.unit == "mm" else "",
         gauge=aligned.gauge,
-        settings=to_json({**asdict(config), "curve_semilandmarks": len(raw.curve_sliders),
+        tangent=aligned.tangent,
+        settings=to_json({**asdict(config), "reflect": reflect, "curve_semilandmarks": len(raw.curve_sliders),
                           "surface_semilandmarks": len(raw.surface_sliders)}),
         estimated=int(aligned.estimated.sum()),
         iterations=aligned.iterations,
@@ -69,27 +77,38 @@ def align(
         notes=(*aligned.notes, *map(str, findings)),
         version=__version__,
     )  # fmt: skip
+    write_text(make_folder(folder) / METHODS_FILE, alignment_text(record))
     write_aligned(folder, aligned, record)
     return aligned, record
 
 
-def _covariates(path: Path, aligned: AlignedLandmarks) -> tuple[dict[str, tuple[str, ...]], list[str]]:
+def _covariates(path: Path, raw: LandmarkConfigurations) -> tuple[dict[str, tuple[str, ...]], list[str]]:
     """Return the columns of the landmark file and of a table, in the order of the specimens, and notes."""
     given, keys = read_table(path, as_files=False)
     row = {key: k for k, key in enumerate(keys)}
-    missing = [name for name in aligned.names if name not in row]
-    if len(missing) == len(aligned):
+    missing = [name for name in raw.names if name not in row]
+    if len(missing) == len(raw):
         raise InputError(
-            f"{path} has no row of a specimen (such as {list_names(keys)}; there is {list_names(aligned.names)}); name "
+            f"{path} has no row of a specimen (such as {list_names(keys)}; there is {list_names(raw.names)}); name "
             "the specimens alike."
         )
     columns = {
-        name: tuple(cells[row[one]] if one in row else "" for one in aligned.names)
+        name: tuple(cells[row[one]] if one in row else "" for one in raw.names)
         for name, cells in given.columns.items()
         if name != SIZE
     }
-    note = f"{len(missing)} of {len(aligned)} specimens have no row in {path} ({list_names(missing)})."
-    return {**aligned.columns, **columns}, [note] if missing else []
+    note = f"{len(missing)} of {len(raw)} specimens have no row in {path} ({list_names(missing)})."
+    return {**raw.columns, **columns}, [note] if missing else []
+
+
+def _reflected(raw: LandmarkConfigurations, column: str, value: str) -> LandmarkConfigurations:
+    rows = [k for k, cell in enumerate(Table(raw.columns, raw.names, raw.where).texts(column)) if cell == value]
+    if not rows:
+        raise InputError(f"{raw.where}: no specimen has {column} {value}; correct --reflect.")
+    points = raw.points.copy()
+    points[rows, :, 0] *= -1.0
+    note = f"{len(rows)} of {len(raw)} specimens are reflected, those with {column} {value}."
+    return replace(raw, points=points, notes=(*raw.notes, note))
 
 
 def _structures(path: Path) -> dict[str, str]:

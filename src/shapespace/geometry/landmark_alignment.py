@@ -91,6 +91,7 @@ class AlignedLandmarks:
         columns: name -> N cells of covariates.
         estimated: (N, L) True for missing landmarks, whose positions are estimates.
         gauge: `shape` or `form`.
+        tangent: whether `coords` are projected onto the tangent space at their mean, as one structure.
         unit: of `sizes`, and of `coords` in the gauge `form`: `mm`, or empty for none.
         iterations: number of iterations; with separate structures the largest.
         converged: False if the iterations ended before the criterion was met.
@@ -105,6 +106,7 @@ class AlignedLandmarks:
     estimated: BoolArray
     columns: Mapping[str, tuple[str, ...]] = field(default_factory=dict[str, tuple[str, ...]])
     gauge: Gauge = "shape"
+    tangent: bool = False
     unit: str = ""
     iterations: int = 0
     converged: bool = True
@@ -125,6 +127,18 @@ class AlignedLandmarks:
     def mean(self) -> FloatArray:
         """(L, D) mean of the aligned coordinates."""
         return self.coords.mean(axis=0)
+
+    @property
+    def forms(self) -> FloatArray:
+        """(N, L, D) aligned coordinates with their centroid sizes, without projection."""
+        if self.gauge == "form":
+            return self.coords
+        coords = self.coords
+        if self.tangent:
+            away = coords - self.mean
+            along = np.sqrt(np.maximum(1.0 - (away**2).sum(axis=(1, 2)), 0.0))
+            coords = away + along[:, None, None] * self.mean
+        return coords * self.sizes[:, None, None]
 
     def take(self, rows: Sequence[int]) -> AlignedLandmarks:
         """Return some specimens, in their order, in the same alignment."""
@@ -213,6 +227,7 @@ def align_landmarks(configurations: LandmarkConfigurations, config: AlignConfig 
         estimated=~configurations.observed,
         columns=configurations.columns,
         gauge=config.gauge,
+        tangent=config.tangent and config.gauge == "shape" and len(parts) == 1,
         unit=configurations.unit,
         iterations=iterations,
         converged=converged,

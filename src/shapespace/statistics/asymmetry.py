@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from statistics import NormalDist
-from typing import Any
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -21,18 +21,22 @@ import numpy.typing as npt
 from shapespace.cohort.cohort import Cohort, subjects_of
 from shapespace.errors import InputError
 from shapespace.geometry.normals import vertex_normals
-from shapespace.geometry.procrustes import align_in_place, centroid_size, scale_to_tangent
+from shapespace.geometry.procrustes import centroid_size
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.reprs import list_briefly, short_repr
 from shapespace.schemas import Methods, SampleSize, TestScheme
 from shapespace.statistics.analysis_result import AnalysisResult
+from shapespace.statistics.effect_size import effect_size
 from shapespace.statistics.methods import methods_of
 from shapespace.statistics.observation_weights import weights_of
-from shapespace.statistics.sides import Sides, find_sides, given_sides
+from shapespace.statistics.shape_tests.permutations import orders
+from shapespace.statistics.sides import Sides, aligned_shapes, find_sides, given_sides, match_sides
 from shapespace.step_counter import StepCounter
 from shapespace.types import BoolArray, FloatArray, Mesh, read_only, require
 
 ERROR_ASYMMETRIC, ERROR_SYMMETRIC = "measurement error, asymmetric", "measurement error, symmetric"
+MEASUREMENT_ERROR = "measurement error"
+DegreesOfFreedom: TypeAlias = Literal["klingenberg", "observations"]
 LEVEL = 0.95  # of confidence intervals, the usual one
 _BLOCK = 100  # permutations at a time; bounds memory and spaces the progress messages
 _HEIGHT_OFF = 2.0
@@ -54,6 +58,8 @@ class AnovaRow:
         ms: ss / df.
         f: over `individual x side`, or for that over the asymmetric error; None where there is nothing to compare with.
         p: by permutation; None where nothing can be permuted.
+        z: F in standard deviations above the mean of its arrangements; only with the degrees of freedom of
+            `observations`.
     """
 
     source: str
@@ -62,6 +68,7 @@ class AnovaRow:
     ms: float
     f: float | None = None
     p: float | None = None
+    z: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +116,9 @@ class AsymmetryResult(AnalysisResult):
         seed: of them.
         observed: (n, M) bool, False where a subject's vertex, or its mirror image, is an estimate in most of its
             shapes; None if all are observed.
+        size_anova: the same rows for the centroid sizes of separate sides, with the degrees of freedom of
+            `observations`.
+        degrees_of_freedom: of the ANOVA of shape.
     """
 
     cohort: Cohort
@@ -131,6 +141,8 @@ class AsymmetryResult(AnalysisResult):
     permutations: int
     seed: int
     observed: BoolArray | None = None
+    size_anova: tuple[AnovaRow, ...] = ()
+    degrees_of_freedom: DegreesOfFreedom = "klingenberg"
 
     @property
     def observed_share(self) -> FloatArray:
@@ -167,9 +179,15 @@ class AsymmetryResult(AnalysisResult):
             permuted = tuple(one.source for one in self.anova if one.p is not None and one.source != "side")
             if permuted:
                 tests.append(TestScheme(tested=permuted, unit="shape", reduced_model=None, arrangements=count))
-        paired = (
-            "given or found by mirroring the mean" if self.sides.paired else "the nearest place of the mirror image"
+        sides = self.sides
+        paired = "given or found by mirroring the mean" if sides.paired else "the nearest place of the mirror image"
+        compared = (
+            f"Shapes of the sides {' and '.join(sides.classes)} of a subject are paired in the order of the table."
+            if sides.classes
+            else f"Shapes and their mirror images are superimposed together; partners of vertices are {paired}."
         )
+        dimensions = " times the dimensions of the shapes, of Klingenberg et al. (2002)"
+        freedom = "of the observations" if self.degrees_of_freedom == "observations" else f"of the subjects{dimensions}"
         return methods_of(
             self.cohort, len(self.subjects), vertices=len(self.sides),
             sizes=tuple(
@@ -179,9 +197,7 @@ class AsymmetryResult(AnalysisResult):
             tests=tuple(tests),
             corrected_over=("the vertices of a map",) if tests else (),
             assumptions=(
-                f"Shapes and their mirror images are superimposed together; partners of vertices are {paired}. Sums of "
-                "squares are over all vertices of shapes and images, with the degrees of freedom of Klingenberg et al. "
-                "(2002).",
+                f"{compared} Sums of squares are over all vertices; degrees of freedom are those {freedom}.",
                 "Scores in standard deviations are distances from the mean of the reference group, not effect sizes.",
             ),
         )  # fmt: skip
@@ -201,7 +217,9 @@ def measure_asymmetry(
     subject: str | None = None,
     pairs: Sequence[tuple[int, int]] | None = None,
     where: str = "The pairs",
+    side: str | None = None,
     reference: tuple[str, str] | None = None,
+    degrees_of_freedom: DegreesOfFreedom = "klingenberg",
     permutations: int = 999,
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
@@ -214,7 +232,11 @@ def measure_asymmetry(
             if the table has it; otherwise each shape is of another subject).
         pairs: of vertices that mirror each other, one on the plane beside itself; None finds them on the mean.
         where: what the pairs are called in messages.
+        side: column of the sides where they are separate shapes, such as left and right wings (matching symmetry);
+            None for symmetric objects.
         reference: column and value of the subjects that scores are compared with; None for all.
+        degrees_of_freedom: of the ANOVA: those of the subjects times the dimensions of the shapes (`klingenberg`), or
+            those of the `observations` alone, as in geomorph.
         permutations: number of permutations for p; 0 for none.
         seed: seed of the permutations.
         progress: called with (permutations done, in all).
@@ -226,10 +248,18 @@ def measure_asymmetry(
     require(cohort, Cohort, "measure_asymmetry", "read one with shapespace.read_cohort")
     if permutations < 0 or seed < 0:
         raise InputError("The number of permutations and the seed must be 0 or more.")
-    sides = find_sides(cohort) if pairs is None else given_sides(cohort, pairs, where)
-    names, codes = _subjects(cohort, subject)
-    in_reference = _in_reference(cohort, names, codes, reference)
-    symmetric, difference, mean = _split(cohort, sides)
+    if degrees_of_freedom not in get_args(DegreesOfFreedom):
+        raise InputError(f"There are no degrees of freedom {degrees_of_freedom!r}; choose klingenberg or observations.")
+    if side is None:
+        sides = find_sides(cohort) if pairs is None else given_sides(cohort, pairs, where)
+        first, both = cohort, _with_images(cohort, sides)
+    else:
+        matched = match_sides(cohort, subject, side)
+        cohort, both, sides = matched.cohort, matched.shapes, matched.sides
+        first = cohort.take(range(len(cohort) // 2))
+    names, codes = _subjects(first, subject)
+    in_reference = _in_reference(first, names, codes, reference)
+    symmetric, difference, mean = _split(first, sides, both)
     pairs_observed = _pairs_observed(cohort, sides)
     counts = np.bincount(codes)
     normals = None if sides.faces is None else vertex_normals(Mesh(mean, sides.faces))
@@ -243,15 +273,22 @@ def measure_asymmetry(
     along = _along(difference, normals) if normals is not None else difference
     own, own_difference = who.of(along), who.of(difference)
     asymmetry = own[..., None] * normals if normals is not None else own
-    scores = _scores(along, who, _shared_error(cohort, sides, mean, asymmetry, who))
-    vertex_scores = _scores(difference, who, _shared_error(cohort, sides, mean, own_difference, who))
+    fitted = cohort if side is None else replace(first, fitted=None)
+    scores = _scores(along, who, _shared_error(fitted, sides, mean, asymmetry, who))
+    vertex_scores = _scores(difference, who, _shared_error(fitted, sides, mean, own_difference, who))
     z, z_low, z_high = _standardised(scores, in_reference)
     steps = _Steps(4 * permutations, progress)
     parts = symmetric, difference
     if normals is not None and not sides.paired:
         # Places nearest on the mean leave its sides no difference along the surface, which single shapes have.
         parts = _along(symmetric, normals), along
-    anova = _anova(*parts, who, sides.dimensions(scaled=cohort.gauge == "shape"), rng, steps)
+    if degrees_of_freedom == "klingenberg":
+        anova = _anova(*parts, who, sides.dimensions(scaled=cohort.gauge == "shape"), rng, steps)
+    else:
+        anova = _observed_anova(both.reshape(len(both), -1), codes, permutations, seed)
+    sizes = cohort.sizes_mm[:, None]
+    has_sizes = side is not None and bool(np.isfinite(sizes).all())
+    size_anova = _observed_anova(sizes, codes, permutations, seed) if has_sizes else ()
     directional = own.mean(axis=0) if normals is not None else np.linalg.norm(own.mean(axis=0), axis=1)
     observed = None if pairs_observed is None else who.of(pairs_observed.astype(np.float64)) >= _MOSTLY
     weight = None if observed is None else weights_of(observed.mean(axis=0))
@@ -281,6 +318,8 @@ def measure_asymmetry(
         permutations=permutations,
         seed=seed,
         observed=observed,
+        size_anova=size_anova,
+        degrees_of_freedom=degrees_of_freedom,
     )
 
 
@@ -350,16 +389,19 @@ def _in_reference(
     return share > 0
 
 
-def _split(cohort: Cohort, sides: Sides) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the symmetric parts and differences (N, M, 3) of shapes superimposed with their images, and the mean."""
+def _with_images(cohort: Cohort, sides: Sides) -> FloatArray:
+    """Return N shapes and their mirror images (2N, M, 3), superimposed."""
     n = len(cohort)
     both = np.empty((2 * n, len(sides), 3))
     for k in range(n):
         both[k] = cohort.vertices(k)[sides.vertices]
     both[n:] = sides.image(both[:n])
-    align_in_place(both, cohort.gauge)
-    if cohort.gauge == "shape":
-        scale_to_tangent(both)
+    return aligned_shapes(cohort, both)
+
+
+def _split(cohort: Cohort, sides: Sides, both: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the symmetric parts and differences (N, M, 3) of N superimposed pairs (2N, M, 3), and the mean."""
+    n, both = len(cohort), both.copy()
     mean = both.mean(axis=0)
     difference = both[:n] - both[n:]  # S31
     if cohort.analysed is not None:
@@ -379,6 +421,8 @@ def _pairs_observed(cohort: Cohort, sides: Sides) -> BoolArray | None:
     if cohort.analysed is not None:
         own = np.logical_and(own, cohort.analysed)
     own = own[:, sides.vertices]
+    if sides.classes:
+        return np.logical_and(own[: len(own) // 2], own[len(own) // 2 :])
     image = np.logical_or(own[:, sides.corners], sides.weights == 0).all(axis=2)
     return np.logical_and(own, image)
 
@@ -436,6 +480,77 @@ def _anova(
         AnovaRow(ERROR_ASYMMETRIC, error_d, df * d_asym, ms_error),
         AnovaRow(ERROR_SYMMETRIC, error_s, df * d_sym, error_s / (df * d_sym)),
     )
+
+
+def _observed_anova(
+    both: FloatArray, codes: npt.NDArray[np.intp], permutations: int, seed: int
+) -> tuple[AnovaRow, ...]:
+    """Return the Procrustes ANOVA with the degrees of freedom of the observations.
+
+    F of individuals and sides is over their interaction, and that of the interaction over the measurement error of
+    repeated shapes, as in geomorph. Arrangements: mean shapes of the sides of individuals permuted, signs of the
+    differences of individuals flipped, and differences of repeated shapes permuted.
+
+    Args:
+        both: (2P, K) of the first sides, then of the others.
+        codes: (P,) individuals.
+        permutations: number of permutations.
+        seed: of them.
+    """
+    pairs, n, count = len(codes), int(codes.max()) + 1, 1 + permutations
+    member = (codes[:, None] == np.arange(n)).astype(np.float64)
+    repeats = member.sum(axis=0)
+    half, difference = 0.5 * (both[:pairs] + both[pairs:]), both[:pairs] - both[pairs:]
+    centred, off = half - half.mean(axis=0), difference - difference.mean(axis=0)
+    between = member / repeats @ member.T
+    df = {"individual": n - 1, "side": 1, "individual x side": n - 1, MEASUREMENT_ERROR: 2 * (pairs - n)}
+    ss = {
+        "individual": 2.0 * float((between @ centred * centred).sum()),
+        "side": float((difference.sum(axis=0) ** 2).sum()) / (2 * pairs),
+        "individual x side": float((between @ off * off).sum()) / 2.0,
+    }
+    error_symmetric = 2.0 * float((centred**2).sum()) - ss["individual"]
+    asymmetric = float((off**2).sum()) / 2.0
+    ss[MEASUREMENT_ERROR] = max(asymmetric - ss["individual x side"], 0.0) + max(error_symmetric, 0.0)
+    f = {name: np.empty(count) for name in ("individual", "side", "individual x side")}
+
+    means = np.concatenate([(member / repeats).T @ both[:pairs], (member / repeats).T @ both[pairs:]])
+    weight = np.tile(repeats, 2)
+    means -= weight @ means / weight.sum()
+    gram = means @ means.T
+    one, other = (np.hstack([np.eye(n), sign * np.eye(n)]) * repeats[:, None] for sign in (1.0, -1.0))
+    contrast = other.sum(axis=0)
+    own = (one.T / (2 * repeats)) @ one - np.outer(weight, weight) / weight.sum()
+    noise = (other.T / (2 * repeats)) @ other - np.outer(contrast, contrast) / weight.sum()
+    for part, order in orders(2 * n, count, seed):
+        drawn = gram[order[:, :, None], order[:, None, :]].reshape(len(order), -1)
+        f["individual"][part] = drawn @ own.ravel() / np.maximum(drawn @ noise.ravel(), 1e-300)
+
+    sums = member.T @ difference
+    signs = np.random.default_rng([seed, 1]).choice([-1.0, 1.0], (count, n))
+    signs[0] = 1.0
+    side = np.einsum("pn,pn->p", signs @ (sums @ sums.T), signs) / (2 * pairs)
+    left = ss["side"] + ss["individual x side"] - side
+    f["side"] = side * (n - 1) / np.maximum(left, 1e-300)
+
+    gram = off @ off.T
+    for part, order in orders(pairs, count, seed):
+        drawn = gram[order[:, :, None], order[:, None, :]].reshape(len(order), -1)
+        within = drawn @ between.ravel() / 2.0
+        error = asymmetric - within + error_symmetric
+        f["individual x side"][part] = within / (n - 1) / np.maximum(error, 1e-300) * max(df[MEASUREMENT_ERROR], 1)
+
+    table: list[AnovaRow] = []
+    for name, squares in ss.items():
+        if not df[name]:
+            continue
+        if name not in f or (name == "individual x side" and not df[MEASUREMENT_ERROR]):
+            table.append(AnovaRow(name, squares, df[name], squares / df[name]))
+            continue
+        drawn = f[name]
+        p, z = (float((drawn >= drawn[0] * (1 - 1e-12)).mean()), effect_size(drawn)) if permutations else (None, None)
+        table.append(AnovaRow(name, squares, df[name], squares / df[name], float(drawn[0]), p, z))
+    return tuple(table)
 
 
 def _f_ratio(ms: float, error: float) -> float | None:

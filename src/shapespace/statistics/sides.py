@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
-from shapespace.cohort.cohort import Cohort
+from shapespace.cohort.cohort import Cohort, padded, subjects_of
 from shapespace.cohort.table import list_names
 from shapespace.errors import FileFormatError, InputError
+from shapespace.geometry.landmark_alignment import AlignConfig, superimpose
 from shapespace.geometry.mirror_plane import FLIP, find_mirror, mirror_pairs
 from shapespace.geometry.normals import rms_size
+from shapespace.geometry.procrustes import align_in_place, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import read_bytes
@@ -28,6 +31,8 @@ LARGEST_PAIRED_OFF = 0.1
 """The same where pairs are given, from vertex to vertex."""
 _LARGEST_BYTES = 2**26  # bytes; a table of pairs of millions of vertices is smaller
 _FEWEST = 4  # vertices, two pairs: one pair leaves the plane of symmetry to chance
+_MIRROR_IMAGE = 0.5
+"""The two sides are mirror images if reflection reduces the distance of their means to this share."""
 _NUMBER = re.compile(r"[0-9]{1,12}")
 
 
@@ -41,8 +46,10 @@ class Sides:
         corners: (M, 3) of those M, whose mix is the other side of each.
         weights: (M, 3) of them; where vertices pair up the first is 1.
         paired: whether they do, so that the mirror image of the mirror image is the shape itself.
-        off_share: RMS distance of the mean from its mirror image, as a share of its size.
+        off_share: RMS distance of the mean from its mirror image, or of the means of two sides, as a share of its size.
         notes: what should be known of them, a sentence each.
+        space: dimensions of the coordinates: 2 for planar landmarks.
+        classes: the two sides where they are separate shapes (matching symmetry); empty for symmetric objects.
     """
 
     vertices: IntArray
@@ -52,6 +59,8 @@ class Sides:
     paired: bool
     off_share: float
     notes: tuple[str, ...] = ()
+    space: Literal[2, 3] = 3
+    classes: tuple[str, ...] = ()
 
     __repr__ = short_repr
 
@@ -88,13 +97,19 @@ class Sides:
     def dimensions(self, *, scaled: bool) -> tuple[float, float]:
         """Return how many dimensions symmetric and asymmetric variation have, poses divided out.
 
-        With l pairs and k vertices on the plane they are 3 l + 2 k less 3, and 3 l + k less 3; symmetric variation
-        loses one more where size is divided out (Klingenberg, Barluenga and Meyer 2002, table 2). Where vertices do not
-        pair up, displacements along the normals count, of which those on the plane are symmetric.
+        With l pairs and k vertices on the plane they are 3 l + 2 k less 3, and 3 l + k less 3; of planar landmarks
+        2 l + k less 1, and 2 l + k less 2. Symmetric variation loses one more where size is divided out (Klingenberg,
+        Barluenga and Meyer 2002, table 2). Where vertices do not pair up, displacements along the normals count, of
+        which those on the plane are symmetric. Separate sides have all dimensions of a shape.
 
         Args:
             scaled: whether size is divided out.
         """
+        if self.classes:
+            shape = self.space * len(self) - (4 if self.space == 2 else 7) + (not scaled)
+            return shape, shape
+        if self.space == 2:
+            return len(self) - (2 if scaled else 1), len(self) - 2  # M12
         half, plane = (1.5 if self.paired else 0.5) * len(self), 0.5 * self.on_the_plane
         return half + plane - (4 if scaled else 3), half - plane - 3
 
@@ -107,7 +122,7 @@ def find_sides(cohort: Cohort) -> Sides:
     """
     if cohort.faces is None:
         raise InputError("Points without triangles show no plane of symmetry; name the points that mirror each other "
-                         "with --pairs.")  # fmt: skip
+                         "with --pairs, or the column of the sides of separate shapes with --side.")  # fmt: skip
     # A model is made of more shapes than most cohorts hold, so its mean is the more symmetric one.
     mean = cohort.reference if cohort.fitted is None else cohort.fitted.model.mean_vertices
     mesh = Mesh(mean, cohort.faces, name="mean")
@@ -188,7 +203,15 @@ def given_sides(cohort: Cohort, pairs: Sequence[tuple[int, int]], where: str = "
     faces = None if cohort.faces is None else own[cohort.faces]
     faces = None if faces is None else faces[(faces >= 0).all(axis=1)]
     faces = None if faces is None or not len(faces) else faces
-    sides = Sides(vertices=vertices, faces=faces, corners=corners, weights=weights, paired=True, off_share=0.0)
+    sides = Sides(
+        vertices=vertices,
+        faces=faces,
+        corners=corners,
+        weights=weights,
+        paired=True,
+        off_share=0.0,
+        space=cohort.dimensions,
+    )
     x = cohort.reference[vertices]
     image = sides.image(x)
     try:
@@ -203,13 +226,110 @@ def given_sides(cohort: Cohort, pairs: Sequence[tuple[int, int]], where: str = "
         )
     left = cohort.n_vertices - len(vertices)
     notes = (f"{left} of {cohort.n_vertices} vertices stand in no pair of {where} and are left out.",) if left else ()
-    return Sides(
-        vertices=vertices, faces=faces, corners=corners, weights=weights, paired=True, off_share=share, notes=notes
+    return replace(sides, off_share=share, notes=notes)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MatchedSides:
+    """Pairs of shapes of two sides of a subject, such as left and right wings.
+
+    Args:
+        cohort: P shapes of the first side, then P of the other.
+        shapes: (2P, V, 3) of them, one side mirrored where the two sides were mirror images.
+        sides: with the names of the two.
+    """
+
+    cohort: Cohort
+    shapes: FloatArray
+    sides: Sides
+
+
+def match_sides(cohort: Cohort, subject: str | None, side: str) -> MatchedSides:
+    """Return pairs of shapes of the two sides of each subject, its repeated shapes in the order of the table.
+
+    Where the mean of one side is the mirror image of the other, surfaces of one side are mirrored, and all are aligned
+    again.
+
+    Args:
+        cohort: of separate left and right shapes.
+        subject: column of the subjects; None for `subject`.
+        side: column of the sides.
+
+    Raises:
+        InputError: no such columns, other than two sides, no subject with both, or landmarks that are mirror images.
+    """
+    cells, owners = cohort.table.texts(side), subjects_of(cohort, subject)
+    classes = tuple(sorted(set(cells) - {""}))
+    if len(classes) != 2:
+        raise InputError(
+            f"{cohort.table.where}: {side!r} has {len(classes)} classes ({list_names(classes)}); two sides need one "
+            "each."
+        )
+    rows: tuple[list[int], list[int]] = [], []
+    for owner in dict.fromkeys(owners):
+        own = [[k for k, cell in enumerate(cells) if cell == one and owners[k] == owner] for one in classes]
+        for both, part in zip(rows, own, strict=True):
+            both += part[: min(map(len, own))]
+    left = [cohort.names[k] for k in sorted(set(range(len(cohort))) - {*rows[0], *rows[1]})]
+    if not rows[0]:
+        raise InputError(f"{cohort.table.where}: no subject has both sides; name the subjects with --subject.")
+    notes = [f"{len(left)} shapes without a counterpart on the other side are left out ({list_names(left)})."]
+    notes = notes if left else []
+    matched = cohort.take([*rows[0], *rows[1]])
+    shapes, n = np.stack([matched.vertices(k) for k in range(len(matched))]), len(rows[0])
+    first, second = shapes[:n].mean(axis=0), shapes[n:].mean(axis=0)
+
+    def off(image: FloatArray) -> float:
+        placed = fit_similarity(image, first, with_scale=False).apply(image)
+        return float(np.sqrt(((placed - first) ** 2).sum(axis=1).mean())) / rms_size(first)
+
+    share = off(second)
+    if off(second * FLIP) <= _MIRROR_IMAGE * share:
+        if cohort.source.kind == "landmarks":
+            # Mirror images have no common mean, onto whose tangent space their landmarks could be projected.
+            raise InputError(
+                f"{cohort.table.where}: landmarks with {side} {classes[1]} are mirror images of the others; reflect "
+                f"them before the alignment, with shapespace align --reflect {side}={classes[1]}."
+            )
+        shapes[n:] *= FLIP
+        shapes = aligned_shapes(matched, shapes)
+        share = off(second * FLIP)
+        notes.append(f"Shapes with {side} {classes[1]} are mirrored, since the two sides are mirror images.")
+    vertices = np.arange(cohort.n_vertices, dtype=np.int32)
+    corners, weights = _alone(vertices)
+    sides = Sides(
+        vertices=vertices,
+        faces=cohort.faces,
+        corners=corners,
+        weights=weights,
+        paired=True,
+        off_share=share,
+        notes=tuple(notes),
+        space=cohort.dimensions,
+        classes=classes,
     )
+    return MatchedSides(cohort=matched, shapes=shapes, sides=sides)
+
+
+def aligned_shapes(cohort: Cohort, shapes: FloatArray) -> FloatArray:
+    """Return shapes (N, V, 3) after generalised Procrustes analysis in the gauge of a cohort.
+
+    Landmarks are aligned and projected as by `align_landmarks`, so that sums of squares are those of geomorph.
+    """
+    if cohort.source.kind == "landmarks":
+        config = AlignConfig(gauge=cohort.gauge)
+        return padded(superimpose(shapes[..., : cohort.dimensions], config).coords)
+    out = shapes.copy()
+    align_in_place(out, cohort.gauge)
+    if cohort.gauge == "shape":
+        scale_to_tangent(out)
+    return out
 
 
 def read_pairs(path: Path, cohort: Cohort) -> tuple[tuple[int, int], ...]:
     """Return the pairs of vertices in a CSV table of two columns, as numbers or as names of landmarks.
+
+    Vertices count from 0, and landmarks of a cohort of landmarks from 1.
 
     Raises:
         FileError: it cannot be read.
@@ -223,7 +343,7 @@ def read_pairs(path: Path, cohort: Cohort) -> tuple[tuple[int, int], ...]:
         raise FileFormatError(f"{path} {error}; write two columns with a header, a pair in each row.") from error
     if not rows or any(len(row) != 2 for row in rows):
         raise FileFormatError(f"{path} is no table of pairs; write two columns with a header, a pair in each row.")
-    landmarks = dict(cohort.landmarks or {})
+    landmarks, first = dict(cohort.landmarks or {}), int(cohort.source.kind == "landmarks")
     unknown = sorted(
         {cell for row in rows for cell in row if not (cell.isdecimal() and len(cell) < 12) and cell not in landmarks}
     )
@@ -232,7 +352,7 @@ def read_pairs(path: Path, cohort: Cohort) -> tuple[tuple[int, int], ...]:
         raise InputError(
             f"{path}: {list_names(unknown)} is neither a vertex number nor a landmark (landmarks: {there})."
         )
-    pairs = [tuple(landmarks[cell] if cell in landmarks else int(cell) for cell in row) for row in rows]
+    pairs = [tuple(landmarks[cell] if cell in landmarks else int(cell) - first for cell in row) for row in rows]
     return tuple((a, b) for a, b in pairs)
 
 

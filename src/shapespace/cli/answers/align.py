@@ -11,12 +11,16 @@ from shapespace.cli.printing import say, show, show_json
 def run(arguments: argparse.Namespace) -> int:
     """Align landmarks, and name the specimens to check."""
     from shapespace.commands.align import align
+    from shapespace.errors import InputError
     from shapespace.geometry.landmark_alignment import AlignConfig
     from shapespace.schemas import to_json
 
     config = AlignConfig(**given(arguments, AlignConfig))
+    column, equals, value = (arguments.reflect or "").partition("=")
+    if arguments.reflect and not (column and equals and value):
+        raise InputError(f"--reflect is {arguments.reflect!r}; write COLUMN=VALUE, such as side=left.")
     files = {"table": arguments.table, "sliders": arguments.sliders, "separate": arguments.separate}
-    _, record = align(arguments.data, arguments.output, config, **files)
+    _, record = align(arguments.data, arguments.output, config, **files, reflect=(column, value) if column else None)
     for note in record.notes:
         say(note)
     if arguments.json:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from shapespace.cli.answers.common import cohort_of, finish
 
@@ -11,6 +12,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Measure the asymmetry of a cohort, and keep the answer."""
     from shapespace.batch.progress import steps
     from shapespace.cohort.cohort import SUBJECT
+    from shapespace.cohort.landmark_cohort import has_landmarks
     from shapespace.errors import InputError
     from shapespace.report.analyses.asymmetry_report import asymmetry_report
     from shapespace.statistics.asymmetry import measure_asymmetry
@@ -19,9 +21,12 @@ def run(arguments: argparse.Namespace) -> int:
     column, equals, value = (arguments.reference or "").partition("=")
     if arguments.reference and not (column and equals and value):
         raise InputError(f"--reference is {arguments.reference!r}; write COLUMN=VALUE, such as group=control.")
-    cohort = cohort_of(arguments)
+    # Landmarks are compared as shapes, surfaces with their sizes, unless --gauge is given.
+    source = Path(arguments.shapes or arguments.data)
+    landmarks = arguments.geometry == "landmarks" or (source.exists() and has_landmarks(source))
+    cohort = cohort_of(arguments, gauge=arguments.gauge or ("shape" if landmarks else "form"))
     subject = arguments.subject or (SUBJECT if SUBJECT in cohort.table.columns else None)
-    wanted = [name for name in (subject, column) if name]
+    wanted = [name for name in (subject, column, arguments.side) if name]
     cohort = cohort.complete(wanted, drop_missing=arguments.drop_missing)
     pairs = None if arguments.pairs is None else read_pairs(arguments.pairs, cohort)
     with steps(None, "permuting", "shape", quiet=arguments.quiet) as step:
@@ -30,6 +35,8 @@ def run(arguments: argparse.Namespace) -> int:
             subject=subject,
             pairs=pairs,
             where=str(arguments.pairs),
+            side=arguments.side,
+            degrees_of_freedom=arguments.degrees_of_freedom,
             reference=(column, value) if column else None,
             permutations=arguments.permutations,
             seed=arguments.seed,

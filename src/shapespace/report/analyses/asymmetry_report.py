@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -42,7 +42,7 @@ def asymmetry_report(result: AsymmetryResult) -> AnalysisReport:
     cohort = result.cohort
     parts: list[Part] = [
         TextPart(title="What is measured", text=_method_sentences(result)),
-        _anova_part(result),
+        *_anova_parts(result),
         _histogram(result),
         _most_asymmetric(result, order),
         *pictures,
@@ -53,7 +53,11 @@ def asymmetry_report(result: AsymmetryResult) -> AnalysisReport:
         title="How symmetric?",
         summary=_summary(result, order),
         parts=tuple(parts),
-        tables={"anova.csv": _anova_rows(result), "subjects.csv": _subject_rows(result)},
+        tables={
+            "anova.csv": _anova_rows(result, result.anova),
+            "subjects.csv": _subject_rows(result),
+            **({"size_anova.csv": _anova_rows(result, result.size_anova)} if result.size_anova else {}),
+        },
         arrays={_FILE: arrays},
         meshes=_meshes(result, order),
         notes=(*cohort.notes, *result.sides.notes, *_limitation_notes(result)),
@@ -65,6 +69,8 @@ def asymmetry_report(result: AsymmetryResult) -> AnalysisReport:
             "shapes": len(cohort),
             "permutations": result.permutations,
             "seed": result.seed,
+            "degrees_of_freedom": result.degrees_of_freedom,
+            "sides": result.sides.classes,
         },
         model_hashes=model_hashes(cohort),
         methods=result.methods,
@@ -76,10 +82,16 @@ def _summary(result: AsymmetryResult, order: Any) -> tuple[str, ...]:
     mm, lengths = result.scores.mm, _lengths(result)
     side, interaction = result.effect("side"), result.effect("individual x side")
     directional = float(np.sqrt((result.directional**2).mean()))
+    apart = (
+        f"the sides of {len(result.subjects)} subjects lie {{}} apart"
+        if result.sides.classes
+        else f"{len(result.subjects)} subjects lie {{}} from their own mirror images"
+    ).format(
+        f"{lengths.text(float(np.median(mm)))} (median; 5 to 95 %: {lengths.number(float(np.percentile(mm, 5)))} to "
+        f"{lengths.text(float(np.percentile(mm, 95)))})"
+    )
     sentences = [
-        f"{len(result.subjects)} subjects lie {lengths.text(float(np.median(mm)))} (median; 5 to 95 %: "
-        f"{lengths.number(float(np.percentile(mm, 5)))} to {lengths.text(float(np.percentile(mm, 95)))}) from their "
-        f"own mirror images, RMS {_direction(result)}.",
+        f"{apart[0].upper()}{apart[1:]}, RMS {_direction(result)}.",
         f"On average the sides differ by {lengths.text(directional)} RMS (directional asymmetry): "
         f"F = {_number_text(side.f)}, p = {_p_text(side)}.",
     ]
@@ -133,6 +145,13 @@ def _score_text(result: AsymmetryResult, subject: int) -> str:
 
 def _method_sentences(result: AsymmetryResult) -> tuple[str, ...]:
     sides = result.sides
+    if sides.classes:
+        first, second = sides.classes
+        return (
+            f"Each shape of the side {first} is compared with one of the side {second} of the same subject. The means "
+            f"of the two sides lie {100 * sides.off_share:.2f} % of their size from each other.",
+            f"Maps are positive where the side {first} stands further out.",
+        )
     pairs = f"{len(sides)} vertices, {sides.on_the_plane:.0f} of them on the plane" if sides.paired else (
         f"{len(sides)} vertices, each with the place nearest to its mirror image")  # fmt: skip
     return (
@@ -173,21 +192,32 @@ def _p_text(effect: AnovaRow) -> str:
     return "not known" if effect.p is None else f"{effect.p:.3g}"
 
 
-def _anova_part(result: AsymmetryResult) -> TablePart:
+def _anova_parts(result: AsymmetryResult) -> tuple[TablePart, ...]:
     lengths = _lengths(result)
-    names = (lengths.label("SS", "²"), "df", lengths.label("MS", "²"), "F")
-    numbers = (TableColumn(name=name, kind="number") for name in names)
-    columns = (TableColumn(name="source"), *numbers, TableColumn(name="p", kind="p"))
-    rows = tuple((e.source, e.ss, e.df, e.ms, e.f, e.p) for e in result.anova)
-    return TablePart(
-        title="Procrustes ANOVA", columns=columns, rows=rows, note="df are those of subjects times dimensions."
+    has_z = any(e.z is not None for e in (*result.anova, *result.size_anova))
+    names = (lengths.label("SS", "²"), "df", lengths.label("MS", "²"), "F", *(("Z",) if has_z else ()))
+    columns = (
+        TableColumn(name="source"),
+        *(TableColumn(name=name, kind="number") for name in names),
+        TableColumn(name="p", kind="p"),
     )
 
+    def part(title: str, anova: Sequence[AnovaRow], note: str) -> TablePart:
+        rows = tuple((e.source, e.ss, e.df, e.ms, e.f, *((e.z,) if has_z else ()), e.p) for e in anova)
+        return TablePart(title=title, columns=columns, rows=rows, note=note)
 
-def _anova_rows(result: AsymmetryResult) -> Rows:
+    note = "Degrees of freedom are those of the subjects times the dimensions of the shapes."
+    observed = "Degrees of freedom are those of the observations, sums of squares of type I."
+    parts = [part("Procrustes ANOVA", result.anova, note if result.degrees_of_freedom == "klingenberg" else observed)]
+    if result.size_anova:
+        parts.append(part("ANOVA of centroid size", result.size_anova, observed))
+    return tuple(parts)
+
+
+def _anova_rows(result: AsymmetryResult, anova: Sequence[AnovaRow]) -> Rows:
     field = _lengths(result).field
-    return ("source", field("ss", "2"), "df", field("ms", "2"), "f", "p"), [
-        (e.source, e.ss, e.df, e.ms, "" if e.f is None else e.f, "" if e.p is None else e.p) for e in result.anova
+    return ("source", field("ss", "2"), "df", field("ms", "2"), "f", "z", "p"), [
+        (e.source, e.ss, e.df, e.ms, *("" if value is None else value for value in (e.f, e.z, e.p))) for e in anova
     ]
 
 
