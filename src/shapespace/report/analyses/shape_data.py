@@ -20,7 +20,7 @@ _MOST_ROWS = 10  # rows that fit one screen; files have all
 _MOST_LANDMARKS = 500  # vectors that can be distinguished in a figure
 _MOST_PAIRS = 1000  # dots of a figure: more cover each other
 _EQUAL = 1e-9  # relative difference of sizes that is rounding
-_BLOCK = 5000  # pairs of shapes in memory at once
+_MOST_SHAPES = 300  # of which all pairs take less than a second
 
 
 def shape_change_parts(cohort: Cohort, **known: Any) -> tuple[MorphPart | DeformationPart, ...]:
@@ -52,6 +52,15 @@ def scree_part(eigenvalues: FloatArray, *, axis: str = "principal component") ->
     )
 
 
+def tangent_parts(cohort: Cohort) -> tuple[CurvePart, ...]:
+    """Return the check of the tangent space of a cohort in the gauge `shape`; nothing in the gauge `form`."""
+    if cohort.gauge != "shape" or len(cohort) < 3:
+        return ()
+    rows = np.unique(np.linspace(0, len(cohort) - 1, min(len(cohort), _MOST_SHAPES)).round().astype(int)).tolist()
+    shapes = np.stack([cohort.vertices(row) for row in rows])
+    return (tangent_part(shapes, projected=cohort.source.kind == "landmarks"),)
+
+
 def tangent_part(coords: FloatArray, *, projected: bool = False) -> CurvePart:
     """Return a check of the tangent space: Euclidean against Procrustes distances of all pairs of shapes.
 
@@ -64,21 +73,20 @@ def tangent_part(coords: FloatArray, *, projected: bool = False) -> CurvePart:
     flat = shapes.reshape(len(shapes), -1)
     sizes, mean = np.linalg.norm(flat, axis=1), flat.mean(axis=0)
     # Shapes in a tangent plane differ in size, and touch the sphere at their mean.
-    flat = flat / (sizes.mean() if np.ptp(sizes) < _EQUAL * sizes.mean() else np.linalg.norm(mean))
-    if projected:
+    of_one_size = np.ptp(sizes) < _EQUAL * sizes.mean()
+    flat = flat / (sizes.mean() if of_one_size else np.linalg.norm(mean))
+    if projected and not of_one_size:
         pole = mean / np.linalg.norm(mean)
         part = flat - np.outer(flat @ pole, pole)
         shapes = (part + np.outer(np.sqrt(1 - (part**2).sum(axis=1)), pole)).reshape(shapes.shape)
     shapes = shapes / np.linalg.norm(shapes, axis=(1, 2), keepdims=True)
     first, second = np.triu_indices(len(coords), 1)
-    cosines = np.empty(len(first))
-    for start in range(0, len(first), _BLOCK):
-        rows = slice(start, start + _BLOCK)
-        products = shapes[first[rows]].transpose(0, 2, 1) @ shapes[second[rows]]
-        values = np.linalg.svd(products, compute_uv=False)
-        values[:, -1] *= np.where(np.linalg.det(products) < 0, -1.0, 1.0)
-        cosines[rows] = values.sum(axis=1)
-    procrustes, euclidean = np.arccos(np.minimum(cosines, 1.0)), pdist(flat)
+    n, L, D = shapes.shape
+    rows = shapes.transpose(0, 2, 1).reshape(n * D, L)
+    products = (rows @ rows.T).reshape(n, D, n, D)[first, :, second]
+    singular = np.linalg.svd(products, compute_uv=False)
+    singular[:, -1] *= np.where(np.linalg.det(products) < 0, -1.0, 1.0)
+    procrustes, euclidean = np.arccos(np.minimum(singular.sum(axis=1), 1.0)), pdist(flat)
     slope = float(euclidean @ procrustes / (procrustes @ procrustes))
     r = float(euclidean @ procrustes / np.sqrt((euclidean @ euclidean) * (procrustes @ procrustes)))
     order = procrustes.argsort()
@@ -124,10 +132,13 @@ def shape_notes(cohort: Cohort) -> tuple[str, ...]:
     share = cohort.estimated_share
     if share.any():
         worst = int(share.argmax())
+        points, method = "vertices", " (conditional mean by PCA with missing data)"
+        if cohort.source.kind == "landmarks":
+            points, method = "landmarks", ""
         notes.append(
-            f"{_percent(float(share.mean()))} of the analysed vertices are estimates, not observations (conditional "
-            f"mean by PCA with missing data): in {int((share > 0).sum())} of {len(cohort)} shapes, most in "
-            f"{cohort.names[worst]} ({_percent(float(share[worst]))})."
+            f"{_percent(float(share.mean()))} of the analysed {points} are estimates, not observations{method}: in "
+            f"{int((share > 0).sum())} of {len(cohort)} shapes, most in {cohort.names[worst]} "
+            f"({_percent(float(share[worst]))})."
         )
     if cohort.analysed is not None:
         count = int((~cohort.analysed).sum())
@@ -171,10 +182,16 @@ def add_shape_data(report: AnalysisReport, cohort: Cohort) -> AnalysisReport:
     order = sorted(range(len(share)), key=lambda k: (-share[k], k))
     rows: list[tuple[str, float]] = [(cohort.names[k], float(share[k])) for k in order if share[k] > 0]
     table: Rows = (("shape", "estimated_share"), rows)
+    title = "Estimated vertices"
+    note = (
+        "Share of the vertices of a shape that its scan does not show, largest first; they are estimated by the "
+        "conditional mean of a PCA model with missing data, without the table."
+    )
+    if cohort.source.kind == "landmarks":
+        title, note = "Estimated landmarks", "Share of the landmarks of a specimen that are estimates, largest first."
     part = TablePart(
-        title="Estimated vertices",
-        note="Share of the vertices of a shape that its scan does not show, largest first; they are estimated by the "
-        f"conditional mean of a PCA model with missing data, without the table. All of them are in {_FILE}.",
+        title=title,
+        note=f"{note} All of them are in {_FILE}.",
         columns=(TableColumn(name="shape"), TableColumn(name="estimated", kind="percent")),
         rows=tuple(rows[:_MOST_ROWS]),
     )
