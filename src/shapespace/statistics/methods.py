@@ -15,6 +15,7 @@ SCAN_OF_SUBJECT = "scan of a subject"
 """`TestScheme.unit` where values are permuted within subjects, and between subjects with the same number of scans."""
 
 
+_RANK = 1e-9  # of the largest singular value, below which coordinates vary by rounding alone
 _ALONG = 0.01
 """Of the squared distance from the mean: shapes of one size vary along the mean by half of it, those in the tangent
 space at the mean by nothing."""
@@ -31,6 +32,7 @@ def methods_of(cohort: Cohort, subjects: int, **known: Any) -> Methods:
     centred = cohort.coefficients - cohort.coefficients.mean(axis=0)
     mean = cohort.vertices(cohort.coefficients.mean(axis=0))
     middle = (mean - mean.mean(axis=0)).ravel()
+    singular = np.linalg.svd(centred, compute_uv=False)
     along = np.abs(centred @ (cohort.basis @ middle)).max(initial=0.0)
     facts: dict[str, Any] = {
         "shapes": len(cohort),
@@ -41,7 +43,7 @@ def methods_of(cohort: Cohort, subjects: int, **known: Any) -> Methods:
         "source": cohort.source.kind,
         "modes": cohort.source.modes,
         "explained_variance_ratio": cohort.source.explained_variance_ratio,
-        "dimensions": int(np.linalg.matrix_rank(centred)),
+        "dimensions": int((singular > _RANK * singular.max(initial=0.0)).sum()),
         "unit": cohort.unit,
     }
     return Methods(subjects=subjects, **{**facts, **known})

@@ -5,7 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import cast
 
-from shapespace.schemas import Analysis, Dispersion, Methods, Part, TableColumn, TablePart, TestScheme, TextPart
+from shapespace.schemas import (
+    AlignRecord,
+    Analysis,
+    Dispersion,
+    Methods,
+    Part,
+    TableColumn,
+    TablePart,
+    TestScheme,
+    TextPart,
+)
 from shapespace.statistics.dispersion import FEWEST_OF_GROUP
 from shapespace.statistics.methods import SCAN_OF_SUBJECT
 
@@ -31,6 +41,9 @@ _ALIGNMENT = (
     "Gower J. C. (1975) Generalized Procrustes analysis. Psychometrika 40, 33-51.",
     "Rohlf F. J., Slice D. (1990) Extensions of the Procrustes method for the optimal superimposition of landmarks. "
     "Systematic Zoology 39, 40-59.",
+)
+_SLIDING = (
+    "Gunz P., Mitteroecker P. (2013) Semilandmarks: a method for quantifying curves and surfaces. Hystrix 24, 103-109.",
 )
 _OF_FITS = (
     "Quan W., Matuszewski B. J., Shark L.-K., Ait-Boudaoud D. Low Dimensional Surface Parameterisation with "
@@ -80,7 +93,7 @@ def methods_text(analysis: Analysis) -> str:
         return ""
     versions = ", ".join(f"{name} {version}" for name, version in analysis.versions.items())
     sentences = [f"Shapes were analysed with the command {analysis.question} of shapespace ({versions})."]
-    data, *others = _sentences(methods)
+    data, *others = _sentences(methods, in_paper=True)
     sentences += [data, *_test_sentences(methods.tests), *others]
     if methods.tests:
         sentences.append(f"The level of significance is {methods.level:g}.")
@@ -94,8 +107,7 @@ def methods_text(analysis: Analysis) -> str:
         and value not in ("", [], {}, ())
     ]
     sentences += [f"Settings: {'; '.join(chosen)}."] if chosen else []
-    references = "".join(f"{one}\n" for one in citations_of(analysis))
-    return f"{' '.join(sentences)}\n" + (f"\nReferences\n\n{references}" if references else "")
+    return _paragraph(sentences, citations_of(analysis))
 
 
 def citations_of(analysis: Analysis) -> tuple[str, ...]:
@@ -115,6 +127,43 @@ def citations_of(analysis: Analysis) -> tuple[str, ...]:
         analysis.citations,
     )
     return tuple(dict.fromkeys(one for group in groups for one in group))
+
+
+def alignment_text(record: AlignRecord) -> str:
+    """Return methods.txt of an alignment of landmarks.
+
+    Args:
+        record: of the alignment.
+    """
+    settings = record.settings
+    curves, surface = (int(settings.get(f"{kind}_semilandmarks") or 0) for kind in ("curve", "surface"))
+    tangent = record.gauge == "shape" and bool(settings.get("tangent", True))
+    sentences = [
+        f"Landmarks were aligned with the command align of shapespace {record.version}. The data are "
+        f"{record.specimens} specimens with {record.landmarks} landmarks in {record.dimensions} dimensions each.",
+        "They were aligned by generalised Procrustes analysis "
+        + ("with scaling to unit centroid size" if record.gauge == "shape" else "without scaling")
+        + (", and projected orthogonally to the tangent space at their mean." if tangent else "."),
+    ]
+    if curves or surface:
+        by = str(settings.get("slide_by", "bending-energy")).replace("-", " ")
+        sentences.append(
+            f"{curves} semilandmarks on curves and {surface} on surfaces were slid to minimise the "
+            f"{'Procrustes distance' if by == 'procrustes' else by} to the mean."
+        )
+    if record.estimated:
+        method = "a thin-plate spline" if settings.get("missing", "tps") == "tps" else "regression"
+        sentences.append(f"{record.estimated} missing landmarks were estimated by {method}.")
+    if settings.get("structures"):
+        sentences.append("Structures were aligned separately.")
+    end = "converged" if record.converged else "stopped before convergence"
+    sentences.append(f"The alignment {end} in {record.iterations} iterations.")
+    references = (*_ALIGNMENT, *(_SLIDING if curves or surface else ()))
+    return _paragraph(sentences, references)
+
+
+def _paragraph(sentences: Sequence[str], references: Sequence[str]) -> str:
+    return "\n".join([" ".join(sentences), *(["", "References", "", *references] if references else []), ""])
 
 
 def _value_text(value: object) -> str:
@@ -187,7 +236,8 @@ def _parts(methods: Methods) -> Iterator[Part]:
         )  # fmt: skip
 
 
-def _sentences(methods: Methods) -> Iterator[str]:
+def _sentences(methods: Methods, *, in_paper: bool = False) -> Iterator[str]:
+    """Yield the sentences on data and tests; those in a paper have no advice."""
     shapes = f"{methods.shapes} shapes of {methods.subjects} subjects"
     points = points_word(methods)
     modes = (
@@ -209,7 +259,13 @@ def _sentences(methods: Methods) -> Iterator[str]:
     )
     if any(test.resampling in ("permutation", "sign flips") for test in methods.tests):
         yield f"Exchangeability: {_exchangeability(methods)}"
-    yield from (dispersion_sentence(one, methods.unequal_variances, methods.unit) for one in methods.dispersions)
+    if in_paper and methods.dispersions:
+        tests = [
+            f"{one.variable}{f' {one.stratum}' if one.stratum else ''} (p = {one.p:.3g})" for one in methods.dispersions
+        ]
+        yield f"Equal dispersion was tested by permutation of distances to class means: {', '.join(tests)}."
+    elif methods.dispersions:
+        yield from (dispersion_sentence(one, methods.unequal_variances, methods.unit) for one in methods.dispersions)
     if methods.r2_strata is not None:
         strata = [one for one in methods.r2_strata if one]
         yield (

@@ -12,7 +12,7 @@ from shapespace.cohort.cohort import Cohort
 from shapespace.errors import InputError
 from shapespace.report.analyses.analysis_report import AnalysisReport, Rows
 from shapespace.report.analyses.methods_section import methods_parts
-from shapespace.report.analyses.shape_data import add_shape_data, model_hashes, scree_part
+from shapespace.report.analyses.shape_data import add_shape_data, model_hashes, scree_part, tangent_parts
 from shapespace.schemas import ConfusionPart, MorphospacePart, Part, TableColumn, TablePart
 from shapespace.statistics.methods import methods_of, sample_sizes
 from shapespace.statistics.shape_tests.ordination import Ordination, ordinate, principal_components
@@ -62,7 +62,8 @@ def morphospace_report(result: Ordination, first: tuple[int, int] = (1, 2)) -> A
     variables = [] if groups is None else [(result.variable, _classes(groups, groups.codes))]
     methods = methods_of(cohort, len(cohort), sizes=sample_sizes(cohort.names, variables))
     eigenvalues = _eigenvalue_table(result)
-    parts = [part, *_validation_parts(result), scree_part(result.eigenvalues, axis=_AXES[result.method]), eigenvalues]
+    scree = scree_part(result.eigenvalues, axis=_AXES[result.method])
+    parts = [part, *_validation_parts(result), scree, *tangent_parts(cohort), eigenvalues]
     report = AnalysisReport(
         question="morphospace",
         title=_TITLES[result.method],

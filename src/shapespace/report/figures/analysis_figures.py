@@ -270,5 +270,6 @@ def histogram_figure(
     axes.set_ylim(0, axes.get_ylim()[1] * 1.2)
     axes.yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
     if any(name for name, _ in series) or (observed is not None and observed_label):
-        legend(axes, loc="upper left" if observed is not None and 2 * observed > low + high else "upper right")
+        on_left = observed is not None and 2 * observed > low + high
+        legend(axes, loc="upper left" if on_left else "upper right", handlelength=2.4)
     return finish(figure)

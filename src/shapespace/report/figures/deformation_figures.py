@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
@@ -13,7 +12,20 @@ from matplotlib.figure import Figure
 from shapespace.errors import InputError
 from shapespace.geometry.thin_plate_spline import ThinPlateSpline
 from shapespace.report.figures.analysis_figures import current_orientation
-from shapespace.report.figures.draw import DPI, INK, LAYOUT, SMALL, TEXT, charts, escaped, finish, short, type_size
+from shapespace.report.figures.draw import (
+    DPI,
+    INK,
+    LAYOUT,
+    TEXT,
+    Scale,
+    bar_height,
+    charts,
+    colour_bar,
+    escaped,
+    finish,
+    short,
+    type_size,
+)
 from shapespace.report.inputs.orientation import view_rotation
 from shapespace.report.inputs.staged_fit import nice_ceiling
 from shapespace.report.render.palette import CATEGORIES, DIVERGING, SEQUENTIAL, UNKNOWN_COLOUR
@@ -51,10 +63,10 @@ def deformation_grid_figure(low: FloatArray, high: FloatArray, labels: tuple[str
         raise InputError("A deformation grid needs planar landmarks; draw vectors of three-dimensional ones.")
     low, high = (_turned(ends, _first_rotation())[:, :2] for ends in (low, high))
     mean = (low + high) / 2
-    lines = grid_lines(mean)
     panels = [
         (short(label, 30), ThinPlateSpline.fit(mean, end), end) for label, end in zip(labels, (low, high), strict=True)
     ]
+    lines = grid_lines(mean)
     warped = [spline.apply(lines.reshape(-1, 2)).reshape(lines.shape) for _, spline, _ in panels]
     figure, plots = _panels([label for label, _, _ in panels], np.concatenate([one.reshape(-1, 2) for one in warped]))
     for axes, grid, (_, _, end) in zip(plots, warped, panels, strict=True):
@@ -65,24 +77,22 @@ def deformation_grid_figure(low: FloatArray, high: FloatArray, labels: tuple[str
 
 
 def landmark_vectors_figure(low: FloatArray, high: FloatArray, labels: tuple[str, str]) -> Figure:
-    """Draw each landmark of one configuration with an arrow to its place in the other.
+    """Draw each landmark of one configuration as a dot with a line to its place in the other.
 
     Three-dimensional landmarks are drawn in the named views of the orientation, or from the front, the side and the
     top.
 
     Args:
-        low: (L, 2 or 3) where the arrows start.
+        low: (L, 2 or 3) where the lines start.
         high: (L, 2 or 3) where they end.
         labels: what the configurations are.
     """
     figure, plots, placed = _in_views(np.stack([low, high]), " → ".join(map(short, labels)))
     for axes, (start, end) in zip(plots, placed, strict=True):
         draw_links(axes, start, _GRID)
-        axes.scatter(*start.T, s=24, color=CATEGORIES[0], linewidths=0, zorder=2)
-        axes.quiver(
-            *start.T, *(end - start).T, angles="xy", scale_units="xy", scale=1, color=CATEGORIES[1], zorder=3,
-            width=0.02 * LAYOUT.get().scale, units="inches", headwidth=4.5, headlength=5, headaxislength=4.5,
-        )  # fmt: skip
+        vectors = LineCollection(list(np.stack([start, end], axis=1)), colors=[CATEGORIES[1]], linewidths=2.4, zorder=3)
+        axes.add_collection(vectors)
+        axes.scatter(*start.T, s=26, color=CATEGORIES[0], linewidths=0, zorder=2)
     return finish(figure, w_pad=0.6)
 
 
@@ -114,32 +124,32 @@ def landmark_map_figure(
     if not known.any():
         raise InputError("There is nothing to draw on landmarks without numbers.")
     end = limit or nice_ceiling(float(np.abs(values[known]).max()))
-    norm, colours = Normalize(-end if signed else 0.0, end), ListedColormap(DIVERGING if signed else SEQUENTIAL)
-    figure, plots, placed = _in_views(points[None], "")
-    sizes = np.where(mask if mask is not None else True, 90.0, 30.0)
+    start, colours = (-end, DIVERGING) if signed else (0.0, SEQUENTIAL)
+    figure, plots, placed = _in_views(points[None], "", bar_height() / DPI)
+    sizes = np.full(len(points), 70.0) if mask is None else np.where(mask, 70.0, 22.0)
     for axes, (place,) in zip(plots, placed, strict=True):
         draw_links(axes, place, _GRID)
         style: Any = {"edgecolors": INK, "linewidths": 0.8, "zorder": 3}
+        scale: Any = {"norm": Normalize(start, end), "cmap": ListedColormap(colours)}
         axes.scatter(*place[~known].T, s=sizes[~known], color=UNKNOWN_COLOUR, **style)
-        axes.scatter(*place[known].T, s=sizes[known], c=values[known], norm=norm, cmap=colours, **style)
-    bar = figure.colorbar(ScalarMappable(norm, colours), cax=plots[-1].inset_axes((1.06, 0.0, 0.05, 1.0)))
-    bar.ax.tick_params(labelsize=type_size(SMALL), colors=INK, length=3, pad=2)
-    bar.set_label(escaped(short(unit, 60)), fontsize=type_size(SMALL), color=INK)
-    cast(Any, bar).outline.set_visible(False)
-    return finish(figure, w_pad=0.6)
+        axes.scatter(*place[known].T, s=sizes[known], c=values[known], **scale, **style)
+    finish(figure, w_pad=0.6)
+    height = float(figure.get_figheight()) * DPI
+    colour_bar(figure, Scale(short(unit, 60), colours, start, end), height - bar_height(), height)
+    return figure
 
 
-def _in_views(shapes: FloatArray, label: str) -> tuple[Figure, list[Axes], list[FloatArray]]:
+def _in_views(shapes: FloatArray, label: str, below: float = 0.0) -> tuple[Figure, list[Axes], list[FloatArray]]:
     """Return a figure with the views of landmarks (n, L, 2 or 3), its panels, and the landmarks (n, L, 2) in each.
 
-    Planar landmarks have one view, with a label.
+    Planar landmarks have one view, with a label. There are `below` free inches under the panels.
     """
     is_planar = shapes.shape[2] == 2 or np.ptp(shapes[:, :, 2]) == 0
     named = [(one.name, view_rotation(one)) for one in current_orientation().views]
     views = [(label, _first_rotation())] if is_planar else named[:4] or list(_THREE_SIDES)
     placed = [np.stack([_turned(shape, turn)[:, :2] for shape in shapes]) for _, turn in views]
     placed = [one - (one.max(axis=(0, 1)) + one.min(axis=(0, 1))) / 2 for one in placed]
-    figure, plots = _panels([name for name, _ in views], np.concatenate([one.reshape(-1, 2) for one in placed]))
+    figure, plots = _panels([name for name, _ in views], np.concatenate([one.reshape(-1, 2) for one in placed]), below)
     return figure, plots, placed
 
 
@@ -171,15 +181,20 @@ def grid_lines(points: FloatArray) -> FloatArray:
     return np.stack(lines)
 
 
-def _panels(names: list[str], points: FloatArray) -> tuple[Figure, list[Axes]]:
-    """Return a figure with a panel for each name, all of them with one scale, in which points (n, 2) fit."""
+def _panels(names: list[str], points: FloatArray, below: float = 0.0) -> tuple[Figure, list[Axes]]:
+    """Return a figure with a panel for each name, all of them with one scale, in which points (n, 2) fit.
+
+    There are `below` free inches under the panels.
+    """
     layout, columns = LAYOUT.get(), len(names)
     low, high = points.min(axis=0), points.max(axis=0)
     room = 0.04 * float((high - low).max())
     width = (layout.chart_width if columns == 1 else layout.row_width) / columns / DPI
     aspect = float(high[1] - low[1] + 2 * room) / float(high[0] - low[0] + 2 * room)
     height = min(width * aspect, _MOST_INCHES * layout.scale) + 1.6 * type_size(TEXT) / 72 * any(names)
-    figure, plots = charts("", [height / layout.scale], columns=columns)
+    figure, plots = charts("", [(height + below) / layout.scale], columns=columns)
+    left, bottom, right, top = cast(Any, figure).plots_within
+    cast(Any, figure).plots_within = (left, bottom + below / figure.get_figheight(), right, top)
     for axes, name in zip(plots, names, strict=True):
         axes.set(xlim=(low[0] - room, high[0] + room), ylim=(low[1] - room, high[1] + room), aspect="equal")
         axes.set_axis_off()
@@ -188,7 +203,7 @@ def _panels(names: list[str], points: FloatArray) -> tuple[Figure, list[Axes]]:
     return figure, plots
 
 
-def draw_links(axes: Axes, points: FloatArray, colour: str) -> None:
+def draw_links(axes: Axes, points: FloatArray, colour: str, width: float = 1.6) -> None:
     """Draw the links of the orientation between landmarks (L, 2).
 
     Raises:
@@ -197,4 +212,4 @@ def draw_links(axes: Axes, points: FloatArray, colour: str) -> None:
     links = np.array(current_orientation().links, dtype=int).reshape(-1, 2) - 1
     if links.max(initial=-1) >= len(points):
         raise InputError(f"A link of the orientation has landmark {links.max() + 1}, but there are {len(points)}.")
-    axes.add_collection(LineCollection(list(points[links]), colors=colour, linewidths=1.6, zorder=2))
+    axes.add_collection(LineCollection(list(points[links]), colors=colour, linewidths=width, zorder=2))

@@ -237,13 +237,13 @@ def grid(
         y += _place_keys(texts, keys, y, total_w)
     bar_at = y + 10
     if scale is not None:
-        y = bar_at + 24 + 2.5 * line_height(type_size(TEXT))
+        y = bar_at + bar_height()
     if note:
         y += 4 + write(_EDGE, note, total_w - 2 * _EDGE, SMALL, color=GREY)
     total_h = int(np.ceil(y + 6))
     figure = _compose(pictures, texts, total_w, total_h)
     if scale is not None:
-        _colour_bar(figure, scale, bar_at, total_w, total_h)
+        colour_bar(figure, scale, bar_at, total_h)
     return figure
 
 
@@ -288,7 +288,13 @@ def _place_keys(
     return step * len(lines)
 
 
-def _colour_bar(figure: Figure, scale: Scale, top: float, total_w: int, total_h: int) -> None:
+def bar_height() -> float:
+    """Return the height of a colour bar with its label in pixels."""
+    return 24 + 2.5 * line_height(type_size(TEXT))
+
+
+def colour_bar(figure: Figure, scale: Scale, top: float, total_h: float) -> None:
+    """Draw a colour bar at a height in pixels from the top of a figure that is `total_h` pixels high."""
     axes = figure.add_axes((0.18, 1 - (top + 18) / total_h, 0.64, 18 / total_h))
     bar = figure.colorbar(
         ScalarMappable(Normalize(scale.low, scale.high), ListedColormap(scale.colours)),

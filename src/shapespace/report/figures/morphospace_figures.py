@@ -232,6 +232,6 @@ def _draw_shapes(row: Axes, space: Morphospace, across: int, up: int) -> None:
         landmarks = vertices[: space.n_landmarks, :2]
         grid = vertices[space.n_landmarks :, :2].reshape(*(space.grid or (0, 0)), 2)
         panel.add_collection(LineCollection(list(grid), colors="#b9bcc2", linewidths=type_size(0.5)))
-        draw_links(panel, landmarks, INK)
+        draw_links(panel, landmarks, INK, type_size(0.9))
         panel.scatter(*landmarks.T, s=type_size(6), color=INK, linewidths=0, zorder=3)
         panel.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.ticker import MaxNLocator
 
 from shapespace.errors import InputError
 from shapespace.report.figures.draw import (
@@ -335,6 +336,8 @@ def curve_figure(
         high = min(axes.get_xlim()[1], axes.get_ylim()[1])
         if low < high:
             axes.plot([low, high], [low, high], color=GREY, ls=(0, (4, 3)), lw=1.3, scalex=False, scaley=False)
+    if scales[0] == "linear" and all(np.array_equal(curve.x, curve.x.round()) for curve in curves):
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set(xlabel=axis_label(x), ylabel=axis_label(y, 0.4))
     if any(curve.name for curve in curves):
         legend(axes, loc="best")

@@ -252,7 +252,7 @@ class StudyParts:
         if values.dtype.kind not in "iuf" or (mask is not None and masks[0].dtype.kind not in "biu"):
             raise self.parts_file.damaged("the values of a map are no numbers, or its mask is none")
         values = values.astype(np.float64)
-        style = {"unit": part.unit, "signed": part.signed, "limit": part.limit, "mask": mask}
+        style: Any = {"unit": part.unit, "signed": part.signed, "limit": part.limit, "mask": mask}
         if mesh.faces is None and len(mesh.vertices) <= figures.MOST_LANDMARKS:
             figure = figures.landmark_map_figure(mesh.vertices, values, **style)
         else:
@@ -302,7 +302,7 @@ class StudyParts:
             about = f"Thin-plate splines from the mean of both to {labels[0]} and to {labels[1]}."
         else:
             figure = figures.landmark_vectors_figure(low, high, labels)
-            about = f"Each arrow leads from a landmark of {labels[0]} to its place in {labels[1]}."
+            about = f"Each line leads from a landmark of {labels[0]}, a dot, to its place in {labels[1]}."
         caption = f"{note} {about}{_times_sentence(part.times)}".strip()
         return [self.page.figure(figure, caption, alt=f"{title}: {about}", chart=True)]
 
