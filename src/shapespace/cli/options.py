@@ -29,6 +29,7 @@ _PARSERS: dict[str, Callable[[str], Any]] = {
     "str": str,
     "Path": Path,
     "tuple[str, ...]": values.words,
+    "tuple[int, ...]": values.counts,
 }
 """Annotation -> parser of its values."""
 

@@ -113,6 +113,19 @@ def control_points(text: str) -> tuple[int, int]:
     return int(counts[0]), int(counts[1])
 
 
+def error_term(text: str) -> tuple[str, str]:
+    """Return a term and its error term of TERM=ERROR."""
+    term, equals, error = text.rpartition("=")
+    if not equals or not term.strip() or not error.strip():
+        raise argparse.ArgumentTypeError(f"must be TERM=ERROR, such as genus=genus:species, not {text!r}")
+    return term.strip(), error.strip()
+
+
+def counts(text: str) -> tuple[int, ...]:
+    """Return whole numbers of 1 or more, separated by commas."""
+    return tuple(positive(word) for word in words(text))
+
+
 def words(text: str) -> tuple[str, ...]:
     """Return words separated by commas."""
     return tuple(word.strip() for word in text.split(",") if word.strip())
@@ -129,6 +142,14 @@ def mode_counts(text: str) -> tuple[int, ...]:
         return tuple(int(word) for word in text.split(","))
     except ValueError:
         raise argparse.ArgumentTypeError(f"must be numbers of modes such as 2,5,10, not {text!r}") from None
+
+
+def axes(text: str) -> tuple[int, int]:
+    """Parse two numbers of axes, from 1, separated by a comma."""
+    across, comma, up = text.partition(",")
+    if not comma:
+        raise argparse.ArgumentTypeError(f"must be two numbers of axes such as 1,2, not {text!r}")
+    return positive(across), positive(up)
 
 
 def labels(text: str) -> str | tuple[int, ...]:

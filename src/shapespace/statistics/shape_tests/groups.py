@@ -1,23 +1,39 @@
-"""Tests of groups of shapes: disparity, equality of means and covariance, equivalence, power and discriminants.
+"""Tests of groups of shapes: disparity, equality of means and covariances, equivalence, and discriminant analysis.
 
-Equations Sn are those of docs/morphometrics.md.
+Equations Mn are those of docs/morphometrics.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
 from shapespace.cohort.cohort import Cohort
+from shapespace.errors import InputError
 from shapespace.schemas import TableColumn, TablePart
 from shapespace.statistics.compare_formula import columns_of, design_of
+from shapespace.statistics.dispersion import unequal_variances
 from shapespace.statistics.methods import sample_sizes
-from shapespace.statistics.shape_tests.permutations import Groups, orders
+from shapespace.statistics.shape_tests.ordination import canonical_variates, group_means, principal_components
+from shapespace.statistics.shape_tests.permutations import Groups, Orders, orders, permuted
 from shapespace.statistics.shape_tests.shape_test_result import ShapeTestResult, Statistic
 from shapespace.statistics.shape_tests.test_table import shape_test
 from shapespace.step_counter import StepCounter
 from shapespace.types import FloatArray
+
+Progress = Callable[[int, int], None]
+Priors: TypeAlias = Literal["proportional", "equal"]
+_LEVEL = 0.05
+_DRAWS = 2000  # bootstrap samples of a confidence interval; its limits then vary by a few percent of its width
+_MOST_COMPONENTS = 10  # default limit for covariances; Mitteroecker and Bookstein (2009) take few components
+_SHAPES_PER_COMPONENT = 3  # in the smallest group; eigenvalues of fewer are too variable
+_CLEAR_MARGIN = 2.0  # times the distance by sampling alone; the level was 4 to 6 % from there on in simulations
+_BISECTIONS = 55  # halvings of an interval until float64 numbers are equal
+_TINY = 1e-7  # smallest score, in roots of the scatter; a smaller one changes no classification
+_SMALLEST = 1e-300  # avoids divisions by zero
 
 
 def compare_disparity(
@@ -29,67 +45,450 @@ def compare_disparity(
     permutations: int = 1000,
     seed: int = 0,
     drop_missing: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> ShapeTestResult:
     """Compare the disparity of groups of shapes, as `morphol.disparity` of geomorph.
 
     Args:
         cohort: the shapes.
         group: columns whose classes, or combinations of classes, are the groups.
-        formula: linear model about whose predictions disparity is measured (default: the mean of all shapes).
-        partial: whether to divide sums of squares by the number of all shapes, so that those of the groups add up.
+        formula: linear model about whose predictions disparity is measured (default: ~ 1, the mean of all shapes).
+        partial: partial disparities (Foote 1993): sums of squares about the mean of all shapes, divided by the number
+            of all shapes - 1, so that those of the groups add up to the total disparity.
+        permutations: number of permutations, including the observed data.
+        seed: of the permutations, and of the bootstrap samples of the intervals.
+        drop_missing: exclude shapes with missing values in the table (default: an error).
+        progress: called with (done, total).
+
+    Raises:
+        InputError: no such column, a group of one shape, a formula that cannot be read, or partial with a formula.
+    """
+    if partial and formula is not None:
+        raise InputError("Partial disparities are about the mean of all shapes; leave out --formula or --partial.")
+    cohort, groups = groups_of(cohort, group, drop_missing, 2, "a variance", formula)
+    n, design = len(cohort), design_of(formula, cohort.table) if formula else None
+    q = np.linalg.qr(np.column_stack([np.ones(n), design.matrix] if design else [np.ones(n)]))[0]
+    # Rows of residuals are permuted, so their squared norms are.
+    squares = ((cohort.coefficients - q @ (q.T @ cohort.coefficients)) ** 2).sum(axis=1)
+    divisor = np.full(len(groups.names), n - 1.0) if partial else groups.counts.astype(np.float64)
+    variances = permuted(n, permutations, seed, lambda rows: groups.sums(squares[:, None], rows)[..., 0], progress)
+    variances /= divisor  # M20
+    name = "partial disparity" if partial else "Procrustes variance"
+    limits = [
+        Statistic(name=name, tested=one, value=float(value), low=float(low * value), high=float(high * value))
+        for one, value, (low, high) in zip(groups.names, variances[0], _intervals(groups, squares, seed), strict=True)
+    ]
+    differences = np.abs([variances[:, a] - variances[:, b] for a, b in groups.pairs])
+    kinds = {"group": "text", "shapes": "count", name: "number", "lower 95 %": "number", "upper 95 %": "number"}
+    rows = [(s.tested, int(count), s.value, s.low, s.high) for s, count in zip(limits, groups.counts, strict=True)]
+    return group_result(
+        "disparity", cohort, group, [*_pairs("difference of disparity", groups, differences), *limits],
+        {"formula": formula, "partial": partial, "permutations": permutations, "seed": seed},
+        tables=(table_part("Disparity", kinds, rows),),
+        reduced_model=tuple(term.label for term in design.terms) if design else (),
+    )  # fmt: skip
+
+
+def _intervals(groups: Groups, squares: FloatArray, seed: int) -> FloatArray:
+    """Return factors (G, 2) from means of squared distances (N,) to the limits of their 95 % interval.
+
+    They are of the bootstrap t of the logarithm of the mean, since variances are skewed.
+    """
+    drawn = groups.resamples(_DRAWS, seed)[:, None, :] * groups.indicator.T
+    mean, second = (drawn @ squares**power / groups.counts for power in (1, 2))
+    error = np.sqrt(np.maximum(second - mean**2, 0.0) / groups.counts) / np.maximum(mean, _SMALLEST)
+    # Samples of a single shape have no standard error; a tenth of the observed one bounds their t.
+    t = np.log(np.maximum(mean, _SMALLEST) / np.maximum(mean[0], _SMALLEST))
+    t /= np.maximum(error, 0.1 * error[0] + _SMALLEST)
+    return np.exp(-np.quantile(t, (1 - _LEVEL / 2, _LEVEL / 2), axis=0) * error[0]).T
+
+
+def compare_means_and_covariances(
+    cohort: Cohort,
+    *,
+    group: tuple[str, ...],
+    components: int | None = None,
+    permutations: int = 1000,
+    seed: int = 0,
+    drop_missing: bool = False,
+    progress: Progress | None = None,
+) -> ShapeTestResult:
+    """Test whether groups of shapes have equal means and equal covariance matrices.
+
+    Args:
+        cohort: the shapes.
+        group: columns whose classes, or combinations of classes, are the groups.
+        components: number of principal components of the residuals in which covariance matrices are compared
+            (default: a third of the smallest group, at most 10).
         permutations: number of permutations, including the observed data.
         seed: of the permutations.
         drop_missing: exclude shapes with missing values in the table (default: an error).
         progress: called with (done, total).
 
     Raises:
-        InputError: no such column, a group of one shape, or a formula that cannot be read.
+        InputError: no such column, a group of fewer than three shapes, or components with a singular covariance.
     """
+    cohort, groups = groups_of(cohort, group, drop_missing, 3, "a covariance matrix")
+    n, counts = len(cohort), groups.counts
+    centred = cohort.coefficients - cohort.coefficients.mean(axis=0)
+    residual = groups.residuals(centred)
+    scores = residual @ principal_components(residual)[1].T
+    most = min(int(counts.min()) - 2, scores.shape[1])
+    usual = min(max(int(counts.min()) // _SHAPES_PER_COMPONENT, 1), _MOST_COMPONENTS, most)
+    used = usual if components is None else components
+    if not 1 <= used <= most:
+        raise InputError(
+            f"Covariance matrices of {used} components are singular: the smallest group has {counts.min()} shapes, and "
+            f"shapes vary in {scores.shape[1]} dimensions within groups; take 1 to {most} components."
+        )
+    scores = scores[:, :used]
+    # Proportional covariance matrices are exchangeable once the groups have the same total variance.
+    scaled = scores / np.sqrt(np.bincount(groups.codes, (scores**2).sum(axis=1)) / counts)[groups.codes, None]
+
+    def statistics(rows: Orders) -> FloatArray:
+        means = groups.sums(centred, rows) / counts[:, None]
+        own, relative = _covariances(groups, scores, rows), _covariances(groups, scaled, rows)
+        columns = [(means**2).sum(axis=2) @ counts]
+        for a, b in groups.pairs:
+            logs, log_shape = _log_ratios(own[:, a], own[:, b]), _log_ratios(relative[:, a], relative[:, b])
+            columns += [np.linalg.norm(means[:, a] - means[:, b], axis=1), np.linalg.norm(logs, axis=1),
+                        np.sqrt(used) * log_shape.std(axis=1)]  # M22, M23  # fmt: skip
+        return np.stack(columns, axis=1)
+
+    values = permuted(n, permutations, seed, statistics, progress).T
+    between, within, free = values[0], (centred**2).sum() - values[0], len(groups.names) - 1
+    f = between / free / np.maximum(within / (n - free - 1), _SMALLEST)  # M21
+    full, mean = groups.indicator / np.sqrt(counts), np.full((n, 1), 1 / np.sqrt(n))
+    along = np.linalg.svd(full - mean @ (mean.T @ full), full_matrices=False)[0][:, :free]
+    flips = unequal_variances(centred, full, mean, groups.codes, permutations, seed, " × ".join(group))
+    weights = np.array([counts[a] * counts[b] / (counts[a] + counts[b]) for a, b in groups.pairs])
+    return group_result(
+        "equality", cohort, group,
+        [
+            Statistic.of("F of means", f),
+            Statistic.of("F of means, unequal covariances", flips.estimate(along).statistic()),
+            *_pairs("Riemannian distance of covariance", groups, values[2::3], weights),
+            *_pairs("Riemannian distance of relative covariance", groups, values[3::3], weights),
+            *_pairs("Procrustes distance of means", groups, values[1::3]),
+        ],
+        {"components": used, "permutations": permutations, "seed": seed},
+        assumptions=(
+            f"Covariance matrices are compared in the first {used} principal components of the residuals of the group "
+            "means, which are corrected for the size of the group and permuted among all groups; this assumes that "
+            "they have the same distribution in all groups, for the relative covariance after division by the "
+            "standard deviation of each group. F with unequal covariances is tested by sign flips of residuals.",
+        ),
+    )  # fmt: skip
+
+
+def _covariances(groups: Groups, scores: FloatArray, rows: Orders) -> FloatArray:
+    """Return the (b, G, q, q) covariance matrices of groups of permuted rows of scores (N, q)."""
+    q, counts = scores.shape[1], groups.counts[:, None, None]
+    products = (scores[:, :, None] * scores[:, None, :]).reshape(len(scores), -1)
+    sums = groups.sums(np.hstack([scores, products]), rows)
+    means, squares = sums[..., :q] / counts[..., 0], sums[..., q:].reshape(*sums.shape[:2], q, q)
+    return (squares - counts * means[..., :, None] * means[..., None, :]) / (counts - 1)
+
+
+def _log_ratios(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return the (b, q) logarithms of the relative eigenvalues of pairs of covariance matrices (b, q, q)."""
+    lower = np.linalg.cholesky(first)
+    half = np.linalg.solve(lower, second)
+    return np.log(np.maximum(np.linalg.eigvalsh(np.linalg.solve(lower, half.transpose(0, 2, 1))), _SMALLEST))
+
+
+def assess_equivalence(
+    cohort: Cohort,
+    *,
+    group: tuple[str, ...],
+    margin: float | None = None,
+    margin_sd: float | None = None,
+    permutations: int = 1000,
+    seed: int = 0,
+    drop_missing: bool = False,
+    progress: Progress | None = None,
+) -> ShapeTestResult:
+    """Test whether the mean shapes of pairs of groups are equivalent: their distance is below a margin.
+
+    Args:
+        cohort: the shapes.
+        group: columns whose classes, or combinations of classes, are the groups.
+        margin: Procrustes distance, in the unit of the data, from which on means are not equivalent.
+        margin_sd: the same in standard deviations within groups, the root of the pooled Procrustes variance.
+        permutations: number of bootstrap samples, including the observed data.
+        seed: of the bootstrap samples.
+        drop_missing: exclude shapes with missing values in the table (default: an error).
+        progress: called with (done, total).
+
+    Raises:
+        InputError: no margin or two, a margin that is not above 0, fewer than 20 bootstrap samples, no such column, or
+            a group of fewer than three shapes.
+    """
+    given = margin if margin_sd is None else margin_sd
+    if (margin is None) == (margin_sd is None) or given is None or not 0 < given < np.inf:
+        raise InputError("Equivalence needs one margin above 0: --margin, a distance, or --margin-sd.")
+    if permutations * _LEVEL < 1:
+        raise InputError(f"A bound of 95 % needs 20 or more bootstrap samples, not {permutations}.")
+    cohort, groups = groups_of(cohort, group, drop_missing, 3, "an equivalence test")
+    distances = _mean_distances(cohort.coefficients, groups, groups.resamples(permutations, seed))
+    step = StepCounter(len(distances), progress)
+    tests, limits, rows, notes = list[Statistic](), list[Statistic](), list[tuple[Any, ...]](), list[str]()
+    for one, pair in zip(distances, groups.pair_names, strict=True):
+        limit = given * (1.0 if margin_sd is None else one.deviation)
+        t, bound = one.t(limit, relative=margin_sd is not None), one.upper_bound()
+        tests.append(Statistic.of("t of equivalence", t, pair, tail="lower", z="none"))
+        name = "corrected Procrustes distance"
+        limits.append(Statistic(name=name, tested=pair, value=one.corrected, low=0.0, high=bound))
+        equivalent = "yes" if (t <= t[0]).mean() <= _LEVEL else "not shown"
+        rows.append((pair, one.length, one.corrected, bound, limit, tests[-1].p, equivalent))
+        if limit < _CLEAR_MARGIN * one.noise:
+            notes.append(
+                f"{pair}: the margin {limit:.3g} is below {_CLEAR_MARGIN:g} times {one.noise:.3g}, the distance that "
+                "sampling alone gives; the level of the test then depends on the direction of the difference."
+            )
+        step.add()
+    numbers = ("Procrustes distance", "corrected distance", "upper 95 % bound", "margin")
+    kinds = {"pair": "text", **dict.fromkeys(numbers, "number"), "p": "p", "equivalent": "text"}
+    return group_result(
+        "equivalence", replace(cohort, notes=(*cohort.notes, *notes)), group, [*tests, *limits],
+        {"margin": margin, "margin_sd": margin_sd, "permutations": permutations, "seed": seed},
+        tables=(table_part("Equivalence", kinds, rows),),
+        assumptions=(
+            "Equivalence is tested against a distance of the means equal to the margin, in the direction of their "
+            "observed difference; the intervals of corrected distances have an upper bound of 95 % confidence alone.",
+        ),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _MeanDistance:
+    """Distance of the means of two groups, with B bootstrap samples of its error.
+
+    Args:
+        length: Procrustes distance of the means.
+        noise: root of the expected squared distance of the means of two samples of one population.
+        deviation: standard deviation within groups.
+        errors: (2, B) squared length of the error less its expectation, and its product with the difference.
+        spread: (3, B) variance along the difference, product along difference and error, and along the error.
+        ratio: (B,) variance within groups relative to the observed one.
+    """
+
+    length: float
+    noise: float
+    deviation: float
+    errors: FloatArray
+    spread: FloatArray
+    ratio: FloatArray
+
+    @property
+    def corrected(self) -> float:
+        """Distance without the bias by sampling; 0 where it is below this bias."""
+        return float(np.sqrt(max(self.length**2 - self.noise**2, 0.0)))  # M24
+
+    def t(self, limit: float, *, relative: bool = False) -> FloatArray:
+        """Return the (B,) squared distances less that of a limit by their standard error, the observed one first.
+
+        In the bootstrap samples the means differ by the limit, which is `relative` to the estimated variance or not.
+        """
+        # M25
+        scale = limit / self.length
+        squares = self.errors[0] + 2 * scale * self.errors[1] + (limit**2 * (1 - self.ratio) if relative else 0.0)
+        variances = scale**2 * self.spread[0] + 2 * scale * self.spread[1] + self.spread[2]
+        squares[0], variances[0] = self.length**2 - self.noise**2 - limit**2, self.spread[0, 0]
+        return squares / np.sqrt(4 * np.maximum(variances, _SMALLEST))
+
+    def upper_bound(self) -> float:
+        """Return the smallest distance whose test of equivalence is significant at 5 %."""
+        low, high = 0.0, 10 * (self.length + self.noise)
+        for _ in range(_BISECTIONS):
+            t = self.t(middle := (low + high) / 2)
+            low, high = (low, middle) if (t <= t[0]).mean() <= _LEVEL else (middle, high)
+        return high
+
+
+def _mean_distances(coefficients: FloatArray, groups: Groups, drawn: FloatArray) -> list[_MeanDistance]:
+    """Return the distances of the means of each pair of groups; `drawn` is (B, N) of `Groups.resamples`."""
+    means, residual, counts = group_means(coefficients, groups), groups.residuals(coefficients), groups.counts
+    shares = drawn[:, None, :] * (groups.indicator / counts).T
+    off = (shares.reshape(-1, len(residual)) @ (residual @ residual.T)).reshape(shares.shape)
+    variances = shares @ (residual**2).sum(axis=1) - (shares * off).sum(axis=2)
+    distances: list[_MeanDistance] = []
+    for pair in map(list, groups.pairs):
+        size, own = counts[pair], variances[:, pair]
+        (error, share), difference = (
+            (one[:, pair[0]] - one[:, pair[1]] for one in (off, shares)),
+            np.diff(means[pair[::-1]], axis=0)[0],
+        )
+        along, weights = residual @ difference, (groups.indicator[:, pair] / size**2).sum(axis=1)
+        within = float(own[0] @ (size - 1) / (size.sum() - 2))
+        distances.append(_MeanDistance(
+            length=max(float(np.linalg.norm(difference)), _SMALLEST), noise=float(np.sqrt(own[0] @ (1 / size))),
+            deviation=float(np.sqrt(within)), ratio=own @ size / (size.sum() - 2) / within,
+            errors=np.stack([(error * share).sum(axis=1) - own @ (1 / (size - 1)), share @ along]),
+            spread=np.stack([np.full(len(drawn), weights @ along**2), error @ (weights * along), error**2 @ weights]),
+        ))  # fmt: skip
+    return distances
+
+
+def discriminate(
+    cohort: Cohort,
+    *,
+    group: tuple[str, ...],
+    components: int | None = None,
+    priors: Priors = "proportional",
+    permutations: int = 1000,
+    seed: int = 0,
+    drop_missing: bool = False,
+    progress: Progress | None = None,
+) -> ShapeTestResult:
+    """Classify shapes by linear discriminants of the other shapes, and test the distances of the group means.
+
+    Args:
+        cohort: the shapes.
+        group: columns whose classes, or combinations of classes, are the groups.
+        components: number of principal components, computed without the shape that is classified (default: all, or
+            where the covariance within groups is singular, those of 95 % of the variance, at most half of the shapes
+            minus the groups).
+        priors: prior probabilities of the groups: `proportional` to their sizes, or `equal`.
+        permutations: number of permutations of the groups, including the observed data.
+        seed: of the permutations.
+        drop_missing: exclude shapes with missing values in the table (default: an error).
+        progress: called with (done, total).
+
+    Raises:
+        InputError: no such column, a group of fewer than three shapes, or a covariance within groups that is singular.
+    """
+    cohort, groups = groups_of(cohort, group, drop_missing, 3, "a leave-one-out classification")
+    n, counts, g = len(cohort), groups.counts, len(groups.names)
+    used = canonical_variates(cohort.coefficients, groups, components).n_components
+    centre, axes, variances = principal_components(cohort.coefficients)
+    scores, squares = (cohort.coefficients - centre) @ axes.T, variances * (n - 1)
+    rows = np.concatenate([one for _, one in orders(n, permutations, seed)])
+    codes, labels = groups.codes[rows], groups.labels(rows)[:, 1:].reshape(-1, n)
+
+    def sums(values: FloatArray) -> FloatArray:
+        # Values have the mean 0, so the sum of the first group follows from those of the others.
+        others = (labels @ values).reshape(len(rows), g - 1, -1)
+        return np.concatenate([-others.sum(axis=1, keepdims=True), others], axis=1)
+
+    means = sums(scores) / counts[:, None]
+    products = _within(sums(scores[:, :used] / np.sqrt(squares[:used])) / counts[:, None], np.zeros(used), counts)
+    diagonal = products.diagonal(axis1=1, axis2=2)
+    lengths = [(n - g) * (diagonal[:, a] + diagonal[:, b] - 2 * products[:, a, b]) for a, b in groups.pairs]
+    logs = np.log(counts / n if priors == "proportional" else np.full(g, 1 / g))
+    correct, posterior, step = np.zeros(permutations), np.empty((n, g)), StepCounter(n, progress)
+    for k in range(n):
+        whitened = _whitened_without(scores, squares, used, k)
+        shape, whitened[k] = whitened[k].copy(), 0.0
+        sizes = counts - (codes[:, k, None] == np.arange(g))
+        products = _within(sums(whitened) / sizes[..., None], shape, sizes)
+        # M27
+        score = logs + (n - 1 - g) * (products[..., g] - products.diagonal(axis1=1, axis2=2) / 2)
+        correct += score.argmax(axis=1) == codes[:, k]
+        posterior[k] = np.exp(score[0] - score[0].max())
+        step.add()
+    posterior /= posterior.sum(axis=1, keepdims=True)
+    predicted: list[int] = posterior.argmax(axis=1).tolist()
+    table = groups.indicator.T @ np.eye(g)[predicted]
+    kinds = {"group": "text", **{f"as {name}": "count" for name in groups.names}, "correct": "percent"}
+    classified = [
+        (name, *map(int, row), float(row[k] / row.sum()))
+        for k, (name, row) in enumerate(zip(groups.names, table, strict=True))
+    ]
+    shapes = [
+        (name, groups.names[int(code)], groups.names[best], *map(float, own))
+        for name, code, best, own in zip(cohort.names, groups.codes, predicted, posterior, strict=True)
+    ]
+    chance = f"Leave-one-out; by chance {np.exp(logs) @ counts / n:.1%} are correct."
+    columns = {"shape": "text", "group": "text", "predicted": "text", **dict.fromkeys(groups.names, "number")}
+    distances = [np.linalg.norm(means[:, a] - means[:, b], axis=1) for a, b in groups.pairs]
+    return group_result(
+        "discriminant", cohort, group,
+        [
+            Statistic.of("correct classification", correct / n, z="standard"),
+            *_pairs("Mahalanobis distance of means", groups, np.sqrt(np.maximum(lengths, 0.0))),
+            *_pairs("Procrustes distance of means", groups, np.array(distances)),
+        ],
+        {"components": used, "priors": priors, "permutations": permutations, "seed": seed},
+        tables=(table_part("Classification", kinds, classified, chance),
+                table_part("Posterior probabilities", columns, shapes)),
+        assumptions=(
+            f"Linear discriminants of {used} principal components, which do not depend on the groups; each shape is "
+            "classified by components and discriminants of the others. They assume equal covariances of the groups.",
+        ),
+    )  # fmt: skip
+
+
+def _within(means: FloatArray, shape: FloatArray, counts: Orders) -> FloatArray:
+    """Return the products (b, G, G + 1) of group means with each other and a shape, by the scatter within.
+
+    Args:
+        means: (b, G, q) of the groups, in coordinates where the mean is 0 and the total scatter the identity.
+        shape: (q,) in these coordinates.
+        counts: (b, G) or (G,) number of shapes of each group.
+    """
+    # The scatter within is the identity less that of the means, so that systems of G equations are solved (M26).
+    products = np.concatenate([means @ means.transpose(0, 2, 1), (means @ shape)[..., None]], axis=2)
+    size = means.shape[1]
+    solved = np.linalg.solve(np.eye(size) - products[..., :size] * counts[..., None, :], products)
+    return np.asarray(solved, dtype=np.float64)
+
+
+def _whitened_without(scores: FloatArray, squares: FloatArray, components: int, row: int) -> FloatArray:
+    """Return coordinates (N, q), of scatter 1, on the first q principal components of all shapes but one.
+
+    Without a shape, the scatter changes by a matrix of rank one, so that its eigenvalues solve the secular equation.
+
+    Args:
+        scores: (N, r) on all principal components of all shapes.
+        squares: (r,) their scatter, falling.
+        components: q.
+        row: the shape that is left out.
+    """
+    # M28
+    n, tiny = len(scores), _TINY * np.sqrt(squares)
+    # Scores of 0 would leave eigenvectors undefined.
+    shape = np.where(np.abs(scores[row]) < tiny, tiny, scores[row])
+    low, high = np.append(squares[1:], 0.0)[:components], squares[:components]
+    middle = (low + high) / 2
+    for _ in range(_BISECTIONS):
+        above = n / (n - 1) * (1 / (squares - middle[:, None])) @ shape**2 > 1
+        low, high = np.where(above, low, middle), np.where(above, middle, high)
+        middle = (low + high) / 2
+    vectors = shape[:, None] / (squares[:, None] - middle)
+    return (scores + scores[row] / (n - 1)) @ (vectors / np.linalg.norm(vectors, axis=0) / np.sqrt(middle))
+
+
+def groups_of(
+    cohort: Cohort, group: tuple[str, ...], drop_missing: bool, least: int, why: str, formula: str | None = None
+) -> tuple[Cohort, Groups]:
+    """Return the shapes without missing values in some columns and a formula, and their groups, as `Groups.of`."""
     named = [*group, *(columns_of(formula, cohort.table) if formula else ())]
     cohort = cohort.complete(named, drop_missing=drop_missing)
-    groups = Groups.of(cohort, group, least=2, why="a variance")
-    n = len(cohort)
-    design = np.ones((n, 1)) if formula is None else np.column_stack(
-        [np.ones(n), design_of(formula, cohort.table).matrix]
-    )  # fmt: skip
-    q = np.linalg.qr(design)[0]
-    residual = cohort.coefficients - q @ (q.T @ cohort.coefficients)
-    divisor = np.full(len(groups.names), float(n)) if partial else groups.counts.astype(np.float64)
-    indicator = groups.indicator / divisor
-    # Rows of residuals are permuted, so their squared norms are.
-    squares = (residual**2).sum(axis=1)
-    variances = np.empty((permutations, len(groups.names)))
-    step = StepCounter(permutations, progress)
-    for part, rows in orders(n, permutations, seed):
-        variances[part] = squares[rows] @ indicator
-        step.add(len(rows))
-    statistics = [
-        Statistic.of(
-            "difference of disparity", np.abs(variances[:, a] - variances[:, b]),
-            f"{groups.names[a]} – {groups.names[b]}",
-        )
-        for a, b in groups.pairs
-    ]  # fmt: skip
+    return cohort, Groups.of(cohort, group, least=least, why=why)
+
+
+def _pairs(name: str, groups: Groups, values: FloatArray, weights: FloatArray | None = None) -> list[Statistic]:
+    """Return the statistics of pairs of groups (pairs, P), after their weighted root mean square if there are some."""
+    pairs = [Statistic.of(name, one, pair) for one, pair in zip(values, groups.pair_names, strict=True)]
+    if weights is None or len(pairs) < 2:
+        return pairs
+    return [Statistic.of(name, np.sqrt(weights @ values**2 / weights.sum()), "all groups"), *pairs]
+
+
+def table_part(title: str, columns: Mapping[str, Any], rows: Sequence[tuple[Any, ...]], note: str = "") -> TablePart:
+    """Return a table from the kinds of its columns by name."""
+    kinds = tuple(TableColumn(name=name, kind=kind) for name, kind in columns.items())
+    return TablePart(title=title, columns=kinds, rows=tuple(rows), note=note or None)
+
+
+def group_result(
+    test: str, cohort: Cohort, group: tuple[str, ...], statistics: Sequence[Statistic], settings: Mapping[str, Any],
+    **known: Any,
+) -> ShapeTestResult:  # fmt: skip
+    """Return the result of a test of groups, with their sizes."""
+    sizes = sample_sizes(cohort.names, [(column, cohort.table.texts(column)) for column in group])
     return ShapeTestResult(
-        test=shape_test("disparity"),
-        cohort=cohort,
-        statistics=tuple(statistics),
-        tables=(_disparity_table(groups, variances[0]),),
-        settings={"group": list(group), "formula": formula, "partial": partial, "permutations": permutations,
-                  "seed": seed},
-        sizes=sample_sizes(cohort.names, [(column, cohort.table.texts(column)) for column in group]),
-        reduced_model=tuple(term.label for term in design_of(formula, cohort.table).terms) if formula else (),
-    )  # fmt: skip
-
-
-def _disparity_table(groups: Groups, variances: FloatArray) -> TablePart:
-    return TablePart(
-        title="Disparity",
-        columns=(TableColumn(name="group"), TableColumn(name="shapes", kind="count"),
-                 TableColumn(name="Procrustes variance", kind="number")),
-        rows=tuple(
-            (name, int(count), float(value))
-            for name, count, value in zip(groups.names, groups.counts, variances, strict=True)
-        ),
+        test=shape_test(test), cohort=cohort, statistics=tuple(statistics), settings={"group": list(group), **settings},
+        sizes=sizes, **known,
     )  # fmt: skip

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,11 +10,13 @@ import numpy.typing as npt
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.errors import InputError
+from shapespace.step_counter import StepCounter
 from shapespace.types import FloatArray
 
 _BATCH = 50
 """Permutations that are drawn from one seed."""
 _STREAM = 22  # separates these permutations from those of other tests with the same seed
+_RESAMPLES = 1  # no multiple of the batch, so that bootstrap samples differ from permutations
 Orders = npt.NDArray[np.intp]
 
 
@@ -34,6 +36,18 @@ def orders(n: int, permutations: int, seed: int) -> Iterator[tuple[slice, Orders
         if start == 0:
             rows[0] = np.arange(n)
         yield slice(start, start + count), rows
+
+
+def permuted(
+    n: int, permutations: int, seed: int, statistic: Callable[[Orders], FloatArray],
+    progress: Callable[[int, int], None] | None,
+) -> FloatArray:  # fmt: skip
+    """Return the (P, ...) statistics of all `orders`, of which `statistic` takes a batch."""
+    step, batches = StepCounter(permutations, progress), list[FloatArray]()
+    for _, rows in orders(n, permutations, seed):
+        batches.append(statistic(rows))
+        step.add(len(rows))
+    return np.concatenate(batches)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +77,33 @@ class Groups:
         """Pairs of groups by number."""
         return [(a, b) for a in range(len(self.names)) for b in range(a + 1, len(self.names))]
 
+    @property
+    def pair_names(self) -> list[str]:
+        """Pairs of groups in words, such as `female – male`."""
+        return [f"{self.names[a]} – {self.names[b]}" for a, b in self.pairs]
+
+    def labels(self, rows: Orders) -> FloatArray:
+        """Return (b, G, N) 1 where a shape is of a group, of which orders (b, N) permute the members."""
+        return (self.codes[rows][:, None, :] == np.arange(len(self.names))[:, None]).astype(np.float64)
+
+    def sums(self, values: FloatArray, rows: Orders) -> FloatArray:
+        """Return the (b, G, K) sums of values (N, K) in each group, of which orders (b, N) permute the members."""
+        return (self.labels(rows).reshape(-1, len(values)) @ values).reshape(len(rows), len(self.names), -1)
+
+    def residuals(self, values: FloatArray) -> FloatArray:
+        """Return the (N, K) differences of values from group means, with a variance that is free of group size."""
+        counts = self.counts[self.codes, None]
+        means = self.indicator.T @ values / self.counts[:, None]
+        return (values - means[self.codes]) * np.sqrt(counts / (counts - 1))
+
+    def resamples(self, draws: int, seed: int) -> FloatArray:
+        """Return how often each shape is drawn (draws, N) in bootstrap samples of each group; in the first, once."""
+        rng = np.random.default_rng([seed, _STREAM, _RESAMPLES])
+        counts = np.ones((draws, len(self.codes)))
+        for g, n in enumerate(self.counts.tolist()):
+            counts[1:, self.codes == g] = rng.multinomial(n, [1 / n] * n, size=draws - 1)
+        return counts
+
     @staticmethod
     def of(cohort: Cohort, columns: Sequence[str], *, least: int = 1, why: str = "") -> Groups:
         """Return the groups by the classes of one column, or of several combined as `a.b`.
@@ -82,7 +123,7 @@ class Groups:
         label = " × ".join(columns)
         if len(names) < 2:
             raise InputError(
-                f"{cohort.table.where}: {label} is {names[0][:40]!r} for all {len(cells)} shapes; groups need two "
+                f"{cohort.table.where}: {label} is {cells[0][:40]!r} for all {len(cells)} shapes; groups need two "
                 "different values."
             )
         number = {name: k for k, name in enumerate(names)}
