@@ -108,8 +108,9 @@ def read_cohort(
     if config.geometry == "landmarks":
         least = 1 if onto is not None else config.least
         surfaces = read_cohort(data, replace(config, geometry="surface", least=least), on_shape=on_shape)
-        if surfaces.landmarks is None and (source / _LANDMARKS).is_file():
-            surfaces = replace(surfaces, landmarks=read_surface_landmarks(source / _LANDMARKS))
+        listed = (source if source.is_dir() else source.parent) / _LANDMARKS
+        if surfaces.landmarks is None and listed.is_file():
+            surfaces = replace(surfaces, landmarks=read_surface_landmarks(listed))
         return landmark_cohort(surfaces, onto)
     table, keys = (None, ()) if data.is_dir() else read_table(data)
     folder = Path(config.shapes) if config.shapes else (data if table is None else data.parent)
