@@ -1,5 +1,8 @@
 """methods.txt: each fact comes from the record of the analysis, and every analysis writes it."""
 
+import json
+import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from shapespace.cohort.cohort import Cohort
+from shapespace.cohort.cohort import Cohort, ShapeSource
 from shapespace.report.analyses.analysis_report import METHODS_FILE, AnalysisReport
 from shapespace.report.analyses.methods_section import alignment_text, citations_of, methods_parts, methods_text
 from shapespace.report.analyses.shape_data import add_shape_data
@@ -123,6 +126,18 @@ def test_answers_write_their_methods_beside_the_analysis(tmp_path: Path) -> None
         text = (tmp_path / name / METHODS_FILE).read_text("utf-8")
         assert "12 shapes of" in text and "20 arrangements" in text and "seed 0" in text and citation in text
         assert f"shapespace {__version__}" in text
+
+
+def test_reports_of_landmarks_do_not_call_them_vertices(tmp_path: Path) -> None:
+    landmarks = replace(cohort(), source=ShapeSource("landmarks"))
+    for name, used in (("landmarks", landmarks), ("points", cohort())):
+        compare(used, "~ sex", CompareConfig(permutations=20)).save(tmp_path / name)
+        content = json.loads((tmp_path / name / "analysis.json").read_text())
+        texts = [*content["summary"], *content["notes"], (tmp_path / name / METHODS_FILE).read_text()]
+        texts += [str(part.get(key)) for part in content["parts"] for key in ("title", "note", "text")]
+        assert bool(re.search("[Vv]ert(ices|ex)", " ".join(texts))) is (name == "points")
+        kinds = [part["kind"] for part in content["parts"]]
+        assert "deformation" in kinds and "morph" not in kinds
 
 
 def test_answers_without_tests_state_their_data(tmp_path: Path) -> None:

@@ -381,8 +381,8 @@ def effect_size_sentence(kind: str) -> str:
     if kind == "log":
         return "Z is log F in standard deviations above the mean of its arrangements (RRPP before version 0.6)."
     return (
-        "Z is F, made normal by a Box-Cox transformation, in standard deviations above the mean of its arrangements "
-        "(as in RRPP from version 0.6)."
+        "Z is the statistic, made normal by a Box-Cox transformation, in standard deviations above the mean of its "
+        "arrangements (as in RRPP from version 0.6)."
     )
 
 

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from msgspec import structs
 from scipy.spatial.distance import pdist
 
 from shapespace.cohort.cohort import Cohort, subjects_of
 from shapespace.report.analyses.analysis_report import AnalysisReport, Rows
-from shapespace.schemas import CurvePart, DeformationPart, MorphPart, Series, TableColumn, TablePart
+from shapespace.schemas import CurvePart, DeformationPart, MorphPart, Part, Series, TableColumn, TablePart, TextPart
 from shapespace.statistics.methods import methods_of
 from shapespace.statistics.observation_weights import LEAST_INFORMATION
 from shapespace.types import FloatArray
 
 _FILE = "observed.csv"
 _MOST_ROWS = 10  # rows that fit one screen; files have all
+_LANDMARK_WORDS = {"vertices": "landmarks", "vertex": "landmark", "Vertices": "Landmarks", "Vertex": "Landmark"}
 _MOST_LANDMARKS = 500  # vectors that can be distinguished in a figure
 _MOST_PAIRS = 1000  # dots of a figure: more cover each other
 _EQUAL = 1e-9  # relative difference of sizes that is rounding
@@ -169,6 +172,26 @@ def shape_settings(cohort: Cohort) -> dict[str, Any]:
     return out
 
 
+def _in_landmarks(report: AnalysisReport) -> AnalysisReport:
+    """Return a report whose sentences call the vertices of shapes landmarks."""
+
+    def named(text: str | None) -> str:
+        return re.sub(r"\b[Vv]ert(?:ices|ex)\b", lambda found: _LANDMARK_WORDS[found[0]], text or "")
+
+    def renamed(part: Part) -> Part:
+        changed: dict[str, Any] = {"title": named(part.title), "note": named(part.note)}
+        if isinstance(part, TextPart):
+            changed["text"] = named(part.text) if isinstance(part.text, str) else tuple(map(named, part.text))
+        return structs.replace(part, **changed)
+
+    methods = report.methods
+    if methods is not None:
+        over, assumptions = tuple(map(named, methods.corrected_over)), tuple(map(named, methods.assumptions))
+        methods = structs.replace(methods, corrected_over=over, assumptions=assumptions)
+    summary, notes = tuple(map(named, report.summary)), tuple(map(named, report.notes))
+    return replace(report, summary=summary, notes=notes, parts=tuple(map(renamed, report.parts)), methods=methods)
+
+
 def add_shape_data(report: AnalysisReport, cohort: Cohort) -> AnalysisReport:
     """Return a report with its methods, the source of its shapes and the share of estimated vertices of each shape."""
     share = cohort.estimated_share
@@ -177,6 +200,8 @@ def add_shape_data(report: AnalysisReport, cohort: Cohort) -> AnalysisReport:
     if methods is None and len(cohort) > 1:
         methods = methods_of(cohort, len(set(subjects_of(cohort, report.settings.get("subject")))))
     report = replace(report, notes=notes, settings=settings, methods=methods)
+    if cohort.source.kind == "landmarks":
+        report = _in_landmarks(report)
     if not share.any():
         return report
     order = sorted(range(len(share)), key=lambda k: (-share[k], k))

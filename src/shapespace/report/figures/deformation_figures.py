@@ -90,8 +90,8 @@ def landmark_vectors_figure(low: FloatArray, high: FloatArray, labels: tuple[str
     figure, plots, placed = _in_views(np.stack([low, high]), " → ".join(map(short, labels)))
     for axes, (start, end) in zip(plots, placed, strict=True):
         draw_links(axes, start, _GRID)
-        vectors = LineCollection(list(np.stack([start, end], axis=1)), colors=[CATEGORIES[1]], linewidths=2.4, zorder=3)
-        axes.add_collection(vectors)
+        vectors: FloatArray = np.stack([start, end], axis=1)
+        axes.add_collection(LineCollection(list(vectors), colors=[CATEGORIES[1]], linewidths=2.4, zorder=3))
         axes.scatter(*start.T, s=26, color=CATEGORIES[0], linewidths=0, zorder=2)
     return finish(figure, w_pad=0.6)
 
@@ -174,9 +174,9 @@ def grid_lines(points: FloatArray) -> FloatArray:
     lines: list[FloatArray] = []
     for axis in (0, 1):
         half = counts * step / 2
-        for place in np.linspace(-half[axis], half[axis], int(counts[axis]) + 1).tolist():
+        for k in range(int(counts[axis]) + 1):
             line = np.empty((m, 2))
-            line[:, axis], line[:, 1 - axis] = place, np.linspace(-half[1 - axis], half[1 - axis], m)
+            line[:, axis], line[:, 1 - axis] = k * step - half[axis], np.linspace(-half[1 - axis], half[1 - axis], m)
             lines.append(centre + line)
     return np.stack(lines)
 

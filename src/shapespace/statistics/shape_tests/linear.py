@@ -247,8 +247,8 @@ def analyse_allometry(
     )  # fmt: skip
     figures = tuple(
         _curve(title.capitalize(), covariate, title,
-               [Series(x=_floats(x[rows]), y=_floats(score[rows]), label=name, points=True)
-                for name, rows in ((name, indicator[:, k] > 0) for k, name in enumerate(names))])
+               [Series(x=_floats(x[rows]), y=_floats(score[rows]), label=name, points=True, group=k)
+                for k, name, rows in ((k, name, indicator[:, k] > 0) for k, name in enumerate(names))])
         for title, score in zip(titles, scores, strict=True)
     )  # fmt: skip
     arrays = {"names": np.array(cohort.names), "groups": np.array(names), "size_corrected_coefficients": corrected,
