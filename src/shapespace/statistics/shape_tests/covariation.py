@@ -37,15 +37,9 @@ _SHOWN = 3  # pairs of axes whose scores are in the table
 
 
 def fit_pls(
-    cohort: Cohort,
-    *,
-    columns: tuple[str, ...] = (),
-    modules: Path | None = None,
-    permutations: int = 1000,
-    seed: int = 0,
-    drop_missing: bool = False,
-    progress: Callable[[int, int], None] | None = None,
-) -> ShapeTestResult:
+    cohort: Cohort, *, columns: tuple[str, ...] = (), modules: Path | None = None, permutations: int = 1000,
+    seed: int = 0, drop_missing: bool = False, progress: Callable[[int, int], None] | None = None,
+) -> ShapeTestResult:  # fmt: skip
     """Fit partial least squares of shape and columns of the table, or of modules (the mean of all pairs).
 
     These are `two.b.pls` and `integration.test` of geomorph: variables are centred and not standardised.
@@ -118,14 +112,9 @@ def fit_pls(
 
 
 def estimate_modularity(
-    cohort: Cohort,
-    *,
-    modules: Path,
-    permutations: int = 1000,
-    seed: int = 0,
-    drop_missing: bool = False,
+    cohort: Cohort, *, modules: Path, permutations: int = 1000, seed: int = 0, drop_missing: bool = False,
     progress: Callable[[int, int], None] | None = None,
-) -> ShapeTestResult:
+) -> ShapeTestResult:  # fmt: skip
     """Estimate modularity by the covariance ratio CR (the mean of all pairs of modules).
 
     CR depends on the directions of the axes. As in `modularity.test` of geomorph, it is taken at the rotation in the
@@ -176,18 +165,14 @@ def estimate_modularity(
 
 
 def compare_effect_sizes(first: Statistic, second: Statistic) -> Statistic:
-    """Compare Z of one statistic in two cohorts, as `compare.pls` and `compare.CR` of geomorph.
-
-    Returns:
-        the difference of the Z in standard deviations, with a two-sided normal p.
+    """Compare Z of one statistic in two cohorts with a two-sided normal p, as `compare.pls` and `compare.CR`.
 
     Raises:
-        InputError: a statistic without a Z.
+        InputError: a statistic without permutations.
     """
     if first.z is None or second.z is None or min(len(first.arrangements), len(second.arrangements)) < 3:
-        raise InputError("Effect sizes are compared by their Z, which needs permutations; repeat both tests with them.")
-    variance = sum(1 - 1 / (len(one.arrangements) - 1) for one in (first, second))
-    z = (first.z - second.z) / math.sqrt(variance)  # M46
+        raise InputError("Effect sizes are compared by Z, which needs permutations; repeat both tests with them.")
+    z = (first.z - second.z) / math.sqrt(sum(1 - 1 / (len(one.arrangements) - 1) for one in (first, second)))  # M45
     return Statistic(name=f"difference of Z of {first.name}", value=z, z=z, p=math.erfc(abs(z) / math.sqrt(2)))
 
 

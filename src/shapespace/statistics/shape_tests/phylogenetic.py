@@ -14,15 +14,13 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from shapespace.cohort.cohort import Cohort, with_columns
-from shapespace.errors import InputError
 from shapespace.io.trees import Tree, read_tree
 from shapespace.reprs import short_repr
 from shapespace.schemas import TableColumn, TablePart
 from shapespace.statistics.compare_formula import Term, columns_of, design_of
 from shapespace.statistics.compare_shapes import CompareConfig, SquaresType, term_tests
 from shapespace.statistics.compare_strata import Stratum, less, refuse_aliased, refuse_few
-from shapespace.statistics.effect_size import effect_size
-from shapespace.statistics.shape_tests.permutations import Orders, orders
+from shapespace.statistics.shape_tests.permutations import orders
 from shapespace.statistics.shape_tests.shape_test_result import ShapeTestResult, Statistic
 from shapespace.statistics.shape_tests.test_table import shape_test
 from shapespace.step_counter import StepCounter
@@ -30,18 +28,15 @@ from shapespace.types import FloatArray, read_only
 
 PhylogeneticMethod: TypeAlias = Literal["phylomorphospace", "ppca", "paca"]
 
-_RANK = 1e-4  # standard deviation relative to the first axis, below which axes are left out, as `physignal.z`
 _MOST_AXES = 10  # principal components in the table of signal
-_LAMBDA_BOUNDS = (1e-6, 1.0)  # of Pagel's lambda, as in geomorph
-_LAMBDA_TOLERANCE = 1e-4  # absolute, as in geomorph
-_LEAST_POSITIVE = 1e-4  # of log-likelihoods that are shifted above 0 for Box-Cox, as in RRPP
+_RANK = 1e-9  # ratio of singular values; below is float64 rounding
 
 
-def _least_squares(covariance: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Return weights (N,) of the root, the matrix (N, N) of squares about it, and the precision of the root (M51)."""
+def _least_squares(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return weights (N,) whose mean is the state at the root, and the matrix (N, N) of squares about it (M51)."""
     inverse = np.linalg.inv(covariance)
     rows = inverse.sum(axis=0)
-    return rows / rows.sum(), inverse - np.outer(rows, rows) / rows.sum(), float(rows.sum())
+    return rows / rows.sum(), inverse - np.outer(rows, rows) / rows.sum()
 
 
 def _transformation(covariance: FloatArray) -> FloatArray:
@@ -113,9 +108,9 @@ def phylogenetic_axes(
     centred = values - mean
     weighted = _transformation(tree.covariance) @ centred if method == "ppca" else centred
     s, vt = np.linalg.svd(tree.covariance @ weighted if method == "paca" else weighted, full_matrices=False)[1:]
-    kept = s > 1e-9 * s[0]
+    kept = s > _RANK * s[0]
     scores = centred @ vt[kept].T
-    scale = math.sqrt(float((weighted**2).sum() / (s**2).sum()) / (len(values) - 1))  # M53
+    scale = math.sqrt(float((weighted**2).sum() / (s**2).sum()) / (len(values) - 1))  # M54
     return PhylogeneticAxes(
         tree=tree, mean=read_only(mean), directions=read_only(vt[kept].T), scores=read_only(scores),
         ancestors=read_only(ancestral_states(tree, scores)), deviations=read_only(scale * s[kept]),
@@ -123,56 +118,41 @@ def phylogenetic_axes(
 
 
 def estimate_phylogenetic_signal(
-    cohort: Cohort,
-    *,
-    tree: Tree | Path,
-    axes: int | None = None,
-    permutations: int = 1000,
-    seed: int = 0,
-    drop_missing: bool = False,
+    cohort: Cohort, *, tree: Tree | Path, permutations: int = 1000, seed: int = 0, drop_missing: bool = False,
     progress: Callable[[int, int], None] | None = None,
-) -> ShapeTestResult:
-    """Estimate phylogenetic signal: K of shape and of principal components, and the likelihood with Pagel's lambda.
+) -> ShapeTestResult:  # fmt: skip
+    """Estimate phylogenetic signal: K of shape (`physignal` of geomorph), and of principal components.
 
     Args:
         cohort: one shape for each species.
         tree: Newick or Nexus file whose tips have the names of the shapes; other tips are pruned.
-        axes: number of phylogenetically aligned components in the likelihood (default: all, at most N - 2).
         permutations: number of permutations of the shapes over the tips, including the observed data.
         seed: of the permutations.
         drop_missing: has no effect, because no column of the table is used.
         progress: called with (done, total).
 
     Raises:
-        InputError: shapes without tip, fewer than three, tips without a distance between them, or too many axes.
+        InputError: shapes without tip, fewer than three, or tips without a distance between them.
     """
     cohort, tree = _on_tree(cohort.complete((), drop_missing=drop_missing), tree)
     n = len(cohort)
-    centred = cohort.coefficients - cohort.coefficients.mean(axis=0)
-    gram = centred @ centred.T
-    u, s, _ = np.linalg.svd(centred, full_matrices=False)
+    u, s, _ = np.linalg.svd(cohort.coefficients - cohort.coefficients.mean(axis=0), full_matrices=False)
+    gram, share = (u * s**2) @ u.T, s**2 / (s**2).sum()
     components = (u * s)[:, : min(_MOST_AXES, int((s > _RANK * s[0]).sum()))]
-    weights, precision, root_precision = _least_squares(tree.covariance)
-    expected = (float(np.trace(tree.covariance)) - n / root_precision) / (n - 1)
+    weights, precision = _least_squares(tree.covariance)
+    expected = (float(np.trace(tree.covariance)) - n * float(weights @ tree.covariance @ weights)) / (n - 1)
     factor = np.linalg.cholesky(precision + 1.0 / n).T  # its squares are those about the root, as rows are centred
     forms = np.column_stack([n * np.outer(weights, weights).ravel(), precision.ravel()])
-    likelihood, pagel, n_axes = _likelihood(tree.covariance, centred, axes)
-    k, log_likelihoods = np.empty((permutations, 1 + components.shape[1])), np.empty(permutations)
+    k = np.empty((permutations, 1 + components.shape[1]))
     step = StepCounter(permutations, progress)
     for part, rows in orders(n, permutations, seed):
         root, squares = np.stack([gram[np.ix_(order, order)].ravel() @ forms for order in rows]).T
-        k[part, 0] = (np.trace(gram) + root) / squares / expected  # M54
+        k[part, 0] = ((s**2).sum() + root) / squares / expected  # M53
         roots = np.tensordot(components[rows], weights, axes=(1, 0))
         total = (components**2).sum(axis=0) + n * roots**2
         k[part, 1:] = total / ((factor @ components[rows]) ** 2).sum(axis=1) / expected
-        log_likelihoods[part] = likelihood(rows)
         step.add(len(rows))
-    shift = 0.0 if log_likelihoods.min() > 0 else _LEAST_POSITIVE - float(log_likelihoods.min())
-    fitted = Statistic.of(
-        "log-likelihood", log_likelihoods, f"Pagel's λ {pagel:.3g}, {n_axes} aligned components", z="none"
-    )
     by_axis = [Statistic.of("K", k[:, j], f"principal component {j}") for j in range(1, k.shape[1])]
-    share = s**2 / (s**2).sum()
     table = TablePart(
         title="Phylogenetic signal of principal components",
         columns=(TableColumn(name="component"), TableColumn(name="variance", kind="percent"),
@@ -180,68 +160,16 @@ def estimate_phylogenetic_signal(
         rows=tuple((one.tested, float(share[j]), one.value, one.z, one.p) for j, one in enumerate(by_axis)),
     )  # fmt: skip
     return ShapeTestResult(
-        test=shape_test("signal"), cohort=cohort, tables=(table,),
-        statistics=(Statistic.of("K", k[:, 0], "shape"), replace(fitted, z=effect_size(log_likelihoods + shift))),
-        settings={"tree": tree.where, "axes": n_axes, "lambda": pagel, "permutations": permutations, "seed": seed},
+        test=shape_test("signal"), cohort=cohort, statistics=(Statistic.of("K", k[:, 0], "shape"),), tables=(table,),
+        settings={"tree": tree.where, "permutations": permutations, "seed": seed},
         assumptions=("Shapes evolve by Brownian motion along the branches of the tree.",),
     )  # fmt: skip
 
 
-def _likelihood(
-    covariance: FloatArray, centred: FloatArray, axes: int | None
-) -> tuple[Callable[[Orders], FloatArray], float, int]:
-    """Return log-likelihoods as a function of orders of rows (b, N), the best lambda, and the number of axes.
-
-    With N - 1 axes the likelihood is the same in all orders.
-
-    Args:
-        covariance: (N, N) of species.
-        centred: (N, K) shapes less their mean.
-        axes: number of phylogenetically aligned components; None for all.
-    """
-    from scipy.optimize import minimize_scalar  # loads much
-
-    n = len(centred)
-    s, vt = np.linalg.svd(covariance @ centred, full_matrices=False)[1:]
-    most = min(n - 2, int((s > _RANK * s[0]).sum()))
-    if axes is not None and not 1 <= axes <= most:
-        raise InputError(f"The likelihood of these {n} shapes can have 1 to {most} aligned components, not {axes}.")
-    p = axes or most
-    scores = centred @ vt[:p].T
-    size = float(np.linalg.slogdet(scores.T @ scores)[1])
-    # Orthonormal columns: the mean, the scores, and all other directions.
-    basis, rest = np.split(np.linalg.qr(np.column_stack([np.ones(n), scores]), mode="complete")[0], [p + 1], axis=1)
-
-    def log_likelihoods(pagel: float, rows: Orders) -> FloatArray:
-        own = pagel * covariance + (1 - pagel) * np.diag(np.diagonal(covariance))
-        _, precision, total = _least_squares(own)
-        log_determinant = float(np.linalg.slogdet(own)[1])
-        # The determinant of the rates is by complementary minors that of the other directions, if these are fewer.
-        few = 2 * p < n
-        columns, matrix = (basis[rows][:, :, 1:], precision) if few else (rest[rows], own)
-        inner = np.linalg.slogdet(columns.transpose(0, 2, 1) @ (matrix @ columns))[1]
-        rates = inner + size - p * math.log(n) + (0.0 if few else math.log(n / total) - log_determinant)
-        return -0.5 * (n * p * (math.log(2 * math.pi) + 1) + p * log_determinant + n * rates)  # M55
-
-    best = minimize_scalar(
-        lambda pagel: -float(log_likelihoods(float(pagel), np.arange(n)[None])[0]), bounds=_LAMBDA_BOUNDS,
-        method="bounded", options={"xatol": _LAMBDA_TOLERANCE},
-    )  # fmt: skip
-    pagel = 1.0 if best.x > 0.999 else float(best.x)  # as geomorph
-    return lambda rows: log_likelihoods(pagel, rows), pagel, p
-
-
 def fit_pgls(
-    cohort: Cohort,
-    *,
-    formula: str,
-    tree: Tree | Path,
-    anova_type: SquaresType = "II",
-    permutations: int = 1000,
-    seed: int = 0,
-    drop_missing: bool = False,
-    progress: Callable[[int, int], None] | None = None,
-) -> ShapeTestResult:
+    cohort: Cohort, *, formula: str, tree: Tree | Path, anova_type: SquaresType = "II", permutations: int = 1000,
+    seed: int = 0, drop_missing: bool = False, progress: Callable[[int, int], None] | None = None,
+) -> ShapeTestResult:  # fmt: skip
     """Fit a linear model of shape by phylogenetic generalised least squares, as `procD.pgls` of geomorph.
 
     Args:
@@ -267,7 +195,7 @@ def fit_pgls(
     design = design_of(formula, cohort.table)
     n, p = len(cohort), len(design.matrix[0])
     refuse_few(n - 1, design, "", n, "shapes", p)
-    transformation = _transformation(tree.covariance)  # M56
+    transformation = _transformation(tree.covariance)  # M55
     constant, columns = transformation.sum(axis=1)[:, None], np.arange(p + 1, dtype=np.intp)
     matrix = transformation @ design.matrix
     refuse_aliased(less(matrix, constant), columns[:p], design.terms, design)

@@ -121,7 +121,7 @@ SHAPE_TESTS: tuple[ShapeTest, ...] = (
         permuted="shape",
         references=("Collyer, Sekora and Adams (2015) Heredity 115, 357-365.",),
         example="shapespace test pairwise people.csv --formula '~ species * site' --group species,site -o pairs",
-        options={"formula": "FORMULA", "group": "COLUMN", "covariate": "COLUMN", "null": "FORMULA"},
+        options={"formula": "FORMULA", "group": "COLUMN", "covariate": "COLUMN", "null": "FORMULA", "residuals": ""},
         required=("formula", "group"),
     ),
     ShapeTest(
@@ -133,7 +133,8 @@ SHAPE_TESTS: tuple[ShapeTest, ...] = (
         permuted="shape",
         references=("Collyer and Adams (2013) Hystrix 24, 75-83.",),
         example="shapespace test trajectory people.csv --group species --points stage -o trajectories",
-        options={"group": "COLUMN", "points": "COLUMN", "order": "LIST", "formula": "FORMULA", "null": "FORMULA"},
+        options={"group": "COLUMN", "points": "COLUMN", "order": "LIST", "formula": "FORMULA", "null": "FORMULA",
+                 "residuals": ""},
         required=("group", "points"),
     ),
     ShapeTest(
@@ -208,17 +209,17 @@ SHAPE_TESTS: tuple[ShapeTest, ...] = (
     ),
     ShapeTest(
         name="signal",
-        summary="estimate phylogenetic signal (K, and the likelihood with Pagel's lambda)",
+        summary="estimate phylogenetic signal K of shape and of principal components",
         module="phylogenetic",
         function="estimate_phylogenetic_signal",
-        statistics="K of shape and of each principal component, and the log-likelihood of Brownian motion",
+        statistics="K of shape, and of principal components",
         permuted="shape",
         references=(
             "Adams (2014) Syst. Biol. 63, 685-697.",
             "Collyer, Baken and Adams (2022) Methods Ecol. Evol. 13, 367-382.",
         ),
         example="shapespace test signal species.csv --tree species.nwk -o signal",
-        options={"tree": "FILE", "axes": "N"},
+        options={"tree": "FILE"},
         required=("tree",),
     ),
     ShapeTest(
