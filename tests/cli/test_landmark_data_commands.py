@@ -62,7 +62,7 @@ def test_landmarks_are_converted_with_their_sliders_and_what_is_left_out_is_prin
     outcome = run("landmarks", "convert", table, tmp_path / "newts.tps", "--sliders", sliders)
     assert outcome.code == 0 and "24 specimens with 9 landmarks" in outcome.out
     assert outcome.err.splitlines() == [
-        "The columns sex, site are left out, which TPS has no place for.",
+        "The columns sex, site are left out, which the format tps has no place for.",
         "The sliders are in newts.curveslide.csv.",
     ]
     assert (tmp_path / "newts.curveslide.csv").read_text() == "before,slide,after\n1,2,3\n"
@@ -78,7 +78,8 @@ def test_data_without_faults_are_counted_and_found_clean(run: Run, table: Path) 
     outcome = run("landmarks", "check", table)
     assert outcome.code == 0 and outcome.err == ""
     assert outcome.out.splitlines() == [
-        "24 specimens with 9 landmarks (2-D)", "columns: sex, site", "0 landmarks are missing, 0 findings",
+        "specimens: 24", "landmarks: 9", "semilandmarks: 0", "dimensions: 2", "columns: [sex, site]", "missing: 0",
+        "0 findings",
     ]  # fmt: skip
 
 

@@ -256,12 +256,13 @@ def test_a_folder_of_tps_files_is_joined(tmp_path: Path) -> None:
         ("a.tps", "LM=1\n1 2\n3 4\n", "more rows of coordinates than it declares"),
         ("a.tps", "LM=x\n1 2\n", "declares 'x' points"),
         ("a.tps", "LM=0\nID=a\n", "it has no landmarks"),
-        ("a.tps", "LM=1\n1 2\nID=a\nLM=2\n1 2\n3 4\nID=b\n", "specimen 'b' has 2 landmarks and 'a' 1"),
+        ("a.tps", "LM=1\n1 2\nID=a\nLM=2\n1 2\n3 4\nID=b\n", "specimen 'b' has 2 landmarks and 'a' has 1 landmarks"),
+        ("a.tps", "LM=1\n1 2\nCURVES=1\nPOINTS=1\n1 2\nLM=1\n1 2\n", "has 1 landmarks, curves of [1] points"),
         ("a.tps", "LM=1\n1 2\nID=a\nLM3=1\n1 2 3\nID=b\n", "do not mix 2-D and 3-D"),
         ("a.tps", "LM=1\n1 inf\nID=a\n", "coordinate that is infinite"),
         ("a.tps", "LM=1\n1 a\nID=a\n", "coordinate that is not a number ('a')"),
         ("a.tps", "LM=1\n1 2\nID=a\nSCALE=0\n", "a SCALE= is not above 0"),
-        ("a.tps", "LM=1\n1 2\nID=a\nSCALE=x\n", "SCALE= has a coordinate that is not a number"),
+        ("a.tps", "LM=1\n1 2\nID=a\nSCALE=x\n", "SCALE= of a has a coordinate that is not a number"),
         ("a.tps", "LM=1\n1\n", "landmarks need 2 or 3 coordinates"),
         ("a.nts", "1 2 4 0\n1 2 3 4 5 6 7 8\n", "no NTS header with its dimensions"),
         ("a.nts", "1 2 5 0 DIM=2\n1 2 3 4 5 6 7 8 9 0\n", "are not landmarks with DIM=2"),
@@ -311,7 +312,7 @@ def test_formats_refuse_what_they_cannot_hold(tmp_path: Path) -> None:
     for given, format, words in (
         (missing, "morphoj", "cannot read missing landmarks"), (tabbed, "morphoj", "tabs or line breaks"),
         (spaced, "nts", "cannot hold the specimen name 'a b'"), (missing, "fcsv", "cannot hold missing landmarks"),
-        (same, "mrk.json", "two specimens would be in a_b.mrk.json"), (whole, "doc", "no format 'doc'"),
+        (same, "mrk.json", "the specimen name 'a/b' cannot name a file"), (whole, "doc", "no format 'doc'"),
         (whole, None, "the ending '' has no format"),
     ):  # fmt: skip
         with pytest.raises(InputError, match=words):

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 _BY_SCAN = ("set_aside", "unreadable", "to_be_looked_at")
 _LISTED = 10
 """Scans that the terminal lists."""
+_LONGEST = 400
+"""Characters of a line on landmark data."""
 
 
 def demo(arguments: argparse.Namespace) -> int:
@@ -430,27 +432,21 @@ def landmarks_check(arguments: argparse.Namespace) -> int:
 
 def _check_landmark_data(arguments: argparse.Namespace) -> int:
     from shapespace.commands.landmark_data import check_configurations
-    from shapespace.schemas import to_json
 
     if arguments.output is not None:
         raise InputError("-o goes with SAME, the folder that correspond wrote; leave it out.")
-    found = check_configurations(arguments.marked, arguments.sliders)
+    facts = check_configurations(arguments.marked, arguments.sliders)
     if arguments.json:
-        show_json(to_json(found))
-        return 1 if found.findings else 0
-    for note in (*found.notes, *found.findings):
-        say(note)
-    sliding = f", {found.semilandmarks} of them semilandmarks" if found.semilandmarks else ""
-    show(f"{found.specimens} specimens with {found.landmarks} landmarks ({found.dimensions}-D){sliding}")
-    if found.columns:
-        show(f"columns: {', '.join(found.columns)}")
-    for kind, missing in (("specimen", found.missing_by_specimen), ("landmark", found.missing_by_landmark)):
-        listed = sorted(missing.items(), key=lambda one: -one[1])
-        if listed:
-            counts = ", ".join(f"{name} {count}" for name, count in listed[:_LISTED])
-            show(f"missing by {kind}: {counts}{', ...' if len(listed) > _LISTED else ''}")
-    show(f"{sum(found.missing_by_specimen.values())} landmarks are missing, {len(found.findings)} findings")
-    return 1 if found.findings else 0
+        show_json(facts)
+    else:
+        for sentence in (*facts["notes"], *facts["findings"]):
+            say(sentence)
+        for key, value in facts.items():
+            if key not in ("notes", "findings") and value not in ([], {}):
+                text = short(value)
+                show(f"{key.replace('_', ' ')}: {text if len(text) < _LONGEST else f'{text[:_LONGEST]}, ...'}")
+        show(f"{len(facts['findings'])} findings")
+    return 1 if facts["findings"] else 0
 
 
 def landmarks_convert(arguments: argparse.Namespace) -> int:

@@ -192,7 +192,7 @@ def export_cohort(cohort: Cohort, output: Path, to: Target, formula: str | None 
     Args:
         cohort: its coordinates are written as they are compared: aligned, and in the tangent space in the gauge shape.
         output: the file; a folder for geomorph, or to write landmarks.ENDING into.
-        to: geomorph (a folder with a script in R), morphoj, tps or csv (default: fits of STORE as files)
+        to: geomorph (a folder with a script in R), morphoj, tps or csv (default: fits of DATA as files)
         formula: for geomorph, linear model of shape, such as '~ sex + age' (default: the mean alone)
 
     Raises:
@@ -230,48 +230,41 @@ def _r_script(dimensions: int, formula: str | None) -> str:
 
 _R = """\
 # Linear model of the exported shapes. Run with: Rscript shapespace.R in this folder.
-# With geomorph installed, procD.lm tests it by permutation. The sums of squares are also computed without geomorph.
+# With geomorph installed, procD.lm tests it by permutation; the sums of squares are also computed without geomorph.
 model <- coords ~ @FORMULA
-ss_type <- "II"  # of the sums of squares: "I", "II" or "III"
-iterations <- 999
-
+ss_type <- "II"  # type of the sums of squares: "I", "II" or "III"
 covariates <- read.csv("covariates.csv", check.names = FALSE, stringsAsFactors = TRUE, na.strings = "")
 table <- read.csv("coordinates.csv", check.names = FALSE)
 stopifnot(identical(as.character(table$name), as.character(covariates$name)))
 coords <- as.matrix(table[, -1])
 rownames(coords) <- table$name
-
-# The functions of formulas of shapespace.
+# Coding and functions of formulas as in shapespace.
+options(contrasts = c("contr.sum", "contr.poly"))
 C <- function(x) factor(x)
 center <- function(x) x - mean(x)
 bs <- splines::bs
 
-options(contrasts = c("contr.sum", "contr.poly"))
 if (requireNamespace("geomorph", quietly = TRUE)) {
   shapes <- geomorph::arrayspecs(coords, ncol(coords) / @K, @K)
   data <- do.call(geomorph::geomorph.data.frame, c(list(coords = shapes), as.list(covariates)))
-  fit <- geomorph::procD.lm(model, data = data, iter = iterations, SS.type = ss_type, print.progress = FALSE)
+  fit <- geomorph::procD.lm(model, data = data, iter = 999, SS.type = ss_type, print.progress = FALSE)
   print(summary(fit))
 }
 
-# Sums of squares by differences of residual sums of squares of nested models.
+# Differences of the residual sums of squares of nested models, in R alone.
 right <- model[-2]
 X <- model.matrix(right, covariates)
-term <- attr(X, "assign")
 labels <- attr(terms(right), "term.labels")
-contains <- function(outer, inner) {
-  factors <- attr(terms(right), "factors") > 0
-  all(factors[, outer] >= factors[, inner])
-}
+factors <- attr(terms(right), "factors") > 0
 residual <- function(terms) {
-  qr <- qr(X[, term %in% c(0, terms), drop = FALSE])
+  qr <- qr(X[, attr(X, "assign") %in% c(0, terms), drop = FALSE])
   c(SS = sum(qr.resid(qr, coords)^2), Df = nrow(X) - qr$rank)
 }
 all <- seq_along(labels)
 rows <- lapply(all, function(k) {
   without <- switch(ss_type,
     I = all[all < k],
-    II = Filter(function(other) !contains(other, k), all),
+    II = Filter(function(other) any(factors[, other] < factors[, k]), all),
     III = all[all != k])
   residual(without) - residual(c(without, k))
 })

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -56,35 +56,10 @@ def convert_landmarks(
     return found, tuple(notes)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class LandmarkDataCheck:
-    """Contents and findings of landmark data.
+def check_configurations(data: Path, sliders: Sequence[Path] = ()) -> dict[str, Any]:
+    """Return what landmark data contain: counts, missing landmarks, and `findings`, a sentence each.
 
-    Args:
-        specimens: their number.
-        landmarks: their number.
-        dimensions: 2 or 3.
-        semilandmarks: number of sliding ones.
-        columns: of covariates.
-        missing_by_specimen: name -> number of missing landmarks, where there are any.
-        missing_by_landmark: name -> number of specimens without it, where there are any.
-        findings: what is to be checked, a sentence each.
-        notes: of the reader.
-    """
-
-    specimens: int
-    landmarks: int
-    dimensions: int
-    semilandmarks: int
-    columns: tuple[str, ...]
-    missing_by_specimen: dict[str, int]
-    missing_by_landmark: dict[str, int]
-    findings: tuple[str, ...]
-    notes: tuple[str, ...]
-
-
-def check_configurations(data: Path, sliders: Sequence[Path] = ()) -> LandmarkDataCheck:
-    """Return what landmark data contain, and specimens and landmarks that look wrong.
+    Findings are duplicates, specimens of another scale, mirrored specimens, swapped landmarks, and outliers.
 
     Args:
         data: file or folder with the landmarks of many specimens.
@@ -96,22 +71,23 @@ def check_configurations(data: Path, sliders: Sequence[Path] = ()) -> LandmarkDa
     found = read_configurations(data, sliders=sliders)
     absent = ~found.observed
     findings = [*_duplicates(found), *_other_scales(found)]
-    if len(found) > 1:
-        try:
-            findings += map(str, find_outliers(align_landmarks(found)))
-        except InputError as error:
-            findings.append(f"The landmarks cannot be aligned: {error}")
-    return LandmarkDataCheck(
-        specimens=len(found),
-        landmarks=len(found.landmarks),
-        dimensions=found.dimensions,
-        semilandmarks=len(np.unique(found.curve_sliders[:, 1])) + len(np.unique(found.surface_sliders)),
-        columns=tuple(found.columns),
-        missing_by_specimen={found.names[k]: int(absent[k].sum()) for k in np.unique(np.nonzero(absent)[0])},
-        missing_by_landmark={found.landmarks[k]: int(absent[:, k].sum()) for k in np.unique(np.nonzero(absent)[1])},
-        findings=tuple(findings),
-        notes=found.notes,
-    )
+    try:
+        findings += map(str, find_outliers(align_landmarks(found))) if len(found) > 1 else ()
+    except InputError as error:
+        findings.append(f"The landmarks cannot be aligned: {error}")
+    at = np.argwhere(absent).tolist()
+    return {
+        "specimens": len(found),
+        "landmarks": len(found.landmarks),
+        "semilandmarks": len({*found.curve_sliders[:, 1].tolist(), *found.surface_sliders.tolist()}),
+        "dimensions": found.dimensions,
+        "columns": list(found.columns),
+        "missing": int(absent.sum()),
+        "missing_by_specimen": dict(Counter(found.names[k] for k, _ in at).most_common()),
+        "missing_by_landmark": dict(Counter(found.landmarks[k] for _, k in at).most_common()),
+        "notes": list(found.notes),
+        "findings": findings,
+    }
 
 
 def _duplicates(found: LandmarkConfigurations) -> list[str]:

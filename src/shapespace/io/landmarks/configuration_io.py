@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -37,7 +36,6 @@ _SINGLE = tuple(sorted({*LANDMARK_FORMATS, *READ_ONLY_LANDMARKS} - {".tps"}, key
 _MILLIMETRES = (".mrk.json", ".fcsv")
 _TPS_KEYS = ("image", "comment")
 """Columns that TPS has keys for."""
-_SLIDER_COLUMNS = 3
 _NAMED = 3  # names in a sentence
 
 CONFIGURATION_FORMATS: Mapping[str, str] = MappingProxyType(
@@ -204,7 +202,7 @@ def read_sliders(path: Path | str, landmarks: int) -> IntArray:
         # R writes row names in a first column without a name.
         rows = [row[1:] if rows[0][0] == "" and len(rows[0]) > 1 else row for row in rows][1:]
     width = len(rows[0]) if rows else 0
-    if width not in (1, _SLIDER_COLUMNS) or any(len(row) != width or not all(map(is_number, row)) for row in rows):
+    if width not in (1, 3) or any(len(row) != width or not all(map(is_number, row)) for row in rows):
         raise damage_error(path, "it needs rows of before, slide, after, or of one surface landmark, as numbers from 1")
     numbers = np.array(rows, dtype=np.float64)
     return slider_numbers(numbers if width > 1 else numbers.ravel(), landmarks, path)
@@ -233,56 +231,54 @@ def write_configurations(
         InputError: an unknown format, or one that cannot hold these landmarks.
         FileError: it cannot be written.
     """
-    path = Path(path)
+    path, found = Path(path), configurations
     if format is None:
         format = next((key for key, ending in CONFIGURATION_FORMATS.items() if path.suffix.lower() == ending), None)
     if format not in {**CONFIGURATION_FORMATS, **FOLDER_FORMATS}:
         known = ", ".join((*CONFIGURATION_FORMATS, *FOLDER_FORMATS))
         problem = f"the ending {path.suffix!r} has no format" if format is None else f"there is no format {format!r}"
         raise InputError(f"Cannot write {path}: {problem}; give one of {known} with --to.")
-    if format in FOLDER_FORMATS:
-        return _write_folder(path, configurations, format)
-    columns, notes = configurations.columns, list[str]()
-    plain = configurations.landmarks == tuple(map(str, range(1, len(configurations.landmarks) + 1)))
-    if format == "tps":
-        named = dict(zip(configurations.names, configurations.points, strict=True))
-        # A line break would end the value.
-        values = {k.upper(): [" ".join(c.split()) for c in cells] for k, cells in columns.items() if k in _TPS_KEYS}
-        text, columns = tps_text(named, values), {key: cells for key, cells in columns.items() if key not in _TPS_KEYS}
-    elif format == "nts":
-        text = nts_text(configurations)
-    elif format == "morphoj":
-        text, classifiers = morphoj_texts(configurations)
-        if classifiers:
-            beside = path.with_name(f"{path.name.removesuffix(path.suffix)}{CLASSIFIERS}")
-            write_text(beside, classifiers)
-            notes.append(f"The columns {', '.join(columns)} are in {beside.name}; import it as classifier variables.")
-    else:
-        text = wide_text(configurations) if format == "csv" else long_text(configurations)
-    write_text(path, text)
-    if columns and format in ("tps", "nts"):
-        notes.append(f"The columns {', '.join(columns)} are left out, which {format.upper()} has no place for.")
-    if not plain and format in ("tps", "nts", "morphoj"):
+    files, held = _folder_texts(path, found, format) if format in FOLDER_FORMATS else _file_texts(path, found, format)
+    for file, text in files.items():
+        make_folder(file.parent)
+        write_text(file, text)
+    notes: list[str] = []
+    if lost := [column for column in found.columns if column not in held]:
+        notes.append(f"The columns {', '.join(lost)} are left out, which the format {format} has no place for.")
+    if format == "morphoj" and found.columns:
+        notes.append(f"The columns are in {list(files)[1].name}; import it as classifier variables.")
+    numbers = tuple(map(str, range(1, len(found.landmarks) + 1)))
+    if format in ("tps", "nts", "morphoj") and found.landmarks != numbers:
         notes.append("The landmarks are numbered in their order, because the format has no names of landmarks.")
     return tuple(notes)
 
 
-def _write_folder(folder: Path, configurations: LandmarkConfigurations, format: str) -> tuple[str, ...]:
+def _file_texts(path: Path, found: LandmarkConfigurations, format: str) -> tuple[dict[Path, str], Collection[str]]:
+    """Return the text of each file, and the columns in them."""
+    if format == "tps":
+        # A line break would end the value.
+        values = {k.upper(): [" ".join(c.split()) for c in found.columns.get(k, [""] * len(found))] for k in _TPS_KEYS}
+        return {path: tps_text(dict(zip(found.names, found.points, strict=True)), values)}, _TPS_KEYS
+    if format == "nts":
+        return {path: nts_text(found)}, ()
+    if format == "morphoj":
+        table, classes = morphoj_texts(found)
+        beside = path.with_name(f"{path.name.removesuffix(path.suffix)}{CLASSIFIERS}")
+        return {path: table, **({beside: classes} if classes else {})}, found.columns
+    return {path: wide_text(found) if format == "csv" else long_text(found)}, found.columns
+
+
+def _folder_texts(folder: Path, found: LandmarkConfigurations, format: str) -> tuple[dict[Path, str], Collection[str]]:
     ending = FOLDER_FORMATS[format]
-    if configurations.dimensions != 3:
-        raise InputError(f"{configurations.where}: {ending} files cannot hold 2-D landmarks; write tps, nts or csv.")
-    if format == "fcsv" and not configurations.observed.all():
-        raise InputError(f"{configurations.where}: .fcsv files cannot hold missing landmarks; write mrk.json.")
-    stems = [re.sub(r'[/\\:*?"<>|\x00-\x1f]', "_", name) for name in configurations.names]
-    same = next((stem for stem, count in Counter(stems).items() if count > 1), None)
-    if same is not None:
-        raise InputError(f"{configurations.where}: two specimens would be in {same[:60]}{ending}; rename one of them.")
-    make_folder(folder)
-    for stem, points in zip(stems, configurations.points, strict=True):
-        named = dict(zip(configurations.landmarks, points, strict=True))
-        write_text(folder / f"{stem}{ending}", LANDMARK_FORMATS[ending].write(named))
-    changed = [stem for stem, name in zip(stems, configurations.names, strict=True) if stem != name]
-    notes = [f"{len(changed)} names are changed for file names ({first_names(changed, _NAMED)})."] if changed else []
-    if configurations.columns:
-        notes.append(f"The columns {', '.join(configurations.columns)} are left out.")
-    return tuple(notes)
+    if found.dimensions != 3:
+        raise InputError(f"{found.where}: {ending} files cannot hold 2-D landmarks; write tps, nts or csv.")
+    if format == "fcsv" and not found.observed.all():
+        raise InputError(f"{found.where}: .fcsv files cannot hold missing landmarks; write mrk.json.")
+    bad = next((name for name in found.names if re.search(r'[/\\:*?"<>|\x00-\x1f]|^\.', name)), None)
+    if bad is not None:
+        raise InputError(f"{found.where}: the specimen name {bad[:60]!r} cannot name a file; rename it.")
+    texts = {
+        folder / f"{name}{ending}": LANDMARK_FORMATS[ending].write(dict(zip(found.landmarks, points, strict=True)))
+        for name, points in zip(found.names, found.points, strict=True)
+    }
+    return texts, ()

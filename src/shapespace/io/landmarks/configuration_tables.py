@@ -11,9 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from shapespace.errors import FileFormatError, InputError
+from shapespace.io.files import read_bytes
 from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations, marked_missing
-from shapespace.io.landmarks.tps_nts import coordinate
+from shapespace.io.landmarks.tps_nts import coordinates
 from shapespace.io.parsing import damage_error
+from shapespace.io.read_limits import LARGEST_CONFIGURATIONS_FILE_BYTES
 from shapespace.io.tables.table_io import KEYS, key_column, rows_text, table_rows
 from shapespace.reprs import first_names
 from shapespace.types import FloatArray
@@ -25,6 +27,7 @@ _AXIS_LAST = re.compile(r"(.*\d|.+?)(?:(?<=\d)|[ ._-])([xyz])", re.IGNORECASE)
 _LANDMARK = ("landmark", "landmarks", "lm", "point", "semilandmark")
 _KEYS = (*KEYS, "individual", "label")
 _NAMED = 3  # names in a sentence
+_Columns = dict[str, tuple[str, ...]]
 
 
 def header_kind(header: Sequence[str]) -> str:
@@ -55,23 +58,29 @@ def _landmark_columns(header: Sequence[str]) -> dict[str, dict[str, int]]:
 
 
 def parse_table(content: bytes, path: Path) -> LandmarkConfigurations:
-    """Return the landmarks in a wide or long table (CSV, tab-separated or Excel), with its other columns.
-
-    Raises:
-        FileFormatError: it has no such columns, or a cell that is no number.
-        InputError: two specimens have one name.
-    """
+    """Return the landmarks in a wide or long table (CSV, tab-separated or Excel), with its other columns."""
     header, rows = _table(content, path)
     kind = header_kind(header)
     if kind not in ("wide", "long"):
-        raise damage_error(
-            path,
-            "its header has no landmark columns, such as x1, y1, x2, y2 or specimen, landmark, x, y "
-            f"({', '.join(header)[:60]})",
-        )
+        known = "such as x1, y1, x2, y2 or specimen, landmark, x, y"
+        raise damage_error(path, f"its header has no landmark columns, {known} ({', '.join(header)[:60]})")
     if not rows:
         raise damage_error(path, "it has no specimens below its header")
-    return _wide(header, rows, path) if kind == "wide" else _long(header, rows, path)
+    names, labels, points, columns, notes = (_wide if kind == "wide" else _long)(header, rows, path)
+    points, coded = marked_missing(points, names)
+    numbered = labels == list(map(str, range(1, len(labels) + 1)))
+    return LandmarkConfigurations(
+        names=tuple(names),
+        points=points,
+        landmarks=() if numbered else tuple(labels),
+        columns=columns,
+        where=str(path),
+        notes=(*notes, *coded),
+    )
+
+
+_Content = tuple[list[str], list[str], FloatArray, _Columns, list[str]]
+"""Names, landmarks, points (N, L, D), further columns, and notes."""
 
 
 def _table(content: bytes, path: Path) -> tuple[list[str], list[list[str]]]:
@@ -82,63 +91,50 @@ def _table(content: bytes, path: Path) -> tuple[list[str], list[list[str]]]:
     return header, [[cell.strip() for cell in row] for row in rows]
 
 
-def _dimensions(axes: Mapping[str, Mapping[str, int]], path: Path) -> str:
-    with_z = ["z" in one for one in axes.values()]
-    for label, one in axes.items():
-        if lacking := {"x", "y"} - set(one):
-            raise damage_error(path, f"landmark {label[:40]!r} has no column for its {min(lacking)} coordinate")
-    if any(with_z) and not all(with_z):
-        label = list(axes)[with_z.index(False)]
-        raise damage_error(path, f"landmark {label[:40]!r} has no z and others have; do not mix 2-D and 3-D landmarks")
-    return "xyz" if any(with_z) else "xy"
+def _axes(found: Mapping[str, Mapping[str, int]], path: Path) -> str:
+    axes = "xyz" if any("z" in one for one in found.values()) else "xy"
+    for label, one in found.items():
+        if lacking := set(axes) - set(one):
+            advice = "do not mix 2-D and 3-D landmarks" if lacking == {"z"} else "add it"
+            raise damage_error(path, f"landmark {label[:40]!r} has no column for its {min(lacking)}; {advice}")
+    return axes
 
 
-def _wide(header: Sequence[str], rows: Sequence[Sequence[str]], path: Path) -> LandmarkConfigurations:
-    axes = _landmark_columns(header)
-    width = _dimensions(axes, path)
-    used = {column for one in axes.values() for column in one.values()}
+def _wide(header: Sequence[str], rows: Sequence[Sequence[str]], path: Path) -> _Content:
+    found = _landmark_columns(header)
+    labels, width = list(found), _axes(found, path)
+    used = [one[axis] for one in found.values() for axis in width]
     key = 0 if header[0].lower() in _KEYS else key_column(header, _KEYS)
     if key is None and 0 not in used and (not header[0] or len({row[0] for row in rows}) == len(rows)):
         key = 0
     names = [f"specimen {k}" if key is None else row[key] for k, row in enumerate(rows, 1)]
-    points = np.array([
-        [[coordinate(row[one[axis]], f"landmark {label} of {name[:40]!r}", path) for axis in width]
-         for label, one in axes.items()] for name, row in zip(names, rows, strict=True)
-    ])  # fmt: skip
-    columns = {
-        head: tuple(row[column] for row in rows)
-        for column, head in enumerate(header)
-        if column not in used and column != key and head
-    }
-    columns, notes = _with_classifiers(columns, names, path)
-    points, coded = marked_missing(points, names)
-    return LandmarkConfigurations(
-        names=tuple(names), points=points, landmarks=_names(list(axes)), columns=columns, where=str(path),
-        notes=(*notes, *coded),
-    )  # fmt: skip
+
+    def read(name: str, row: Sequence[str]) -> list[float]:
+        cells = (row[column] for column in used)
+        return coordinates(cells, path, lambda at: f"landmark {labels[at // len(width)]} of {name[:40]!r}")
+
+    points = np.array([read(name, row) for name, row in zip(names, rows, strict=True)])
+    others = {head: k for k, head in enumerate(header) if head and k != key and k not in set(used)}
+    columns: _Columns = {head: tuple(row[k] for row in rows) for head, k in others.items()}
+    further, notes = _classifiers(names, path)
+    return names, labels, points.reshape(len(rows), -1, len(width)), {**further, **columns}, notes
 
 
-def _names(labels: Sequence[str]) -> tuple[str, ...]:
-    return tuple(labels) if [*labels] != [str(k) for k in range(1, len(labels) + 1)] else ()
-
-
-def _with_classifiers(
-    columns: dict[str, tuple[str, ...]], names: Sequence[str], path: Path
-) -> tuple[dict[str, tuple[str, ...]], list[str]]:
-    """Return the columns with those of the classifiers of a MorphoJ table beside it."""
+def _classifiers(names: Sequence[str], path: Path) -> tuple[_Columns, list[str]]:
+    """Return the columns of the classifiers beside a MorphoJ table, and a note."""
     beside = path.with_name(f"{path.name.removesuffix(path.suffix)}{CLASSIFIERS}")
     if path.suffix.lower() != ".txt" or not beside.is_file():
-        return columns, []
-    header, rows = _table(beside.read_bytes(), beside)
-    by_name = {row[0]: row for row in rows}
-    lacking = [name for name in names if name not in by_name]
+        return {}, []
+    header, rows = _table(read_bytes(beside, LARGEST_CONFIGURATIONS_FILE_BYTES), beside)
+    row = {row[0]: row for row in rows}
+    lacking = [name for name in names if name not in row]
     if lacking:
         raise damage_error(beside, f"it has no row for {first_names(lacking, _NAMED)}")
-    further = {head: tuple(by_name[n][k] for n in names) for k, head in enumerate(header) if k and head not in columns}
-    return columns | further, [f"The columns {', '.join(further)} are those of {beside.name}."]
+    columns = {head: tuple(row[name][k] for name in names) for k, head in enumerate(header) if k}
+    return columns, [f"The columns {', '.join(columns)} are those of {beside.name}."]
 
 
-def _long(header: Sequence[str], rows: Sequence[Sequence[str]], path: Path) -> LandmarkConfigurations:
+def _long(header: Sequence[str], rows: Sequence[Sequence[str]], path: Path) -> _Content:
     lower = [name.lower() for name in header]
     key = 0 if lower[0] in _KEYS else key_column(header, _KEYS)
     landmark = key_column(header, _LANDMARK)
@@ -150,86 +146,66 @@ def _long(header: Sequence[str], rows: Sequence[Sequence[str]], path: Path) -> L
         name, label = row[key], row[landmark]
         if (name, label) in found:
             raise damage_error(path, f"specimen {name[:40]!r} has two rows of landmark {label[:40]!r}, so remove one")
-        what = f"landmark {label[:40]} of {name[:40]!r}"
-        found[name, label] = [coordinate(row[axis], what, path) for axis in axes]
-    names = list(dict.fromkeys(name for name, _ in found))
-    labels = list(dict.fromkeys(label for _, label in found))
-    if len(names) * len(labels) > 2 * len(found):
+        cells = (row[axis] for axis in axes)
+        found[name, label] = coordinates(cells, path, lambda _, of=(label, name): f"landmark {of[0]} of {of[1]!r}")
+    names, labels = (list(dict.fromkeys(pair[k] for pair in found)) for k in (0, 1))
+    absent = len(names) * len(labels) - len(found)
+    if absent > len(found):
         raise damage_error(path, "most specimens lack most landmarks; give each specimen the same landmark names")
     nothing = [math.nan] * len(axes)
     points = np.array([[found.get((name, label), nothing) for label in labels] for name in names])
-    notes, columns = list[str](), dict[str, tuple[str, ...]]()
+    notes, columns = list[str](), _Columns()
     for column, head in enumerate(header):
-        if column in (key, landmark, *axes) or not head:
-            continue
-        cells = {(row[key], row[column]) for row in rows}
-        if len(cells) == len(names):
-            columns[head] = tuple(dict(cells)[name] for name in names)
-        else:
-            notes.append(f"The column {head} is left out, since it differs between the landmarks of a specimen.")
-    if absent := [name for name in names if any((name, label) not in found for label in labels)]:
-        count = len(names) * len(labels) - len(found)
-        notes.append(f"{count} landmarks without a row are missing ({first_names(absent, _NAMED)}).")
-    points, coded = marked_missing(points, names)
-    return LandmarkConfigurations(
-        names=tuple(names), points=points, landmarks=_names(labels), columns=columns, where=str(path),
-        notes=(*notes, *coded),
-    )  # fmt: skip
+        if column not in (key, landmark, *axes) and head:
+            cells = {(row[key], row[column]) for row in rows}
+            if len(cells) == len(names):
+                columns[head] = tuple(dict(cells)[name] for name in names)
+            else:
+                notes.append(f"The column {head} is left out, since it differs between the landmarks of a specimen.")
+    if absent:
+        lacking = [name for name in names if any((name, label) not in found for label in labels)]
+        notes.append(f"{absent} landmarks without a row are missing ({first_names(lacking, _NAMED)}).")
+    return names, labels, points, columns, notes
 
 
 def _cells(points: FloatArray) -> list[str]:
     return ["NA" if math.isnan(value) else repr(value) for value in points.ravel().tolist()]
 
 
-def wide_text(configurations: LandmarkConfigurations) -> str:
+def wide_text(found: LandmarkConfigurations) -> str:
     """Return a table with a row for each specimen: name, columns, coordinates as `two.d.array` of geomorph has them."""
-    axes = "XYZ"[: configurations.dimensions]
-    columns = configurations.columns
-    header = ["name", *columns, *(f"{label}.{axis}" for label in configurations.landmarks for axis in axes)]
+    axes, columns = "XYZ"[: found.dimensions], found.columns
+    header = ["name", *columns, *(f"{label}.{axis}" for label in found.landmarks for axis in axes)]
     repeated = next((name for name, count in Counter(header).items() if count > 1), None)
     if repeated is not None:
-        raise InputError(f"{configurations.where}: a table cannot have the column {repeated[:40]!r} twice; rename one.")
-    rows = [
-        [name, *(cells[k] for cells in columns.values()), *_cells(points)]
-        for k, (name, points) in enumerate(zip(configurations.names, configurations.points, strict=True))
-    ]
-    return rows_text([header, *rows])
+        raise InputError(f"{found.where}: a table cannot have the column {repeated[:40]!r} twice; rename one.")
+    rows = zip(
+        found.names, zip(*columns.values(), strict=True) if columns else [()] * len(found), found.points, strict=True
+    )
+    return rows_text([header, *([name, *cells, *_cells(points)] for name, cells, points in rows)])
 
 
-def long_text(configurations: LandmarkConfigurations) -> str:
+def long_text(found: LandmarkConfigurations) -> str:
     """Return a table with a row for each landmark of each specimen: specimen, landmark, coordinates, columns."""
-    axes = "xyz"[: configurations.dimensions]
-    columns = configurations.columns
     rows = [
-        [name, label, *_cells(point), *(cells[k] for cells in columns.values())]
-        for k, (name, points) in enumerate(zip(configurations.names, configurations.points, strict=True))
-        for label, point in zip(configurations.landmarks, points, strict=True)
+        [name, label, *_cells(point), *(cells[k] for cells in found.columns.values())]
+        for k, (name, points) in enumerate(zip(found.names, found.points, strict=True))
+        for label, point in zip(found.landmarks, points, strict=True)
     ]
-    return rows_text([["specimen", "landmark", *axes, *columns], *rows])
+    return rows_text([["specimen", "landmark", *"xyz"[: found.dimensions], *found.columns], *rows])
 
 
-def morphoj_texts(configurations: LandmarkConfigurations) -> tuple[str, str]:
-    """Return the two tables of MorphoJ, separated by tabs: coordinates, and classifiers, empty without columns.
-
-    Raises:
-        InputError: a landmark is missing, which MorphoJ cannot read, or a cell has a tab.
-    """
-    lacking = [n for n, row in zip(configurations.names, configurations.observed, strict=True) if not row.all()]
+def morphoj_texts(found: LandmarkConfigurations) -> tuple[str, str]:
+    """Return the two tables of MorphoJ, separated by tabs: coordinates, and classifiers, empty without columns."""
+    lacking = [name for name, row in zip(found.names, found.observed, strict=True) if not row.all()]
     if lacking:
-        raise InputError(
-            f"MorphoJ cannot read missing landmarks ({first_names(lacking, _NAMED)}); estimate them first with "
-            "shapespace align."
-        )
-    axes = "xyz"[: configurations.dimensions]
-    numbers = range(1, len(configurations.landmarks) + 1)
-    table = [["ID", *(f"{axis}{k}" for k in numbers for axis in axes)]]
-    table += [[name, *_cells(points)] for name, points in zip(configurations.names, configurations.points, strict=True)]
-    columns = configurations.columns
-    classes = [
-        ["ID", *columns],
-        *([n, *cells] for n, *cells in zip(configurations.names, *columns.values(), strict=True)),
-    ]
+        names = first_names(lacking, _NAMED)
+        raise InputError(f"MorphoJ cannot read missing landmarks ({names}); estimate them first with shapespace align.")
+    numbers = range(1, len(found.landmarks) + 1)
+    table = [["ID", *(f"{axis}{k}" for k in numbers for axis in "xyz"[: found.dimensions])]]
+    table += [[name, *_cells(points)] for name, points in zip(found.names, found.points, strict=True)]
+    classes = [["ID", *found.columns], *map(list, zip(found.names, *found.columns.values(), strict=True))]
     if any(re.search(r"[\t\r\n]", cell) for row in (*table, *classes) for cell in row):
-        raise InputError(f"{configurations.where}: MorphoJ cannot read names or cells with tabs or line breaks.")
+        raise InputError(f"{found.where}: MorphoJ cannot read names or cells with tabs or line breaks.")
     texts = ["".join("\t".join(row) + "\n" for row in rows) for rows in (table, classes)]
-    return texts[0], texts[1] if columns else ""
+    return texts[0], texts[1] if found.columns else ""

@@ -8,6 +8,7 @@ import lzma
 import warnings
 import zlib
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -35,10 +36,6 @@ def parse_r(data: bytes, path: Path, name: str | None = None) -> LandmarkConfigu
 
     Factors and vectors beside the array, with a value for each specimen, become columns; `curvepts`, `curveslide` and
     `surfslide` beside it are sliders.
-
-    Raises:
-        ShapespaceError: the extra `r` is not installed.
-        FileFormatError: it is no R file, or has no such array or several.
     """
     rdata = require_package("rdata", f"Reading {path}", "'shapespace[r]'")
     try:
@@ -60,13 +57,14 @@ def parse_r(data: bytes, path: Path, name: str | None = None) -> LandmarkConfigu
     [(key, (points, labels, names, beside))] = chosen.items()
     notes = [f"The landmarks are those of {key}."] if key else []
     names = names or tuple(f"specimen {k}" for k in range(1, len(points) + 1))
+    labels = labels or tuple(map(str, range(1, points.shape[1] + 1)))
     columns = {part: cells for part, one in beside.items() if len(cells := _cells(one)) == len(points)}
     sliders = {3: np.zeros((0, 3), dtype=np.int32), 1: np.zeros(0, dtype=np.int32)}
     for part, one in beside.items():
         width = 3 if part.lower() in _CURVES else 1
         if part.lower() in (*_CURVES, *_SURFACES) and getattr(one, "size", 0) and one.size % width == 0:
-            numbers = np.asarray(one, dtype=np.float64)
-            sliders[width] = slider_numbers(numbers.reshape(-1, 3) if width > 1 else numbers.ravel(), len(labels), path)
+            numbers = np.asarray(one, dtype=np.float64).reshape((-1, 3) if width > 1 else -1)
+            sliders[width] = slider_numbers(numbers, len(labels), path)
             columns.pop(part, None)
             notes.append(f"The sliders are those of {part}.")
     points, coded = marked_missing(points, names)
@@ -101,17 +99,14 @@ def _unpacked(data: bytes) -> bytes:
 
 def _expansions(rdata: Any) -> dict[bytes, Any]:
     """Return what expands compact vectors of R, which refuses sequences longer than any file's."""
-    known = dict(rdata.parser.DEFAULT_ALTREP_MAP)
 
-    def bounded(name: bytes) -> Any:
-        def expand(state: Any) -> Any:
-            if not 0 <= state.value[0] <= LARGEST_CONFIGURATIONS_FILE_BYTES // 8:
-                raise ValueError("it has a sequence that would fill the memory")
-            return known[name](state)
+    def bounded(expand: Any, state: Any) -> Any:
+        if not 0 <= state.value[0] <= LARGEST_CONFIGURATIONS_FILE_BYTES // 8:
+            raise ValueError("it has a sequence that would fill the memory")
+        return expand(state)
 
-        return expand
-
-    return {**known, **{name: bounded(name) for name in (b"compact_intseq", b"compact_realseq")}}
+    known: dict[bytes, Any] = dict(rdata.parser.DEFAULT_ALTREP_MAP)
+    return {name: partial(bounded, expand) if b"compact" in name else expand for name, expand in known.items()}
 
 
 def _objects(content: Any, rdata: Any) -> dict[str, Any]:
@@ -135,19 +130,13 @@ def _arrays(
         shape = getattr(one, "shape", ())
         if len(shape) == 3 and shape[1] in (2, 3) and 0 not in shape and np.asarray(one).dtype.kind in "fi":
             coords = getattr(one, "coords", {})
-            labels, names = (tuple(map(str, coords[axis].values)) if axis in coords else () for axis in _AXES)
+            labels, names = (
+                tuple(map(str, coords[axis].values)) if axis in coords else () for axis in ("dim_0", "dim_2")
+            )
             points = np.moveaxis(np.ma.filled(np.ma.asarray(one).astype(np.float64), np.nan), 2, 0)
-            yield f"{prefix}{name}", (points, labels or _numbered(shape[0]), names, objects)
+            yield f"{prefix}{name}", (points, labels, names, objects)
         elif isinstance(one, Mapping) and depth < _DEEPEST:
             yield from _arrays(cast(Mapping[str, Any], one), f"{prefix}{name}$" if name else prefix, depth + 1)
-
-
-_AXES = ("dim_0", "dim_2")
-"""Of the names of landmarks and specimens, as rdata calls them."""
-
-
-def _numbered(count: int) -> tuple[str, ...]:
-    return tuple(map(str, range(1, count + 1)))
 
 
 def _cells(one: Any) -> tuple[str, ...]:
