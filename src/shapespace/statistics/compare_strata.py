@@ -427,9 +427,9 @@ def independent_columns(matrix: FloatArray, terms: Sequence[Term]) -> tuple[Floa
 
 def means_of(rows: FloatArray, group: Rows) -> FloatArray:
     """Return the mean of the rows of each group, whose numbers `at` (n,) count from 0."""
-    out = np.zeros((int(group.max()) + 1, rows.shape[1]))
-    np.add.at(out, group, rows)
-    return out / np.bincount(group)[:, None]
+    order = np.argsort(group, kind="stable")
+    counts = np.bincount(group)
+    return np.add.reduceat(rows[order], np.cumsum(counts) - counts, axis=0) / counts[:, None]
 
 
 def refuse_few(free: int, design: Design, where: str, count: int, unit: str, columns: int) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from shapespace.step_counter import StepCounter
 from shapespace.types import FloatArray
 
 Progress = Callable[[int, int], None]
+Residuals: TypeAlias = Literal["scaled", "raw"]
 _LEVEL = 0.05
 _RANK = 1e-8  # relative length; columns below it follow from others, and estimates below it are equal
 _MOST_COORDINATES = 20_000_000
@@ -40,6 +41,7 @@ def compare_trajectories(
     order: tuple[str, ...] = (),
     formula: str | None = None,
     null: str | None = None,
+    residuals: Residuals = "scaled",
     permutations: int = 1000,
     seed: int = 0,
     drop_missing: bool = False,
@@ -54,6 +56,7 @@ def compare_trajectories(
         order: classes of the points in their order (default: numbers ascending, others alphabetically).
         formula: linear model whose least-squares means are the points (default: group * points).
         null: reduced model whose residuals are permuted, `1` for the mean shape (default: without the last term).
+        residuals: `scaled` to the variance of errors, or `raw`, as RRPP, which are smaller than errors.
         permutations: number of permutations, including the observed data.
         seed: of the permutations.
         drop_missing: exclude shapes with missing values in the table (default: an error).
@@ -64,7 +67,7 @@ def compare_trajectories(
             nested or leave no residuals.
     """
     if formula is None:
-        formula = " * ".join(f"C({c})" if cohort.table.kind(c) == "number" else f"`{c}`" for c in (*group, points))
+        formula = " * ".join(_class_factor(cohort, column) for column in (*group, points))
     cohort = _complete(cohort, [formula, null], [*group, points], drop_missing=drop_missing)
     groups, texts = Groups.of(cohort, group), cohort.table.texts(points)
     stages = order or tuple(sorted(set(texts), key=float if cohort.table.kind(points) == "number" else str))
@@ -85,7 +88,7 @@ def compare_trajectories(
     estimator = _mean_estimator(design, np.eye(g * p)[cells])
     columns: list[list[FloatArray]] = []
     observed = np.zeros(0)
-    for means in _permuted(estimator, reduced, cohort, permutations, seed, progress):
+    for means in _permuted(estimator, reduced, cohort, residuals, permutations, seed, progress):
         paths = means.reshape(len(means), g, p, -1)
         observed = observed if observed.size else paths[0]
         length = np.linalg.norm(np.diff(paths, axis=2), axis=3).sum(axis=2)  # M31
@@ -108,7 +111,7 @@ def compare_trajectories(
            for name, one in zip(groups.names, scores, strict=True)),
          Series(x=_floats(shown[:, 0]), y=_floats(shown[:, 1]), label="shapes", points=True)],
     )  # fmt: skip
-    settings = {"group": list(group), "points": list(stages), "formula": formula, "null": null}
+    settings = {"group": list(group), "points": list(stages), "formula": formula, "null": null, "residuals": residuals}
     return _pairs_result(
         "trajectory", cohort, groups, columns, names[: len(columns[0])], (*group, points), labels,
         settings | {"permutations": permutations, "seed": seed}, (figure,),
@@ -136,6 +139,7 @@ def compare_pairs(
     group: tuple[str, ...],
     covariate: str | None = None,
     null: str | None = None,
+    residuals: Residuals = "scaled",
     permutations: int = 1000,
     seed: int = 0,
     drop_missing: bool = False,
@@ -149,6 +153,7 @@ def compare_pairs(
         group: columns whose classes, or combinations of classes, are the groups.
         covariate: column of numbers whose slopes are compared (default: means are, at the mean of all numbers).
         null: reduced model whose residuals are permuted, `1` for the mean shape (default: without the last term).
+        residuals: `scaled` to the variance of errors, or `raw`, as RRPP, which are smaller than errors.
         permutations: number of permutations, including the observed data.
         seed: of the permutations.
         drop_missing: exclude shapes with missing values in the table (default: an error).
@@ -175,13 +180,14 @@ def compare_pairs(
             f"{'the interaction of the groups with the covariate' if covariate else 'the groups'}."
         )
     columns: list[list[FloatArray]] = []
-    for vectors in _permuted(estimator, reduced, cohort, permutations, seed, progress):
+    for vectors in _permuted(estimator, reduced, cohort, residuals, permutations, seed, progress):
         length = np.linalg.norm(vectors, axis=2)
         for a, b in groups.pairs:
             columns.append([np.linalg.norm(vectors[:, a] - vectors[:, b], axis=1)])
             if covariate is not None:
                 columns[-1] += [np.abs(length[:, a] - length[:, b]), angles_between(vectors[:, a], vectors[:, b])]
-    settings = {"formula": formula, "group": list(group), "covariate": covariate, "null": null}
+    settings = {"formula": formula, "group": list(group), "covariate": covariate, "null": null,
+                "residuals": residuals}  # fmt: skip
     return _pairs_result(
         "pairwise", cohort, groups, columns, names, group, labels,
         settings | {"permutations": permutations, "seed": seed},
@@ -216,19 +222,19 @@ def analyse_allometry(
     """
     if separate and group is None:
         raise InputError("Separate slopes need groups; name their column with --group.")
-    formula = f"~ `{covariate}`"
+    formula = _quoted(covariate)
     if group is not None:
-        formula += f" * C(`{group}`)" if cohort.table.kind(group) == "number" else f" * `{group}`"
+        formula += f" * {_class_factor(cohort, group)}"
     cohort = _complete(cohort, [formula], [], drop_missing=drop_missing)
-    step = StepCounter(3 if group else 1, progress)
-    stratum = independent_stratum(cohort.coefficients, design_of(formula, cohort.table))
-    tests = list(term_tests(stratum, CompareConfig(permutations=permutations, seed=seed, maps=False), step.add))
     x, y = cohort.table.numbers(covariate), cohort.coefficients - cohort.coefficients.mean(axis=0)
     classes = ["all"] * len(cohort) if group is None else list(cohort.table.texts(group))
     names = sorted(set(classes))
     indicator = np.array([[one == name for name in names] for one in classes], dtype=np.float64)
-    within = less(x[:, None], indicator)
-    model = _lines(indicator, x, covariate) if separate else np.hstack([indicator, x[:, None]])
+    lines, within = _lines(indicator, x, covariate), less(x[:, None], indicator)
+    step = StepCounter(3 if group else 1, progress)
+    stratum = independent_stratum(cohort.coefficients, design_of(formula, cohort.table))
+    tests = list(term_tests(stratum, CompareConfig(permutations=permutations, seed=seed, maps=False), step.add))
+    model = lines if separate else np.hstack([indicator, x[:, None]])
     coefficients = np.linalg.pinv(model) @ y
     fitted, slopes = model @ coefficients, coefficients[len(names) :]
     own = slopes[indicator.argmax(axis=1)] if separate else np.repeat(slopes, len(x), axis=0)
@@ -404,6 +410,14 @@ def _complete(cohort: Cohort, formulas: Sequence[str | None], columns: Sequence[
     return complete_cohort(cohort, given, columns, drop_missing=drop_missing)
 
 
+def _quoted(column: str) -> str:
+    return column if column.isidentifier() else f"`{column}`"
+
+
+def _class_factor(cohort: Cohort, column: str) -> str:
+    return f"C({_quoted(column)})" if cohort.table.kind(column) == "number" else _quoted(column)
+
+
 def _with_constant(columns: FloatArray) -> FloatArray:
     return np.column_stack([np.ones(len(columns)), columns])
 
@@ -444,14 +458,21 @@ def _lines(indicator: FloatArray, x: FloatArray, covariate: str) -> FloatArray:
 
 
 def _permuted(
-    estimator: FloatArray, reduced: FloatArray, cohort: Cohort, permutations: int, seed: int, progress: Progress | None
-) -> Iterator[FloatArray]:
+    estimator: FloatArray, reduced: FloatArray, cohort: Cohort, residuals: Residuals, permutations: int, seed: int,
+    progress: Progress | None,
+) -> Iterator[FloatArray]:  # fmt: skip
     """Yield estimates (b, m, K) of batches, with the residuals of the reduced model permuted (M30)."""
+    n = len(cohort)
     residual = less(cohort.coefficients, reduced)
     fixed, step = estimator @ (cohort.coefficients - residual), StepCounter(permutations, progress)
-    for _, rows in orders(len(cohort), permutations, seed):
-        placed = estimator.T[rows].transpose(0, 2, 1).reshape(-1, len(cohort)) @ residual
-        yield fixed + placed.reshape(len(rows), len(estimator), -1)
+    # Distances and angles are not divided by an error. A sum of permuted residuals has the variance of their squares by
+    # n - 1, and that of errors is their squares by n - q.
+    scale = float(np.sqrt((n - 1) / (n - np.linalg.matrix_rank(reduced)))) if residuals == "scaled" else 1.0
+    for part, rows in orders(n, permutations, seed):
+        factor = np.full((len(rows), 1, 1), scale)
+        factor[: int(part.start == 0)] = 1.0
+        placed = estimator.T[rows].transpose(0, 2, 1).reshape(-1, n) @ residual
+        yield fixed + factor * placed.reshape(len(rows), len(estimator), -1)
         step.add(len(rows))
 
 
