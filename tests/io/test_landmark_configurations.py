@@ -225,6 +225,8 @@ def test_a_folder_has_a_file_for_each_specimen(tmp_path: Path) -> None:
     write_landmarks(tmp_path / "a.landmarks.fcsv", marks)
     write_landmarks(tmp_path / "b.landmarks.fcsv", dict(reversed(marks.items())))
     write_landmarks(tmp_path / "old.pp", marks)
+    for name in ("curveslide.csv", "x.curveslide.csv", "surfslide.csv"):
+        write(tmp_path, name, "surface\n1\n")
     found = read_configurations(tmp_path)
     assert found.names == ("a", "b") and found.landmarks == ("nose", "chin") and found.unit == "mm"
     np.testing.assert_array_equal(found.points[0], found.points[1])
@@ -307,11 +309,13 @@ def test_files_beyond_the_limit_and_absent_ones_are_refused(tmp_path: Path, monk
 def test_formats_refuse_what_they_cannot_hold(tmp_path: Path) -> None:
     whole, missing = configurations(), configurations(missing=True)
     spaced = replace(whole, names=("a b", *whole.names[1:]))
+    broken = replace(whole, names=("a\nb", *whole.names[1:]))
     tabbed = replace(whole, columns={"a": ("\t", "", "", "")})
     same = replace(whole, names=("a/b", "a:b", "c", "d"))
     for given, format, words in (
         (missing, "morphoj", "cannot read missing landmarks"), (tabbed, "morphoj", "tabs or line breaks"),
-        (spaced, "nts", "cannot hold the specimen name 'a b'"), (missing, "fcsv", "cannot hold missing landmarks"),
+        (spaced, "nts", "cannot hold the specimen name 'a b'"), (broken, "tps", "cannot hold the specimen name"),
+        (missing, "fcsv", "cannot hold missing landmarks"),
         (same, "mrk.json", "the specimen name 'a/b' cannot name a file"), (whole, "doc", "no format 'doc'"),
         (whole, None, "the ending '' has no format"),
     ):  # fmt: skip

@@ -94,14 +94,14 @@ def _duplicates(found: LandmarkConfigurations) -> list[str]:
     findings: list[str] = []
     first: dict[bytes, str] = {}
     together: Counter[tuple[str, str]] = Counter()
-    for name, points in zip(found.names, found.points, strict=True):
+    for name, points, seen in zip(found.names, found.points, found.observed, strict=True):
         other = first.setdefault(points.tobytes(), name)
         if other != name:
             findings.append(f"{name} has the same coordinates as {other}; remove one of them.")
         place: dict[bytes, str] = {}
-        for label, point in zip(found.landmarks, points, strict=True):
-            if not np.isnan(point).any() and (before := place.setdefault(point.tobytes(), label)) != label:
-                together[before, label] += 1
+        for k in np.flatnonzero(seen) if len(np.unique(points[seen], axis=0)) < seen.sum() else ():
+            if (before := place.setdefault(points[k].tobytes(), found.landmarks[k])) != found.landmarks[k]:
+                together[before, found.landmarks[k]] += 1
     for (one, two), count in together.most_common():
         findings.append(f"Landmarks {one} and {two} are at one place in {count} of {len(found)} specimens.")
     return findings

@@ -21,6 +21,7 @@ from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.geometry.landmark_placement import place_landmarks
 from shapespace.geometry.normals import rms_size
 from shapespace.io.files import make_folder, read_bytes, write_text
+from shapespace.io.landmarks.configuration_io import CURVE_SLIDERS, SURFACE_SLIDERS
 from shapespace.io.landmarks.fiducials import point_texts
 from shapespace.io.landmarks.landmark_io import read_landmarks, surface_landmark_cells
 from shapespace.io.landmarks.tps_nts import tps_text
@@ -35,8 +36,6 @@ from shapespace.types import FloatArray, Mesh, SurfaceLandmarks
 
 TPS = "landmarks.tps"
 """File in the output folder with the landmarks of all scans."""
-CURVE_SLIDERS, SURFACE_SLIDERS = "curveslide.csv", "surfslide.csv"
-"""Files with the numbers of semilandmarks in `TPS`, from 1, as geomorph reads them: before, slide, after; surface."""
 _SET_COLUMNS, _THEN = ("name", "kind", "along", "points"), ">"
 """Columns of a table of curves and patches, and the character between the names along one."""
 _SAME_MARK = 0.01

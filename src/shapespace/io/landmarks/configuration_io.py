@@ -37,6 +37,8 @@ _MILLIMETRES = (".mrk.json", ".fcsv")
 _TPS_KEYS = ("image", "comment")
 """Columns that TPS has keys for."""
 _NAMED = 3  # names in a sentence
+CURVE_SLIDERS, SURFACE_SLIDERS = "curveslide.csv", "surfslide.csv"
+"""Files with the numbers of semilandmarks, from 1, as geomorph reads them: before, slide, after; surface."""
 
 CONFIGURATION_FORMATS: Mapping[str, str] = MappingProxyType(
     {"tps": ".tps", "nts": ".nts", "morphoj": ".txt", "csv": ".csv", "long": ".csv"}
@@ -128,7 +130,7 @@ def _read_folder(folder: Path) -> LandmarkConfigurations:
     files: dict[str, list[Path]] = {}
     for file in sorted(folder.iterdir()):
         ending = next((ending for ending in endings if file.name.lower().endswith(ending)), None)
-        if ending is not None and file.is_file():
+        if ending is not None and file.is_file() and not file.name.endswith((CURVE_SLIDERS, SURFACE_SLIDERS)):
             files.setdefault(ending, []).append(file)
     if not files:
         raise damage_error(folder, f"it has no landmark files, which end with {', '.join(endings)}")
@@ -211,8 +213,8 @@ def read_sliders(path: Path | str, landmarks: int) -> IntArray:
 def slider_texts(configurations: LandmarkConfigurations) -> dict[str, str]:
     """Return file name -> CSV of the sliders as geomorph reads them; empty without sliders."""
     tables = {
-        "curveslide.csv": (("before", "slide", "after"), (configurations.curve_sliders + 1).tolist()),
-        "surfslide.csv": (("surface",), (configurations.surface_sliders[:, None] + 1).tolist()),
+        CURVE_SLIDERS: (("before", "slide", "after"), (configurations.curve_sliders + 1).tolist()),
+        SURFACE_SLIDERS: (("surface",), (configurations.surface_sliders[:, None] + 1).tolist()),
     }
     return {name: table_text(header, rows) for name, (header, rows) in tables.items() if rows}
 
@@ -256,6 +258,8 @@ def write_configurations(
 def _file_texts(path: Path, found: LandmarkConfigurations, format: str) -> tuple[dict[Path, str], Collection[str]]:
     """Return the text of each file, and the columns in them."""
     if format == "tps":
+        if bad := [name for name in found.names if "\n" in name or "\r" in name]:
+            raise InputError(f"{found.where}: TPS cannot hold the specimen name {bad[0][:60]!r}; rename it.")
         # A line break would end the value.
         values = {k.upper(): [" ".join(c.split()) for c in found.columns.get(k, [""] * len(found))] for k in _TPS_KEYS}
         return {path: tps_text(dict(zip(found.names, found.points, strict=True)), values)}, _TPS_KEYS
