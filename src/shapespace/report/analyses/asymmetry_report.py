@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,9 +13,10 @@ from shapespace.geometry.distortion import factor_to_draw, flip_factor
 from shapespace.geometry.normals import rms_size
 from shapespace.report.analyses.analysis_report import REDUCED_MORPH_NOTE, AnalysisReport, LengthFormat, Rows
 from shapespace.report.analyses.methods_section import methods_parts
-from shapespace.report.analyses.shape_data import add_shape_data, blank_sentence, model_hashes
+from shapespace.report.analyses.shape_data import MOST_LANDMARKS, add_shape_data, blank_sentence, model_hashes
 from shapespace.schemas import (
     Counts,
+    DeformationPart,
     HistogramPart,
     MorphPart,
     Part,
@@ -276,6 +278,17 @@ def _finite_or_none(value: float) -> float | None:
     return None if np.isnan(value) else float(value)
 
 
+def _vectors(mean: FloatArray, half_difference: FloatArray, arrays: dict[str, Any]) -> tuple[Part, ...]:
+    """Return the vectors from the mirrored mean to the mean of landmarks, whose ends are added to `arrays`."""
+    most = float(np.linalg.norm(half_difference, axis=1).max())
+    if most == 0 or len(mean) > MOST_LANDMARKS:
+        return ()
+    times = factor_to_draw(max(1.0, _MORPH_SHARE * rms_size(mean) / most), math.inf)
+    arrays |= {"mean_low": mean - times * half_difference, "mean_high": mean + times * half_difference}
+    return (DeformationPart(title="The asymmetric mean", arrays=_FILE, low="mean_low", high="mean_high",
+                            low_label="the mirrored mean", high_label="the mean", times=times),)  # fmt: skip
+
+
 def _maps_and_morphs(result: AsymmetryResult, order: Any) -> tuple[Mapping[str, Any], list[Part]]:
     subjects = [int(k) for k in order[:_MOST_MAPS]]
     half_difference = result.difference.mean(axis=0) / 2.0
@@ -292,7 +305,7 @@ def _maps_and_morphs(result: AsymmetryResult, order: Any) -> tuple[Mapping[str, 
         "vertex_of_cohort": result.sides.vertices,
     }
     if result.sides.faces is None:
-        return arrays, [_point_table(result)]
+        return arrays, [_point_table(result), *_vectors(result.mean, half_difference, arrays)]
     arrays["faces"] = result.sides.faces
     untested = not result.permutations
     parts: list[Part] = [

@@ -20,7 +20,8 @@ from shapespace.types import FloatArray
 _FILE = "observed.csv"
 _MOST_ROWS = 10  # rows that fit one screen; files have all
 _LANDMARK_WORDS = {"vertices": "landmarks", "vertex": "landmark", "Vertices": "Landmarks", "Vertex": "Landmark"}
-_MOST_LANDMARKS = 500  # vectors that can be distinguished in a figure
+MOST_LANDMARKS = 500
+"""Points of a shape without triangles up to which they are drawn as landmarks: more cover each other."""
 _MOST_PAIRS = 1000  # dots of a figure: more cover each other
 _EQUAL = 1e-9  # relative difference of sizes that is rounding
 _MOST_SHAPES = 300  # of which all pairs take less than a second
@@ -36,7 +37,7 @@ def shape_change_parts(cohort: Cohort, **known: Any) -> tuple[MorphPart | Deform
     """
     if cohort.faces is not None:
         return (MorphPart(**known),)
-    if cohort.n_vertices > _MOST_LANDMARKS:
+    if cohort.n_vertices > MOST_LANDMARKS:
         return ()
     return (DeformationPart(**known, drawing="grid" if cohort.dimensions == 2 else "vectors"),)
 
@@ -187,7 +188,8 @@ def _in_landmarks(report: AnalysisReport) -> AnalysisReport:
     methods = report.methods
     if methods is not None:
         over, assumptions = tuple(map(named, methods.corrected_over)), tuple(map(named, methods.assumptions))
-        methods = structs.replace(methods, corrected_over=over, assumptions=assumptions)
+        tests = tuple(structs.replace(test, tested=tuple(map(named, test.tested))) for test in methods.tests)
+        methods = structs.replace(methods, corrected_over=over, assumptions=assumptions, tests=tests)
     summary, notes = tuple(map(named, report.summary)), tuple(map(named, report.notes))
     return replace(report, summary=summary, notes=notes, parts=tuple(map(renamed, report.parts)), methods=methods)
 

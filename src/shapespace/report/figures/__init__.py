@@ -28,7 +28,6 @@ from shapespace.report.figures.correspondence_figures import (
     position_std_figure,
 )
 from shapespace.report.figures.deformation_figures import (
-    MOST_LANDMARKS,
     deformation_grid_figure,
     landmark_map_figure,
     landmark_vectors_figure,
@@ -77,7 +76,6 @@ from shapespace.report.figures.recognition_figures import (
 from shapespace.report.inputs.staged_fit import StagedFit
 
 __all__ = [
-    "MOST_LANDMARKS",
     "SIDE_DEG",
     "STAGE_WORDS",
     "THRESHOLDS_MM",

@@ -34,8 +34,6 @@ from shapespace.types import BoolArray, FloatArray
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-MOST_LANDMARKS = 500
-"""Points above which a shape without triangles is drawn as a point cloud, not as landmarks: they cover each other."""
 _CELLS = 20  # cells of a grid along its longer side: deformations of a tenth of the shape are seen
 _POINTS_OF_CELL = 5  # points of a grid line in each cell, so that bent lines look smooth
 _MARGIN = 0.12  # of the longer side, around the landmarks

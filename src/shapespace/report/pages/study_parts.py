@@ -11,6 +11,7 @@ import numpy.typing as npt
 from msgspec import structs
 
 from shapespace.errors import FileFormatError
+from shapespace.report.analyses.shape_data import MOST_LANDMARKS
 from shapespace.report.blocks.blocks import Block, Cell, Column, Figure, Folded, Table, Text, length
 from shapespace.report.blocks.wording import DASH, counted, listed, percent
 from shapespace.report.inputs.saved_fits import Folder
@@ -253,7 +254,7 @@ class StudyParts:
             raise self.parts_file.damaged("the values of a map are no numbers, or its mask is none")
         values = values.astype(np.float64)
         style: Any = {"unit": part.unit, "signed": part.signed, "limit": part.limit, "mask": mask}
-        if mesh.faces is None and len(mesh.vertices) <= figures.MOST_LANDMARKS:
+        if mesh.faces is None and len(mesh.vertices) <= MOST_LANDMARKS:
             figure = figures.landmark_map_figure(mesh.vertices, values, **style)
         else:
             figure = figures.surface_map_figure(mesh, values, title=None, **style)
