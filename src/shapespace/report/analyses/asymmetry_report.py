@@ -33,6 +33,8 @@ _ALPHA = 0.05  # significance level of the summary, the usual one
 _MOST_MAPS, _MOST_ROWS, _BINS = 2, 10, 20  # maps, rows and bins of the report: what fits one screen each
 _MORPH_SHARE = 0.05
 """Largest displacement in an exaggerated morph, as a share of the size (RMS distance from the centroid)."""
+_VECTOR_SHARE = 0.2
+"""Largest half vector in a figure of landmarks, as a share of the size: longer than the dot where it starts."""
 _FILE = "asymmetry.npz"
 _FEWEST_REPEATS = 10  # repeated scans; with fewer the measurement error is known to no better than 22 %
 
@@ -283,7 +285,7 @@ def _vectors(mean: FloatArray, half_difference: FloatArray, arrays: dict[str, An
     most = float(np.linalg.norm(half_difference, axis=1).max())
     if most == 0 or len(mean) > MOST_LANDMARKS:
         return ()
-    times = factor_to_draw(max(1.0, _MORPH_SHARE * rms_size(mean) / most), math.inf)
+    times = factor_to_draw(max(1.0, _VECTOR_SHARE * rms_size(mean) / most), math.inf)
     arrays |= {"mean_low": mean - times * half_difference, "mean_high": mean + times * half_difference}
     return (DeformationPart(title="The asymmetric mean", arrays=_FILE, low="mean_low", high="mean_high",
                             low_label="the mirrored mean", high_label="the mean", times=times),)  # fmt: skip
