@@ -271,7 +271,9 @@ def analyse_allometry(
         settings={"covariate": covariate, "group": group, "separate": separate, "permutations": permutations,
                   "seed": seed},
         sizes=sample_sizes(cohort.names, [(group, classes)] if group else []),
-        reduced_model=(),
+        reduced_model=(covariate, group) if group else (),
+        assumptions=("The residuals of each test are those of the model of the terms that do not contain its term.",)
+        if group else (),
     )  # fmt: skip
 
 
