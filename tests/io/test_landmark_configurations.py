@@ -2,6 +2,7 @@
 
 import base64
 import bz2
+import contextlib
 import gzip
 import json
 import lzma
@@ -381,3 +382,21 @@ def test_plethodon_is_read_back_from_every_format(shared_data: Path, tmp_path: P
     for format, ending in CONFIGURATION_FORMATS.items():
         write_configurations(tmp_path / f"p{ending}", given, format)
         np.testing.assert_array_equal(read_configurations(tmp_path / f"p{ending}").points, points)
+
+
+@pytest.mark.parametrize("format", [*CONFIGURATION_FORMATS, "rda"])
+def test_damaged_files_are_read_or_refused_without_a_traceback(format: str, tmp_path: Path) -> None:
+    path = tmp_path / f"set{ENDINGS.get(format, '.rda')}"
+    if format == "rda":
+        path.write_bytes(r_file(("A", r_doubles(np.ones((5, 3, 4))))))
+    else:
+        write_configurations(path, configurations(missing=format != "morphoj"), format)
+    whole, rng = path.read_bytes(), np.random.default_rng(4)
+    for _ in range(60):
+        data, at = bytearray(whole), int(rng.integers(len(whole)))
+        data[at : at + int(rng.integers(3))] = bytes(
+            rng.choice([b"\xff", b"=", b"\n", b"inf", b"9" * 10, b'"', b"\t,"])
+        )
+        path.write_bytes(data[: len(data) if rng.random() < 0.7 else at])
+        with contextlib.suppress(ShapespaceError):
+            read_configurations(path)
