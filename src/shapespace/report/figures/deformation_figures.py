@@ -50,24 +50,22 @@ def deformation_grid_figure(low: FloatArray, high: FloatArray, labels: tuple[str
     """Draw two planar configurations as thin-plate splines of a square grid on their mean.
 
     Args:
-        low: (L, 2 or 3) one configuration; of three coordinates the third is the same everywhere.
-        high: (L, 2 or 3) the other.
+        low: (L, 3) one configuration; z is the same everywhere.
+        high: (L, 3) the other.
         labels: what they are.
 
     Raises:
         InputError: landmarks that are not planar, or that lie on a line.
     """
-    if low.shape[1] == 3 and np.ptp(np.stack([low, high])[:, :, 2]) > 0:
+    ends = np.stack([low, high])
+    if np.ptp(ends[:, :, 2]) > 0:
         raise InputError("A deformation grid needs planar landmarks; draw vectors of three-dimensional ones.")
-    low, high = (_turned(ends, _first_rotation())[:, :2] for ends in (low, high))
-    mean = (low + high) / 2
-    panels = [
-        (short(label, 30), ThinPlateSpline.fit(mean, end), end) for label, end in zip(labels, (low, high), strict=True)
-    ]
-    lines = grid_lines(mean)
-    warped = [spline.apply(lines.reshape(-1, 2)).reshape(lines.shape) for _, spline, _ in panels]
-    figure, plots = _panels([label for label, _, _ in panels], np.concatenate([one.reshape(-1, 2) for one in warped]))
-    for axes, grid, (_, _, end) in zip(plots, warped, panels, strict=True):
+    ends = (ends @ _first_rotation().T)[:, :, :2]
+    splines = [ThinPlateSpline.fit(ends.mean(axis=0), end) for end in ends]
+    lines = grid_lines(ends.mean(axis=0))
+    warped = [spline.apply(lines.reshape(-1, 2)).reshape(lines.shape) for spline in splines]
+    figure, plots = _panels([short(label, 30) for label in labels], np.concatenate(warped).reshape(-1, 2))
+    for axes, grid, end in zip(plots, warped, ends, strict=True):
         axes.add_collection(LineCollection(list(grid), colors=_GRID, linewidths=0.9, zorder=1))
         draw_links(axes, end, INK)
         axes.scatter(*end.T, s=30, color=INK, linewidths=0, zorder=3)
@@ -81,8 +79,8 @@ def landmark_vectors_figure(low: FloatArray, high: FloatArray, labels: tuple[str
     top.
 
     Args:
-        low: (L, 2 or 3) where the lines start.
-        high: (L, 2 or 3) where they end.
+        low: (L, 3) where the lines start.
+        high: (L, 3) where they end.
         labels: what the configurations are.
     """
     figure, plots, placed = _in_views(np.stack([low, high]), " → ".join(map(short, labels)))
@@ -106,7 +104,7 @@ def landmark_map_figure(
     """Draw a number for each landmark as its colour.
 
     Args:
-        points: (L, 2 or 3) places.
+        points: (L, 3) places.
         values: (L,); not-a-number is drawn in grey.
         unit: of the numbers.
         signed: whether two colours part at zero.
@@ -138,27 +136,22 @@ def landmark_map_figure(
 
 
 def _in_views(shapes: FloatArray, label: str, below: float = 0.0) -> tuple[Figure, list[Axes], list[FloatArray]]:
-    """Return a figure with the views of landmarks (n, L, 2 or 3), its panels, and the landmarks (n, L, 2) in each.
+    """Return a figure with the views of landmarks (n, L, 3), its panels, and the landmarks (n, L, 2) in each.
 
     Planar landmarks have one view, with a label. There are `below` free inches under the panels.
     """
-    is_planar = shapes.shape[2] == 2 or np.ptp(shapes[:, :, 2]) == 0
     named = [(one.name, view_rotation(one)) for one in current_orientation().views]
+    is_planar = np.ptp(shapes[:, :, 2]) == 0
     views = [(label, _first_rotation())] if is_planar else named[:4] or list(_THREE_SIDES)
-    placed = [np.stack([_turned(shape, turn)[:, :2] for shape in shapes]) for _, turn in views]
+    placed = [(shapes @ turn.T)[:, :, :2] for _, turn in views]
     placed = [one - (one.max(axis=(0, 1)) + one.min(axis=(0, 1))) / 2 for one in placed]
-    figure, plots = _panels([name for name, _ in views], np.concatenate([one.reshape(-1, 2) for one in placed]), below)
+    figure, plots = _panels([name for name, _ in views], np.concatenate(placed).reshape(-1, 2), below)
     return figure, plots, placed
 
 
 def _first_rotation() -> FloatArray:
     views = current_orientation().views
     return view_rotation(views[0]) if views else np.eye(3)
-
-
-def _turned(points: FloatArray, rotation: FloatArray) -> FloatArray:
-    size = points.shape[1]
-    return points @ rotation[:size, :size].T
 
 
 def grid_lines(points: FloatArray) -> FloatArray:
@@ -180,10 +173,7 @@ def grid_lines(points: FloatArray) -> FloatArray:
 
 
 def _panels(names: list[str], points: FloatArray, below: float = 0.0) -> tuple[Figure, list[Axes]]:
-    """Return a figure with a panel for each name, all of them with one scale, in which points (n, 2) fit.
-
-    There are `below` free inches under the panels.
-    """
+    """Return a figure with a panel for each name, in one scale, in which points (n, 2) fit, and the panels."""
     layout, columns = LAYOUT.get(), len(names)
     low, high = points.min(axis=0), points.max(axis=0)
     room = 0.04 * float((high - low).max())

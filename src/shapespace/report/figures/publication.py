@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from html import unescape
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any
 
 import matplotlib
 from matplotlib import font_manager
@@ -20,9 +20,8 @@ from shapespace.errors import InputError
 from shapespace.io.files import write_bytes
 from shapespace.report.figures.draw import DPI, LAYOUT, Layout, without_glyph_warnings
 
-FigureFormat: TypeAlias = Literal["svg", "pdf", "png"]
+FORMATS = ("svg", "pdf", "png")
 """Formats of figures for papers."""
-FORMATS: tuple[FigureFormat, ...] = ("svg", "pdf", "png")
 ONE_COLUMN_MM, TWO_COLUMNS_MM = 85.0, 174.0
 """Widths of charts, and of rows of pictures, mm: the columns of most journals (Elsevier 90 and 190, Nature 89 and 183,
 PLOS 83 and 173)."""
@@ -103,6 +102,7 @@ def _with_fonts(svg: bytes) -> bytes:
 
 def _subset(weight: int, letters: str) -> bytes:
     """Return the font of all figures, WOFF, with some letters alone."""
+    # matplotlib depends on fontTools.
     subset: Any = import_module("fontTools.subset")
     options = subset.Options(flavor="woff", recalc_timestamp=False, layout_features=[], notdef_outline=True)
     options.drop_tables += ["FFTM"]
