@@ -10,8 +10,6 @@ import pytest
 from shapespace.cohort.cohort import Cohort
 from shapespace.errors import InputError
 from shapespace.statistics.shape_tests.ordination import (
-    canonical_variates,
-    leave_one_out_classes,
     ordinate,
     principal_components,
 )
@@ -100,15 +98,13 @@ def test_leave_one_out_classes_and_scores_are_those_of_brute_force() -> None:
         away = values[k] - other.means_
         squares = np.einsum("gi,gi->g", away, np.linalg.solve(covariance, away.T).T)
         predicted.append((np.log(groups.counts / n) - squares / 2).argmax())
-    variates = canonical_variates(cohort.coefficients, groups)
-    assert leave_one_out_classes(variates, groups).tolist() == predicted
     result = ordinate(cohort, method="cva", group=("kind",))
     assert result.predicted is not None and result.predicted.tolist() == predicted
     assert result.cross_validated is not None
     k = 7
     rest = [row for row in range(n) if row != k]
-    own = canonical_variates(cohort.coefficients[rest], groups_of(cohort.take(rest)))
-    alone = (cohort.coefficients[k] - own.centre) @ own.weights
+    own = ordinate(cohort.take(rest), method="cva", group=("kind",))
+    alone = (cohort.coefficients[k] - own.centre) @ own.axes.T
     # The axes are those of the other shapes, turned to those of all of them.
     assert np.linalg.norm(result.cross_validated[k]) == pytest.approx(np.linalg.norm(alone), rel=1e-6)
 
@@ -150,7 +146,11 @@ def test_leave_one_out_scores_of_groups_that_do_not_differ_are_not_separated(met
 def test_canonical_variates_of_few_shapes_use_fewer_components_or_say_so() -> None:
     cohort = cohort_of(n=20, landmarks=30)
     result = ordinate(cohort, method="cva", group=("kind",))
-    assert result.components is not None and result.components <= (20 - 3) // 2 and "first" in result.notes[0]
+    assert (
+        result.components is not None
+        and result.components <= (20 - 3) // 2
+        and "principal components" in result.notes[0]
+    )
     assert ordinate(cohort, method="cva", group=("kind",), components=4).components == 4
     with pytest.raises(InputError, match="singular with 17 principal components; take 1 to 16"):
         ordinate(cohort, method="cva", group=("kind",), components=17)
@@ -173,6 +173,11 @@ def test_designs_without_an_ordination_are_refused() -> None:
     for method, column, words in (("cva", "kind", "'b' of kind has 1"), ("between-groups", "same", "two")):
         with pytest.raises(InputError, match=words):
             ordinate(few, method=method, group=(column,))  # type: ignore[arg-type]
+    shapes = cohort_of().coefficients @ cohort.basis
+    shapes = shapes.reshape(len(cohort), -1, 3)
+    shapes[:, 0, 0] = groups_of(cohort).codes
+    with pytest.raises(InputError, match="the shapes of each group are equal"):
+        ordinate(Cohort.of_shapes(shapes, cohort.table.columns, align=False), method="cva", group=("kind",))
     with pytest.raises(InputError, match="three or more"):
         ordinate(cohort.take([0, 1]))
     with pytest.raises(InputError, match="components"):

@@ -19,6 +19,7 @@ from shapespace.report.analyses.methods_section import (
     methods_parts,
     multiplicity_sentence,
 )
+from shapespace.report.analyses.morphospace_report import compared_morphospace
 from shapespace.report.analyses.shape_data import add_shape_data, blank_sentence, model_hashes, shape_change_parts
 from shapespace.schemas import (
     Counts,
@@ -49,10 +50,12 @@ _NO_FACES = np.zeros((0, 3), dtype=np.int32)
 def compare_report(result: CompareResult) -> AnalysisReport:
     """Return a comparison with all that its report shows; files are numbered as its effects are."""
     effects = result.effects
+    morphospace, plotted = compared_morphospace(result)
     parts: list[Part] = [
         *_term_parts(result),
         *_pair_parts(result),
         *_angle_parts(result),
+        morphospace,
         *(part for number, effect in enumerate(effects, 1) for part in _effect_parts(result, effect, number)),
         *methods_parts(result.methods),
     ]
@@ -62,7 +65,10 @@ def compare_report(result: CompareResult) -> AnalysisReport:
         summary=tuple(_summary(result)),
         parts=tuple(parts),
         tables=_tables(result),
-        arrays={f"effect_{number}.npz": _arrays(result, effect) for number, effect in enumerate(effects, 1)},
+        arrays={
+            morphospace.arrays: plotted,
+            **{f"effect_{number}.npz": _arrays(result, effect) for number, effect in enumerate(effects, 1)},
+        },
         meshes=dict(_meshes(result)),
         notes=(*result.cohort.notes, *_repeated_measures_notes(result)),
         settings={

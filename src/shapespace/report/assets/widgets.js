@@ -596,86 +596,69 @@
 
   /** Corners of the convex hull of points [[x, y], ...], by Andrew's monotone chain. */
   function hullOf(points) {
+    const chain = (list) => list.reduce((out, p) => {
+      const left = ([a, b]) => (b[0] - a[0]) * (p[1] - a[1]) - (b[1] - a[1]) * (p[0] - a[0]) > 0;
+      while (out.length > 1 && !left(out.slice(-2))) out.pop();
+      return out.push(p), out;
+    }, []).slice(0, -1);
     const sorted = points.slice().sort((a, b) => a[0] - b[0] || a[1] - b[1]);
-    const chain = (list) => {
-      const out = [];
-      for (const p of list) {
-        for (let k = out.length; k > 1; k--) {
-          const [a, b] = [out[k - 2], out[k - 1]];
-          if ((b[0] - a[0]) * (p[1] - a[1]) - (b[1] - a[1]) * (p[0] - a[0]) > 0) break;
-          out.pop();
-        }
-        out.push(p);
-      }
-      return out.slice(0, -1);
-    };
-    return points.length < 3 ? sorted : chain(sorted).concat(chain(sorted.reverse()));
+    return chain(sorted).concat(chain(sorted.reverse()));
   }
 
-  /** Points of the ellipse of a Mahalanobis radius about the mean of points. */
+  /** Points of the ellipse of a Mahalanobis radius about the mean of points, by the Cholesky factor of their covariance. */
   function ellipseOf(points, radius) {
-    const n = points.length, [mx, my] = [0, 1].map((k) => points.reduce((sum, p) => sum + p[k], 0) / n);
-    let xx = 0, xy = 0, yy = 0;
-    for (const [x, y] of points) xx += (x - mx) ** 2, xy += (x - mx) * (y - my), yy += (y - my) ** 2;
-    const a = Math.sqrt(xx / (n - 1)) || 1e-12, b = xy / (n - 1) / a, c = Math.sqrt(Math.max(yy / (n - 1) - b * b, 0));
-    return Array.from({ length: 73 }, (_, k) => {
-      const u = radius * Math.cos((k * Math.PI) / 36), v = radius * Math.sin((k * Math.PI) / 36);
-      return [mx + a * u, my + b * u + c * v];
-    });
+    const mean = (of) => points.reduce((sum, p) => sum + of(p), 0) / points.length, mx = mean((p) => p[0]), my = mean((p) => p[1]);
+    const unbiased = points.length / (points.length - 1), cross = (i, j) => unbiased * mean((p) => (p[i] - [mx, my][i]) * (p[j] - [mx, my][j]));
+    const a = Math.sqrt(cross(0, 0)) || 1e-12, b = cross(0, 1) / a, c = Math.sqrt(Math.max(cross(1, 1) - b * b, 0));
+    return Array.from({ length: 73 }, (_, k) => [Math.cos((k * Math.PI) / 36) * radius, Math.sin((k * Math.PI) / 36) * radius])
+      .map(([u, v]) => [mx + a * u, my + b * u + c * v]);
   }
 
-  /** A picture of planar landmarks with their grid, or a view of others; {show(positions)}. */
-  function shapePicture(element, model, facts, label) {
-    const { mean, faces } = model, [count, size] = facts.grid || [0, 0], L = facts.landmarks;
-    const place = (p, v) => [p[3 * v], p[3 * v + 1], p[3 * v + 2]];
+  /** An empty canvas of the size of its element: its context and sizes in CSS pixels, and a function that draws a line. */
+  function cleared(canvas) {
+    const ratio = Math.min(window.devicePixelRatio || 1, 2), { clientWidth: width, clientHeight: height } = canvas;
+    const context = canvas.getContext("2d");
+    canvas.width = Math.round(width * ratio); // which empties it
+    canvas.height = Math.round(height * ratio);
+    context.scale(ratio, ratio);
+    const line = (points, colour, size = 1, fill = null) => {
+      context.beginPath();
+      points.forEach((point) => context.lineTo(...point));
+      Object.assign(context, { strokeStyle: colour, lineWidth: size, fillStyle: fill });
+      if (fill) context.closePath(), context.fill();
+      context.stroke();
+    };
+    return { context, width, height, line };
+  }
+
+  /** A picture of planar landmarks with their grid, or a view of other shapes: {show(positions)}. */
+  function shapePicture(element, label, model, facts) {
+    const { mean, faces } = model, [lines, size] = facts.grid, L = facts.landmarks;
+    const range = (count, of) => Array.from({ length: count }, (_, k) => of(k));
     if (!facts.planar) {
-      const view = new Shapespace.View(element, { label });
+      const view = new Shapespace.View(element, { label }), at = (p, v) => [p[3 * v], p[3 * v + 1], p[3 * v + 2]];
       view.setSurface("shape", { positions: mean, faces, colour: faces ? colours().clay : colours().model });
-      view.frame(["shape"], faces ? 1 : 1.15);
+      view.frame(["shape"], 1.1);
       return { view, show: (positions) => {
         view.move("shape", positions);
-        if (faces) return;
-        if (facts.links.length) view.lines("links", facts.links.flat().map((v) => place(positions, v)), colours().unknown);
-        view.lines("vectors", Array.from({ length: 2 * L }, (_, k) => place(k % 2 ? positions : mean, k >> 1)), colours().signal);
+        if (facts.links.length) view.lines("links", facts.links.flat().map((v) => at(positions, v)), colours().unknown);
+        if (!faces) view.lines("vectors", range(2 * L, (k) => at(k % 2 ? positions : mean, k >> 1)), colours().signal);
       } };
     }
     const canvas = make("canvas", { role: "img", "aria-label": label });
     element.append(canvas);
-    const low = [Infinity, Infinity], high = [-Infinity, -Infinity];
-    mean.forEach((value, i) => {
-      if (i % 3 < 2) low[i % 3] = Math.min(low[i % 3], value), high[i % 3] = Math.max(high[i % 3], value);
-    });
-    return { show: (p) => {
-      const { context, width, height } = cleared(canvas), style = getComputedStyle(element);
-      const scale = 0.84 * Math.min(width / (high[0] - low[0]), height / (high[1] - low[1]));
-      const at = (q, v) => [width / 2 + (q[3 * v] - (low[0] + high[0]) / 2) * scale, height / 2 - (q[3 * v + 1] - (low[1] + high[1]) / 2) * scale];
-      const stroke = (colour, size, lines) => {
-        context.strokeStyle = colour;
-        context.lineWidth = size;
-        context.beginPath();
-        for (const line of lines) line.forEach((point, k) => (k ? context.lineTo(...point) : context.moveTo(...point)));
-        context.stroke();
-      };
-      stroke(style.getPropertyValue("--line"), 1, Array.from({ length: count }, (_, line) =>
-        Array.from({ length: size }, (_, k) => at(p, L + line * size + k))));
-      stroke(style.color, 1.5, facts.links.map((pair) => pair.map((v) => at(p, v))));
-      stroke(css(colours().signal), 2, Array.from({ length: L }, (_, v) => [at(mean, v), at(p, v)]));
+    const ends = [0, 1].map((k) => range(mean.length / 3, (v) => mean[3 * v + k])).map((all) => [Math.min(...all), Math.max(...all)]);
+    const [[left, right], [low, high]] = ends;
+    return { show: (positions) => {
+      const { context, width, height, line } = cleared(canvas), style = getComputedStyle(element);
+      const scale = 0.84 * Math.min(width / (right - left), height / (high - low));
+      const at = (p, v) => [width / 2 + (p[3 * v] - (left + right) / 2) * scale, height / 2 - (p[3 * v + 1] - (low + high) / 2) * scale];
+      for (let k = 0; k < lines; k++) line(range(size, (j) => at(positions, L + k * size + j)), style.getPropertyValue("--line"));
+      for (const pair of facts.links) line(pair.map((v) => at(positions, v)), style.color, 1.5);
+      for (let v = 0; v < L; v++) line([at(mean, v), at(positions, v)], css(colours().signal), 2);
       context.fillStyle = style.color;
-      for (let v = 0; v < L; v++) context.beginPath(), context.arc(...at(p, v), 2.6, 0, 7), context.fill();
+      for (let v = 0; v < L; v++) context.beginPath(), context.arc(...at(positions, v), 2.6, 0, 7), context.fill();
     } };
-  }
-
-  /** An empty canvas of the size of its element: {context, width, height} in CSS pixels. */
-  function cleared(canvas) {
-    const ratio = Math.min(window.devicePixelRatio || 1, 2), { clientWidth: width, clientHeight: height } = canvas;
-    const context = canvas.getContext("2d");
-    if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
-      canvas.width = Math.round(width * ratio);
-      canvas.height = Math.round(height * ratio);
-    }
-    context.setTransform(ratio, 0, 0, ratio, 0, 0);
-    context.clearRect(0, 0, width, height);
-    return { context, width, height };
   }
 
   /** Shapes as points in the plane of two axes of an ordination; the shape at the marker is drawn beside the mean. */
@@ -684,271 +667,192 @@
       const { facts, arrays } = unpacked, { names, groups, labels } = facts, n = names.length, K = facts.axes.length;
       const model = new Shapespace.Model(unpacked), positions = new Float32Array(model.mean.length);
       const axes = Array.from(facts.first), place = new Float32Array(K), hidden = new Set();
-      const shown = { hulls: groups.length > 0, ellipses: groups.length > 0, phylogeny: true, validated: false };
+      const shown = { hulls: groups.length > 0, ellipses: groups.length > 0, phylogeny: true, validated: false, coloured: false };
+      const canvas = make("canvas", { tabindex: 0, role: "application" }), tip = make("div", { class: "ss-tip", hidden: true });
+      const marker = make("span", { class: "ss-marker" }), ring = make("span", { class: "ss-ring", hidden: true });
+      const plot = make("div", { class: "ss-plate ss-plot" }, canvas, ring, marker, tip), shapes = make("div", { class: "ss-shapes" });
+      const said = make("p", { class: "ss-said", "aria-live": "polite" }), bar = make("div", { class: "ss-bar", hidden: true });
+      const controls = make("div", { class: "ss-controls" });
       element.classList.add("ss-morphospace");
-      const base = make("canvas", { "aria-hidden": "true" }), tip = make("div", { class: "ss-tip", hidden: true });
-      const top = make("canvas", { tabindex: 0, role: "application" });
-      const plot = make("div", { class: "ss-plate ss-plot" }, base, top, tip), controls = make("div", { class: "ss-controls" });
-      const figure = (title) => {
-        const plate = make("div", { class: "ss-plate" }), words = make("figcaption", { text: title });
-        return { plate, words, figure: make("figure", {}, plate, words) };
-      };
-      const here = figure("Shape at the marker"), middle = figure("Mean shape");
-      element.append(plot, make("div", { class: "ss-shapes" }, here.figure, middle.figure), controls);
-      const pictures = [shapePicture(here.plate, model, facts, "Shape at the marker"), shapePicture(middle.plate, model, facts, "Mean shape")];
-      if (pictures[0].view) pictures[0].view.link(pictures[1].view);
-      const said = make("p", { class: "ss-said", "aria-live": "polite" });
+      element.append(plot, shapes, controls);
+      const [picture, average] = ["Shape at the marker", "Mean shape"].map((label) => {
+        const plate = make("div", { class: "ss-plate" });
+        shapes.append(make("figure", {}, plate, make("figcaption", { text: label })));
+        return shapePicture(plate, label, model, facts);
+      });
+      if (picture.view) picture.view.link(average.view);
 
-      const score = (v, axis) => (shown.validated ? arrays.cross_validated : arrays.scores)[v * K + axes[axis]];
-      const node = (v, axis) => (v < n ? score(v, axis) : arrays.nodes[(v - n) * K + axes[axis]]);
+      // The plot: scores of shapes from 0, and of internal nodes of the phylogeny from n.
+      const score = (v, axis) => (v >= n ? arrays.nodes[(v - n) * K + axes[axis]]
+        : (shown.validated ? arrays.cross_validated : arrays.scores)[v * K + axes[axis]]);
       const colourOf = (g) => {
         const colour = colours().categories[g % colours().categories.length];
         return getComputedStyle(element).colorScheme === "dark" && Math.max(...colour) < 0.6 ? colour.map((c) => 0.55 + 0.4 * c) : colour;
       };
-      const markers = MARKERS.map((path) => new Path2D(path));
-      const markerOf = (g) => (g + Math.floor(g / colours().categories.length)) % MARKERS.length;
-      let frame = { scale: 1, x: 0, y: 0 }, over = null, waiting = 0, stale = { base: true, shape: true };
-      const toPixels = (x, y) => [frame.x + x * frame.scale, frame.y - y * frame.scale];
-      const request = (what = {}) => {
-        Object.assign(stale, what);
-        waiting = waiting || requestAnimationFrame(draw);
-      };
+      const markerOf = (g) => MARKERS[(g + Math.floor(g / colours().categories.length)) % MARKERS.length];
+      let scale = 1, x0 = 0, y0 = 0, over = null, frame = 0, later = 0, stale = {};
+      const pixels = ([x, y]) => [x0 + x * scale, y0 - y * scale], at = (v) => [score(v, 0), score(v, 1)];
 
-      function fit(width, height, rings) {
-        const low = [Infinity, Infinity], high = [-Infinity, -Infinity], count = n + arrays.nodes.length / K;
-        const points = Array.from({ length: count }, (_, v) => [node(v, 0), node(v, 1)]).concat(...rings);
-        for (const point of points) {
-          for (const axis of [0, 1]) low[axis] = Math.min(low[axis], point[axis]), high[axis] = Math.max(high[axis], point[axis]);
-        }
-        const span = [0, 1].map((axis) => high[axis] - low[axis] || 1e-9), [left, right, above, below] = [56, 14, 12, 44];
-        const scale = 0.94 * Math.min((width - left - right) / span[0], (height - above - below) / span[1]);
-        frame = { scale, left, right: width - right, above, below: height - below,
-          x: (left + width - right) / 2 - ((low[0] + high[0]) / 2) * scale, y: (above + height - below) / 2 + ((low[1] + high[1]) / 2) * scale };
-      }
-
-      function drawBase() {
-        const { context, width, height } = cleared(base), style = getComputedStyle(element);
+      function drawPlot() {
+        const { context, width, height, line } = cleared(canvas), style = getComputedStyle(element);
+        const [left, right, above, below] = [56, width - 14, 12, height - 44], [soft, rule] = ["--soft", "--line"].map((name) => style.getPropertyValue(name));
         const members = Array.from({ length: Math.max(groups.length, 1) }, () => []);
-        for (let v = 0; v < n; v++) members[arrays.codes[v]].push([score(v, 0), score(v, 1)]);
-        const rings = members.map((points, g) => (shown.ellipses && points.length > 2 ? ellipseOf(points, facts.radii[g]) : []));
-        fit(width, height, rings);
-        const { left, right, above, below, scale } = frame, line = style.getPropertyValue("--line");
-        const path = (points, close) => {
-          context.beginPath();
-          points.forEach((p, k) => (k ? context.lineTo(...toPixels(...p)) : context.moveTo(...toPixels(...p))));
-          if (close) context.closePath();
+        for (let v = 0; v < n; v++) members[arrays.groups[v]].push(at(v));
+        const ellipses = members.map((points, g) => (shown.ellipses && points.length > 2 ? ellipseOf(points, facts.radii[g]) : []));
+        const all = Array.from({ length: n + arrays.nodes.length / K }, (_, v) => at(v)).concat(...ellipses);
+        const ends = [0, 1].map((axis) => all.reduce(([low, high], p) => [Math.min(low, p[axis]), Math.max(high, p[axis])], [Infinity, -Infinity]));
+        const [[low, high], [bottom, top]] = ends;
+        scale = 0.94 * Math.min((right - left) / (high - low || 1e-9), (below - above) / (top - bottom || 1e-9));
+        x0 = (left + right - (low + high) * scale) / 2;
+        y0 = (above + below + (bottom + top) * scale) / 2;
+        const write = (text, x, y, align, font, colour) => {
+          Object.assign(context, { font: `${font} ${style.fontFamily}`, fillStyle: colour, textAlign: align, textBaseline: "middle" });
+          context.fillText(text, x, y);
         };
-        context.font = `12px ${style.fontFamily}`;
-        context.lineWidth = 1;
         // The least round step whose labels, 52 pixels wide, stand apart.
-        const power = 10 ** Math.floor(Math.log10(52 / scale)), step = [1, 2, 5, 10].map((f) => f * power).find((one) => one * scale >= 52);
-        const digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
-        const ticks = (axis, from, to) => {
-          for (let k = Math.ceil(from / step); k * step <= to; k++) {
-            const [x, y] = toPixels(axis ? 0 : k * step, axis ? k * step : 0);
-            context.strokeStyle = line;
-            context.globalAlpha = k ? 0.5 : 1;
-            context.beginPath();
-            context.moveTo(axis ? left : x, axis ? y : above);
-            context.lineTo(axis ? right : x, axis ? y : below);
-            context.stroke();
-            context.globalAlpha = 1;
-            context.fillStyle = style.getPropertyValue("--soft");
-            context.textAlign = axis ? "right" : "center";
-            context.textBaseline = axis ? "middle" : "top";
-            context.fillText((k * step).toFixed(digits).replace("-", "\u2212"), axis ? left - 6 : x, axis ? y : below + 6);
-          }
-        };
-        ticks(0, (left - frame.x) / scale, (right - frame.x) / scale);
-        ticks(1, (frame.y - below) / scale, (frame.y - above) / scale);
-        context.fillStyle = style.color;
-        context.font = `600 13px ${style.fontFamily}`;
-        context.textAlign = "center";
-        context.fillText(labels[axes[0]], (left + right) / 2, height - 18);
-        context.save();
-        context.translate(13, (above + below) / 2);
-        context.rotate(-Math.PI / 2);
-        context.fillText(labels[axes[1]], 0, 0);
-        context.restore();
-        if (shown.phylogeny && arrays.edges.length) {
-          context.strokeStyle = style.getPropertyValue("--soft");
-          for (let e = 0; e < arrays.edges.length; e += 2) {
-            path([0, 1].map((k) => [0, 1].map((axis) => node(arrays.edges[e + k], axis))));
-            context.stroke();
-          }
+        const power = 10 ** Math.floor(Math.log10(52 / scale)), step = [1, 2, 5, 10].map((f) => f * power).find((one) => one * scale >= 51.9);
+        const label = (k) => signed(k * step, Math.max(0, -Math.floor(Math.log10(step) + 1e-9))).replace("+", "");
+        for (let k = Math.ceil((left - x0) / scale / step); x0 + k * step * scale <= right; k++) {
+          line([[x0 + k * step * scale, above], [x0 + k * step * scale, below]], rule, k ? 0.5 : 1.5);
+          write(label(k), x0 + k * step * scale, below + 12, "center", "12px", soft);
         }
+        for (let k = Math.ceil((y0 - below) / scale / step); y0 - k * step * scale >= above; k++) {
+          line([[left, y0 - k * step * scale], [right, y0 - k * step * scale]], rule, k ? 0.5 : 1.5);
+          write(label(k), left - 6, y0 - k * step * scale, "right", "12px", soft);
+        }
+        write(labels[axes[0]], (left + right) / 2, height - 14, "center", "600 13px", style.color);
+        context.rotate(-Math.PI / 2);
+        write(labels[axes[1]], -(above + below) / 2, 11, "center", "600 13px", style.color);
+        context.rotate(Math.PI / 2);
+        if (shown.phylogeny) for (let e = 0; e < arrays.edges.length; e += 2) line([0, 1].map((k) => pixels(at(arrays.edges[e + k]))), soft);
         members.forEach((points, g) => {
           if (hidden.has(g) || points.length < 3) return;
-          context.strokeStyle = css(colourOf(g), 0.75);
-          context.fillStyle = css(colourOf(g), 0.1);
-          if (shown.hulls) path(hullOf(points), true), context.fill(), context.stroke();
+          if (shown.hulls) line(hullOf(points).map(pixels), css(colourOf(g), 0.75), 1, css(colourOf(g), 0.1));
           context.setLineDash([6, 4]);
-          path(rings[g], true);
-          context.stroke();
+          line(ellipses[g].map(pixels), css(colourOf(g), 0.75));
           context.setLineDash([]);
         });
         const radius = n > 600 ? 3.2 : 5;
-        context.strokeStyle = style.getPropertyValue("--card");
-        context.lineWidth = 0.8 / radius;
+        Object.assign(context, { strokeStyle: style.getPropertyValue("--card"), lineWidth: 0.8 / radius });
         members.forEach((points, g) => {
-          if (hidden.has(g)) return;
+          const path = new Path2D(markerOf(g));
           context.fillStyle = css(colourOf(g));
-          for (const point of points) {
+          for (const point of hidden.has(g) ? [] : points) {
+            const [x, y] = pixels(point);
             context.save();
-            context.translate(...toPixels(...point));
+            context.translate(x, y);
             context.scale(radius, radius);
-            context.fill(markers[markerOf(g)]);
-            context.stroke(markers[markerOf(g)]);
+            context.fill(path);
+            context.stroke(path);
             context.restore();
           }
         });
       }
-
+      const request = (changed) => {
+        Object.assign(stale, changed);
+        frame = frame || requestAnimationFrame(draw);
+      };
       function draw() {
-        waiting = 0;
-        if (stale.base) drawBase();
-        const { context } = cleared(top), style = getComputedStyle(element);
-        const [x, y] = toPixels(place[axes[0]], place[axes[1]]);
-        const ring = (px, py, r, colour, size) => {
-          context.strokeStyle = colour;
-          context.lineWidth = size;
-          context.beginPath();
-          context.arc(px, py, r, 0, 7);
-          context.stroke();
-        };
-        if (over !== null) ring(...toPixels(score(over, 0), score(over, 1)), 8, style.color, 2);
-        ring(x, y, 10, style.getPropertyValue("--card"), 5);
-        ring(x, y, 10, style.getPropertyValue("--accent"), 2.5);
-        for (const [dx, dy] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) {
-          context.beginPath();
-          context.moveTo(x + 6 * dx, y + 6 * dy);
-          context.lineTo(x + 15 * dx, y + 15 * dy);
-          context.stroke();
-        }
-        if (stale.shape) {
-          pictures[0].show(model.vertices(place, positions));
-          if (facts.planar) pictures[1].show(model.mean);
-          if (coloured) paint();
-        }
-        stale = { base: false, shape: false };
-      }
-
-      // The marker
-
-      const nearest = (px, py, reach) => {
-        let best = null, least = reach * reach;
-        for (let v = 0; v < n; v++) {
-          if (hidden.has(arrays.codes[v])) continue;
-          const [x, y] = toPixels(score(v, 0), score(v, 1)), far = (x - px) ** 2 + (y - py) ** 2;
-          if (far < least) least = far, best = v;
-        }
-        return best;
-      };
-      const title = (v) => (groups.length ? `${names[v]}: ${groups[arrays.codes[v]]}` : names[v]);
-      const moveTo = (x, y, specimen = null) => {
-        place.fill(0);
-        place[axes[0]] = x;
-        place[axes[1]] = y;
-        list.value = specimen === null ? "" : String(specimen);
-        const digits = Math.max(0, 2 - Math.floor(Math.log10(Math.abs(frame.right - frame.left) / frame.scale)));
-        const values = [x, y].map((value, k) => `${facts.axes[axes[k]]} ${signed(value, digits)}`);
-        said.textContent = `Marker at ${values.join(", ")}${specimen === null ? "" : `, the place of ${title(specimen)}`}.`;
-        request({ shape: true });
-      };
-      const moveToSpecimen = (v) => moveTo(score(v, 0), score(v, 1), v);
-      const hover = (v) => {
-        if (v === over) return;
-        over = v;
-        tip.hidden = v === null;
-        if (v !== null) {
-          const [x, y] = toPixels(score(v, 0), score(v, 1));
-          tip.textContent = title(v);
+        const { plot: points, shape } = stale;
+        [frame, stale] = [0, {}];
+        if (points) drawPlot();
+        const put = (mark, [x, y]) => { mark.style.transform = `translate(${x}px, ${y}px)`; };
+        put(marker, pixels(axes.map((k) => place[k])));
+        ring.hidden = tip.hidden = over === null;
+        if (over !== null) {
+          const [x, y] = pixels(at(over));
+          put(ring, [x, y]);
+          tip.textContent = title(over);
           tip.style.left = `${Math.max(4, Math.min(x + 12, plot.clientWidth - tip.offsetWidth - 4))}px`;
           tip.style.top = `${Math.max(4, y - tip.offsetHeight - 10)}px`;
         }
-        request();
+        if (!shape) return;
+        picture.show(model.vertices(place, positions));
+        if (facts.planar) average.show(model.mean);
+        else paint();
+      }
+      function paint() {
+        bar.hidden = !shown.coloured;
+        if (!shown.coloured) return picture.view.paint("shape", null);
+        const moved = model.displacement(place), end = niceCeiling(quantile(moved, 0.98));
+        const scale = { map: model.faces ? colours().diverging : colours().sequential, range: [model.faces ? -end : 0, end] };
+        picture.view.paint("shape", moved, scale);
+        Shapespace.colourBar(bar, { ...scale, unit: facts.unit, open: true, title: model.faces ? "Inwards (\u2212) or outwards (+) from the mean" : "Moved from the mean" });
+      }
+
+      // The marker
+      const title = (v) => (groups.length ? `${names[v]}: ${groups[arrays.groups[v]]}` : names[v]);
+      const moveTo = (x, y, v = null) => {
+        place.fill(0);
+        [place[axes[0]], place[axes[1]]] = [x, y];
+        // What rests is announced: words that change with each frame would be read aloud, and cost half of its time.
+        clearTimeout(later);
+        later = setTimeout(() => {
+          const digits = Math.max(0, Math.ceil(Math.log10(scale))), values = [x, y].map((value, k) => `${facts.axes[axes[k]]} ${signed(value, digits)}`);
+          list.value = v === null ? "" : String(v);
+          said.textContent = `Marker at ${values.join(", ")}${v === null ? "" : `, the place of ${title(v)}`}.`;
+        }, 150);
+        request({ shape: true });
       };
       let drags = false;
       const point = (event) => {
-        const v = nearest(event.offsetX, event.offsetY, event.pointerType === "touch" ? 16 : 9);
-        hover(v);
-        if (!drags) return;
-        if (v !== null) moveToSpecimen(v);
-        else moveTo((event.offsetX - frame.x) / frame.scale, (frame.y - event.offsetY) / frame.scale);
+        let least = event.pointerType === "touch" ? 256 : 81; // square of the distance within which a shape is meant, pixels
+        over = null;
+        for (let v = 0; v < n; v++) {
+          const [x, y] = pixels(at(v)), far = (x - event.offsetX) ** 2 + (y - event.offsetY) ** 2;
+          if (far < least && !hidden.has(arrays.groups[v])) [least, over] = [far, v];
+        }
+        if (!drags) request({});
+        else if (over !== null) moveTo(...at(over), over);
+        else moveTo((event.offsetX - x0) / scale, (y0 - event.offsetY) / scale);
       };
-      top.addEventListener("pointerdown", (event) => {
+      canvas.addEventListener("pointerdown", (event) => {
         drags = event.button === 0;
-        if (drags) top.setPointerCapture(event.pointerId);
+        if (drags) canvas.setPointerCapture(event.pointerId);
         point(event);
       });
-      top.addEventListener("pointermove", point);
-      for (const name of ["pointerup", "pointercancel"]) top.addEventListener(name, () => { drags = false; });
-      top.addEventListener("pointerleave", () => hover(null));
-      top.addEventListener("keydown", (event) => {
-        const step = ((event.shiftKey ? 0.1 : 0.02) * (frame.right - frame.left)) / frame.scale;
-        const moves = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }, by = moves[event.key];
-        if ((!by && event.key !== "Home") || event.ctrlKey || event.metaKey || event.altKey) return;
+      canvas.addEventListener("pointermove", point);
+      for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, () => { drags = false; });
+      canvas.addEventListener("pointerleave", () => { over = null; request({}); });
+      canvas.addEventListener("keydown", (event) => {
+        const step = ((event.shiftKey ? 0.1 : 0.02) * canvas.clientWidth) / scale;
+        const by = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1], Home: [0, 0] }[event.key];
+        if (!by || event.ctrlKey || event.metaKey || event.altKey) return;
         event.preventDefault();
-        if (by) moveTo(place[axes[0]] + by[0] * step, place[axes[1]] + by[1] * step);
-        else moveTo(0, 0);
+        moveTo(...by.map((one, axis) => (event.key === "Home" ? 0 : place[axes[axis]] + one * step)));
       });
 
       // Controls
-
-      const named = () => top.setAttribute("aria-label",
-        `${n} shapes on ${labels[axes[0]]} and ${labels[axes[1]]}. Click, or press the arrow keys, to move the marker; Home goes to the mean.`);
       const { row: specimens, list } = select("Shape", [["", "none chosen"], ...names.map((name, v) => [String(v), name])], "", (key) =>
-        key === "" ? moveTo(0, 0) : moveToSpecimen(Number(key)));
+        key === "" ? moveTo(0, 0) : moveTo(...at(Number(key)), Number(key)));
       const legend = make("div", { class: "ss-buttons", role: "group", "aria-label": `Groups of ${facts.variable}` });
       groups.forEach((name, g) => {
-        const toggle = button("", () => {
+        const toggle = button(name, () => {
           if (!hidden.delete(g)) hidden.add(g);
           toggle.setAttribute("aria-pressed", String(!hidden.has(g)));
-          request({ base: true });
+          request({ plot: true });
         }, { class: "ss-group", "aria-pressed": "true" });
-        const icon = document.createElementNS("http://www.w3.org/2000/svg", "svg"), path = document.createElementNS(icon.namespaceURI, "path");
-        icon.setAttribute("viewBox", "-1.5 -1.5 3 3");
-        icon.setAttribute("aria-hidden", "true");
-        path.setAttribute("d", MARKERS[markerOf(g)]);
-        icon.append(path);
-        toggle.append(icon, name);
+        toggle.insertAdjacentHTML("afterbegin", `<svg viewBox="-1.5 -1.5 3 3" aria-hidden="true"><path d="${markerOf(g)}"/></svg>`);
         legend.append(toggle);
       });
-      const recolour = () => {
+      const redraw = () => {
         legend.querySelectorAll("path").forEach((path, g) => path.setAttribute("fill", css(colourOf(g))));
-        request({ base: true, shape: true });
+        canvas.setAttribute("aria-label", `${n} shapes on ${labels[axes[0]]} and ${labels[axes[1]]}. Click, or press the arrow keys, to move the marker; Home goes to the mean.`);
+        request({ plot: true, shape: true });
       };
       const choices = ["Across", "Up"].map((name, axis) => select(name, labels.map((label, k) => [String(k), label]), String(axes[axis]), (key) => {
         axes[axis] = Number(key);
-        named();
-        drawBase();
         moveTo(place[axes[0]], place[axes[1]]);
+        redraw();
       }).row);
-      let coloured = false;
-      const bar = make("div", { class: "ss-bar", hidden: true });
-      function paint() {
-        const moved = model.displacement(place), end = niceCeiling(quantile(moved, 0.98));
-        const map = model.faces ? colours().diverging : colours().sequential, range = [model.faces ? -end : 0, end];
-        pictures[0].view.paint("shape", moved, { map, range });
-        Shapespace.colourBar(bar, { map, range, unit: facts.unit, open: true, title: model.faces ? "Inwards (\u2212) or outwards (+) from the mean" : "Moved from the mean" });
-      }
-      const layer = (text, key) => tick(text, shown[key], (on) => { shown[key] = on; request({ base: true }); });
-      controls.append(...(groups.length ? [legend] : []), make("div", { class: "ss-buttons" },
-        ...(groups.length ? [layer("Convex hulls", "hulls"), layer("95 % ellipses", "ellipses")] : []),
-        ...(arrays.edges.length ? [layer("Phylogeny", "phylogeny")] : []),
-        ...(arrays.cross_validated ? [layer("Leave-one-out scores", "validated")] : []),
-        ...(facts.planar ? [] : [tick("Colour by distance from the mean", false, (on) => {
-          coloured = on;
-          bar.hidden = !on;
-          if (on) paint();
-          else pictures[0].view.paint("shape", null);
-        })])), bar, make("div", { class: "ss-choices" }, ...choices, specimens), said);
-      named();
-      document.addEventListener("shapespace:theme", recolour);
-      new ResizeObserver(() => request({ base: true, shape: true })).observe(plot);
-      recolour();
-      draw();
+      const ticks = [["Convex hulls", "hulls", groups.length], ["95 % ellipses", "ellipses", groups.length], ["Phylogeny", "phylogeny", arrays.edges.length],
+        ["Leave-one-out scores", "validated", arrays.cross_validated], ["Colour by distance from the mean", "coloured", !facts.planar]];
+      controls.append(legend, make("div", { class: "ss-buttons" }, ...ticks.filter((one) => one[2]).map(([text, key]) =>
+        tick(text, shown[key], (on) => { shown[key] = on; redraw(); }))), bar, make("div", { class: "ss-choices" }, ...choices, specimens), said);
+      document.addEventListener("shapespace:theme", redraw);
+      new ResizeObserver(redraw).observe(plot);
+      drawPlot();
       moveTo(0, 0);
-      return { view: { works: true }, place, pictures, frame: () => frame, toPixels, moveTo };
+      return { view: { works: true }, place, pixels, at };
     });
 })();

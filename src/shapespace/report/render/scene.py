@@ -202,10 +202,7 @@ def pack_morph(low: Mesh, high: Mesh, labels: tuple[str, str], *, largest: int =
 
 
 def pack_morphospace(space: Morphospace, *, largest: int = 12_000) -> bytes:
-    """Return the data of the morphospace widget: a shape model whose modes are the axes, and the scores of shapes.
-
-    Arrays: `mean` (V, 3); `faces`, absent for landmarks; `modes` (A, V, 3) quantised, change per unit of score;
-    `scores` (N, A), perhaps `cross_validated` (N, A); `codes` (N,) of groups; `nodes` (M, A) and `edges` (E, 2).
+    """Return the data of the morphospace widget: its shape model, whose modes are the axes, and its other arrays.
 
     Args:
         space: the plot.
@@ -213,24 +210,23 @@ def pack_morphospace(space: Morphospace, *, largest: int = 12_000) -> bytes:
     """
     from shapespace.report.figures.analysis_figures import current_orientation
 
-    part, mesh, rows = space.part, Mesh(space.mean, space.faces), np.arange(len(space.mean))
+    part, given, rows = space.part, dict(space.arrays), np.arange(len(space.arrays["mean"]))
+    mesh = Mesh(given.pop("mean"), space.faces)
     if space.faces is not None:
         mesh, rows = _decimate(mesh, largest)
-    extent = float(np.ptp(mesh.vertices, axis=0).max())
+    codes = {name: given.pop(name).astype(np.int32) for name in ("groups", "edges")}
+    given.pop("faces")
     arrays: dict[str, npt.NDArray[Any] | Steps] = {
-        "mean": quantise(mesh.vertices, step=extent / 16000, coded=True),
-        "modes": quantise(space.shape_axes[:, rows], by_row=True, coded=True),
-        "scores": space.scores, "codes": space.codes.astype(np.int32), "nodes": space.nodes, "edges": space.edges,
+        "mean": quantise(mesh.vertices, step=float(np.ptp(mesh.vertices)) / 16000, coded=True),
+        "modes": quantise(given.pop("shape_axes")[:, rows], by_row=True, coded=True), **given, **codes,
     }  # fmt: skip
     if mesh.faces is not None:
         arrays["faces"] = _indices(mesh.faces, len(mesh.vertices), coded=True)
-    if space.cross_validated is not None:
-        arrays["cross_validated"] = space.cross_validated
+    links = [[a - 1, b - 1] for a, b in current_orientation().links if max(a, b) <= space.n_landmarks]
     return pack(arrays, {
-        "kind": "morphospace", "names": part.names, "axes": part.axes, "labels": space.labels, "first": part.first,
-        "groups": part.groups, "variable": part.variable, "radii": space.radii.tolist(), "planar": space.is_planar,
-        "grid": space.grid, "landmarks": space.n_landmarks, "unit": part.unit,
-        "links": [[a - 1, b - 1] for a, b in current_orientation().links if max(a, b) <= space.n_landmarks],
+        "names": part.names, "axes": part.axes, "labels": space.labels, "first": part.first, "groups": part.groups,
+        "variable": part.variable, "radii": space.radii.tolist(), "planar": space.is_planar, "grid": space.grid,
+        "landmarks": space.n_landmarks, "links": links, "unit": part.unit,
     })  # fmt: skip
 
 

@@ -17,7 +17,7 @@ from shapespace.schemas import TableColumn, TablePart
 from shapespace.statistics.compare_formula import columns_of, design_of
 from shapespace.statistics.dispersion import unequal_variances
 from shapespace.statistics.methods import sample_sizes
-from shapespace.statistics.shape_tests.ordination import canonical_variates, group_means, principal_components
+from shapespace.statistics.shape_tests.ordination import discriminant_components, group_means, principal_components
 from shapespace.statistics.shape_tests.permutations import Groups, Orders, orders, permuted
 from shapespace.statistics.shape_tests.shape_test_result import ShapeTestResult, Statistic
 from shapespace.statistics.shape_tests.test_table import shape_test
@@ -360,7 +360,7 @@ def discriminate(
     """
     cohort, groups = groups_of(cohort, group, drop_missing, 3, "a leave-one-out classification")
     n, counts, g = len(cohort), groups.counts, len(groups.names)
-    used = canonical_variates(cohort.coefficients, groups, components).n_components
+    used = discriminant_components(cohort.coefficients, groups, components)
     centre, axes, variances = principal_components(cohort.coefficients)
     scores, squares = (cohort.coefficients - centre) @ axes.T, variances * (n - 1)
     rows = np.concatenate([one for _, one in orders(n, permutations, seed)])

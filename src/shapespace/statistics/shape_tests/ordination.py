@@ -12,12 +12,11 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.errors import InputError
 from shapespace.reprs import short_repr
-from shapespace.statistics.shape_tests.permutations import Groups
+from shapespace.statistics.shape_tests.permutations import Groups, Orders
 from shapespace.types import FloatArray, IntArray
 
 OrdinationMethod: TypeAlias = Literal["pca", "between-groups", "cva", "phylogenetic-pca", "paca"]
@@ -168,167 +167,87 @@ def group_means(values: FloatArray, groups: Groups) -> FloatArray:
     return (groups.indicator / groups.counts).T @ values
 
 
-def _between_axes(means: FloatArray, counts: npt.NDArray[np.intp]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the centre (K,), axes (A, K) and sums of squares (A,) of group means (G, K), weighted by group size."""
-    # M14
-    centre = counts @ means / counts.sum()
-    _, s, vt = np.linalg.svd(np.sqrt(counts)[:, None] * (means - centre), full_matrices=False)
-    n_axes = min(len(counts) - 1, len(s))
-    return centre, vt[:n_axes], s[:n_axes] ** 2
-
-
 def _between_groups(coefficients: FloatArray, groups: Groups, make: _Make) -> Ordination:
-    n, counts, codes = len(coefficients), groups.counts, groups.codes
-    means = group_means(coefficients, groups)
+    means, counts = group_means(coefficients, groups), groups.counts
     centre, axes, squares = _between_axes(means, counts)
-    if squares[0] <= (_RANK**2) * float(((coefficients - centre) ** 2).sum()):
+    known = squares > _RANK**2 * float(((coefficients - centre) ** 2).sum())
+    if not known.any():
         raise InputError("The means of the groups are equal, so there are no between-group components.")
-    axes = axes[squares > _RANK**2 * squares[0]]
-    axes, squares = _signed((coefficients - centre) @ axes.T, axes), squares[: len(axes)]
-    validated = np.empty((n, len(axes)))
-    predicted = np.empty(n, dtype=np.int32)
-    # M15
-    for k, (shape, code) in enumerate(zip(coefficients, codes, strict=True)):
-        others, sizes = means.copy(), counts.copy()
-        sizes[code] -= 1
-        others[code] = (counts[code] * means[code] - shape) / sizes[code]
+    axes = _signed((coefficients - centre) @ axes[known].T, axes[known])
+    validated, predicted = np.empty((len(coefficients), len(axes))), np.empty(len(coefficients), dtype=np.int32)
+    for k, (shape, code) in enumerate(zip(coefficients, groups.codes, strict=True)):
+        others, sizes = _without(means, counts, shape, int(code))
+        # M15
         middle, own, _ = _between_axes(others, sizes)
         validated[k] = (shape - middle) @ own.T @ _rotation(own @ axes.T)
-        predicted[k] = np.linalg.norm((others - shape) @ own.T, axis=1).argmin()
+        predicted[k] = (((others - shape) @ own.T) ** 2).sum(axis=1).argmin()
     return make(
         axes=axes, shape_axes=axes, centre=centre, scores=(coefficients - centre) @ axes.T,
-        eigenvalues=squares / (n - 1), cross_validated=validated, predicted=predicted,
+        eigenvalues=squares[known] / (len(coefficients) - 1), cross_validated=validated, predicted=predicted,
     )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class CanonicalVariates:
-    """Canonical variates of groups, as `lda` of the R package MASS.
+def discriminant_components(coefficients: FloatArray, groups: Groups, components: int | None = None) -> int:
+    """Return the number of principal components of shapes (N, K) that linear discriminants of groups can use.
 
     Args:
-        weights: (K, A) scores are (coefficients - centre) weights; their pooled within-group covariance, with the
-            divisor N - G, is the identity.
-        shape_axes: (A, K) change of the coefficients per unit of score: covariance within groups times `weights`.
-        centre: (K,) mean of all shapes.
-        eigenvalues: (A,) variance between groups (divisor G - 1) of the scores, whose variance within groups is 1.
-        whitened: (N, P) coefficients with the identity as pooled within-group covariance.
-        means: (G, P) means of the groups in these.
-        rotation: (P, A) whitened coefficients, centred, to scores.
-        n_components: number of principal components used, P.
-        is_reduced: whether there are more.
-    """
-
-    weights: FloatArray
-    shape_axes: FloatArray
-    centre: FloatArray
-    eigenvalues: FloatArray
-    whitened: FloatArray
-    means: FloatArray
-    rotation: FloatArray
-    n_components: int
-    is_reduced: bool
-
-
-def canonical_variates(coefficients: FloatArray, groups: Groups, components: int | None = None) -> CanonicalVariates:
-    """Return the canonical variates of groups of shapes.
-
-    Args:
-        coefficients: (N, K) of the shapes.
-        groups: two or more shapes of each.
-        components: number of principal components; None for all, or where the covariance within groups would be
-            singular, for those of 95 % of the variance, at most half of N - G.
+        coefficients: of the shapes.
+        groups: of the shapes, two or more in each.
+        components: the number asked for; None for all, or where the covariance within groups would be singular, for
+            those of 95 % of the variance, at most half of N - G.
 
     Raises:
-        InputError: more components than the shapes have or N - G - 1, which leaves the covariance within groups
-            singular for the cross-validation, or no variation within groups.
+        InputError: more components than the shapes have, or than N - G - 1, which leave-one-out needs.
     """
-    n, n_groups = len(coefficients), len(groups.names)
-    centre, axes, variances = principal_components(coefficients)
-    most = n - n_groups - 1
+    free, variances = len(coefficients) - len(groups.names), principal_components(coefficients)[2]
+    most = min(len(variances), free - 1)
     if components is None:
-        components = len(axes)
-        if components > most:
-            share = np.cumsum(variances) / variances.sum()
-            components = min(int(np.searchsorted(share, _MOST_VARIANCE)) + 1, max((n - n_groups) // 2, 1))
-    if not 1 <= components <= min(len(axes), most):
+        share = variances.cumsum() / variances.sum()
+        components = most if most == len(variances) else min(int((share < _MOST_VARIANCE).sum()) + 1, max(free // 2, 1))
+    if not 1 <= components <= most:
         raise InputError(
-            f"The covariance within groups of {n} shapes in {n_groups} groups is singular with {components} principal "
-            f"components; take 1 to {min(len(axes), most)}, or add shapes."
-            if most >= 1 else f"Canonical variates of {n_groups} groups need more than {n_groups + 1} shapes, not {n}."
-        )  # fmt: skip
-    axes = axes[:components]
-    values = (coefficients - centre) @ axes.T
-    residual = values - group_means(values, groups)[groups.codes]
-    # M16
-    _, s, vt = np.linalg.svd(residual, full_matrices=False)
-    if s[-1] <= _RANK * s[0] or s[0] <= _RANK * np.linalg.norm(values):
-        raise InputError(
-            f"The covariance within groups is singular: in some direction of the {components} principal components "
-            "the shapes of each group are equal; take fewer with --components."
+            f"The covariance within {len(groups.names)} groups of {len(coefficients)} shapes is singular with "
+            f"{components} principal components; take {f'1 to {most}, or ' if most > 0 else ''}more shapes."
         )
-    spread = s / np.sqrt(n - n_groups)
-    whitening = vt.T / spread
-    whitened = values @ whitening
-    means = group_means(whitened, groups)
-    _, rotation, squares = _between_axes(means, groups.counts)
-    rotation = _signed(whitened @ rotation.T, rotation).T
-    return CanonicalVariates(
-        weights=axes.T @ whitening @ rotation, shape_axes=(rotation.T * spread) @ vt @ axes, centre=centre,
-        eigenvalues=squares / (n_groups - 1), whitened=whitened, means=means, rotation=rotation,
-        n_components=components, is_reduced=components < len(variances),
-    )  # fmt: skip
-
-
-def leave_one_out_classes(variates: CanonicalVariates, groups: Groups) -> IntArray:
-    """Return the (N,) group of each shape by the linear discriminants of the other shapes.
-
-    The prior probabilities are the group sizes, as of `lda(CV = TRUE)` of the R package MASS. Principal components,
-    which do not depend on the groups, are those of all shapes.
-    """
-    # M17
-    n, n_groups = len(variates.whitened), len(groups.names)
-    residual = variates.whitened - variates.means[groups.codes]
-    counts = groups.counts[groups.codes]
-    factor = counts / ((counts - 1) * (n - n_groups))
-    gain = factor / (1 - factor * (residual**2).sum(axis=1))
-    distances = np.empty((n, n_groups))
-    for g in range(n_groups):
-        own = groups.codes == g
-        away = np.where(
-            own[:, None], residual * (counts / (counts - 1))[:, None], variates.whitened - variates.means[g]
-        )
-        distances[:, g] = (away**2).sum(axis=1) + gain * (away * residual).sum(axis=1) ** 2
-    distances *= (n - 1 - n_groups) / (n - n_groups)
-    return (np.log(groups.counts / n) - distances / 2).argmax(axis=1).astype(np.int32)
+    return components
 
 
 def _canonical(coefficients: FloatArray, groups: Groups, components: int | None, make: _Make) -> Ordination:
-    variates = canonical_variates(coefficients, groups, components)
-    n, n_groups, whitened = len(coefficients), len(groups.names), variates.whitened
-    validated = np.empty((n, len(variates.eigenvalues)))
-    for k, code in enumerate(groups.codes):
-        sizes, others = groups.counts.copy(), variates.means.copy()
-        sizes[code] -= 1
-        residual = whitened[k] - others[code]
-        others[code] -= residual / sizes[code]
-        # Whitening by the covariance within groups without this shape, a change of rank one.
-        length = residual @ residual
-        lost = length * groups.counts[code] / (sizes[code] * (n - n_groups))
-        scale = np.sqrt((n - 1 - n_groups) / (n - n_groups))
-        change = (1 / np.sqrt(1 - lost) - 1) / max(length, np.finfo(np.float64).tiny)
-        rows = np.vstack([others, whitened[k]])
-        rows = scale * (rows + change * np.outer(rows @ residual, residual))
+    n, n_groups, counts = len(coefficients), len(groups.names), groups.counts
+    used = discriminant_components(coefficients, groups, components)
+    centre, all_axes, _ = principal_components(coefficients)
+    values = (coefficients - centre) @ all_axes[:used].T
+    residual = values - group_means(values, groups)[groups.codes]
+    # M16
+    _, s, vt = np.linalg.svd(residual / np.sqrt(n - n_groups), full_matrices=False)
+    if s[-1] <= _RANK * np.linalg.norm(values):
+        raise InputError(
+            f"The covariance within groups is singular: in some direction of {used} principal components the shapes of "
+            "each group are equal; take fewer with --components."
+        )
+    whitened = values @ (vt.T / s)
+    means = group_means(whitened, groups)
+    _, rotation, squares = _between_axes(means, counts)
+    rotation = _signed(whitened @ rotation.T, rotation)
+    validated, predicted = np.empty((n, len(rotation))), np.empty(n, dtype=np.int32)
+    for k, (shape, code) in enumerate(zip(whitened, groups.codes, strict=True)):
+        others, sizes = _without(means, counts, shape, int(code))
+        # M17: without this shape, the covariance within groups changes by a matrix of rank one.
+        away = shape - means[code]
+        lost = away @ away * counts[code] / (sizes[code] * (n - n_groups))
+        change = (1 / np.sqrt(1 - lost) - 1) / max(away @ away, np.finfo(np.float64).tiny)
+        rows = np.vstack([others, shape]) * np.sqrt((n - 1 - n_groups) / (n - n_groups))
+        rows += change * np.outer(rows @ away, away)
         middle, own, _ = _between_axes(rows[:-1], sizes)
-        validated[k] = (rows[-1] - middle) @ own.T @ _rotation(own @ variates.rotation)
-    note = (
-        f"Canonical variates are of the first {variates.n_components} principal components, since the covariance "
-        "within groups is singular with all of them." if variates.is_reduced and components is None else ""
-    )  # fmt: skip
+        validated[k] = (rows[-1] - middle) @ own.T @ _rotation(own @ rotation.T)
+        predicted[k] = (np.log(counts) - ((rows[:-1] - rows[-1]) ** 2).sum(axis=1) / 2).argmax()
+    axes = rotation @ (vt / s[:, None]) @ all_axes[:used]
+    is_reduced = used < len(all_axes)
+    note = f"Canonical variates are of {used} of {len(all_axes)} principal components."
     return make(
-        axes=variates.weights.T, shape_axes=variates.shape_axes, centre=variates.centre,
-        scores=(coefficients - variates.centre) @ variates.weights, eigenvalues=variates.eigenvalues,
-        cross_validated=validated, predicted=leave_one_out_classes(variates, groups),
-        components=variates.n_components if variates.is_reduced else None, notes=(note,) if note else (),
+        axes=axes, shape_axes=(rotation * s) @ vt @ all_axes[:used], centre=centre,
+        scores=(coefficients - centre) @ axes.T, eigenvalues=squares / (n_groups - 1), cross_validated=validated,
+        predicted=predicted, components=used if is_reduced else None, notes=(note,) if is_reduced else (),
     )  # fmt: skip
 
 
@@ -342,6 +261,22 @@ def _phylogenetic(cohort: Cohort, path: Path, method: str, make: _Make) -> Ordin
         axes=found.directions.T, shape_axes=found.directions.T, centre=found.mean, scores=found.scores,
         eigenvalues=found.deviations**2, ancestors=found.ancestors, edges=found.tree.edges, notes=found.tree.notes,
     )  # fmt: skip
+
+
+def _between_axes(means: FloatArray, counts: Orders) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the centre (K,), axes (A, K) and sums of squares (A,) of group means (G, K), weighted by group size."""
+    # M14
+    centre = counts @ means / counts.sum()
+    _, s, vt = np.linalg.svd(np.sqrt(counts)[:, None] * (means - centre), full_matrices=False)
+    return centre, vt[: len(counts) - 1], s[: len(counts) - 1] ** 2
+
+
+def _without(means: FloatArray, counts: Orders, shape: FloatArray, code: int) -> tuple[FloatArray, Orders]:
+    """Return the means (G, K) and counts (G,) of groups without a shape (K,) of the group `code`."""
+    others, sizes = means.copy(), counts.copy()
+    sizes[code] -= 1
+    others[code] -= (shape - means[code]) / sizes[code]
+    return others, sizes
 
 
 def _signed(scores: FloatArray, axes: FloatArray) -> FloatArray:
