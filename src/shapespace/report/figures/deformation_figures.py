@@ -109,7 +109,7 @@ def landmark_map_figure(
         unit: of the numbers.
         signed: whether two colours part at zero.
         limit: where the colours end; None for the largest number.
-        mask: (L,) outside which landmarks are small; None for none.
+        mask: (L,) outside which landmarks are small and pale; None for none.
 
     Raises:
         InputError: another number of values or flags than of landmarks, or no finite value.
@@ -122,13 +122,14 @@ def landmark_map_figure(
     end = limit or nice_ceiling(float(np.abs(values[known]).max()))
     start, colours = (-end, DIVERGING) if signed else (0.0, SEQUENTIAL)
     figure, plots, placed = _in_views(points[None], "", bar_height() / DPI)
-    sizes = np.full(len(points), 70.0) if mask is None else np.where(mask, 70.0, 22.0)
+    inside: BoolArray = np.ones(len(points), np.bool_) if mask is None else mask
+    sizes, alpha = np.where(inside, 70.0, 22.0), np.where(inside, 1.0, 0.45)
     for axes, (place,) in zip(plots, placed, strict=True):
         draw_links(axes, place, _GRID)
         style: Any = {"edgecolors": INK, "linewidths": 0.8, "zorder": 3}
         scale: Any = {"norm": Normalize(start, end), "cmap": ListedColormap(colours)}
-        axes.scatter(*place[~known].T, s=sizes[~known], color=UNKNOWN_COLOUR, **style)
-        axes.scatter(*place[known].T, s=sizes[known], c=values[known], **scale, **style)
+        axes.scatter(*place[~known].T, s=sizes[~known], color=UNKNOWN_COLOUR, alpha=alpha[~known], **style)
+        axes.scatter(*place[known].T, s=sizes[known], c=values[known], alpha=alpha[known], **scale, **style)
     finish(figure, w_pad=0.6)
     height = float(figure.get_figheight()) * DPI
     colour_bar(figure, Scale(short(unit, 60), colours, start, end), height - bar_height(), height)

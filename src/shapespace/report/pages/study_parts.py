@@ -305,7 +305,7 @@ class StudyParts:
             figure = figures.landmark_vectors_figure(low, high, labels)
             about = f"Each line leads from a landmark of {labels[0]}, a dot, to its place in {labels[1]}."
         caption = f"{note} {about}{_times_sentence(part.times)}".strip()
-        return [self.page.figure(figure, caption, alt=f"{title}: {about}", chart=True)]
+        return [self.page.figure(figure, caption, alt=f"{title}: {about}")]
 
     def histogram(self, part: HistogramPart, title: str, note: str) -> list[Block]:
         """Return a histogram."""
