@@ -107,9 +107,9 @@ def compare_trajectories(
     scores, shown = (observed - center) @ axes, (cohort.coefficients - center) @ axes
     figure = _curve(
         "Trajectories", "principal component 1 of the points", "principal component 2",
-        [*(Series(x=_floats(one[:, 0]), y=_floats(one[:, 1]), label=name)
+        [*(Series(x=_floats(one[:, 0]), y=_floats(one[:, -1]), label=name)
            for name, one in zip(groups.names, scores, strict=True)),
-         Series(x=_floats(shown[:, 0]), y=_floats(shown[:, 1]), label="shapes", points=True)],
+         Series(x=_floats(shown[:, 0]), y=_floats(shown[:, -1]), label="shapes", points=True)],
     )  # fmt: skip
     settings = {"group": list(group), "points": list(stages), "formula": formula, "null": null, "residuals": residuals}
     return _pairs_result(
