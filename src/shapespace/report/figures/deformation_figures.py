@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from matplotlib.collections import LineCollection
-from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 
 from shapespace.errors import InputError
@@ -38,6 +37,7 @@ _CELLS = 20  # cells of a grid along its longer side: deformations of a tenth of
 _POINTS_OF_CELL = 5  # points of a grid line in each cell, so that bent lines look smooth
 _MARGIN = 0.12  # of the longer side, around the landmarks
 _GRID = "#8d96a3"  # lines of a grid and links, paler than landmarks
+_PALE = 0.55  # share of white outside the mask
 _MOST_INCHES = 4.0  # of the height of a panel
 _THREE_SIDES = (
     ("front", np.eye(3)),
@@ -123,13 +123,14 @@ def landmark_map_figure(
     start, colours = (-end, DIVERGING) if signed else (0.0, SEQUENTIAL)
     figure, plots, placed = _in_views(points[None], "", bar_height() / DPI)
     inside: BoolArray = np.ones(len(points), np.bool_) if mask is None else mask
-    sizes, alpha = np.where(inside, 70.0, 22.0), np.where(inside, 1.0, 0.45)
+    shades = np.tile(np.array(UNKNOWN_COLOUR), (len(points), 1))
+    place_in_scale = np.clip((values[known] - start) / (end - start), 0, 1) * (len(colours) - 1)
+    shades[known] = colours[place_in_scale.round().astype(int)]
+    shades[~inside] = _PALE + (1 - _PALE) * shades[~inside]
     for axes, (place,) in zip(plots, placed, strict=True):
         draw_links(axes, place, _GRID)
-        style: Any = {"edgecolors": INK, "linewidths": 0.8, "zorder": 3}
-        scale: Any = {"norm": Normalize(start, end), "cmap": ListedColormap(colours)}
-        axes.scatter(*place[~known].T, s=sizes[~known], color=UNKNOWN_COLOUR, alpha=alpha[~known], **style)
-        axes.scatter(*place[known].T, s=sizes[known], c=values[known], alpha=alpha[known], **scale, **style)
+        sizes = np.where(inside, 70.0, 22.0)
+        axes.scatter(*place.T, s=sizes, facecolors=shades, edgecolors=INK, linewidths=0.8, zorder=3)
     finish(figure, w_pad=0.6)
     height = float(figure.get_figheight()) * DPI
     colour_bar(figure, Scale(short(unit, 60), colours, start, end), height - bar_height(), height)
