@@ -175,15 +175,17 @@ def _value_text(value: object) -> str:
 
 
 def _test_sentences(tests: Sequence[TestScheme]) -> Iterator[str]:
-    for count in dict.fromkeys(test.arrangements for test in tests):
+    kinds = [(test.arrangements, test.resampling == "bootstrap") for test in tests]
+    for count, draws in dict.fromkeys(kinds):
         details = [
             f"of {', '.join(test.tested)}{f' in the stratum {test.stratum}' if test.stratum else ''}"
             f"{f' ({test.statistic})' if test.statistic else ''} by {scheme_text(test)}"
-            for test in tests
-            if test.arrangements == count
+            for test, kind in zip(tests, kinds, strict=True)
+            if kind == (count, draws)
         ]
         source = f"come from {count:,} arrangements, the observed data among them: " if count else "are "
-        yield f"p values {source}{'; '.join(details)}."
+        subject = f"Intervals come from {count:,} draws: " if draws else f"p values {source}"
+        yield f"{subject}{'; '.join(details)}."
 
 
 def methods_parts(methods: Methods) -> tuple[Part, ...]:
