@@ -92,7 +92,7 @@ def test_effects_of_a_term_with_an_error_term_are_tested_between_its_units() -> 
     assert strata == {"genus": "between genus:species", "sex": ""}  # no pairs of species, whose means are not crossed
     schemes = {scheme.tested: scheme for scheme in result.methods.tests}
     assert schemes["genus",].statistic == "F over genus:species"
-    assert schemes["genus",].unit == "unit of genus:species"
+    assert schemes["genus",].unit == "genus:species unit"
     report = compare_report(result)
     assert report.settings["errors"] == ERRORS
     header, rows = report.tables["terms.csv"]

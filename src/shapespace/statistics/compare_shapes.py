@@ -348,11 +348,14 @@ def compare(
         for family in families
         for effect in _effects(cohort, family, design, owners, config, root, step)
     )
+    crossed = {one for term in design.terms if not is_nested(term, design.terms) for one in term.variables}
+    columns = {one.name: one.column for one in design.variables}
     dispersions = tuple(
         test
         for stratum in strata
         if is_between_units(stratum)
         for test in units_of(stratum, design, owners).dispersions(cohort.n_vertices, config.permutations, config.seed)
+        if columns[test.variable] in crossed  # classes within others are small
     )
     methods = _methods(cohort, design, strata, subjects, dispersions, config, errors)
     return CompareResult(
@@ -474,7 +477,7 @@ def _methods(
             flips = config.unequal_variances or stratum.flips(reduced)
             own, error = unit if is_between_units(stratum) else f"difference within a {unit}", errors.get(term.label)
             if error is not None and config.error_permutation == "units":
-                own, reduced = f"unit of {error.label}", [one for one in reduced if one is not error]
+                own, reduced = f"{error.label} unit", [one for one in reduced if one is not error]
             schemes.append(
                 TestScheme(
                     tested=(term.label,),

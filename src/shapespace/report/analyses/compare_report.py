@@ -135,7 +135,7 @@ def compare_warnings(result: CompareResult) -> tuple[str, ...]:
         *(
             f"{one.name} has {len(one.levels)} classes; pairs of the first {MOST_LEVELS} are compared."
             for one in result.design.variables
-            if len(one.levels) > MOST_LEVELS
+            if len(one.levels) > MOST_LEVELS and any(effect.name == one.name for effect in result.effects)
         ),
     )
 
