@@ -112,7 +112,7 @@ def test_degrees_of_freedom_of_the_observations_pool_the_error() -> None:
         assert plain[source].f == pytest.approx(own[source].f) and plain[source].ss == pytest.approx(own[source].ss)
     interaction, error = plain["individual x side"], plain["measurement error"]
     assert interaction.f == pytest.approx(interaction.ss / (n - 1) / (error.ss / (2 * (rows - n))))
-    assert all(plain[s].z is not None for s in ("individual", "side", "individual x side"))
+    assert [plain[s].p for s in ("side", "individual x side")] == [own[s].p for s in ("side", "individual x side")]
 
 
 @pytest.mark.parametrize("kind", ["klingenberg", "observations"])
@@ -155,7 +155,7 @@ def test_asymmetries_of_sides_that_do_not_differ_are_found_in_the_share_of_the_l
 
 def test_mirror_images_and_impossible_sides_are_refused() -> None:
     rng = np.random.default_rng(3)
-    with pytest.raises(InputError, match="with side R are mirror images of the others; reflect them before"):
+    with pytest.raises(InputError, match="shapes with side R are mirror images of the others; reflect them before"):
         measure_asymmetry(wings(rng, mirror=True), side="side")
     cohort = wings(rng)
     with pytest.raises(InputError, match="'subject' has 9 classes"):

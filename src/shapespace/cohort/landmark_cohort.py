@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from shapespace.cohort.cohort import Cohort, padded
-from shapespace.cohort.table import Table, list_names, numbers_as_text, read_table
+from shapespace.cohort.table import Table, note_unmatched, numbers_as_text, read_table
 from shapespace.errors import FileFormatError, InputError
 from shapespace.geometry.landmark_alignment import AlignConfig, AlignedLandmarks, align_landmarks
 from shapespace.geometry.procrustes import Gauge, centroid_size
@@ -197,24 +197,9 @@ def _matched(
     if table is None:
         return list(range(len(names))), own, []
     given, keys = read_table(table, as_files=False)
-    stems = {stem_of(name): k for k, name in enumerate(names)}
-    number = stems | {name: k for k, name in enumerate(names)}
+    number = {stem_of(name): k for k, name in enumerate(names)} | {name: k for k, name in enumerate(names)}
     found = [(number[key], row) for row, key in enumerate(keys) if key in number]
-    if not found:
-        raise InputError(
-            f"{where} holds no specimen of {given.where} (such as {list_names(keys)}; there is {list_names(names)}); "
-            "name the specimens alike."
-        )
-    unknown = [key for key in keys if key not in number]
-    left = [name for k, name in enumerate(names) if k not in {specimen for specimen, _ in found}]
-    notes = [
-        f"{len(some)} {what} ({list_names(some)})."
-        for some, what in (
-            (unknown, f"of {len(keys)} rows of {given.where} are left out, whose landmarks are not in {where}"),
-            (left, f"of {len(names)} specimens in {where} have no row in {given.where} and are left out"),
-        )
-        if some
-    ]
-    rows = [specimen for specimen, _ in found]
+    rows, notes = [specimen for specimen, _ in found], list[str]()
+    note_unmatched(notes, given, keys, number, [names[k] for k in rows], names, where)
     joined = {**own.take(rows).columns, **given.take([row for _, row in found]).columns}
     return rows, Table(joined, tuple(names[k] for k in rows), given.where), notes

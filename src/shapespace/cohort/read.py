@@ -13,7 +13,7 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort, Fitted, ShapeSource
 from shapespace.cohort.landmark_cohort import has_landmarks, landmark_cohort, read_landmark_cohort
-from shapespace.cohort.table import Table, list_names, read_table
+from shapespace.cohort.table import Table, list_names, note_unmatched, read_table
 from shapespace.errors import InputError
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.landmarks.landmark_io import read_surface_landmarks
@@ -191,14 +191,14 @@ def _of_results(
     else:
         by_key = _by_key(rows)
         pairs = [(by_key[key], index) for index, key in enumerate(keys) if key in by_key]
-        _note_unmatched(
+        note_unmatched(
             notes=notes,
             table=table,
             keys=keys,
             available=by_key,
             used=[row.name for row, _ in pairs],
             names=[row.name for row in rows],
-            folder=results.folder,
+            where=results.folder,
         )
     accepted = [(row, index) for row, index in pairs if row.status in used]
     for status, count in Counter(row.status for row, _ in pairs if row.status not in used).items():
@@ -286,14 +286,14 @@ def _of_surfaces(
         listing.refuse_mixed_units()
     files = {surface_stem(file): file for file in listing.files if file.suffix.lower() != ".csv"}
     matched = [(files[key], row_index) for row_index, key in enumerate(keys) if key in files]
-    _note_unmatched(
+    note_unmatched(
         notes=notes,
         table=table,
         keys=keys,
         available=files,
         used=[surface_stem(file) for file, _ in matched],
         names=list(files),
-        folder=folder,
+        where=folder,
     )
     least = config.least if onto is None else 1
     if len(matched) < least:
@@ -311,39 +311,6 @@ def _of_surfaces(
     corresponding = all(file.name.endswith(SURFACE) for file, _ in matched)
     source = ShapeSource("corresponding" if corresponding else "surfaces")
     return replace(cohort, notes=(*notes, *cohort.notes), source=source)
-
-
-def _note_unmatched(
-    notes: list[str],
-    table: Table,
-    keys: Sequence[str],
-    available: Mapping[str, Any],
-    used: Sequence[str],
-    names: Sequence[str],
-    folder: Path,
-) -> None:
-    """Add a note on rows without a shape and shapes without a row.
-
-    Raises:
-        InputError: no row has a shape.
-    """
-    unknown = [key for key in keys if key not in available]
-    if len(unknown) == len(keys):
-        raise InputError(
-            f"{folder} holds no shape of {table.where} (such as {list_names(unknown)}; there is {list_names(names)}); "
-            "give the folder of its shapes with --shapes."
-        )
-    if unknown:
-        notes.append(
-            f"{len(unknown)} of {len(keys)} rows of {table.where} are left out, whose shape is not in "
-            f"{folder} ({list_names(unknown)})."
-        )
-    unmatched = sorted(set(names) - set(used))
-    if unmatched:
-        notes.append(
-            f"{len(unmatched)} of {len(names)} shapes in {folder} have no row in {table.where} "
-            f"({list_names(unmatched)})."
-        )
 
 
 def _by_key(rows: Sequence[_Row]) -> dict[str, _Row]:

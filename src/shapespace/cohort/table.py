@@ -192,6 +192,39 @@ def list_names(names: Sequence[str]) -> str:
     return ", ".join(names[:_NAMED]) + _others_note(len(names) - _NAMED)
 
 
+def note_unmatched(
+    notes: list[str],
+    table: Table,
+    keys: Sequence[str],
+    available: Mapping[str, object],
+    used: Sequence[str],
+    names: Sequence[str],
+    where: Path | str,
+) -> None:
+    """Add a note on rows without a shape and shapes without a row.
+
+    Raises:
+        InputError: no row has a shape.
+    """
+    unknown = [key for key in keys if key not in available]
+    if len(unknown) == len(keys):
+        raise InputError(
+            f"{where} holds no shape of {table.where} (such as {list_names(unknown)}; there is {list_names(names)}); "
+            "give the folder of its shapes with --shapes."
+        )
+    if unknown:
+        notes.append(
+            f"{len(unknown)} of {len(keys)} rows of {table.where} are left out, whose shape is not in "
+            f"{where} ({list_names(unknown)})."
+        )
+    unmatched = sorted(set(names) - set(used))
+    if unmatched:
+        notes.append(
+            f"{len(unmatched)} of {len(names)} shapes in {where} have no row in {table.where} "
+            f"({list_names(unmatched)})."
+        )
+
+
 def numbers_as_text(values: FloatArray) -> tuple[str, ...]:
     """Return text cells that parse to the same numbers; NaN becomes an empty cell."""
     return tuple("" if np.isnan(value) else repr(float(value)) for value in values)

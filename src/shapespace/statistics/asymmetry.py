@@ -26,10 +26,8 @@ from shapespace.geometry.similarity import fit_similarity
 from shapespace.reprs import list_briefly, short_repr
 from shapespace.schemas import Methods, SampleSize, TestScheme
 from shapespace.statistics.analysis_result import AnalysisResult
-from shapespace.statistics.effect_size import effect_size
 from shapespace.statistics.methods import methods_of
 from shapespace.statistics.observation_weights import weights_of
-from shapespace.statistics.shape_tests.permutations import orders
 from shapespace.statistics.sides import Sides, aligned_shapes, find_sides, given_sides, match_sides
 from shapespace.step_counter import StepCounter
 from shapespace.types import BoolArray, FloatArray, Mesh, read_only, require
@@ -58,8 +56,6 @@ class AnovaRow:
         ms: ss / df.
         f: over `individual x side`, or for that over the asymmetric error; None where there is nothing to compare with.
         p: by permutation; None where nothing can be permuted.
-        z: F in standard deviations above the mean of its arrangements; only with the degrees of freedom of
-            `observations`.
     """
 
     source: str
@@ -68,7 +64,6 @@ class AnovaRow:
     ms: float
     f: float | None = None
     p: float | None = None
-    z: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,9 +249,8 @@ def measure_asymmetry(
         sides = find_sides(cohort) if pairs is None else given_sides(cohort, pairs, where)
         first, both = cohort, _with_images(cohort, sides)
     else:
-        matched = match_sides(cohort, subject, side)
-        cohort, both, sides = matched.cohort, matched.shapes, matched.sides
-        first = cohort.take(range(len(cohort) // 2))
+        cohort, sides = match_sides(cohort, subject, side)
+        first, both = cohort.take(range(len(cohort) // 2)), np.stack([cohort.vertices(k) for k in range(len(cohort))])
     names, codes = _subjects(first, subject)
     in_reference = _in_reference(first, names, codes, reference)
     symmetric, difference, mean = _split(first, sides, both)
@@ -282,13 +276,16 @@ def measure_asymmetry(
     if normals is not None and not sides.paired:
         # Places nearest on the mean leave its sides no difference along the surface, which single shapes have.
         parts = _along(symmetric, normals), along
-    if degrees_of_freedom == "klingenberg":
-        anova = _anova(*parts, who, sides.dimensions(scaled=cohort.gauge == "shape"), rng, steps)
-    else:
-        anova = _observed_anova(both.reshape(len(both), -1), codes, permutations, seed)
-    sizes = cohort.sizes_mm[:, None]
-    has_sizes = side is not None and bool(np.isfinite(sizes).all())
-    size_anova = _observed_anova(sizes, codes, permutations, seed) if has_sizes else ()
+    dimensions = sides.dimensions(scaled=cohort.gauge == "shape") if degrees_of_freedom == "klingenberg" else (1.0, 1.0)
+    anova = _anova(*parts, who, dimensions, rng, steps)
+    anova = anova if degrees_of_freedom == "klingenberg" else _pooled(anova)
+    size_anova: tuple[AnovaRow, ...] = ()
+    if side is not None and np.isfinite(cohort.sizes_mm).all():
+        one, other = cohort.sizes_mm[: len(first), None], cohort.sizes_mm[len(first) :, None]
+        own_steps = _Steps(4 * permutations, None)
+        size_anova = _pooled(
+            _anova((one + other) / 2, one - other, who, (1.0, 1.0), np.random.default_rng(seed), own_steps)
+        )
     directional = own.mean(axis=0) if normals is not None else np.linalg.norm(own.mean(axis=0), axis=1)
     observed = None if pairs_observed is None else who.of(pairs_observed.astype(np.float64)) >= _MOSTLY
     weight = None if observed is None else weights_of(observed.mean(axis=0))
@@ -482,75 +479,14 @@ def _anova(
     )
 
 
-def _observed_anova(
-    both: FloatArray, codes: npt.NDArray[np.intp], permutations: int, seed: int
-) -> tuple[AnovaRow, ...]:
-    """Return the Procrustes ANOVA with the degrees of freedom of the observations.
-
-    F of individuals and sides is over their interaction, and that of the interaction over the measurement error of
-    repeated shapes, as in geomorph. Arrangements: mean shapes of the sides of individuals permuted, signs of the
-    differences of individuals flipped, and differences of repeated shapes permuted.
-
-    Args:
-        both: (2P, K) of the first sides, then of the others.
-        codes: (P,) individuals.
-        permutations: number of permutations.
-        seed: of them.
-    """
-    pairs, n, count = len(codes), int(codes.max()) + 1, 1 + permutations
-    member = (codes[:, None] == np.arange(n)).astype(np.float64)
-    repeats = member.sum(axis=0)
-    half, difference = 0.5 * (both[:pairs] + both[pairs:]), both[:pairs] - both[pairs:]
-    centred, off = half - half.mean(axis=0), difference - difference.mean(axis=0)
-    between = member / repeats @ member.T
-    df = {"individual": n - 1, "side": 1, "individual x side": n - 1, MEASUREMENT_ERROR: 2 * (pairs - n)}
-    ss = {
-        "individual": 2.0 * float((between @ centred * centred).sum()),
-        "side": float((difference.sum(axis=0) ** 2).sum()) / (2 * pairs),
-        "individual x side": float((between @ off * off).sum()) / 2.0,
-    }
-    error_symmetric = 2.0 * float((centred**2).sum()) - ss["individual"]
-    asymmetric = float((off**2).sum()) / 2.0
-    ss[MEASUREMENT_ERROR] = max(asymmetric - ss["individual x side"], 0.0) + max(error_symmetric, 0.0)
-    f = {name: np.empty(count) for name in ("individual", "side", "individual x side")}
-
-    means = np.concatenate([(member / repeats).T @ both[:pairs], (member / repeats).T @ both[pairs:]])
-    weight = np.tile(repeats, 2)
-    means -= weight @ means / weight.sum()
-    gram = means @ means.T
-    one, other = (np.hstack([np.eye(n), sign * np.eye(n)]) * repeats[:, None] for sign in (1.0, -1.0))
-    contrast = other.sum(axis=0)
-    own = (one.T / (2 * repeats)) @ one - np.outer(weight, weight) / weight.sum()
-    noise = (other.T / (2 * repeats)) @ other - np.outer(contrast, contrast) / weight.sum()
-    for part, order in orders(2 * n, count, seed):
-        drawn = gram[order[:, :, None], order[:, None, :]].reshape(len(order), -1)
-        f["individual"][part] = drawn @ own.ravel() / np.maximum(drawn @ noise.ravel(), 1e-300)
-
-    sums = member.T @ difference
-    signs = np.random.default_rng([seed, 1]).choice([-1.0, 1.0], (count, n))
-    signs[0] = 1.0
-    side = np.einsum("pn,pn->p", signs @ (sums @ sums.T), signs) / (2 * pairs)
-    left = ss["side"] + ss["individual x side"] - side
-    f["side"] = side * (n - 1) / np.maximum(left, 1e-300)
-
-    gram = off @ off.T
-    for part, order in orders(pairs, count, seed):
-        drawn = gram[order[:, :, None], order[:, None, :]].reshape(len(order), -1)
-        within = drawn @ between.ravel() / 2.0
-        error = asymmetric - within + error_symmetric
-        f["individual x side"][part] = within / (n - 1) / np.maximum(error, 1e-300) * max(df[MEASUREMENT_ERROR], 1)
-
-    table: list[AnovaRow] = []
-    for name, squares in ss.items():
-        if not df[name]:
-            continue
-        if name not in f or (name == "individual x side" and not df[MEASUREMENT_ERROR]):
-            table.append(AnovaRow(name, squares, df[name], squares / df[name]))
-            continue
-        drawn = f[name]
-        p, z = (float((drawn >= drawn[0] * (1 - 1e-12)).mean()), effect_size(drawn)) if permutations else (None, None)
-        table.append(AnovaRow(name, squares, df[name], squares / df[name], float(drawn[0]), p, z))
-    return tuple(table)
+def _pooled(anova: Sequence[AnovaRow]) -> tuple[AnovaRow, ...]:
+    """Return an ANOVA of one dimension with the errors of both parts pooled, as geomorph has it."""
+    rows, errors = list(anova[:3]), anova[3:]
+    if errors:
+        ss, df = sum(row.ss for row in errors), sum(row.df for row in errors)
+        rows[2] = replace(rows[2], f=_f_ratio(rows[2].ms, ss / df))
+        rows.append(AnovaRow(MEASUREMENT_ERROR, ss, df, ss / df))
+    return tuple(rows)
 
 
 def _f_ratio(ms: float, error: float) -> float | None:

@@ -229,86 +229,58 @@ def given_sides(cohort: Cohort, pairs: Sequence[tuple[int, int]], where: str = "
     return replace(sides, off_share=share, notes=notes)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class MatchedSides:
-    """Pairs of shapes of two sides of a subject, such as left and right wings.
-
-    Args:
-        cohort: P shapes of the first side, then P of the other.
-        shapes: (2P, V, 3) of them, one side mirrored where the two sides were mirror images.
-        sides: with the names of the two.
-    """
-
-    cohort: Cohort
-    shapes: FloatArray
-    sides: Sides
-
-
-def match_sides(cohort: Cohort, subject: str | None, side: str) -> MatchedSides:
+def match_sides(cohort: Cohort, subject: str | None, side: str) -> tuple[Cohort, Sides]:
     """Return pairs of shapes of the two sides of each subject, its repeated shapes in the order of the table.
 
-    Where the mean of one side is the mirror image of the other, surfaces of one side are mirrored, and all are aligned
-    again.
-
     Args:
-        cohort: of separate left and right shapes.
+        cohort: of separate left and right shapes, one side reflected.
         subject: column of the subjects; None for `subject`.
         side: column of the sides.
 
+    Returns:
+        P shapes of the first side, then P of the other; and the two sides.
+
     Raises:
-        InputError: no such columns, other than two sides, no subject with both, or landmarks that are mirror images.
+        InputError: no such columns, other than two sides, no subject with both, or sides that are mirror images.
     """
-    cells, owners = cohort.table.texts(side), subjects_of(cohort, subject)
+    where, cells, owners = cohort.table.where, cohort.table.texts(side), subjects_of(cohort, subject)
     classes = tuple(sorted(set(cells) - {""}))
     if len(classes) != 2:
         raise InputError(
-            f"{cohort.table.where}: {side!r} has {len(classes)} classes ({list_names(classes)}); two sides need one "
-            "each."
+            f"{where}: {side!r} has {len(classes)} classes ({list_names(classes)}), not one for each side."
         )
     rows: tuple[list[int], list[int]] = [], []
     for owner in dict.fromkeys(owners):
         own = [[k for k, cell in enumerate(cells) if cell == one and owners[k] == owner] for one in classes]
         for both, part in zip(rows, own, strict=True):
             both += part[: min(map(len, own))]
-    left = [cohort.names[k] for k in sorted(set(range(len(cohort))) - {*rows[0], *rows[1]})]
     if not rows[0]:
-        raise InputError(f"{cohort.table.where}: no subject has both sides; name the subjects with --subject.")
-    notes = [f"{len(left)} shapes without a counterpart on the other side are left out ({list_names(left)})."]
-    notes = notes if left else []
-    matched = cohort.take([*rows[0], *rows[1]])
-    shapes, n = np.stack([matched.vertices(k) for k in range(len(matched))]), len(rows[0])
-    first, second = shapes[:n].mean(axis=0), shapes[n:].mean(axis=0)
+        raise InputError(f"{where}: no subject has both sides; name the subjects with --subject.")
+    left = [cohort.names[k] for k in sorted(set(range(len(cohort))) - {*rows[0], *rows[1]})]
+    note = f"{len(left)} shapes without a counterpart on the other side are left out ({list_names(left)})."
+    one, other = (cohort.vertices(cohort.coefficients[part].mean(axis=0)) for part in rows)
 
     def off(image: FloatArray) -> float:
-        placed = fit_similarity(image, first, with_scale=False).apply(image)
-        return float(np.sqrt(((placed - first) ** 2).sum(axis=1).mean())) / rms_size(first)
+        return float(np.linalg.norm(fit_similarity(image, one, with_scale=False).apply(image) - one))
 
-    share = off(second)
-    if off(second * FLIP) <= _MIRROR_IMAGE * share:
-        if cohort.source.kind == "landmarks":
-            # Mirror images have no common mean, onto whose tangent space their landmarks could be projected.
-            raise InputError(
-                f"{cohort.table.where}: landmarks with {side} {classes[1]} are mirror images of the others; reflect "
-                f"them before the alignment, with shapespace align --reflect {side}={classes[1]}."
-            )
-        shapes[n:] *= FLIP
-        shapes = aligned_shapes(matched, shapes)
-        share = off(second * FLIP)
-        notes.append(f"Shapes with {side} {classes[1]} are mirrored, since the two sides are mirror images.")
-    vertices = np.arange(cohort.n_vertices, dtype=np.int32)
-    corners, weights = _alone(vertices)
+    if off(other * FLIP) <= _MIRROR_IMAGE * off(other):
+        raise InputError(
+            f"{where}: shapes with {side} {classes[1]} are mirror images of the others; reflect them before the "
+            f"alignment, landmarks with shapespace align --reflect {side}={classes[1]}."
+        )
+    corners, weights = _alone(np.arange(cohort.n_vertices, dtype=np.int32))
     sides = Sides(
-        vertices=vertices,
+        vertices=np.arange(cohort.n_vertices, dtype=np.int32),
         faces=cohort.faces,
         corners=corners,
         weights=weights,
         paired=True,
-        off_share=share,
-        notes=tuple(notes),
+        off_share=off(other) / float(np.linalg.norm(one - one.mean(axis=0))),
+        notes=(note,) if left else (),
         space=cohort.dimensions,
         classes=classes,
     )
-    return MatchedSides(cohort=matched, shapes=shapes, sides=sides)
+    return cohort.take([*rows[0], *rows[1]]), sides
 
 
 def aligned_shapes(cohort: Cohort, shapes: FloatArray) -> FloatArray:

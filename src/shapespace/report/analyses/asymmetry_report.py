@@ -198,30 +198,26 @@ def _p_text(effect: AnovaRow) -> str:
 
 def _anova_parts(result: AsymmetryResult) -> tuple[TablePart, ...]:
     lengths = _lengths(result)
-    has_z = any(e.z is not None for e in (*result.anova, *result.size_anova))
-    names = (lengths.label("SS", "²"), "df", lengths.label("MS", "²"), "F", *(("Z",) if has_z else ()))
-    columns = (
-        TableColumn(name="source"),
-        *(TableColumn(name=name, kind="number") for name in names),
-        TableColumn(name="p", kind="p"),
-    )
-
-    def part(title: str, anova: Sequence[AnovaRow], note: str) -> TablePart:
-        rows = tuple((e.source, e.ss, e.df, e.ms, e.f, *((e.z,) if has_z else ()), e.p) for e in anova)
-        return TablePart(title=title, columns=columns, rows=rows, note=note)
-
-    note = "Degrees of freedom are those of the subjects times the dimensions of the shapes."
-    observed = "Degrees of freedom are those of the observations, sums of squares of type I."
-    parts = [part("Procrustes ANOVA", result.anova, note if result.degrees_of_freedom == "klingenberg" else observed)]
+    names = (lengths.label("SS", "²"), "df", lengths.label("MS", "²"), "F")
+    numbers = (TableColumn(name=name, kind="number") for name in names)
+    columns = (TableColumn(name="source"), *numbers, TableColumn(name="p", kind="p"))
+    note = "df are those of subjects times dimensions."
+    observed = "df are those of the observations."
+    parts = [("Procrustes ANOVA", result.anova, note if result.degrees_of_freedom == "klingenberg" else observed)]
     if result.size_anova:
-        parts.append(part("ANOVA of centroid size", result.size_anova, observed))
-    return tuple(parts)
+        parts.append(("ANOVA of centroid size", result.size_anova, observed))
+    return tuple(
+        TablePart(
+            title=title, columns=columns, rows=tuple((e.source, e.ss, e.df, e.ms, e.f, e.p) for e in anova), note=text
+        )
+        for title, anova, text in parts
+    )
 
 
 def _anova_rows(result: AsymmetryResult, anova: Sequence[AnovaRow]) -> Rows:
     field = _lengths(result).field
-    return ("source", field("ss", "2"), "df", field("ms", "2"), "f", "z", "p"), [
-        (e.source, e.ss, e.df, e.ms, *("" if value is None else value for value in (e.f, e.z, e.p))) for e in anova
+    return ("source", field("ss", "2"), "df", field("ms", "2"), "f", "p"), [
+        (e.source, e.ss, e.df, e.ms, "" if e.f is None else e.f, "" if e.p is None else e.p) for e in anova
     ]
 
 
