@@ -35,14 +35,27 @@ _SHARES: Mapping[OrdinationMethod, str] = {
 """What shares of axes refer to, where it is not the variance of the shapes."""
 _CITATIONS: Mapping[OrdinationMethod, tuple[str, ...]] = {
     "pca": (),
-    "between-groups": ("Cardini, O'Higgins and Rohlf (2019) Evolutionary Biology 46:303–316.",),
-    "cva": (
-        "Campbell and Atchley (1981) Systematic Zoology 30:268–280.",
-        "Venables and Ripley (2002) Modern Applied Statistics with S, 4th edition, Springer.",
+    "between-groups": (
+        "Cardini A., O'Higgins P., Rohlf F. J. (2019) Seeing distinct groups where there are none: spurious patterns "
+        "from between-group PCA. Evolutionary Biology 46, 303-316.",
     ),
-    "phylogenetic-pca": ("Revell (2009) Evolution 63:3258–3268.",),
-    "paca": ("Collyer and Adams (2021) Methods in Ecology and Evolution 12:359–372.",),
+    "cva": (
+        "Campbell N. A., Atchley W. R. (1981) The geometry of canonical variate analysis. Systematic Zoology 30, "
+        "268-280.",
+    ),
+    "phylogenetic-pca": (
+        "Revell L. J. (2009) Size-correction and principal components for interspecific comparative studies. "
+        "Evolution 63, 3258-3268.",
+    ),
+    "paca": (
+        "Collyer M. L., Adams D. C. (2021) Phylogenetically aligned component analysis. Methods in Ecology and "
+        "Evolution 12, 359-372.",
+    ),
 }
+_PHYLOMORPHOSPACE = (
+    "Sidlauskas B. (2008) Continuous and arrested morphological diversification in sister clades of characiform "
+    "fishes: a phylomorphospace approach. Evolution 62, 3135-3156."
+)
 
 
 def morphospace_report(result: Ordination, first: tuple[int, int] = (1, 2)) -> AnalysisReport:
@@ -59,7 +72,6 @@ def morphospace_report(result: Ordination, first: tuple[int, int] = (1, 2)) -> A
     cohort, eigenvalues = result.cohort, _eigenvalue_table(result)
     variables = [(result.variable, _classes(result, result.groups.codes))] if result.groups is not None else []
     methods = methods_of(cohort, len(cohort), sizes=sample_sizes(cohort.names, variables))
-    phylomorphospace = ("Sidlauskas (2008) Evolution 62:3135–3156.",) if result.edges is not None else ()
     report = AnalysisReport(
         question="morphospace",
         title=f"Morphospace: {_AXES[result.method]}s",
@@ -75,7 +87,7 @@ def morphospace_report(result: Ordination, first: tuple[int, int] = (1, 2)) -> A
         },
         model_hashes=model_hashes(cohort),
         methods=methods,
-        citations=(*_CITATIONS[result.method], *phylomorphospace),
+        citations=(*_CITATIONS[result.method], *((_PHYLOMORPHOSPACE,) if result.edges is not None else ())),
     )  # fmt: skip
     return add_shape_data(report, cohort)
 
@@ -99,8 +111,9 @@ def morphospace_part(
     if len(shape_axes) == 1:
         residual = cohort.coefficients - result.centre - scores @ shape_axes
         _, s, vt = np.linalg.svd(residual, full_matrices=False)
-        across = residual @ vt[0]
-        scores, shape_axes = np.column_stack([scores, across]), np.vstack([shape_axes, vt[0]])
+        axis = vt[0] * np.sign(max(residual @ vt[0], key=abs))
+        across = residual @ axis
+        scores, shape_axes = np.column_stack([scores, across]), np.vstack([shape_axes, axis])
         validated = None if validated is None else np.column_stack([validated, across])
         names, shares = [*names, "residual PC1"], [*shares, s[0] ** 2 / max((s**2).sum(), np.finfo(np.float64).tiny)]
     shown = min(max(_SHOWN_AXES, *first), len(shape_axes))
@@ -115,7 +128,7 @@ def morphospace_part(
         "shape_axes": (shape_axes[:shown] @ cohort.basis).reshape(shown, -1, 3),
         "faces": np.zeros((0, 3), dtype=np.int32) if cohort.faces is None else cohort.faces,
     }
-    note = f"The axes have their share of the {_SHARES.get(result.method, 'variance')}."
+    note = f"Labels of axes give their share of the {_SHARES.get(result.method, 'variance')}."
     if result.groups is not None:
         arrays["groups"] = result.groups.codes
         note += " Convex hulls and 95 % ellipses are those of the groups."

@@ -638,7 +638,9 @@
     if (!facts.planar) {
       const view = new Shapespace.View(element, { label }), at = (p, v) => [p[3 * v], p[3 * v + 1], p[3 * v + 2]];
       view.setSurface("shape", { positions: mean, faces, colour: faces ? colours().clay : colours().model });
-      view.frame(["shape"], 1.1);
+      view.frame(["shape"], faces ? 1.1 : 1.3);
+      // Landmarks are small, so that the vectors from those of the mean are seen.
+      if (!faces && L <= 500) view.setSurface("shape", { positions: mean, colour: colours().model, size: 0.035 * Math.max(...view.camera.extent) });
       return { view, show: (positions) => {
         view.move("shape", positions);
         if (facts.links.length) view.lines("links", facts.links.flat().map((v) => at(positions, v)), colours().unknown);
@@ -853,6 +855,6 @@
       new ResizeObserver(redraw).observe(plot);
       drawPlot();
       moveTo(0, 0);
-      return { view: { works: true }, place, pixels, at };
+      return { view: { works: true } }; // without WebGL too, where the pictures say so
     });
 })();

@@ -15,6 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from shapespace.errors import ShapespaceError
 from shapespace.geometry.thin_plate_spline import ThinPlateSpline
+from shapespace.report.analyses.shape_data import MOST_LANDMARKS
 from shapespace.report.figures.analysis_figures import upright_views
 from shapespace.report.figures.deformation_figures import draw_links, grid_lines
 from shapespace.report.figures.draw import (
@@ -192,11 +193,12 @@ def _draw_shapes(row: Axes, space: Morphospace) -> None:
         named = [low, *named, high]
     points = np.concatenate([vertices for _, vertices in named])
     seen, (low, high) = view(points, len(named)), (points.min(axis=0), points.max(axis=0))
+    room = 0.04 * float((high - low).max())
     for k, (name, vertices) in enumerate(named):
         panel = row.inset_axes(((k + 0.02) / len(named), 0.0, 0.96 / len(named), 0.76))
         panel.set_axis_off()
         panel.set_title(escaped(name), fontsize=type_size(SMALL), color=INK, pad=2)
-        if not space.is_planar:
+        if space.faces is not None or space.n_landmarks > MOST_LANDMARKS:
             panel.imshow(render(Layer(Mesh(vertices, space.faces)), camera=seen.camera, size=seen.size))
             continue
         landmarks = vertices[: space.n_landmarks, :2]
@@ -204,4 +206,4 @@ def _draw_shapes(row: Axes, space: Morphospace) -> None:
         panel.add_collection(LineCollection(list(lines), colors=GREY, alpha=0.5, linewidths=type_size(0.5)))
         draw_links(panel, landmarks, INK, type_size(0.9))
         panel.scatter(*landmarks.T, s=type_size(6), color=INK, linewidths=0, zorder=3)
-        panel.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+        panel.set(xlim=(low[0] - room, high[0] + room), ylim=(low[1] - room, high[1] + room), aspect="equal")
