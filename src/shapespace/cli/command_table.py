@@ -209,12 +209,17 @@ def _identity() -> tuple[Option, ...]:
     )
 
 
+_BASIC_OF_TEST = 4
+"""First options of a test that `--help` lists, beside those that all tests have."""
+
+
 def _shape_test(test: ShapeTest) -> Command:
     """Return the command of a test of shape."""
     source = Source(f"statistics.shape_tests.{test.module}", test.function)
     own = tuple(
-        basic(f"--{field.replace('_', '-')}", metavar, source=source, field=field, required=field in test.required)
-        for field, metavar in test.options.items()
+        Option(f"--{field.replace('_', '-')}", metavar, source=source, field=field, required=field in test.required,
+               basic=number < _BASIC_OF_TEST)
+        for number, (field, metavar) in enumerate(test.options.items())
     )
     return Command(
         f"test {test.name}", test.summary, (test.example,), shape_tests.run,
@@ -644,8 +649,8 @@ COMMANDS: tuple[Command, ...] = (
             advanced("--iterations", "N", source=ALIGN, parse=values.positive),
         ),
         (
-            "Writes aligned.csv (name, covariates, coordinates, centroid size), mean.csv, estimated.csv (landmarks that "
-            "are estimates) and align.json. The commands about cohorts, such as compare, take the folder. Conventions "
+            "Writes aligned.csv (name, covariates, centroid size, coordinates), mean.csv, estimated.csv (the estimated "
+            "landmarks) and align.json. The commands about cohorts, such as compare, take the folder. Conventions "
             "are those of gpagen in geomorph, but the set is never reflected. Specimens that are outliers, mirrored or "
             "have swapped landmarks are named.",
         ),

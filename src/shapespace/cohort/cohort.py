@@ -601,7 +601,7 @@ def _orthonormal(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
 
     Coordinates that are 0 in all rows, such as z of planar landmarks, are 0 in the basis, without rounding.
     """
-    varying = rows.any(axis=0)
+    varying = rows.any(axis=0) | ~rows.any()
     q, r = np.linalg.qr(rows[:, varying].T)
     basis = np.zeros((q.shape[1], rows.shape[1]))
     basis[:, varying] = q.T
