@@ -269,7 +269,7 @@ def test_designs_that_cannot_be_tested_are_refused() -> None:
 
 @pytest.mark.parametrize("method", ["signal", "pgls"])
 def test_species_without_signal_or_effect_are_significant_in_about_5_percent(method: str) -> None:
-    """2,000 simulations of 200 permutations are in docs/morphometrics.md."""
+    """2,000 simulations and more of 200 permutations are in docs/morphometrics.md."""
     rng = np.random.default_rng(10)
     significant = 0
     for seed in range(60):

@@ -63,7 +63,7 @@ class Tree:
     def covariance(self) -> FloatArray:
         """(T, T) lengths of the paths from the root that tips share: covariances of Brownian motion of rate 1."""
         own = self.paths[: len(self.tips)]
-        return read_only(own @ own.T)  # M50
+        return read_only(own @ own.T)
 
     @property
     def edges(self) -> IntArray:

@@ -172,7 +172,7 @@ def compare_effect_sizes(first: Statistic, second: Statistic) -> Statistic:
     """
     if first.z is None or second.z is None or min(len(first.arrangements), len(second.arrangements)) < 3:
         raise InputError("Effect sizes are compared by Z, which needs permutations; repeat both tests with them.")
-    z = (first.z - second.z) / math.sqrt(sum(1 - 1 / (len(one.arrangements) - 1) for one in (first, second)))  # M45
+    z = (first.z - second.z) / math.sqrt(sum(1 - 1 / (len(one.arrangements) - 1) for one in (first, second)))  # M44
     return Statistic(name=f"difference of Z of {first.name}", value=z, z=z, p=math.erfc(abs(z) / math.sqrt(2)))
 
 
@@ -290,7 +290,7 @@ def _indicator(codes: Orders, count: int) -> FloatArray:
 
 
 def _ratios(sums: FloatArray, diagonal: FloatArray) -> FloatArray:
-    """Return CR (b, pairs, A) from sums of squared covariances (b, m, m), and squared variances (b, m, A) (M43)."""
+    """Return CR (b, pairs, A) from sums of squared covariances (b, m, m), and squared variances (b, m, A) (M42)."""
     m = sums.shape[1]
     within = sums[:, range(m), range(m), None] - diagonal
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -314,7 +314,7 @@ def _bootstrap(x: FloatArray, codes: Orders, samples: int, seed: int) -> FloatAr
     for a, b in itertools.combinations_with_replacement(range(m), 2):
         totals = (counts * means[a]).sum(axis=1) * (counts * means[b]).sum(axis=1)
         products = ((counts @ (grams[a] * grams[b]) - 2 * n * means[a] * means[b]) * counts).sum(axis=1)
-        sums[:, a, b] = sums[:, b, a] = products + totals  # M44
+        sums[:, a, b] = sums[:, b, a] = products + totals  # M43
     centres = [counts @ x[:, :, a] for a in range(x.shape[2])]
     moments = [counts @ (x[:, :, a] * x[:, :, b]) - centres[a] * centres[b] / n for a, b in _moments(x)]
     diagonal = _at(_indicator(codes[None], m) @ _squared_variances(moments), _BOOTSTRAP_ANGLES)

@@ -40,7 +40,7 @@ def _least_squares(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _transformation(covariance: FloatArray) -> FloatArray:
-    """Return the symmetric root (N, N) of the inverse of a covariance, which makes species independent."""
+    """Return the symmetric root (N, N) of the inverse of the covariance of species (M50)."""
     values, vectors = np.linalg.eigh(covariance)
     return (vectors / np.sqrt(values)) @ vectors.T
 
@@ -224,5 +224,6 @@ def fit_pgls(
         ),
         settings={"formula": formula, "tree": tree.where, "anova_type": anova_type, "permutations": permutations,
                   "seed": seed},
+        reduced_model=("reduced model of each term",),
         assumptions=("Residuals evolve by Brownian motion along the branches of the tree.",),
     )  # fmt: skip
