@@ -779,8 +779,9 @@ COMMANDS: tuple[Command, ...] = (
         ),
     ),
     Command(
-        "morphospace", "draw shapes on the axes of an ordination: principal components, canonical variates, phylogenetic",
-        ("shapespace morphospace people.csv --group sex -o morphospace",), morphospace.run,
+        "morphospace", "draw shapes on axes of an ordination, and the shape at any place: PCA, CVA, phylogenetic axes",
+        ("shapespace morphospace people.csv --group sex -o morphospace",
+         "shapespace morphospace species.tps --tree species.nwk --format pdf -o phylomorphospace"), morphospace.run,
         (
             *_cohort(),
             basic("--method", source=MORPHOSPACE),

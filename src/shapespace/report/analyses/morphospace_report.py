@@ -138,7 +138,7 @@ def morphospace_part(
         arrays |= {"nodes": result.ancestors[:, :shown], "edges": result.edges}
         note += " Lines are the phylogeny, with ancestral shapes by Brownian motion."
     part = MorphospacePart(
-        title=f"Morphospace: {_AXES[result.method]}s", level=2, note=note, arrays=FILE, names=cohort.names,
+        title="Morphospace", level=2, note=note, arrays=FILE, names=cohort.names,
         axes=tuple(names[:shown]), shares=tuple(map(float, shares[:shown])), first=(first[0] - 1, first[1] - 1),
         variable=result.variable, groups=() if result.groups is None else result.groups.names,
         unit="" if result.method == "cva" else cohort.unit,
