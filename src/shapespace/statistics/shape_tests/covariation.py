@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.errors import FileFormatError, InputError
@@ -70,9 +71,11 @@ def fit_pls(
     pairs = list(itertools.combinations(range(len(blocks)), 2))
     values = np.empty((permutations, len(pairs)))
     step = StepCounter(permutations, progress)
-    for part, rows in orders(len(cohort), permutations, seed):
-        values[part] = np.column_stack([_first_correlations(scores[a], scores[b], rows) for a, b in pairs])
-        step.add(len(rows))
+    # Threads of many small products wait for one another on a machine with other work.
+    with threadpool_limits(1, user_api="blas"):
+        for part, rows in orders(len(cohort), permutations, seed):
+            values[part] = np.column_stack([_first_correlations(scores[a], scores[b], rows) for a, b in pairs])
+            step.add(len(rows))
     result = ShapeTestResult(
         test=shape_test("pls" if columns else "integration"), cohort=cohort,
         statistics=_mean_and_pairs("r-PLS", values, list(blocks), "upper"),

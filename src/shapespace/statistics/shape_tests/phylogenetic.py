@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from shapespace.cohort.cohort import Cohort, with_columns
 from shapespace.io.trees import Tree, read_tree
@@ -145,13 +146,15 @@ def estimate_phylogenetic_signal(
     forms = np.column_stack([n * np.outer(weights, weights).ravel(), precision.ravel()])
     k = np.empty((permutations, 1 + components.shape[1]))
     step = StepCounter(permutations, progress)
-    for part, rows in orders(n, permutations, seed):
-        root, squares = np.stack([gram[np.ix_(order, order)].ravel() @ forms for order in rows]).T
-        k[part, 0] = ((s**2).sum() + root) / squares / expected  # M53
-        roots = np.tensordot(components[rows], weights, axes=(1, 0))
-        total = (components**2).sum(axis=0) + n * roots**2
-        k[part, 1:] = total / ((factor @ components[rows]) ** 2).sum(axis=1) / expected
-        step.add(len(rows))
+    # Threads of many small products wait for one another on a machine with other work.
+    with threadpool_limits(1, user_api="blas"):
+        for part, rows in orders(n, permutations, seed):
+            root, squares = np.stack([gram[np.ix_(order, order)].ravel() @ forms for order in rows]).T
+            k[part, 0] = ((s**2).sum() + root) / squares / expected  # M53
+            roots = np.tensordot(components[rows], weights, axes=(1, 0))
+            total = (components**2).sum(axis=0) + n * roots**2
+            k[part, 1:] = total / ((factor @ components[rows]) ** 2).sum(axis=1) / expected
+            step.add(len(rows))
     by_axis = [Statistic.of("K", k[:, j], f"principal component {j}") for j in range(1, k.shape[1])]
     table = TablePart(
         title="Phylogenetic signal of principal components",
