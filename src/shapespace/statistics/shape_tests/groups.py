@@ -31,7 +31,9 @@ _DRAWS = 2000  # bootstrap samples of a confidence interval; its limits then var
 _MOST_COMPONENTS = 10  # default limit for covariances; Mitteroecker and Bookstein (2009) take few components
 _SHAPES_PER_COMPONENT = 3  # in the smallest group; eigenvalues of fewer are too variable
 _CLEAR_MARGIN = 2.0  # times the distance by sampling alone; the level was 4 to 6 % from there on in simulations
+_ITERATIONS = 50  # of a spatial median; its error is then far below the standard error
 _BISECTIONS = 55  # halvings of an interval until float64 numbers are equal
+_RANK = 1e-9  # ratio of singular values; below is float64 rounding
 _TINY = 1e-7  # smallest score, in roots of the scatter; a smaller one changes no classification
 _SMALLEST = 1e-300  # avoids divisions by zero
 
@@ -42,6 +44,7 @@ def compare_disparity(
     group: tuple[str, ...],
     formula: str | None = None,
     partial: bool = False,
+    correct_leverage: bool = False,
     permutations: int = 1000,
     seed: int = 0,
     drop_missing: bool = False,
@@ -55,6 +58,8 @@ def compare_disparity(
         formula: linear model about whose predictions disparity is measured (default: ~ 1, the mean of all shapes).
         partial: partial disparities (Foote 1993): sums of squares about the mean of all shapes, divided by the number
             of all shapes - 1, so that those of the groups add up to the total disparity.
+        correct_leverage: divide squared residuals by 1 - leverage. Those of a model with the groups are else smaller in
+            small groups, which geomorph leaves so.
         permutations: number of permutations, including the observed data.
         seed: of the permutations, and of the bootstrap samples of the intervals.
         drop_missing: exclude shapes with missing values in the table (default: an error).
@@ -67,9 +72,13 @@ def compare_disparity(
         raise InputError("Partial disparities are about the mean of all shapes; leave out --formula or --partial.")
     cohort, groups = groups_of(cohort, group, drop_missing, 2, "a variance", formula)
     n, design = len(cohort), design_of(formula, cohort.table) if formula else None
-    q = np.linalg.qr(np.column_stack([np.ones(n), design.matrix] if design else [np.ones(n)]))[0]
+    columns = np.column_stack([np.ones(n), design.matrix]) if design else np.ones((n, 1))
+    q, size, _ = np.linalg.svd(columns, full_matrices=False)
+    q = q[:, size > _RANK * size[0]]
     # Rows of residuals are permuted, so their squared norms are.
     squares = ((cohort.coefficients - q @ (q.T @ cohort.coefficients)) ** 2).sum(axis=1)
+    if correct_leverage:
+        squares = squares / np.maximum(1 - (q**2).sum(axis=1), _TINY)
     divisor = np.full(len(groups.names), n - 1.0) if partial else groups.counts.astype(np.float64)
     variances = permuted(n, permutations, seed, lambda rows: groups.sums(squares[:, None], rows)[..., 0], progress)
     variances /= divisor  # M20
@@ -83,7 +92,8 @@ def compare_disparity(
     rows = [(s.tested, int(count), s.value, s.low, s.high) for s, count in zip(limits, groups.counts, strict=True)]
     return group_result(
         "disparity", cohort, group, [*_pairs("difference of disparity", groups, differences), *limits],
-        {"formula": formula, "partial": partial, "permutations": permutations, "seed": seed},
+        {"formula": formula, "partial": partial, "correct_leverage": correct_leverage, "permutations": permutations,
+         "seed": seed},
         tables=(table_part("Disparity", kinds, rows),),
         reduced_model=tuple(term.label for term in design.terms) if design else (),
     )  # fmt: skip
@@ -131,7 +141,11 @@ def compare_means_and_covariances(
     cohort, groups = groups_of(cohort, group, drop_missing, 3, "a covariance matrix")
     n, counts = len(cohort), groups.counts
     centred = cohort.coefficients - cohort.coefficients.mean(axis=0)
-    residual = groups.residuals(centred)
+    # Residuals of spatial medians, since an outlier moves a mean and so the residuals of its whole group.
+    residual, scale = np.empty_like(centred), np.empty((n, 1))
+    for own in (groups.codes == k for k in range(len(counts))):
+        residual[own] = centred[own] - _spatial_median(centred[own])
+        scale[own] = max(float(np.median(np.linalg.norm(residual[own], axis=1))), _SMALLEST)
     scores = residual @ principal_components(residual)[1].T
     most = min(int(counts.min()) - 2, scores.shape[1])
     usual = min(max(int(counts.min()) // _SHAPES_PER_COMPONENT, 1), _MOST_COMPONENTS, most)
@@ -141,9 +155,9 @@ def compare_means_and_covariances(
             f"Covariance matrices of {used} components are singular: the smallest group has {counts.min()} shapes, and "
             f"shapes vary in {scores.shape[1]} dimensions within groups; take 1 to {most} components."
         )
-    scores = scores[:, :used]
-    # Proportional covariance matrices are exchangeable once the groups have the same total variance.
-    scaled = scores / np.sqrt(np.bincount(groups.codes, (scores**2).sum(axis=1)) / counts)[groups.codes, None]
+    # Proportional covariance matrices are exchangeable once the groups have the same scale.
+    scores, scaled = scores[:, :used], residual / scale
+    scaled = scaled @ principal_components(scaled)[1][:used].T
 
     def statistics(rows: Orders) -> FloatArray:
         means = groups.sums(centred, rows) / counts[:, None]
@@ -173,10 +187,10 @@ def compare_means_and_covariances(
         ],
         {"components": used, "permutations": permutations, "seed": seed},
         assumptions=(
-            f"Covariance matrices are compared in the first {used} principal components of the residuals of the group "
-            "means, which are corrected for the size of the group and permuted among all groups; this assumes that "
-            "they have the same distribution in all groups, for the relative covariance after division by the "
-            "standard deviation of each group. F with unequal covariances is tested by sign flips of residuals.",
+            f"Covariance matrices are compared in the first {used} principal components of the residuals of the "
+            "spatial medians of the groups, which are permuted among all groups; this assumes that they have the same "
+            "distribution in all groups, for the relative covariance after division by the median length of the "
+            "residuals of each group. F with unequal covariances is tested by sign flips of residuals.",
         ),
     )  # fmt: skip
 
@@ -188,6 +202,15 @@ def _covariances(groups: Groups, scores: FloatArray, rows: Orders) -> FloatArray
     sums = groups.sums(np.hstack([scores, products]), rows)
     means, squares = sums[..., :q] / counts[..., 0], sums[..., q:].reshape(*sums.shape[:2], q, q)
     return (squares - counts * means[..., :, None] * means[..., None, :]) / (counts - 1)
+
+
+def _spatial_median(values: FloatArray) -> FloatArray:
+    """Return the point (K,) with the smallest sum of distances to values (n, K), by the algorithm of Weiszfeld."""
+    median = values.mean(axis=0)
+    for _ in range(_ITERATIONS):
+        weights = 1 / np.maximum(np.linalg.norm(values - median, axis=1), _SMALLEST)
+        median = weights @ values / weights.sum()
+    return median
 
 
 def _log_ratios(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -315,10 +338,8 @@ def _mean_distances(coefficients: FloatArray, groups: Groups, drawn: FloatArray)
     distances: list[_MeanDistance] = []
     for pair in map(list, groups.pairs):
         size, own = counts[pair], variances[:, pair]
-        (error, share), difference = (
-            (one[:, pair[0]] - one[:, pair[1]] for one in (off, shares)),
-            np.diff(means[pair[::-1]], axis=0)[0],
-        )
+        error, share = (one[:, pair[0]] - one[:, pair[1]] for one in (off, shares))
+        difference = means[pair[0]] - means[pair[1]]
         along, weights = residual @ difference, (groups.indicator[:, pair] / size**2).sum(axis=1)
         within = float(own[0] @ (size - 1) / (size.sum() - 2))
         distances.append(_MeanDistance(
@@ -363,6 +384,11 @@ def discriminate(
     used = discriminant_components(cohort.coefficients, groups, components)
     centre, axes, variances = principal_components(cohort.coefficients)
     scores, squares = (cohort.coefficients - centre) @ axes.T, variances * (n - 1)
+    if np.linalg.matrix_rank(groups.residuals(scores[:, :used])) < used:
+        raise InputError(
+            f"In some direction of {used} principal components the shapes of each group are equal, so the covariance "
+            "within groups is singular; take fewer with --components."
+        )
     rows = np.concatenate([one for _, one in orders(n, permutations, seed)])
     codes, labels = groups.codes[rows], groups.labels(rows)[:, 1:].reshape(-1, n)
 

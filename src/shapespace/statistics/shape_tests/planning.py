@@ -77,10 +77,11 @@ def plan_sample_size(
         simulated = Groups(groups.names, np.repeat(np.arange(len(groups.names)), size))
         for _ in range(simulations):
             shapes = simulate(simulated.codes, rng)
-            drawn = orders(len(shapes), permutations, seed + step.done)
-            between: FloatArray = np.concatenate(
-                [(simulated.sums(shapes, rows) ** 2).sum(axis=(1, 2)) for _, rows in drawn]
+            products = shapes @ shapes.T
+            labels = np.concatenate(
+                [simulated.labels(r) for _, r in orders(len(shapes), permutations, seed + step.done)]
             )
+            between = (labels * (labels.reshape(-1, len(shapes)) @ products).reshape(labels.shape)).sum(axis=(1, 2))
             found += bool((between >= between[0] * (1 - _TIE)).mean() <= _LEVEL)
             step.add()
         low, high = map(float, binomtest(found, simulations).proportion_ci(method="wilson"))
@@ -135,7 +136,7 @@ def _distance(effect: str, observed: float, corrected: float) -> float:
 def _simulator(
     residual: FloatArray, means: FloatArray, deviations: FloatArray, groups: Groups
 ) -> Callable[[Orders, np.random.Generator], FloatArray]:
-    """Return a function that simulates shapes (n, d) of groups (n,), up to a rotation, by a smoothed bootstrap.
+    """Return a function that simulates centred shapes (n, d) of groups (n,), in rotated axes, by a smoothed bootstrap.
 
     Residuals (N, K) of all groups are pooled after division by the standard deviation of their group. The noise lies in
     their span, so that a singular covariance stays one.
@@ -154,9 +155,7 @@ def _simulator(
         drawn = (drawn + width * spread * rng.normal(size=drawn.shape)) / math.hypot(1, width)
         shapes = centres[codes]
         shapes[:, : scores.shape[1]] += deviations[codes, None] * drawn
-        shapes -= shapes.mean(axis=0)
-        # Tests depend on products alone, which fewer coordinates than dimensions have too.
-        return shapes if shapes.shape[1] <= len(shapes) else np.linalg.qr(shapes.T)[1].T
+        return shapes - shapes.mean(axis=0)
 
     return simulate
 
