@@ -11,6 +11,7 @@ from pathlib import Path
 
 from shapespace.cli.command_table import COMMANDS, Command
 from shapespace.cli.options import Option
+from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 GENERATED = "<!-- Written by tools/make_cli_reference.py; edit src/shapespace/cli/command_table.py. -->\n\n"
@@ -20,6 +21,7 @@ PAGES = {
     "data list": ["data.md"],
     "data organs": ["data.md"],
     "data bones": ["data.md", "tutorial-bones.md"],
+    "data landmarks": ["data.md", "tutorial-landmarks.md"],
     "surface": ["volumes.md", "tutorial-volumes.md"],
     "check": ["mesh-formats.md"],
     "correspond": ["correspondence.md", "landmarks.md"],
@@ -40,7 +42,10 @@ PAGES = {
     "recognise study": ["recognise.md", "data.md"],
     "recognise verify": ["identity.md", "statistics.md"],
     "recognise identify": ["identity.md", "statistics.md"],
+    "align": ["morphometrics.md", "tutorial-landmarks.md"],
+    "morphospace": ["morphometrics.md", "tutorial-landmarks.md"],
     "compare": ["compare.md", "statistics.md"],
+    **{f"test {test.name}": ["morphometrics.md", "statistics.md"] for test in SHAPE_TESTS},
     "change": ["change.md", "statistics.md"],
     "asymmetry": ["asymmetry.md", "statistics.md"],
     "regress": ["regress.md", "statistics.md"],
