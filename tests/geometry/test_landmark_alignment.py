@@ -230,21 +230,44 @@ def test_structures_are_aligned_separately_at_their_relative_sizes() -> None:
 
 def test_outliers_swapped_and_mirrored_specimens_are_named() -> None:
     points = sample(30, 10, 3, noise=0.05, seed=3)
-    assert all(one.reason == "outlier" for one in find_outliers(align_landmarks(configurations(points))))
+    assert find_outliers(align_landmarks(configurations(points))) == ()
     points[4] *= [-1, 1, 1]
     points[9, [2, 6]] = points[9, [6, 2]]
     points[20, 0] += 0.8 * np.linalg.norm(points[20] - points[20].mean(axis=0))
     found = {one.specimen: one for one in find_outliers(align_landmarks(configurations(points)))}
     assert found["s4"].reason == "mirrored" and found["s20"].reason == "outlier"
+    assert found["s20"].landmarks == ("1",) and "its landmark 1 lies" in str(found["s20"])
     assert found["s9"].reason == "swapped" and found["s9"].landmarks == ("3", "7")
     assert str(found["s9"]).startswith("s9: exchange of the landmarks 3 and 7 reduces")
 
 
-def test_published_sets_have_no_swapped_or_mirrored_specimens(reference: dict[str, Any]) -> None:
+@pytest.mark.parametrize("shared", [0.0, 0.8])
+def test_few_clean_sets_have_an_outlier_and_a_displaced_landmark_is_named(shared: float) -> None:
+    """Of 200 sets each of 20 to 400 specimens 0 to 6 % have one; here with the bounds of 30, on equal or one axis."""
+    rng = np.random.default_rng(6)
+    clean = named = 0
+    for _ in range(30):
+        base, axis = rng.normal(size=(2, 15, 3))
+        axis /= np.linalg.norm(axis)
+        spread = 0.2 * (rng.normal(size=(40, 15, 3)) * np.sqrt((1 - shared) / 45))
+        points = base + spread + 0.2 * np.sqrt(shared) * rng.normal(size=(40, 1, 1)) * axis
+        clean += bool(find_outliers(align_landmarks(configurations(points))))
+        points[7, 4] += 0.1 * np.linalg.norm(base - base.mean(axis=0)) * np.array([0.6, 0.0, 0.8])
+        found = find_outliers(align_landmarks(configurations(points)))
+        named += any((one.specimen, one.reason, one.landmarks) == ("s7", "outlier", ("5",)) for one in found)
+    assert clean <= 5 and named >= 27
+
+
+def test_specimens_that_are_all_alike_have_no_outlier() -> None:
+    points = posed(np.repeat(np.random.default_rng(7).normal(size=(1, 9, 2)), 12, axis=0), np.random.default_rng(8))
+    assert find_outliers(align_landmarks(configurations(points))) == ()
+
+
+def test_published_sets_have_no_findings(reference: dict[str, Any]) -> None:
     for key, L in (("plethodon_raw", 12), ("food_raw", 13), ("humming_raw", 25)):
         points = np.array(reference[key], dtype=np.float64).reshape(-1, L, 2)
         found = find_outliers(align_landmarks(configurations(points)))
-        assert {one.reason for one in found} <= {"outlier"}
+        assert found == ()
 
 
 def line(points: FloatArray) -> None:
