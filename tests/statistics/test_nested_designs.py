@@ -1,6 +1,7 @@
 """Error terms of nested and mixed designs: sums of squares by hand, scipy's F, permutation of units, and refusals."""
 
 import argparse
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -63,6 +64,28 @@ def test_sums_of_squares_are_those_by_hand_and_f_is_over_the_error_term(unequal:
     assert first.r2 == pytest.approx(a / total)
     assert first.f == pytest.approx((a / 2) / (b / 9))
     assert second.f == pytest.approx((b / 9) / ((total - a - b) / (len(cohort) - 12)))
+
+
+@pytest.mark.parametrize("unequal", [False, True])
+def test_type_iii_with_treatment_coding_compares_genera_in_their_first_species_as_in_r(unequal: bool) -> None:
+    cohort = simulate(4, unequal=unequal)
+    # The same names of species in all genera, so that R has full rank.
+    species = tuple("abcd"[int(name[-1])] for name in cohort.table.texts("species"))
+    table = replace(cohort.table, columns={**cohort.table.columns, "species": species})
+    y, genus = cohort.coefficients, np.array(cohort.table.texts("genus"))
+    own = np.array(
+        [[g == a and s == b for a in np.unique(genus) for b in "bcd"] for g, s in zip(genus, species, strict=True)]
+    )
+    other = np.array([[g == a for a in np.unique(genus)[1:]] for g in genus])
+
+    def left(*columns: np.ndarray) -> float:  # type: ignore[type-arg]
+        x = np.column_stack([np.ones(len(y)), *columns]).astype(np.float64)
+        return float(((y - x @ np.linalg.lstsq(x, y)[0]) ** 2).sum())
+
+    result = nested(replace(cohort, table=table), anova_type="III", coding="treatment")
+    squares = left(own) - left(own, other), left(other) - left(own, other)
+    assert [test.squares for test in result.tests] == pytest.approx(squares)
+    assert result.test("genus").f == pytest.approx((squares[0] / 2) / (squares[1] / 9))
 
 
 @pytest.mark.parametrize("permutation", ["units", "residuals"])
@@ -159,7 +182,7 @@ def test_designs_without_degrees_of_freedom_of_the_error_are_refused() -> None:
     with pytest.raises(InputError, match="equal variances"):
         CompareConfig(errors=ERRORS, unequal_variances=True)
     with pytest.raises(InputError, match="deviation coding"):
-        CompareConfig(errors=ERRORS, coding="treatment")
+        CompareConfig(random="1 | who", coding="treatment")
 
 
 def test_the_command_takes_error_terms() -> None:

@@ -118,8 +118,8 @@ class CompareConfig:
             raise InputError(f"There is no effect size {self.effect_size!r}; choose one of {', '.join(EFFECT_SIZES)}.")
         if self.errors and self.unequal_variances:
             raise InputError("Tests with error terms assume equal variances; leave out one of the two.")
-        if self.coding == "treatment" and (self.errors or self.blocks or self.random):
-            raise InputError("Error terms, blocks and random terms need deviation coding; leave out the other coding.")
+        if self.coding == "treatment" and (self.blocks or self.random):
+            raise InputError("Blocks and random terms need deviation coding; leave out the other coding.")
         if self.bump_width_mm is not None and not 0 < self.bump_width_mm < math.inf:
             raise InputError(f"The width of bumps must be millimetres above 0, not {self.bump_width_mm}.")
 
