@@ -15,6 +15,8 @@ from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 GENERATED = "<!-- Written by tools/make_cli_reference.py; edit src/shapespace/cli/command_table.py. -->\n\n"
+TESTS_PAGE = "morphometrics.md"
+BEGIN, END = "<!-- tests of shape: written by tools/make_cli_reference.py -->\n", "\n<!-- end -->"
 PAGES = {
     "data faces": ["data.md"],
     "data get": ["data.md"],
@@ -110,7 +112,20 @@ def pages() -> dict[str, str]:
     return {
         "cli.md": GENERATED + INTRODUCTION + index + EXIT_CODES,
         **{f"cli/{file_name(command)}": GENERATED + page(command) for command in COMMANDS},
+        TESTS_PAGE: with_tests((DOCS / TESTS_PAGE).read_text(encoding="utf-8")),
     }
+
+
+def with_tests(text: str) -> str:
+    """Return the page on tests of shape with their table between its marks."""
+    before, _, rest = text.partition(BEGIN)
+    rows = "".join(
+        f"| [`{test.name}`](cli/test-{test.name}.md) | {test.summary} | {test.statistics} | {test.permuted} "
+        f"| {' '.join(test.references)} |\n"
+        for test in SHAPE_TESTS
+    )
+    table = "\n| test | what it does | statistics | permuted | source |\n|---|---|---|---|---|\n" + rows
+    return before + BEGIN + table + END + rest.partition(END)[2]
 
 
 def file_name(command: Command) -> str:
