@@ -265,9 +265,13 @@ def test_leave_one_out_posteriors_and_permutations_are_those_of_brute_force(comp
     posterior = np.array([row[3:] for row in found.table("Posterior probabilities").rows])
     assert posterior == pytest.approx(brute_force(cohort.coefficients, codes, components, priors), abs=1e-8)
     [(_, rows)] = orders(37, 6, 0)
+    keys = []
     for order, rate in zip(rows, found.statistics[0].arrangements, strict=True):
-        best = brute_force(cohort.coefficients, codes[order], components, priors).argmax(axis=1)
-        assert rate == pytest.approx((best == codes[order]).mean())
+        own = codes[order]
+        shares = brute_force(cohort.coefficients, own, components, priors)
+        assert rate == pytest.approx((shares.argmax(axis=1) == own).mean())
+        keys.append((rate, shares[np.arange(37), own].mean()))
+    assert found.statistics[0].p == pytest.approx(np.mean([key >= keys[0] for key in keys]))
 
 
 def test_posterior_odds_are_those_of_scikit_learn(reference: dict[str, Any]) -> None:
@@ -305,9 +309,9 @@ def test_groups_without_a_difference_are_classified_by_chance() -> None:
         lambda seed: discriminate(
             simulated((12, 18), dimensions=20, seed=seed), group=GROUP, components=3, permutations=40
         ).statistics[0].p,
-        60,
+        40,
     )  # fmt: skip
-    assert rate <= 0.14  # 5 % + 3 standard errors
+    assert rate <= 0.16  # 5 % + 3 standard errors
 
 
 # All

@@ -402,7 +402,8 @@ def discriminate(
     diagonal = products.diagonal(axis1=1, axis2=2)
     lengths = [(n - g) * (diagonal[:, a] + diagonal[:, b] - 2 * products[:, a, b]) for a, b in groups.pairs]
     logs = np.log(counts / n if priors == "proportional" else np.full(g, 1 / g))
-    correct, posterior, step = np.zeros(permutations), np.empty((n, g)), StepCounter(n, progress)
+    correct, support, posterior = np.zeros(permutations), np.zeros(permutations), np.empty((n, g))
+    step = StepCounter(n, progress)
     for k in range(n):
         whitened = _whitened_without(scores, squares, used, k)
         shape, whitened[k] = whitened[k].copy(), 0.0
@@ -411,9 +412,13 @@ def discriminate(
         # M27
         score = logs + (n - 1 - g) * (products[..., g] - products.diagonal(axis1=1, axis2=2) / 2)
         correct += score.argmax(axis=1) == codes[:, k]
-        posterior[k] = np.exp(score[0] - score[0].max())
+        shares = np.exp(score - score.max(axis=1, keepdims=True))
+        shares /= shares.sum(axis=1, keepdims=True)
+        support += shares[range(permutations), codes[:, k]]
+        posterior[k] = shares[0]
         step.add()
-    posterior /= posterior.sum(axis=1, keepdims=True)
+    # Counts have many ties, which would make their test conservative.
+    untied = Statistic.of("correct classification", correct + support / (n + 1), z="none")
     predicted: list[int] = posterior.argmax(axis=1).tolist()
     table = groups.indicator.T @ np.eye(g)[predicted]
     kinds = {"group": "text", **{f"as {name}": "count" for name in groups.names}, "correct": "percent"}
@@ -431,7 +436,7 @@ def discriminate(
     return group_result(
         "discriminant", cohort, group,
         [
-            Statistic.of("correct classification", correct / n, z="standard"),
+            replace(Statistic.of("correct classification", correct / n, z="standard"), p=untied.p),
             *_pairs("Mahalanobis distance of means", groups, np.sqrt(np.maximum(lengths, 0.0))),
             *_pairs("Procrustes distance of means", groups, np.array(distances)),
         ],
@@ -440,7 +445,8 @@ def discriminate(
                 table_part("Posterior probabilities", columns, shapes)),
         assumptions=(
             f"Linear discriminants of {used} principal components, which do not depend on the groups; each shape is "
-            "classified by components and discriminants of the others. They assume equal covariances of the groups.",
+            "classified by components and discriminants of the others. They assume equal covariances of the groups. In "
+            "the test, equal numbers of correct classifications are ordered by the mean probability of the own group.",
         ),
     )  # fmt: skip
 
