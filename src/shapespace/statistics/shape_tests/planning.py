@@ -67,7 +67,7 @@ def plan_sample_size(
     first, second = np.array(groups.pairs).T
     observed = math.sqrt(((means[first] - means[second]) ** 2).sum(axis=1).mean())
     noise = (variances / groups.counts)[[first, second]].sum(axis=0).mean()
-    corrected = math.sqrt(max(observed**2 - noise, 0.0))  # M25
+    corrected = math.sqrt(max(observed**2 - noise, 0.0))  # M24
     distance = _distance(effect, observed, corrected)
     means = (means - means.mean(axis=0)) * distance / observed
     simulate = _simulator(residual, means, np.sqrt(variances), groups)
@@ -141,7 +141,7 @@ def _simulator(
     Residuals (N, K) of all groups are pooled after division by the standard deviation of their group. The noise lies in
     their span, so that a singular covariance stays one.
     """
-    # M27
+    # Smoothed bootstrap (Silverman and Young 1987)
     _, axes, variances = principal_components(residual / deviations[groups.codes, None])
     scores = residual @ axes.T / deviations[groups.codes, None]
     spread = np.sqrt((scores**2).mean(axis=0))
