@@ -23,7 +23,7 @@ HOMES = {
     "R": ("fit",),
     "C": ("correspondence", "model", "geometry", "batch"),
     "S": ("statistics",),
-    "M": ("statistics", "geometry"),
+    "M": ("statistics", "geometry", "report"),
 }
 """Folders of the code whose comments have the numbers of a prefix; elsewhere R2 and the like are other things."""
 NUMBER = r"[PRCSM]\d+[a-z]?"
