@@ -146,3 +146,27 @@ def test_bad_input_ends_in_one_sentence(
     write_csv(folder / "structures.csv", ("landmark", "structure"), ("1", "head"))
     outcome = run("align", "skulls.tps" if content is None else "bad_input.csv", *arguments, "-o", "out")
     assert outcome.code == 2 and words in outcome.sentence()
+
+
+def test_links_and_views_beside_the_data_are_in_the_output_with_numbers(run: Run, folder: Path) -> None:
+    write_csv(folder / "links.csv", ("from", "to"), (1, 2), ("3", "9"))
+    (folder / "orientation.json").write_text(
+        '{"views": [{"name": "dorsal", "toward_viewer": [0, 0, 1], "up": [0, 1, 0]}]}'
+    )
+    assert run("align", "skulls.tps", "-o", "out").code == 0
+    assert rows_of(folder / "out" / "links.csv") == [{"from": "1", "to": "2"}, {"from": "3", "to": "9"}]
+    assert json.loads((folder / "out" / "orientation.json").read_text())["views"][0]["name"] == "dorsal"
+    write_csv(folder / "links.csv", ("from", "to"), (1, 77))
+    refused = run("align", "skulls.tps", "-o", "other")
+    assert refused.code == 2 and "links.csv has the row '1, 77'" in refused.err and not (folder / "other").exists()
+
+
+def test_commands_that_read_aligned_landmarks_have_one_note_on_specimens_to_check(run: Run, folder: Path) -> None:
+    given = points()
+    given[5] *= [-1, 1]
+    given[3, 2] = np.nan
+    write(folder / "skulls.tps", given)
+    assert "1 specimen to check" in run("align", "skulls.tps", "--table", "skulls.csv", "-o", "aligned").out
+    outcome = run("test", "disparity", "aligned", "--group", "sex", "--permutations", "20", "-o", "out")
+    assert outcome.err.count("aligned: 1 specimen to check, 1 estimated landmark (see align.json).") == 1
+    assert "mirrored" not in outcome.err + outcome.out

@@ -79,7 +79,7 @@ def test_data_without_faults_are_counted_and_found_clean(run: Run, table: Path) 
     assert outcome.code == 0 and outcome.err == ""
     assert outcome.out.splitlines() == [
         "specimens: 24", "landmarks: 9", "semilandmarks: 0", "dimensions: 2", "columns: [sex, site]", "missing: 0",
-        "0 findings",
+        "no problems found",
     ]  # fmt: skip
 
 

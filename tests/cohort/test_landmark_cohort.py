@@ -81,7 +81,8 @@ def test_a_file_a_folder_of_align_and_a_table_beside_either_are_the_same_cohort(
         read_cohort(table, CohortConfig(shapes=file)),
         read_cohort(table, CohortConfig(shapes=tmp_path / "aligned")),
     ]
-    assert any("default options" in note for note in cohorts[0].notes) and not cohorts[1].notes
+    assert any("default options" in note for note in cohorts[0].notes) and len(cohorts[1].notes) == 1
+    assert "aligned: 1 specimen to check (see align.json)." in cohorts[1].notes[0]
     for cohort in cohorts:
         order = [cohort.names.index(name) for name in NAMES]
         assert np.allclose(cohort.sizes_mm[order], cohorts[0].sizes_mm, rtol=1e-12)

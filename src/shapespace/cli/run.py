@@ -432,6 +432,7 @@ def landmarks_check(arguments: argparse.Namespace) -> int:
 
 def _check_landmark_data(arguments: argparse.Namespace) -> int:
     from shapespace.commands.landmark_data import check_configurations
+    from shapespace.report.blocks.wording import counted
 
     if arguments.output is not None:
         raise InputError("-o goes with SAME, the folder that correspond wrote; leave it out.")
@@ -445,7 +446,8 @@ def _check_landmark_data(arguments: argparse.Namespace) -> int:
             if key not in ("notes", "findings") and value not in ([], {}):
                 text = short(value)
                 show(f"{key.replace('_', ' ')}: {text if len(text) < _LONGEST else f'{text[:_LONGEST]}, ...'}")
-        show(f"{len(facts['findings'])} findings")
+        found = len(facts["findings"])
+        show(counted(found, "finding") if found else "no problems found")
     return 1 if facts["findings"] else 0
 
 

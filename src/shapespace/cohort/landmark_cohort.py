@@ -90,8 +90,16 @@ def read_aligned(folder: Path) -> AlignedLandmarks:
         iterations=record.iterations,
         converged=record.converged,
         where=str(folder),
-        notes=record.notes,
+        notes=_notes(folder, record),
     )
+
+
+def _notes(folder: Path, record: AlignRecord) -> tuple[str, ...]:
+    """Return one sentence on specimens to check, estimated landmarks and convergence; `align` printed them in full."""
+    counts = (("specimen", " to check", len(record.findings)), ("estimated landmark", "", record.estimated))
+    facts = [f"{count} {noun}{'s' * (count != 1)}{rest}" for noun, rest, count in counts if count]
+    facts += [] if record.converged else ["an alignment that has not converged"]
+    return (f"{folder}: {', '.join(facts)} (see {RECORD}).",) if facts else ()
 
 
 def read_landmark_cohort(
@@ -196,8 +204,8 @@ def _matched(
     own = Table(columns, tuple(names), where)
     if table is None:
         return list(range(len(names))), own, []
-    given, keys = read_table(table, as_files=False)
     number = {stem_of(name): k for k, name in enumerate(names)} | {name: k for k, name in enumerate(names)}
+    given, keys = read_table(table, number)
     found = [(number[key], row) for row, key in enumerate(keys) if key in number]
     rows, notes = [specimen for specimen, _ in found], list[str]()
     note_unmatched(notes, given, keys, number, [names[k] for k in rows], names, where)

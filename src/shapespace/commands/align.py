@@ -8,15 +8,17 @@ from pathlib import Path
 
 from shapespace.cohort.landmark_cohort import SIZE, write_aligned
 from shapespace.cohort.table import Table, list_names, read_table
+from shapespace.commands.landmark_data import read_links
 from shapespace.errors import FileFormatError, InputError
 from shapespace.geometry.landmark_alignment import AlignConfig, AlignedLandmarks, align_landmarks, find_outliers
 from shapespace.io.files import make_folder, read_bytes, write_text
 from shapespace.io.landmarks.configuration_io import read_configurations, read_sliders
 from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations
-from shapespace.io.tables.table_io import key_column, table_rows
+from shapespace.io.tables.table_io import key_column, table_rows, write_rows
 from shapespace.report.analyses.analysis_report import METHODS_FILE
 from shapespace.report.analyses.methods_section import alignment_text
-from shapespace.schemas import AlignFinding, AlignRecord, to_json
+from shapespace.report.inputs.orientation import LINKS, read_orientation
+from shapespace.schemas import AlignFinding, AlignRecord, Orientation, json_text, to_json
 from shapespace.version import __version__
 
 
@@ -31,6 +33,8 @@ def align(
     reflect: tuple[str, str] | None = None,
 ) -> tuple[AlignedLandmarks, AlignRecord]:
     """Align the landmarks of many specimens, name specimens to check, and write all to a folder.
+
+    links.csv and orientation.json beside the data are written to the folder too, for its figures.
 
     Args:
         data: landmark file, or folder of them.
@@ -58,6 +62,9 @@ def align(
         raw = replace(raw, columns=columns, notes=(*raw.notes, *notes))
     if reflect is not None:
         raw = _reflected(raw, *reflect)
+    beside = data if data.is_dir() else data.parent
+    links = read_links(beside / LINKS, raw.landmarks) if (beside / LINKS).is_file() else []
+    views = read_orientation(beside / Orientation.FILE) if (beside / Orientation.FILE).is_file() else None
     aligned = align_landmarks(raw, config)
     findings = find_outliers(aligned)
     record = AlignRecord(
@@ -78,13 +85,17 @@ def align(
         version=__version__,
     )  # fmt: skip
     write_text(make_folder(folder) / METHODS_FILE, alignment_text(record))
+    if links:
+        write_rows(folder / LINKS, ("from", "to"), [(one + 1, two + 1) for one, two in links])
+    if views is not None:
+        write_text(folder / Orientation.FILE, json_text(views))
     write_aligned(folder, aligned, record)
     return aligned, record
 
 
 def _covariates(path: Path, raw: LandmarkConfigurations) -> tuple[dict[str, tuple[str, ...]], list[str]]:
     """Return the columns of the landmark file and of a table, in the order of the specimens, and notes."""
-    given, keys = read_table(path, as_files=False)
+    given, keys = read_table(path, set(raw.names))
     row = {key: k for k, key in enumerate(keys)}
     missing = [name for name in raw.names if name not in row]
     if len(missing) == len(raw):

@@ -141,14 +141,20 @@ def plot_configurations(
 
     found = read_configurations(data, sliders=sliders)
     aligned = align_landmarks(found)
-    pairs = [] if links is None else _read_links(links, found.landmarks)
+    pairs = [] if links is None else read_links(links, found.landmarks)
     with publication_style():
         figure = superimposed_landmarks(aligned, pairs)
         save_figure(figure, output.with_suffix(""), (output.suffix.lower().lstrip("."),))
     return (*found.notes, *aligned.notes)
 
 
-def _read_links(file: Path, landmarks: Sequence[str]) -> list[tuple[int, int]]:
+def read_links(file: Path, landmarks: Sequence[str]) -> list[tuple[int, int]]:
+    """Return pairs of landmarks, from 0, that figures connect by lines.
+
+    Raises:
+        FileError: the file cannot be read.
+        FileFormatError: it is damaged, or has a landmark that is not among `landmarks`.
+    """
     try:
         rows = [[cell.strip() for cell in row] for row in table_rows(read_bytes(file, LARGEST_LANDMARK_FILE_BYTES))]
     except ValueError as error:

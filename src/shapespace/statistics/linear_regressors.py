@@ -18,7 +18,7 @@ from shapespace.types import FloatArray
 
 IndexArray = npt.NDArray[np.intp]
 PENALTIES = tuple(10.0 ** (0.5 * k) for k in range(-10, 1))
-"""Of ridge regression on coefficients in mm, times the largest squared singular value."""
+"""Of ridge regression on coefficients, times the largest squared singular value."""
 MODES = (1, 2, 3, 5, 8, 12, 20, 30, 50)
 """Leading principal components that a regression on whitened coefficients keeps."""
 _NOTHING = 1e-10  # share of the first singular value; below is rounding
@@ -29,7 +29,7 @@ class Regularisation:
     """How much of the shapes a regression goes by.
 
     Args:
-        space: `raw` for ridge regression on coefficients in mm, `whitened` for least squares on the leading principal
+        space: `raw` for ridge regression on coefficients, `whitened` for least squares on the leading principal
             components, which then count alike.
         amount: the penalty times the largest squared singular value, or the number of components.
     """
@@ -46,7 +46,7 @@ class Regularisation:
     def words(self) -> str:
         """Return what it is."""
         if self.space == "raw":
-            return f"ridge regression on coefficients in mm, penalty {self.amount:.2g} of the largest variance"
+            return f"ridge regression on coefficients, penalty {self.amount:.2g} of the largest variance"
         return f"least squares on the first {self.amount:.0f} principal components"
 
 

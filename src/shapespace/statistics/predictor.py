@@ -119,7 +119,10 @@ class Predictor:
         all_ways = off.reshape(len(off), -1) @ self.weights.T + self.intercepts
         low, high = cv_plus(all_ways[:, 1:], self.residuals, self.fold - 1, self.share, self.confidence)
         away = np.sqrt((off**2).sum(axis=2).mean(axis=1))
-        outside = tuple(self._outside(float(v), float(mm)) for v, mm in zip(all_ways[:, 0], away, strict=True))
+        outside = tuple(
+            self._outside(float(value), float(length), cohort.unit)
+            for value, length in zip(all_ways[:, 0], away, strict=True)
+        )
         return Predictions(cohort.names, read_only(all_ways[:, 0]), low, high, outside)
 
     def _check(self, cohort: Cohort) -> None:
@@ -149,12 +152,10 @@ class Predictor:
             placed = centre + own * float((other**2).sum() / (own * other).sum())
         return placed
 
-    def _outside(self, value: float, away_mm: float) -> str:
-        if away_mm > self.farthest_mm * (1 + _ROUNDING):
-            return (
-                f"its shape lies {away_mm:.2f} mm RMS from the mean, beyond all learned from "
-                f"({self.farthest_mm:.2f} mm)"
-            )
+    def _outside(self, value: float, away: float, unit: str) -> str:
+        if away > self.farthest_mm * (1 + _ROUNDING):
+            own, farthest = (f"{length:.2f} {unit}" if unit else f"{length:.4f}" for length in (away, self.farthest_mm))
+            return f"its shape lies {own} RMS from the mean, beyond all learned from ({farthest})"
         slack = _ROUNDING * (self.highest - self.lowest)
         if not self.lowest - slack <= value <= self.highest + slack:
             return f"{self.target} was learned between {self.lowest:g} and {self.highest:g} alone"

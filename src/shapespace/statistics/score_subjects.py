@@ -551,9 +551,10 @@ def _outside(scores: ScoreResult, k: int) -> list[str]:
     def beyond(share: float) -> str:
         return "all" if share <= 1 / (scores.people + 1) + 1e-9 else f"{100 * (1 - share):.0f} %"
 
+    rest = f"{scores.rest_mm[k]:.2f} mm" if scores.subjects.unit else f"{scores.rest_mm[k]:.4f}"
     if scores.rest_farther[k] <= rare:
         out.append(
-            f"the {scores.modes} modes of the reference leave {scores.rest_mm[k]:.2f} mm of its shape (RMS), more than "
+            f"the {scores.modes} modes of the reference leave {rest} of its shape (RMS), more than "
             f"of {beyond(float(scores.rest_farther[k]))} of the reference"
         )
     if scores.beyond_farther[k] <= rare:

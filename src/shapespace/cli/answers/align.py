@@ -13,6 +13,7 @@ def run(arguments: argparse.Namespace) -> int:
     from shapespace.commands.align import align
     from shapespace.errors import InputError
     from shapespace.geometry.landmark_alignment import AlignConfig
+    from shapespace.report.blocks.wording import counted
     from shapespace.schemas import to_json
 
     config = AlignConfig(**given(arguments, AlignConfig))
@@ -26,8 +27,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         show_json({"folder": str(arguments.output), **to_json(record)})
     else:
-        show(
-            f"{record.specimens} specimens with {record.landmarks} landmarks ({record.dimensions}-D) aligned in "
-            f"{record.iterations} iterations, {len(record.findings)} to check: {arguments.output}"
-        )
+        show(f"{record.specimens} specimens with {record.landmarks} landmarks ({record.dimensions}-D) are aligned.")
+        check = len({finding.specimen for finding in record.findings})
+        show(f"{counted(check, 'specimen')} to check." if check else "No specimens to check.")
+        show(f"Results are in {arguments.output}")
     return 0

@@ -276,7 +276,8 @@ def _near_landmark(cohort: Cohort, vertex: int) -> str:
         return ""
     landmarks = cohort.landmarks.interpolate(cohort.reference)
     distances = np.linalg.norm(landmarks - cohort.reference[vertex], axis=1)
-    return f" near {cohort.landmarks.names[int(distances.argmin())]}"
+    name = cohort.landmarks.names[int(distances.argmin())]
+    return f" at landmark {name}" if cohort.source.kind == "landmarks" else f" near {name}"
 
 
 def _column(name: str, kind: Any = "text") -> TableColumn:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import cast
 
+from shapespace.report.blocks.wording import counted
 from shapespace.schemas import (
     AlignRecord,
     Analysis,
@@ -151,13 +152,15 @@ def alignment_text(record: AlignRecord) -> str:
             f"{curves} semilandmarks on curves and {surface} on surfaces were slid to minimise the "
             f"{'Procrustes distance' if by == 'procrustes' else by} to the mean."
         )
+    if reflect := settings.get("reflect"):
+        sentences.append(f"Specimens with {reflect[0]} {reflect[1]} were reflected before the alignment.")
     if record.estimated:
         method = "a thin-plate spline" if settings.get("missing", "tps") == "tps" else "regression"
-        sentences.append(f"{record.estimated} missing landmarks were estimated by {method}.")
+        sentences.append(f"{counted(record.estimated, 'missing landmark was', 'missing landmarks were')} estimated by {method}.")
     if settings.get("structures"):
         sentences.append("Structures were aligned separately.")
     end = "converged" if record.converged else "stopped before convergence"
-    sentences.append(f"The alignment {end} in {record.iterations} iterations.")
+    sentences.append(f"The alignment {end} in {counted(record.iterations, 'iteration')}.")
     references = (*_ALIGNMENT, *(_SLIDING if curves or surface else ()))
     return _paragraph(sentences, references)
 
