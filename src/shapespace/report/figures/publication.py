@@ -102,7 +102,6 @@ def _with_fonts(svg: bytes) -> bytes:
 
 def _subset(weight: int, letters: str) -> bytes:
     """Return the font of all figures, WOFF, with some letters alone."""
-    # matplotlib depends on fontTools.
     subset: Any = import_module("fontTools.subset")
     options = subset.Options(flavor="woff", recalc_timestamp=False, layout_features=[], notdef_outline=True)
     options.drop_tables += ["FFTM"]
