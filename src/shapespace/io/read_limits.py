@@ -17,7 +17,7 @@ LARGEST_LANDMARK_FILE_BYTES = 2**23
 """Landmark files longer than this are not read (8 MiB)."""
 
 LARGEST_CONFIGURATIONS_FILE_BYTES = 2**27
-"""Files with the landmarks of many specimens longer than this are not read (128 MiB), nor R files that unpack to more."""
+"""Longer files with the landmarks of many specimens are not read (128 MiB), nor R files that unpack to more."""
 
 MOST_PARTS = 50_000
 """Most nodes, shapes, pieces, sections and blocks in one file: each costs some microseconds, however small it is."""
