@@ -11,6 +11,7 @@ import pytest
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.landmark_cohort import landmark_cohort
 from shapespace.cohort.read import CohortConfig, read_cohort
+from shapespace.cohort.table import read_table
 from shapespace.commands.align import align
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.geometry.landmark_alignment import AlignConfig, align_landmarks
@@ -173,3 +174,9 @@ def test_damaged_folders_are_refused_in_one_sentence(
     with pytest.raises(ShapespaceError, match=words) as caught:
         read_cohort(tmp_path / "aligned")
     assert str(caught.value).count(". ") == 0
+
+
+def test_a_table_of_scans_and_one_of_specimens_both_name_the_landmarks(tmp_path: Path) -> None:
+    table = tmp_path / "table.csv"
+    table.write_text("file,sex\na.1,f\nscans/b.ply,m\nc.2,f\nc.3,m\n")
+    assert read_table(table, {"a.1", "b"})[1] == ("a.1", "b", "c.2", "c.3")

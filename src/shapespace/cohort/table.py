@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Literal
@@ -115,8 +115,8 @@ class Table:
         return Table(chosen, tuple(self.rows[row] for row in rows), self.where)
 
 
-def read_table(path: Path, *, as_files: bool = True) -> tuple[Table, tuple[str, ...]]:
-    """Return a table, and the name of the shape of each row, without folder and ending unless `as_files` is False.
+def read_table(path: Path, specimens: Collection[str] = ()) -> tuple[Table, tuple[str, ...]]:
+    """Return a table, and the name of the shape of each row: without folder and ending, or as one of `specimens`.
 
     The table is what `io.tables.table_rows` reads. The first of the columns `file`, `scan`, `specimen`, `name` and `id`
     that it has, in any case, names the shapes. Columns of a coefficients.csv that came with the list of its scans lose
@@ -142,7 +142,11 @@ def read_table(path: Path, *, as_files: bool = True) -> tuple[Table, tuple[str, 
     # Scans of one name in different folders are called by their folders too, as their fits are.
     repeated = {stem for stem, count in Counter(stem_of(scan) for scan in places).items() if count > 1}
     keys = tuple(_with_folders(scan) if stem_of(scan) in repeated else stem_of(scan) for scan in places)
-    keys = keys if as_files else tuple(row[key] for row in rows)
+    if specimens:
+        # Names of specimens may have points, as those of files have before their ending.
+        cells = [row[key] for row in rows]
+        keys = tuple(stem if stem in specimens and cell not in specimens else cell
+                     for cell, stem in zip(cells, keys, strict=True))  # fmt: skip
     if "" in keys:
         raise FileFormatError(
             f"{path} has no {names} in row {keys.index('') + 1}; name the shape, or leave the row out."
