@@ -19,6 +19,23 @@ if TYPE_CHECKING:
     from shapespace.statistics.predictor import Predictions, Predictor
     from shapespace.statistics.regression import RegressionResult, regress
     from shapespace.statistics.score_subjects import ScoreConfig, ScoreResult, score
+    from shapespace.statistics.shape_tests.covariation import compare_effect_sizes, estimate_modularity, fit_pls
+    from shapespace.statistics.shape_tests.groups import (
+        assess_equivalence,
+        compare_disparity,
+        compare_means_and_covariances,
+        discriminate,
+    )
+    from shapespace.statistics.shape_tests.linear import (
+        analyse_allometry,
+        compare_pairs,
+        compare_trajectories,
+        measure_repeatability,
+    )
+    from shapespace.statistics.shape_tests.ordination import Ordination, ordinate
+    from shapespace.statistics.shape_tests.phylogenetic import estimate_phylogenetic_signal, fit_pgls, phylogenetic_axes
+    from shapespace.statistics.shape_tests.planning import plan_sample_size
+    from shapespace.statistics.shape_tests.shape_test_result import ShapeTestResult, Statistic
 
 __all__ = [
     "AsymmetryResult",
@@ -28,16 +45,35 @@ __all__ = [
     "CompareResult",
     "IdentificationResult",
     "IdentityConfig",
+    "Ordination",
     "Predictions",
     "Predictor",
     "RegressionResult",
     "ScoreConfig",
     "ScoreResult",
+    "ShapeTestResult",
+    "Statistic",
     "VerificationResult",
+    "analyse_allometry",
+    "assess_equivalence",
     "change",
     "compare",
+    "compare_disparity",
+    "compare_effect_sizes",
+    "compare_means_and_covariances",
+    "compare_pairs",
+    "compare_trajectories",
+    "discriminate",
+    "estimate_modularity",
+    "estimate_phylogenetic_signal",
+    "fit_pgls",
+    "fit_pls",
     "identify",
     "measure_asymmetry",
+    "measure_repeatability",
+    "ordinate",
+    "phylogenetic_axes",
+    "plan_sample_size",
     "regress",
     "score",
     "verify",
@@ -55,5 +91,22 @@ __getattr__, __dir__ = lazy_names(
         "statistics.predictor": ("Predictions", "Predictor"),
         "statistics.regression": ("RegressionResult", "regress"),
         "statistics.score_subjects": ("ScoreConfig", "ScoreResult", "score"),
+        "statistics.shape_tests.covariation": ("compare_effect_sizes", "estimate_modularity", "fit_pls"),
+        "statistics.shape_tests.groups": (
+            "assess_equivalence",
+            "compare_disparity",
+            "compare_means_and_covariances",
+            "discriminate",
+        ),
+        "statistics.shape_tests.linear": (
+            "analyse_allometry",
+            "compare_pairs",
+            "compare_trajectories",
+            "measure_repeatability",
+        ),
+        "statistics.shape_tests.ordination": ("Ordination", "ordinate"),
+        "statistics.shape_tests.phylogenetic": ("estimate_phylogenetic_signal", "fit_pgls", "phylogenetic_axes"),
+        "statistics.shape_tests.planning": ("plan_sample_size",),
+        "statistics.shape_tests.shape_test_result": ("ShapeTestResult", "Statistic"),
     },
 )
