@@ -24,11 +24,11 @@ from shapespace.io.landmarks.configuration_io import (
     FOLDER_FORMATS,
     is_configurations,
     read_configurations,
-    read_sliders,
     write_configurations,
 )
 from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations
 from shapespace.io.landmarks.landmark_io import write_landmarks
+from shapespace.io.tables.table_io import table_rows
 from shapespace.types import FloatArray
 
 refusal = partial(refusal_of, read_configurations)
@@ -76,10 +76,14 @@ def test_what_is_written_is_read_back_to_the_bit(format: str, dimensions: int, t
     order = [back.names.index(name) for name in given.names]
     np.testing.assert_array_equal(back.points[order], given.points)
     assert back.landmarks == given.landmarks
-    assert dict(back.columns) == ({} if lossy else dict(given.columns))
+    classes = [table_rows(file.read_bytes()) for file in tmp_path.glob("*.classifiers.txt")]
+    assert [row[1:] for rows in classes for row in rows] == (
+        [["sex", "age"], ["f", "1"], ["", "2"], ["m", ""], ["f", "4"]] if format == "morphoj" else []
+    )
+    assert dict(back.columns) == ({} if lossy or format == "morphoj" else dict(given.columns))
 
 
-@pytest.mark.parametrize("format", ["csv", "long", "mrk.json", "csv-folder"])
+@pytest.mark.parametrize("format", ["csv", "long", "mrk.json"])
 def test_names_of_landmarks_are_kept_where_a_format_has_them(format: str, tmp_path: Path) -> None:
     named = replace(configurations(missing=True), landmarks=("nose", "lm1", "x.y", "eye 2", "5"))
     write_configurations(tmp_path / f"set{ENDINGS[format]}", named, format)
@@ -233,7 +237,10 @@ def test_a_folder_has_a_file_for_each_specimen(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.points[0], found.points[1])
     assert found.notes == ("1 files without .fcsv are left out (old.pp).",)
     write_landmarks(tmp_path / "c.fcsv", {"nose": marks["nose"]})
-    with pytest.raises(FileError, match=r"c\.fcsv: it has 1 landmarks and a\.landmarks\.fcsv has 2 \(chin in one of"):
+    with pytest.raises(
+        FileError,
+        match=r"c\.fcsv: it has 1 landmarks in 3-D and a\.landmarks\.fcsv has 2 landmarks in 3-D \(chin in one of",
+    ):
         read_configurations(tmp_path)
 
 
@@ -243,7 +250,7 @@ def test_a_folder_of_tps_files_is_joined(tmp_path: Path) -> None:
     found = read_configurations(tmp_path)
     assert found.names == ("a", "b") and found.columns["comment"] == ("", "c")
     write(tmp_path, "c.tps", "LM3=1\n3 4 5\nID=c\n")
-    with pytest.raises(FileError, match=r"c\.tps has 1 landmarks of 3 dimensions and .*a\.tps"):
+    with pytest.raises(FileError, match=r"c\.tps: it has 1 landmarks in 3-D and a\.tps has 1 landmarks in 2-D;"):
         read_configurations(tmp_path)
 
 
@@ -325,6 +332,11 @@ def test_formats_refuse_what_they_cannot_hold(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def read_with_sliders(path: Path) -> LandmarkConfigurations:
+    tps = write(path.parent, "a.tps", "LM=4\n1 2\n3 4\n5 6\n7 8\nID=a\n")
+    return read_configurations(tps, sliders=[path])
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -335,28 +347,27 @@ def test_formats_refuse_what_they_cannot_hold(tmp_path: Path) -> None:
     ],
 )
 def test_sliders_are_those_of_geomorph(text: str, expected: list[object], tmp_path: Path) -> None:
-    path = write(tmp_path, "s.csv", text)
-    np.testing.assert_array_equal(read_sliders(path, 4), expected)
-    tps = write(tmp_path, "a.tps", "LM=4\n1 2\n3 4\n5 6\n7 8\nID=a\n")
-    found = read_configurations(tps, sliders=[path])
+    found = read_with_sliders(write(tmp_path, "s.csv", text))
+    given = found.surface_sliders if len(found.surface_sliders) else found.curve_sliders
+    np.testing.assert_array_equal(given, expected)
     assert len(found.curve_sliders) + len(found.surface_sliders) == len(expected)
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("before,slide,after\n1,2,5\n", "5 is no number of a landmark, which go from 1 to 4"),
-        ("before,slide,after\n0,2,3\n", "0 is no number"),
-        ("before,slide,after\n1,2,2\n", "one landmark twice"),
-        ("before,slide,after\n1,2\n", "needs rows of before, slide, after"),
-        ("before,slide,after\n", "needs rows"),
-        ("a,b\n1,2\n", "needs rows"),
-        ("surface\n1.5\n", "1.5 is no number"),
-        ("surface\nx\n", "needs rows"),
+        ("before,slide,after\n1,2,5\n", "the row '1, 2, 5'; write before, slide, after"),
+        ("before,slide,after\n0,2,3\n", "the row '0, 2, 3'"),
+        ("before,slide,after\n1,2,2\n", "the row '1, 2, 2'"),
+        ("before,slide,after\n1,2\n", "the row '1, 2, '"),
+        ("before,slide,after\n", "no row"),
+        ("a,b\n1,2\n", "the row '1, 2'; write before, slide, after"),
+        ("surface\n1.5\n", "the row '1.5'"),
+        ("surface\nx\n", "by number from 1 to 4, or by name"),
     ],
 )
 def test_sliders_that_are_none_are_refused(text: str, words: str, tmp_path: Path) -> None:
-    assert words in refusal_of(partial(read_sliders, landmarks=4), write(tmp_path, "s.csv", text))
+    assert words in refusal_of(read_with_sliders, write(tmp_path, "s.csv", text))
 
 
 @pytest.mark.parametrize(

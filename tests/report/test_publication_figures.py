@@ -202,8 +202,8 @@ def test_views_and_links_are_found_next_to_the_shapes(tmp_path: Path) -> None:
         ("orientation.json", '{"views": [{"name": "dorsal"}]}', "is damaged"),
         ("orientation.json", '{"views": [{"name": "a", "toward_viewer": [0, 0, 1], "up": [0, 0, 2]}]}', "not parallel"),
         ("orientation.json", '{"links": [[0, 1]]}', "number landmarks from 1"),
-        ("links.csv", "from,to\nnose,ear\n", "two columns"),
-        ("links.csv", "from,to,by\n1,2,3\n", "two columns"),
+        ("links.csv", "from,to\nnose,ear\n", "the row 'nose, ear'; write two landmarks"),
+        ("links.csv", "from,to,by\n1,2,3\n", "the row '1, 2, 3'"),
     ],
 )
 def test_damaged_orientations_are_refused_in_one_sentence(tmp_path: Path, file: str, text: str, words: str) -> None:

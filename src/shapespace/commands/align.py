@@ -8,16 +8,15 @@ from pathlib import Path
 
 from shapespace.cohort.landmark_cohort import SIZE, write_aligned
 from shapespace.cohort.table import Table, list_names, read_table
-from shapespace.commands.landmark_data import read_links
 from shapespace.errors import FileFormatError, InputError
 from shapespace.geometry.landmark_alignment import AlignConfig, AlignedLandmarks, align_landmarks, find_outliers
-from shapespace.io.files import make_folder, read_bytes, write_text
-from shapespace.io.landmarks.configuration_io import read_configurations, read_sliders
+from shapespace.io.files import make_folder, write_text
+from shapespace.io.landmarks.configuration_io import read_configurations
 from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations
-from shapespace.io.tables.table_io import key_column, table_rows, write_rows
+from shapespace.io.tables.table_io import key_column, read_rows
 from shapespace.report.analyses.analysis_report import METHODS_FILE
 from shapespace.report.analyses.methods_section import alignment_text
-from shapespace.report.inputs.orientation import LINKS, read_orientation
+from shapespace.report.inputs.orientation import find_orientation
 from shapespace.schemas import AlignFinding, AlignRecord, Orientation, json_text, to_json
 from shapespace.version import __version__
 
@@ -34,7 +33,7 @@ def align(
 ) -> tuple[AlignedLandmarks, AlignRecord]:
     """Align the landmarks of many specimens, name specimens to check, and write all to a folder.
 
-    links.csv and orientation.json beside the data are written to the folder too, for its figures.
+    links.csv and orientation.json beside the data become orientation.json in the folder, for its figures.
 
     Args:
         data: landmark file, or folder of them.
@@ -51,10 +50,7 @@ def align(
         InputError: landmarks that cannot be aligned.
     """
     config = config or AlignConfig()
-    raw = read_configurations(data)
-    for file in sliders:
-        numbers = read_sliders(file, len(raw.landmarks))
-        raw = replace(raw, **{"curve_sliders" if numbers.ndim == 2 else "surface_sliders": numbers})
+    raw = read_configurations(data, sliders=sliders)
     if separate is not None:
         config = replace(config, structures=_structures(separate))
     if table is not None:
@@ -62,9 +58,7 @@ def align(
         raw = replace(raw, columns=columns, notes=(*raw.notes, *notes))
     if reflect is not None:
         raw = _reflected(raw, *reflect)
-    beside = data if data.is_dir() else data.parent
-    links = read_links(beside / LINKS, raw.landmarks) if (beside / LINKS).is_file() else []
-    views = read_orientation(beside / Orientation.FILE) if (beside / Orientation.FILE).is_file() else None
+    orientation = find_orientation(None, [data if data.is_dir() else data.parent], raw.landmarks)
     aligned = align_landmarks(raw, config)
     findings = find_outliers(aligned)
     record = AlignRecord(
@@ -85,10 +79,8 @@ def align(
         version=__version__,
     )  # fmt: skip
     write_text(make_folder(folder) / METHODS_FILE, alignment_text(record))
-    if links:
-        write_rows(folder / LINKS, ("from", "to"), [(one + 1, two + 1) for one, two in links])
-    if views is not None:
-        write_text(folder / Orientation.FILE, json_text(views))
+    if orientation is not None:
+        write_text(folder / Orientation.FILE, json_text(orientation))
     write_aligned(folder, aligned, record)
     return aligned, record
 
@@ -123,10 +115,7 @@ def _reflected(raw: LandmarkConfigurations, column: str, value: str) -> Landmark
 
 
 def _structures(path: Path) -> dict[str, str]:
-    try:
-        header, *rows = table_rows(read_bytes(path))
-    except ValueError as error:
-        raise FileFormatError(f"{path} {error}; write the columns landmark and structure.") from error
+    header, *rows = read_rows(path)
     landmark, structure = key_column(header, ("landmark",)), key_column(header, ("structure",))
     if landmark is None or structure is None:
         raise FileFormatError(f"{path} has no columns landmark and structure; write one row for each landmark.")

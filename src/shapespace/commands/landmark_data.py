@@ -9,18 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from shapespace.errors import FileFormatError, InputError
+from shapespace.errors import InputError
 from shapespace.geometry.landmark_alignment import align_landmarks, find_outliers
-from shapespace.io.files import read_bytes, write_text
-from shapespace.io.landmarks.configuration_io import (
-    read_configurations,
-    slider_texts,
-    write_configurations,
-)
+from shapespace.io.files import write_text
+from shapespace.io.landmarks.configuration_io import read_configurations, slider_texts, write_configurations
 from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations
-from shapespace.io.read_limits import LARGEST_LANDMARK_FILE_BYTES
-from shapespace.io.tables.table_io import table_rows
 from shapespace.lazy import require_package
+from shapespace.report.inputs.orientation import read_links
+from shapespace.schemas import Orientation
 
 _OTHER_SCALE = 4.0
 """Ratio to the median size of a specimen in another unit: units differ by 10 or more, individuals by less than 2."""
@@ -37,7 +33,7 @@ def convert_landmarks(
         source: file or folder with landmarks.
         output: file, or folder for formats with a file for each specimen.
         to: format: tps, nts, morphoj, csv (a row for each specimen), long (a row for each landmark), or a folder of
-            mrk.json, fcsv or csv-folder (default: by the ending of OUT)
+            mrk.json or fcsv (default: by the ending of OUT)
         sliders: CSV of the semilandmarks as geomorph has them: before, slide, after, or surface; can be repeated
         object_name: array of an R file with several, such as plethodon$land
 
@@ -136,34 +132,12 @@ def plot_configurations(
         ShapespaceError: the extra `report` is not installed.
     """
     require_package("matplotlib", "A plot", "'shapespace[report]'")
-    from shapespace.report.figures.landmark_figures import superimposed_landmarks
-    from shapespace.report.figures.publication import publication_style, save_figure
+    from shapespace.report import figures
 
     found = read_configurations(data, sliders=sliders)
     aligned = align_landmarks(found)
-    pairs = [] if links is None else read_links(links, found.landmarks)
-    with publication_style():
-        figure = superimposed_landmarks(aligned, pairs)
-        save_figure(figure, output.with_suffix(""), (output.suffix.lower().lstrip("."),))
+    orientation = Orientation() if links is None else Orientation(links=read_links(links, found.landmarks))
+    with figures.publication_style(), figures.oriented(orientation):
+        figure = figures.superimposed_landmarks(aligned)
+        figures.save_figure(figure, output.with_suffix(""), (output.suffix.lower().lstrip("."),))
     return (*found.notes, *aligned.notes)
-
-
-def read_links(file: Path, landmarks: Sequence[str]) -> list[tuple[int, int]]:
-    """Return pairs of landmarks, from 0, that figures connect by lines.
-
-    Raises:
-        FileError: the file cannot be read.
-        FileFormatError: it is damaged, or has a landmark that is not among `landmarks`.
-    """
-    try:
-        rows = [[cell.strip() for cell in row] for row in table_rows(read_bytes(file, LARGEST_LANDMARK_FILE_BYTES))]
-    except ValueError as error:
-        raise FileFormatError(f"{file} {error}; correct the table.") from error
-    number = {**{str(k): k - 1 for k in range(1, len(landmarks) + 1)}, **{name: k for k, name in enumerate(landmarks)}}
-    if rows and not set(rows[0]) <= set(number):
-        rows = rows[1:]
-    bad = next((row for row in rows if len(row) != 2 or not set(row) <= set(number)), None)
-    if bad is not None or not rows:
-        row = f"the row {', '.join(bad)[:60]!r}" if bad else "no row"
-        raise FileFormatError(f"{file} has {row}; give two landmarks in each row, by number from 1 or by name.")
-    return [(number[one], number[two]) for one, two in rows]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -12,23 +12,15 @@ import numpy as np
 
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.io.files import make_folder, read_bytes, write_text
-from shapespace.io.landmarks.configuration_tables import (
-    CLASSIFIERS,
-    header_kind,
-    long_text,
-    morphoj_texts,
-    parse_table,
-    wide_text,
-)
-from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations, slider_numbers
+from shapespace.io.landmarks.configuration_tables import header_kind, long_text, morphoj_texts, parse_table, wide_text
+from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations, read_landmark_numbers
 from shapespace.io.landmarks.landmark_io import LANDMARK_FORMATS, READ_ONLY_LANDMARKS, read_landmarks
 from shapespace.io.landmarks.r_arrays import R_ENDINGS, parse_r
 from shapespace.io.landmarks.tps_nts import nts_text, parse_nts, parse_tps, tps_text
-from shapespace.io.parsing import damage_error, is_number
+from shapespace.io.parsing import damage_error
 from shapespace.io.read_limits import LARGEST_CONFIGURATIONS_FILE_BYTES
 from shapespace.io.tables.table_io import decoded_text, table_rows, table_text
 from shapespace.reprs import first_names
-from shapespace.types import IntArray
 
 _TEXTS: Mapping[str, Callable[[str, Path], LandmarkConfigurations]] = {".tps": parse_tps, ".nts": parse_nts}
 _TABLES = (".csv", ".txt", ".tsv", ".xlsx")
@@ -44,8 +36,8 @@ CONFIGURATION_FORMATS: Mapping[str, str] = MappingProxyType(
     {"tps": ".tps", "nts": ".nts", "morphoj": ".txt", "csv": ".csv", "long": ".csv"}
 )
 """Format -> ending of files of all specimens; `csv` is wide, a row for each specimen."""
-FOLDER_FORMATS: Mapping[str, str] = MappingProxyType({"mrk.json": ".mrk.json", "fcsv": ".fcsv", "csv-folder": ".csv"})
-"""Format -> ending of folders with a file for each specimen."""
+FOLDER_FORMATS = ("mrk.json", "fcsv")
+"""Formats, which are endings, of folders with a file for each specimen."""
 
 
 def read_configurations(
@@ -53,14 +45,15 @@ def read_configurations(
 ) -> LandmarkConfigurations:
     """Read the landmarks of many specimens, missing ones as not-a-number.
 
-    Formats: TPS with curves and scale, NTS, wide and long tables (CSV, Excel), MorphoJ tables (.txt, with the columns
-    of NAME.classifiers.txt), arrays of R (.rda, .RData, .rds), and folders with a file for each specimen in any format
-    of `read_landmarks`, TPS or NTS. Values that are scaled, left out or taken as missing are in the notes.
+    Formats: TPS with curves and scale, NTS, wide and long tables (CSV, Excel), MorphoJ tables (.txt), arrays of R
+    (.rda, .RData, .rds), and folders with a file for each specimen in any format of `read_landmarks`, TPS or NTS.
+    Values that are scaled, left out or taken as missing are in the notes.
 
     Args:
         path: the file or folder.
         name: of the array, for R files with several.
-        sliders: files for `read_sliders`, in place of sliders in `path`.
+        sliders: tables of semilandmarks, as geomorph has them: before, slide, after; or surface alone. Each replaces
+            those in `path`.
 
     Raises:
         FileError: it cannot be read, or is too long.
@@ -70,8 +63,10 @@ def read_configurations(
     """
     found = _read_folder(Path(path)) if Path(path).is_dir() else _read_file(Path(path), name)
     for file in sliders:
-        numbers = read_sliders(file, len(found.landmarks))
-        found = replace(found, **{"curve_sliders" if numbers.ndim > 1 else "surface_sliders": numbers})
+        form = "before, slide, after, or one landmark on the surface,"
+        numbers = read_landmark_numbers(file, found.landmarks, (1, 3), form) - 1
+        is_surface = numbers.shape[1] == 1
+        found = replace(found, **({"surface_sliders": numbers[:, 0]} if is_surface else {"curve_sliders": numbers}))
     return found
 
 
@@ -84,16 +79,20 @@ def _read_file(path: Path, name: str | None) -> LandmarkConfigurations:
     data = read_bytes(path, LARGEST_CONFIGURATIONS_FILE_BYTES)
     if not data.strip():
         raise damage_error(path, "it is empty; export or copy it again")
-    if name is not None and suffix not in R_ENDINGS:
-        raise InputError(f"{path} is no file of R, whose arrays have names; leave --object out.")
     if suffix in R_ENDINGS:
         return parse_r(data, path, name)
+    if name is not None:
+        raise InputError(f"{path} is no file of R, whose arrays have names; leave --object out.")
     if suffix in _TEXTS or re.match(rb"\s*LM3?\s*=", data, re.IGNORECASE):
-        return _TEXTS.get(suffix, parse_tps)(_text(data, path), path)
+        try:
+            text = decoded_text(data)
+        except ValueError as error:
+            raise FileFormatError(f"{path} {error}; export it again.") from error
+        return _TEXTS.get(suffix, parse_tps)(text, path)
     kind = _header_kind(data) if suffix in _TABLES else "single"
     if single is None or kind in ("wide", "long") or (suffix == ".csv" and kind != "single"):
         return parse_table(data, path)
-    return _of_files([path], single)
+    return _read_specimen(path, single)
 
 
 def is_configurations(path: Path | str) -> bool:
@@ -102,9 +101,8 @@ def is_configurations(path: Path | str) -> bool:
     if path.is_dir():
         names = [file.name.lower() for file in path.iterdir()]
         return any(n.endswith((*_TEXTS, *_SINGLE)) for n in names) and not any(n.endswith(".fit.json") for n in names)
-    suffix = path.suffix.lower()
-    if suffix not in _TABLES:
-        return path.is_file() and suffix in (*_TEXTS, *R_ENDINGS)
+    if path.suffix.lower() not in _TABLES:
+        return path.is_file() and path.suffix.lower() in (*_TEXTS, *R_ENDINGS)
     try:
         return _header_kind(read_bytes(path, LARGEST_CONFIGURATIONS_FILE_BYTES)) in ("wide", "long")
     except ShapespaceError:
@@ -118,14 +116,20 @@ def _header_kind(data: bytes) -> str:
         return ""
 
 
-def _text(data: bytes, path: Path) -> str:
-    try:
-        return decoded_text(data)
-    except ValueError as error:
-        raise FileFormatError(f"{path} {error}; export it again.") from error
+def _read_specimen(path: Path, ending: str) -> LandmarkConfigurations:
+    found = read_landmarks(path, keep_absent=True)
+    is_numbered = all(re.fullmatch(r"point_\d+", label) for label in found)
+    return LandmarkConfigurations(
+        names=(path.name[: -len(ending)].removesuffix(".landmarks"),),
+        points=np.array([list(found.values())]),
+        landmarks=() if is_numbered else tuple(found),
+        unit="mm" if ending in _MILLIMETRES else "",
+        where=str(path),
+    )
 
 
 def _read_folder(folder: Path) -> LandmarkConfigurations:
+    """Return the landmarks in the files of the most frequent ending, in the order of the first file."""
     endings = (*_TEXTS, *_SINGLE)
     files: dict[str, list[Path]] = {}
     for file in sorted(folder.iterdir()):
@@ -138,76 +142,30 @@ def _read_folder(folder: Path) -> LandmarkConfigurations:
     ending = max(files, key=lambda one: (len(files[one]), one == ".mrk.json"))
     others = [file.name for other, listed in files.items() if other != ending for file in listed]
     notes = [f"{len(others)} files without {ending} are left out ({first_names(others, _NAMED)})."] if others else []
-    found = _of_files(files[ending], ending)
-    return replace(found, where=str(folder), notes=(*notes, *found.notes))
-
-
-def _of_files(files: Sequence[Path], ending: str) -> LandmarkConfigurations:
-    """Return the landmarks of files of one specimen each, in the order of the first, or of TPS and NTS files."""
-    if ending in _TEXTS:
-        return _joined([read_configurations(file) for file in files])
-    marks = [read_landmarks(file, keep_absent=True) for file in files]
-    labels = tuple(marks[0])
-    for file, found in zip(files, marks, strict=True):
-        if found.keys() != marks[0].keys():
-            other = first_names(sorted(found.keys() ^ marks[0].keys()), _NAMED)
+    first, *rest = parts = [
+        _read_file(file, None) if ending in _TEXTS else _read_specimen(file, ending) for file in files[ending]
+    ]
+    points = [first.points]
+    for file, part in zip(files[ending][1:], rest, strict=True):
+        place = {name: k for k, name in enumerate(part.landmarks)}
+        if part.dimensions != first.dimensions or place.keys() != set(first.landmarks):
+            has, expected = (f"{len(one.landmarks)} landmarks in {one.dimensions}-D" for one in (part, first))
+            other = first_names(sorted(place.keys() ^ set(first.landmarks)), _NAMED)
             raise damage_error(
-                file, f"it has {len(found)} landmarks and {files[0].name} has {len(labels)} ({other} in one of them "
-                "alone); name the same landmarks in all files, with NA or as undefined where one is missing"
+                file, f"it has {has} and {files[ending][0].name} has {expected}"
+                f"{f' ({other} in one of them alone)' if other else ''}; give the same landmarks to all files, with NA "
+                "or as undefined where one is missing"
             )  # fmt: skip
-    names = tuple(file.name[: -len(ending)].removesuffix(".landmarks") for file in files)
-    plain = all(re.fullmatch(r"point_\d+", label) for label in labels)
-    return LandmarkConfigurations(
-        names=names,
-        points=np.array([[found[label] for label in labels] for found in marks]),
-        landmarks=() if plain else labels,
-        unit="mm" if ending in _MILLIMETRES else "",
-        where=str(files[0]),
-    )
-
-
-def _joined(parts: Sequence[LandmarkConfigurations]) -> LandmarkConfigurations:
-    first = parts[0]
-    for part in parts:
-        if part.points.shape[1:] != first.points.shape[1:]:
-            shapes = [f"{one.points.shape[1]} landmarks of {one.dimensions} dimensions" for one in (part, first)]
-            raise FileFormatError(f"{part.where} has {shapes[0]} and {first.where} {shapes[1]}; give the same to all.")
+        points.append(part.points[:, [place[name] for name in first.landmarks]])
     keys = dict.fromkeys(key for part in parts for key in part.columns)
     return replace(
         first,
         names=tuple(name for part in parts for name in part.names),
-        points=np.concatenate([part.points for part in parts]),
+        points=np.concatenate(points),
         columns={key: tuple(c for p in parts for c in p.columns.get(key, [""] * len(p))) for key in keys},
-        notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
+        where=str(folder),
+        notes=(*notes, *dict.fromkeys(note for part in parts for note in part.notes)),
     )
-
-
-def read_sliders(path: Path | str, landmarks: int) -> IntArray:
-    """Read the numbers of semilandmarks from CSV as geomorph has them: before, slide, after; or surface alone.
-
-    Args:
-        path: the file, with a header or without; landmarks count from 1.
-        landmarks: their number.
-
-    Returns:
-        (M, 3) of curves or (S,) on the surface, from 0.
-
-    Raises:
-        FileError: it cannot be read.
-        FileFormatError: another number of columns, or numbers that are no landmarks.
-    """
-    path = Path(path)
-    text = _text(read_bytes(path, LARGEST_CONFIGURATIONS_FILE_BYTES), path)
-    rows = [re.split(r"[,;\t]", line.replace('"', "")) for line in text.splitlines() if line.strip()]
-    rows = [[cell.strip() for cell in row] for row in rows]
-    if rows and not all(map(is_number, rows[0])):
-        # R writes row names in a first column without a name.
-        rows = [row[1:] if rows[0][0] == "" and len(rows[0]) > 1 else row for row in rows][1:]
-    width = len(rows[0]) if rows else 0
-    if width not in (1, 3) or any(len(row) != width or not all(map(is_number, row)) for row in rows):
-        raise damage_error(path, "it needs rows of before, slide, after, or of one surface landmark, as numbers from 1")
-    numbers = np.array(rows, dtype=np.float64)
-    return slider_numbers(numbers if width > 1 else numbers.ravel(), landmarks, path)
 
 
 def slider_texts(configurations: LandmarkConfigurations) -> dict[str, str]:
@@ -227,7 +185,7 @@ def write_configurations(
     Args:
         path: the file; a folder for the formats of `FOLDER_FORMATS`.
         configurations: the landmarks; sliders are not written.
-        format: a key of `CONFIGURATION_FORMATS` or `FOLDER_FORMATS`; None for that of the ending of `path`.
+        format: one of `CONFIGURATION_FORMATS` or `FOLDER_FORMATS`; None for that of the ending of `path`.
 
     Raises:
         InputError: an unknown format, or one that cannot hold these landmarks.
@@ -236,53 +194,48 @@ def write_configurations(
     path, found = Path(path), configurations
     if format is None:
         format = next((key for key, ending in CONFIGURATION_FORMATS.items() if path.suffix.lower() == ending), None)
-    if format not in {**CONFIGURATION_FORMATS, **FOLDER_FORMATS}:
+    if format not in (*CONFIGURATION_FORMATS, *FOLDER_FORMATS):
         known = ", ".join((*CONFIGURATION_FORMATS, *FOLDER_FORMATS))
         problem = f"the ending {path.suffix!r} has no format" if format is None else f"there is no format {format!r}"
         raise InputError(f"Cannot write {path}: {problem}; give one of {known} with --to.")
-    files, held = _folder_texts(path, found, format) if format in FOLDER_FORMATS else _file_texts(path, found, format)
-    for file, text in files.items():
+    texts = _texts_in_folder(path, found, format) if format in FOLDER_FORMATS else _texts(path, found, format)
+    for file, text in texts.items():
         make_folder(file.parent)
         write_text(file, text)
     notes: list[str] = []
+    held = found.columns if format in ("csv", "long", "morphoj") else _TPS_KEYS if format == "tps" else ()
     if lost := [column for column in found.columns if column not in held]:
         notes.append(f"The columns {', '.join(lost)} are left out, which the format {format} has no place for.")
     if format == "morphoj" and found.columns:
-        notes.append(f"The columns are in {list(files)[1].name}; import it as classifier variables.")
+        notes.append(f"The columns are in {list(texts)[1].name}; import it as classifier variables.")
     numbers = tuple(map(str, range(1, len(found.landmarks) + 1)))
     if format in ("tps", "nts", "morphoj") and found.landmarks != numbers:
         notes.append("The landmarks are numbered in their order, because the format has no names of landmarks.")
     return tuple(notes)
 
 
-def _file_texts(path: Path, found: LandmarkConfigurations, format: str) -> tuple[dict[Path, str], Collection[str]]:
-    """Return the text of each file, and the columns in them."""
+def _texts(path: Path, found: LandmarkConfigurations, format: str) -> dict[Path, str]:
     if format == "tps":
         if bad := [name for name in found.names if "\n" in name or "\r" in name]:
             raise InputError(f"{found.where}: TPS cannot hold the specimen name {bad[0][:60]!r}; rename it.")
         # A line break would end the value.
         values = {k.upper(): [" ".join(c.split()) for c in found.columns.get(k, [""] * len(found))] for k in _TPS_KEYS}
-        return {path: tps_text(dict(zip(found.names, found.points, strict=True)), values)}, _TPS_KEYS
-    if format == "nts":
-        return {path: nts_text(found)}, ()
+        return {path: tps_text(dict(zip(found.names, found.points, strict=True)), values)}
     if format == "morphoj":
         table, classes = morphoj_texts(found)
-        beside = path.with_name(f"{path.name.removesuffix(path.suffix)}{CLASSIFIERS}")
-        return {path: table, **({beside: classes} if classes else {})}, found.columns
-    return {path: wide_text(found) if format == "csv" else long_text(found)}, found.columns
+        beside = path.with_name(f"{path.name.removesuffix(path.suffix)}.classifiers.txt")
+        return {path: table, **({beside: classes} if found.columns else {})}
+    return {path: {"nts": nts_text, "csv": wide_text, "long": long_text}[format](found)}
 
 
-def _folder_texts(folder: Path, found: LandmarkConfigurations, format: str) -> tuple[dict[Path, str], Collection[str]]:
-    ending = FOLDER_FORMATS[format]
+def _texts_in_folder(folder: Path, found: LandmarkConfigurations, format: str) -> dict[Path, str]:
     if found.dimensions != 3:
-        raise InputError(f"{found.where}: {ending} files cannot hold 2-D landmarks; write tps, nts or csv.")
+        raise InputError(f"{found.where}: .{format} files cannot hold 2-D landmarks; write tps, nts or csv.")
     if format == "fcsv" and not found.observed.all():
         raise InputError(f"{found.where}: .fcsv files cannot hold missing landmarks; write mrk.json.")
     bad = next((name for name in found.names if re.search(r'[/\\:*?"<>|\x00-\x1f]|^\.', name)), None)
     if bad is not None:
         raise InputError(f"{found.where}: the specimen name {bad[:60]!r} cannot name a file; rename it.")
-    texts = {
-        folder / f"{name}{ending}": LANDMARK_FORMATS[ending].write(dict(zip(found.landmarks, points, strict=True)))
-        for name, points in zip(found.names, found.points, strict=True)
-    }
-    return texts, ()
+    write = LANDMARK_FORMATS[f".{format}"].write
+    marks = (dict(zip(found.landmarks, points, strict=True)) for points in found.points)
+    return {folder / f"{name}.{format}": write(one) for name, one in zip(found.names, marks, strict=True)}

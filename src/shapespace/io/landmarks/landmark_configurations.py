@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from shapespace.errors import InputError
-from shapespace.io.parsing import damage_error
+from shapespace.errors import FileFormatError, InputError
+from shapespace.io.parsing import is_number
+from shapespace.io.tables.table_io import read_rows
 from shapespace.reprs import first_names, short_repr
 from shapespace.types import BoolArray, FloatArray, IntArray
 
 _NO_SLIDERS = np.zeros((0, 3), dtype=np.int32)
 _NO_POINTS = np.zeros(0, dtype=np.int32)
 _NAMED = 3  # specimens in a sentence
+_MOST_DIGITS = 9  # of a number of a landmark, which fits 32 bits
 _MISSING_CODES, _MISSING_BELOW_ZERO = (-999.0, -9999.0), (-1.0, -9.0, -99.0)
 """All coordinates of a missing landmark; the latter only where no other coordinate is negative, as in pictures. tpsDig
 writes -1, and older programs -999."""
@@ -80,41 +80,60 @@ class LandmarkConfigurations:
         return np.logical_not(np.logical_or.reduce(np.isnan(self.points), axis=2))
 
 
-def marked_missing(points: FloatArray, names: Sequence[str]) -> tuple[FloatArray, tuple[str, ...]]:
-    """Return points (N, L, D) with not-a-number for all coordinates of missing landmarks, and sentences on them.
+def mark_missing(found: LandmarkConfigurations) -> LandmarkConfigurations:
+    """Return landmarks with not-a-number for all coordinates of missing ones, and notes on them.
 
     A landmark is missing if one of its coordinates is not-a-number, or all are one of the codes of digitising programs.
     """
-    points, notes = points.copy(), list[str]()
+    points, notes = found.points.copy(), list(found.notes)
     lacking = np.isnan(points)
     partly = lacking.any(axis=2) & ~lacking.all(axis=2)
     points[partly] = np.nan
-    same = (points == points[:, :, :1]).all(axis=2)
-    codes = [code for code in _MISSING_CODES if (same & (points[:, :, 0] == code)).any()]
-    negative = (points < 0) & ~(same & np.isin(points[:, :, 0], (*_MISSING_CODES, *_MISSING_BELOW_ZERO)))[:, :, None]
-    codes += [code for code in _MISSING_BELOW_ZERO if not negative.any() and (same & (points[:, :, 0] == code)).any()]
-    coded = same & np.isin(points[:, :, 0], codes)
+    first = np.where((points == points[:, :, :1]).all(axis=2), points[:, :, 0], np.nan)
+    codes = [code for code in _MISSING_CODES if (first == code).any()]
+    negative = (points < 0) & ~np.isin(first, (*_MISSING_CODES, *_MISSING_BELOW_ZERO))[:, :, None]
+    codes += [code for code in _MISSING_BELOW_ZERO if not negative.any() and (first == code).any()]
+    coded = np.isin(first, codes)
     points[coded] = np.nan
     for mask, reason in (
         (partly, "lack one of their coordinates and are taken as missing"),
         (coded, f"with the coordinates {' or '.join(f'{code:g}' for code in codes)} are taken as missing"),
     ):
         if mask.any():
-            affected = [names[int(row)] for row in np.unique(np.nonzero(mask)[0])]
+            affected = [found.names[int(row)] for row in np.unique(np.nonzero(mask)[0])]
             notes.append(f"{int(mask.sum())} landmarks of {first_names(affected, _NAMED)} {reason}.")
-    return points, tuple(notes)
+    return replace(found, points=points, notes=tuple(notes))
 
 
-def slider_numbers(numbers: npt.NDArray[Any], landmarks: int, where: Path) -> IntArray:
-    """Return the numbers of semilandmarks, (M, 3) or (S,) from 1, counted from 0.
+def read_landmark_numbers(path: Path, landmarks: Sequence[str] | None, widths: Sequence[int], form: str) -> IntArray:
+    """Return the numbers, from 1, of the landmarks in each row of a table with a header or without.
+
+    Args:
+        path: of the table; it has numbers from 1, or names.
+        landmarks: L names; None if they are not known.
+        widths: numbers of columns that it may have; row names of R are left out.
+        form: of its rows, for messages.
+
+    Returns:
+        (M, width), all different in a row.
 
     Raises:
-        FileFormatError: a number that is no landmark, or a row with a landmark twice.
+        FileError: it cannot be read.
+        FileFormatError: it has no rows, or one of another form.
     """
-    whole = np.asarray(numbers, dtype=np.float64)
-    bad = whole[~((whole >= 1) & (whole <= landmarks) & (whole == np.floor(whole)))]
-    if bad.size:
-        raise damage_error(where, f"{bad.flat[0]:g} is no number of a landmark, which go from 1 to {landmarks}")
-    if whole.ndim == 2 and any(len(set(row)) < len(row) for row in whole.tolist()):
-        raise damage_error(where, "a row of before, slide, after has one landmark twice")
-    return (whole - 1).astype(np.int32)
+    number = {name: k for k, name in enumerate(landmarks or (), 1)}
+
+    def number_of(cell: str) -> int:
+        count = int(cell) if cell.isdecimal() and len(cell) < _MOST_DIGITS else 0
+        return number.get(cell, 0 if landmarks is not None and count > len(landmarks) else count)
+
+    rows = read_rows(path)
+    if rows and not any(is_number(cell) or cell in number for cell in rows[0]):
+        rows = [row[1:] if rows[0][0] == "" else row for row in rows][1:]
+    numbers = [list(map(number_of, row)) for row in rows]
+    bad = next((k for k, row in enumerate(numbers) if len(row) not in widths or len({*row} - {0}) < len(row)), None)
+    if bad is not None or not rows:
+        given = "no row" if bad is None else f"the row {', '.join(rows[bad])[:60]!r}"
+        last = "" if landmarks is None else f" to {len(landmarks)}, or by name"
+        raise FileFormatError(f"{path} has {given}; write {form} in each row, by number from 1{last}.")
+    return np.array(numbers, dtype=np.int32)

@@ -14,7 +14,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations, marked_missing, slider_numbers
+from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations, mark_missing
 from shapespace.io.parsing import damage_error
 from shapespace.io.read_limits import LARGEST_CONFIGURATIONS_FILE_BYTES
 from shapespace.lazy import require_package
@@ -59,25 +59,20 @@ def parse_r(data: bytes, path: Path, name: str | None = None) -> LandmarkConfigu
     names = names or tuple(f"specimen {k}" for k in range(1, len(points) + 1))
     labels = labels or tuple(map(str, range(1, points.shape[1] + 1)))
     columns = {part: cells for part, one in beside.items() if len(cells := _cells(one)) == len(points)}
-    sliders = {3: np.zeros((0, 3), dtype=np.int32), 1: np.zeros(0, dtype=np.int32)}
+    sliders = {3: np.zeros((0, 3), dtype=np.int32), 1: np.zeros((0, 1), dtype=np.int32)}
     for part, one in beside.items():
         width = 3 if part.lower() in _CURVES else 1
         if part.lower() in (*_CURVES, *_SURFACES) and getattr(one, "size", 0) and one.size % width == 0:
-            numbers = np.asarray(one, dtype=np.float64).reshape((-1, 3) if width > 1 else -1)
-            sliders[width] = slider_numbers(numbers, len(labels), path)
+            numbers = np.asarray(one, dtype=np.float64).reshape(-1, width)
+            if not np.isin(numbers, np.arange(1, len(labels) + 1)).all():
+                raise damage_error(path, f"{part} has numbers that are no landmarks, which go from 1 to {len(labels)}")
+            sliders[width] = numbers.astype(np.int32) - 1
             columns.pop(part, None)
             notes.append(f"The sliders are those of {part}.")
-    points, coded = marked_missing(points, names)
-    return LandmarkConfigurations(
-        names=names,
-        points=points,
-        landmarks=labels,
-        columns=columns,
-        curve_sliders=sliders[3],
-        surface_sliders=sliders[1],
-        where=str(path),
-        notes=(*notes, *coded),
-    )
+    return mark_missing(LandmarkConfigurations(
+        names=names, points=points, landmarks=labels, columns=columns, curve_sliders=sliders[3],
+        surface_sliders=sliders[1][:, 0], where=str(path), notes=tuple(notes),
+    ))  # fmt: skip
 
 
 def _unpacked(data: bytes) -> bytes:

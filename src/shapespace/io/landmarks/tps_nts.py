@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from itertools import pairwise
+from dataclasses import replace
+from itertools import pairwise, takewhile
 from pathlib import Path
 
 import numpy as np
 
 from shapespace.errors import InputError
-from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations, marked_missing
+from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations, mark_missing
 from shapespace.io.parsing import CUT_SHORT, damage_error
 from shapespace.io.tables.table_io import MISSING
 from shapespace.reprs import first_names
@@ -43,27 +43,22 @@ def coordinates(cells: Iterable[str], path: Path, describe: Callable[[int], str]
     return numbers
 
 
-@dataclass
-class _Specimen:
-    """Rows of coordinates of the landmarks and of each curve, and the values of other keys."""
-
-    parts: list[list[list[float]]]
-    values: dict[str, str] = field(default_factory=dict[str, str])
-
-    def name(self, number: int) -> str:
-        image = re.sub(r"\.\w{1,5}$", "", self.values.get("image", ""))
-        return self.values.get("id") or image or f"specimen {number}"
-
-
 def parse_tps(text: str, path: Path) -> LandmarkConfigurations:
     """Return the landmarks of a TPS file; the points of curves are semilandmarks after the landmarks.
 
     The inner points of a curve slide between their neighbours. SCALE= is applied if all specimens have it, as in
     geomorph. IMAGE=, COMMENT= and other keys become columns. Outlines are left out.
     """
-    specimens = _specimens([line.strip() for line in text.splitlines() if line.strip()], path)
-    names = tuple(specimen.name(number) for number, specimen in enumerate(specimens, 1))
-    counts = [list(map(len, specimen.parts)) for specimen in specimens]
+    lines = "\n".join(line.strip() for line in text.splitlines() if line.strip())
+    start, *blocks = re.split(r"^(?=LM3?\s*=)", lines, flags=re.IGNORECASE | re.MULTILINE)
+    if start or not blocks:
+        raise damage_error(path, "it is no TPS file, since it does not begin with LM= or LM3=")
+    parts, values = zip(*(_specimen(block, number, path) for number, block in enumerate(blocks, 1)), strict=True)
+    names = tuple(
+        one.get("id") or re.sub(r"\.\w{1,5}$", "", one.get("image", "")) or f"specimen {k}"
+        for k, one in enumerate(values, 1)
+    )
+    counts = [list(map(len, own)) for own in parts]
     for name, count in zip(names, counts, strict=True):
         if count != counts[0]:
             has, expected = (
@@ -71,16 +66,13 @@ def parse_tps(text: str, path: Path) -> LandmarkConfigurations:
             )
             problem = f"specimen {name[:60]!r} has {has} and {names[0][:60]!r} has {expected}"
             raise damage_error(path, f"{problem}; digitise the same for all, with NA for missing landmarks")
-    points = _array([[row for part in one.parts for row in part] for one in specimens], names, path)
-    points, coded = marked_missing(points, names)
-    notes, unscaled = list[str](), [n for n, one in zip(names, specimens, strict=True) if "scale" not in one.values]
+    points = _array([[row for part in own for row in part] for own in parts], names, path)
+    notes, unscaled = list[str](), [name for name, one in zip(names, values, strict=True) if "scale" not in one]
+    scales = np.ones(len(names))
     if not unscaled:
-        scales = np.array(
-            coordinates((one.values["scale"] for one in specimens), path, lambda k: f"SCALE= of {names[k]}")
-        )
+        scales = np.array(coordinates((one["scale"] for one in values), path, lambda k: f"SCALE= of {names[k]}"))
         if not (scales > 0).all():
             raise damage_error(path, "a SCALE= is not above 0, so correct it")
-        points *= scales[:, None, None]
         notes.append("The coordinates are multiplied by the SCALE= of each specimen.")
     elif len(unscaled) < len(names):
         notes.append(
@@ -89,66 +81,57 @@ def parse_tps(text: str, path: Path) -> LandmarkConfigurations:
         )
     elif points.shape[2] == 2:
         notes.append("No specimen has SCALE=, so sizes are in the unit of the file, such as pixels.")
-    if any("outlines" in one.values for one in specimens):
+    if any("outlines" in one for one in values):
         notes.append("Outlines (OUTLINES=) are left out.")
     ends = np.cumsum(counts[0])
     inner = [k for a, b in pairwise(ends) for k in range(int(a) + 1, int(b) - 1)]
     if inner:
         notes.append(f"{len(inner)} inner points of {len(ends) - 1} curves are semilandmarks.")
-    keys = dict.fromkeys(key for one in specimens for key in one.values if key not in ("id", "scale", "outlines"))
-    return LandmarkConfigurations(
-        names=names,
-        points=points,
-        columns={key: tuple(one.values.get(key, "") for one in specimens) for key in keys},
-        curve_sliders=(np.array(inner, dtype=np.int32)[:, None] + np.arange(-1, 2)).astype(np.int32),
-        where=str(path),
-        notes=(*notes, *coded),
-    )
+    keys = dict.fromkeys(key for one in values for key in one if key not in ("id", "scale", "outlines"))
+    found = mark_missing(LandmarkConfigurations(
+        names=names, points=points, columns={key: tuple(one.get(key, "") for one in values) for key in keys},
+        curve_sliders=np.reshape(inner, (-1, 1)).astype(np.int32) + np.arange(-1, 2, dtype=np.int32),
+        where=str(path), notes=tuple(notes),
+    ))  # fmt: skip
+    return replace(found, points=found.points * scales[:, None, None])
 
 
-def _specimens(lines: Sequence[str], path: Path) -> list[_Specimen]:
-    specimens: list[_Specimen] = []
+def _specimen(block: str, number: int, path: Path) -> tuple[list[list[list[float]]], dict[str, str]]:
+    """Return the rows of coordinates of the landmarks and of each curve of a specimen, and the values of other keys."""
+    lines, parts, values = block.splitlines(), list[list[list[float]]](), dict[str, str]()
     at, is_outline = 0, False
     while at < len(lines):
         key, equals, value = (part.strip() for part in lines[at].partition("="))
-        key, at, is_new = key.lower(), at + 1, key.lower() in ("lm", "lm3")
-        if not specimens and not is_new:
-            raise damage_error(path, "it is no TPS file, since it does not begin with LM= or LM3=")
+        key, at = key.lower(), at + 1
         if not equals:
-            problem = f"specimen {len(specimens)} has more rows of coordinates than it declares"
+            problem = f"specimen {number} has more rows of coordinates than it declares"
             raise damage_error(path, f"{problem} ({lines[at - 1][:40]!r})")
-        if is_new or key in ("points", "points3"):
+        is_outline = key == "outlines" or (is_outline and key != "curves")
+        if key in ("lm", "lm3", "points", "points3"):
             count = int(value) if re.fullmatch(r"\d{1,10}", value) else -1
-            rows = lines[at : at + max(count, 0)]
-            rows = rows[: next((k for k, row in enumerate(rows) if "=" in row), len(rows))]
-            label, at = f"specimen {len(specimens) + is_new}", at + count
+            rows = list(takewhile(lambda row: "=" not in row, lines[at : at + max(count, 0)]))
             if len(rows) != count:
-                declared = f"{label} declares {value[:20]!r} points, and {len(rows)} rows of coordinates follow"
-                raise damage_error(path, f"{declared}; {CUT_SHORT}")
-            # tpsDig writes the decimal comma of the system.
-            words = (row.replace(",", ".").split() for row in rows)
-            parsed = [coordinates(row, path, lambda _, label=label: label) for row in words]
-            if is_new:
-                specimens.append(_Specimen([parsed]))
-            elif not is_outline:
-                specimens[-1].parts.append(parsed)
+                declared = f"specimen {number} declares {value[:20]!r} points"
+                raise damage_error(path, f"{declared}, and {len(rows)} rows of coordinates follow; {CUT_SHORT}")
+            at += count
+            if not is_outline:
+                # tpsDig writes the decimal comma of the system.
+                words = (row.replace(",", ".").split() for row in rows)
+                parts.append([coordinates(row, path, lambda _: f"specimen {number}") for row in words])
         elif key != "curves":
-            specimens[-1].values[key] = value
-        is_outline = key == "outlines" or (is_outline and not is_new and key != "curves")
-    return specimens
+            values[key] = value
+    return parts, values
 
 
 def _array(specimens: Sequence[list[list[float]]], names: Sequence[str], path: Path) -> FloatArray:
     """Return (N, L, D) coordinates; a row of not-a-number alone may have any width."""
     rows = [(name, row) for name, points in zip(names, specimens, strict=True) for row in points]
     widths = {len(row): name for name, row in reversed(rows) if not all(map(math.isnan, row))}
-    if len(widths) > 1:
-        several = " and ".join(f"{width} coordinates in a row of {name[:60]!r}" for width, name in widths.items())
-        raise damage_error(path, f"it has {several}; do not mix 2-D and 3-D landmarks")
-    width = next(iter(widths), 0)
-    if width not in (2, 3):
-        has = f"{width} coordinates in a row" if width else "no landmarks"
-        raise damage_error(path, f"it has {has}; landmarks need 2 or 3 coordinates each")
+    if set(widths) not in ({2}, {3}):
+        has = " and ".join(f"{width} coordinates in a row of {name[:60]!r}" for width, name in widths.items())
+        advice = "do not mix 2-D and 3-D landmarks" if len(widths) > 1 else "landmarks need 2 or 3 coordinates each"
+        raise damage_error(path, f"it has {has or 'no landmarks'}; {advice}")
+    [width] = widths
     flat = [row if len(row) == width else [math.nan] * width for _, row in rows]
     return np.array(flat, dtype=np.float64).reshape(len(specimens), -1, width)
 
@@ -160,14 +143,13 @@ def tps_text(specimens: Mapping[str, FloatArray], values: Mapping[str, Sequence[
         specimens: name -> (L, 2) or (L, 3).
         values: key, such as `IMAGE` -> value of each specimen; empty ones are left out.
     """
-    blocks: list[str] = []
+    lines: list[str] = []
     for at, (name, points) in enumerate(specimens.items()):
-        rows = [" ".join(map(repr, p)) if np.isfinite(p).all() else " ".join(["NA"] * len(p)) for p in points.tolist()]
-        known = [f"{key}={cells[at]}" for key, cells in (values or {}).items() if cells[at]]
-        blocks.append(
-            "\n".join([f"LM{'3' if points.shape[1] == 3 else ''}={len(points)}", *rows, *known, f"ID={name}"])
-        )
-    return "\n".join(blocks) + "\n"
+        lines.append(f"LM{'3' if points.shape[1] == 3 else ''}={len(points)}")
+        lines += [" ".join(map(repr, p) if np.isfinite(p).all() else ["NA"] * len(p)) for p in points.tolist()]
+        lines += [f"{key}={cells[at]}" for key, cells in (values or {}).items() if cells[at]]
+        lines.append(f"ID={name}")
+    return "\n".join(lines) + "\n"
 
 
 def parse_nts(text: str, path: Path) -> LandmarkConfigurations:
@@ -197,8 +179,8 @@ def parse_nts(text: str, path: Path) -> LandmarkConfigurations:
         notes.append(f"Coordinates {code:g} are missing, as the header says.")
     if p == width and n > 1:
         names = [path.name.removesuffix(path.suffix)]
-    points, coded = marked_missing(points.reshape(len(names), -1, width), names)
-    return LandmarkConfigurations(names=tuple(names), points=points, where=str(path), notes=(*notes, *coded))
+    points = points.reshape(len(names), -1, width)
+    return mark_missing(LandmarkConfigurations(names=tuple(names), points=points, where=str(path), notes=tuple(notes)))
 
 
 def nts_text(configurations: LandmarkConfigurations) -> str:

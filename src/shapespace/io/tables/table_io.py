@@ -13,7 +13,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Final, TextIO
 
-from shapespace.io.files import write_text
+from shapespace.errors import FileFormatError
+from shapespace.io.files import read_bytes, write_text
 from shapespace.io.tables.workbook import WORKBOOK_START, sheet_rows
 
 CHECKSUM: Final = "checksum"
@@ -158,6 +159,24 @@ def table_rows(content: bytes) -> Iterator[list[str]]:
             yield [*map(unescape_formula, row), *[""] * (len(raw) - len(row))]
     except csv.Error as error:
         raise ValueError(f"is not a CSV table ({error})") from error
+
+
+def read_rows(path: Path, content: bytes | None = None) -> list[list[str]]:
+    """Return the header and the rows of a table that `table_rows` reads, cells without white space at their ends.
+
+    Args:
+        path: the file.
+        content: its bytes; None to read them.
+
+    Raises:
+        FileError: it cannot be read.
+        FileFormatError: it is no table.
+    """
+    try:
+        rows = table_rows(read_bytes(path) if content is None else content)
+        return [[cell.strip() for cell in row] for row in rows]
+    except ValueError as error:
+        raise FileFormatError(f"{path} {error}; correct the table.") from error
 
 
 def decoded_text(content: bytes) -> str:

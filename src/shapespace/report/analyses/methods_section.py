@@ -18,7 +18,7 @@ from shapespace.schemas import (
     TextPart,
 )
 from shapespace.statistics.dispersion import FEWEST_OF_GROUP
-from shapespace.statistics.methods import SCAN_OF_SUBJECT
+from shapespace.statistics.methods import REDUCED_OF_EACH_TERM, SCAN_OF_SUBJECT
 
 _SOURCES = {
     "coefficients": "coefficients of the model of the fits",
@@ -156,7 +156,8 @@ def alignment_text(record: AlignRecord) -> str:
         sentences.append(f"Specimens with {reflect[0]} {reflect[1]} were reflected before the alignment.")
     if record.estimated:
         method = "a thin-plate spline" if settings.get("missing", "tps") == "tps" else "regression"
-        sentences.append(f"{counted(record.estimated, 'missing landmark was', 'missing landmarks were')} estimated by {method}.")
+        estimated = counted(record.estimated, "missing landmark was", "missing landmarks were")
+        sentences.append(f"{estimated} estimated by {method}.")
     if settings.get("structures"):
         sentences.append("Structures were aligned separately.")
     end = "converged" if record.converged else "stopped before convergence"
@@ -181,14 +182,22 @@ def _test_sentences(tests: Sequence[TestScheme]) -> Iterator[str]:
     kinds = [(test.arrangements, test.resampling == "bootstrap") for test in tests]
     for count, draws in dict.fromkeys(kinds):
         details = [
-            f"of {', '.join(test.tested)}{f' in the stratum {test.stratum}' if test.stratum else ''}"
-            f"{f' ({test.statistic})' if test.statistic else ''} by {scheme_text(test)}"
+            f"of {_tested_text(test)} by {scheme_text(test)}"
             for test, kind in zip(tests, kinds, strict=True)
             if kind == (count, draws)
         ]
         source = f"come from {count:,} arrangements, the observed data among them: " if count else "are "
         subject = f"Intervals come from {count:,} draws: " if draws else f"p values {source}"
         yield f"{subject}{'; '.join(details)}."
+
+
+def _tested_text(test: TestScheme) -> str:
+    tested = ", ".join(test.tested)
+    if test.statistic.startswith(tested):
+        # Names such as K, which a description of the statistics repeats.
+        return test.statistic
+    stratum = f" in the stratum {test.stratum}" if test.stratum else ""
+    return f"{tested}{stratum}{f' ({test.statistic})' if test.statistic else ''}"
 
 
 def methods_parts(methods: Methods) -> tuple[Part, ...]:
@@ -302,9 +311,13 @@ def _alignment_sentence(methods: Methods) -> str:
 
 
 def _exchangeability(methods: Methods) -> str:
-    kinds = {test.resampling for test in methods.tests if not test.unequal_variances}
+    equal = [test for test in methods.tests if not test.unequal_variances]
+    kinds = {test.resampling for test in equal}
+    permuted = [test for test in equal if test.resampling == "permutation"]
     sentences: list[str] = []
-    if "permutation" in kinds:
+    if permuted and not methods.sizes and all(test.reduced_model is None for test in permuted):
+        sentences.append("permutation assumes that what is permuted is exchangeable under the null hypothesis")
+    elif permuted:
         sentences.append(
             "permutation assumes that the residuals have the same distribution in all groups, with equal dispersion"
         )
@@ -327,20 +340,31 @@ def scheme_text(test: TestScheme) -> str:
     if test.resampling == "leave-one-out":
         return f"leaving out each {test.unit} of the reference"
     every = ", all of them" if test.exhaustive else ""
+    difference, _, block = test.unit.partition(" within a ")
+    within = f" within {_plural(block)}" if block else ""
+    if test.resampling == "permutation" and test.reduced_model is None and test.unit != SCAN_OF_SUBJECT:
+        return f"permutation of {_plural(difference)}{within}{every}"
     units = (
         "values"
         if test.reduced_model is None
+        else f"residuals of {REDUCED_OF_EACH_TERM[0]}"
+        if test.reduced_model == REDUCED_OF_EACH_TERM
         else f"residuals of shape ~ {' + '.join(test.reduced_model)}"
         if test.reduced_model
         else "residuals of the mean"
     )
     if test.resampling == "sign flips":
         return f"{units} with signs flipped by {test.unit}{every}"
-    difference, _, block = test.unit.partition(" within a ")
-    scope = f"of {difference}s permuted within {block}s" if block else f"permuted between {test.unit}s"
+    scope = f"of {_plural(difference)} permuted{within}" if block else f"permuted between {_plural(test.unit)}"
     if test.unit == SCAN_OF_SUBJECT:
         scope = "permuted within subjects, and between subjects with the same number of scans"
     return f"{units} {scope}{every}"
+
+
+def _plural(unit: str) -> str:
+    """Return the plural of a unit such as `subject` or `mean of a side`."""
+    noun, of, rest = unit.partition(" of ")
+    return f"{noun}s{of}{rest}"
 
 
 def dispersion_sentence(one: Dispersion, unequal_variances: bool | None, unit: str) -> str:

@@ -27,11 +27,6 @@ from shapespace.report.figures.correspondence_figures import (
     nearness_figure,
     position_std_figure,
 )
-from shapespace.report.figures.deformation_figures import (
-    deformation_grid_figure,
-    landmark_map_figure,
-    landmark_vectors_figure,
-)
 from shapespace.report.figures.draw import STAGE_WORDS, encode_webp
 from shapespace.report.figures.fit_figures import (
     THRESHOLDS_MM,
@@ -43,6 +38,12 @@ from shapespace.report.figures.fit_figures import (
     signed_maps,
     stages_figure,
     threshold_figure,
+)
+from shapespace.report.figures.landmark_figures import (
+    deformation_grid_figure,
+    landmark_map_figure,
+    landmark_vectors_figure,
+    superimposed_landmarks,
 )
 from shapespace.report.figures.many_fit_figures import (
     aligned_grid,
@@ -126,6 +127,7 @@ __all__ = [
     "signed_maps",
     "spectrum_figure",
     "stages_figure",
+    "superimposed_landmarks",
     "surface_map_figure",
     "threshold_figure",
     "upright_views",

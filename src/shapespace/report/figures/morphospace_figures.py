@@ -17,7 +17,6 @@ from shapespace.errors import ShapespaceError
 from shapespace.geometry.thin_plate_spline import ThinPlateSpline
 from shapespace.report.analyses.shape_data import MOST_LANDMARKS
 from shapespace.report.figures.analysis_figures import upright_views
-from shapespace.report.figures.deformation_figures import draw_links, grid_lines
 from shapespace.report.figures.draw import (
     GREY,
     INK,
@@ -32,6 +31,7 @@ from shapespace.report.figures.draw import (
     type_size,
     view,
 )
+from shapespace.report.figures.landmark_figures import draw_links, grid_lines
 from shapespace.report.render.palette import CATEGORIES
 from shapespace.report.render.renderer import Layer, render
 from shapespace.schemas import MorphospacePart

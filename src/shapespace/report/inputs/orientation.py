@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,63 +9,54 @@ import numpy as np
 from msgspec import structs
 
 from shapespace.errors import FileFormatError, InputError
-from shapespace.io.files import read_bytes
-from shapespace.io.tables.table_io import table_rows
+from shapespace.io.containers.json_files import read_json
+from shapespace.io.landmarks.landmark_configurations import read_landmark_numbers
 from shapespace.schemas import NamedView, Orientation, read
 from shapespace.types import FloatArray
 
 LINKS = "links.csv"
-"""Table of pairs of landmarks, numbers from 1, between which figures have a line."""
+"""Table of pairs of landmarks between which figures have a line."""
 _PARALLEL = 1e-3  # sine of the angle below which two directions determine no rotation
 _AGAIN = 'write {"views": [{"name": "dorsal", "toward_viewer": [0, 0, 1], "up": [0, 1, 0]}]}'
 
 
-def read_orientation(path: Path) -> Orientation:
-    """Return the named views of an orientation.json.
-
-    Raises:
-        FileError: the file cannot be read.
-        FileFormatError: it is damaged, or two directions of a view are parallel.
-    """
-    try:
-        content = json.loads(read_bytes(path))
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{path} is not JSON; {_AGAIN}.") from error
-    orientation = read(Orientation, content, str(path), _AGAIN)
-    try:
-        for view in orientation.views:
-            view_rotation(view)
-    except InputError as error:
-        raise FileFormatError(f"{path}: {error}") from error
-    return orientation
-
-
-def find_orientation(path: Path | None, folders: Sequence[Path]) -> Orientation | None:
+def find_orientation(
+    path: Path | None, folders: Sequence[Path], landmarks: Sequence[str] | None = None
+) -> Orientation | None:
     """Return the orientation of a file, or of orientation.json and links.csv in the first folders that have them.
 
     Args:
         path: the file; None searches the folders.
         folders: of the shapes.
+        landmarks: names of the landmarks, which links.csv may have; None for numbers alone.
 
     Raises:
         FileError: a file cannot be read.
-        FileFormatError: it is damaged.
+        FileFormatError: it is damaged, or two directions of a view are parallel.
     """
     views, links = (
         next((folder / name for folder in folders if (folder / name).is_file()), None)
         for name in (Orientation.FILE, LINKS)
     )
-    path = path or views
-    orientation = Orientation() if path is None else read_orientation(path)
-    if links is not None and not orientation.links:
+    path, orientation = path or views, Orientation()
+    if path is not None:
+        orientation = read(Orientation, read_json(path, _AGAIN), str(path), _AGAIN)
         try:
-            rows = list(table_rows(read_bytes(links)))[1:]
-            orientation = structs.replace(orientation, links=tuple((int(a), int(b)) for a, b in rows))
-        except ValueError as error:
-            raise FileFormatError(f"{links} needs two columns with the numbers of landmarks, from 1.") from error
-    if any(number < 1 for link in orientation.links for number in link):
-        raise FileFormatError(f"{path or links}: a link has a landmark below 1; number landmarks from 1.")
+            for view in orientation.views:
+                view_rotation(view)
+        except InputError as error:
+            raise FileFormatError(f"{path}: {error}") from error
+        if any(number < 1 for link in orientation.links for number in link):
+            raise FileFormatError(f"{path}: a link has a landmark below 1; number landmarks from 1.")
+    if links is not None and not orientation.links:
+        orientation = structs.replace(orientation, links=read_links(links, landmarks))
     return orientation if orientation.views or orientation.links else None
+
+
+def read_links(path: Path, landmarks: Sequence[str] | None) -> tuple[tuple[int, int], ...]:
+    """Return the numbers of landmarks, from 1, in a table of pairs; errors are those of `read_landmark_numbers`."""
+    rows = read_landmark_numbers(path, landmarks, (2,), "two landmarks").tolist()
+    return tuple((first, second) for first, second in rows)
 
 
 def view_rotation(view: NamedView) -> FloatArray:
