@@ -16,7 +16,7 @@ from shapespace.report.analyses.methods_section import alignment_text, citations
 from shapespace.report.analyses.shape_data import add_shape_data
 from shapespace.schemas import AlignRecord, Analysis, Dispersion, Methods, TestScheme, TextPart
 from shapespace.statistics.compare_shapes import CompareConfig, compare
-from shapespace.statistics.methods import methods_of
+from shapespace.statistics.methods import REDUCED_OF_EACH_TERM, methods_of
 from shapespace.statistics.shape_tests.groups import compare_disparity
 from shapespace.version import __version__
 
@@ -158,3 +158,23 @@ def test_an_alignment_states_semilandmarks_and_estimates() -> None:
         assert words in text
     plain = AlignRecord(specimens=4, landmarks=5, dimensions=3, gauge="form", version="9.9")
     assert "without scaling." in alignment_text(plain) and "semilandmarks" not in alignment_text(plain)
+
+
+@pytest.mark.parametrize(
+    ("scheme", "words"),
+    [
+        (TestScheme(tested=("K",), statistic="K of shape", unit="shape", reduced_model=None, arrangements=99),
+         ": of K of shape by permutation of shapes."),
+        (TestScheme(tested=("individual",), unit="mean of a side", reduced_model=None, arrangements=99),
+         ": of individual (F) by permutation of means of a side."),
+        (TestScheme(tested=("F",), statistic="F of each term", unit="shape", reduced_model=REDUCED_OF_EACH_TERM,
+                    arrangements=99),
+         ": of F of each term by residuals of the reduced model of each term permuted between shapes."),
+        (TestScheme(tested=("dose",), unit="cell within a subject", reduced_model=None, arrangements=99),
+         ": of dose (F) by permutation of cells within subjects."),
+    ],
+)  # fmt: skip
+def test_what_is_permuted_is_named_in_plain_words(scheme: TestScheme, words: str) -> None:
+    text = text_of(msgspec.structs.replace(METHODS, tests=(scheme,)))
+    assert words in text
+    assert ("all groups" in text) == (scheme.reduced_model is not None)

@@ -167,7 +167,7 @@ def test_targets_of_subjects_are_exchanged_whatever_their_number_of_scans() -> N
     found = regress(cohort, "age", folds=5, permutations=99, draws=1)
     assert found.p is not None and found.p < 0.2, "no two subjects have as many scans"
     assert permutation_scheme(found.subjects, found.observed).endswith("the targets of all 20 subjects.")
-    assert scheme_text(found.methods.tests[0]) == "values permuted between subjects"
+    assert scheme_text(found.methods.tests[0]) == "permutation of subjects"
 
 
 def test_methods_state_the_scheme_of_targets_that_vary_within_subjects() -> None:

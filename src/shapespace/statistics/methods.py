@@ -13,7 +13,8 @@ from shapespace.statistics.dispersion import DispersionTest
 
 SCAN_OF_SUBJECT = "scan of a subject"
 """`TestScheme.unit` where values are permuted within subjects, and between subjects with the same number of scans."""
-
+REDUCED_OF_EACH_TERM = ("the reduced model of each term",)
+"""`TestScheme.reduced_model` of several terms, each tested by residuals of the model of the other terms."""
 
 _RANK = 1e-9  # of the largest singular value, below which coordinates vary by rounding alone
 _ALONG = 0.01

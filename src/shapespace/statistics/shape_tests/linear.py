@@ -17,7 +17,7 @@ from shapespace.schemas import CurvePart, Part, Series, SurfaceMapPart, TableCol
 from shapespace.statistics.compare_formula import Design, design_of
 from shapespace.statistics.compare_shapes import CompareConfig, angles_between, complete_cohort, term_tests
 from shapespace.statistics.compare_strata import Stratum, independent_stratum, less, means_of
-from shapespace.statistics.methods import sample_sizes
+from shapespace.statistics.methods import REDUCED_OF_EACH_TERM, sample_sizes
 from shapespace.statistics.shape_tests.permutations import Groups, Orders, orders
 from shapespace.statistics.shape_tests.shape_test_result import ShapeTestResult, Statistic
 from shapespace.statistics.shape_tests.test_table import shape_test
@@ -271,7 +271,7 @@ def analyse_allometry(
         settings={"covariate": covariate, "group": group, "separate": separate, "permutations": permutations,
                   "seed": seed},
         sizes=sample_sizes(cohort.names, [(group, classes)] if group else []),
-        reduced_model=(covariate, group) if group else (),
+        reduced_model=REDUCED_OF_EACH_TERM if group else (),
         assumptions=("The residuals of each test are those of the model of the terms that do not contain its term.",)
         if group else (),
     )  # fmt: skip
@@ -364,7 +364,7 @@ def measure_repeatability(
         arrays={"measurement_error.npz": {"vertices": cohort.reference, "faces": faces, "values": deviation}},
         settings={"subject": subject, "session": session, "permutations": permutations, "seed": seed},
         sizes=sample_sizes(cohort.table.texts(subject), [(session, cohort.table.texts(session))] if session else []),
-        reduced_model=(session,) if session else (),
+        reduced_model=REDUCED_OF_EACH_TERM if session else (),
         n_subjects=s,
     )  # fmt: skip
 

@@ -21,6 +21,7 @@ from shapespace.schemas import TableColumn, TablePart
 from shapespace.statistics.compare_formula import Term, columns_of, design_of
 from shapespace.statistics.compare_shapes import CompareConfig, SquaresType, term_tests
 from shapespace.statistics.compare_strata import Stratum, less, refuse_aliased, refuse_few
+from shapespace.statistics.methods import REDUCED_OF_EACH_TERM
 from shapespace.statistics.shape_tests.permutations import orders
 from shapespace.statistics.shape_tests.shape_test_result import ShapeTestResult, Statistic
 from shapespace.statistics.shape_tests.test_table import shape_test
@@ -227,6 +228,6 @@ def fit_pgls(
         ),
         settings={"formula": formula, "tree": tree.where, "anova_type": anova_type, "permutations": permutations,
                   "seed": seed},
-        reduced_model=("reduced model of each term",),
+        reduced_model=REDUCED_OF_EACH_TERM,
         assumptions=("Residuals evolve by Brownian motion along the branches of the tree.",),
     )  # fmt: skip

@@ -142,7 +142,7 @@ SHAPE_TESTS: tuple[ShapeTest, ...] = (
         summary="regress shape on size, test common slopes of groups, and correct shapes for size",
         module="linear",
         function="analyse_allometry",
-        statistics="F of type II; that of the interaction with the covariate tests common slopes",
+        statistics="F of type II (that of the interaction with the covariate tests common slopes)",
         permuted="shape",
         references=(
             "Drake and Klingenberg (2008) Proceedings of the Royal Society B 275, 71-76.",
@@ -197,7 +197,7 @@ SHAPE_TESTS: tuple[ShapeTest, ...] = (
         summary="estimate modularity by the covariance ratio CR",
         module="covariation",
         function="estimate_modularity",
-        statistics="CR of each pair of modules, and their mean; small values are modular",
+        statistics="CR of each pair of modules, and their mean (small values are modular)",
         permuted="point",
         references=(
             "Adams (2016) Methods Ecol. Evol. 7, 565-572.",
