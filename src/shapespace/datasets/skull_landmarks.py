@@ -52,7 +52,7 @@ def skull_landmarks(seed: int, k: int) -> tuple[FloatArray, float]:
     turn = rng.uniform(-0.6, 0.6)
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     pixels = _LENGTH_MM * np.exp(log_size) / mm_per_pixel * x @ rotation.T + rng.uniform(300, 600, 2)
-    return np.round(pixels, 2), float(np.round(mm_per_pixel, 6))
+    return np.asarray(np.round(pixels, 2), dtype=np.float64), float(np.round(mm_per_pixel, 6))
 
 
 def write_skull_landmarks(folder: Path, *, count: int, seed: int = 0) -> Path:

@@ -315,7 +315,7 @@ def _landmark_points(tree: Tree, path: Path) -> dict[str, FloatArray]:
             pairs = LANDMARK_FORMATS[".json"].read(text.encode(), path) if kind == "json" else _tlms(text)
         except (ShapespaceError, ValueError, IndexError) as error:
             raise ValueError("its landmarks cannot be read") from error
-        return {name: point for name, point in pairs if are_measurable(point)}
+        return {name: point for name, point in pairs if point is not None and are_measurable(point)}
     return {}
 
 
