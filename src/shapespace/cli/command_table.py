@@ -315,8 +315,8 @@ COMMANDS: tuple[Command, ...] = (
             basic("--seed", "S", source=SKULLS),
         ),
         (
-            "skulls.tps has 12 landmarks per specimen in pixels with its scale in mm per pixel; links.csv has the lines "
-            "between landmarks of an outline.",
+            "skulls.tps has 12 landmarks per specimen in pixels with its scale in mm per pixel; links.csv has the "
+            "lines between landmarks of an outline.",
         ),
     ),
     Command(
@@ -827,8 +827,9 @@ COMMANDS: tuple[Command, ...] = (
             basic("--subject", "COLUMN", source=ASYMMETRY),
             basic("--reference", "COLUMN=VALUE", "group that scores are compared with (default: all)"),
             basic("--pairs",
-                  "PAIRS.csv", "two columns of vertices or landmarks that mirror each other; one on the plane is "
-                  "paired with itself; landmarks of a landmark file count from 1 (default: found on the mean)",
+                  "PAIRS.csv", "two columns of landmarks that mirror each other, by name or by number from 1; those in "
+                  "no pair lie on the plane of symmetry; of surfaces: names of landmarks, or vertices from 0, those on "
+                  "the plane paired with themselves, others left out (default: found on the mean)",
                   parse=Path),
             basic("--side", "COLUMN", source=ASYMMETRY),
             advanced("--degrees-of-freedom", source=ASYMMETRY),

@@ -26,6 +26,7 @@ from shapespace.geometry.similarity import fit_similarity
 from shapespace.reprs import list_briefly, short_repr
 from shapespace.schemas import Methods, SampleSize, TestScheme
 from shapespace.statistics.analysis_result import AnalysisResult
+from shapespace.statistics.effect_size import effect_size
 from shapespace.statistics.methods import methods_of
 from shapespace.statistics.observation_weights import weights_of
 from shapespace.statistics.sides import Sides, aligned_shapes, find_sides, given_sides, match_sides
@@ -40,6 +41,9 @@ _BLOCK = 100  # permutations at a time; bounds memory and spaces the progress me
 _HEIGHT_OFF = 2.0
 """Error of the height of the surface above a triangle, as a share of the height: curvature differs at its corners."""
 _FEWEST = 3  # subjects; two leave one degree of freedom
+_Tested: TypeAlias = tuple[float | None, float | None]
+"""p and Z."""
+_UNTESTED: _Tested = None, None
 _MOSTLY = 0.5
 """Share of the shapes of a subject that must observe a vertex, so that it counts as observed."""
 
@@ -56,6 +60,8 @@ class AnovaRow:
         ms: ss / df.
         f: over `individual x side`, or for that over the asymmetric error; None where there is nothing to compare with.
         p: by permutation; None where nothing can be permuted.
+        z: F in standard deviations of its permutation distribution, after a Box-Cox transformation; None without p.
+        r2: share of the total sum of squares.
     """
 
     source: str
@@ -64,6 +70,8 @@ class AnovaRow:
     ms: float
     f: float | None = None
     p: float | None = None
+    z: float | None = None
+    r2: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,6 +148,11 @@ class AsymmetryResult(AnalysisResult):
     degrees_of_freedom: DegreesOfFreedom = "klingenberg"
 
     @property
+    def exchanges_sides(self) -> bool:
+        """Whether individuals are tested by exchange of sides, rather than of shapes as in geomorph."""
+        return bool(self.sides.classes) and self.degrees_of_freedom == "klingenberg"
+
+    @property
     def observed_share(self) -> FloatArray:
         """(M,) share of the subjects that observe a vertex and its mirror image."""
         return np.ones(len(self.mean)) if self.observed is None else self.observed.mean(axis=0)
@@ -171,9 +184,13 @@ class AsymmetryResult(AnalysisResult):
             count = 1 + self.permutations
             flipped = ("side", "directional asymmetry of each vertex")
             tests.append(TestScheme(tested=flipped, resampling="sign flips", reduced_model=None, arrangements=count))
-            permuted = tuple(one.source for one in self.anova if one.p is not None and one.source != "side")
-            if permuted:
-                tests.append(TestScheme(tested=permuted, unit="shape", reduced_model=None, arrangements=count))
+            tested = [one.source for one in self.anova if one.p is not None and one.source != "side"]
+            if self.exchanges_sides:
+                unit = "mean of a side of a subject"
+                tests.append(TestScheme(tested=("individual",), unit=unit, reduced_model=None, arrangements=count))
+                tested.remove("individual")
+            if tested:
+                tests.append(TestScheme(tested=tuple(tested), unit="shape", reduced_model=None, arrangements=count))
         sides = self.sides
         paired = "given or found by mirroring the mean" if sides.paired else "the nearest place of the mirror image"
         compared = (
@@ -277,14 +294,23 @@ def measure_asymmetry(
         # Places nearest on the mean leave its sides no difference along the surface, which single shapes have.
         parts = _along(symmetric, normals), along
     dimensions = sides.dimensions(scaled=cohort.gauge == "shape") if degrees_of_freedom == "klingenberg" else (1.0, 1.0)
-    anova = _anova(*parts, who, dimensions, rng, steps)
+    exchange = side is not None and degrees_of_freedom == "klingenberg"
+    anova = _anova(*parts, who, dimensions, rng, steps, exchange_sides=exchange)
     anova = anova if degrees_of_freedom == "klingenberg" else _pooled(anova)
     size_anova: tuple[AnovaRow, ...] = ()
     if side is not None and np.isfinite(cohort.sizes_mm).all():
         one, other = cohort.sizes_mm[: len(first), None], cohort.sizes_mm[len(first) :, None]
         own_steps = _Steps(4 * permutations, None)
         size_anova = _pooled(
-            _anova((one + other) / 2, one - other, who, (1.0, 1.0), np.random.default_rng(seed), own_steps)
+            _anova(
+                (one + other) / 2,
+                one - other,
+                who,
+                (1.0, 1.0),
+                np.random.default_rng(seed),
+                own_steps,
+                exchange_sides=exchange,
+            )
         )
     directional = own.mean(axis=0) if normals is not None else np.linalg.norm(own.mean(axis=0), axis=1)
     observed = None if pairs_observed is None else who.of(pairs_observed.astype(np.float64)) >= _MOSTLY
@@ -437,6 +463,8 @@ def _anova(
     dimensions: tuple[float, float],
     rng: np.random.Generator,
     steps: _Steps,
+    *,
+    exchange_sides: bool = False,
 ) -> tuple[AnovaRow, ...]:
     n, rows = len(who.counts), len(who.codes)
     flat_s = symmetric.reshape(rows, -1) - symmetric.reshape(rows, -1).mean(axis=0)
@@ -457,25 +485,30 @@ def _anova(
 
     sums = np.zeros((n, rows))
     sums[who.codes, np.arange(rows)] = 1.0
-    p_side = _p_flipping(sums @ gram_d @ sums.T, rng, steps)
-    p_both = _p_permuting(gram_off, between, rng, steps) if repeated else None
-    p_individual = _p_permuting(gram_s, between, rng, steps) if repeated else None
+    p_side = _p_flipping(sums @ gram_d @ sums.T, 2.0 * rows * (side + both), rng, steps)
+    p_both = _p_permuting(gram_off, between, rng, steps) if repeated else _UNTESTED
+    if exchange_sides:
+        p_individual = _p_exchanging(who.of(flat_s), who.of(off) / 2.0, who.counts, rng, steps)
+    else:
+        p_individual = _p_permuting(gram_s, between, rng, steps) if repeated else _UNTESTED
+    total = individual + side + both + error_s + error_d
 
-    ms_subject, ms_side = individual / ((n - 1) * d_sym), side / d_asym
-    ms_both = both / ((n - 1) * d_asym)
+    def row(source: str, ss: float, df: float, f: float | None = None, p: _Tested = _UNTESTED) -> AnovaRow:
+        return AnovaRow(source, ss, df, ss / df, f, *p, r2=ss / max(total, 1e-300))
+
+    df_subject, df_both, df_error = (n - 1) * d_sym, (n - 1) * d_asym, (rows - n) * d_asym
+    ms_both = both / df_both
     rows_of_table = [
-        AnovaRow("individual", individual, (n - 1) * d_sym, ms_subject, _f_ratio(ms_subject, ms_both), p_individual),
-        AnovaRow("side", side, d_asym, ms_side, _f_ratio(ms_side, ms_both), p_side),
+        row("individual", individual, df_subject, _f_ratio(individual / df_subject, ms_both), p_individual),
+        row("side", side, d_asym, _f_ratio(side / d_asym, ms_both), p_side),
     ]
     if not repeated:
-        return (*rows_of_table, AnovaRow("individual x side", both, (n - 1) * d_asym, ms_both))
-    df = rows - n
-    ms_error = error_d / (df * d_asym)
+        return (*rows_of_table, row("individual x side", both, df_both))
     return (
         *rows_of_table,
-        AnovaRow("individual x side", both, (n - 1) * d_asym, ms_both, _f_ratio(ms_both, ms_error), p_both),
-        AnovaRow(ERROR_ASYMMETRIC, error_d, df * d_asym, ms_error),
-        AnovaRow(ERROR_SYMMETRIC, error_s, df * d_sym, error_s / (df * d_sym)),
+        row("individual x side", both, df_both, _f_ratio(ms_both, error_d / df_error), p_both),
+        row(ERROR_ASYMMETRIC, error_d, df_error),
+        row(ERROR_SYMMETRIC, error_s, (rows - n) * d_sym),
     )
 
 
@@ -485,7 +518,7 @@ def _pooled(anova: Sequence[AnovaRow]) -> tuple[AnovaRow, ...]:
     if errors:
         ss, df = sum(row.ss for row in errors), sum(row.df for row in errors)
         rows[2] = replace(rows[2], f=_f_ratio(rows[2].ms, ss / df))
-        rows.append(AnovaRow(MEASUREMENT_ERROR, ss, df, ss / df))
+        rows.append(AnovaRow(MEASUREMENT_ERROR, ss, df, ss / df, r2=sum(row.r2 for row in errors)))
     return tuple(rows)
 
 
@@ -493,25 +526,77 @@ def _f_ratio(ms: float, error: float) -> float | None:
     return ms / error if error > 0 else None
 
 
-def _p_flipping(gram: FloatArray, rng: np.random.Generator, steps: _Steps) -> float | None:
-    """Return how often the mean of vectors is as long with random signs; `gram` (n, n) is theirs."""
-    observed, beyond = float(gram.sum()), 1
+def _p_and_z(draw: Callable[[int], FloatArray], observed: float, total: float, steps: _Steps) -> _Tested:
+    """Return the share of arrangements with as large a statistic as the observed one, and the effect size of F.
+
+    Args:
+        draw: the statistics (k,) of k random arrangements.
+        observed: that of the data.
+        total: sum of the statistic and what F divides it by, in all arrangements.
+        steps: called after each block.
+    """
+    if not steps.each:
+        return _UNTESTED
+    values = [np.array([observed])]
     for count in steps.blocks():
+        values.append(draw(count))
+        steps.add(count)
+    statistic = np.concatenate(values)
+    f = statistic / np.maximum(total - statistic, 1e-12 * total + 1e-300)
+    return float((statistic >= observed * (1 - 1e-12)).mean()), effect_size(f)
+
+
+def _p_flipping(gram: FloatArray, total: float, rng: np.random.Generator, steps: _Steps) -> _Tested:
+    """Test the mean of vectors by random signs; `gram` (n, n) is theirs."""
+
+    def draw(count: int) -> FloatArray:
         signs = rng.choice([-1.0, 1.0], (count, len(gram)))
-        beyond += int((np.einsum("pi,pi->p", signs @ gram, signs) >= observed * (1 - 1e-12)).sum())
-        steps.add(count)
-    return beyond / (1 + steps.each) if steps.each else None
+        return np.einsum("pi,pi->p", signs @ gram, signs)
+
+    return _p_and_z(draw, float(gram.sum()), total, steps)
 
 
-def _p_permuting(gram: FloatArray, between: FloatArray, rng: np.random.Generator, steps: _Steps) -> float | None:
-    """Return how often subjects differ as much when shapes are dealt out anew; `gram` (N, N) is of centred shapes."""
-    observed, beyond = float((between * gram).sum()), 1
-    for count in steps.blocks():
-        for _ in range(count):
-            order = rng.permutation(len(gram))
-            beyond += int(float((between * gram[np.ix_(order, order)]).sum()) >= observed * (1 - 1e-12))
-        steps.add(count)
-    return beyond / (1 + steps.each) if steps.each else None
+def _p_permuting(gram: FloatArray, between: FloatArray, rng: np.random.Generator, steps: _Steps) -> _Tested:
+    """Test whether subjects differ by dealing out shapes anew; `gram` (N, N) is of centred shapes."""
+
+    def draw(count: int) -> FloatArray:
+        orders = [rng.permutation(len(gram)) for _ in range(count)]
+        return np.array([float((between * gram[np.ix_(order, order)]).sum()) for order in orders])
+
+    return _p_and_z(draw, float((between * gram).sum()), float(np.trace(gram)), steps)
+
+
+def _p_exchanging(
+    middle: FloatArray, half: FloatArray, counts: npt.NDArray[np.intp], rng: np.random.Generator, steps: _Steps
+) -> _Tested:
+    """Test whether the two sides of a subject are alike by pairing them with sides of other subjects.
+
+    Unlike permutations of all shapes, this keeps what a subject's sides differ by, which F divides by.
+
+    Args:
+        middle: (n, K) mean of the two sides of each subject, centred.
+        half: (n, K) half of their difference, centred.
+        counts: (n,) shapes of a side.
+        rng: of the permutations.
+        steps: called after each block.
+    """
+    share = counts / counts.sum()
+    one, other = (side - share @ side for side in (middle + half, middle - half))
+    cross = (counts[:, None] * one) @ other.T
+    lengths = counts[:, None] * (other**2).sum(axis=1)
+    own = np.arange(len(one))
+    base = float((counts * (one**2).sum(axis=1)).sum())
+
+    def sums(order: npt.NDArray[np.intp]) -> tuple[float, float]:
+        return float(cross[own, order].sum()), base + float(lengths[own, order].sum())
+
+    def draw(count: int) -> FloatArray:
+        # The ratio of SS_I to SS_I + SS_IS, which has the order of F.
+        pairs = np.array([sums(rng.permutation(len(own))) for _ in range(count)])
+        return 0.5 + pairs[:, 0] / pairs[:, 1]
+
+    cross_sum, total = sums(own)
+    return _p_and_z(draw, 0.5 + cross_sum / max(total, 1e-300), 1.0, steps)
 
 
 def _known_beyond(own: FloatArray, heights: FloatArray) -> FloatArray:

@@ -23,7 +23,7 @@ from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import read_bytes
 from shapespace.io.tables.table_io import table_rows
 from shapespace.reprs import short_repr
-from shapespace.types import FloatArray, IntArray, Mesh
+from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks
 
 LARGEST_OFF = 0.02
 """A mean that lies further (RMS, share of its size) from its mirror image about any plane is not symmetric."""
@@ -170,7 +170,9 @@ def find_sides(cohort: Cohort) -> Sides:
 
 
 def given_sides(cohort: Cohort, pairs: Sequence[tuple[int, int]], where: str = "The pairs") -> Sides:
-    """Return the sides that pairs of vertices give; others are left out.
+    """Return the sides that pairs of vertices give.
+
+    Of a cohort of landmarks the others lie on the plane of symmetry, as in geomorph; other vertices are left out.
 
     Args:
         cohort: of the shapes.
@@ -182,15 +184,26 @@ def given_sides(cohort: Cohort, pairs: Sequence[tuple[int, int]], where: str = "
             nowhere near its mirror image.
     """
     other: dict[int, int] = {}
+    is_landmarks = cohort.source.kind == "landmarks"
+    noun, first = ("landmark", 1) if is_landmarks else ("vertex", 0)
     for a, b in pairs:
         for v in (a, b):
             if not 0 <= v < cohort.n_vertices:
                 raise InputError(
-                    f"{where}: there is no vertex {v}; they are counted from 0 to {cohort.n_vertices - 1}."
+                    f"{where}: there is no {noun} {v + first}; they are counted from {first} to "
+                    f"{cohort.n_vertices - 1 + first}."
                 )
         if other.get(a, b) != b or other.get(b, a) != a:
-            raise InputError(f"{where}: the vertex {a if other.get(a, b) != b else b} stands in two pairs; keep one.")
+            twice = (a if other.get(a, b) != b else b) + first
+            raise InputError(f"{where}: the {noun} {twice} stands in two pairs; keep one.")
         other[a], other[b] = b, a
+    notes: tuple[str, ...] = ()
+    single = [v for v in range(cohort.n_vertices) if v not in other]
+    if other and single and is_landmarks:
+        other |= {v: v for v in single}
+        of = {vertex: name for name, vertex in (cohort.landmarks or SurfaceLandmarks()).items()}
+        notes = (f"{len(single)} landmarks in no pair of {where} are taken to lie on the plane of symmetry "
+                 f"({list_names([of.get(v, str(v + 1)) for v in single])}).",)  # fmt: skip
     if len(other) < _FEWEST:
         raise InputError(
             f"{where} name {len(other)} vertices, and {_FEWEST} are the least that show a plane; add some."
@@ -225,7 +238,7 @@ def given_sides(cohort: Cohort, pairs: Sequence[tuple[int, int]], where: str = "
             f"{100 * LARGEST_PAIRED_OFF:.0f} % is the most; check that each row names points that mirror each other."
         )
     left = cohort.n_vertices - len(vertices)
-    notes = (f"{left} of {cohort.n_vertices} vertices stand in no pair of {where} and are left out.",) if left else ()
+    notes += (f"{left} of {cohort.n_vertices} vertices stand in no pair of {where} and are left out.",) if left else ()
     return replace(sides, off_share=share, notes=notes)
 
 
@@ -299,9 +312,10 @@ def aligned_shapes(cohort: Cohort, shapes: FloatArray) -> FloatArray:
 
 
 def read_pairs(path: Path, cohort: Cohort) -> tuple[tuple[int, int], ...]:
-    """Return the pairs of vertices in a CSV table of two columns, as numbers or as names of landmarks.
+    """Return the pairs in a CSV table of two columns, with a header or without, as names of landmarks or as numbers.
 
-    Vertices count from 0, and landmarks of a cohort of landmarks from 1.
+    Vertices count from 0, and landmarks of a cohort of landmarks from 1, as in geomorph. A cell that is the name of a
+    landmark is not read as a number. A first column without a name, which R writes for the rows, is left out.
 
     Raises:
         FileError: it cannot be read.
@@ -310,15 +324,19 @@ def read_pairs(path: Path, cohort: Cohort) -> tuple[tuple[int, int], ...]:
     """
     check_file(path, _LARGEST_BYTES, "give a smaller table")
     try:
-        rows = [[cell.strip() for cell in row] for row in table_rows(read_bytes(path))][1:]
+        rows = [[cell.strip() for cell in row] for row in table_rows(read_bytes(path))]
     except ValueError as error:
-        raise FileFormatError(f"{path} {error}; write two columns with a header, a pair in each row.") from error
-    if not rows or any(len(row) != 2 for row in rows):
-        raise FileFormatError(f"{path} is no table of pairs; write two columns with a header, a pair in each row.")
+        raise FileFormatError(f"{path} {error}; write two columns, a pair in each row.") from error
     landmarks, first = dict(cohort.landmarks or {}), int(cohort.source.kind == "landmarks")
-    unknown = sorted(
-        {cell for row in rows for cell in row if not (cell.isdecimal() and len(cell) < 12) and cell not in landmarks}
-    )
+
+    def is_place(cell: str) -> bool:
+        return cell in landmarks or bool(_NUMBER.fullmatch(cell))
+
+    if rows and not all(map(is_place, rows[0])):
+        rows = [row[1:] if rows[0][0] == "" else row for row in rows][1:]
+    if not rows or any(len(row) != 2 for row in rows):
+        raise FileFormatError(f"{path} is no table of pairs; write two columns, a pair in each row.")
+    unknown = sorted({cell for row in rows for cell in row if not is_place(cell)})
     if unknown:
         there = list_names(sorted(landmarks)) if landmarks else "none are known"
         raise InputError(

@@ -198,7 +198,7 @@ def _p_text(effect: AnovaRow) -> str:
 
 def _anova_parts(result: AsymmetryResult) -> tuple[TablePart, ...]:
     lengths = _lengths(result)
-    names = (lengths.label("SS", "²"), "df", lengths.label("MS", "²"), "F")
+    names = (lengths.label("SS", "²"), "df", lengths.label("MS", "²"), "R²", "F", "Z")
     numbers = (TableColumn(name=name, kind="number") for name in names)
     columns = (TableColumn(name="source"), *numbers, TableColumn(name="p", kind="p"))
     note = "df are those of subjects times dimensions."
@@ -208,7 +208,10 @@ def _anova_parts(result: AsymmetryResult) -> tuple[TablePart, ...]:
         parts.append(("ANOVA of centroid size", result.size_anova, observed))
     return tuple(
         TablePart(
-            title=title, columns=columns, rows=tuple((e.source, e.ss, e.df, e.ms, e.f, e.p) for e in anova), note=text
+            title=title,
+            columns=columns,
+            rows=tuple((e.source, e.ss, e.df, e.ms, e.r2, e.f, e.z, e.p) for e in anova),
+            note=text,
         )
         for title, anova, text in parts
     )
@@ -216,8 +219,9 @@ def _anova_parts(result: AsymmetryResult) -> tuple[TablePart, ...]:
 
 def _anova_rows(result: AsymmetryResult, anova: Sequence[AnovaRow]) -> Rows:
     field = _lengths(result).field
-    return ("source", field("ss", "2"), "df", field("ms", "2"), "f", "p"), [
-        (e.source, e.ss, e.df, e.ms, "" if e.f is None else e.f, "" if e.p is None else e.p) for e in anova
+    return ("source", field("ss", "2"), "df", field("ms", "2"), "r2", "f", "z", "p"), [
+        (e.source, e.ss, e.df, e.ms, e.r2, *("" if value is None else value for value in (e.f, e.z, e.p)))
+        for e in anova
     ]
 
 
