@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import bz2
 import contextlib
+import gzip
+import io
 import lzma
 import warnings
-import zlib
 from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
@@ -27,7 +28,6 @@ _CURVES = ("curvepts", "curves", "curveslide", "curvslide")
 _SURFACES = ("surfslide", "surfaces", "surfpts")
 """Parts of geomorph's data sets with the numbers of semilandmarks."""
 _LISTED = 8  # arrays in a sentence
-_XZ_BYTES = 2**28  # memory of unpacking; xz -9 takes a quarter of it
 _DEEPEST = 2  # lists in lists that arrays are looked for in
 
 
@@ -78,18 +78,14 @@ def parse_r(data: bytes, path: Path, name: str | None = None) -> LandmarkConfigu
 def _unpacked(data: bytes) -> bytes:
     """Return data without compression, up to the limit of a file, so that a small one cannot fill the memory."""
     limit = LARGEST_CONFIGURATIONS_FILE_BYTES
-    if data.startswith(b"\x1f\x8b"):
-        gzip = zlib.decompressobj(wbits=31)
-        out, is_cut = gzip.decompress(data, limit), bool(gzip.unconsumed_tail)
-    elif data.startswith((b"BZh", b"\xfd7zXZ")):
-        other = bz2.BZ2Decompressor() if data.startswith(b"BZh") else lzma.LZMADecompressor(memlimit=_XZ_BYTES)
-        out = other.decompress(data, limit)
-        is_cut = not other.eof and not other.needs_input
-    else:
-        return data
-    if is_cut:
-        raise ValueError(f"it unpacks to more than {limit >> 20} MiB")
-    return out
+    for start, module in ((b"\x1f\x8b", gzip), (b"BZh", bz2), (b"\xfd7zXZ", lzma)):
+        if data.startswith(start):
+            with module.open(io.BytesIO(data)) as stream:
+                data = stream.read(limit + 1)
+            if len(data) > limit:
+                raise ValueError(f"it unpacks to more than {limit >> 20} MiB")
+            break
+    return data
 
 
 def _expansions(rdata: Any) -> dict[bytes, Any]:

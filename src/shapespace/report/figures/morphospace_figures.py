@@ -80,16 +80,16 @@ class Morphospace:
                   "nodes": (-1, a), "edges": (-1, 2), "cross_validated": (n, a)}  # fmt: skip
         absent = {"groups": np.zeros(n), "nodes": np.zeros((0, a)), "edges": np.zeros((0, 2))}
         known = {name: values for name, values in {**absent, **arrays}.items() if name in shapes}
+        ends = {"groups": max(len(part.groups), 1), "edges": n + known["nodes"].size // max(a, 1), "faces": v}
         for name, shape in shapes.items():
             values = known.get(name, np.zeros(shape) if name == "cross_validated" else np.zeros(0))
-            fits = values.ndim == len(shape) and values.dtype.kind in "iuf" and bool(np.isfinite(values).all())
-            if not fits or any(want not in (-1, got) for want, got in zip(shape, values.shape, strict=True)):
+            fits = values.ndim == len(shape) and all(a in (-1, b) for a, b in zip(shape, values.shape, strict=True))
+            if not fits or values.dtype.kind not in "iuf" or not np.isfinite(values).all() or (
+                name in ends and values.size and not 0 <= values.min() <= values.max() < ends[name]
+            ):  # fmt: skip
                 raise damaged(f"the array {name!r} of a morphospace does not fit its names and axes")
-        counts = {"groups": max(len(part.groups), 1), "edges": n + len(known["nodes"]), "faces": v}
-        outside = [name for name, count in counts.items() if known[name].size and not (
-            0 <= known[name].min() <= known[name].max() < count)]  # fmt: skip
-        if outside or len(part.shares) != a or not all(0 <= axis < a for axis in part.first):
-            raise damaged("a morphospace has groups, branches, triangles or axes that do not exist")
+        if len(part.shares) != a or not all(0 <= axis < a for axis in part.first):
+            raise damaged("a morphospace has axes that do not exist")
         faces = known["faces"].astype(np.int32) if known["faces"].size else None
         turn, _ = upright_views(Mesh(known["mean"], faces))
         known |= {"mean": known["mean"] @ turn.T, "shape_axes": known["shape_axes"] @ turn.T}

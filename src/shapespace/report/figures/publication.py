@@ -88,14 +88,12 @@ def save_figure(
 def _with_fonts(svg: bytes) -> bytes:
     """Return an SVG with the letters that it uses as embedded fonts."""
     text = svg.decode("utf-8")
-    letters: dict[str, set[str]] = {"400": set(), "700": set()}
-    for style, run in re.findall(r"<text([^>]*)>(.*?)</text>", text, re.DOTALL):
-        letters["700" if re.search(r"\b(700|bold)\b", style) else "400"] |= set(unescape(re.sub("<[^>]*>", "", run)))
+    runs = re.findall(r"<text[^>]*>(.*?)</text>", text, re.DOTALL)
+    letters = "".join(sorted(set(unescape(re.sub("<[^>]*>", "", "".join(runs))))))
     rules = [
         f"@font-face{{font-family:'DejaVu Sans';font-weight:{weight};src:url(data:font/woff;base64,"
-        f"{base64.b64encode(_subset(int(weight), ''.join(sorted(used)))).decode()}) format('woff')}}"
-        for weight, used in letters.items()
-        if used
+        f"{base64.b64encode(_subset(weight, letters)).decode()}) format('woff')}}"
+        for weight in ((400, 700) if re.search(r"<text[^>]*\b(700|bold)\b", text) else (400,))
     ]
     return text.replace("<defs>", f"<defs>\n  <style>{''.join(rules)}</style>", 1).encode()
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from itertools import chain
+from itertools import count as count_from
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -67,12 +69,10 @@ def write_figures(folder: Path, formats: Sequence[str], dpi: int = 300) -> tuple
 
     source = Folder(folder, ANALYSIS.again)
     analysis = Analysis.from_json(source.json(Analysis.FILE))
-    page, output = _Drawings(), make_folder(folder / FOLDER)
-    paths: list[Path] = []
-    captions: list[str] = []
-    notes: list[str] = []
+    output, paths, captions, notes = make_folder(folder / FOLDER), list[Path](), list[str](), list[str]()
     with oriented(analysis.orientation), publication_style(dpi):
         for name, title, part in _named(read_part(one, Analysis.FILE, ANALYSIS.again) for one in analysis.parts):
+            page = _Drawings()
             try:
                 StudyParts(page, source, ANALYSIS).blocks(part, title)
             except ShapespaceError as error:
@@ -80,8 +80,6 @@ def write_figures(folder: Path, formats: Sequence[str], dpi: int = 300) -> tuple
             for drawing in page.drawings:
                 paths += save_figure(drawing, output / name, formats, dpi)
                 captions.append(f"{name}: {title}. {' '.join(page.captions)}".strip())
-            page.drawings.clear()
-            page.captions.clear()
     write_text(output / "captions.txt", "".join(f"{caption}\n" for caption in captions))
     return tuple(paths), tuple(notes)
 
@@ -96,10 +94,7 @@ def _named(parts: Iterator[Part]) -> Iterator[tuple[str, str, Part]]:
         if isinstance(part, TextPart | TablePart):
             continue
         prefix = f"{anchor(chapter)[:_LONGEST]}-" if count[anchor(title)] > 1 and chapter != title else ""
-        name = base = f"{prefix}{anchor(title)[:_LONGEST]}".strip("-")
-        number = 1
-        while name in taken:
-            number += 1
-            name = f"{base}-{number}"
+        base = f"{prefix}{anchor(title)[:_LONGEST]}".strip("-")
+        name = next(one for one in chain([base], (f"{base}-{k}" for k in count_from(2))) if one not in taken)
         taken.add(name)
         yield name, title, part
