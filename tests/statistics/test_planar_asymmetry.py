@@ -193,8 +193,8 @@ def test_shapes_without_a_counterpart_are_left_out() -> None:
 
 
 def test_asymmetries_of_sides_that_do_not_differ_are_found_in_the_share_of_the_level() -> None:
-    """2,000 simulations of each of eight designs at 5 %: side 4.0 to 5.3 %; individual 4.3 to 5.1 % without variation of
-    individuals or their asymmetry; individual x side 3.7 to 5.3 % without asymmetry of individuals. Here 80 of side.
+    """2,000 simulations of each of eight designs at 5 %: side 4.0 to 5.3 %; individual 4.3 to 5.1 % without variation
+    of individuals or their asymmetry; individual x side 3.7 to 5.3 % without asymmetry of individuals. Here 80 of side.
     """
     hits = 0
     for seed in range(80):
