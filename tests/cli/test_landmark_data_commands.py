@@ -62,7 +62,7 @@ def test_landmarks_are_converted_with_their_sliders_and_what_is_left_out_is_prin
     outcome = run("landmarks", "convert", table, tmp_path / "newts.tps", "--sliders", sliders)
     assert outcome.code == 0 and "24 specimens with 9 landmarks" in outcome.out
     assert outcome.err.splitlines() == [
-        "The columns sex, site are left out, which the format tps has no place for.",
+        "Columns of the table (sex, site) are left out, since the format tps has none.",
         "The sliders are in newts.curveslide.csv.",
     ]
     assert (tmp_path / "newts.curveslide.csv").read_text() == "before,slide,after\n1,2,3\n"

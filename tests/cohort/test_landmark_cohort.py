@@ -102,7 +102,7 @@ def test_rows_without_landmarks_and_landmarks_without_rows_are_left_out_with_not
     assert "1 of 6 rows" in cohort.notes[0] and "7 of 12 shapes" in cohort.notes[1]
     with pytest.raises(InputError, match="holds no shape of"):
         read_cohort(write_table(tmp_path / "none.csv", ("a", "b")), CohortConfig(shapes=file))
-    with pytest.raises(InputError, match="landmarks of 1 specimens can be used, and 2 are the least"):
+    with pytest.raises(InputError, match="1 specimen can be used, and 2 are needed"):
         read_cohort(write_table(tmp_path / "one.csv", NAMES[:1]), CohortConfig(shapes=file))
 
 

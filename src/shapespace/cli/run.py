@@ -454,6 +454,7 @@ def _check_landmark_data(arguments: argparse.Namespace) -> int:
 def landmarks_convert(arguments: argparse.Namespace) -> int:
     """Convert landmarks of many specimens."""
     from shapespace.commands.landmark_data import convert_landmarks
+    from shapespace.report.blocks.wording import counted
 
     found, notes = convert_landmarks(arguments.data, arguments.output, **given(arguments, convert_landmarks))
     for note in notes:
@@ -462,7 +463,8 @@ def landmarks_convert(arguments: argparse.Namespace) -> int:
         show_json({"output": str(arguments.output), "specimens": len(found), "landmarks": len(found.landmarks),
                    "dimensions": found.dimensions, "notes": notes})  # fmt: skip
     else:
-        show(f"{len(found)} specimens with {len(found.landmarks)} landmarks in {arguments.output}")
+        specimens, landmarks = counted(len(found), "specimen"), counted(len(found.landmarks), "landmark")
+        show(f"{specimens} with {landmarks} in {arguments.output}")
     return 0
 
 

@@ -123,7 +123,7 @@ def read_landmark_cohort(
     rows, covariates, notes = _matched(source.names, source.columns, table, str(path))
     least = least if onto is None else 1
     if len(rows) < least:
-        raise InputError(f"{path}: landmarks of {len(rows)} specimens can be used, and {least} are the least.")
+        raise InputError(f"{path}: {len(rows)} specimen{'s' * (len(rows) != 1)} can be used, and {least} are needed.")
     if isinstance(source, AlignedLandmarks):
         if onto is not None:
             coords = np.where(source.estimated[..., None], np.nan, source.forms)[rows]

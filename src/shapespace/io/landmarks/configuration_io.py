@@ -24,7 +24,7 @@ from shapespace.reprs import first_names
 
 _TEXTS: Mapping[str, Callable[[str, Path], LandmarkConfigurations]] = {".tps": parse_tps, ".nts": parse_nts}
 _TABLES = (".csv", ".txt", ".tsv", ".xlsx")
-_SINGLE = tuple(sorted({*LANDMARK_FORMATS, *READ_ONLY_LANDMARKS} - {".tps"}, key=len, reverse=True))
+_SINGLE = tuple(sorted({*LANDMARK_FORMATS, *READ_ONLY_LANDMARKS} - {".tps"}, key=lambda one: (-len(one), one)))
 _MILLIMETRES = (".mrk.json", ".fcsv")
 _TPS_KEYS = ("image", "comment")
 """Columns that TPS has keys for."""
@@ -205,7 +205,7 @@ def write_configurations(
     notes: list[str] = []
     held = found.columns if format in ("csv", "long", "morphoj") else _TPS_KEYS if format == "tps" else ()
     if lost := [column for column in found.columns if column not in held]:
-        notes.append(f"The columns {', '.join(lost)} are left out, which the format {format} has no place for.")
+        notes.append(f"Columns of the table ({', '.join(lost)}) are left out, since the format {format} has none.")
     if format == "morphoj" and found.columns:
         notes.append(f"The columns are in {list(texts)[1].name}; import it as classifier variables.")
     numbers = tuple(map(str, range(1, len(found.landmarks) + 1)))

@@ -96,12 +96,14 @@ def mark_missing(found: LandmarkConfigurations) -> LandmarkConfigurations:
     coded = np.isin(first, codes)
     points[coded] = np.nan
     for mask, reason in (
-        (partly, "lack one of their coordinates and are taken as missing"),
-        (coded, f"with the coordinates {' or '.join(f'{code:g}' for code in codes)} are taken as missing"),
+        (partly, "with a part of the coordinates"),
+        (coded, f"with the coordinates {' or '.join(f'{code:g}' for code in codes)}"),
     ):
         if mask.any():
             affected = [found.names[int(row)] for row in np.unique(np.nonzero(mask)[0])]
-            notes.append(f"{int(mask.sum())} landmarks of {first_names(affected, _NAMED)} {reason}.")
+            count = int(mask.sum())
+            noun, verb = ("landmark", "is") if count == 1 else ("landmarks", "are")
+            notes.append(f"{count} {noun} of {first_names(affected, _NAMED)} {reason} {verb} taken as missing.")
     return replace(found, points=points, notes=tuple(notes))
 
 

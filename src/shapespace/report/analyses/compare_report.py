@@ -78,22 +78,30 @@ def compare_report(result: CompareResult) -> AnalysisReport:
             "random": result.config.random,
             "permutations": result.config.permutations,
             "seed": result.config.seed,
-            "bump_width_mm": result.config.bump_width_mm,
             "level": result.config.alpha,
             "unequal_variances": result.config.unequal_variances,
             "effect_size": result.config.effect_size,
-            "weights": result.config.weights,
-            "errors": dict(result.config.errors),
-            "error_permutation": result.config.error_permutation,
             "coding": result.config.coding,
             "gauge": result.cohort.gauge,
             "shapes": len(result.cohort),
             "subjects": result.n_subjects,
+            **dict(_special_settings(result)),
         },
         model_hashes=model_hashes(result.cohort),
         methods=result.methods,
     )
     return add_shape_data(report, result.cohort)
+
+
+def _special_settings(result: CompareResult) -> Iterator[tuple[str, Any]]:
+    """Yield the settings that not all cohorts and models have."""
+    config = result.config
+    if config.bump_width_mm is not None:
+        yield "bump_width_mm", config.bump_width_mm
+    if result.cohort.source.kind == "corresponding":
+        yield "weights", config.weights
+    if config.errors:
+        yield from (("errors", dict(config.errors)), ("error_permutation", config.error_permutation))
 
 
 def _summary(result: CompareResult) -> Iterator[str]:
