@@ -116,11 +116,10 @@ def _reflected(raw: LandmarkConfigurations, column: str, value: str) -> Landmark
 
 def _structures(path: Path) -> dict[str, str]:
     header, *rows = read_rows(path)
-    landmark, structure = key_column(header, ("landmark",)), key_column(header, ("structure",))
+    landmark, structure = (key_column(header, (name,)) for name in ("landmark", "structure"))
     if landmark is None or structure is None:
         raise FileFormatError(f"{path} has no columns landmark and structure; write one row for each landmark.")
-    names = [row[landmark] for row in rows]
-    repeated = [name for name in names if names.count(name) > 1]
-    if repeated:
-        raise FileFormatError(f"{path} has two rows of landmark {repeated[0]!r}; keep one for each.")
-    return {row[landmark]: row[structure] for row in rows}
+    structures = {row[landmark]: row[structure] for row in rows}
+    if len(structures) < len(rows):
+        raise FileFormatError(f"{path} has two rows of one landmark; keep one for each.")
+    return structures

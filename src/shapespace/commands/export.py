@@ -31,8 +31,8 @@ _MAT_HEADER, _MAT_HEADER_BYTES = b"MATLAB 5.0 MAT-file, written by shapespace", 
 _LONGEST_IN_MATLAB = 63  # characters; MATLAB's namelengthmax
 Target: TypeAlias = Literal["geomorph", "morphoj", "tps", "csv"]
 """Programs and formats that cohorts are exported to."""
-COORDINATES, COVARIATES, R_SCRIPT, R_TABLE = "coordinates.csv", "covariates.csv", "shapespace.R", "anova.csv"
-"""Files of an export to geomorph, and the table that the script writes."""
+COORDINATES, COVARIATES, R_SCRIPT = "coordinates.csv", "covariates.csv", "shapespace.R"
+"""Files of an export to geomorph; the script writes anova.csv."""
 
 
 def export(
@@ -217,27 +217,21 @@ def export_cohort(cohort: Cohort, output: Path, to: Target, formula: str | None 
     write_configurations(output / COORDINATES, replace(found, columns={}), "csv")
     table = zip(cohort.names, *columns.values(), strict=True)
     write_rows(output / COVARIATES, ("name", *columns), table)
-    write_text(output / R_SCRIPT, _r_script(cohort.dimensions, formula))
+    model = "1" if formula is None else formula.strip().removeprefix("~").strip()
+    write_text(output / R_SCRIPT, _R.replace("@FORMULA", model).replace("@K", str(cohort.dimensions)))
     if cohort.position_std is not None:
         notes.append("The script gives all vertices the same weight, as compare does with --weights none.")
     return [output / name for name in (COORDINATES, COVARIATES, R_SCRIPT)], notes
 
 
-def _r_script(dimensions: int, formula: str | None) -> str:
-    right = "1" if formula is None else formula.strip().removeprefix("~").strip()
-    return _R.replace("@FORMULA", right).replace("@K", str(dimensions)).replace("@TABLE", R_TABLE)
-
-
 _R = """\
-# Linear model of the exported shapes. Run with: Rscript shapespace.R in this folder.
-# With geomorph installed, procD.lm tests it by permutation; the sums of squares are also computed without geomorph.
+# Linear model of the exported shapes: by procD.lm where geomorph is installed, and its sums of squares in R alone.
 model <- coords ~ @FORMULA
 ss_type <- "II"  # type of the sums of squares: "I", "II" or "III"
 covariates <- read.csv("covariates.csv", check.names = FALSE, stringsAsFactors = TRUE, na.strings = "")
 table <- read.csv("coordinates.csv", check.names = FALSE)
 stopifnot(identical(as.character(table$name), as.character(covariates$name)))
-coords <- as.matrix(table[, -1])
-rownames(coords) <- table$name
+coords <- as.matrix(data.frame(table[, -1], row.names = table$name))
 # Coding and functions of formulas as in shapespace.
 options(contrasts = c("contr.sum", "contr.poly"))
 C <- function(x) factor(x)
@@ -245,8 +239,8 @@ center <- function(x) x - mean(x)
 bs <- splines::bs
 
 if (requireNamespace("geomorph", quietly = TRUE)) {
-  shapes <- geomorph::arrayspecs(coords, ncol(coords) / @K, @K)
-  data <- do.call(geomorph::geomorph.data.frame, c(list(coords = shapes), as.list(covariates)))
+  data <- list(coords = geomorph::arrayspecs(coords, ncol(coords) / @K, @K))
+  data <- do.call(geomorph::geomorph.data.frame, c(data, as.list(covariates)))
   fit <- geomorph::procD.lm(model, data = data, iter = 999, SS.type = ss_type, print.progress = FALSE)
   print(summary(fit))
 }
@@ -257,8 +251,8 @@ X <- model.matrix(right, covariates)
 labels <- attr(terms(right), "term.labels")
 factors <- attr(terms(right), "factors") > 0
 residual <- function(terms) {
-  qr <- qr(X[, attr(X, "assign") %in% c(0, terms), drop = FALSE])
-  c(SS = sum(qr.resid(qr, coords)^2), Df = nrow(X) - qr$rank)
+  fit <- qr(X[, attr(X, "assign") %in% c(0, terms), drop = FALSE])
+  c(SS = sum(qr.resid(fit, coords)^2), Df = nrow(X) - fit$rank)
 }
 all <- seq_along(labels)
 rows <- lapply(all, function(k) {
@@ -274,5 +268,5 @@ last <- length(labels) + 1
 anova$R2 <- anova$SS / anova$SS[last + 1]
 anova$F <- ifelse(seq_len(nrow(anova)) < last, (anova$SS / anova$Df) / (anova$SS[last] / anova$Df[last]), NA)
 print(anova, row.names = FALSE)
-write.csv(anova, "@TABLE", row.names = FALSE)
+write.csv(anova, "anova.csv", row.names = FALSE)
 """

@@ -90,16 +90,18 @@ def _duplicates(found: LandmarkConfigurations) -> list[str]:
     findings: list[str] = []
     first: dict[bytes, str] = {}
     together: Counter[tuple[str, str]] = Counter()
-    for name, points, seen in zip(found.names, found.points, found.observed, strict=True):
+    for name, points in zip(found.names, found.points, strict=True):
         other = first.setdefault(points.tobytes(), name)
         if other != name:
             findings.append(f"{name} has the same coordinates as {other}; remove one of them.")
-        place: dict[bytes, str] = {}
-        for k in np.flatnonzero(seen) if len(np.unique(points[seen], axis=0)) < seen.sum() else ():
-            if (before := place.setdefault(points[k].tobytes(), found.landmarks[k])) != found.landmarks[k]:
-                together[before, found.landmarks[k]] += 1
+        place: dict[tuple[float, ...], str] = {}
+        for label, point in zip(found.landmarks, points.tolist(), strict=True):
+            # Missing landmarks differ, since not-a-number does not equal itself.
+            before = place.setdefault(tuple(point), label)
+            together[before, label] += before != label
     for (one, two), count in together.most_common():
-        findings.append(f"Landmarks {one} and {two} are at one place in {count} of {len(found)} specimens.")
+        if count:
+            findings.append(f"Landmarks {one} and {two} are at one place in {count} of {len(found)} specimens.")
     return findings
 
 
