@@ -25,7 +25,7 @@ def write_page(kind: str, folder: Path) -> Path:
     rng, n, faces = np.random.default_rng(4), 24, None
     kinds, spread = ["short", EVIL] * (n // 2), np.array([2.0, 1.0, 1.0, 1.0, 1.0])
     if kind == "surfaces":
-        directions, faces = sphere(500)
+        directions, faces = sphere(300)
         shapes = np.stack([blob(directions, spread * rng.normal(0, 1, 5)) for _ in range(n)])
     else:
         shapes = np.zeros((n, 9, 3))
@@ -42,14 +42,21 @@ def opened(open_tab, report: Path, viewport: dict, scheme: str = "light"):
     widget = tab.page.locator("figure.turning .widget")
     widget.scroll_into_view_if_needed()
     tab.until("!!document.querySelector('.turning.running')")
-    tab.page.wait_for_timeout(400)
+    settled(tab, "Marker at bgPC1")
     return tab, widget
+
+
+def settled(tab, words: str, *, absent: str = "nothing") -> None:
+    """Wait until the marker rests, which the widget announces after it has drawn the shape."""
+    said = "document.querySelector('.widget [aria-live]').innerText"
+    tab.until(f"{said}.includes({words!r}) && !{said}.includes({absent!r})")
+    tab.page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
 
 
 def place_of(tab, widget, shape: int) -> dict[str, float]:
     """Return the place of a shape in the canvas, by the scores that the select moves the marker to."""
     widget.locator("select").nth(2).select_option(str(shape))
-    tab.page.wait_for_timeout(300)
+    settled(tab, f"the place of shape {shape}:")
     box, marker = widget.locator(".ss-plot canvas").bounding_box(), widget.locator(".ss-marker").bounding_box()
     return {"x": marker["x"] + marker["width"] / 2 - box["x"], "y": marker["y"] + marker["height"] / 2 - box["y"]}
 
@@ -68,25 +75,24 @@ def test_a_click_or_a_key_draws_the_shape_at_another_place(
     mean = shape.screenshot()
     assert drawn_share(mean) > 0.01 and drawn_share(canvas.screenshot()) > 0.01
     at = place_of(tab, widget, 3)
-    assert "the place of shape 3" in said.inner_text()
     named = shape.screenshot()
     assert change(mean, named) > 0.002
     widget.locator("select").nth(2).select_option("")
-    tab.page.wait_for_timeout(500)
+    settled(tab, "Marker at", absent="place of")
     assert change(mean, shape.screenshot()) < 0.002
     canvas.hover(position=at)
     tab.page.wait_for_timeout(200)
     assert widget.locator(".ss-tip").inner_text() == f"shape 3: {EVIL}"
     canvas.click(position=at)
-    tab.page.wait_for_timeout(500)
-    assert "the place of shape 3" in said.inner_text() and change(named, shape.screenshot()) < 0.01
+    settled(tab, "the place of shape 3:")
+    assert change(named, shape.screenshot()) < 0.01
     for _ in range(4):
         canvas.press("ArrowLeft")
-    tab.page.wait_for_timeout(500)
+    settled(tab, "Marker at", absent="place of")
     moved = said.inner_text()
-    assert "shape 3" not in moved and change(named, shape.screenshot()) > 0.002
+    assert change(named, shape.screenshot()) > 0.002
     canvas.press("Home")
-    tab.page.wait_for_timeout(500)
+    settled(tab, "Marker at", absent=moved)
     assert change(mean, shape.screenshot()) < 0.002
     assert tab.page.evaluate("document.documentElement.scrollWidth <= window.innerWidth"), "it scrolls sideways"
     tab.shot(kind)
@@ -100,17 +106,17 @@ def test_the_legend_hides_a_group_and_axes_can_be_chosen(open_tab, reports: dict
     toggle.click()
     assert toggle.get_attribute("aria-pressed") == "false"
     canvas.hover(position=at)
-    tab.page.wait_for_timeout(300)
+    tab.page.wait_for_timeout(100)
     assert widget.locator(".ss-tip").is_hidden() or "short" not in widget.locator(".ss-tip").inner_text()
     toggle.click()
     for name in ("Convex hulls", "95 % ellipses", "Leave-one-out scores"):
         box, picture = widget.get_by_role("checkbox", name=name), canvas.screenshot()
         box.click()
-        tab.page.wait_for_timeout(200)
+        tab.page.wait_for_timeout(100)
         assert change(picture, canvas.screenshot()) > 0.001, name
         box.click()
     widget.get_by_label("Across").select_option("1")
-    tab.page.wait_for_timeout(300)
+    settled(tab, "residual PC1")
     assert change(before, canvas.screenshot()) > 0.01
     assert (canvas.get_attribute("aria-label") or "").startswith("24 shapes on residual PC1")
     assert tab.complaints == []
