@@ -714,13 +714,13 @@
         // The least round step whose labels, 52 pixels wide, stand apart.
         const power = 10 ** Math.floor(Math.log10(52 / scale)), step = [1, 2, 5, 10].map((f) => f * power).find((one) => one * scale >= 51.9);
         const label = (k) => signed(k * step, Math.max(0, -Math.floor(Math.log10(step) + 1e-9))).replace("+", "");
-        for (let k = Math.ceil((left - x0) / scale / step); x0 + k * step * scale <= right; k++) {
-          line([[x0 + k * step * scale, above], [x0 + k * step * scale, below]], rule, k ? 0.5 : 1.5);
-          write(label(k), x0 + k * step * scale, below + 12, "center", "12px", soft);
+        for (let k = Math.ceil((left - x0) / scale / step), x; (x = x0 + k * step * scale) <= right; k++) {
+          line([[x, above], [x, below]], rule, k ? 0.5 : 1.5);
+          write(label(k), x, below + 12, "center", "12px", soft);
         }
-        for (let k = Math.ceil((y0 - below) / scale / step); y0 - k * step * scale >= above; k++) {
-          line([[left, y0 - k * step * scale], [right, y0 - k * step * scale]], rule, k ? 0.5 : 1.5);
-          write(label(k), left - 6, y0 - k * step * scale, "right", "12px", soft);
+        for (let k = Math.ceil((y0 - below) / scale / step), y; (y = y0 - k * step * scale) >= above; k++) {
+          line([[left, y], [right, y]], rule, k ? 0.5 : 1.5);
+          write(label(k), left - 6, y, "right", "12px", soft);
         }
         write(labels[axes[0]], (left + right) / 2, height - 14, "center", "600 13px", style.color);
         context.rotate(-Math.PI / 2);
@@ -735,19 +735,12 @@
           context.setLineDash([]);
         });
         const radius = n > 600 ? 3.2 : 5;
-        Object.assign(context, { strokeStyle: style.getPropertyValue("--card"), lineWidth: 0.8 / radius });
         members.forEach((points, g) => {
-          const path = new Path2D(markerOf(g));
-          context.fillStyle = css(colourOf(g));
-          for (const point of hidden.has(g) ? [] : points) {
-            const [x, y] = pixels(point);
-            context.save();
-            context.translate(x, y);
-            context.scale(radius, radius);
-            context.fill(path);
-            context.stroke(path);
-            context.restore();
-          }
+          const sign = new Path2D(markerOf(g)), path = new Path2D();
+          for (const point of hidden.has(g) ? [] : points) path.addPath(sign, new DOMMatrix([radius, 0, 0, radius, ...pixels(point)]));
+          Object.assign(context, { fillStyle: css(colourOf(g)), strokeStyle: style.getPropertyValue("--card"), lineWidth: 0.8 });
+          context.fill(path);
+          context.stroke(path);
         });
       }
       const request = (changed) => {
