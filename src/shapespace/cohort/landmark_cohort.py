@@ -14,11 +14,11 @@ from shapespace.errors import FileFormatError, InputError
 from shapespace.geometry.landmark_alignment import AlignConfig, AlignedLandmarks, align_landmarks
 from shapespace.geometry.procrustes import Gauge, centroid_size
 from shapespace.io.containers.json_files import read_json
-from shapespace.io.files import make_folder, read_bytes, write_text
+from shapespace.io.files import make_folder, write_text
 from shapespace.io.landmarks.configuration_io import is_configurations, read_configurations, write_configurations
 from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations
 from shapespace.io.meshes.mesh_io import MESH_ENDINGS, ending_of, stem_of
-from shapespace.io.tables.table_io import table_rows, write_rows
+from shapespace.io.tables.table_io import read_rows, write_rows
 from shapespace.schemas import AlignRecord, json_text, read
 from shapespace.types import FloatArray
 
@@ -70,7 +70,7 @@ def read_aligned(folder: Path) -> AlignedLandmarks:
     column = {name: k for k, name in enumerate(table.landmarks)}
     estimated = np.zeros(table.points.shape[:2], dtype=np.bool_)
     try:
-        for specimen, landmark in list(table_rows(read_bytes(folder / ESTIMATED)))[1:]:
+        for specimen, landmark in read_rows(folder / ESTIMATED)[1:]:
             if specimen in row:
                 estimated[row[specimen], column[landmark]] = True
     except (ValueError, KeyError) as error:

@@ -207,14 +207,14 @@ def export_cohort(cohort: Cohort, output: Path, to: Target, formula: str | None 
     known = cohort.landmarks.names if cohort.source.kind == "landmarks" and cohort.landmarks is not None else ()
     shapes = np.stack([cohort.vertices(k) for k in range(len(cohort))])[:, :, : cohort.dimensions]
     columns = {"size": numbers_as_text(cohort.sizes_mm), **cohort.table.columns}
-    found = LandmarkConfigurations(names=cohort.names, points=shapes, landmarks=known, columns=columns)
+    configurations = LandmarkConfigurations(names=cohort.names, points=shapes, landmarks=known, columns=columns)
     if to != "geomorph":
         ending = CONFIGURATION_FORMATS[to]
         if output.suffix.lower() != ending:
             output = make_folder(output) / f"landmarks{ending}"
-        return [output], [*notes, *write_configurations(output, found, to)]
+        return [output], [*notes, *write_configurations(output, configurations, to)]
     make_folder(output)
-    write_configurations(output / COORDINATES, replace(found, columns={}), "csv")
+    write_configurations(output / COORDINATES, replace(configurations, columns={}), "csv")
     table = zip(cohort.names, *columns.values(), strict=True)
     write_rows(output / COVARIATES, ("name", *columns), table)
     model = "1" if formula is None else formula.strip().removeprefix("~").strip()

@@ -43,13 +43,13 @@ def convert_landmarks(
     """
     if source.resolve() == output.resolve():
         raise InputError(f"{output} is the file to convert; give another name to write to.")
-    found = read_configurations(source, name=object_name, sliders=sliders)
-    notes = [*found.notes, *write_configurations(output, found, to)]
-    for name, text in slider_texts(found).items():
+    raw = read_configurations(source, name=object_name, sliders=sliders)
+    notes = [*raw.notes, *write_configurations(output, raw, to)]
+    for name, text in slider_texts(raw).items():
         path = output.with_name(f"{output.name.removesuffix(output.suffix)}.{name}")
         write_text(path, text)
         notes.append(f"The sliders are in {path.name}.")
-    return found, tuple(notes)
+    return raw, tuple(notes)
 
 
 def check_configurations(data: Path, sliders: Sequence[Path] = ()) -> dict[str, Any]:
@@ -64,55 +64,55 @@ def check_configurations(data: Path, sliders: Sequence[Path] = ()) -> dict[str, 
     Raises:
         FileError: something cannot be read.
     """
-    found = read_configurations(data, sliders=sliders)
-    absent = ~found.observed
-    findings = [*_duplicates(found), *_other_scales(found)]
+    raw = read_configurations(data, sliders=sliders)
+    absent = ~raw.observed
+    findings = [*_duplicates(raw), *_other_scales(raw)]
     try:
-        findings += map(str, find_outliers(align_landmarks(found))) if len(found) > 1 else ()
+        findings += map(str, find_outliers(align_landmarks(raw))) if len(raw) > 1 else ()
     except InputError as error:
         findings.append(f"The landmarks cannot be aligned: {error}")
     at = np.argwhere(absent).tolist()
     return {
-        "specimens": len(found),
-        "landmarks": len(found.landmarks),
-        "semilandmarks": len({*found.curve_sliders[:, 1].tolist(), *found.surface_sliders.tolist()}),
-        "dimensions": found.dimensions,
-        "columns": list(found.columns),
+        "specimens": len(raw),
+        "landmarks": len(raw.landmarks),
+        "semilandmarks": len({*raw.curve_sliders[:, 1].tolist(), *raw.surface_sliders.tolist()}),
+        "dimensions": raw.dimensions,
+        "columns": list(raw.columns),
         "missing": int(absent.sum()),
-        "missing_by_specimen": dict(Counter(found.names[k] for k, _ in at).most_common()),
-        "missing_by_landmark": dict(Counter(found.landmarks[k] for _, k in at).most_common()),
-        "notes": list(found.notes),
+        "missing_by_specimen": dict(Counter(raw.names[k] for k, _ in at).most_common()),
+        "missing_by_landmark": dict(Counter(raw.landmarks[k] for _, k in at).most_common()),
+        "notes": list(raw.notes),
         "findings": findings,
     }
 
 
-def _duplicates(found: LandmarkConfigurations) -> list[str]:
+def _duplicates(raw: LandmarkConfigurations) -> list[str]:
     findings: list[str] = []
     first: dict[bytes, str] = {}
     together: Counter[tuple[str, str]] = Counter()
-    for name, points in zip(found.names, found.points, strict=True):
+    for name, points in zip(raw.names, raw.points, strict=True):
         other = first.setdefault(points.tobytes(), name)
         if other != name:
             findings.append(f"{name} has the same coordinates as {other}; remove one of them.")
         place: dict[tuple[float, ...], str] = {}
-        for label, point in zip(found.landmarks, points.tolist(), strict=True):
+        for label, point in zip(raw.landmarks, points.tolist(), strict=True):
             # Missing landmarks differ, since not-a-number does not equal itself.
             before = place.setdefault(tuple(point), label)
             together[before, label] += before != label
     for (one, two), count in together.most_common():
         if count:
-            findings.append(f"Landmarks {one} and {two} are at one place in {count} of {len(found)} specimens.")
+            findings.append(f"Landmarks {one} and {two} are at one place in {count} of {len(raw)} specimens.")
     return findings
 
 
-def _other_scales(found: LandmarkConfigurations) -> list[str]:
+def _other_scales(raw: LandmarkConfigurations) -> list[str]:
     # Root mean squares, which missing landmarks hardly change.
-    known = [points[seen] for points, seen in zip(found.points, found.observed, strict=True)]
+    known = [points[seen] for points, seen in zip(raw.points, raw.observed, strict=True)]
     sizes = np.array([float(np.sqrt(np.var(one - one.mean(axis=0)))) if len(one) > 1 else np.nan for one in known])
     ratios = sizes / np.nanmedian(sizes) if np.isfinite(sizes).any() else sizes
     return [
         f"{name} is {ratio:.3g} times the median size, so its unit or scale differs."
-        for name, ratio in zip(found.names, ratios.tolist(), strict=True)
+        for name, ratio in zip(raw.names, ratios.tolist(), strict=True)
         if ratio > _OTHER_SCALE or ratio < 1 / _OTHER_SCALE
     ]
 
@@ -136,10 +136,10 @@ def plot_configurations(
     require_package("matplotlib", "A plot", "'shapespace[report]'")
     from shapespace.report import figures
 
-    found = read_configurations(data, sliders=sliders)
-    aligned = align_landmarks(found)
-    orientation = Orientation() if links is None else Orientation(links=read_links(links, found.landmarks))
+    raw = read_configurations(data, sliders=sliders)
+    aligned = align_landmarks(raw)
+    orientation = Orientation() if links is None else Orientation(links=read_links(links, raw.landmarks))
     with figures.publication_style(), figures.oriented(orientation):
         figure = figures.superimposed_landmarks(aligned)
         figures.save_figure(figure, output.with_suffix(""), (output.suffix.lower().lstrip("."),))
-    return (*found.notes, *aligned.notes)
+    return (*raw.notes, *aligned.notes)

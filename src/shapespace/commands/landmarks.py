@@ -20,15 +20,14 @@ from shapespace.correspondence.semilandmarks import Semilandmarks, SemilandmarkS
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.geometry.landmark_placement import place_landmarks
 from shapespace.geometry.normals import rms_size
-from shapespace.io.files import make_folder, read_bytes, write_text
+from shapespace.io.files import make_folder, write_text
 from shapespace.io.landmarks.configuration_io import CURVE_SLIDERS, SURFACE_SLIDERS
 from shapespace.io.landmarks.fiducials import point_texts
 from shapespace.io.landmarks.landmark_io import read_landmarks, surface_landmark_cells
 from shapespace.io.landmarks.tps_nts import tps_text
 from shapespace.io.meshes.mesh_io import read_mesh
-from shapespace.io.read_limits import LARGEST_LANDMARK_FILE_BYTES
 from shapespace.io.remote import is_address
-from shapespace.io.tables.table_io import table_rows, table_text, write_rows
+from shapespace.io.tables.table_io import read_rows, table_text, write_rows
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, read
 from shapespace.store.corresponding import RECORD, SUMMARY, json_of, surface_files, surface_stem
 from shapespace.store.results import mesh_at
@@ -115,15 +114,12 @@ def _read_sets(file: Path) -> list[SemilandmarkSet]:
         FileError: it cannot be read.
         FileFormatError: it is no such table.
     """
-    try:
-        header, *rows = table_rows(read_bytes(file, LARGEST_LANDMARK_FILE_BYTES))
-    except ValueError as error:
-        raise FileFormatError(f"{file} {error}; correct the table.") from error
+    header, *rows = read_rows(file)
     if not rows or not set(_SET_COLUMNS) <= set(header):
         raise FileFormatError(f"{file} needs the columns {', '.join(_SET_COLUMNS)} and a row for each curve or patch.")
     sets: list[SemilandmarkSet] = []
     for row in rows:
-        name, kind, along, points = (row[header.index(column)].strip() for column in _SET_COLUMNS)
+        name, kind, along, points = (row[header.index(column)] for column in _SET_COLUMNS)
         if kind not in ("curve", "patch") or not name or not points.isdecimal():
             raise FileFormatError(
                 f"{file}: the row {', '.join(row)!r} needs a name, the kind curve or patch, and a number of points."

@@ -61,13 +61,13 @@ def read_configurations(
         InputError: two specimens have one name.
         ShapespaceError: the extra `r`, which R files need, is not installed.
     """
-    found = _read_folder(Path(path)) if Path(path).is_dir() else _read_file(Path(path), name)
+    raw = _read_folder(Path(path)) if Path(path).is_dir() else _read_file(Path(path), name)
     for file in sliders:
         form = "before, slide, after, or one landmark on the surface,"
-        numbers = read_landmark_numbers(file, found.landmarks, (1, 3), form) - 1
+        numbers = read_landmark_numbers(file, raw.landmarks, (1, 3), form) - 1
         is_surface = numbers.shape[1] == 1
-        found = replace(found, **({"surface_sliders": numbers[:, 0]} if is_surface else {"curve_sliders": numbers}))
-    return found
+        raw = replace(raw, **({"surface_sliders": numbers[:, 0]} if is_surface else {"curve_sliders": numbers}))
+    return raw
 
 
 def _read_file(path: Path, name: str | None) -> LandmarkConfigurations:
@@ -117,12 +117,12 @@ def _header_kind(data: bytes) -> str:
 
 
 def _read_specimen(path: Path, ending: str) -> LandmarkConfigurations:
-    found = read_landmarks(path, keep_absent=True)
-    is_numbered = all(re.fullmatch(r"point_\d+", label) for label in found)
+    points = read_landmarks(path, keep_absent=True)
+    is_numbered = all(re.fullmatch(r"point_\d+", label) for label in points)
     return LandmarkConfigurations(
         names=(path.name[: -len(ending)].removesuffix(".landmarks"),),
-        points=np.array([list(found.values())]),
-        landmarks=() if is_numbered else tuple(found),
+        points=np.array([list(points.values())]),
+        landmarks=() if is_numbered else tuple(points),
         unit="mm" if ending in _MILLIMETRES else "",
         where=str(path),
     )
@@ -168,74 +168,72 @@ def _read_folder(folder: Path) -> LandmarkConfigurations:
     )
 
 
-def slider_texts(configurations: LandmarkConfigurations) -> dict[str, str]:
+def slider_texts(raw: LandmarkConfigurations) -> dict[str, str]:
     """Return file name -> CSV of the sliders as geomorph reads them; empty without sliders."""
     tables = {
-        CURVE_SLIDERS: (("before", "slide", "after"), (configurations.curve_sliders + 1).tolist()),
-        SURFACE_SLIDERS: (("surface",), (configurations.surface_sliders[:, None] + 1).tolist()),
+        CURVE_SLIDERS: (("before", "slide", "after"), (raw.curve_sliders + 1).tolist()),
+        SURFACE_SLIDERS: (("surface",), (raw.surface_sliders[:, None] + 1).tolist()),
     }
     return {name: table_text(header, rows) for name, (header, rows) in tables.items() if rows}
 
 
-def write_configurations(
-    path: Path | str, configurations: LandmarkConfigurations, format: str | None = None
-) -> tuple[str, ...]:
+def write_configurations(path: Path | str, raw: LandmarkConfigurations, format: str | None = None) -> tuple[str, ...]:
     """Write the landmarks of many specimens, and return sentences on what the format cannot hold.
 
     Args:
         path: the file; a folder for the formats of `FOLDER_FORMATS`.
-        configurations: the landmarks; sliders are not written.
+        raw: the landmarks; sliders are not written.
         format: one of `CONFIGURATION_FORMATS` or `FOLDER_FORMATS`; None for that of the ending of `path`.
 
     Raises:
         InputError: an unknown format, or one that cannot hold these landmarks.
         FileError: it cannot be written.
     """
-    path, found = Path(path), configurations
+    path = Path(path)
     if format is None:
         format = next((key for key, ending in CONFIGURATION_FORMATS.items() if path.suffix.lower() == ending), None)
     if format not in (*CONFIGURATION_FORMATS, *FOLDER_FORMATS):
         known = ", ".join((*CONFIGURATION_FORMATS, *FOLDER_FORMATS))
         problem = f"the ending {path.suffix!r} has no format" if format is None else f"there is no format {format!r}"
         raise InputError(f"Cannot write {path}: {problem}; give one of {known} with --to.")
-    texts = _texts_in_folder(path, found, format) if format in FOLDER_FORMATS else _texts(path, found, format)
+    texts = _texts_in_folder(path, raw, format) if format in FOLDER_FORMATS else _texts(path, raw, format)
     for file, text in texts.items():
         make_folder(file.parent)
         write_text(file, text)
     notes: list[str] = []
-    held = found.columns if format in ("csv", "long", "morphoj") else _TPS_KEYS if format == "tps" else ()
-    if lost := [column for column in found.columns if column not in held]:
+    held = raw.columns if format in ("csv", "long", "morphoj") else _TPS_KEYS if format == "tps" else ()
+    if lost := [column for column in raw.columns if column not in held]:
         notes.append(f"Columns of the table ({', '.join(lost)}) are left out, since the format {format} has none.")
-    if format == "morphoj" and found.columns:
+    if format == "morphoj" and raw.columns:
         notes.append(f"The columns are in {list(texts)[1].name}; import it as classifier variables.")
-    numbers = tuple(map(str, range(1, len(found.landmarks) + 1)))
-    if format in ("tps", "nts", "morphoj") and found.landmarks != numbers:
+    numbers = tuple(map(str, range(1, len(raw.landmarks) + 1)))
+    if format in ("tps", "nts", "morphoj") and raw.landmarks != numbers:
         notes.append("The landmarks are numbered in their order, because the format has no names of landmarks.")
     return tuple(notes)
 
 
-def _texts(path: Path, found: LandmarkConfigurations, format: str) -> dict[Path, str]:
+def _texts(path: Path, raw: LandmarkConfigurations, format: str) -> dict[Path, str]:
     if format == "tps":
-        if bad := [name for name in found.names if "\n" in name or "\r" in name]:
-            raise InputError(f"{found.where}: TPS cannot hold the specimen name {bad[0][:60]!r}; rename it.")
+        if bad := [name for name in raw.names if "\n" in name or "\r" in name]:
+            raise InputError(f"{raw.where}: TPS cannot hold the specimen name {bad[0][:60]!r}; rename it.")
         # A line break would end the value.
-        values = {k.upper(): [" ".join(c.split()) for c in found.columns.get(k, [""] * len(found))] for k in _TPS_KEYS}
-        return {path: tps_text(dict(zip(found.names, found.points, strict=True)), values)}
+        values = {k.upper(): [" ".join(c.split()) for c in raw.columns.get(k, [""] * len(raw))] for k in _TPS_KEYS}
+        return {path: tps_text(dict(zip(raw.names, raw.points, strict=True)), values)}
     if format == "morphoj":
-        table, classes = morphoj_texts(found)
+        table, classes = morphoj_texts(raw)
         beside = path.with_name(f"{path.name.removesuffix(path.suffix)}.classifiers.txt")
-        return {path: table, **({beside: classes} if found.columns else {})}
-    return {path: {"nts": nts_text, "csv": wide_text, "long": long_text}[format](found)}
+        return {path: table, **({beside: classes} if raw.columns else {})}
+    return {path: {"nts": nts_text, "csv": wide_text, "long": long_text}[format](raw)}
 
 
-def _texts_in_folder(folder: Path, found: LandmarkConfigurations, format: str) -> dict[Path, str]:
-    if found.dimensions != 3:
-        raise InputError(f"{found.where}: .{format} files cannot hold 2-D landmarks; write tps, nts or csv.")
-    if format == "fcsv" and not found.observed.all():
-        raise InputError(f"{found.where}: .fcsv files cannot hold missing landmarks; write mrk.json.")
-    bad = next((name for name in found.names if re.search(r'[/\\:*?"<>|\x00-\x1f]|^\.', name)), None)
+def _texts_in_folder(folder: Path, raw: LandmarkConfigurations, format: str) -> dict[Path, str]:
+    if raw.dimensions != 3:
+        raise InputError(f"{raw.where}: .{format} files cannot hold 2-D landmarks; write tps, nts or csv.")
+    if format == "fcsv" and not raw.observed.all():
+        raise InputError(f"{raw.where}: .fcsv files cannot hold missing landmarks; write mrk.json.")
+    bad = next((name for name in raw.names if re.search(r'[/\\:*?"<>|\x00-\x1f]|^\.', name)), None)
     if bad is not None:
-        raise InputError(f"{found.where}: the specimen name {bad[:60]!r} cannot name a file; rename it.")
+        raise InputError(f"{raw.where}: the specimen name {bad[:60]!r} cannot name a file; rename it.")
     write = LANDMARK_FORMATS[f".{format}"].write
-    marks = (dict(zip(found.landmarks, points, strict=True)) for points in found.points)
-    return {folder / f"{name}.{format}": write(one) for name, one in zip(found.names, marks, strict=True)}
+    marks = (dict(zip(raw.landmarks, points, strict=True)) for points in raw.points)
+    return {folder / f"{name}.{format}": write(one) for name, one in zip(raw.names, marks, strict=True)}

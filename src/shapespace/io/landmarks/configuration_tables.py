@@ -38,16 +38,16 @@ def header_kind(header: Sequence[str]) -> str:
 
 def _landmark_columns(header: Sequence[str]) -> dict[str, dict[str, int]]:
     """Return landmark -> axis -> column for the styles x1, X.1, 1.X, 1X, lm1_x and nose_x."""
-    found: dict[str, dict[str, int]] = {}
+    columns: dict[str, dict[str, int]] = {}
     for column, name in enumerate(header):
         first, last = _AXIS_FIRST.fullmatch(name.strip()), _AXIS_LAST.fullmatch(name.strip())
         if match := first or last:
             label, axis = (match[2], match[1]) if first else (match[1], match[2])
-            found.setdefault(label, {})[axis.lower()] = column
+            columns.setdefault(label, {})[axis.lower()] = column
     # R writes an X before column names that begin with a digit.
     return {
         label[1:] if re.fullmatch(r"X\d+", label) else label: axes
-        for label, axes in found.items()
+        for label, axes in columns.items()
         if re.search(r"\d$", label) or {"x", "y"} <= set(axes)
     }
 
@@ -64,9 +64,9 @@ def parse_table(content: bytes, path: Path) -> LandmarkConfigurations:
     return mark_missing((_wide if kind == "wide" else _long)(header, rows, path))
 
 
-def _axes(found: Mapping[str, Mapping[str, int]], path: Path) -> str:
-    axes = "xyz" if any("z" in one for one in found.values()) else "xy"
-    for label, one in found.items():
+def _axes(columns: Mapping[str, Mapping[str, int]], path: Path) -> str:
+    axes = "xyz" if any("z" in one for one in columns.values()) else "xy"
+    for label, one in columns.items():
         if lacking := set(axes) - set(one):
             advice = "do not mix 2-D and 3-D landmarks" if lacking == {"z"} else "add it"
             raise damage_error(path, f"landmark {label[:40]!r} has no column for its {min(lacking)}; {advice}")
@@ -74,9 +74,9 @@ def _axes(found: Mapping[str, Mapping[str, int]], path: Path) -> str:
 
 
 def _wide(header: Sequence[str], rows: Sequence[Sequence[str]], path: Path) -> LandmarkConfigurations:
-    found = _landmark_columns(header)
-    labels, width = tuple(found), _axes(found, path)
-    used = [one[axis] for one in found.values() for axis in width]
+    columns = _landmark_columns(header)
+    labels, width = tuple(columns), _axes(columns, path)
+    used = [one[axis] for one in columns.values() for axis in width]
     key = 0 if header[0].lower() in _KEYS else key_column(header, _KEYS)
     if key is None and 0 not in used and (not header[0] or len({row[0] for row in rows}) == len(rows)):
         key = 0
@@ -137,38 +137,38 @@ def _cells(points: FloatArray) -> list[str]:
     return ["NA" if math.isnan(value) else repr(value) for value in points.ravel().tolist()]
 
 
-def wide_text(found: LandmarkConfigurations) -> str:
+def wide_text(raw: LandmarkConfigurations) -> str:
     """Return a table with a row for each specimen: name, columns, coordinates as `two.d.array` of geomorph has them."""
-    coordinates = [f"{label}.{axis}" for label in found.landmarks for axis in "XYZ"[: found.dimensions]]
-    header = ["name", *found.columns, *coordinates]
+    coordinates = [f"{label}.{axis}" for label in raw.landmarks for axis in "XYZ"[: raw.dimensions]]
+    header = ["name", *raw.columns, *coordinates]
     repeated = next((name for name, count in Counter(header).items() if count > 1), None)
     if repeated is not None:
-        raise InputError(f"{found.where}: a table cannot have the column {repeated[:40]!r} twice; rename one.")
-    known = zip(found.names, *found.columns.values(), strict=True)
-    return rows_text([header, *([*cells, *_cells(points)] for cells, points in zip(known, found.points, strict=True))])
+        raise InputError(f"{raw.where}: a table cannot have the column {repeated[:40]!r} twice; rename one.")
+    known = zip(raw.names, *raw.columns.values(), strict=True)
+    return rows_text([header, *([*cells, *_cells(points)] for cells, points in zip(known, raw.points, strict=True))])
 
 
-def long_text(found: LandmarkConfigurations) -> str:
+def long_text(raw: LandmarkConfigurations) -> str:
     """Return a table with a row for each landmark of each specimen: specimen, landmark, coordinates, columns."""
     rows = [
-        [name, label, *_cells(point), *(cells[k] for cells in found.columns.values())]
-        for k, (name, points) in enumerate(zip(found.names, found.points, strict=True))
-        for label, point in zip(found.landmarks, points, strict=True)
+        [name, label, *_cells(point), *(cells[k] for cells in raw.columns.values())]
+        for k, (name, points) in enumerate(zip(raw.names, raw.points, strict=True))
+        for label, point in zip(raw.landmarks, points, strict=True)
     ]
-    return rows_text([["specimen", "landmark", *"xyz"[: found.dimensions], *found.columns], *rows])
+    return rows_text([["specimen", "landmark", *"xyz"[: raw.dimensions], *raw.columns], *rows])
 
 
-def morphoj_texts(found: LandmarkConfigurations) -> tuple[str, str]:
+def morphoj_texts(raw: LandmarkConfigurations) -> tuple[str, str]:
     """Return the two tables of MorphoJ, separated by tabs: coordinates, and classifier variables."""
-    lacking = [name for name, row in zip(found.names, found.observed, strict=True) if not row.all()]
+    lacking = [name for name, row in zip(raw.names, raw.observed, strict=True) if not row.all()]
     if lacking:
         names = first_names(lacking, _NAMED)
         raise InputError(f"MorphoJ cannot read missing landmarks ({names}); estimate them first with shapespace align.")
-    numbers = range(1, len(found.landmarks) + 1)
-    table = [["ID", *(f"{axis}{k}" for k in numbers for axis in "xyz"[: found.dimensions])]]
-    table += [[name, *_cells(points)] for name, points in zip(found.names, found.points, strict=True)]
-    classes = [["ID", *found.columns], *map(list, zip(found.names, *found.columns.values(), strict=True))]
+    numbers = range(1, len(raw.landmarks) + 1)
+    table = [["ID", *(f"{axis}{k}" for k in numbers for axis in "xyz"[: raw.dimensions])]]
+    table += [[name, *_cells(points)] for name, points in zip(raw.names, raw.points, strict=True)]
+    classes = [["ID", *raw.columns], *map(list, zip(raw.names, *raw.columns.values(), strict=True))]
     if any(re.search(r"[\t\r\n]", cell) for row in (*table, *classes) for cell in row):
-        raise InputError(f"{found.where}: MorphoJ cannot read names or cells with tabs or line breaks.")
+        raise InputError(f"{raw.where}: MorphoJ cannot read names or cells with tabs or line breaks.")
     first, second = ("".join("\t".join(row) + "\n" for row in rows) for rows in (table, classes))
     return first, second

@@ -80,12 +80,12 @@ class LandmarkConfigurations:
         return np.logical_not(np.logical_or.reduce(np.isnan(self.points), axis=2))
 
 
-def mark_missing(found: LandmarkConfigurations) -> LandmarkConfigurations:
+def mark_missing(raw: LandmarkConfigurations) -> LandmarkConfigurations:
     """Return landmarks with not-a-number for all coordinates of missing ones, and notes on them.
 
     A landmark is missing if one of its coordinates is not-a-number, or all are one of the codes of digitising programs.
     """
-    points, notes = found.points.copy(), list(found.notes)
+    points, notes = raw.points.copy(), list(raw.notes)
     lacking = np.isnan(points)
     partly = lacking.any(axis=2) & ~lacking.all(axis=2)
     points[partly] = np.nan
@@ -100,11 +100,11 @@ def mark_missing(found: LandmarkConfigurations) -> LandmarkConfigurations:
         (coded, f"with the coordinates {' or '.join(f'{code:g}' for code in codes)}"),
     ):
         if mask.any():
-            affected = [found.names[int(row)] for row in np.unique(np.nonzero(mask)[0])]
+            affected = [raw.names[int(row)] for row in np.unique(np.nonzero(mask)[0])]
             count = int(mask.sum())
             noun, verb = ("landmark", "is") if count == 1 else ("landmarks", "are")
             notes.append(f"{count} {noun} of {first_names(affected, _NAMED)} {reason} {verb} taken as missing.")
-    return replace(found, points=points, notes=tuple(notes))
+    return replace(raw, points=points, notes=tuple(notes))
 
 
 def read_landmark_numbers(path: Path, landmarks: Sequence[str] | None, widths: Sequence[int], form: str) -> IntArray:

@@ -88,12 +88,12 @@ def parse_tps(text: str, path: Path) -> LandmarkConfigurations:
     if inner:
         notes.append(f"{len(inner)} inner points of {len(ends) - 1} curves are semilandmarks.")
     keys = dict.fromkeys(key for one in values for key in one if key not in ("id", "scale", "outlines"))
-    found = mark_missing(LandmarkConfigurations(
+    raw = mark_missing(LandmarkConfigurations(
         names=names, points=points, columns={key: tuple(one.get(key, "") for one in values) for key in keys},
         curve_sliders=np.reshape(inner, (-1, 1)).astype(np.int32) + np.arange(-1, 2, dtype=np.int32),
         where=str(path), notes=tuple(notes),
     ))  # fmt: skip
-    return replace(found, points=found.points * scales[:, None, None])
+    return replace(raw, points=raw.points * scales[:, None, None])
 
 
 def _specimen(block: str, number: int, path: Path) -> tuple[list[list[list[float]]], dict[str, str]]:
@@ -183,17 +183,17 @@ def parse_nts(text: str, path: Path) -> LandmarkConfigurations:
     return mark_missing(LandmarkConfigurations(names=tuple(names), points=points, where=str(path), notes=tuple(notes)))
 
 
-def nts_text(configurations: LandmarkConfigurations) -> str:
+def nts_text(raw: LandmarkConfigurations) -> str:
     """Return an NTS file with a labelled row for each specimen; names with white space raise InputError."""
-    bad = next((name for name in configurations.names if not name or len(name.split()) != 1 or name[0] in "\"'"), None)
+    bad = next((name for name in raw.names if not name or len(name.split()) != 1 or name[0] in "\"'"), None)
     if bad is not None:
         raise InputError(f"NTS cannot hold the specimen name {bad[:60]!r}; rename it without spaces or write TPS.")
-    n, count, width = configurations.points.shape
+    n, count, width = raw.points.shape
     missing = _NTS_MISSING
-    while (configurations.points == missing).any():
+    while (raw.points == missing).any():
         missing *= 10
-    flag = "0" if configurations.observed.all() else f"1 {missing:.0f}"
-    flat = np.where(configurations.observed[..., None], configurations.points, missing).reshape(n, -1)
+    flag = "0" if raw.observed.all() else f"1 {missing:.0f}"
+    flat = np.where(raw.observed[..., None], raw.points, missing).reshape(n, -1)
     rows = [" ".join(map(repr, row)) for row in flat.tolist()]
-    head = ['"written by shapespace', f"1 {n}L {count * width} {flag} DIM={width}", " ".join(configurations.names)]
+    head = ['"written by shapespace', f"1 {n}L {count * width} {flag} DIM={width}", " ".join(raw.names)]
     return "\n".join([*head, *rows]) + "\n"
