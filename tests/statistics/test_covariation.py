@@ -195,7 +195,7 @@ def test_separate_modules_have_a_small_cr_and_integrated_ones_a_large_r(tmp_path
 def test_points_are_named_by_landmark_or_counted_and_others_are_left_out(tmp_path: Path) -> None:
     cohort = cohort_of(correlated(9))
     by_number = fit_pls(cohort, modules=written(tmp_path, "AAA-BBB--"), permutations=3)
-    assert "3 of 9 points belong to no module" in by_number.cohort.notes[-1]
+    assert "3 of 9 vertices belong to no module" in by_number.cohort.notes[-1]
     by_vertex = fit_pls(cohort, modules=written(tmp_path, "AAA-BBB--", "vertex"), permutations=3)
     path = tmp_path / "named.csv"
     path.write_text("landmark,module\n" + "".join(f"p{k},{'A' if k < 3 else 'B'}\n" for k in (0, 1, 2, 4, 5, 6)))
@@ -209,12 +209,12 @@ def test_points_are_named_by_landmark_or_counted_and_others_are_left_out(tmp_pat
     [
         ("point,module\n1,A\n", FileFormatError, "is no table of modules"),
         ("landmark,module\n1\n", FileFormatError, "is no table of modules"),
-        ("landmark,module\n1,A\n2,A\n3,A\n", InputError, "two modules of two points"),
-        ("landmark,module\n1,A\n2,A\n3,B\n", InputError, "two modules of two points"),
+        ("landmark,module\n1,A\n2,A\n3,A\n", InputError, "two modules of two vertices"),
+        ("landmark,module\n1,A\n2,A\n3,B\n", InputError, "two modules of two vertices"),
         ("landmark,module\n1,A\n2,A\n3,B\n99,B\n", InputError, "'99' is not in the shapes"),
         ("landmark,module\n1,A\n2,A\n3,B\n4,\n", InputError, "has no module"),
         ("landmark,module\n1,A\n2,A\n3,B\n2,B\n", InputError, "is listed twice"),
-        ("landmark,module\n", InputError, "two modules of two points"),
+        ("landmark,module\n", InputError, "two modules of two vertices"),
     ],
 )
 def test_tables_that_are_no_modules_of_the_shapes_are_refused(
@@ -230,7 +230,7 @@ def test_tables_that_are_no_modules_of_the_shapes_are_refused(
 def test_blocks_that_cannot_covary_are_refused(tmp_path: Path) -> None:
     shapes = correlated(11)
     cohort = cohort_of(shapes, {"a": [1.0] * 20, "sex": ["f", "m"] * 10, "b": [None, *range(19)]})
-    with pytest.raises(InputError, match="The block columns is the same for all shapes"):
+    with pytest.raises(InputError, match="The block of columns is the same for all shapes"):
         fit_pls(cohort, columns=("a",))
     with pytest.raises(InputError, match="which is no number"):
         fit_pls(cohort, columns=("sex",))

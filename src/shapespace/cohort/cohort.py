@@ -278,6 +278,7 @@ class Cohort:
             new = [note for note in class_notes(self.table, columns) if note not in self.notes]
             return replace(self, notes=(*self.notes, *new)) if new else self
         excluded_names = list_names([self.names[row] for row in missing])
+        columns = [column for column in dict.fromkeys(columns) if self.table.missing([column])]
         if not drop_missing:
             raise InputError(
                 f"{self.table.where}: {' or '.join(columns)} of {len(missing)} of {len(self)} shapes is missing "

@@ -19,6 +19,7 @@ from shapespace.reprs import first_names, short_repr
 from shapespace.types import FloatArray, IntArray, read_only
 
 _LARGEST_BYTES = 2**24  # 16 MiB, a tree of more than 100,000 tips
+_LONGEST_REASON = 120  # characters of a message of the parser, in a sentence
 _MOST_NODES = 20_000  # of a file, whose parser then takes a second
 _MOST_SPECIES = 2_000  # tips that are used; memory grows with their square
 _NAMED = 4  # names in a message
@@ -147,7 +148,9 @@ def read_tree(path: Path | str) -> Tree:
         found, has_more = next(trees, None), next(trees, None) is not None
     # The parser raises what it likes on what it cannot read; deep nesting is a RecursionError.
     except Exception as error:
-        reason = " ".join(str(error).split())[:160].rstrip(".")
+        # The first sentence, without an explanation after a colon that is too long.
+        reason = " ".join(str(error).split()).split(". ")[0].rstrip(".")
+        reason = reason if len(reason) <= _LONGEST_REASON else reason[:_LONGEST_REASON].rpartition(":")[0] or "damaged"
         raise FileFormatError(f"{path} cannot be read as a tree ({reason}); {remedy}.") from error
     leaves: list[Any] = [] if found is None else list(found.leaf_node_iter())
     nodes = leaves if found is None else [*leaves, *found.preorder_internal_node_iter()]

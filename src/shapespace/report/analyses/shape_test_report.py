@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from shapespace.report.analyses.analysis_report import AnalysisReport, Rows
-from shapespace.report.analyses.methods_section import methods_parts
+from shapespace.report.analyses.methods_section import methods_parts, points_word
 from shapespace.report.analyses.shape_data import add_shape_data, model_hashes
 from shapespace.schemas import Counts, HistogramPart, Part, TableColumn, TablePart
 from shapespace.statistics.shape_tests.shape_test_result import ShapeTestResult, Statistic
@@ -18,6 +18,9 @@ _MOST_SENTENCES = 10
 """Statistics with a sentence; the table has all."""
 _MOST_HISTOGRAMS = 3
 """Histograms of the first statistics; more of them fill the page."""
+
+_HAS_UNIT = re.compile("Procrustes|^distance|length|difference of disparity")
+"""Names of statistics that have the unit of the cohort, or its square."""
 
 
 def shape_test_report(result: ShapeTestResult) -> AnalysisReport:
@@ -46,6 +49,10 @@ def _sentences(result: ShapeTestResult) -> Iterator[str]:
         yield f"{_sentence(one, result.level)}."
     if len(result.statistics) > _MOST_SENTENCES:
         yield f"{len(result.statistics) - _MOST_SENTENCES} further statistics are in the table."
+    unit = result.cohort.unit
+    if unit and any(_HAS_UNIT.search(one.name) for one in result.statistics):
+        points = points_word(result.methods)
+        yield f"Distances and lengths are in {unit}, variances in {unit}², summed over all {points} of a shape."
     counts = [len(one.arrangements) for one in result.statistics if len(one.arrangements)]
     if counts:
         yield f"{len(result.cohort)} shapes, {max(counts)} permutations, the observed data among them."

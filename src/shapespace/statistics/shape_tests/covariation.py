@@ -196,6 +196,7 @@ def _modules(cohort: Cohort, path: Path) -> tuple[Cohort, dict[str, list[int]]]:
         FileError: the file cannot be read, or is no table of modules.
         InputError: fewer than two modules, a module of one point, points that the shapes lack or that are listed twice.
     """
+    noun = "landmarks" if cohort.source.kind == "landmarks" else "vertices"
     rows = csv_rows(read_bytes(path, LARGEST_LANDMARK_FILE_BYTES), path)
     header = [cell.lower() for cell in rows[0]] if rows else []
     if header not in (["landmark", "module"], ["vertex", "module"]) or any(len(row) != 2 for row in rows):
@@ -209,11 +210,11 @@ def _modules(cohort: Cohort, path: Path) -> tuple[Cohort, dict[str, list[int]]]:
         problem = f"{unknown[0][:40]!r} is not in the shapes or has no module" if unknown else "one is listed twice"
         raise InputError(f"{path}: list each {header[0]} of the shapes once, with its module; {problem}.")
     if len(points) < 2 or min(map(len, points.values())) < 2 or len(cohort) < 3:
-        raise InputError(f"{path}: covariation needs 3 shapes or more, and two modules of two points or more each.")
+        raise InputError(f"{path}: covariation needs 3 shapes or more, and two modules of two {noun} or more each.")
     if cohort.analysed is not None and not cohort.analysed[flat].all():
-        raise InputError(f"{path} lists points that are missing in most shapes; leave them out.")
+        raise InputError(f"{path} lists {noun} that are missing in most shapes; leave them out.")
     left = cohort.n_vertices - len(flat)
-    note = f"{left:,} of {cohort.n_vertices:,} points belong to no module and are left out."
+    note = f"{left:,} of {cohort.n_vertices:,} {noun} belong to no module and are left out."
     return (replace(cohort, notes=(*cohort.notes, note)) if left else cohort), points
 
 
@@ -233,7 +234,7 @@ def _principal_components(name: str, block: FloatArray) -> tuple[FloatArray, Flo
     u, s, vt = np.linalg.svd(block - block.mean(axis=0), full_matrices=False)
     kept = s > _RANK * float(np.abs(block).max())
     if not kept.any():
-        raise InputError(f"The block {name} is the same for all shapes, so that it does not covary; leave it out.")
+        raise InputError(f"The block of {name} is the same for all shapes, so that it does not covary; choose another.")
     return u[:, kept] * s[kept], vt[kept]
 
 

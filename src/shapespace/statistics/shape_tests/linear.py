@@ -455,6 +455,8 @@ def _lines(indicator: FloatArray, x: FloatArray, covariate: str) -> FloatArray:
     """Return the columns (N, 2 G) of a line for each group."""
     lines = np.hstack([indicator, indicator * x[:, None]])
     if (np.linalg.norm(less(lines[:, len(indicator.T) :], indicator), axis=0) <= _RANK * np.linalg.norm(x)).any():
+        if indicator.shape[1] == 1:
+            raise InputError(f"{covariate!r} is the same for all shapes, which have no slope; choose another column.")
         raise InputError(f"{covariate!r} is constant within a group, which has no slope; leave the group out.")
     return lines
 

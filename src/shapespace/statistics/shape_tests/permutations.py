@@ -131,7 +131,8 @@ class Groups:
         small = int(groups.counts.argmin())
         if groups.counts[small] < least:
             raise InputError(
-                f"{cohort.table.where}: the group {names[small]!r} of {label} has {groups.counts[small]} shapes, and "
+                f"{cohort.table.where}: the group {names[small]!r} of {label} has {groups.counts[small]} "
+                f"shape{'s' if groups.counts[small] > 1 else ''}, and "
                 f"{why or 'this test'} needs {least} or more; leave it out, or combine groups."
             )
         return groups
