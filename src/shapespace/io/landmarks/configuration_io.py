@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -22,7 +22,7 @@ from shapespace.io.read_limits import LARGEST_CONFIGURATIONS_FILE_BYTES
 from shapespace.io.tables.table_io import decoded_text, table_rows, table_text
 from shapespace.reprs import first_names
 
-_TEXTS: Mapping[str, Callable[[str, Path], LandmarkConfigurations]] = {".tps": parse_tps, ".nts": parse_nts}
+_TEXTS = {".tps": parse_tps, ".nts": parse_nts}
 _TABLES = (".csv", ".txt", ".tsv", ".xlsx")
 _SINGLE = tuple(sorted({*LANDMARK_FORMATS, *READ_ONLY_LANDMARKS} - {".tps"}, key=lambda one: (-len(one), one)))
 _MILLIMETRES = (".mrk.json", ".fcsv")
