@@ -242,7 +242,7 @@ def test_blocks_that_cannot_covary_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="needs --columns"):
         fit_pls(cohort)
     shapes[:, :3] = 0.0
-    with pytest.raises(InputError, match="The block A is the same for all shapes"):
+    with pytest.raises(InputError, match="The block of A is the same for all shapes"):
         fit_pls(cohort_of(shapes), modules=written(tmp_path, "AAABBBBBB"))
     with pytest.raises(InputError, match="CR is not defined"):
         estimate_modularity(cohort_of(shapes), modules=written(tmp_path, "AAABBBBBB"))

@@ -7,13 +7,19 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+_LARGEST = 2**63
+"""Larger whole numbers are none of JSON, in which all settings are written."""
+
 
 def integer(text: str) -> int:
     """Return a whole number of any sign."""
     try:
-        return int(text)
+        value = int(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from None
+    if abs(value) >= _LARGEST:
+        raise argparse.ArgumentTypeError(f"must be below {_LARGEST}")
+    return value
 
 
 def natural(text: str) -> int:
