@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import structs
 
 from shapespace.errors import InputError
 from shapespace.geometry.landmark_alignment import align_landmarks, find_outliers
@@ -15,7 +16,7 @@ from shapespace.io.files import write_text
 from shapespace.io.landmarks.configuration_io import read_configurations, slider_texts, write_configurations
 from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations
 from shapespace.lazy import require_package
-from shapespace.report.inputs.orientation import read_links
+from shapespace.report.inputs.orientation import find_orientation, read_links
 from shapespace.schemas import Orientation
 
 _OTHER_SCALE = 4.0
@@ -122,10 +123,12 @@ def plot_configurations(
 ) -> tuple[str, ...]:
     """Draw all specimens superimposed around their mean with numbered landmarks; return the notes of the alignment.
 
+    Views and links are those of orientation.json and links.csv beside the data.
+
     Args:
         data: file or folder with the landmarks of many specimens.
         output: FILE.svg, FILE.pdf or FILE.png.
-        links: CSV of two columns of landmarks, by number or name, that lines connect on the mean
+        links: CSV of two columns of landmarks, by number or name, that lines connect (default: links.csv beside DATA)
         sliders: CSV of the semilandmarks as geomorph has them; can be repeated
 
     Raises:
@@ -138,7 +141,9 @@ def plot_configurations(
 
     raw = read_configurations(data, sliders=sliders)
     aligned = align_landmarks(raw)
-    orientation = Orientation() if links is None else Orientation(links=read_links(links, raw.landmarks))
+    orientation = find_orientation(None, [data if data.is_dir() else data.parent], raw.landmarks) or Orientation()
+    if links is not None:
+        orientation = structs.replace(orientation, links=read_links(links, raw.landmarks))
     with figures.publication_style(), figures.oriented(orientation):
         figure = figures.superimposed_landmarks(aligned)
         figures.save_figure(figure, output.with_suffix(""), (output.suffix.lower().lstrip("."),))
