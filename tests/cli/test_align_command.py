@@ -170,3 +170,9 @@ def test_commands_that_read_aligned_landmarks_have_one_note_on_specimens_to_chec
     outcome = run("test", "disparity", "aligned", "--group", "sex", "--permutations", "20", "-o", "out")
     assert outcome.err.count("aligned: 1 specimen to check, 1 estimated landmark (see align.json).") == 1
     assert "mirrored" not in outcome.err + outcome.out
+
+
+def test_a_folder_that_align_wrote_is_not_aligned_again(run: Run, folder: Path) -> None:
+    assert run("align", "skulls.tps", "-o", "aligned").code == 0
+    refused = run("align", "aligned", "-o", "again")
+    assert refused.code == 2 and "aligned is a folder that align wrote; give the landmark file" in refused.err

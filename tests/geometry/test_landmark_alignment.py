@@ -291,7 +291,7 @@ def ring(points: FloatArray) -> None:
     [
         (line, {}, {}, "all landmarks of s2 lie on a line"),
         (lost, {}, {}, "no landmarks are observed of s2"),
-        (lost, {}, {"missing": "refuse"}, "landmarks of 1 specimens are missing"),
+        (lost, {}, {"missing": "refuse"}, "specimens lack landmarks"),
         (often, {}, {}, "landmark 4 is missing in 11 of 12"),
         (ring, {}, {}, "a coordinate is infinite"),
         (None, {"curve_sliders": [[0, 1, 12]]}, {}, "name landmark 13, and there are 9"),

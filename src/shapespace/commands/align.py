@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from shapespace.cohort.landmark_cohort import SIZE, write_aligned
+from shapespace.cohort.landmark_cohort import RECORD, SIZE, write_aligned
 from shapespace.cohort.table import Table, list_names, read_table
 from shapespace.errors import FileFormatError, InputError
 from shapespace.geometry.landmark_alignment import AlignConfig, AlignedLandmarks, align_landmarks, find_outliers
@@ -50,6 +50,8 @@ def align(
         InputError: landmarks that cannot be aligned.
     """
     config = config or AlignConfig()
+    if (data / RECORD).is_file():
+        raise InputError(f"{data} is a folder that align wrote; give the landmark file that it was made from.")
     raw = read_configurations(data, sliders=sliders)
     if separate is not None:
         config = replace(config, structures=_structures(separate))

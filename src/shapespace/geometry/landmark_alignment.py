@@ -430,7 +430,7 @@ def _complete(configurations: LandmarkConfigurations, config: AlignConfig) -> tu
     first = configurations.names[int(incomplete[0])]
     if config.missing == "refuse":
         raise InputError(
-            f"{where}: landmarks of {len(incomplete)} specimens are missing (such as {first}); leave these out, or "
+            f"{where}: {len(incomplete)} of {n} specimens lack landmarks (such as {first}); leave these out, or "
             "estimate the landmarks with --missing tps."
         )
     few = np.flatnonzero(observed.sum(axis=1) < D + 1)

@@ -152,13 +152,13 @@ class ScoreResult(AnalysisResult):
             tests=(
                 TestScheme(tested=("percentiles",), statistic="Mahalanobis distance",
                            resampling="leave-one-out"),
-                TestScheme(tested=("p (F)",), statistic="Mahalanobis distance", resampling="none"),
+                TestScheme(tested=("Mahalanobis distance",), statistic="F", resampling="none"),
             ),
             corrected_over=("the vertices of a map (limit of |z|)",),
             assumptions=(
-                "Percentiles leave each subject of the reference out in turn and assume no distribution; p by the F "
-                "distribution assumes normal shapes. z of vertices and sizes are standard deviations of the reference, "
-                "not effect sizes.",
+                f"The reference has {len(self.reference_names)} shapes of {self.people} subjects. Percentiles leave "
+                "each subject of the reference out in turn and assume no distribution; p by the F distribution assumes "
+                "normal shapes. z of vertices and sizes are standard deviations of the reference, not effect sizes.",
             ),
         )  # fmt: skip
 

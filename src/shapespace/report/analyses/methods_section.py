@@ -334,7 +334,7 @@ def _exchangeability(methods: Methods) -> str:
 def scheme_text(test: TestScheme) -> str:
     """Return how the p value of a test was computed."""
     if test.resampling == "none":
-        return "distribution"
+        return "its distribution"
     if test.resampling == "bootstrap":
         return f"bootstrap of {test.unit}s"
     if test.resampling == "leave-one-out":
@@ -344,6 +344,8 @@ def scheme_text(test: TestScheme) -> str:
     within = f" within {_plural(block)}" if block else ""
     if test.resampling == "permutation" and test.reduced_model is None and test.unit != SCAN_OF_SUBJECT:
         return f"permutation of {_plural(difference)}{within}{every}"
+    if test.resampling == "sign flips" and test.reduced_model is None:
+        return f"sign flips of {_plural(test.unit)}{every}"
     units = (
         "values"
         if test.reduced_model is None
