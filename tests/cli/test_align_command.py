@@ -176,3 +176,14 @@ def test_a_folder_that_align_wrote_is_not_aligned_again(run: Run, folder: Path) 
     assert run("align", "skulls.tps", "-o", "aligned").code == 0
     refused = run("align", "aligned", "-o", "again")
     assert refused.code == 2 and "aligned is a folder that align wrote; give the landmark file" in refused.err
+
+
+def test_columns_of_files_call_landmarks_by_their_name(run: Run, folder: Path) -> None:
+    assert run("align", "skulls.tps", "--table", "skulls.csv", "-o", "aligned").code == 0
+    given = points() + 0.1 * np.random.default_rng(1).normal(size=(N, L, 2))
+    names = tuple(f"n{k}" for k in range(len(given)))
+    write_configurations(folder / "new.tps", LandmarkConfigurations(names=names, points=given))
+    assert run("score", "new.tps", "--reference", "aligned", "--modes", "3", "-o", "out").code == 0
+    header = (folder / "out" / "scores.csv").read_text().splitlines()[0]
+    assert "landmarks_beyond_2sd" in header and "vertices" not in header and "_mm" not in header
+    assert "The reference has 16 shapes" in (folder / "out" / "methods.txt").read_text()

@@ -129,7 +129,7 @@ def _lengths(result: AsymmetryResult) -> LengthFormat:
 
 
 def _direction(result: AsymmetryResult) -> str:
-    return "along the normals" if result.normals is not None else "over the points"
+    return "along the normals" if result.normals is not None else "over the vertices"
 
 
 def _score_text(result: AsymmetryResult, subject: int) -> str:

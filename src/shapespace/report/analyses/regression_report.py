@@ -11,6 +11,7 @@ from shapespace.report.analyses.analysis_report import AnalysisReport, LengthFor
 from shapespace.report.analyses.methods_section import methods_parts
 from shapespace.report.analyses.shape_data import add_shape_data, model_hashes, shape_change_parts
 from shapespace.schemas import CurvePart, Part, Series, SurfaceMapPart, TableColumn, TablePart, TextPart
+from shapespace.statistics.methods import methods_of
 from shapespace.statistics.observation_weights import blank_where, weights_of
 from shapespace.statistics.predictor import Predictions, Predictor
 from shapespace.statistics.regression import (
@@ -79,8 +80,15 @@ def prediction_report(predictor: Predictor, cohort: Cohort, predictions: Predict
         tables={"new.csv": _prediction_rows(cohort, predictions)},
         notes=cohort.notes,
         settings={"target": predictor.target, "gauge": predictor.gauge, "level": predictor.confidence},
+        methods=methods_of(
+            cohort, len(cohort),
+            assumptions=(
+                f"{predictor.target} is predicted by {predictor.method}, learned from {predictor.subjects} other "
+                f"subjects, with prediction intervals of {100 * predictor.confidence:.0f} % by cross-validation (CV+).",
+            ),
+        ),
         model_hashes=(predictor.model_hash,) if predictor.model_hash else (),
-    )
+    )  # fmt: skip
     return add_shape_data(report, cohort)
 
 

@@ -12,13 +12,24 @@ from scipy.spatial.distance import pdist
 
 from shapespace.cohort.cohort import Cohort, subjects_of
 from shapespace.report.analyses.analysis_report import AnalysisReport, Rows
-from shapespace.schemas import CurvePart, DeformationPart, MorphPart, Part, Series, TableColumn, TablePart, TextPart
+from shapespace.schemas import (
+    CurvePart,
+    DeformationPart,
+    HistogramPart,
+    MorphPart,
+    Part,
+    Series,
+    TableColumn,
+    TablePart,
+    TextPart,
+)
 from shapespace.statistics.methods import methods_of
 from shapespace.statistics.observation_weights import LEAST_INFORMATION
 from shapespace.types import FloatArray
 
 _FILE = "observed.csv"
 _MOST_ROWS = 10  # rows that fit one screen; files have all
+_VERTEX_WORDS = re.compile(r"(?<![A-Za-z])[Vv]ert(?:ices|ex)(?![A-Za-z])")  # in sentences and names of columns
 _LANDMARK_WORDS = {"vertices": "landmarks", "vertex": "landmark", "Vertices": "Landmarks", "Vertex": "Landmark"}
 MOST_LANDMARKS = 500
 """Points of a shape without triangles up to which they are drawn as landmarks: more cover each other."""
@@ -174,15 +185,19 @@ def shape_settings(cohort: Cohort) -> dict[str, Any]:
 
 
 def _in_landmarks(report: AnalysisReport) -> AnalysisReport:
-    """Return a report whose sentences call the vertices of shapes landmarks."""
+    """Return a report whose sentences, labels and columns of files call the vertices of shapes landmarks."""
 
     def named(text: str | None) -> str:
-        return re.sub(r"\b[Vv]ert(?:ices|ex)\b", lambda found: _LANDMARK_WORDS[found[0]], text or "")
+        return _VERTEX_WORDS.sub(lambda found: _LANDMARK_WORDS[found[0]], text or "")
 
     def renamed(part: Part) -> Part:
         changed: dict[str, Any] = {"title": named(part.title), "note": named(part.note)}
         if isinstance(part, TextPart):
             changed["text"] = named(part.text) if isinstance(part.text, str) else tuple(map(named, part.text))
+        if isinstance(part, HistogramPart):
+            changed["x"] = named(part.x)
+        if isinstance(part, TablePart):
+            changed["columns"] = tuple(structs.replace(one, name=named(one.name)) for one in part.columns)
         return structs.replace(part, **changed)
 
     methods = report.methods
@@ -191,7 +206,10 @@ def _in_landmarks(report: AnalysisReport) -> AnalysisReport:
         tests = tuple(structs.replace(test, tested=tuple(map(named, test.tested))) for test in methods.tests)
         methods = structs.replace(methods, corrected_over=over, assumptions=assumptions, tests=tests)
     summary, notes = tuple(map(named, report.summary)), tuple(map(named, report.notes))
-    return replace(report, summary=summary, notes=notes, parts=tuple(map(renamed, report.parts)), methods=methods)
+    tables = {name: (tuple(map(named, header)), rows) for name, (header, rows) in report.tables.items()}
+    return replace(
+        report, summary=summary, notes=notes, parts=tuple(map(renamed, report.parts)), methods=methods, tables=tables
+    )
 
 
 def add_shape_data(report: AnalysisReport, cohort: Cohort) -> AnalysisReport:
