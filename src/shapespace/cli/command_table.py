@@ -217,8 +217,14 @@ def _shape_test(test: ShapeTest) -> Command:
     """Return the command of a test of shape."""
     source = Source(f"statistics.shape_tests.{test.module}", test.function)
     own = tuple(
-        Option(f"--{field.replace('_', '-')}", metavar, source=source, field=field, required=field in test.required,
-               basic=number < _BASIC_OF_TEST)
+        Option(
+            f"--{field.replace('_', '-')}",
+            metavar,
+            source=source,
+            field=field,
+            required=field in test.required,
+            basic=number < _BASIC_OF_TEST,
+        )
         for number, (field, metavar) in enumerate(test.options.items())
     )
     return Command(

@@ -133,8 +133,14 @@ SHAPE_TESTS: tuple[ShapeTest, ...] = (
         permuted="shape",
         references=("Collyer and Adams (2013) Hystrix 24, 75-83.",),
         example="shapespace test trajectory people.csv --group species --points stage -o trajectories",
-        options={"group": "COLUMN", "points": "COLUMN", "order": "LIST", "formula": "FORMULA", "null": "FORMULA",
-                 "residuals": ""},
+        options={
+            "group": "COLUMN",
+            "points": "COLUMN",
+            "order": "LIST",
+            "formula": "FORMULA",
+            "null": "FORMULA",
+            "residuals": "",
+        },
         required=("group", "points"),
     ),
     ShapeTest(
