@@ -102,7 +102,8 @@ def arguments(command: str) -> list[str]:
     """Return the arguments after `shapespace` as a shell would give them."""
     out: list[str] = []
     for word in shlex.split(command, comments=True)[1:]:
-        out += sorted(map(str, Path().glob(word))) if "*" in word else [word]
+        # A pattern without files stays as it is, as in a shell.
+        out += (sorted(map(str, Path().glob(word))) if "*" in word else []) or [word]
     return out
 
 
@@ -220,6 +221,7 @@ LONG = (
     "tutorial-identity.md",
     "tutorial-recognition.md",
     "tutorial-spleens.md",
+    "tutorial-surfaces-and-landmarks.md",
     "tutorial-volumes.md",
 )
 """Documents whose examples take long."""
