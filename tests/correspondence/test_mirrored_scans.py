@@ -65,7 +65,9 @@ def test_what_was_not_compared_is_on_no_side() -> None:
     assert found.mirrored.sum() == 9
 
 
-@pytest.mark.parametrize("mirrored", [MIRRORED, (0, 2, 3, 5)])
+@pytest.mark.parametrize(
+    "mirrored", [MIRRORED, pytest.param((0, 2, 3, 5), marks=[pytest.mark.long, pytest.mark.pairs])]
+)
 def test_mirrored_scans_are_reflected_and_the_majority_keeps_its_side(mirrored: tuple[int, ...]) -> None:
     scans = mixed(mirrored)
     made = correspond(scans, replace(CONFIG, rounds=2))

@@ -216,6 +216,11 @@ def has_examples(document: Path, *, needing_data: bool) -> bool:
 
 
 LONG = (
+    "change.md",
+    "correspondence.md",
+    "landmarks.md",
+    "report.md",
+    "scale.md",
     "tutorial-bones.md",
     "tutorial-faces.md",
     "tutorial-identity.md",
