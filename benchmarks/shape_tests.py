@@ -23,7 +23,7 @@ from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS
 
 SPECIMENS, LANDMARKS, PERMUTATIONS = 400, 500, 1000
 DECAY = 0.98  # ratio of the variances of neighbouring components
-NOISE = 1e-3  # standard deviation of a coordinate beside them; the size is about 40
+NOISE = 1e-3  # standard deviation of independent noise of a coordinate; the size is about 40
 
 
 def simulated_cohort(specimens: int, landmarks: int) -> Cohort:

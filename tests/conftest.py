@@ -1,3 +1,4 @@
+import json
 import os
 import shutil
 from collections.abc import Callable, Generator, Iterator
@@ -122,6 +123,15 @@ def shared_data() -> Path:
     if not (folder / "james" / "james.obj").is_file():
         pytest.skip("real data absent: set SHAPESPACE_DATA to a folder holding james/ and ict-facekit/")
     return folder
+
+
+@pytest.fixture(scope="session")
+def geomorph_reference(shared_data: Path) -> dict[str, Any]:
+    """Data sets of geomorph with results of geomorph and RRPP, which are not part of the repository."""
+    path = shared_data / "geomorph" / "reference.json"
+    if not path.is_file():
+        pytest.skip("reference results of geomorph absent: set SHAPESPACE_DATA to a folder holding geomorph/")
+    return json.loads(path.read_text())
 
 
 @pytest.fixture(scope="session")

@@ -760,7 +760,7 @@ class DeformationPart(Part, frozen=True, kw_only=True, tag="deformation"):
 
 
 class MorphospacePart(Part, frozen=True, kw_only=True, tag="morphospace"):
-    """Shapes as points in the plane of two axes of an ordination; a click draws the shape there beside the mean.
+    """Shapes as points in the plane of two axes of an ordination; a click draws the shape there next to the mean.
 
     Args:
         arrays: an .npz file with `scores` (N, A), `mean` (V, 3), `shape_axes` (A, V, 3), the change of shape per unit
@@ -1011,7 +1011,7 @@ class AlignFinding(Struct, frozen=True, kw_only=True):
 
 
 class AlignRecord(Struct, frozen=True, kw_only=True):
-    """An align.json: the alignment of landmarks whose coordinates are in aligned.csv beside it.
+    """An align.json: the alignment of landmarks whose coordinates are in aligned.csv next to it.
 
     Args:
         source: the landmark file or folder.

@@ -1,9 +1,7 @@
 """Generalised Procrustes analysis of landmarks: against geomorph, scipy and brute force, and what it refuses."""
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,15 +19,6 @@ from shapespace.io.landmarks.landmark_configurations import LandmarkConfiguratio
 from shapespace.types import FloatArray
 
 CONVERGED = AlignConfig(tangent=False, tolerance=1e-15, iterations=200)
-
-
-@pytest.fixture(scope="module")
-def reference(shared_data: Path) -> dict[str, Any]:
-    """Data sets of geomorph with their alignment, which are not part of the repository."""
-    path = shared_data / "geomorph" / "reference.json"
-    if not path.is_file():
-        pytest.skip("reference results of geomorph absent: set SHAPESPACE_DATA to a folder holding geomorph/")
-    return json.loads(path.read_text())
 
 
 def configurations(points: FloatArray, **fields: Any) -> LandmarkConfigurations:
@@ -60,15 +49,15 @@ def sample(n: int = 12, L: int = 9, D: int = 2, noise: float = 0.03, seed: int =
     ],
 )
 def test_alignments_are_those_of_geomorph_in_its_orientation(
-    reference: dict[str, Any], data: str, key: str, slide_by: Any
+    geomorph_reference: dict[str, Any], data: str, key: str, slide_by: Any
 ) -> None:
-    points = np.array(reference[data], dtype=np.float64)
+    points = np.array(geomorph_reference[data], dtype=np.float64)
     points = points.reshape(len(points), -1, 2)
-    curves = np.array(reference["humming_curves"], dtype=np.int32) - 1
+    curves = np.array(geomorph_reference["humming_curves"], dtype=np.int32) - 1
     sliders = {"curve_sliders": curves} if data == "humming_raw" else {}
     aligned = align_landmarks(configurations(points, **sliders), AlignConfig(slide_by=slide_by))
-    assert aligned.sizes == pytest.approx(np.ravel(reference[key]["csize"]), rel=1e-12)
-    assert np.abs(aligned.coords.reshape(len(points), -1) - np.array(reference[key]["coords"])).max() < 1e-10
+    assert aligned.sizes == pytest.approx(np.ravel(geomorph_reference[key]["csize"]), rel=1e-12)
+    assert np.abs(aligned.coords.reshape(len(points), -1) - np.array(geomorph_reference[key]["coords"])).max() < 1e-10
 
 
 @pytest.mark.parametrize("D", [2, 3])
@@ -263,9 +252,9 @@ def test_specimens_that_are_all_alike_have_no_outlier() -> None:
     assert find_outliers(align_landmarks(configurations(points))) == ()
 
 
-def test_published_sets_have_no_findings(reference: dict[str, Any]) -> None:
+def test_published_sets_have_no_findings(geomorph_reference: dict[str, Any]) -> None:
     for key, L in (("plethodon_raw", 12), ("food_raw", 13), ("humming_raw", 25)):
-        points = np.array(reference[key], dtype=np.float64).reshape(-1, L, 2)
+        points = np.array(geomorph_reference[key], dtype=np.float64).reshape(-1, L, 2)
         found = find_outliers(align_landmarks(configurations(points)))
         assert found == ()
 

@@ -4,7 +4,6 @@ import base64
 import bz2
 import contextlib
 import gzip
-import json
 import lzma
 import struct
 import sys
@@ -12,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -384,11 +384,8 @@ def test_landmark_files_are_recognised_by_ending_and_header(
     assert is_configurations(write(tmp_path, name, text)) is expected
 
 
-def test_plethodon_is_read_back_from_every_format(shared_data: Path, tmp_path: Path) -> None:
-    path = shared_data / "geomorph" / "reference.json"
-    if not path.is_file():
-        pytest.skip("reference results of geomorph absent: set SHAPESPACE_DATA to a folder holding geomorph/")
-    points = np.array(json.loads(path.read_text())["plethodon_raw"]).reshape(40, 12, 2)
+def test_plethodon_is_read_back_from_every_format(geomorph_reference: dict[str, Any], tmp_path: Path) -> None:
+    points = np.array(geomorph_reference["plethodon_raw"]).reshape(40, 12, 2)
     given = LandmarkConfigurations(names=tuple(f"p{k}" for k in range(40)), points=points)
     for format, ending in CONFIGURATION_FORMATS.items():
         write_configurations(tmp_path / f"p{ending}", given, format)

@@ -1,7 +1,6 @@
 """Covariation: against geomorph, plain singular value decompositions and resampling, and null simulations."""
 
 import itertools
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -23,15 +22,6 @@ EXACT = 1e-6
 """Relative tolerance of statistics of geomorph."""
 MONTE_CARLO = 0.35
 """Of Z at 999 and 9,999 permutations, as in test_effect_size."""
-
-
-@pytest.fixture(scope="module")
-def reference(shared_data: Path) -> dict[str, Any]:
-    """Data sets of geomorph and its results, which are not part of the repository."""
-    path = shared_data / "geomorph" / "reference.json"
-    if not path.is_file():
-        pytest.skip("reference results of geomorph absent: set SHAPESPACE_DATA to a folder holding geomorph/")
-    return json.loads(path.read_text())
 
 
 def aligned(flat: list[list[float]], columns: dict[str, list[float]] | None = None) -> Cohort:
@@ -86,9 +76,9 @@ def plain_cr(shapes: np.ndarray[Any, Any], modules: str, degrees: float) -> list
     return out
 
 
-def test_published_partial_least_squares_of_food_are_reproduced(reference: dict[str, Any]) -> None:
-    table, expected = reference["food_table"], reference["food_pls"]
-    found = fit_pls(aligned(reference["food_raw"], table), columns=tuple(table), permutations=2000)
+def test_published_partial_least_squares_of_food_are_reproduced(geomorph_reference: dict[str, Any]) -> None:
+    table, expected = geomorph_reference["food_table"], geomorph_reference["food_pls"]
+    found = fit_pls(aligned(geomorph_reference["food_raw"], table), columns=tuple(table), permutations=2000)
     test = found.statistic("r-PLS")
     assert test.value == pytest.approx(expected["r"][0], rel=EXACT)
     np.testing.assert_allclose(found.arrays["pls.npz"]["singular_values"], expected["svd"], rtol=EXACT)
@@ -96,15 +86,15 @@ def test_published_partial_least_squares_of_food_are_reproduced(reference: dict[
 
 
 def test_published_integration_and_modularity_of_plethodon_are_reproduced(
-    reference: dict[str, Any], tmp_path: Path
+    geomorph_reference: dict[str, Any], tmp_path: Path
 ) -> None:
     # Modules of the examples of geomorph.
-    cohort, modules = aligned(reference["plethodon_raw"]), written(tmp_path, "AAAAABBBBBBB")
-    expected = reference["plethodon_integration"]
+    cohort, modules = aligned(geomorph_reference["plethodon_raw"]), written(tmp_path, "AAAAABBBBBBB")
+    expected = geomorph_reference["plethodon_integration"]
     test = fit_pls(cohort, modules=modules, permutations=2000).statistic("r-PLS")
     assert test.value == pytest.approx(expected["r"][0], rel=EXACT) and test.p == 1 / 2000
     assert test.z == pytest.approx(expected["z"][0], abs=MONTE_CARLO)
-    expected = reference["plethodon_modularity"]
+    expected = geomorph_reference["plethodon_modularity"]
     test = estimate_modularity(cohort, modules=modules, permutations=2000).statistic("CR")
     assert test.value == pytest.approx(expected["CR"][0], rel=EXACT)
     assert test.p == pytest.approx(expected["p"][0], abs=0.06)  # 3 standard errors of 999 and 2,000 permutations

@@ -1,8 +1,7 @@
 """Unequal group dispersion: its test, and tests of means that stay valid under it, by plain oracles and simulation."""
 
 import itertools
-import json
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -187,11 +186,8 @@ def test_dispersions_are_standard_deviations_about_the_group_mean_and_classes_of
     )
 
 
-def test_dispersions_and_their_p_are_those_of_morphol_disparity(shared_data: Path) -> None:
-    path = shared_data / "geomorph" / "reference.json"
-    if not path.is_file():
-        pytest.skip("reference results of geomorph absent: set SHAPESPACE_DATA to a folder holding geomorph/")
-    data = json.loads(path.read_text())
+def test_dispersions_and_their_p_are_those_of_morphol_disparity(geomorph_reference: dict[str, Any]) -> None:
+    data = geomorph_reference
     shapes, expected = np.array(data["plethodon_gpa"]["coords"]), data["plethodon_disparity_partial"]
     table = data["plethodon_table"]
     cells = [f"{one}.{other}" for one, other in zip(table["species"], table["site"], strict=True)]

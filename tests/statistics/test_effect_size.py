@@ -1,7 +1,5 @@
 """Effect sizes: against published values of RRPP, scipy's Box-Cox likelihood, and plain logarithms."""
 
-import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,15 +12,6 @@ from shapespace.statistics.effect_size import box_cox_exponent, effect_size
 
 MONTE_CARLO = 0.35
 """Of Z by Box-Cox at 9,999 permutations: 3 standard deviations of 8 seeds (at most 0.12 each)."""
-
-
-@pytest.fixture(scope="module")
-def reference(shared_data: Path) -> dict[str, Any]:
-    """Data sets of geomorph and the results of RRPP, which are not part of the repository."""
-    path = shared_data / "geomorph" / "reference.json"
-    if not path.is_file():
-        pytest.skip("reference results of geomorph absent: set SHAPESPACE_DATA to a folder holding geomorph/")
-    return json.loads(path.read_text())
 
 
 @pytest.mark.parametrize("shape", [0.3, 1.0, 4.0])
@@ -58,9 +47,9 @@ def test_z_of_logarithms_is_the_plain_one_and_of_equal_values_0() -> None:
 
 
 @pytest.mark.parametrize("squares", ["I", "II"])
-def test_published_z_of_plethodon_are_reproduced(squares: SquaresType, reference: dict[str, Any]) -> None:
+def test_published_z_of_plethodon_are_reproduced(squares: SquaresType, geomorph_reference: dict[str, Any]) -> None:
     pytest.importorskip("formulaic")
-    data = reference
+    data = geomorph_reference
     flat = np.array(data["plethodon_gpa"]["coords"])
     shapes = np.zeros((len(flat), flat.shape[1] // 2, 3))
     shapes[:, :, :2] = flat.reshape(len(flat), -1, 2)

@@ -1,6 +1,5 @@
 """Tests of groups of shapes: against geomorph's results, brute force, scipy and scikit-learn, and under the null."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -26,15 +25,6 @@ from shapespace.types import FloatArray
 GROUP = ("group",)
 
 
-@pytest.fixture(scope="module")
-def reference(shared_data: Path) -> dict[str, Any]:
-    """Data sets of geomorph and its results, which are not part of the repository."""
-    path = shared_data / "geomorph" / "reference.json"
-    if not path.is_file():
-        pytest.skip("reference results of geomorph absent: set SHAPESPACE_DATA to a folder holding geomorph/")
-    return json.loads(path.read_text())
-
-
 def cohort_of(values: FloatArray, columns: dict[str, list[str]]) -> Cohort:
     """Return a cohort of which rows of values (N, D) are coordinates, padded with zeros."""
     shapes = np.zeros((len(values), values.shape[1] // 2 + 2, 3))
@@ -54,8 +44,8 @@ def simulated(
     return cohort_of(values, {"group": [chr(97 + code) for code in codes]})
 
 
-def plethodon(reference: dict[str, Any]) -> Cohort:
-    return cohort_of(np.array(reference["plethodon_gpa"]["coords"]), reference["plethodon_table"])
+def plethodon(geomorph_reference: dict[str, Any]) -> Cohort:
+    return cohort_of(np.array(geomorph_reference["plethodon_gpa"]["coords"]), geomorph_reference["plethodon_table"])
 
 
 def codes_of(cohort: Cohort) -> Any:
@@ -74,21 +64,21 @@ def codes_of(cohort: Cohort) -> Any:
     ],
 )
 def test_disparities_and_p_are_those_of_geomorph(
-    reference: dict[str, Any], data: str, key: str, group: tuple[str, ...], formula: str | None
+    geomorph_reference: dict[str, Any], data: str, key: str, group: tuple[str, ...], formula: str | None
 ) -> None:
     if formula:
         pytest.importorskip("formulaic")
-    expected, permutations = reference[key], 4000
+    expected, permutations = geomorph_reference[key], 4000
     cohort = (
-        plethodon(reference)
+        plethodon(geomorph_reference)
         if data == "plethodon"
-        else cohort_of(np.array(reference["pupfish_coords"]), reference["pupfish_table"])
+        else cohort_of(np.array(geomorph_reference["pupfish_coords"]), geomorph_reference["pupfish_table"])
     )
     found = compare_disparity(cohort, group=group, formula=formula, permutations=permutations)
     variances = [found.statistic("Procrustes variance", name).value for name in expected["groups"]]
     assert variances == pytest.approx(expected["var"], rel=1e-6)
     if data == "pupfish":
-        assert variances == pytest.approx(reference["pupfish_lm"]["pup_md"], rel=1e-6)
+        assert variances == pytest.approx(geomorph_reference["pupfish_lm"]["pup_md"], rel=1e-6)
     for a, first in enumerate(expected["groups"]):
         for b, second in enumerate(expected["groups"][a + 1 :], a + 1):
             p = expected["p"][a][b]
@@ -274,9 +264,9 @@ def test_leave_one_out_posteriors_and_permutations_are_those_of_brute_force(comp
     assert found.statistics[0].p == pytest.approx(np.mean([key >= keys[0] for key in keys]))
 
 
-def test_posterior_odds_are_those_of_scikit_learn(reference: dict[str, Any]) -> None:
+def test_posterior_odds_are_those_of_scikit_learn(geomorph_reference: dict[str, Any]) -> None:
     discriminant = pytest.importorskip("sklearn.discriminant_analysis")
-    cohort = plethodon(reference)
+    cohort = plethodon(geomorph_reference)
     found = discriminate(cohort, group=("species", "site"), priors="equal", permutations=2)
     posterior = np.array([row[3:] for row in found.table("Posterior probabilities").rows])
     centred = cohort.coefficients - cohort.coefficients.mean(axis=0)

@@ -1,7 +1,5 @@
 """Trajectories, pairs of groups, allometry and repeatability: published results of geomorph, other libraries, nulls."""
 
-import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,15 +21,6 @@ from shapespace.types import FloatArray
 pytest.importorskip("formulaic")
 
 
-@pytest.fixture(scope="module")
-def reference(shared_data: Path) -> dict[str, Any]:
-    """Data sets of geomorph and the results of RRPP, which are not part of the repository."""
-    path = shared_data / "geomorph" / "reference.json"
-    if not path.is_file():
-        pytest.skip("reference results of geomorph absent: set SHAPESPACE_DATA to a folder holding geomorph/")
-    return json.loads(path.read_text())
-
-
 def planar(rows: Any, table: dict[str, Any]) -> Cohort:
     flat = np.array(rows, dtype=np.float64)
     shapes = np.pad(flat.reshape(len(flat), -1, 2), ((0, 0), (0, 0), (0, 1)))
@@ -39,17 +28,17 @@ def planar(rows: Any, table: dict[str, Any]) -> Cohort:
 
 
 @pytest.fixture(scope="module")
-def plethodon(reference: dict[str, Any]) -> Cohort:
-    table = reference["plethodon_table"]
-    cohort = planar(reference["plethodon_gpa"]["coords"], {name: table[name] for name in ("species", "site")})
+def plethodon(geomorph_reference: dict[str, Any]) -> Cohort:
+    table = geomorph_reference["plethodon_table"]
+    cohort = planar(geomorph_reference["plethodon_gpa"]["coords"], {name: table[name] for name in ("species", "site")})
     sizes = np.array(table["cs"], dtype=np.float64)
     return with_columns(cohort, {"Csize": sizes, "lcs": np.log(sizes)})
 
 
 @pytest.fixture(scope="module")
-def pupfish(reference: dict[str, Any]) -> Cohort:
-    table = reference["pupfish_table"]
-    cohort = planar(reference["pupfish_coords"], {name: table[name] for name in ("Sex", "Pop")})
+def pupfish(geomorph_reference: dict[str, Any]) -> Cohort:
+    table = geomorph_reference["pupfish_table"]
+    cohort = planar(geomorph_reference["pupfish_coords"], {name: table[name] for name in ("Sex", "Pop")})
     return with_columns(cohort, {"lcs": np.log(np.array(table["CS"], dtype=np.float64))})
 
 
@@ -60,15 +49,15 @@ def simulate(rows: FloatArray, table: dict[str, Any]) -> Cohort:
 
 
 def test_published_analyses_of_variance_are_reproduced(
-    reference: dict[str, Any], plethodon: Cohort, pupfish: Cohort
+    geomorph_reference: dict[str, Any], plethodon: Cohort, pupfish: Cohort
 ) -> None:
-    lm = reference["plethodon_lm_raw_landmark_gpa"]
+    lm = geomorph_reference["plethodon_lm_raw_landmark_gpa"]
     types: list[SquaresType] = ["I", "II", "III"]
     for squares in types:
         for cohort, formula, expected in (
             (plethodon, "~ species * site", lm[f"pleth_{squares}"]),
             (plethodon, "~ log(Csize) * species + site", lm[f"plethcov_{squares}"]),
-            (pupfish, "~ lcs + Sex * Pop", reference["pupfish_lm"][f"pup_{squares}"]),
+            (pupfish, "~ lcs + Sex * Pop", geomorph_reference["pupfish_lm"][f"pup_{squares}"]),
         ):
             options = CompareConfig(anova_type=squares, permutations=400, maps=False, coding="treatment")
             result = compare(cohort, formula, options)
@@ -95,8 +84,8 @@ def test_types_i_and_ii_do_not_depend_on_the_coding_of_classes(pupfish: Cohort) 
         assert [e.distance_mm for e in found[0].effects] == pytest.approx([e.distance_mm for e in found[1].effects])
 
 
-def test_published_distances_of_means_are_reproduced(reference: dict[str, Any], plethodon: Cohort) -> None:
-    expected = reference["plethodon_lm_raw_landmark_gpa"]
+def test_published_distances_of_means_are_reproduced(geomorph_reference: dict[str, Any], plethodon: Cohort) -> None:
+    expected = geomorph_reference["plethodon_lm_raw_landmark_gpa"]
     result = compare_pairs(
         plethodon, formula="~ species * site", group=("species", "site"), permutations=2000, residuals="raw"
     )
@@ -116,8 +105,8 @@ def test_published_distances_of_means_are_reproduced(reference: dict[str, Any], 
     assert species.z == pytest.approx(expected["pleth_sp"]["Z"][0], abs=0.35)
 
 
-def test_published_vectors_of_slopes_are_reproduced(reference: dict[str, Any], plethodon: Cohort) -> None:
-    expected = reference["plethodon_lm_raw_landmark_gpa"]
+def test_published_vectors_of_slopes_are_reproduced(geomorph_reference: dict[str, Any], plethodon: Cohort) -> None:
+    expected = geomorph_reference["plethodon_lm_raw_landmark_gpa"]
     result = compare_pairs(
         plethodon, formula="~ lcs * species", group=("species",), covariate="lcs", permutations=2000, residuals="raw"
     )
@@ -131,8 +120,8 @@ def test_published_vectors_of_slopes_are_reproduced(reference: dict[str, Any], p
     assert angle.p == pytest.approx(expected["pleth_vc"]["Pr > angle"][0], abs=0.03)
 
 
-def test_published_trajectories_are_reproduced(reference: dict[str, Any], pupfish: Cohort) -> None:
-    expected = reference["pupfish_trajectory"]
+def test_published_trajectories_are_reproduced(geomorph_reference: dict[str, Any], pupfish: Cohort) -> None:
+    expected = geomorph_reference["pupfish_trajectory"]
     result = compare_trajectories(pupfish, group=("Pop",), points="Sex", residuals="raw")
     length, angle = result.statistics
     assert length.value == pytest.approx(expected["MD"]["d"][0], rel=1e-6)
@@ -143,9 +132,9 @@ def test_published_trajectories_are_reproduced(reference: dict[str, Any], pupfis
 
 
 def test_published_scores_of_allometry_are_reproduced(
-    reference: dict[str, Any], plethodon: Cohort, pupfish: Cohort
+    geomorph_reference: dict[str, Any], plethodon: Cohort, pupfish: Cohort
 ) -> None:
-    lm = reference["plethodon_lm_raw_landmark_gpa"]
+    lm = geomorph_reference["plethodon_lm_raw_landmark_gpa"]
     result = analyse_allometry(plethodon, covariate="lcs")
     rows = np.array([row[3:] for row in result.table("Allometry scores").rows])
     assert rows[:, 0] == pytest.approx(np.array(lm["pleth_regscore"]), abs=1e-12)
@@ -156,8 +145,8 @@ def test_published_scores_of_allometry_are_reproduced(
     assert f.z == pytest.approx(allom["Z"][0], abs=0.2)
     assert f.p == pytest.approx(allom["P"][0], abs=0.04)
     rows = np.array([row[3:] for row in analyse_allometry(pupfish, covariate="lcs").table("Allometry scores").rows])
-    assert rows[:, 0] == pytest.approx(np.array(reference["pupfish_regscore"]["RegScore"]), abs=1e-12)
-    assert rows[:, 1] == pytest.approx(np.array(reference["pupfish_regscore"]["CAC"]), abs=1e-12)
+    assert rows[:, 0] == pytest.approx(np.array(geomorph_reference["pupfish_regscore"]["RegScore"]), abs=1e-12)
+    assert rows[:, 1] == pytest.approx(np.array(geomorph_reference["pupfish_regscore"]["CAC"]), abs=1e-12)
 
 
 def test_trajectories_of_three_points_have_the_size_angle_and_shape_by_hand() -> None:

@@ -1,6 +1,5 @@
 """Ordinations: against R's prcomp, scikit-learn, brute force, and what is known of chance."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -34,11 +33,8 @@ def aligned(found: np.ndarray, expected: np.ndarray) -> np.ndarray:
     return found * np.sign((found * expected).sum(axis=0))
 
 
-def test_principal_components_of_plethodon_are_those_of_geomorph(shared_data: Path) -> None:
-    path = shared_data / "geomorph" / "reference.json"
-    if not path.is_file():
-        pytest.skip("reference results of geomorph absent: set SHAPESPACE_DATA to a folder holding geomorph/")
-    data: dict[str, Any] = json.loads(path.read_text())
+def test_principal_components_of_plethodon_are_those_of_geomorph(geomorph_reference: dict[str, Any]) -> None:
+    data = geomorph_reference
     flat = np.array(data["plethodon_gpa"]["coords"])
     shapes = np.zeros((len(flat), flat.shape[1] // 2, 3))
     shapes[:, :, :2] = flat.reshape(len(flat), -1, 2)

@@ -1,6 +1,5 @@
 """Phylogenetic tests: against results of geomorph, squared-change parsimony, plain least squares and simulations."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,13 +26,10 @@ EXACT = 1e-6
 
 
 @pytest.fixture(scope="module")
-def reference(shared_data: Path) -> dict[str, Any]:
-    """Data sets of geomorph and its results, which are not part of the repository."""
-    path = shared_data / "geomorph" / "reference.json"
-    if not path.is_file():
-        pytest.skip("reference results of geomorph absent: set SHAPESPACE_DATA to a folder holding geomorph/")
+def reference(geomorph_reference: dict[str, Any]) -> dict[str, Any]:
+    """Reference results, where trees can be read."""
     pytest.importorskip("dendropy", reason="the extra `phylogeny` is not installed")
-    return json.loads(path.read_text())
+    return geomorph_reference
 
 
 @pytest.fixture(scope="module")

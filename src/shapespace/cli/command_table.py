@@ -210,7 +210,7 @@ def _identity() -> tuple[Option, ...]:
 
 
 _BASIC_OF_TEST = 4
-"""First options of a test that `--help` lists, beside those that all tests have."""
+"""First options of a test that `--help` lists, in addition to those of all tests."""
 
 
 def _shape_test(test: ShapeTest) -> Command:
@@ -591,7 +591,7 @@ COMMANDS: tuple[Command, ...] = (
             basic("--object", "NAME", source=LANDMARKS_CONVERT, field="object_name"),
         ),
         (
-            "Coordinates are exact. Prints what was scaled, taken as missing or left out. Sliders are written beside "
+            "Coordinates are exact. Prints what was scaled, taken as missing or left out. Sliders are written next to "
             "OUT as geomorph reads them. Files of R need the extra r.",
         ),
     ),
@@ -799,8 +799,8 @@ COMMANDS: tuple[Command, ...] = (
             *_gauge(),
         ),
         (
-            "In the plot of the report a click, or the arrow keys, choose a place; the shape there is drawn beside the "
-            "mean. Scores, loadings (change of each coordinate per unit of score) and eigenvalues are CSV tables.",
+            "In the plot of the report a click, or the arrow keys, choose a place; the shape there is drawn next to "
+            "the mean. Scores, loadings (change of each coordinate per unit of score) and eigenvalues are CSV tables.",
         ),
     ),
     *(_shape_test(test) for test in SHAPE_TESTS),

@@ -33,7 +33,7 @@ def align(
 ) -> tuple[AlignedLandmarks, AlignRecord]:
     """Align the landmarks of many specimens, name specimens to check, and write all to a folder.
 
-    links.csv and orientation.json beside the data become orientation.json in the folder, for its figures.
+    links.csv and orientation.json next to the data become orientation.json in the folder, for its figures.
 
     Args:
         data: landmark file, or folder of them.

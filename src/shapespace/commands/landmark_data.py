@@ -28,7 +28,7 @@ def convert_landmarks(
 ) -> tuple[LandmarkConfigurations, tuple[str, ...]]:
     """Write the landmarks of many specimens in another format; return them, and sentences on what changed.
 
-    Sliders are written beside the output as OUT.curveslide.csv and OUT.surfslide.csv.
+    Sliders are written next to the output as OUT.curveslide.csv and OUT.surfslide.csv.
 
     Args:
         source: file or folder with landmarks.
@@ -123,12 +123,12 @@ def plot_configurations(
 ) -> tuple[str, ...]:
     """Draw all specimens superimposed around their mean with numbered landmarks; return the notes of the alignment.
 
-    Views and links are those of orientation.json and links.csv beside the data.
+    Views and links are those of orientation.json and links.csv next to the data.
 
     Args:
         data: file or folder with the landmarks of many specimens.
         output: FILE.svg, FILE.pdf or FILE.png.
-        links: CSV of two columns of landmarks, by number or name, that lines connect (default: links.csv beside DATA)
+        links: CSV of two columns of landmarks, by number or name, that lines connect (default: links.csv next to DATA)
         sliders: CSV of the semilandmarks as geomorph has them; can be repeated
 
     Raises:

@@ -370,9 +370,10 @@ def find_outliers(aligned: AlignedLandmarks) -> tuple[LandmarkFinding, ...]:
     def distances(shapes: FloatArray) -> FloatArray:
         return np.linalg.norm(_rotated(shapes, middle) - middle, axis=(1, 2))
 
-    moved = np.maximum(np.linalg.norm(_rotated(x, middle) - middle, axis=2), _ROUNDING)
+    displacements = np.linalg.norm(_rotated(x, middle) - middle, axis=2)
+    own = np.linalg.norm(displacements, axis=1)
+    moved = np.maximum(displacements, _ROUNDING)
     moved /= np.median(moved, axis=0)
-    own = distances(x)
     mirrored = distances(x * np.append(-1.0, np.ones(aligned.dimensions - 1)))
     logs = np.log(moved.max(axis=1))
     logs -= np.median(logs)
@@ -522,9 +523,9 @@ def _refuse_sliders(configurations: LandmarkConfigurations) -> None:
     if (counts > 1).any():
         name = configurations.landmarks[int(sliding[counts > 1][0])]
         raise InputError(f"{where}: landmark {name} slides twice; name it once in the sliders.")
-    beside = curves[(curves[:, 0] == curves[:, 1]) | (curves[:, 2] == curves[:, 1]) | (curves[:, 0] == curves[:, 2])]
-    if len(beside):
-        name = configurations.landmarks[int(beside[0, 1])]
+    repeated = curves[(curves[:, 0] == curves[:, 1]) | (curves[:, 2] == curves[:, 1]) | (curves[:, 0] == curves[:, 2])]
+    if len(repeated):
+        name = configurations.landmarks[int(repeated[0, 1])]
         raise InputError(f"{where}: landmark {name} needs two other landmarks, before and after, to slide between.")
     if len(surface) and configurations.dimensions == 2:
         raise InputError(f"{where}: semilandmarks slide on surfaces in 3-D only; name curves for planar landmarks.")

@@ -25,6 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import InputError
+from shapespace.statistics.shape_tests.permutations import orders
 from shapespace.types import FloatArray
 
 Codes: TypeAlias = npt.NDArray[np.intp]
@@ -36,6 +37,7 @@ _FULL_LEVERAGE = 1e-8
 """Rows with 1 - leverage below this limit are fitted exactly, so their residual is zero."""
 _BATCH = 50
 """Number of sign flips drawn from one seed."""
+_STREAM = 3  # separates these permutations from those of other tests with the same seed
 _FLOOR = 1e-12  # share of the total; a variance below is rounding
 
 
@@ -114,7 +116,7 @@ def dispersion_test(
     variances = np.bincount(own, weights=squares) / np.bincount(own)
     distances = np.sqrt(squares)  # S12
     f = np.concatenate(
-        [_f_of_means(distances[rows], own) for rows in _permutations(len(distances), permutations, seed)]
+        [_f_of_means(distances[rows], own) for _, rows in orders(len(distances), permutations, seed, _STREAM)]
     )
     return DispersionTest(
         variable=variable,
@@ -126,15 +128,6 @@ def dispersion_test(
         p=float((f >= f[0] * (1 - _TIE)).mean()),
         permutations=permutations,
     )
-
-
-def _permutations(n: int, permutations: int, seed: int) -> Iterator[Codes]:
-    """Yield orders (b, n) of n values; the first is as observed."""
-    for start in range(0, permutations, _BATCH):
-        rows = np.argsort(np.random.default_rng([seed, 3, start]).random((_BATCH, n)), axis=1)
-        if start == 0:
-            rows[0] = np.arange(n)
-        yield rows[: permutations - start]
 
 
 def _f_of_means(values: FloatArray, codes: Codes) -> FloatArray:

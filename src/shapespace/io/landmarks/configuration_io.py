@@ -221,8 +221,8 @@ def _texts(path: Path, raw: LandmarkConfigurations, format: str) -> dict[Path, s
         return {path: tps_text(dict(zip(raw.names, raw.points, strict=True)), values)}
     if format == "morphoj":
         table, classes = morphoj_texts(raw)
-        beside = path.with_name(f"{path.name.removesuffix(path.suffix)}.classifiers.txt")
-        return {path: table, **({beside: classes} if raw.columns else {})}
+        classifiers = path.with_name(f"{path.name.removesuffix(path.suffix)}.classifiers.txt")
+        return {path: table, **({classifiers: classes} if raw.columns else {})}
     return {path: {"nts": nts_text, "csv": wide_text, "long": long_text}[format](raw)}
 
 

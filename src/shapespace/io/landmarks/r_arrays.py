@@ -34,8 +34,8 @@ _DEEPEST = 2  # lists in lists that arrays are looked for in
 def parse_r(data: bytes, path: Path, name: str | None = None) -> LandmarkConfigurations:
     """Return the landmarks of the only array of an R file, or of the array `name`, such as `plethodon$land`.
 
-    Factors and vectors beside the array, with a value for each specimen, become columns; `curvepts`, `curveslide` and
-    `surfslide` beside it are sliders.
+    Factors and vectors next to the array, with a value for each specimen, become columns; `curvepts`, `curveslide` and
+    `surfslide` next to it are sliders.
     """
     rdata = require_package("rdata", f"Reading {path}", "'shapespace[r]'")
     try:
@@ -54,13 +54,13 @@ def parse_r(data: bytes, path: Path, name: str | None = None) -> LandmarkConfigu
     if len(chosen) != 1:
         problem = "several arrays" if name is None or chosen else f"no array {name[:40]!r}"
         raise damage_error(path, f"it has {problem}; name one of {listed} with --object")
-    [(key, (points, labels, names, beside))] = chosen.items()
+    [(key, (points, labels, names, others))] = chosen.items()
     notes = [f"The landmarks are those of {key}."] if key else []
     names = names or tuple(f"specimen {k}" for k in range(1, len(points) + 1))
     labels = labels or tuple(map(str, range(1, points.shape[1] + 1)))
-    columns = {part: cells for part, one in beside.items() if len(cells := _cells(one)) == len(points)}
+    columns = {part: cells for part, one in others.items() if len(cells := _cells(one)) == len(points)}
     sliders = {3: np.zeros((0, 3), dtype=np.int32), 1: np.zeros((0, 1), dtype=np.int32)}
-    for part, one in beside.items():
+    for part, one in others.items():
         width = 3 if part.lower() in _CURVES else 1
         if part.lower() in (*_CURVES, *_SURFACES) and getattr(one, "size", 0) and one.size % width == 0:
             numbers = np.asarray(one, dtype=np.float64).reshape(-1, width)
@@ -115,7 +115,7 @@ def _objects(content: Any, rdata: Any) -> dict[str, Any]:
 def _arrays(
     objects: Mapping[str, Any], prefix: str, depth: int = 0
 ) -> Iterator[tuple[str, tuple[FloatArray, tuple[str, ...], tuple[str, ...], Mapping[str, Any]]]]:
-    """Yield name -> points (n, p, k), names of landmarks and specimens, and the objects beside, of each array."""
+    """Yield name -> points (n, p, k), names of landmarks and specimens, and the objects next to it, of each array."""
     objects = {str(name): one for name, one in objects.items()}
     for name, one in objects.items():
         shape = getattr(one, "shape", ())

@@ -663,7 +663,7 @@
     } };
   }
 
-  /** Shapes as points in the plane of two axes of an ordination; the shape at the marker is drawn beside the mean. */
+  /** Shapes as points in the plane of two axes of an ordination; the shape at the marker is drawn next to the mean. */
   Shapespace.widgets.morphospace = (element, payload) =>
     lazily(element, payload, (unpacked) => {
       const { facts, arrays } = unpacked, { names, groups, labels } = facts, n = names.length, K = facts.axes.length;

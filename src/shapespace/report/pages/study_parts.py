@@ -334,7 +334,7 @@ class StudyParts:
         still = self.page.still(figures.morphospace_figure(space), alt, lossless=True)
         turning = self.page.turning(
             "morphospace", pack_morphospace(space), still,
-            note or "Shapes in the plane of two axes; choose a place to draw the shape there beside the mean.",
+            note or "Shapes in the plane of two axes; choose a place to draw the shape there next to the mean.",
             label=alt, still="The still shows the mean and the shapes at the ends of both axes.",
         )  # fmt: skip
         return [turning]

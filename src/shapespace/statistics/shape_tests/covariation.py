@@ -21,10 +21,9 @@ from shapespace.io.files import read_bytes
 from shapespace.io.landmarks.landmark_io import csv_rows
 from shapespace.io.read_limits import LARGEST_LANDMARK_FILE_BYTES
 from shapespace.schemas import CurvePart, Series, TableColumn, TablePart
-from shapespace.statistics.shape_tests.permutations import Orders, orders
+from shapespace.statistics.shape_tests.permutations import Orders, permuted
 from shapespace.statistics.shape_tests.shape_test_result import ShapeTestResult, Statistic
 from shapespace.statistics.shape_tests.test_table import shape_test
-from shapespace.step_counter import StepCounter
 from shapespace.types import FloatArray
 
 _MOST_POINTS = 4_000  # of all modules; the covariances of all pairs then take 0.4 GB
@@ -59,7 +58,7 @@ def fit_pls(
             that the shapes do not have.
     """
     if bool(columns) == (modules is not None):
-        raise InputError("Partial least squares needs --columns of the table as a block beside shape, or --modules.")
+        raise InputError("Partial least squares needs --columns of the table as the first block, or --modules.")
     cohort = cohort.complete(columns, drop_missing=drop_missing)
     if modules is None:
         given = np.column_stack([cohort.table.numbers(column) for column in columns])
@@ -69,13 +68,13 @@ def fit_pls(
         blocks = {name: _coordinates(cohort, own).reshape(len(cohort), -1) for name, own in points.items()}
     scores, axes = zip(*(_principal_components(name, block) for name, block in blocks.items()), strict=True)
     pairs = list(itertools.combinations(range(len(blocks)), 2))
-    values = np.empty((permutations, len(pairs)))
-    step = StepCounter(permutations, progress)
+
+    def correlations(rows: Orders) -> FloatArray:
+        return np.column_stack([_first_correlations(scores[a], scores[b], rows) for a, b in pairs])
+
     # Threads of many small products wait for one another on a machine with other work.
     with threadpool_limits(1, user_api="blas"):
-        for part, rows in orders(len(cohort), permutations, seed):
-            values[part] = np.column_stack([_first_correlations(scores[a], scores[b], rows) for a, b in pairs])
-            step.add(len(rows))
+        values = permuted(len(cohort), permutations, seed, correlations, progress)
     result = ShapeTestResult(
         test=shape_test("pls" if columns else "integration"), cohort=cohort,
         statistics=_mean_and_pairs("r-PLS", values, list(blocks), "upper"),
@@ -152,12 +151,12 @@ def estimate_modularity(
         raise InputError(f"{modules}: the points of a module do not covary, so CR is not defined; give it more points.")
     angle = _ANGLES[[int(np.abs(ratios - ratios.mean()).argmin())]]
     diagonal = _at(variances, angle)
-    values = np.empty((permutations, len(points) * (len(points) - 1) // 2))
-    step = StepCounter(permutations, progress)
-    for part, rows in orders(len(flat), permutations, seed):
-        own = _indicator(codes[rows], len(points))
-        values[part] = _ratios(own @ norms @ own.transpose(0, 2, 1), own @ diagonal)[:, :, 0]
-        step.add(len(rows))
+
+    def covariance_ratios(rows: Orders) -> FloatArray:
+        members = _indicator(codes[rows], len(points))
+        return _ratios(members @ norms @ members.transpose(0, 2, 1), members @ diagonal)[:, :, 0]
+
+    values = permuted(len(flat), permutations, seed, covariance_ratios, progress)
     first, *pairs = _mean_and_pairs("CR", values, list(points), "lower")
     low, high = np.percentile(_bootstrap(x, codes, permutations, seed), _INTERVAL).tolist()
     return ShapeTestResult(
@@ -251,18 +250,18 @@ def _first_correlations(x: FloatArray, y: FloatArray, rows: Orders) -> FloatArra
     def scores(v: FloatArray) -> FloatArray:
         return np.take_along_axis(np.take_along_axis(v @ y.T, places, axis=1) @ gram, rows, axis=1)
 
-    vectors, along, beside = (np.zeros((count, *shape)) for shape in ((steps + 1, q), (steps,), (steps,)))
+    vectors, along, across = (np.zeros((count, *shape)) for shape in ((steps + 1, q), (steps,), (steps,)))
     start = np.random.default_rng(0).normal(size=q)
     vectors[:, 0] = start / np.linalg.norm(start)
     for k in range(steps):
         w = scores(vectors[:, k]) @ y
         along[:, k] = (w * vectors[:, k]).sum(axis=1)
         w -= ((vectors[:, : k + 1] @ w[:, :, None]).transpose(0, 2, 1) @ vectors[:, : k + 1])[:, 0]
-        beside[:, k] = np.linalg.norm(w, axis=1)
-        vectors[:, k + 1] = w / np.maximum(beside[:, k], 1e-14 * along.max())[:, None]
+        across[:, k] = np.linalg.norm(w, axis=1)
+        vectors[:, k + 1] = w / np.maximum(across[:, k], 1e-14 * along.max())[:, None]
     index, tridiagonal = np.arange(steps), np.zeros((count, steps, steps))
     tridiagonal[:, index, index] = along
-    tridiagonal[:, index[1:], index[:-1]] = beside[:, :-1]  # the lower triangle is read
+    tridiagonal[:, index[1:], index[:-1]] = across[:, :-1]  # the lower triangle is read
     axis = (np.linalg.eigh(tridiagonal)[1][:, None, :, -1] @ vectors[:, :-1])[:, 0]
     a, b = scores(axis), axis @ y.T
     return (a * b).sum(axis=1) / (np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1))

@@ -485,7 +485,7 @@ def _pairs_result(
     classes: Sequence[str], reduced_model: tuple[str, ...], settings: dict[str, Any], figures: tuple[Part, ...] = (),
 ) -> ShapeTestResult:  # fmt: skip
     """Return the result of statistics of pairs of groups, which `columns` has by batch and pair."""
-    labels = [f"{groups.names[a]} – {groups.names[b]}" for a, b in groups.pairs]
+    labels = groups.pair_names
     statistics = [
         Statistic.of(one, np.concatenate([batch[k] for batch in columns[pair :: len(labels)]]), label)
         for k, one in enumerate(names)

@@ -20,10 +20,11 @@ _RESAMPLES = 1  # no multiple of the batch, so that bootstrap samples differ fro
 Orders = npt.NDArray[np.intp]
 
 
-def orders(n: int, permutations: int, seed: int) -> Iterator[tuple[slice, Orders]]:
+def orders(n: int, permutations: int, seed: int, stream: int = _STREAM) -> Iterator[tuple[slice, Orders]]:
     """Yield (part of the permutations, (b, n) orders of n rows) in batches; the first order is as observed.
 
-    They are the same on each call, and do not depend on how many are drawn.
+    They are the same on each call, and do not depend on how many are drawn. Tests with other numbers of a `stream` have
+    other orders for the same seed.
 
     Raises:
         InputError: a number of permutations below 1, or a negative seed.
@@ -32,7 +33,7 @@ def orders(n: int, permutations: int, seed: int) -> Iterator[tuple[slice, Orders
         raise InputError(f"There must be 1 or more permutations, and a seed from 0, not {permutations} and {seed}.")
     for start in range(0, permutations, _BATCH):
         count = min(_BATCH, permutations - start)
-        rows = np.argsort(np.random.default_rng([seed, _STREAM, start]).random((_BATCH, n)), axis=1)[:count]
+        rows = np.argsort(np.random.default_rng([seed, stream, start]).random((_BATCH, n)), axis=1)[:count]
         if start == 0:
             rows[0] = np.arange(n)
         yield slice(start, start + count), rows

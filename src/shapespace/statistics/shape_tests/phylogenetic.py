@@ -14,15 +14,15 @@ from typing import Literal, TypeAlias
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from shapespace.cohort.cohort import Cohort, with_columns
+from shapespace.cohort.cohort import Cohort
 from shapespace.io.trees import Tree, read_tree
 from shapespace.reprs import short_repr
 from shapespace.schemas import TableColumn, TablePart
-from shapespace.statistics.compare_formula import Term, columns_of, design_of
-from shapespace.statistics.compare_shapes import CompareConfig, SquaresType, term_tests
+from shapespace.statistics.compare_formula import Term, design_of
+from shapespace.statistics.compare_shapes import CompareConfig, SquaresType, complete_cohort, term_tests
 from shapespace.statistics.compare_strata import Stratum, less, refuse_aliased, refuse_few
 from shapespace.statistics.methods import REDUCED_OF_EACH_TERM
-from shapespace.statistics.shape_tests.permutations import orders
+from shapespace.statistics.shape_tests.permutations import Orders, permuted
 from shapespace.statistics.shape_tests.shape_test_result import ShapeTestResult, Statistic
 from shapespace.statistics.shape_tests.test_table import shape_test
 from shapespace.step_counter import StepCounter
@@ -145,17 +145,18 @@ def estimate_phylogenetic_signal(
     expected = (float(np.trace(tree.covariance)) - n * float(weights @ tree.covariance @ weights)) / (n - 1)
     factor = np.linalg.cholesky(precision + 1.0 / n).T  # its squares are those about the root, as rows are centred
     forms = np.column_stack([n * np.outer(weights, weights).ravel(), precision.ravel()])
-    k = np.empty((permutations, 1 + components.shape[1]))
-    step = StepCounter(permutations, progress)
+
+    def ratios(rows: Orders) -> FloatArray:
+        root, squares = np.stack([gram[np.ix_(order, order)].ravel() @ forms for order in rows]).T
+        whole = ((s**2).sum() + root) / squares
+        roots = np.tensordot(components[rows], weights, axes=(1, 0))
+        total = (components**2).sum(axis=0) + n * roots**2
+        by_axis = total / ((factor @ components[rows]) ** 2).sum(axis=1)
+        return np.column_stack([whole, by_axis]) / expected  # M53
+
     # Threads of many small products wait for one another on a machine with other work.
     with threadpool_limits(1, user_api="blas"):
-        for part, rows in orders(n, permutations, seed):
-            root, squares = np.stack([gram[np.ix_(order, order)].ravel() @ forms for order in rows]).T
-            k[part, 0] = ((s**2).sum() + root) / squares / expected  # M53
-            roots = np.tensordot(components[rows], weights, axes=(1, 0))
-            total = (components**2).sum(axis=0) + n * roots**2
-            k[part, 1:] = total / ((factor @ components[rows]) ** 2).sum(axis=1) / expected
-            step.add(len(rows))
+        k = permuted(n, permutations, seed, ratios, progress)
     by_axis = [Statistic.of("K", k[:, j], f"principal component {j}") for j in range(1, k.shape[1])]
     table = TablePart(
         title="Phylogenetic signal of principal components",
@@ -191,11 +192,8 @@ def fit_pgls(
         InputError: a formula that cannot be read, terms that follow from others, missing values, shapes without tip,
             tips without a distance between them, or too few shapes.
     """
-    sizes = {"size": cohort.sizes_mm, "log_size": np.log(cohort.sizes_mm)}
-    cohort = with_columns(cohort, {name: v for name, v in sizes.items() if name not in cohort.table.columns})
     config = CompareConfig(anova_type=anova_type, permutations=permutations, seed=seed, maps=False)
-    cohort = cohort.complete(columns_of(formula, cohort.table), drop_missing=drop_missing)
-    cohort, tree = _on_tree(cohort, tree)
+    cohort, tree = _on_tree(complete_cohort(cohort, [formula], [], drop_missing=drop_missing), tree)
     design = design_of(formula, cohort.table)
     n, p = len(cohort), len(design.matrix[0])
     refuse_few(n - 1, design, "", n, "shapes", p)
@@ -222,10 +220,7 @@ def fit_pgls(
     )  # fmt: skip
     return ShapeTestResult(
         test=shape_test("pgls"), cohort=cohort, tables=(table,),
-        statistics=tuple(
-            Statistic(name="F", tested=one.term, value=one.f, p=one.p, z=one.z, arrangements=one.arrangements)
-            for one in tests
-        ),
+        statistics=tuple(Statistic.of("F", one.arrangements, one.term) for one in tests),
         settings={"formula": formula, "tree": tree.where, "anova_type": anova_type, "permutations": permutations,
                   "seed": seed},
         reduced_model=REDUCED_OF_EACH_TERM,
