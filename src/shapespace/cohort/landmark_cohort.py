@@ -120,7 +120,7 @@ def read_landmark_cohort(
         InputError: specimens that cannot be aligned, or too few of them in the table.
     """
     source = read_aligned(path) if (path / RECORD).is_file() else read_configurations(path)
-    rows, covariates, notes = _matched(source.names, source.columns, table, str(path))
+    rows, covariates, notes = join_table(source.names, source.columns, table, str(path))
     least = least if onto is None else 1
     if len(rows) < least:
         raise InputError(f"{path}: {len(rows)} specimen{'s' * (len(rows) != 1)} can be used, and {least} are needed.")
@@ -193,10 +193,23 @@ def landmark_cohort(cohort: Cohort, onto: Cohort | None = None) -> Cohort:
     return replace(Cohort.of_landmarks(aligned, cohort.table), notes=(*cohort.notes, note))
 
 
-def _matched(
-    names: Sequence[str], columns: Mapping[str, tuple[str, ...]], table: Path | None, where: str
+def join_table(
+    names: Sequence[str],
+    columns: Mapping[str, tuple[str, ...]],
+    table: Path | None,
+    where: str,
+    *,
+    keep_unmatched: bool = False,
 ) -> tuple[list[int], Table, list[str]]:
-    """Return the specimens that have a row, the table of covariates in their order, and notes on the others.
+    """Return specimens, their covariates from the landmark file and a table, and notes on those without a row.
+
+    Args:
+        names: of the specimens.
+        columns: covariates in the landmark file.
+        table: of further covariates, whose key column names the specimens; None for none.
+        where: what the specimens are called in messages.
+        keep_unmatched: keep specimens without a row, with empty cells, in the order of `names`; otherwise specimens
+            are in the order of the table.
 
     Raises:
         InputError: no row is of a specimen.
@@ -206,8 +219,8 @@ def _matched(
         return list(range(len(names))), own, []
     number = {stem_of(name): k for k, name in enumerate(names)} | {name: k for k, name in enumerate(names)}
     given, keys = read_table(table, number)
-    found = [(number[key], row) for row, key in enumerate(keys) if key in number]
-    rows, notes = [specimen for specimen, _ in found], list[str]()
-    note_unmatched(notes, given, keys, number, [names[k] for k in rows], names, where)
-    joined = {**own.take(rows).columns, **given.take([row for _, row in found]).columns}
-    return rows, Table(joined, tuple(names[k] for k in rows), given.where), notes
+    row = {number[key]: k for k, key in enumerate(keys) if key in number}
+    rows, notes = list(range(len(names))) if keep_unmatched else list(row), list[str]()
+    note_unmatched(notes, given, keys, number, [names[k] for k in row], names, where, remedy="name the specimens alike")
+    joined = {name: tuple(cells[row[k]] if k in row else "" for k in rows) for name, cells in given.columns.items()}
+    return rows, Table({**own.take(rows).columns, **joined}, tuple(names[k] for k in rows), given.where), notes

@@ -204,6 +204,7 @@ def note_unmatched(
     used: Sequence[str],
     names: Sequence[str],
     where: Path | str,
+    remedy: str = "give the folder of its shapes with --shapes",
 ) -> None:
     """Add a note on rows without a shape and shapes without a row.
 
@@ -214,7 +215,7 @@ def note_unmatched(
     if len(unknown) == len(keys):
         raise InputError(
             f"{where} holds no shape of {table.where} (such as {list_names(unknown)}; there is {list_names(names)}); "
-            "give the folder of its shapes with --shapes."
+            f"{remedy}."
         )
     if unknown:
         notes.append(

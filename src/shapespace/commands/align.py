@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from shapespace.cohort.landmark_cohort import RECORD, SIZE, write_aligned
-from shapespace.cohort.table import Table, list_names, read_table
+from shapespace.cohort.landmark_cohort import RECORD, join_table, write_aligned
+from shapespace.cohort.table import Table
 from shapespace.errors import FileFormatError, InputError
 from shapespace.geometry.landmark_alignment import AlignConfig, AlignedLandmarks, align_landmarks, find_outliers
 from shapespace.io.files import make_folder, write_text
@@ -56,8 +56,8 @@ def align(
     if separate is not None:
         config = replace(config, structures=_structures(separate))
     if table is not None:
-        columns, notes = _covariates(table, raw)
-        raw = replace(raw, columns=columns, notes=(*raw.notes, *notes))
+        _, covariates, notes = join_table(raw.names, raw.columns, table, raw.where, keep_unmatched=True)
+        raw = replace(raw, columns=covariates.columns, notes=(*raw.notes, *notes))
     if reflect is not None:
         raw = _reflected(raw, *reflect)
     orientation = find_orientation(None, [data if data.is_dir() else data.parent], raw.landmarks)
@@ -85,25 +85,6 @@ def align(
         write_text(folder / Orientation.FILE, json_text(orientation))
     write_aligned(folder, aligned, record)
     return aligned, record
-
-
-def _covariates(path: Path, raw: LandmarkConfigurations) -> tuple[dict[str, tuple[str, ...]], list[str]]:
-    """Return the columns of the landmark file and of a table, in the order of the specimens, and notes."""
-    given, keys = read_table(path, set(raw.names))
-    row = {key: k for k, key in enumerate(keys)}
-    missing = [name for name in raw.names if name not in row]
-    if len(missing) == len(raw):
-        raise InputError(
-            f"{path} has no row of a specimen (such as {list_names(keys)}; there is {list_names(raw.names)}); name "
-            "the specimens alike."
-        )
-    columns = {
-        name: tuple(cells[row[one]] if one in row else "" for one in raw.names)
-        for name, cells in given.columns.items()
-        if name != SIZE
-    }
-    note = f"{len(missing)} of {len(raw)} specimens have no row in {path} ({list_names(missing)})."
-    return {**raw.columns, **columns}, [note] if missing else []
 
 
 def _reflected(raw: LandmarkConfigurations, column: str, value: str) -> LandmarkConfigurations:
