@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeAlias
+
+Progress: TypeAlias = Callable[[int, int], None]
+"""Called with (steps done, in all)."""
 
 
 @dataclass
@@ -17,7 +21,7 @@ class StepCounter:
     """
 
     total: int
-    progress: Callable[[int, int], None] | None
+    progress: Progress | None
     done: int = 0
 
     def add(self, count: int = 1) -> None:

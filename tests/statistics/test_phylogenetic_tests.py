@@ -13,12 +13,12 @@ from shapespace.geometry.landmark_alignment import align_landmarks
 from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations
 from shapespace.io.trees import Tree
 from shapespace.report.analyses.shape_test_report import shape_test_report
+from shapespace.statistics.shape_tests.ordination import OrdinationMethod, ordinate
 from shapespace.statistics.shape_tests.permutations import orders
 from shapespace.statistics.shape_tests.phylogenetic import (
     ancestral_states,
     estimate_phylogenetic_signal,
     fit_pgls,
-    phylogenetic_axes,
 )
 
 EXACT = 1e-6
@@ -106,13 +106,14 @@ def test_published_axes_of_plethodon_are_reproduced(
     reference: dict[str, Any], species: Cohort, tree_file: Path
 ) -> None:
     expected = reference["phylo_pca"]
-    plain = phylogenetic_axes(species, tree_file)
-    np.testing.assert_allclose(plain.deviations, expected["sdev"], rtol=EXACT)
+    plain = ordinate(species, tree=tree_file)
+    np.testing.assert_allclose(np.sqrt(plain.eigenvalues), expected["sdev"], rtol=EXACT)
     ancestors = np.array(expected["ancestors"])
+    assert plain.ancestors is not None
     signs = np.sign((plain.ancestors[:, :3] * ancestors).sum(axis=0))
     np.testing.assert_allclose(plain.ancestors[:, :3] * signs, ancestors, atol=EXACT * np.abs(ancestors).max())
-    aligned = phylogenetic_axes(species, tree_file, "paca")
-    np.testing.assert_allclose(aligned.deviations, reference["phylo_paca"]["sdev"], rtol=EXACT)
+    aligned = ordinate(species, tree=tree_file, method="paca")
+    np.testing.assert_allclose(np.sqrt(aligned.eigenvalues), reference["phylo_paca"]["sdev"], rtol=EXACT)
 
 
 @pytest.mark.parametrize("extra", [0.0, 0.7], ids=["ultrametric", "not ultrametric"])
@@ -162,19 +163,20 @@ def test_phylogenetic_components_are_eigenvectors_of_evolutionary_rates() -> Non
     tree = random_tree(rng, 15)
     values = evolved(rng, tree, 9)
     cohort = cohort_of(tree, values)
-    axes = phylogenetic_axes(cohort, tree, "ppca")
+    axes = ordinate(cohort, tree=tree, method="phylogenetic-pca")
     inverse, ones = np.linalg.inv(tree.covariance), np.ones(15)
     centred = values - ones @ inverse @ values / inverse.sum()
     eigenvalues, vectors = np.linalg.eigh(centred.T @ inverse @ centred / 14)
-    np.testing.assert_allclose(axes.deviations**2, eigenvalues[::-1], rtol=1e-9)
+    np.testing.assert_allclose(axes.eigenvalues, eigenvalues[::-1], rtol=1e-9)
     np.testing.assert_allclose(np.abs(axes.scores), np.abs(centred @ vectors[:, ::-1]), atol=1e-9)
-    np.testing.assert_allclose(cohort.vertices(axes.mean).ravel(), (values - centred)[0], atol=1e-9)
-    for method in ("phylomorphospace", "ppca", "paca"):
-        axes = phylogenetic_axes(cohort, tree, method)
-        first = cohort.vertices(axes.mean + axes.directions @ axes.scores[3])
+    np.testing.assert_allclose(cohort.vertices(axes.centre).ravel(), (values - centred)[0], atol=1e-9)
+    methods: tuple[OrdinationMethod, ...] = ("pca", "phylogenetic-pca", "paca")
+    for method in methods:
+        axes = ordinate(cohort, tree=tree, method=method)
+        first = cohort.vertices(axes.centre + axes.scores[3] @ axes.shape_axes)
         np.testing.assert_allclose(first.ravel(), values[3], atol=1e-9)
-        np.testing.assert_allclose(axes.directions.T @ axes.directions, np.eye(9), atol=1e-9)
-        assert axes.ancestors.shape == (14, 9)
+        np.testing.assert_allclose(axes.axes @ axes.axes.T, np.eye(9), atol=1e-9)
+        assert axes.ancestors is not None and axes.ancestors.shape == (14, 9)
 
 
 @pytest.mark.parametrize("anova_type", ["I", "II", "III"])
@@ -247,14 +249,14 @@ def test_designs_that_cannot_be_tested_are_refused() -> None:
     with pytest.raises(InputError, match=r"no tip for 1 of 8 shapes \(t0\)"):
         estimate_phylogenetic_signal(cohort, tree=other)
     with pytest.raises(InputError, match=r"no tip for 1 of 8 shapes \(t0\)"):
-        phylogenetic_axes(cohort, other)
+        ordinate(cohort, tree=other)
     flat = tree.lengths.copy()
     flat[np.flatnonzero(tree.parents == tree.parents[0])] = 0.0
     with pytest.raises(InputError, match="is 0, so the covariance of the species is singular"):
         fit_pgls(cohort, formula="~ age", tree=replace(tree, lengths=flat))
     with pytest.raises(InputError, match="leave it out"):
         fit_pgls(cohort, formula="~ same", tree=tree)
-    with pytest.raises(InputError, match="too many for 8 shapes"):
+    with pytest.raises(InputError, match="columns for 8 shapes, so that no degrees of freedom are left"):
         fit_pgls(cohort, formula="~ id", tree=tree)
     with pytest.raises(InputError, match="follows from the other terms"):
         fit_pgls(cohort, formula="~ age + center(age)", tree=tree)

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
         measure_repeatability,
     )
     from shapespace.statistics.shape_tests.ordination import Ordination, ordinate
-    from shapespace.statistics.shape_tests.phylogenetic import estimate_phylogenetic_signal, fit_pgls, phylogenetic_axes
+    from shapespace.statistics.shape_tests.phylogenetic import estimate_phylogenetic_signal, fit_pgls
     from shapespace.statistics.shape_tests.planning import plan_sample_size
     from shapespace.statistics.shape_tests.shape_test_result import ShapeTestResult, Statistic
 
@@ -72,7 +72,6 @@ __all__ = [
     "measure_asymmetry",
     "measure_repeatability",
     "ordinate",
-    "phylogenetic_axes",
     "plan_sample_size",
     "regress",
     "score",
@@ -105,7 +104,7 @@ __getattr__, __dir__ = lazy_names(
             "measure_repeatability",
         ),
         "statistics.shape_tests.ordination": ("Ordination", "ordinate"),
-        "statistics.shape_tests.phylogenetic": ("estimate_phylogenetic_signal", "fit_pgls", "phylogenetic_axes"),
+        "statistics.shape_tests.phylogenetic": ("estimate_phylogenetic_signal", "fit_pgls"),
         "statistics.shape_tests.planning": ("plan_sample_size",),
         "statistics.shape_tests.shape_test_result": ("ShapeTestResult", "Statistic"),
     },

@@ -22,11 +22,11 @@ from shapespace.reprs import short_repr
 from shapespace.statistics.compare_formula import INSTALL
 from shapespace.statistics.compare_strata import Stratum
 from shapespace.statistics.dispersion import Estimate
+from shapespace.statistics.tolerances import TIE
 from shapespace.types import BoolArray, FloatArray, Mesh, read_only
 
 _VERTICES = 512  # vertices at a time; with _BYTES it bounds the memory of permuted values
 _BYTES = 48 * 2**20  # bytes of permuted values at a time
-_TIE = 1e-9  # relative; statistics nearer than float64 sums are accurate count as equal
 _NONE = 1e-12  # share of the squares; a residual below is rounding
 _BINS = 6000
 """Of the logarithm of F, from a millionth to a million."""
@@ -167,7 +167,7 @@ def effect_maps(
                     f *= weights[:, None, part]
                 if start == 0:
                     observed[name][:, part] = f[:, 0]
-                as_large[name][:, part] += (f >= observed[name][:, None, part] * (1 - _TIE)).sum(axis=1)
+                as_large[name][:, part] += (f >= observed[name][:, None, part] * (1 - TIE)).sum(axis=1)
                 for e in range(E):
                     counted = f[e] if weights is None else f[e][:, weights[e, part] > 0]
                     pooled[name][e] += np.bincount(_bin(counted).ravel(), minlength=_BINS)
@@ -266,8 +266,8 @@ def _bin(f: FloatArray) -> Any:
 def _tested(f: FloatArray, p: FloatArray, largest: FloatArray, pooled: FloatArray, alpha: float) -> Tested:
     from scipy.stats import false_discovery_control  # loads much
 
-    as_large = len(largest) - np.searchsorted(np.sort(largest), f * (1 - _TIE))  # S8
+    as_large = len(largest) - np.searchsorted(np.sort(largest), f * (1 - TIE))  # S8
     of_all = np.cumsum(pooled[::-1])[::-1] / pooled.sum()
     q = false_discovery_control(of_all[_bin(f)])
-    critical = float(np.sort(largest)[-(int(alpha * len(largest) * (1 + _TIE)) + 1)])
+    critical = float(np.sort(largest)[-(int(alpha * len(largest) * (1 + TIE)) + 1)])
     return Tested(read_only(f), read_only(p), read_only(as_large / len(largest)), read_only(q), critical)

@@ -30,13 +30,14 @@ from shapespace.statistics.compare_formula import (
     random_effects_of,
 )
 from shapespace.statistics.compare_maps import EffectMap, effect_maps
-from shapespace.statistics.compare_strata import Stratum, is_nested, less, unit_stratum
+from shapespace.statistics.compare_strata import Stratum, is_nested, less, span, unit_stratum
 from shapespace.statistics.compare_unequal import Units, is_between_units, units_of
 from shapespace.statistics.compare_within import ModelStrata, RepeatedMeasures, WithinSubjects, strata_of
 from shapespace.statistics.dispersion import DispersionTest
-from shapespace.statistics.effect_size import EFFECT_SIZES, EffectSize, effect_size
+from shapespace.statistics.effect_size import EFFECT_SIZES, EffectSize, effect_size, permutation_p
 from shapespace.statistics.methods import dispersion_record, methods_of, sample_sizes
 from shapespace.statistics.observation_weights import information, weights_of
+from shapespace.statistics.tolerances import TIE
 from shapespace.step_counter import StepCounter
 from shapespace.types import FloatArray, read_only, require
 
@@ -46,8 +47,6 @@ TYPES: tuple[SquaresType, ...] = ("I", "II", "III")
 
 VertexWeights: TypeAlias = Literal["confidence", "none"]
 ErrorPermutation: TypeAlias = Literal["units", "residuals"]
-_RANK = 1e-9  # ratio of singular values; below is float64 rounding
-_TIE = 1e-9  # relative; statistics nearer than float64 sums are accurate count as equal
 _WEIGHTED_NOTE = (
     "Vertices have weights in the sums of squares by the standard deviation of their position along the surface; "
     "--weights none gives all the same weight."
@@ -544,7 +543,7 @@ def term_tests(
         reduced = stratum.reduced(term, config.anova_type)
         residual = stratum.residual(reduced)
         own = _own_columns(stratum, term, config)
-        rest = _span(stratum.matrix - own @ (own.T @ stratum.matrix), stratum.matrix.shape[1] - own.shape[1])
+        rest = span(stratum.matrix - own @ (own.T @ stratum.matrix), stratum.matrix.shape[1] - own.shape[1])
         count = config.permutations if units is None else 1
         products = stratum.products(np.hstack([own, rest]), residual, count, config.seed, flips=stratum.flips(reduced))
         squares = (products**2).sum(axis=2)
@@ -567,7 +566,7 @@ def term_tests(
             r2=float(explained[0] / total),
             f=float(f[0]),
             z=effect_size(f, config.effect_size),
-            p=_share(f),
+            p=permutation_p(f),
             arrangements=read_only(f),
             error="residuals" if error is None else error.label,
         )
@@ -577,7 +576,7 @@ def term_tests(
 def _own_columns(stratum: Stratum, term: Term, config: CompareConfig) -> FloatArray:
     """Return (n, r) orthonormal columns that a term adds to its reduced model."""
     reduced = stratum.columns_of(stratum.reduced(term, config.anova_type))
-    return _span(less(stratum.matrix[:, stratum.columns_of([term])], stratum.matrix[:, reduced]))
+    return span(less(stratum.matrix[:, stratum.columns_of([term])], stratum.matrix[:, reduced]))
 
 
 def _error_f(stratum: Stratum, term: Term, error: Term, config: CompareConfig) -> FloatArray:
@@ -772,8 +771,8 @@ def _effects(
                 rms_mm=distance / math.sqrt(cohort.n_vertices),
                 f=float(f[0]),
                 z=effect_size(f, config.effect_size),
-                p=_share(f),
-                p_family=float((largest >= f[0] * (1 - _TIE)).mean()),
+                p=permutation_p(f),
+                p_family=float((largest >= f[0] * (1 - TIE)).mean()),
                 map=effect_map,
             )
 
@@ -873,7 +872,7 @@ def _parallel(design: Design, strata: ModelStrata, config: CompareConfig) -> Ite
         for (first, second), drawn in zip(pairs, _changes_in_pairs(design, strata, one, other, config), strict=False):
             angles = angles_between(*drawn)
             # Their arrangements assume equal variances.
-            p = None if config.unequal_variances else float((angles >= angles[0] - _TIE).mean())
+            p = None if config.unequal_variances else float((angles >= angles[0] - TIE).mean())
             yield EffectAngle(words[first], words[second], float(angles[0]), p)
 
 
@@ -938,15 +937,5 @@ def angles_between(one: FloatArray, other: FloatArray) -> FloatArray:
     return np.degrees(np.arccos(np.clip((one * other).sum(axis=1) / np.maximum(lengths, 1e-300), -1, 1)))
 
 
-def _share(statistic: FloatArray) -> float:
-    return float((statistic >= statistic[0] * (1 - _TIE)).mean())  # S4
-
-
 def _ratio(explained: FloatArray, left: FloatArray) -> FloatArray:
     return explained / np.maximum(left, 1e-300)
-
-
-def _span(columns: FloatArray, rank: int | None = None) -> FloatArray:
-    """Return orthonormal columns (n, r) that span those given."""
-    u, s, _ = np.linalg.svd(columns, full_matrices=False)
-    return u[:, : int((s > _RANK * max(float(s.max(initial=0.0)), 1e-300)).sum()) if rank is None else rank]

@@ -21,6 +21,7 @@ import numpy.typing as npt
 from shapespace.errors import InputError
 from shapespace.reprs import short_repr
 from shapespace.statistics.compare_formula import Design, Term
+from shapespace.statistics.tolerances import RANK
 from shapespace.types import FloatArray
 
 Rows: TypeAlias = npt.NDArray[np.intp]
@@ -217,6 +218,12 @@ def less(shapes: FloatArray, columns: FloatArray) -> FloatArray:
         return shapes
     q = np.linalg.qr(columns)[0]
     return shapes - q @ (q.T @ shapes)
+
+
+def span(columns: FloatArray, rank: int | None = None) -> FloatArray:
+    """Return orthonormal columns (n, r) that span those given."""
+    u, s, _ = np.linalg.svd(columns, full_matrices=False)
+    return u[:, : int((s > RANK * max(float(s.max(initial=0.0)), 1e-300)).sum()) if rank is None else rank]
 
 
 def independent_stratum(shapes: FloatArray, design: Design) -> Stratum:
@@ -441,8 +448,8 @@ def refuse_few(free: int, design: Design, where: str, count: int, unit: str, col
     if free - columns < 1:
         where_text = f" {where}" if where else ""
         raise InputError(
-            f"{design.formula!r} has {columns} columns{where_text}, too many for {count} {unit}; leave out terms or "
-            "classes."
+            f"{design.formula!r} has {columns} column{'s' * (columns != 1)}{where_text} for {count} {unit}, so that "
+            "no degrees of freedom are left for the error; leave out terms or classes, or add shapes."
         )
 
 

@@ -9,12 +9,9 @@ import numpy as np
 
 from shapespace.errors import InputError
 from shapespace.statistics.compare_formula import Design, Term, Variable
-from shapespace.statistics.compare_strata import Rows, Stratum, less
+from shapespace.statistics.compare_strata import Rows, Stratum, less, span
 from shapespace.statistics.dispersion import DispersionTest, Estimate, dispersion_test, unequal_variances
 from shapespace.types import FloatArray
-
-_RANK = 1e-9
-"""Singular values below this share of the largest are rounding."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -51,8 +48,7 @@ class Units:
 
     def own(self, term: Term, reduced: Sequence[Term]) -> FloatArray:
         """Return the (s, q) orthonormal columns of a term, orthogonal to those of its reduced model."""
-        u, size, _ = np.linalg.svd(less(self.columns([term]), self.columns(reduced)), full_matrices=False)
-        return u[:, size > _RANK * max(float(size.max(initial=0.0)), 1e-300)]
+        return span(less(self.columns([term]), self.columns(reduced)))
 
     def classes(self, variables: Sequence[Variable]) -> Rows | None:
         """Return the (s,) combination of classes of each unit; None without a variable of classes."""

@@ -25,6 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import InputError
+from shapespace.statistics.effect_size import permutation_p
 from shapespace.statistics.shape_tests.permutations import orders
 from shapespace.types import FloatArray
 
@@ -32,7 +33,6 @@ Codes: TypeAlias = npt.NDArray[np.intp]
 
 FEWEST_OF_GROUP = 5
 """Subjects per class below which the test with unequal variances has over 7 % false positives (docs/compare.md)."""
-_TIE = 1e-9  # relative; statistics nearer than float64 sums are accurate count as equal
 _FULL_LEVERAGE = 1e-8
 """Rows with 1 - leverage below this limit are fitted exactly, so their residual is zero."""
 _BATCH = 50
@@ -125,7 +125,7 @@ def dispersion_test(
         counts=tuple(int(counts[k]) for k in used),
         stddev_mm=tuple(float(v) for v in np.sqrt(variances / n_vertices)),
         f=float(f[0]),
-        p=float((f >= f[0] * (1 - _TIE)).mean()),
+        p=permutation_p(f),
         permutations=permutations,
     )
 

@@ -10,6 +10,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
+from shapespace.statistics.tolerances import TIE
 from shapespace.types import FloatArray
 
 EffectSize: TypeAlias = Literal["box-cox", "log"]
@@ -44,6 +45,13 @@ def effect_size(statistic: FloatArray, kind: EffectSize = "box-cox") -> float:
     if not np.isfinite(spread) or spread <= 1e-12 * max(float(np.abs(transformed).max()), _SMALLEST):
         return 0.0
     return float((transformed[0] - transformed.mean()) / spread)  # S5
+
+
+def permutation_p(statistic: FloatArray, tail: Literal["upper", "lower"] = "upper") -> float:
+    """Return the share of (P,) statistics that are as large, or as small, as the first; equal ones count."""
+    slack = TIE * abs(float(statistic[0]))
+    extreme = statistic >= statistic[0] - slack if tail == "upper" else statistic <= statistic[0] + slack
+    return float(extreme.mean())  # S4
 
 
 def box_cox_exponent(values: FloatArray) -> float:

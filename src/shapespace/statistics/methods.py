@@ -10,13 +10,13 @@ import numpy as np
 from shapespace.cohort.cohort import Cohort
 from shapespace.schemas import Dispersion, Methods, SampleSize
 from shapespace.statistics.dispersion import DispersionTest
+from shapespace.statistics.tolerances import RANK
 
 SCAN_OF_SUBJECT = "scan of a subject"
 """`TestScheme.unit` where values are permuted within subjects, and between subjects with the same number of scans."""
 REDUCED_OF_EACH_TERM = ("the reduced model of each term",)
 """`TestScheme.reduced_model` of several terms, each tested by residuals of the model of the other terms."""
 
-_RANK = 1e-9  # of the largest singular value, below which coordinates vary by rounding alone
 _ALONG = 0.01
 """Of the squared distance from the mean: shapes of one size vary along the mean by half of it, those in the tangent
 space at the mean by nothing."""
@@ -44,7 +44,7 @@ def methods_of(cohort: Cohort, subjects: int, **known: Any) -> Methods:
         "source": cohort.source.kind,
         "modes": cohort.source.modes,
         "explained_variance_ratio": cohort.source.explained_variance_ratio,
-        "dimensions": int((singular > _RANK * singular.max(initial=0.0)).sum()),
+        "dimensions": int((singular > RANK * singular.max(initial=0.0)).sum()),
         "unit": cohort.unit,
     }
     return Methods(subjects=subjects, **{**facts, **known})

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -20,10 +20,16 @@ from shapespace.errors import FileFormatError, InputError
 from shapespace.io.files import read_bytes
 from shapespace.io.landmarks.landmark_io import csv_rows
 from shapespace.io.read_limits import LARGEST_LANDMARK_FILE_BYTES
-from shapespace.schemas import CurvePart, Series, TableColumn, TablePart
+from shapespace.schemas import CurvePart, Series
 from shapespace.statistics.shape_tests.permutations import Orders, permuted
-from shapespace.statistics.shape_tests.shape_test_result import ShapeTestResult, Statistic
-from shapespace.statistics.shape_tests.test_table import shape_test
+from shapespace.statistics.shape_tests.shape_test_result import (
+    ShapeTestResult,
+    Statistic,
+    pair_statistics,
+    table_of,
+)
+from shapespace.statistics.tolerances import RANK
+from shapespace.step_counter import Progress
 from shapespace.types import FloatArray
 
 _MOST_POINTS = 4_000  # of all modules; the covariances of all pairs then take 0.4 GB
@@ -31,14 +37,13 @@ _ANGLES = np.radians(np.arange(0.0, 90.0, 0.05))  # rotations of CR, as in geomo
 _BOOTSTRAP_ANGLES = np.radians(np.arange(-44.0, 45.0, 2.0))  # as in geomorph
 _INTERVAL = (2.5, 97.5)  # percentiles of the bootstrap
 _BOOTSTRAP_STREAM = 40  # separates the bootstrap from permutations with the same seed
-_RANK = 1e-9  # ratio of singular values; below is float64 rounding
 _STEPS = 40  # of the Lanczos iteration; r is accurate to 1e-9, and to 1e-6 for 400 shapes of white noise
 _SHOWN = 3  # pairs of axes whose scores are in the table
 
 
 def fit_pls(
     cohort: Cohort, *, columns: tuple[str, ...] = (), modules: Path | None = None, permutations: int = 1000,
-    seed: int = 0, drop_missing: bool = False, progress: Callable[[int, int], None] | None = None,
+    seed: int = 0, drop_missing: bool = False, progress: Progress | None = None,
 ) -> ShapeTestResult:  # fmt: skip
     """Fit partial least squares of shape and columns of the table, or of modules (the mean of all pairs).
 
@@ -76,7 +81,7 @@ def fit_pls(
     with threadpool_limits(1, user_api="blas"):
         values = permuted(len(cohort), permutations, seed, correlations, progress)
     result = ShapeTestResult(
-        test=shape_test("pls" if columns else "integration"), cohort=cohort,
+        name="pls" if columns else "integration", cohort=cohort,
         statistics=_mean_and_pairs("r-PLS", values, list(blocks), "upper"),
         settings={"columns": list(columns), "modules": modules and str(modules), "permutations": permutations,
                   "seed": seed},
@@ -88,24 +93,19 @@ def fit_pls(
     lengths = np.linalg.norm(left, axis=0) * np.linalg.norm(right, axis=0)
     r, share = (left * right).sum(axis=0) / np.maximum(lengths, 1e-300), s**2 / (s**2).sum()
     directions = axes[0].T @ u, (cohort.basis.T @ axes[1].T if columns else axes[1].T) @ vt.T
-    numbers = [TableColumn(name=f"{name} {k + 1}", kind="number") for name in blocks for k in range(len(s))]
+    names = [f"{name} {k + 1}" for name in blocks for k in range(min(len(s), _SHOWN))]
     shown = np.hstack([left[:, :_SHOWN], right[:, :_SHOWN]])
     return replace(
         result,
         tables=(
-            TablePart(
-                title="Pairs of axes",
-                columns=(TableColumn(name="axis", kind="count"), TableColumn(name="singular value", kind="number"),
-                         TableColumn(name="squared covariance", kind="percent"), TableColumn(name="r", kind="number")),
-                rows=tuple((k + 1, *map(float, row)) for k, row in enumerate(zip(s, share, r, strict=True))),
-            ),
-            TablePart(
-                title="Scores", columns=(TableColumn(name="shape"), *numbers[:_SHOWN], *numbers[len(s):][:_SHOWN]),
-                rows=tuple((name, *row) for name, row in zip(cohort.names, shown.tolist(), strict=True)),
-            ),
+            table_of("Pairs of axes", ("axis", "singular value", "squared covariance", "r"),
+                     [(k, *map(float, row)) for k, row in enumerate(zip(s, share, r, strict=True), 1)],
+                     percent=("squared covariance",)),
+            table_of("Scores", ("shape", *names),
+                     [(name, *row) for name, row in zip(cohort.names, shown.tolist(), strict=True)]),
         ),
         figures=(
-            CurvePart(title="Scores of the first pair of axes", x=numbers[0].name, y=numbers[len(s)].name,
+            CurvePart(title="Scores of the first pair of axes", x=names[0], y=names[len(names) // 2],
                       series=(Series(x=tuple(left[:, 0].tolist()), y=tuple(right[:, 0].tolist()), points=True),)),
         ),
         arrays={"pls.npz": {"singular_values": s, "scores_1": left, "scores_2": right, "loadings_1": directions[0],
@@ -115,7 +115,7 @@ def fit_pls(
 
 def estimate_modularity(
     cohort: Cohort, *, modules: Path, permutations: int = 1000, seed: int = 0, drop_missing: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> ShapeTestResult:  # fmt: skip
     """Estimate modularity by the covariance ratio CR (the mean of all pairs of modules).
 
@@ -160,7 +160,7 @@ def estimate_modularity(
     first, *pairs = _mean_and_pairs("CR", values, list(points), "lower")
     low, high = np.percentile(_bootstrap(x, codes, permutations, seed), _INTERVAL).tolist()
     return ShapeTestResult(
-        test=shape_test("modularity"), cohort=cohort, statistics=(replace(first, low=low, high=high), *pairs),
+        name="modularity", cohort=cohort, statistics=(replace(first, low=low, high=high), *pairs),
         settings={"modules": str(modules), "rotation_degrees": float(np.degrees(angle[0])),
                   "mean_over_rotations": float(ratios.mean()), "permutations": permutations, "seed": seed},
     )  # fmt: skip
@@ -180,12 +180,11 @@ def compare_effect_sizes(first: Statistic, second: Statistic) -> Statistic:
 
 def _mean_and_pairs(
     name: str, values: FloatArray, modules: Sequence[str], tail: Literal["upper", "lower"]
-) -> tuple[Statistic, ...]:
+) -> list[Statistic]:
     """Return the statistic of the mean of pairs of modules, and those of the pairs if there are several."""
-    pairs = [f"{a} – {b}" for a, b in itertools.combinations(modules, 2)]
-    each = tuple(Statistic.of(name, values[:, k], pair, tail=tail) for k, pair in enumerate(pairs))
-    mean = Statistic.of(name, values.mean(axis=1), f"mean of {len(pairs)} pairs", tail=tail)
-    return each if len(pairs) == 1 else (mean, *each)
+    each = pair_statistics(name, values.T, [f"{a} – {b}" for a, b in itertools.combinations(modules, 2)], tail)
+    mean = Statistic.of(name, values.mean(axis=1), f"mean of {len(each)} pairs", tail=tail)
+    return each if len(each) == 1 else [mean, *each]
 
 
 def _modules(cohort: Cohort, path: Path) -> tuple[Cohort, dict[str, list[int]]]:
@@ -231,7 +230,7 @@ def _principal_components(name: str, block: FloatArray) -> tuple[FloatArray, Flo
         InputError: it is the same for all shapes.
     """
     u, s, vt = np.linalg.svd(block - block.mean(axis=0), full_matrices=False)
-    kept = s > _RANK * float(np.abs(block).max())
+    kept = s > RANK * float(np.abs(block).max())
     if not kept.any():
         raise InputError(f"The block of {name} is the same for all shapes, so that it does not covary; choose another.")
     return u[:, kept] * s[kept], vt[kept]

@@ -5,7 +5,6 @@ Equations Mn are those of docs/morphometrics.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
@@ -13,27 +12,28 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.errors import InputError
-from shapespace.schemas import TableColumn, TablePart
 from shapespace.statistics.compare_formula import columns_of, design_of
+from shapespace.statistics.compare_strata import span
 from shapespace.statistics.dispersion import unequal_variances
-from shapespace.statistics.methods import sample_sizes
 from shapespace.statistics.shape_tests.ordination import discriminant_components, group_means, principal_components
 from shapespace.statistics.shape_tests.permutations import Groups, Orders, orders, permuted
-from shapespace.statistics.shape_tests.shape_test_result import ShapeTestResult, Statistic
-from shapespace.statistics.shape_tests.test_table import shape_test
-from shapespace.step_counter import StepCounter
+from shapespace.statistics.shape_tests.shape_test_result import (
+    LEVEL,
+    ShapeTestResult,
+    Statistic,
+    pair_statistics,
+    table_of,
+)
+from shapespace.step_counter import Progress, StepCounter
 from shapespace.types import FloatArray
 
-Progress = Callable[[int, int], None]
 Priors: TypeAlias = Literal["proportional", "equal"]
-_LEVEL = 0.05
 _DRAWS = 2000  # bootstrap samples of a confidence interval; its limits then vary by a few percent of its width
 _MOST_COMPONENTS = 10  # default limit for covariances; Mitteroecker and Bookstein (2009) take few components
 _SHAPES_PER_COMPONENT = 3  # in the smallest group; eigenvalues of fewer are too variable
 _CLEAR_MARGIN = 2.0  # times the distance by sampling alone; the level was 4 to 6 % from there on in simulations
 _ITERATIONS = 50  # of a spatial median; its error is then far below the standard error
 _BISECTIONS = 55  # halvings of an interval until float64 numbers are equal
-_RANK = 1e-9  # ratio of singular values; below is float64 rounding
 _TINY = 1e-7  # smallest score, in roots of the scatter; a smaller one changes no classification
 _SMALLEST = 1e-300  # avoids divisions by zero
 
@@ -73,8 +73,7 @@ def compare_disparity(
     cohort, groups = groups_of(cohort, group, drop_missing, 2, "a variance", formula)
     n, design = len(cohort), design_of(formula, cohort.table) if formula else None
     columns = np.column_stack([np.ones(n), design.matrix]) if design else np.ones((n, 1))
-    q, size, _ = np.linalg.svd(columns, full_matrices=False)
-    q = q[:, size > _RANK * size[0]]
+    q = span(columns)
     # Rows of residuals are permuted, so their squared norms are.
     squares = ((cohort.coefficients - q @ (q.T @ cohort.coefficients)) ** 2).sum(axis=1)
     if correct_leverage:
@@ -88,13 +87,13 @@ def compare_disparity(
         for one, value, (low, high) in zip(groups.names, variances[0], _intervals(groups, squares, seed), strict=True)
     ]
     differences = np.abs([variances[:, a] - variances[:, b] for a, b in groups.pairs])
-    kinds = {"group": "text", "shapes": "count", name: "number", "lower 95 %": "number", "upper 95 %": "number"}
     rows = [(s.tested, int(count), s.value, s.low, s.high) for s, count in zip(limits, groups.counts, strict=True)]
-    return group_result(
-        "disparity", cohort, group, [*_pairs("difference of disparity", groups, differences), *limits],
-        {"formula": formula, "partial": partial, "correct_leverage": correct_leverage, "permutations": permutations,
-         "seed": seed},
-        tables=(table_part("Disparity", kinds, rows),),
+    return ShapeTestResult(
+        name="disparity", cohort=cohort, classes=group,
+        statistics=[*_pairs("difference of disparity", groups, differences), *limits],
+        settings={"group": list(group), "formula": formula, "partial": partial, "correct_leverage": correct_leverage,
+                  "permutations": permutations, "seed": seed},
+        tables=(table_of("Disparity", ("group", "shapes", name, "lower 95 %", "upper 95 %"), rows),),
         reduced_model=tuple(term.label for term in design.terms) if design else (),
     )  # fmt: skip
 
@@ -110,7 +109,7 @@ def _intervals(groups: Groups, squares: FloatArray, seed: int) -> FloatArray:
     # Samples of a single shape have no standard error; a tenth of the observed one bounds their t.
     t = np.log(np.maximum(mean, _SMALLEST) / np.maximum(mean[0], _SMALLEST))
     t /= np.maximum(error, 0.1 * error[0] + _SMALLEST)
-    return np.exp(-np.quantile(t, (1 - _LEVEL / 2, _LEVEL / 2), axis=0) * error[0]).T
+    return np.exp(-np.quantile(t, (1 - LEVEL / 2, LEVEL / 2), axis=0) * error[0]).T
 
 
 def compare_means_and_covariances(
@@ -176,16 +175,16 @@ def compare_means_and_covariances(
     along = np.linalg.svd(full - mean @ (mean.T @ full), full_matrices=False)[0][:, :free]
     flips = unequal_variances(centred, full, mean, groups.codes, permutations, seed, " × ".join(group))
     weights = np.array([counts[a] * counts[b] / (counts[a] + counts[b]) for a, b in groups.pairs])
-    return group_result(
-        "equality", cohort, group,
-        [
+    return ShapeTestResult(
+        name="equality", cohort=cohort, classes=group,
+        statistics=[
             Statistic.of("F of means", f),
             Statistic.of("F of means, unequal covariances", flips.estimate(along).statistic()),
             *_pairs("Riemannian distance of covariance", groups, values[2::3], weights),
             *_pairs("Riemannian distance of relative covariance", groups, values[3::3], weights),
             *_pairs("Procrustes distance of means", groups, values[1::3]),
         ],
-        {"components": used, "permutations": permutations, "seed": seed},
+        settings={"group": list(group), "components": used, "permutations": permutations, "seed": seed},
         assumptions=(
             f"Covariance matrices are compared in the first {used} principal components of the residuals of the "
             "spatial medians of the groups, which are permuted among all groups; this assumes that they have the same "
@@ -250,7 +249,7 @@ def assess_equivalence(
     given = margin if margin_sd is None else margin_sd
     if (margin is None) == (margin_sd is None) or given is None or not 0 < given < np.inf:
         raise InputError("Equivalence needs one margin above 0: --margin, a distance, or --margin-sd.")
-    if permutations * _LEVEL < 1:
+    if permutations * LEVEL < 1:
         raise InputError(f"A bound of 95 % needs 20 or more bootstrap samples, not {permutations}.")
     cohort, groups = groups_of(cohort, group, drop_missing, 3, "an equivalence test")
     distances = _mean_distances(cohort.coefficients, groups, groups.resamples(permutations, seed))
@@ -262,7 +261,7 @@ def assess_equivalence(
         tests.append(Statistic.of("t of equivalence", t, pair, tail="lower", z="none"))
         name = "corrected Procrustes distance"
         limits.append(Statistic(name=name, tested=pair, value=one.corrected, low=0.0, high=bound))
-        equivalent = "yes" if (t <= t[0]).mean() <= _LEVEL else "not shown"
+        equivalent = "yes" if (t <= t[0]).mean() <= LEVEL else "not shown"
         rows.append((pair, one.length, one.corrected, bound, limit, tests[-1].p, equivalent))
         if limit < _CLEAR_MARGIN * one.noise:
             notes.append(
@@ -270,12 +269,12 @@ def assess_equivalence(
                 "sampling alone gives; the level of the test then depends on the direction of the difference."
             )
         step.add()
-    numbers = ("Procrustes distance", "corrected distance", "upper 95 % bound", "margin")
-    kinds = {"pair": "text", **dict.fromkeys(numbers, "number"), "p": "p", "equivalent": "text"}
-    return group_result(
-        "equivalence", replace(cohort, notes=(*cohort.notes, *notes)), group, [*tests, *limits],
-        {"margin": margin, "margin_sd": margin_sd, "permutations": permutations, "seed": seed},
-        tables=(table_part("Equivalence", kinds, rows),),
+    columns = ("pair", "Procrustes distance", "corrected distance", "upper 95 % bound", "margin", "p", "equivalent")
+    return ShapeTestResult(
+        name="equivalence", cohort=replace(cohort, notes=(*cohort.notes, *notes)), classes=group,
+        statistics=[*tests, *limits], tables=(table_of("Equivalence", columns, rows),),
+        settings={"group": list(group), "margin": margin, "margin_sd": margin_sd, "permutations": permutations,
+                  "seed": seed},
         assumptions=(
             "Equivalence is tested against a distance of the means equal to the margin, in the direction of their "
             "observed difference; the intervals of corrected distances have an upper bound of 95 % confidence alone.",
@@ -325,7 +324,7 @@ class _MeanDistance:
         low, high = 0.0, 10 * (self.length + self.noise)
         for _ in range(_BISECTIONS):
             t = self.t(middle := (low + high) / 2)
-            low, high = (low, middle) if (t <= t[0]).mean() <= _LEVEL else (middle, high)
+            low, high = (low, middle) if (t <= t[0]).mean() <= LEVEL else (middle, high)
         return high
 
 
@@ -421,7 +420,6 @@ def discriminate(
     untied = Statistic.of("correct classification", correct + support / (n + 1), z="none")
     predicted: list[int] = posterior.argmax(axis=1).tolist()
     table = groups.indicator.T @ np.eye(g)[predicted]
-    kinds = {"group": "text", **{f"as {name}": "count" for name in groups.names}, "correct": "percent"}
     classified = [
         (name, *map(int, row), float(row[k] / row.sum()))
         for k, (name, row) in enumerate(zip(groups.names, table, strict=True))
@@ -430,19 +428,20 @@ def discriminate(
         (name, groups.names[int(code)], groups.names[best], *map(float, own))
         for name, code, best, own in zip(cohort.names, groups.codes, predicted, posterior, strict=True)
     ]
-    chance = f"Leave-one-out; by chance {np.exp(logs) @ counts / n:.1%} are correct."
-    columns = {"shape": "text", "group": "text", "predicted": "text", **dict.fromkeys(groups.names, "number")}
     distances = [np.linalg.norm(means[:, a] - means[:, b], axis=1) for a, b in groups.pairs]
-    return group_result(
-        "discriminant", cohort, group,
-        [
+    return ShapeTestResult(
+        name="discriminant", cohort=cohort, classes=group,
+        statistics=[
             replace(Statistic.of("correct classification", correct / n, z="standard"), p=untied.p),
             *_pairs("Mahalanobis distance of means", groups, np.sqrt(np.maximum(lengths, 0.0))),
             *_pairs("Procrustes distance of means", groups, np.array(distances)),
         ],
-        {"components": used, "priors": priors, "permutations": permutations, "seed": seed},
-        tables=(table_part("Classification", kinds, classified, chance),
-                table_part("Posterior probabilities", columns, shapes)),
+        settings={"group": list(group), "components": used, "priors": priors, "permutations": permutations,
+                  "seed": seed},
+        tables=(table_of("Classification", ("group", *(f"as {name}" for name in groups.names), "correct"), classified,
+                         percent=("correct",),
+                         note=f"Leave-one-out; by chance {np.exp(logs) @ counts / n:.1%} are correct."),
+                table_of("Posterior probabilities", ("shape", "group", "predicted", *groups.names), shapes)),
         assumptions=(
             f"Linear discriminants of {used} principal components, which do not depend on the groups; each shape is "
             "classified by components and discriminants of the others. They assume equal covariances of the groups. In "
@@ -502,25 +501,7 @@ def groups_of(
 
 def _pairs(name: str, groups: Groups, values: FloatArray, weights: FloatArray | None = None) -> list[Statistic]:
     """Return the statistics of pairs of groups (pairs, P), after their weighted root mean square if there are some."""
-    pairs = [Statistic.of(name, one, pair) for one, pair in zip(values, groups.pair_names, strict=True)]
+    pairs = pair_statistics(name, values, groups.pair_names)
     if weights is None or len(pairs) < 2:
         return pairs
     return [Statistic.of(name, np.sqrt(weights @ values**2 / weights.sum()), "all groups"), *pairs]
-
-
-def table_part(title: str, columns: Mapping[str, Any], rows: Sequence[tuple[Any, ...]], note: str = "") -> TablePart:
-    """Return a table from the kinds of its columns by name."""
-    kinds = tuple(TableColumn(name=name, kind=kind) for name, kind in columns.items())
-    return TablePart(title=title, columns=kinds, rows=tuple(rows), note=note or None)
-
-
-def group_result(
-    test: str, cohort: Cohort, group: tuple[str, ...], statistics: Sequence[Statistic], settings: Mapping[str, Any],
-    **known: Any,
-) -> ShapeTestResult:  # fmt: skip
-    """Return the result of a test of groups, with their sizes."""
-    sizes = sample_sizes(cohort.names, [(column, cohort.table.texts(column)) for column in group])
-    return ShapeTestResult(
-        test=shape_test(test), cohort=cohort, statistics=tuple(statistics), settings={"group": list(group), **settings},
-        sizes=sizes, **known,
-    )  # fmt: skip

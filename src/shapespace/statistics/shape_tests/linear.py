@@ -5,7 +5,7 @@ Equations Mn are those of docs/morphometrics.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any, Literal, TypeAlias
 
@@ -13,21 +13,24 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.errors import InputError
-from shapespace.schemas import CurvePart, Part, Series, SurfaceMapPart, TableColumn, TablePart
+from shapespace.schemas import CurvePart, Part, Series, SurfaceMapPart
 from shapespace.statistics.compare_formula import Design, design_of
 from shapespace.statistics.compare_shapes import CompareConfig, angles_between, complete_cohort, term_tests
 from shapespace.statistics.compare_strata import Stratum, independent_stratum, less, means_of
-from shapespace.statistics.methods import REDUCED_OF_EACH_TERM, sample_sizes
+from shapespace.statistics.methods import REDUCED_OF_EACH_TERM
 from shapespace.statistics.shape_tests.permutations import Groups, Orders, orders
-from shapespace.statistics.shape_tests.shape_test_result import ShapeTestResult, Statistic
-from shapespace.statistics.shape_tests.test_table import shape_test
-from shapespace.step_counter import StepCounter
+from shapespace.statistics.shape_tests.shape_test_result import (
+    LEVEL,
+    ShapeTestResult,
+    Statistic,
+    pair_statistics,
+    table_of,
+)
+from shapespace.step_counter import Progress, StepCounter
 from shapespace.types import FloatArray
 
-Progress = Callable[[int, int], None]
 Residuals: TypeAlias = Literal["scaled", "raw"]
-_LEVEL = 0.05
-_RANK = 1e-8  # relative length; columns below it follow from others, and estimates below it are equal
+_ALIASED = 1e-8  # relative length; columns below it follow from others, and estimates below it are equal
 _MOST_COORDINATES = 20_000_000
 """Size-corrected coordinates that are written; more fill gigabytes, and the coefficients are written alone."""
 _BLOCK = 20_000  # vertices at a time; bounds memory
@@ -86,7 +89,7 @@ def compare_trajectories(
         )
     design, reduced, labels = _models(cohort, formula, null)
     estimator = _mean_estimator(design, np.eye(g * p)[cells])
-    columns: list[list[FloatArray]] = []
+    batches: list[FloatArray] = []
     observed = np.zeros(0)
     for means in _permuted(estimator, reduced, cohort, residuals, permutations, seed, progress):
         paths = means.reshape(len(means), g, p, -1)
@@ -96,25 +99,27 @@ def compare_trajectories(
         vectors = np.linalg.eigh(centred @ centred.swapaxes(2, 3))[1][..., -1]
         axis = np.einsum("bgpk,bgp->bgk", centred, vectors)  # M32
         axis *= np.where(((paths[:, :, -1] - paths[:, :, 0]) * axis).sum(axis=2) < 0, -1.0, 1.0)[:, :, None]
-        aligned = _aligned(centred) if p > 2 else None
-        for a, b in groups.pairs:
-            columns.append([np.abs(length[:, a] - length[:, b]), angles_between(axis[:, a], axis[:, b])])
-            if aligned is not None:
-                columns[-1].append(np.linalg.norm(aligned[:, a] - aligned[:, b], axis=(1, 2)))
+        one, other = np.array(groups.pairs).T
+        values = [np.abs(length[:, one] - length[:, other]).T,
+                  np.array([angles_between(axis[:, a], axis[:, b]) for a, b in groups.pairs])]  # fmt: skip
+        if p > 2:
+            aligned = _aligned(centred)
+            values.append(np.linalg.norm(aligned[:, one] - aligned[:, other], axis=(2, 3)).T)
+        batches.append(np.array(values))
     names = ("difference of path length", "angle, degrees", "difference of trajectory shape")
     center = observed.mean(axis=(0, 1))
     axes = np.linalg.svd((observed - center).reshape(g * p, -1), full_matrices=False)[2][:2].T
     scores, shown = (observed - center) @ axes, (cohort.coefficients - center) @ axes
-    figure = _curve(
-        "Trajectories", "principal component 1 of the points", "principal component 2",
-        [*(Series(x=_floats(one[:, 0]), y=_floats(one[:, -1]), label=name)
-           for name, one in zip(groups.names, scores, strict=True)),
-         Series(x=_floats(shown[:, 0]), y=_floats(shown[:, -1]), label="shapes", points=True)],
+    figure = CurvePart(
+        title="Trajectories", x="principal component 1 of the points", y="principal component 2",
+        series=(*(Series(x=tuple(own[:, 0].tolist()), y=tuple(own[:, -1].tolist()), label=name)
+                  for name, own in zip(groups.names, scores, strict=True)),
+                Series(x=tuple(shown[:, 0].tolist()), y=tuple(shown[:, -1].tolist()), label="shapes", points=True)),
     )  # fmt: skip
-    settings = {"group": list(group), "points": list(stages), "formula": formula, "null": null, "residuals": residuals}
     return _pairs_result(
-        "trajectory", cohort, groups, columns, names[: len(columns[0])], (*group, points), labels,
-        settings | {"permutations": permutations, "seed": seed}, (figure,),
+        "trajectory", cohort, groups, batches, names, (*group, points), labels,
+        {"group": list(group), "points": list(stages), "formula": formula, "null": null, "residuals": residuals,
+         "permutations": permutations, "seed": seed}, (figure,),
     )  # fmt: skip
 
 
@@ -174,23 +179,24 @@ def compare_pairs(
         full = _with_constant(design.matrix)
         estimator = np.linalg.pinv(lines)[len(groups.names) :] @ full @ np.linalg.pinv(full)
         names = ("distance", "difference of vector length", "angle, degrees")
-    if float(np.ptp(estimator, axis=0).max()) <= _RANK * float(np.abs(estimator).max()):
+    if float(np.ptp(estimator, axis=0).max()) <= _ALIASED * float(np.abs(estimator).max()):
         raise InputError(
             f"In {formula!r} all groups of {' × '.join(group)} have the same {'slope' if covariate else 'mean'}; add "
             f"{'the interaction of the groups with the covariate' if covariate else 'the groups'}."
         )
-    columns: list[list[FloatArray]] = []
+    batches: list[FloatArray] = []
+    one, other = np.array(groups.pairs).T
     for vectors in _permuted(estimator, reduced, cohort, residuals, permutations, seed, progress):
-        length = np.linalg.norm(vectors, axis=2)
-        for a, b in groups.pairs:
-            columns.append([np.linalg.norm(vectors[:, a] - vectors[:, b], axis=1)])
-            if covariate is not None:
-                columns[-1] += [np.abs(length[:, a] - length[:, b]), angles_between(vectors[:, a], vectors[:, b])]
-    settings = {"formula": formula, "group": list(group), "covariate": covariate, "null": null,
-                "residuals": residuals}  # fmt: skip
+        values = [np.linalg.norm(vectors[:, one] - vectors[:, other], axis=2).T]
+        if covariate is not None:
+            length = np.linalg.norm(vectors, axis=2)
+            values += [np.abs(length[:, one] - length[:, other]).T,
+                       np.array([angles_between(vectors[:, a], vectors[:, b]) for a, b in groups.pairs])]  # fmt: skip
+        batches.append(np.array(values))
     return _pairs_result(
-        "pairwise", cohort, groups, columns, names, group, labels,
-        settings | {"permutations": permutations, "seed": seed},
+        "pairwise", cohort, groups, batches, names, group, labels,
+        {"formula": formula, "group": list(group), "covariate": covariate, "null": null, "residuals": residuals,
+         "permutations": permutations, "seed": seed},
     )  # fmt: skip
 
 
@@ -245,16 +251,17 @@ def analyse_allometry(
     predicted = line[0][:, 0] * line[1][0]
     scores.append(predicted if predicted @ (x - x.mean()) >= 0 else -predicted)
     titles = ("regression score", "common allometric component", "predicted line")
-    rows = zip(cohort.names, classes, *(_floats(one) for one in (x, *scores)), strict=True)
+    rows = list(zip(cohort.names, classes, *(one.tolist() for one in (x, *scores)), strict=True))
     tables = (
-        _table("Analysis of variance", ("term", "df", "sum of squares", "R²", "F", "Z", "p"),
-               [(t.term, t.df, t.squares, t.r2, t.f, t.z, t.p) for t in tests]),
-        _table("Allometry scores", ("shape", "group", covariate, *titles), list(rows)),
+        table_of("Analysis of variance", ("term", "df", "sum of squares", "R²", "F", "Z", "p"),
+                 [(t.term, t.df, t.squares, t.r2, t.f, t.z, t.p) for t in tests], percent=("R²",)),
+        table_of("Allometry scores", ("shape", "group", covariate, *titles), rows),
     )  # fmt: skip
+    members = [indicator[:, k] > 0 for k in range(len(names))]
     figures = tuple(
-        _curve(title.capitalize(), covariate, title,
-               [Series(x=_floats(x[rows]), y=_floats(score[rows]), label=name, points=True, group=k)
-                for k, name, rows in ((k, name, indicator[:, k] > 0) for k, name in enumerate(names))])
+        CurvePart(title=title.capitalize(), x=covariate, y=title, series=tuple(
+            Series(x=tuple(x[own].tolist()), y=tuple(score[own].tolist()), label=name, points=True, group=k)
+            for k, (name, own) in enumerate(zip(names, members, strict=True))))
         for title, score in zip(titles, scores, strict=True)
     )  # fmt: skip
     arrays = {"names": np.array(cohort.names), "groups": np.array(names), "size_corrected_coefficients": corrected,
@@ -262,15 +269,11 @@ def analyse_allometry(
     if len(cohort) * cohort.reference.size <= _MOST_COORDINATES:
         arrays["size_corrected"] = cohort.reference + (corrected @ cohort.basis).reshape(len(cohort), -1, 3)
     return ShapeTestResult(
-        test=shape_test("allometry"),
-        cohort=cohort,
-        statistics=tuple(Statistic.of("F", one.arrangements, one.term) for one in tests),
-        tables=tables,
-        figures=figures,
-        arrays={"allometry.npz": arrays},
+        name="allometry", cohort=cohort, classes=(group,) if group else (),
+        statistics=[Statistic.of("F", one.arrangements, one.term) for one in tests],
         settings={"covariate": covariate, "group": group, "separate": separate, "permutations": permutations,
                   "seed": seed},
-        sizes=sample_sizes(cohort.names, [(group, classes)] if group else []),
+        tables=tables, figures=figures, arrays={"allometry.npz": arrays},
         reduced_model=REDUCED_OF_EACH_TERM if group else (),
         assumptions=("The residuals of each test are those of the model of the terms that do not contain its term.",)
         if group else (),
@@ -355,17 +358,13 @@ def measure_repeatability(
     ])  # fmt: skip
     faces = np.zeros((0, 3), dtype=np.int32) if cohort.faces is None else cohort.faces
     return ShapeTestResult(
-        test=shape_test("repeatability"),
-        cohort=cohort,
-        statistics=tuple(statistics),
-        tables=(_table("Analysis of variance", ("source", "df", "sum of squares", "mean square"), rows),),
+        name="repeatability", cohort=cohort, statistics=statistics, classes=named[1:], subject=subject,
+        settings={"subject": subject, "session": session, "permutations": permutations, "seed": seed},
+        tables=(table_of("Analysis of variance", ("source", "df", "sum of squares", "mean square"), rows),),
         figures=(SurfaceMapPart(title="Standard deviation of measurement", arrays="measurement_error.npz",
                                 signed=False, unit=cohort.unit),),
         arrays={"measurement_error.npz": {"vertices": cohort.reference, "faces": faces, "values": deviation}},
-        settings={"subject": subject, "session": session, "permutations": permutations, "seed": seed},
-        sizes=sample_sizes(cohort.table.texts(subject), [(session, cohort.table.texts(session))] if session else []),
         reduced_model=REDUCED_OF_EACH_TERM if session else (),
-        n_subjects=s,
     )  # fmt: skip
 
 
@@ -400,7 +399,7 @@ def _jackknifed(name: str, value: tuple[float, float], left_out: Sequence[tuple[
 
     s, center = len(left_out), transform(*value)
     each = np.array([transform(*one) for one in left_out])
-    width = float(t.ppf(1 - _LEVEL / 2, s - 1) * np.sqrt((s - 1) / s * ((each - each.mean()) ** 2).sum()))
+    width = float(t.ppf(1 - LEVEL / 2, s - 1) * np.sqrt((s - 1) / s * ((each - each.mean()) ** 2).sum()))
     low, high = (
         (ratio - 1) / (ratio + value[1] - 1) for ratio in np.exp(2 * np.array([center - width, center + width]))
     )
@@ -438,7 +437,7 @@ def _models(cohort: Cohort, formula: str, null: str | None) -> tuple[Design, Flo
     rank = int(np.linalg.matrix_rank(full))
     if rank >= len(cohort):
         raise InputError(f"{formula!r} has {rank} columns for {len(cohort)} shapes, which leaves no residuals.")
-    if np.linalg.norm(reduced - full @ (np.linalg.pinv(full) @ reduced)) > _RANK * np.linalg.norm(reduced):
+    if np.linalg.norm(reduced - full @ (np.linalg.pinv(full) @ reduced)) > _ALIASED * np.linalg.norm(reduced):
         raise InputError(f"The null model {null!r} must be nested in {formula!r}; leave out terms that this lacks.")
     return design, reduced, tuple(term.label for term in terms)
 
@@ -454,7 +453,7 @@ def _mean_estimator(design: Design, indicator: FloatArray) -> FloatArray:
 def _lines(indicator: FloatArray, x: FloatArray, covariate: str) -> FloatArray:
     """Return the columns (N, 2 G) of a line for each group."""
     lines = np.hstack([indicator, indicator * x[:, None]])
-    if (np.linalg.norm(less(lines[:, len(indicator.T) :], indicator), axis=0) <= _RANK * np.linalg.norm(x)).any():
+    if (np.linalg.norm(less(lines[:, len(indicator.T) :], indicator), axis=0) <= _ALIASED * np.linalg.norm(x)).any():
         if indicator.shape[1] == 1:
             raise InputError(f"{covariate!r} is the same for all shapes, which have no slope; choose another column.")
         raise InputError(f"{covariate!r} is constant within a group, which has no slope; leave the group out.")
@@ -481,43 +480,19 @@ def _permuted(
 
 
 def _pairs_result(
-    name: str, cohort: Cohort, groups: Groups, columns: Sequence[Sequence[FloatArray]], names: Sequence[str],
+    name: str, cohort: Cohort, groups: Groups, batches: Sequence[FloatArray], names: Sequence[str],
     classes: Sequence[str], reduced_model: tuple[str, ...], settings: dict[str, Any], figures: tuple[Part, ...] = (),
 ) -> ShapeTestResult:  # fmt: skip
-    """Return the result of statistics of pairs of groups, which `columns` has by batch and pair."""
-    labels = groups.pair_names
+    """Return the result of statistics of pairs of groups, from batches (statistics, pairs, b) of permutations."""
+    values = np.concatenate(batches, axis=2)
     statistics = [
-        Statistic.of(one, np.concatenate([batch[k] for batch in columns[pair :: len(labels)]]), label)
-        for k, one in enumerate(names)
-        for pair, label in enumerate(labels)
-    ]
-    limits = [float(np.quantile(one.arrangements, 1 - _LEVEL)) for one in statistics]
-    rows = [(one.name, one.tested, one.value, limit, one.z, one.p)
-            for one, limit in zip(statistics, limits, strict=True)]  # fmt: skip
+        one for name_of_one, own in zip(names, values, strict=False)
+        for one in pair_statistics(name_of_one, own, groups.pair_names)
+    ]  # fmt: skip
+    rows = [(one.name, one.tested, one.value, float(np.quantile(one.arrangements, 1 - LEVEL)), one.z, one.p)
+            for one in statistics]  # fmt: skip
+    table = table_of("Pairs of groups", ("statistic", "groups", "value", "95 % limit", "Z", "p"), rows)
     return ShapeTestResult(
-        test=shape_test(name),
-        cohort=cohort,
-        statistics=tuple(statistics),
-        tables=(_table("Pairs of groups", ("statistic", "groups", "value", "95 % limit", "Z", "p"), rows),),
-        figures=figures,
-        settings=settings,
-        sizes=sample_sizes(cohort.names, [(column, cohort.table.texts(column)) for column in classes]),
-        reduced_model=reduced_model,
-    )
-
-
-def _table(title: str, names: Sequence[str], rows: Sequence[tuple[Any, ...]]) -> TablePart:
-    kinds: Mapping[str, Any] = {"p": "p", "df": "count", "R²": "percent"}
-    columns = tuple(
-        TableColumn(name=name, kind="text" if isinstance(cell, str) else kinds.get(name, "number"))
-        for name, cell in zip(names, rows[0], strict=True)
-    )
-    return TablePart(title=title, columns=columns, rows=tuple(rows))
-
-
-def _curve(title: str, x: str, y: str, series: Sequence[Series]) -> CurvePart:
-    return CurvePart(title=title, x=x, y=y, series=tuple(series))
-
-
-def _floats(values: FloatArray) -> tuple[float, ...]:
-    return tuple(map(float, values))
+        name=name, cohort=cohort, statistics=statistics, settings=settings, classes=classes, tables=(table,),
+        figures=figures, reduced_model=reduced_model,
+    )  # fmt: skip

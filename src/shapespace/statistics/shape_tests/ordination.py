@@ -15,14 +15,16 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.errors import InputError
+from shapespace.io.trees import Tree, read_tree
 from shapespace.reprs import short_repr
 from shapespace.statistics.shape_tests.permutations import Groups, Orders
+from shapespace.statistics.shape_tests.phylogenetic import ancestral_states, inverse_root, least_squares
+from shapespace.statistics.tolerances import RANK
 from shapespace.types import FloatArray, IntArray
 
 OrdinationMethod: TypeAlias = Literal["pca", "between-groups", "cva", "phylogenetic-pca", "paca"]
 AXIS_NAMES = {"pca": "PC", "between-groups": "bgPC", "cva": "CV", "phylogenetic-pca": "pPC", "paca": "PAC"}
 """Prefix of the number of an axis, by method."""
-_RANK = 1e-9  # relative to the largest singular value: smaller ones are rounding
 _MOST_VARIANCE = 0.95
 """Share of the variance that the default number of components keeps where the within-group covariance is singular."""
 
@@ -39,7 +41,7 @@ class Ordination:
         centre: (K,) coefficients of the shape at the origin.
         scores: (N, A).
         eigenvalues: (A,) variance of the scores of principal components; variance of the group means of between-group
-            components; F of canonical variates; squared standard deviation of phylogenetic axes.
+            components; F of canonical variates; of phylogenetic axes the square of `sdev` of geomorph (M54).
         groups: of the shapes; None without a variable.
         variable: name of that variable.
         cross_validated: (N, A) scores of each shape on the axes of the others; None without.
@@ -99,7 +101,7 @@ def ordinate(
     *,
     method: OrdinationMethod = "pca",
     group: tuple[str, ...] = (),
-    tree: Path | None = None,
+    tree: Tree | Path | None = None,
     components: int | None = None,
     drop_missing: bool = False,
 ) -> Ordination:
@@ -156,7 +158,7 @@ def principal_components(coefficients: FloatArray) -> tuple[FloatArray, FloatArr
     # M13
     centre = coefficients.mean(axis=0)
     u, s, vt = np.linalg.svd(coefficients - centre, full_matrices=False)
-    known = s > _RANK * max(s[0], np.finfo(np.float64).tiny)
+    known = s > RANK * max(s[0], np.finfo(np.float64).tiny)
     if not known.any():
         raise InputError("All shapes are equal, so there are no principal components; check the data.")
     return centre, _signed(u[:, known] * s[known], vt[known]), s[known] ** 2 / (len(coefficients) - 1)
@@ -170,7 +172,7 @@ def group_means(values: FloatArray, groups: Groups) -> FloatArray:
 def _between_groups(coefficients: FloatArray, groups: Groups, make: _Make) -> Ordination:
     means, counts = group_means(coefficients, groups), groups.counts
     centre, axes, squares = _between_axes(means, counts)
-    known = squares > _RANK**2 * float(((coefficients - centre) ** 2).sum())
+    known = squares > RANK**2 * float(((coefficients - centre) ** 2).sum())
     if not known.any():
         raise InputError("The means of the groups are equal, so there are no between-group components.")
     axes = _signed((coefficients - centre) @ axes[known].T, axes[known])
@@ -220,7 +222,7 @@ def _canonical(coefficients: FloatArray, groups: Groups, components: int | None,
     residual = values - group_means(values, groups)[groups.codes]
     # M16
     _, s, vt = np.linalg.svd(residual / np.sqrt(n - n_groups), full_matrices=False)
-    if s[-1] <= _RANK * np.linalg.norm(values):
+    if s[-1] <= RANK * np.linalg.norm(values):
         raise InputError(
             f"The covariance within groups is singular: in some direction of {used} principal components the shapes of "
             "each group are equal; take fewer with --components."
@@ -251,15 +253,19 @@ def _canonical(coefficients: FloatArray, groups: Groups, components: int | None,
     )  # fmt: skip
 
 
-def _phylogenetic(cohort: Cohort, path: Path, method: str, make: _Make) -> Ordination:
-    from shapespace.io.trees import read_tree
-    from shapespace.statistics.shape_tests.phylogenetic import PhylogeneticMethod, phylogenetic_axes
-
-    kinds: dict[str, PhylogeneticMethod] = {"pca": "phylomorphospace", "phylogenetic-pca": "ppca", "paca": "paca"}
-    found = phylogenetic_axes(cohort, read_tree(path), kinds[method])
+def _phylogenetic(cohort: Cohort, tree: Tree | Path, method: str, make: _Make) -> Ordination:
+    """Return axes of species as `gm.prcomp` of geomorph, with their ancestors."""
+    tree = (tree if isinstance(tree, Tree) else read_tree(tree)).matched(cohort.names)
+    is_phylogenetic, values = method == "phylogenetic-pca", cohort.coefficients
+    centre = least_squares(tree.covariance)[0] @ values if is_phylogenetic else values.mean(axis=0)
+    weighted = inverse_root(tree.covariance) @ (values - centre) if is_phylogenetic else values - centre
+    s, vt = np.linalg.svd(tree.covariance @ weighted if method == "paca" else weighted, full_matrices=False)[1:]
+    axes = vt[s > RANK * s[0]]
+    scores = (values - centre) @ axes.T
+    variances = s**2 * float((weighted**2).sum() / (s**2).sum()) / (len(values) - 1)  # M54
     return make(
-        axes=found.directions.T, shape_axes=found.directions.T, centre=found.mean, scores=found.scores,
-        eigenvalues=found.deviations**2, ancestors=found.ancestors, edges=found.tree.edges, notes=found.tree.notes,
+        axes=axes, shape_axes=axes, centre=centre, scores=scores, eigenvalues=variances[: len(axes)],
+        ancestors=ancestral_states(tree, scores), edges=tree.edges, notes=tree.notes,
     )  # fmt: skip
 
 

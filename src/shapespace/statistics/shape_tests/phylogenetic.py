@@ -1,47 +1,39 @@
-"""Tests and axes of shapes of species on a phylogeny: signal, generalised least squares, and aligned components.
+"""Tests of shapes of species on a phylogeny: signal, and generalised least squares.
 
 The shapes of a cohort are those of the tips, one for each. Equations Mn are those of docs/morphometrics.md.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal, TypeAlias
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.io.trees import Tree, read_tree
-from shapespace.reprs import short_repr
-from shapespace.schemas import TableColumn, TablePart
 from shapespace.statistics.compare_formula import Term, design_of
 from shapespace.statistics.compare_shapes import CompareConfig, SquaresType, complete_cohort, term_tests
 from shapespace.statistics.compare_strata import Stratum, less, refuse_aliased, refuse_few
 from shapespace.statistics.methods import REDUCED_OF_EACH_TERM
 from shapespace.statistics.shape_tests.permutations import Orders, permuted
-from shapespace.statistics.shape_tests.shape_test_result import ShapeTestResult, Statistic
-from shapespace.statistics.shape_tests.test_table import shape_test
-from shapespace.step_counter import StepCounter
-from shapespace.types import FloatArray, read_only
-
-PhylogeneticMethod: TypeAlias = Literal["phylomorphospace", "ppca", "paca"]
+from shapespace.statistics.shape_tests.shape_test_result import ShapeTestResult, Statistic, pair_statistics, table_of
+from shapespace.statistics.tolerances import RANK
+from shapespace.step_counter import Progress, StepCounter
+from shapespace.types import FloatArray
 
 _MOST_AXES = 10  # principal components in the table of signal
-_RANK = 1e-9  # ratio of singular values; below is float64 rounding
 
 
-def _least_squares(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+def least_squares(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return weights (N,) whose mean is the state at the root, and the matrix (N, N) of squares about it (M51)."""
     inverse = np.linalg.inv(covariance)
     rows = inverse.sum(axis=0)
     return rows / rows.sum(), inverse - np.outer(rows, rows) / rows.sum()
 
 
-def _transformation(covariance: FloatArray) -> FloatArray:
+def inverse_root(covariance: FloatArray) -> FloatArray:
     """Return the symmetric root (N, N) of the inverse of the covariance of species (M50)."""
     values, vectors = np.linalg.eigh(covariance)
     return (vectors / np.sqrt(values)) @ vectors.T
@@ -60,68 +52,14 @@ def ancestral_states(tree: Tree, values: FloatArray) -> FloatArray:
         tree: with T tips.
         values: (T, K) states of the tips in their order.
     """
-    root = _least_squares(tree.covariance)[0] @ values
+    root = least_squares(tree.covariance)[0] @ values
     shared = tree.paths[len(values) :] @ tree.paths[: len(values)].T
     return root + shared @ np.linalg.solve(tree.covariance, values - root)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class PhylogeneticAxes:
-    """Axes of the shapes of species, and the scores of species and of their ancestors.
-
-    Args:
-        tree: whose tip k is shape k of the cohort.
-        mean: (K,) coefficients at the origin: the mean, or the estimate at the root for `ppca`.
-        directions: (K, A) orthonormal; the shape at scores s has the coefficients mean + directions s.
-        scores: (N, A) of the shapes.
-        ancestors: (M - N, A) of the internal nodes, as numbered in the tree.
-        deviations: (A,) `sdev` of geomorph: standard deviations, for `ppca` of independent contrasts; for `paca` the
-            total variance is divided by the squared covariance with the phylogeny.
-    """
-
-    tree: Tree
-    mean: FloatArray
-    directions: FloatArray
-    scores: FloatArray
-    ancestors: FloatArray
-    deviations: FloatArray
-
-    __repr__ = short_repr
-
-
-def phylogenetic_axes(
-    cohort: Cohort, tree: Tree | Path, method: PhylogeneticMethod = "phylomorphospace"
-) -> PhylogeneticAxes:
-    """Compute axes of the shapes of species with their phylogeny, as `gm.prcomp` of geomorph.
-
-    Args:
-        cohort: one shape for each species.
-        tree: whose tips have the names of the shapes; others are pruned.
-        method: `phylomorphospace`, principal components with the ancestors projected onto them; `ppca`, phylogenetic
-            principal components (Revell, Evolution 63, 2009); `paca`, phylogenetically aligned components (Collyer and
-            Adams, Methods in Ecology and Evolution 12, 2021).
-
-    Raises:
-        InputError: shapes without tip, fewer than three, or tips without a distance between them.
-    """
-    tree = _on_tree(cohort, tree)[1]
-    values = cohort.coefficients
-    mean = _least_squares(tree.covariance)[0] @ values if method == "ppca" else values.mean(axis=0)
-    centred = values - mean
-    weighted = _transformation(tree.covariance) @ centred if method == "ppca" else centred
-    s, vt = np.linalg.svd(tree.covariance @ weighted if method == "paca" else weighted, full_matrices=False)[1:]
-    kept = s > _RANK * s[0]
-    scores = centred @ vt[kept].T
-    scale = math.sqrt(float((weighted**2).sum() / (s**2).sum()) / (len(values) - 1))  # M54
-    return PhylogeneticAxes(
-        tree=tree, mean=read_only(mean), directions=read_only(vt[kept].T), scores=read_only(scores),
-        ancestors=read_only(ancestral_states(tree, scores)), deviations=read_only(scale * s[kept]),
-    )  # fmt: skip
-
-
 def estimate_phylogenetic_signal(
     cohort: Cohort, *, tree: Tree | Path, permutations: int = 1000, seed: int = 0, drop_missing: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> ShapeTestResult:  # fmt: skip
     """Estimate phylogenetic signal: K of shape (`physignal` of geomorph), and of principal components.
 
@@ -140,8 +78,8 @@ def estimate_phylogenetic_signal(
     n = len(cohort)
     u, s, _ = np.linalg.svd(cohort.coefficients - cohort.coefficients.mean(axis=0), full_matrices=False)
     gram, share = (u * s**2) @ u.T, s**2 / (s**2).sum()
-    components = (u * s)[:, : min(_MOST_AXES, int((s > _RANK * s[0]).sum()))]
-    weights, precision = _least_squares(tree.covariance)
+    components = (u * s)[:, : min(_MOST_AXES, int((s > RANK * s[0]).sum()))]
+    weights, precision = least_squares(tree.covariance)
     expected = (float(np.trace(tree.covariance)) - n * float(weights @ tree.covariance @ weights)) / (n - 1)
     factor = np.linalg.cholesky(precision + 1.0 / n).T  # its squares are those about the root, as rows are centred
     forms = np.column_stack([n * np.outer(weights, weights).ravel(), precision.ravel()])
@@ -157,15 +95,12 @@ def estimate_phylogenetic_signal(
     # Threads of many small products wait for one another on a machine with other work.
     with threadpool_limits(1, user_api="blas"):
         k = permuted(n, permutations, seed, ratios, progress)
-    by_axis = [Statistic.of("K", k[:, j], f"principal component {j}") for j in range(1, k.shape[1])]
-    table = TablePart(
-        title="Phylogenetic signal of principal components",
-        columns=(TableColumn(name="component"), TableColumn(name="variance", kind="percent"),
-                 *(TableColumn(name=name, kind="number") for name in "KZ"), TableColumn(name="p", kind="p")),
-        rows=tuple((one.tested, float(share[j]), one.value, one.z, one.p) for j, one in enumerate(by_axis)),
-    )  # fmt: skip
+    by_axis = pair_statistics("K", k.T[1:], [f"principal component {j}" for j in range(1, k.shape[1])])
+    rows = [(one.tested, float(own), one.value, one.z, one.p) for one, own in zip(by_axis, share, strict=False)]
+    table = table_of("Phylogenetic signal of principal components", ("component", "variance", "K", "Z", "p"), rows,
+                     percent=("variance",))  # fmt: skip
     return ShapeTestResult(
-        test=shape_test("signal"), cohort=cohort, statistics=(Statistic.of("K", k[:, 0], "shape"),), tables=(table,),
+        name="signal", cohort=cohort, statistics=[Statistic.of("K", k[:, 0], "shape")], tables=(table,),
         settings={"tree": tree.where, "permutations": permutations, "seed": seed},
         assumptions=("Shapes evolve by Brownian motion along the branches of the tree.",),
     )  # fmt: skip
@@ -173,7 +108,7 @@ def estimate_phylogenetic_signal(
 
 def fit_pgls(
     cohort: Cohort, *, formula: str, tree: Tree | Path, anova_type: SquaresType = "II", permutations: int = 1000,
-    seed: int = 0, drop_missing: bool = False, progress: Callable[[int, int], None] | None = None,
+    seed: int = 0, drop_missing: bool = False, progress: Progress | None = None,
 ) -> ShapeTestResult:  # fmt: skip
     """Fit a linear model of shape by phylogenetic generalised least squares, as `procD.pgls` of geomorph.
 
@@ -197,7 +132,7 @@ def fit_pgls(
     design = design_of(formula, cohort.table)
     n, p = len(cohort), len(design.matrix[0])
     refuse_few(n - 1, design, "", n, "shapes", p)
-    transformation = _transformation(tree.covariance)  # M55
+    transformation = inverse_root(tree.covariance)  # M55
     constant, columns = transformation.sum(axis=1)[:, None], np.arange(p + 1, dtype=np.intp)
     matrix = transformation @ design.matrix
     refuse_aliased(less(matrix, constant), columns[:p], design.terms, design)
@@ -209,18 +144,13 @@ def fit_pgls(
     tests = list(term_tests(stratum, config, StepCounter(len(design.terms), progress).add))
     residual = less(stratum.shapes, stratum.matrix)
     total, left = (float((rows**2).sum()) for rows in (stratum.shapes, residual))
-    table = TablePart(
-        title="Phylogenetic analysis of variance",
-        columns=(TableColumn(name="term"), TableColumn(name="df", kind="count"),
-                 *(TableColumn(name=name, kind="number") for name in ("SS", "R²", "F", "Z")),
-                 TableColumn(name="p", kind="p")),
-        rows=(*((one.term, one.df, one.squares, one.r2, one.f, one.z, one.p) for one in tests),
-              ("residuals", stratum.df_error, left, left / total, None, None, None),
-              ("total", n - 1, total, None, None, None, None)),
-    )  # fmt: skip
+    rows = [*((one.term, one.df, one.squares, one.r2, one.f, one.z, one.p) for one in tests),
+            ("residuals", stratum.df_error, left, left / total, None, None, None),
+            ("total", n - 1, total, None, None, None, None)]  # fmt: skip
+    table = table_of("Phylogenetic analysis of variance", ("term", "df", "SS", "R²", "F", "Z", "p"), rows)
     return ShapeTestResult(
-        test=shape_test("pgls"), cohort=cohort, tables=(table,),
-        statistics=tuple(Statistic.of("F", one.arrangements, one.term) for one in tests),
+        name="pgls", cohort=cohort, tables=(table,),
+        statistics=[Statistic.of("F", one.arrangements, one.term) for one in tests],
         settings={"formula": formula, "tree": tree.where, "anova_type": anova_type, "permutations": permutations,
                   "seed": seed},
         reduced_model=REDUCED_OF_EACH_TERM,

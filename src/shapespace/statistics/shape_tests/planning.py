@@ -16,16 +16,15 @@ from scipy.stats import binomtest, norm
 from shapespace.cohort.cohort import Cohort
 from shapespace.errors import InputError
 from shapespace.schemas import CurvePart, Series
-from shapespace.statistics.shape_tests.groups import group_result, groups_of, table_part
+from shapespace.statistics.effect_size import permutation_p
+from shapespace.statistics.shape_tests.groups import groups_of
 from shapespace.statistics.shape_tests.ordination import group_means, principal_components
 from shapespace.statistics.shape_tests.permutations import Groups, Orders, orders
-from shapespace.statistics.shape_tests.shape_test_result import ShapeTestResult, Statistic
-from shapespace.step_counter import StepCounter
+from shapespace.statistics.shape_tests.shape_test_result import LEVEL, ShapeTestResult, Statistic, table_of
+from shapespace.step_counter import Progress, StepCounter
 from shapespace.types import FloatArray
 
-_LEVEL = 0.05
 _POWER = 0.8  # that is planned for, as usual
-_TIE = 1e-9  # relative; statistics nearer than float64 sums are accurate count as equal
 
 
 def plan_sample_size(
@@ -38,7 +37,7 @@ def plan_sample_size(
     permutations: int = 200,
     seed: int = 0,
     drop_missing: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> ShapeTestResult:
     """Estimate the power of a comparison of group means, and the sample size for a power of 80 %, from pilot data.
 
@@ -59,7 +58,7 @@ def plan_sample_size(
         InputError: no such column, a group of fewer than three shapes, sizes below 2, an effect that cannot be read or
             is not above 0, or fewer than 20 permutations.
     """
-    if not sizes or min(sizes) < 2 or simulations < 1 or permutations < 1 / _LEVEL:
+    if not sizes or min(sizes) < 2 or simulations < 1 or permutations < 1 / LEVEL:
         raise InputError("Planning needs sizes of 2 or more, 1 or more simulations and 20 or more permutations.")
     cohort, groups = groups_of(cohort, group, drop_missing, 3, "planning")
     means, residual = group_means(cohort.coefficients, groups), groups.residuals(cohort.coefficients)
@@ -82,7 +81,7 @@ def plan_sample_size(
                 [simulated.labels(r) for _, r in orders(len(shapes), permutations, seed + step.done)]
             )
             between = (labels * (labels.reshape(-1, len(shapes)) @ products).reshape(labels.shape)).sum(axis=(1, 2))
-            found += bool((between >= between[0] * (1 - _TIE)).mean() <= _LEVEL)
+            found += permutation_p(between) <= LEVEL
             step.add()
         low, high = map(float, binomtest(found, simulations).proportion_ci(method="wilson"))
         powers.append(
@@ -100,13 +99,13 @@ def plan_sample_size(
         powers.append(Statistic(name="shapes per group", tested="power of 80 %", value=float(smallest)))
     limits = [(one.low, one.high) for one in powers[: len(counts)]]
     curve = Series(x=counts, y=values, low=tuple(low for low, _ in limits), high=tuple(high for _, high in limits))
-    kinds = {"shapes per group": "count", **dict.fromkeys(("power", "lower 95 %", "upper 95 %"), "percent")}
+    shares = ("power", "lower 95 %", "upper 95 %")
     rows = [(int(count), value, *limit) for count, value, limit in zip(counts, values, limits, strict=True)]
-    return group_result(
-        "power", replace(cohort, notes=(*cohort.notes, note)), group, powers,
-        {"effect": effect, "distance": distance, "sizes": sorted(set(sizes)), "simulations": simulations,
-         "permutations": permutations, "seed": seed},
-        tables=(table_part("Power", kinds, rows),),
+    return ShapeTestResult(
+        name="power", cohort=replace(cohort, notes=(*cohort.notes, note)), statistics=powers, classes=group,
+        settings={"group": list(group), "effect": effect, "distance": distance, "sizes": sorted(set(sizes)),
+                  "simulations": simulations, "permutations": permutations, "seed": seed},
+        tables=(table_of("Power", ("shapes per group", *shares), rows, percent=shares),),
         figures=(CurvePart(title="Power by sample size", series=(curve,), x="shapes per group", y="power"),),
         assumptions=(
             f"Power is the share of {simulations} simulated studies whose permutation test of the group means is "

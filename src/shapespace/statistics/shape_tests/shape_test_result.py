@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -10,14 +10,14 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.reprs import list_briefly, short_repr
-from shapespace.schemas import Methods, Part, SampleSize, TablePart, TestScheme
+from shapespace.schemas import Methods, Part, TableColumn, TablePart, TestScheme
 from shapespace.statistics.analysis_result import AnalysisResult
-from shapespace.statistics.effect_size import EffectSize, effect_size
-from shapespace.statistics.methods import methods_of
-from shapespace.statistics.shape_tests.test_table import ShapeTest
+from shapespace.statistics.effect_size import EffectSize, effect_size, permutation_p
+from shapespace.statistics.methods import methods_of, sample_sizes
+from shapespace.statistics.shape_tests.test_table import ShapeTest, shape_test
 from shapespace.types import FloatArray, read_only
 
-_TIE = 1e-9  # relative; statistics nearer than float64 sums are accurate count as equal
+LEVEL = 0.05  # of significance; intervals have a confidence of 1 - LEVEL
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -69,15 +69,13 @@ class Statistic:
             z: transformation before Z is standardised; `standard` for none, `none` for no Z.
         """
         values = np.asarray(arrangements, dtype=np.float64)
-        slack = _TIE * abs(float(values[0]))
-        extreme = values >= values[0] - slack if tail == "upper" else values <= values[0] + slack
         if z == "standard":
             spread = float(values.std())
             score = float((values[0] - values.mean()) / spread) if spread > 0 else 0.0
         else:
             score = None if z == "none" else effect_size(values, z)
         return Statistic(
-            name=name, tested=tested, value=float(values[0]), p=float(extreme.mean()), z=score,
+            name=name, tested=tested, value=float(values[0]), p=permutation_p(values, tail), z=score,
             arrangements=read_only(values),
         )  # fmt: skip
 
@@ -87,34 +85,39 @@ class ShapeTestResult(AnalysisResult):
     """Result of one of `SHAPE_TESTS`.
 
     Args:
-        test: the row of the table of tests.
+        name: of the test in the table of tests.
         cohort: the shapes that were used.
         statistics: the most important ones first.
         tables: further tables of the report; each is also written as CSV, under its title.
         figures: further parts of the report, after the tables.
         arrays: file name (.npz) -> arrays by name, which figures refer to.
         settings: all that the result depends on, the seed among it.
-        sizes: subjects and shapes of each class.
+        classes: columns whose classes are counted in the sample sizes.
         reduced_model: terms of the model whose residuals are permuted; None where shapes or labels themselves are.
         assumptions: sentences on assumptions of the test, for the methods.
         level: of significance.
-        n_subjects: number of independent units; None for that of the shapes.
+        subject: column of the independent units; None where all shapes are independent.
     """
 
     __test__ = False  # no test class of pytest
 
-    test: ShapeTest
+    name: str
     cohort: Cohort
-    statistics: tuple[Statistic, ...]
+    statistics: Sequence[Statistic]
     tables: tuple[TablePart, ...] = ()
     figures: tuple[Part, ...] = ()
     arrays: Mapping[str, Mapping[str, Any]] = field(default_factory=dict[str, Mapping[str, Any]])
     settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    sizes: tuple[SampleSize, ...] = ()
+    classes: Sequence[str] = ()
     reduced_model: tuple[str, ...] | None = None
     assumptions: tuple[str, ...] = ()
-    level: float = 0.05
-    n_subjects: int | None = None
+    level: float = LEVEL
+    subject: str | None = None
+
+    @property
+    def test(self) -> ShapeTest:
+        """Row of the table of tests."""
+        return shape_test(self.name)
 
     def statistic(self, name: str, tested: str = "") -> Statistic:
         """Return a statistic by its name and what it compares.
@@ -147,8 +150,10 @@ class ShapeTestResult(AnalysisResult):
             tested=tested, statistic=self.test.statistics, resampling=self.test.resampling, unit=self.test.permuted,
             reduced_model=self.reduced_model, arrangements=max(counts, default=0),
         )  # fmt: skip
+        subjects = self.cohort.table.texts(self.subject) if self.subject else self.cohort.names
+        sizes = sample_sizes(subjects, [(column, self.cohort.table.texts(column)) for column in self.classes])
         return methods_of(
-            self.cohort, self.n_subjects or len(self.cohort), level=self.level, sizes=self.sizes,
+            self.cohort, len(set(subjects)), level=self.level, sizes=sizes,
             tests=(scheme,) if tested else (), assumptions=self.assumptions,
             effect_size="box-cox" if any(one.z is not None for one in self.statistics) else "",
         )  # fmt: skip
@@ -156,4 +161,31 @@ class ShapeTestResult(AnalysisResult):
     def __repr__(self) -> str:
         rows = [f"{one.label} {one.value:.4g}" + ("" if one.p is None else f", p {one.p:.3g}")
                 for one in self.statistics]  # fmt: skip
-        return f"<ShapeTestResult {self.test.name} of {len(self.cohort)} shapes; {list_briefly(rows)}>"
+        return f"<ShapeTestResult {self.name} of {len(self.cohort)} shapes; {list_briefly(rows)}>"
+
+
+def pair_statistics(
+    name: str, values: FloatArray, pairs: Sequence[str], tail: Literal["upper", "lower"] = "upper"
+) -> list[Statistic]:
+    """Return the statistics of pairs from their arrangements (pairs, P)."""
+    return [Statistic.of(name, one, pair, tail=tail) for one, pair in zip(values, pairs, strict=True)]
+
+
+def table_of(
+    title: str, columns: Sequence[str], rows: Sequence[tuple[Any, ...]], *, percent: Sequence[str] = (),
+    note: str = "",
+) -> TablePart:  # fmt: skip
+    """Return a table; the kind of a column is that of its cell in the first row.
+
+    Args:
+        title: of the table.
+        columns: their names; `p` is the one of p values.
+        rows: of texts, integers and numbers.
+        percent: columns of shares.
+        note: of the table.
+    """
+    kinds: dict[str, Any] = {"p": "p", **dict.fromkeys(percent, "percent")}
+    for name, cell in zip(columns, rows[0], strict=True):
+        kinds.setdefault(name, "text" if isinstance(cell, str) else "count" if isinstance(cell, int) else "number")
+    made = tuple(TableColumn(name=name, kind=kinds[name]) for name in columns)
+    return TablePart(title=title, columns=made, rows=tuple(rows), note=note)
