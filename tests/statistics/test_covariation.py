@@ -198,7 +198,7 @@ def test_points_are_named_by_landmark_or_counted_and_others_are_left_out(tmp_pat
     ("text", "error", "sentence"),
     [
         ("point,module\n1,A\n", FileFormatError, "is no table of modules"),
-        ("landmark,module\n1\n", FileFormatError, "is no table of modules"),
+        ("landmark,module\n1\n", InputError, "has no module"),
         ("landmark,module\n1,A\n2,A\n3,A\n", InputError, "two modules of two vertices"),
         ("landmark,module\n1,A\n2,A\n3,B\n", InputError, "two modules of two vertices"),
         ("landmark,module\n1,A\n2,A\n3,B\n99,B\n", InputError, "'99' is not in the shapes"),

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -20,8 +20,7 @@ from shapespace.geometry.normals import rms_size
 from shapespace.geometry.procrustes import align_in_place, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.containers.json_files import check_file
-from shapespace.io.files import read_bytes
-from shapespace.io.tables.table_io import table_rows
+from shapespace.io.tables.table_io import read_rows
 from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks
 
@@ -143,30 +142,16 @@ def find_sides(cohort: Cohort) -> Sides:
     everything = np.arange(cohort.n_vertices, dtype=np.int32)
     other = mirror_pairs(mesh, symmetry)
     if other is not None:
-        corners, weights = _alone(other)
-        return Sides(
-            vertices=everything,
-            faces=cohort.faces,
-            corners=corners,
-            weights=weights,
-            paired=True,
-            off_share=symmetry.off_share,
-            notes=tuple(notes),
-        )
+        return _paired(everything, cohort.faces, other, off_share=symmetry.off_share, notes=tuple(notes))
     notes.append(
         "The vertices of the mean do not pair up, so each is compared with the place nearest to its mirror image; what "
         "the mean's sides differ by along the surface cannot be seen so, and the Procrustes ANOVA takes differences "
         "along the normals alone."
     )
     return Sides(
-        vertices=everything,
-        faces=cohort.faces,
-        corners=symmetry.corners,
-        weights=symmetry.weights,
-        paired=False,
-        off_share=symmetry.off_share,
-        notes=tuple(notes),
-    )
+        vertices=everything, faces=cohort.faces, corners=symmetry.corners, weights=symmetry.weights, paired=False,
+        off_share=symmetry.off_share, notes=tuple(notes),
+    )  # fmt: skip
 
 
 def given_sides(cohort: Cohort, pairs: Sequence[tuple[int, int]], where: str = "The pairs") -> Sides:
@@ -210,21 +195,12 @@ def given_sides(cohort: Cohort, pairs: Sequence[tuple[int, int]], where: str = "
         )
     vertices = np.array(sorted(other), dtype=np.int32)
     number = {int(v): k for k, v in enumerate(vertices)}
-    corners, weights = _alone(np.array([number[other[int(v)]] for v in vertices], dtype=np.int32))
+    partner = np.array([number[other[int(v)]] for v in vertices], dtype=np.int32)
     own = np.full(cohort.n_vertices, -1, dtype=np.int32)
     own[vertices] = np.arange(len(vertices))
-    faces = None if cohort.faces is None else own[cohort.faces]
-    faces = None if faces is None else faces[(faces >= 0).all(axis=1)]
-    faces = None if faces is None or not len(faces) else faces
-    sides = Sides(
-        vertices=vertices,
-        faces=faces,
-        corners=corners,
-        weights=weights,
-        paired=True,
-        off_share=0.0,
-        space=cohort.dimensions,
-    )
+    faces = np.zeros((0, 3), dtype=np.int32) if cohort.faces is None else own[cohort.faces]
+    faces = faces[(faces >= 0).all(axis=1)]
+    sides = _paired(vertices, faces if len(faces) else None, partner, off_share=0.0, space=cohort.dimensions)
     x = cohort.reference[vertices]
     image = sides.image(x)
     try:
@@ -270,7 +246,12 @@ def match_sides(cohort: Cohort, subject: str | None, side: str) -> tuple[Cohort,
     if not rows[0]:
         raise InputError(f"{where}: no subject has both sides; name the subjects with --subject.")
     left = [cohort.names[k] for k in sorted(set(range(len(cohort))) - {*rows[0], *rows[1]})]
-    note = f"{len(left)} shapes without a counterpart on the other side are left out ({list_names(left)})."
+    verb = (
+        "s without a counterpart on the other side are"
+        if len(left) > 1
+        else " without a counterpart on the other side is"
+    )
+    note = f"{len(left)} shape{verb} left out ({list_names(left)})."
     one, other = (cohort.vertices(cohort.coefficients[part].mean(axis=0)) for part in rows)
 
     def off(image: FloatArray) -> float:
@@ -281,18 +262,11 @@ def match_sides(cohort: Cohort, subject: str | None, side: str) -> tuple[Cohort,
             f"{where}: shapes with {side} {classes[1]} are mirror images of the others; reflect them before the "
             f"alignment, landmarks with shapespace align --reflect {side}={classes[1]}."
         )
-    corners, weights = _alone(np.arange(cohort.n_vertices, dtype=np.int32))
-    sides = Sides(
-        vertices=np.arange(cohort.n_vertices, dtype=np.int32),
-        faces=cohort.faces,
-        corners=corners,
-        weights=weights,
-        paired=True,
-        off_share=off(other) / float(np.linalg.norm(one - one.mean(axis=0))),
-        notes=(note,) if left else (),
-        space=cohort.dimensions,
-        classes=classes,
-    )
+    everything = np.arange(cohort.n_vertices, dtype=np.int32)
+    sides = _paired(
+        everything, cohort.faces, everything, off_share=off(other) / float(np.linalg.norm(one - one.mean(axis=0))),
+        notes=(note,) if left else (), space=cohort.dimensions, classes=classes,
+    )  # fmt: skip
     return cohort.take([*rows[0], *rows[1]]), sides
 
 
@@ -323,10 +297,7 @@ def read_pairs(path: Path, cohort: Cohort) -> tuple[tuple[int, int], ...]:
         InputError: a name that is no landmark of the cohort.
     """
     check_file(path, _LARGEST_BYTES, "give a smaller table")
-    try:
-        rows = [[cell.strip() for cell in row] for row in table_rows(read_bytes(path))]
-    except ValueError as error:
-        raise FileFormatError(f"{path} {error}; write two columns, a pair in each row.") from error
+    rows = read_rows(path)
     landmarks, first = dict(cohort.landmarks or {}), int(cohort.source.kind == "landmarks")
 
     def is_place(cell: str) -> bool:
@@ -346,9 +317,9 @@ def read_pairs(path: Path, cohort: Cohort) -> tuple[tuple[int, int], ...]:
     return tuple((a, b) for a, b in pairs)
 
 
-def _alone(other: IntArray) -> tuple[IntArray, FloatArray]:
-    """Return corners (M, 3) and weights (M, 3) that take the vertex `other` (M,) alone."""
-    weights = np.zeros((len(other), 3))
+def _paired(vertices: IntArray, faces: IntArray | None, partner: IntArray, **known: Any) -> Sides:
+    """Return sides of which the mirror image of each vertex (M,) is its partner (M,), by number among them."""
+    weights = np.zeros((len(partner), 3))
     weights[:, 0] = 1.0
-    corners = np.tile(other[:, None], (1, 3))
-    return corners, weights
+    corners = np.tile(partner[:, None], (1, 3))
+    return Sides(vertices=vertices, faces=faces, corners=corners, weights=weights, paired=True, **known)

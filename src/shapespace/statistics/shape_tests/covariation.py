@@ -18,8 +18,8 @@ from threadpoolctl import threadpool_limits
 from shapespace.cohort.cohort import Cohort
 from shapespace.errors import FileFormatError, InputError
 from shapespace.io.files import read_bytes
-from shapespace.io.landmarks.landmark_io import csv_rows
 from shapespace.io.read_limits import LARGEST_LANDMARK_FILE_BYTES
+from shapespace.io.tables.table_io import read_rows
 from shapespace.schemas import CurvePart, Series
 from shapespace.statistics.shape_tests.permutations import Orders, permuted
 from shapespace.statistics.shape_tests.shape_test_result import (
@@ -195,15 +195,15 @@ def _modules(cohort: Cohort, path: Path) -> tuple[Cohort, dict[str, list[int]]]:
         InputError: fewer than two modules, a module of one point, points that the shapes lack or that are listed twice.
     """
     noun = "landmarks" if cohort.source.kind == "landmarks" else "vertices"
-    rows = csv_rows(read_bytes(path, LARGEST_LANDMARK_FILE_BYTES), path)
-    header = [cell.lower() for cell in rows[0]] if rows else []
-    if header not in (["landmark", "module"], ["vertex", "module"]) or any(len(row) != 2 for row in rows):
+    titles, *rows = read_rows(path, read_bytes(path, LARGEST_LANDMARK_FILE_BYTES))
+    header = [title.lower() for title in titles]
+    if header not in (["landmark", "module"], ["vertex", "module"]):
         raise FileFormatError(f"{path} is no table of modules; write the columns landmark,module or vertex,module.")
     first = int(header[0] == "landmark")  # numbers of landmarks count from 1, those of vertices from 0
     numbers = {str(k + first): k for k in range(cohort.n_vertices)} | (dict(cohort.landmarks or {}) if first else {})
-    points = {module: [numbers.get(cell, -1) for cell, own in rows[1:] if own == module] for _, module in rows[1:]}
+    points = {module: [numbers.get(cell, -1) for cell, own in rows if own == module] for _, module in rows}
     flat = sorted(point for own in points.values() for point in own)
-    unknown = [cell for cell, module in rows[1:] if cell not in numbers or not module]
+    unknown = [cell for cell, module in rows if cell not in numbers or not module]
     if unknown or len(set(flat)) < len(flat):
         problem = f"{unknown[0][:40]!r} is not in the shapes or has no module" if unknown else "one is listed twice"
         raise InputError(f"{path}: list each {header[0]} of the shapes once, with its module; {problem}.")
