@@ -9,8 +9,8 @@ import argparse
 import tempfile
 import time
 from collections.abc import Mapping
-from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 import numpy as np
@@ -81,7 +81,7 @@ def main() -> None:
         }
         for test in SHAPE_TESTS:
             if arguments.only in (None, test.name):
-                function = getattr(import_module(f"shapespace.statistics.shape_tests.{test.module}"), test.function)
+                function = resolve_name(f"shapespace.statistics.shape_tests.{test.function}")
                 own = options.get(test.name, {"group": ("group",)})
                 own |= {} if test.name == "power" else {"permutations": PERMUTATIONS}
                 report(test.name, lambda function=function, own=own: function(cohort, **own))

@@ -215,7 +215,8 @@ _BASIC_OF_TEST = 4
 
 def _shape_test(test: ShapeTest) -> Command:
     """Return the command of a test of shape."""
-    source = Source(f"statistics.shape_tests.{test.module}", test.function)
+    module, _, function = test.function.partition(".")
+    source = Source(f"statistics.shape_tests.{module}", function)
     own = tuple(
         Option(
             f"--{field.replace('_', '-')}",

@@ -30,7 +30,7 @@ from shapespace.statistics.effect_size import effect_size
 from shapespace.statistics.methods import methods_of
 from shapespace.statistics.observation_weights import weights_of
 from shapespace.statistics.sides import Sides, aligned_shapes, find_sides, given_sides, match_sides
-from shapespace.step_counter import StepCounter
+from shapespace.step_counter import Progress, StepCounter
 from shapespace.types import BoolArray, FloatArray, Mesh, read_only, require
 
 ERROR_ASYMMETRIC, ERROR_SYMMETRIC = "measurement error, asymmetric", "measurement error, symmetric"
@@ -148,11 +148,6 @@ class AsymmetryResult(AnalysisResult):
     degrees_of_freedom: DegreesOfFreedom = "klingenberg"
 
     @property
-    def exchanges_sides(self) -> bool:
-        """Whether individuals are tested by exchange of sides, rather than of shapes as in geomorph."""
-        return bool(self.sides.classes) and self.degrees_of_freedom == "klingenberg"
-
-    @property
     def observed_share(self) -> FloatArray:
         """(M,) share of the subjects that observe a vertex and its mirror image."""
         return np.ones(len(self.mean)) if self.observed is None else self.observed.mean(axis=0)
@@ -185,7 +180,7 @@ class AsymmetryResult(AnalysisResult):
             flipped = ("side", "directional asymmetry of each vertex")
             tests.append(TestScheme(tested=flipped, resampling="sign flips", reduced_model=None, arrangements=count))
             tested = [one.source for one in self.anova if one.p is not None and one.source != "side"]
-            if self.exchanges_sides:
+            if _exchanges_sides(self.sides, self.degrees_of_freedom):
                 unit = "mean of a side of a subject"
                 tests.append(TestScheme(tested=("individual",), unit=unit, reduced_model=None, arrangements=count))
                 tested.remove("individual")
@@ -234,7 +229,7 @@ def measure_asymmetry(
     degrees_of_freedom: DegreesOfFreedom = "klingenberg",
     permutations: int = 999,
     seed: int = 0,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> AsymmetryResult:
     """Return what the sides of the objects of a cohort differ by.
 
@@ -293,25 +288,17 @@ def measure_asymmetry(
     if normals is not None and not sides.paired:
         # Places nearest on the mean leave its sides no difference along the surface, which single shapes have.
         parts = _along(symmetric, normals), along
-    dimensions = sides.dimensions(scaled=cohort.gauge == "shape") if degrees_of_freedom == "klingenberg" else (1.0, 1.0)
-    exchange = side is not None and degrees_of_freedom == "klingenberg"
-    anova = _anova(*parts, who, dimensions, rng, steps, exchange_sides=exchange)
-    anova = anova if degrees_of_freedom == "klingenberg" else _pooled(anova)
+    exchange = _exchanges_sides(sides, degrees_of_freedom)
+    if degrees_of_freedom == "klingenberg":
+        dimensions = sides.dimensions(scaled=cohort.gauge == "shape")
+        anova = _anova(*parts, who, dimensions, rng, steps, exchange_sides=exchange)
+    else:
+        anova = _pooled_anova(*parts, who, rng, steps, exchange_sides=exchange)
     size_anova: tuple[AnovaRow, ...] = ()
     if side is not None and np.isfinite(cohort.sizes_mm).all():
         one, other = cohort.sizes_mm[: len(first), None], cohort.sizes_mm[len(first) :, None]
-        own_steps = _Steps(4 * permutations, None)
-        size_anova = _pooled(
-            _anova(
-                (one + other) / 2,
-                one - other,
-                who,
-                (1.0, 1.0),
-                np.random.default_rng(seed),
-                own_steps,
-                exchange_sides=exchange,
-            )
-        )
+        middle, own_rng, own_steps = (one + other) / 2, np.random.default_rng(seed), _Steps(4 * permutations, None)
+        size_anova = _pooled_anova(middle, one - other, who, own_rng, own_steps, exchange_sides=exchange)
     directional = own.mean(axis=0) if normals is not None else np.linalg.norm(own.mean(axis=0), axis=1)
     observed = None if pairs_observed is None else who.of(pairs_observed.astype(np.float64)) >= _MOSTLY
     weight = None if observed is None else weights_of(observed.mean(axis=0))
@@ -321,29 +308,17 @@ def measure_asymmetry(
         weight = known if weight is None else weight * known
     p = _family_wise(own, rng, steps, weight)
     return AsymmetryResult(
-        cohort=cohort,
-        sides=sides,
-        subjects=names,
-        counts=counts,
-        mean=mean,
-        normals=normals,
-        symmetric=who.of(symmetric),
-        difference=own_difference,
-        anova=anova,
-        scores=scores,
-        vertex_scores=vertex_scores,
-        z=z,
-        z_low=z_low,
-        z_high=z_high,
-        in_reference=in_reference,
-        directional=read_only(directional),
-        directional_p=p,
-        permutations=permutations,
-        seed=seed,
-        observed=observed,
-        size_anova=size_anova,
-        degrees_of_freedom=degrees_of_freedom,
-    )
+        cohort=cohort, sides=sides, subjects=names, counts=counts, mean=mean, normals=normals,
+        symmetric=who.of(symmetric), difference=own_difference, observed=observed,
+        anova=anova, size_anova=size_anova, degrees_of_freedom=degrees_of_freedom,
+        scores=scores, vertex_scores=vertex_scores, z=z, z_low=z_low, z_high=z_high, in_reference=in_reference,
+        directional=read_only(directional), directional_p=p, permutations=permutations, seed=seed,
+    )  # fmt: skip
+
+
+def _exchanges_sides(sides: Sides, degrees_of_freedom: DegreesOfFreedom) -> bool:
+    """Return whether individuals are tested by exchange of sides, rather than of shapes as in geomorph."""
+    return bool(sides.classes) and degrees_of_freedom == "klingenberg"
 
 
 class _Steps(StepCounter):
@@ -464,7 +439,7 @@ def _anova(
     rng: np.random.Generator,
     steps: _Steps,
     *,
-    exchange_sides: bool = False,
+    exchange_sides: bool,
 ) -> tuple[AnovaRow, ...]:
     n, rows = len(who.counts), len(who.codes)
     flat_s = symmetric.reshape(rows, -1) - symmetric.reshape(rows, -1).mean(axis=0)
@@ -512,8 +487,12 @@ def _anova(
     )
 
 
-def _pooled(anova: Sequence[AnovaRow]) -> tuple[AnovaRow, ...]:
+def _pooled_anova(
+    symmetric: FloatArray, difference: FloatArray, who: _SubjectMeans, rng: np.random.Generator, steps: _Steps, *,
+    exchange_sides: bool,
+) -> tuple[AnovaRow, ...]:  # fmt: skip
     """Return an ANOVA of one dimension with the errors of both parts pooled, as geomorph has it."""
+    anova = _anova(symmetric, difference, who, (1.0, 1.0), rng, steps, exchange_sides=exchange_sides)
     rows, errors = list(anova[:3]), anova[3:]
     if errors:
         ss, df = sum(row.ss for row in errors), sum(row.df for row in errors)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from importlib import import_module
+from pkgutil import resolve_name
 
 from shapespace.cli.answers.common import cohort_of, finish
 from shapespace.cli.options import given
@@ -15,7 +15,7 @@ def run(arguments: argparse.Namespace) -> int:
     from shapespace.report.analyses.shape_test_report import shape_test_report
 
     test = arguments.shape_test
-    function = getattr(import_module(f"shapespace.statistics.shape_tests.{test.module}"), test.function)
+    function = resolve_name(f"shapespace.statistics.shape_tests.{test.function}")
     cohort = cohort_of(arguments)
     options = given(arguments, function)
     with steps(None, "permuting", "permutation", quiet=arguments.quiet) as step:

@@ -17,8 +17,7 @@ class ShapeTest:
     Args:
         name: word after `shapespace test`.
         summary: what it does, without a capital and a full stop.
-        module: of the function, in `statistics.shape_tests`.
-        function: takes a cohort and the options by name.
+        function: in `statistics.shape_tests`, with its module; it takes a cohort and the options by name.
         statistics: what is computed, in words.
         permuted: what is permuted, as `TestScheme.unit`.
         resampling: how p values are computed.
@@ -30,10 +29,9 @@ class ShapeTest:
 
     name: str
     summary: str
-    module: str
     function: str
     statistics: str
-    permuted: str
+    permuted: str = "shape"
     resampling: Literal["permutation", "sign flips", "bootstrap", "none"] = "permutation"
     references: tuple[str, ...] = ()
     example: str = ""
@@ -41,14 +39,15 @@ class ShapeTest:
     required: tuple[str, ...] = ()
 
 
+_MODEL = {"formula": "FORMULA", "null": "FORMULA", "residuals": ""}
+"""Options of a full and a reduced linear model."""
+
 SHAPE_TESTS: tuple[ShapeTest, ...] = (
     ShapeTest(
         name="disparity",
         summary="compare the disparity (Procrustes variance) of groups, in total or about a model",
-        module="groups",
-        function="compare_disparity",
+        function="groups.compare_disparity",
         statistics="Procrustes variance or partial disparity of each group, and the absolute difference of each pair",
-        permuted="shape",
         references=(
             "Zelditch, Swiderski and Sheets (2012) Geometric Morphometrics for Biologists, 2nd edition, Academic.",
             "Foote (1993) Paleobiology 19, 403-419.",
@@ -60,10 +59,8 @@ SHAPE_TESTS: tuple[ShapeTest, ...] = (
     ShapeTest(
         name="equality",
         summary="test equal means and equal covariance matrices of groups",
-        module="groups",
-        function="compare_means_and_covariances",
+        function="groups.compare_means_and_covariances",
         statistics="F and distances of means; Riemannian distances of covariances, with and without their scale",
-        permuted="shape",
         references=("Mitteroecker and Bookstein (2009) Evolution 63, 727-737.",),
         example="shapespace test equality people.csv --group species -o equality",
         options={"group": "COLUMN", "components": "N"},
@@ -72,10 +69,8 @@ SHAPE_TESTS: tuple[ShapeTest, ...] = (
     ShapeTest(
         name="equivalence",
         summary="test whether means of groups differ by less than a margin",
-        module="groups",
-        function="assess_equivalence",
+        function="groups.assess_equivalence",
         statistics="squared distance of means less that of the margin by its standard error, upper bounds of distances",
-        permuted="shape",
         resampling="bootstrap",
         references=(
             "Wellek (2010) Testing Statistical Hypotheses of Equivalence and Noninferiority, 2nd edition, CRC.",
@@ -87,10 +82,8 @@ SHAPE_TESTS: tuple[ShapeTest, ...] = (
     ShapeTest(
         name="power",
         summary="plan sample sizes of a comparison of groups by simulation from pilot data",
-        module="planning",
-        function="plan_sample_size",
+        function="planning.plan_sample_size",
         statistics="share of simulated studies whose test of group means is significant",
-        permuted="shape",
         resampling="bootstrap",
         references=("Silverman and Young (1987) Biometrika 74, 469-479.",),
         example="shapespace test power pilot.csv --group species --sizes 10,20,40 -o power",
@@ -100,10 +93,8 @@ SHAPE_TESTS: tuple[ShapeTest, ...] = (
     ShapeTest(
         name="discriminant",
         summary="classify shapes by linear discriminants, and test distances of group means",
-        module="groups",
-        function="discriminate",
+        function="groups.discriminate",
         statistics="share of correct leave-one-out classifications, Mahalanobis and Procrustes distances of means",
-        permuted="shape",
         references=(
             "Venables and Ripley (2002) Modern Applied Statistics with S, 4th edition, Springer.",
             "Klingenberg and Monteiro (2005) Systematic Biology 54, 678-688.",
@@ -115,10 +106,8 @@ SHAPE_TESTS: tuple[ShapeTest, ...] = (
     ShapeTest(
         name="pairwise",
         summary="compare pairs of groups by least-squares means, or by vectors of slopes",
-        module="linear",
-        function="compare_pairs",
+        function="linear.compare_pairs",
         statistics="distance of least-squares means, or distance, length difference and angle of vectors of slopes",
-        permuted="shape",
         references=("Collyer, Sekora and Adams (2015) Heredity 115, 357-365.",),
         example="shapespace test pairwise people.csv --formula '~ species * site' --group species,site -o pairs",
         options={"formula": "FORMULA", "group": "COLUMN", "covariate": "COLUMN", "null": "FORMULA", "residuals": ""},
@@ -127,29 +116,18 @@ SHAPE_TESTS: tuple[ShapeTest, ...] = (
     ShapeTest(
         name="trajectory",
         summary="compare trajectories of shape change of groups: size, angle and shape",
-        module="linear",
-        function="compare_trajectories",
+        function="linear.compare_trajectories",
         statistics="difference of path length, angle between principal axes, and difference of trajectory shape",
-        permuted="shape",
         references=("Collyer and Adams (2013) Hystrix 24, 75-83.",),
         example="shapespace test trajectory people.csv --group species --points stage -o trajectories",
-        options={
-            "group": "COLUMN",
-            "points": "COLUMN",
-            "order": "LIST",
-            "formula": "FORMULA",
-            "null": "FORMULA",
-            "residuals": "",
-        },
+        options={"group": "COLUMN", "points": "COLUMN", "order": "LIST", **_MODEL},
         required=("group", "points"),
     ),
     ShapeTest(
         name="allometry",
         summary="regress shape on size, test common slopes of groups, and correct shapes for size",
-        module="linear",
-        function="analyse_allometry",
+        function="linear.analyse_allometry",
         statistics="F of type II (that of the interaction with the covariate tests common slopes)",
-        permuted="shape",
         references=(
             "Drake and Klingenberg (2008) Proceedings of the Royal Society B 275, 71-76.",
             "Mitteroecker, Gunz, Bernhard, Schaefer and Bookstein (2004) Journal of Human Evolution 46, 679-698.",
@@ -160,10 +138,8 @@ SHAPE_TESTS: tuple[ShapeTest, ...] = (
     ShapeTest(
         name="repeatability",
         summary="measure repeatability and measurement error from replicates",
-        module="linear",
-        function="measure_repeatability",
+        function="linear.measure_repeatability",
         statistics="intraclass correlations with jackknife intervals, and F of subjects and of sessions",
-        permuted="shape",
         references=(
             "Fruciano (2016) Development Genes and Evolution 226, 139-158.",
             "Liljequist, Elfving and Skavberg Roaldsen (2019) PLoS ONE 14, e0219854.",
@@ -174,10 +150,8 @@ SHAPE_TESTS: tuple[ShapeTest, ...] = (
     ShapeTest(
         name="pls",
         summary="fit two-block partial least squares of shape and columns of the table",
-        module="covariation",
-        function="fit_pls",
+        function="covariation.fit_pls",
         statistics="r-PLS, the correlation of the scores of both blocks on the first pair of axes",
-        permuted="shape",
         references=("Rohlf and Corti (2000) Syst. Biol. 49, 740-753.",),
         example="shapespace test pls people.csv --columns length,width -o pls",
         options={"columns": "LIST"},
@@ -186,10 +160,8 @@ SHAPE_TESTS: tuple[ShapeTest, ...] = (
     ShapeTest(
         name="integration",
         summary="estimate the integration of modules by partial least squares",
-        module="covariation",
-        function="fit_pls",
+        function="covariation.fit_pls",
         statistics="r-PLS of each pair of modules, and their mean",
-        permuted="shape",
         references=(
             "Bookstein et al. (2003) J. Hum. Evol. 44, 167-187.",
             "Adams and Collyer (2016) Evolution 70, 2623-2631.",
@@ -201,10 +173,9 @@ SHAPE_TESTS: tuple[ShapeTest, ...] = (
     ShapeTest(
         name="modularity",
         summary="estimate modularity by the covariance ratio CR",
-        module="covariation",
-        function="estimate_modularity",
+        function="covariation.estimate_modularity",
         statistics="CR of each pair of modules, and their mean (small values are modular)",
-        permuted="point",
+        permuted="landmark",
         references=(
             "Adams (2016) Methods Ecol. Evol. 7, 565-572.",
             "Adams and Collyer (2019) Evolution 73, 2352-2367.",
@@ -216,10 +187,8 @@ SHAPE_TESTS: tuple[ShapeTest, ...] = (
     ShapeTest(
         name="signal",
         summary="estimate phylogenetic signal K of shape and of principal components",
-        module="phylogenetic",
-        function="estimate_phylogenetic_signal",
+        function="phylogenetic.estimate_phylogenetic_signal",
         statistics="K of shape, and of principal components",
-        permuted="shape",
         references=(
             "Adams (2014) Syst. Biol. 63, 685-697.",
             "Collyer, Baken and Adams (2022) Methods Ecol. Evol. 13, 367-382.",
@@ -231,8 +200,7 @@ SHAPE_TESTS: tuple[ShapeTest, ...] = (
     ShapeTest(
         name="pgls",
         summary="fit a linear model of shape by phylogenetic generalised least squares",
-        module="phylogenetic",
-        function="fit_pgls",
+        function="phylogenetic.fit_pgls",
         statistics="F of each term",
         permuted="phylogenetically transformed shape",
         references=("Adams (2014) Evolution 68, 2675-2688.", "Adams and Collyer (2018) Evolution 72, 1204-1215."),
