@@ -172,10 +172,13 @@ def test_commands_that_read_aligned_landmarks_have_one_note_on_specimens_to_chec
     assert "mirrored" not in outcome.err + outcome.out
 
 
-def test_a_folder_that_align_wrote_is_not_aligned_again(run: Run, folder: Path) -> None:
+def test_a_folder_that_align_wrote_is_no_landmark_file(run: Run, folder: Path) -> None:
     assert run("align", "skulls.tps", "-o", "aligned").code == 0
-    refused = run("align", "aligned", "-o", "again")
-    assert refused.code == 2 and "aligned is a folder that align wrote; give the landmark file" in refused.err
+    landmarks = ("check",), ("plot", "-o", "again.png"), ("convert", "again.tps")
+    for command, *rest in (("align", "-o", "again"), *(("landmarks", *one) for one in landmarks)):
+        name = rest.pop(0) if command == "landmarks" else ""
+        refused = run(*filter(None, (command, name)), "aligned", *rest)
+        assert refused.code == 2 and "aligned is a folder that align wrote; give the landmark file" in refused.err
 
 
 def test_columns_of_files_call_landmarks_by_their_name(run: Run, folder: Path) -> None:

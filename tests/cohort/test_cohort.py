@@ -346,10 +346,10 @@ def test_too_few_fits_say_why(fits: Path, tmp_path: Path) -> None:
 
 def test_what_is_no_folder_or_holds_nothing_is_refused(fits: Path, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="holds no results of fits"):
+    with pytest.raises(InputError, match="holds neither results of fits nor landmark files"):
         read_cohort(tmp_path / "empty")
     write_text(tmp_path / "data.csv", "file\na\n")
-    with pytest.raises(InputError, match="is no folder"):
+    with pytest.raises(InputError, match="is neither a folder nor a landmark file"):
         read_cohort(tmp_path / "data.csv", CohortConfig(shapes=tmp_path / "gone"))
     with pytest.raises((FileError, InputError)):
         read_cohort(tmp_path / "gone.csv")

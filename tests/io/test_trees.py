@@ -45,6 +45,7 @@ def test_tips_without_shape_are_pruned_and_the_root_is_the_last_common_ancestor(
     np.testing.assert_allclose(some.covariance, COVARIANCE[np.ix_([4, 1, 2], [4, 1, 2])], atol=1e-12)
     assert some.tips == ("e", "b_2", "c") and len(some.parents) == 5
     assert "2 of 5 tips have no shape and are pruned" in some.notes[0]
+    assert "1 of 5 tips has no shape and is pruned" in tree.matched(["a_1", "e", "b_2", "c"]).notes[0]
     within = tree.matched(["d", "c", "e"])
     np.testing.assert_allclose(within.covariance, np.diag([0.5, 1.5, 4.0]), atol=1e-12)
 

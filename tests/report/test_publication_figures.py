@@ -80,9 +80,14 @@ def test_surfaces_have_the_resolution_of_the_file(tmp_path: Path, head: Callable
 
 def test_nothing_of_a_chart_is_cut_in_one_column() -> None:
     with figures.publication_style():
-        for figure in (curves(), figures.histogram_figure(np.arange(9.0), [("all", range(8))], x="F", observed=7.5)):
+        bars = figures.histogram_figure(np.arange(9.0), [("all", [9] * 8)], x="F", observed=7.5, observed_label="here")
+        tall = np.random.default_rng(0).normal(size=(12, 3)) * [1.0, 3.0, 0.3]
+        for figure in (curves(), bars, figures.landmark_vectors_figure(tall, 1.1 * tall, ("a", "b"))):
             box, (width, height) = figure.get_tightbbox(), figure.get_size_inches()
             assert box.x0 > -0.01 and box.y0 > -0.01 and box.x1 < width + 0.01 and box.y1 < height + 0.01
+            assert max(axes.title.get_window_extent().y1 for axes in figure.axes) < height * figure.dpi
+        [axes] = bars.axes
+        assert axes.transData.inverted().transform(axes.get_legend().get_window_extent())[0, 1] > 9
 
 
 def test_fonts_are_embedded_and_the_text_of_svg_can_be_searched(tmp_path: Path) -> None:

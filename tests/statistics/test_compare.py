@@ -489,7 +489,7 @@ def refused(table: dict[str, Any], formula: str, *words: str, options: CompareCo
         ("~ age + older", ("older follows from",)),
         ("~ sex + both", ("follows from",)),
         ("~ sex * nested", ("follows from", "empty group")),
-        ("~ each", ("too many for 37 shapes",)),
+        ("~ each", ("columns for 37 shapes, so that no degrees of freedom are left",)),
         ("~ mixed", ("'mixed' holds numbers but 'old'",)),
         ("~ holes", ("holes of 2 of 37", "--drop-missing")),
     ],
@@ -528,7 +528,7 @@ def test_blocks_that_cannot_be_are_refused() -> None:
     table = people() | {"who": ["anna"] * 37, "pair": [f"p{k // 19}" for k in range(37)]}
     of = {name: CompareConfig(blocks=name, permutations=20, maps=False) for name in ("who", "pair", "nobody")}
     refused(table, "~ sex", "one who", options=of["who"])
-    refused(table, "~ pair", "too many", "between pair", options=of["pair"])
+    refused(table, "~ pair", "1 column between pair", "no degrees of freedom", options=of["pair"])
     refused(table, "~ sex", "'nobody'", options=of["nobody"])
 
 

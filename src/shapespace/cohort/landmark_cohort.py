@@ -15,15 +15,20 @@ from shapespace.geometry.landmark_alignment import AlignConfig, AlignedLandmarks
 from shapespace.geometry.procrustes import Gauge, centroid_size
 from shapespace.io.containers.json_files import read_json
 from shapespace.io.files import make_folder, write_text
-from shapespace.io.landmarks.configuration_io import is_configurations, read_configurations, write_configurations
+from shapespace.io.landmarks.configuration_io import (
+    RECORD,
+    is_configurations,
+    read_configurations,
+    write_configurations,
+)
 from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations
 from shapespace.io.meshes.mesh_io import MESH_ENDINGS, ending_of, stem_of
 from shapespace.io.tables.table_io import read_rows, write_rows
 from shapespace.schemas import AlignRecord, json_text, read
 from shapespace.types import FloatArray
 
-ALIGNED, RECORD, MEAN, ESTIMATED = "aligned.csv", "align.json", "mean.csv", "estimated.csv"
-"""Files of a folder that `align` wrote: coordinates, settings, mean, and the landmarks that are estimates."""
+ALIGNED, MEAN, ESTIMATED = "aligned.csv", "mean.csv", "estimated.csv"
+"""Files of a folder that `align` wrote next to `RECORD`: coordinates, mean, and the landmarks that are estimates."""
 SIZE = "centroid_size"
 """Column of `ALIGNED` with centroid sizes in the unit of the file."""
 _AGAIN = "run shapespace align again"
@@ -172,8 +177,8 @@ def landmark_cohort(cohort: Cohort, onto: Cohort | None = None) -> Cohort:
         return cohort
     if marks is None or not len(marks):
         raise InputError(
-            f"{cohort.table.where}: no landmarks are known on these surfaces; use a model with landmarks, or a folder "
-            "with the landmarks.csv of correspond."
+            f"{cohort.table.where}: no landmarks are known on these surfaces; give the folder that landmarks transfer "
+            "wrote as --shapes, or use a model or a folder of correspond with landmarks.csv."
         )
     coords = np.stack([marks.interpolate(cohort.vertices(k)) for k in range(len(cohort))])
     surface = np.array([centroid_size(cohort.vertices(k)) for k in range(len(cohort))])

@@ -116,14 +116,16 @@ def read_cohort(
     folder = Path(config.shapes) if config.shapes else (data if table is None else data.parent)
     if not folder.is_dir():
         raise InputError(
-            f"{folder} is no folder; give the results of fits, or meshes in correspondence, with --shapes."
+            f"{folder} is neither a folder nor a landmark file; give the results of fits, meshes in correspondence, or "
+            "landmarks with --shapes."
         )
     results = Results(folder) if folder != source or results is None else results
     if len(results):
         return _of_results(results, table, keys, config, onto, on_shape)
     if table is None:
         raise InputError(
-            f"{folder} holds no results of fits; give a CSV table of its meshes, and the folder as --shapes."
+            f"{folder} holds neither results of fits nor landmark files; give a CSV table of its meshes, and the "
+            "folder as --shapes."
         )
     return _of_surfaces(folder, table, keys, config, onto, on_shape)
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from shapespace.cohort.landmark_cohort import RECORD, join_table, write_aligned
+from shapespace.cohort.landmark_cohort import join_table, write_aligned
 from shapespace.cohort.table import Table
 from shapespace.errors import FileFormatError, InputError
 from shapespace.geometry.landmark_alignment import AlignConfig, AlignedLandmarks, align_landmarks, find_outliers
@@ -50,8 +50,6 @@ def align(
         InputError: landmarks that cannot be aligned.
     """
     config = config or AlignConfig()
-    if (data / RECORD).is_file():
-        raise InputError(f"{data} is a folder that align wrote; give the landmark file that it was made from.")
     raw = read_configurations(data, sliders=sliders)
     if separate is not None:
         config = replace(config, structures=_structures(separate))

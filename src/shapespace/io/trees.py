@@ -120,7 +120,8 @@ class Tree:
             )
         notes = list(self.notes)
         if len(kept) < count:
-            notes.append(f"{self.where}: {count - len(kept)} of {count} tips have no shape and are pruned.")
+            verbs = "has no shape and is" if count - len(kept) == 1 else "have no shape and are"
+            notes.append(f"{self.where}: {count - len(kept)} of {count} tips {verbs} pruned.")
         if np.ptp(depths) > _ROUNDED * depths.max():
             notes.append(
                 f"{self.where} is not ultrametric: tips are {depths.min():g} to {depths.max():g} from the root."

@@ -29,6 +29,8 @@ _MILLIMETRES = (".mrk.json", ".fcsv")
 _TPS_KEYS = ("image", "comment")
 """Columns that TPS has keys for."""
 _NAMED = 3  # names in a sentence
+RECORD = "align.json"
+"""File of a folder that `align` wrote, with its settings; its coordinates have been aligned."""
 CURVE_SLIDERS, SURFACE_SLIDERS = "curveslide.csv", "surfslide.csv"
 """Files with the numbers of semilandmarks, from 1, as geomorph reads them: before, slide, after; surface."""
 
@@ -130,6 +132,11 @@ def _read_specimen(path: Path, ending: str) -> LandmarkConfigurations:
 
 def _read_folder(folder: Path) -> LandmarkConfigurations:
     """Return the landmarks in the files of the most frequent ending, in the order of the first file."""
+    if (folder / RECORD).is_file():
+        raise InputError(
+            f"{folder} is a folder that align wrote; give the landmark file that it was made from, or write its shapes "
+            "to a landmark file with shapespace export."
+        )
     endings = (*_TEXTS, *_SINGLE)
     files: dict[str, list[Path]] = {}
     for file in sorted(folder.iterdir()):

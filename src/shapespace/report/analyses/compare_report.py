@@ -39,6 +39,8 @@ from shapespace.types import BoolArray, FloatArray, Mesh
 
 _LARGEST_SHARE = 0.05
 """A morph shows changes exaggerated to about this share of the size."""
+_VECTOR_SHARE = 0.25
+"""The same of vectors of landmarks, which dots of their size would cover."""
 _EXAGGERATIONS = (1, 2, 3, 5, 10, 20, 50)  # factors of a displacement; the largest that stays plausible is taken
 _BINS = 40  # bins of a histogram of thousands of permutations
 _FEWEST_ARRANGEMENTS = 20
@@ -325,7 +327,7 @@ def _term_parts(result: CompareResult) -> Iterator[Part]:
         f = np.log10(np.maximum(test.arrangements, 1e-12))
         counts, edges = np.histogram(f, bins=_BINS)
         yield HistogramPart(
-            title=f"F of {test.term} among its arrangements",
+            title=f"log10 F of {test.term} among its arrangements",
             edges=_floats(edges),
             series=(Counts(counts=_floats(counts), label="arrangements"),),
             x="log10 F",
@@ -440,7 +442,8 @@ def _exaggeration(result: CompareResult, effect: ShapeEffect) -> int:
     cohort = result.cohort
     moved = float(np.linalg.norm((effect.change @ cohort.basis).reshape(-1, 3), axis=1).max()) or 1.0
     size = math.sqrt(float((cohort.reference - cohort.reference.mean(axis=0)).var(axis=0).sum()))
-    return max((one for one in _EXAGGERATIONS if one * moved <= _LARGEST_SHARE * size), default=1)
+    share = _VECTOR_SHARE if cohort.faces is None and cohort.dimensions == 3 else _LARGEST_SHARE
+    return max((one for one in _EXAGGERATIONS if one * moved <= share * size), default=1)
 
 
 def _arrays(result: CompareResult, effect: ShapeEffect) -> Mapping[str, npt.NDArray[Any]]:

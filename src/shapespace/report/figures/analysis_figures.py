@@ -267,7 +267,7 @@ def histogram_figure(
     room = 0.02 * (high - low)
     axes.set(xlim=(low - room, high + room), xlabel=axis_label(x), ylabel="count")
     # Room for the legend above the bars, on the side where the observed value is not.
-    axes.set_ylim(0, axes.get_ylim()[1] * 1.2)
+    axes.set_ylim(0, axes.get_ylim()[1] * 1.3)
     axes.yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
     if any(name for name, _ in series) or (observed is not None and observed_label):
         on_left = observed is not None and 2 * observed > low + high

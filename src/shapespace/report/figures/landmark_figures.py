@@ -204,15 +204,18 @@ def _panels(names: list[str], points: FloatArray, below: float = 0.0, note: str 
     room = 0.04 * float((high - low).max())
     width = (layout.chart_width if columns == 1 else layout.row_width) / columns / DPI
     aspect = float(high[1] - low[1] + 2 * room) / float(high[0] - low[0] + 2 * room)
-    height = min(width * aspect, _MOST_INCHES * layout.scale) + 1.6 * type_size(TEXT) / 72 * any(names)
+    room_of_titles = 1.6 * type_size(TEXT) / 72 * any(names)
+    height = min(width * aspect, _MOST_INCHES * layout.scale) + room_of_titles
     figure, plots = charts("", [(height + below) / layout.scale], note=note, columns=columns)
     left, bottom, right, top = cast(Any, figure).plots_within
-    cast(Any, figure).plots_within = (left, bottom + below / figure.get_figheight(), right, top)
+    # Titles have their own room: `tight_layout` counts them only where equal scales leave none above a panel.
+    inches = figure.get_figheight()
+    cast(Any, figure).plots_within = (left, bottom + below / inches, right, top - room_of_titles / inches)
     for axes, name in zip(plots, names, strict=True):
         axes.set(xlim=(low[0] - room, high[0] + room), ylim=(low[1] - room, high[1] + room), aspect="equal")
         axes.set_axis_off()
         if name:
-            axes.set_title(escaped(name), fontsize=type_size(TEXT), color=INK, pad=3)
+            axes.set_title(escaped(name), fontsize=type_size(TEXT), color=INK, pad=3).set_in_layout(False)
     return figure, plots
 
 

@@ -264,7 +264,9 @@ class StudyParts:
             f"{title}: the surface from several sides, coloured by {part.unit}, {known.min():.3g} to {known.max():.3g}"
             f"{inside}"
         )
-        return [self.drawn((figure, f"Seen from several sides; {part.unit}.", alt), note, chart=False)]
+        return [
+            self.drawn((figure, f"Seen from several sides{part.unit and '; '}{part.unit}.", alt), note, chart=False)
+        ]
 
     def morph(self, part: MorphPart, title: str, note: str) -> list[Block]:
         """Return two shapes between which a slider moves; beside each other where nothing turns."""
