@@ -215,6 +215,17 @@ def test_the_upper_bound_is_the_smallest_margin_that_is_shown() -> None:
         assert p is not None and (p <= 0.05) is shown
 
 
+def test_the_upper_bound_of_equal_means_is_that_of_sampling_alone_or_larger() -> None:
+    noise, small = np.sqrt((0.85 ** (2 * np.arange(10))).sum() * 2 / 10), 0
+    for seed in range(30):
+        found = assess_equivalence(simulated((10, 10), seed=seed), group=GROUP, margin=0.25 * noise, permutations=200)
+        distance = found.statistic("corrected Procrustes distance")
+        small += distance.value == 0.0
+        assert distance.high is not None and distance.high > 0.25 * noise
+        assert found.statistics[0].p is not None and found.statistics[0].p > 0.05
+    assert small >= 10
+
+
 def test_a_margin_in_standard_deviations_and_one_below_the_noise_are_reported() -> None:
     cohort = simulated((200, 150))
     found = assess_equivalence(cohort, group=GROUP, margin_sd=0.5, permutations=50)

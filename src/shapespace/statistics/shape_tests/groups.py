@@ -31,7 +31,7 @@ Priors: TypeAlias = Literal["proportional", "equal"]
 _DRAWS = 2000  # bootstrap samples of a confidence interval; its limits then vary by a few percent of its width
 _MOST_COMPONENTS = 10  # default limit for covariances; Mitteroecker and Bookstein (2009) take few components
 _SHAPES_PER_COMPONENT = 3  # in the smallest group; eigenvalues of fewer are too variable
-_CLEAR_MARGIN = 2.0  # times the distance by sampling alone; the level was 4 to 6 % from there on in simulations
+_CLEAR_MARGIN = 2.0  # times the distance by sampling alone; the level in simulations was lower below it
 _ITERATIONS = 50  # of a spatial median; its error is then far below the standard error
 _BISECTIONS = 55  # halvings of an interval until float64 numbers are equal
 _TINY = 1e-7  # smallest score, in roots of the scatter; a smaller one changes no classification
@@ -266,7 +266,7 @@ def assess_equivalence(
         if limit < _CLEAR_MARGIN * one.noise:
             notes.append(
                 f"{pair}: the margin {limit:.3g} is below {_CLEAR_MARGIN:g} times {one.noise:.3g}, the distance that "
-                "sampling alone gives; the level of the test then depends on the direction of the difference."
+                "sampling alone gives; with so few shapes equivalence within it can hardly be shown."
             )
         step.add()
     columns = ("pair", "Procrustes distance", "corrected distance", "upper 95 % bound", "margin", "p", "equivalent")
@@ -310,13 +310,15 @@ class _MeanDistance:
     def t(self, limit: float, *, relative: bool = False) -> FloatArray:
         """Return the (B,) squared distances less that of a limit by their standard error, the observed one first.
 
-        In the bootstrap samples the means differ by the limit, which is `relative` to the estimated variance or not.
+        In the bootstrap samples the means differ by the limit, which is `relative` to the estimated variance or not. An
+        observed distance below that by sampling alone counts as this, since no sample shows smaller ones.
         """
         # M25
         scale = limit / self.length
         squares = self.errors[0] + 2 * scale * self.errors[1] + (limit**2 * (1 - self.ratio) if relative else 0.0)
         variances = scale**2 * self.spread[0] + 2 * scale * self.spread[1] + self.spread[2]
-        squares[0], variances[0] = self.length**2 - self.noise**2 - limit**2, self.spread[0, 0]
+        squares[0] = self.corrected**2 - limit**2
+        variances[0] = self.spread[0, 0] * max(1.0, self.noise / self.length) ** 2
         return squares / np.sqrt(4 * np.maximum(variances, _SMALLEST))
 
     def upper_bound(self) -> float:
