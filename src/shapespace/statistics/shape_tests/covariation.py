@@ -21,7 +21,7 @@ from shapespace.io.files import read_bytes
 from shapespace.io.read_limits import LARGEST_LANDMARK_FILE_BYTES
 from shapespace.io.tables.table_io import read_rows
 from shapespace.schemas import CurvePart, Series
-from shapespace.statistics.shape_tests.permutations import Orders, permuted
+from shapespace.statistics.shape_tests.permutations import Groups, Orders, permuted
 from shapespace.statistics.shape_tests.shape_test_result import (
     ShapeTestResult,
     Statistic,
@@ -82,7 +82,7 @@ def fit_pls(
         values = permuted(len(cohort), permutations, seed, correlations, progress)
     result = ShapeTestResult(
         name="pls" if columns else "integration", cohort=cohort,
-        statistics=_mean_and_pairs("r-PLS", values, list(blocks), "upper"),
+        statistics=_mean_and_pairs("r-PLS", values, [f"{a} – {b}" for a, b in itertools.combinations(blocks, 2)]),
         settings={"columns": list(columns), "modules": modules and str(modules), "permutations": permutations,
                   "seed": seed},
     )  # fmt: skip
@@ -138,27 +138,27 @@ def estimate_modularity(
     flat = [point for own in points.values() for point in own]
     if len(flat) > _MOST_POINTS:
         raise InputError(f"Modules of {len(flat):,} points are too large; choose {_MOST_POINTS:,} of the vertices.")
-    codes = np.repeat(np.arange(len(points)), [len(own) for own in points.values()])
+    groups = Groups(tuple(points), np.repeat(np.arange(len(points)), [len(own) for own in points.values()]))
     x = _coordinates(cohort, flat)
     # Squared norms of the covariances of two points do not change with the axes; variances on the diagonal do.
     norms = np.zeros((len(flat), len(flat)))
     for a, b in itertools.product(range(x.shape[2]), repeat=2):
         norms += (x[:, :, a].T @ x[:, :, b]) ** 2
     variances = _squared_variances([(x[:, :, a] * x[:, :, b]).sum(axis=0) for a, b in _moments(x)])
-    own = _indicator(codes[None], len(points))
-    ratios = _ratios(own @ norms @ own.transpose(0, 2, 1), _at(own @ variances, _ANGLES))[0].mean(axis=0)
+    own = groups.indicator.T[None]
+    ratios = _ratios(own @ norms @ own.transpose(0, 2, 1), _at(own @ variances, _ANGLES), groups)[0].mean(axis=0)
     if not np.isfinite(ratios).all():
         raise InputError(f"{modules}: the points of a module do not covary, so CR is not defined; give it more points.")
     angle = _ANGLES[[int(np.abs(ratios - ratios.mean()).argmin())]]
     diagonal = _at(variances, angle)
 
     def covariance_ratios(rows: Orders) -> FloatArray:
-        members = _indicator(codes[rows], len(points))
-        return _ratios(members @ norms @ members.transpose(0, 2, 1), members @ diagonal)[:, :, 0]
+        members = groups.labels(rows)
+        return _ratios(members @ norms @ members.transpose(0, 2, 1), members @ diagonal, groups)[:, :, 0]
 
     values = permuted(len(flat), permutations, seed, covariance_ratios, progress)
-    first, *pairs = _mean_and_pairs("CR", values, list(points), "lower")
-    low, high = np.percentile(_bootstrap(x, codes, permutations, seed), _INTERVAL).tolist()
+    first, *pairs = _mean_and_pairs("CR", values, groups.pair_names, "lower")
+    low, high = np.percentile(_bootstrap(x, groups, permutations, seed), _INTERVAL).tolist()
     return ShapeTestResult(
         name="modularity", cohort=cohort, statistics=(replace(first, low=low, high=high), *pairs),
         settings={"modules": str(modules), "rotation_degrees": float(np.degrees(angle[0])),
@@ -179,10 +179,10 @@ def compare_effect_sizes(first: Statistic, second: Statistic) -> Statistic:
 
 
 def _mean_and_pairs(
-    name: str, values: FloatArray, modules: Sequence[str], tail: Literal["upper", "lower"]
+    name: str, values: FloatArray, pairs: Sequence[str], tail: Literal["upper", "lower"] = "upper"
 ) -> list[Statistic]:
     """Return the statistic of the mean of pairs of modules, and those of the pairs if there are several."""
-    each = pair_statistics(name, values.T, [f"{a} – {b}" for a, b in itertools.combinations(modules, 2)], tail)
+    each = pair_statistics(name, values.T, pairs, tail)
     mean = Statistic.of(name, values.mean(axis=1), f"mean of {len(each)} pairs", tail=tail)
     return each if len(each) == 1 else [mean, *each]
 
@@ -286,30 +286,25 @@ def _at(variances: FloatArray, angles: FloatArray) -> FloatArray:
     return variances @ np.stack([np.ones(len(angles)), np.cos(4 * angles), np.sin(4 * angles)])
 
 
-def _indicator(codes: Orders, count: int) -> FloatArray:
-    """Return (b, count, L), 1 where a point of codes (b, L) is of a module."""
-    return (codes[:, None, :] == np.arange(count)[:, None]).astype(np.float64)
-
-
-def _ratios(sums: FloatArray, diagonal: FloatArray) -> FloatArray:
+def _ratios(sums: FloatArray, diagonal: FloatArray, groups: Groups) -> FloatArray:
     """Return CR (b, pairs, A) from sums of squared covariances (b, m, m), and squared variances (b, m, A) (M42)."""
     m = sums.shape[1]
     within = sums[:, range(m), range(m), None] - diagonal
     with np.errstate(divide="ignore", invalid="ignore"):
         made = [np.sqrt(sums[:, a, b, None] / np.sqrt(within[:, a] * within[:, b]))
-                for a, b in itertools.combinations(range(m), 2)]  # fmt: skip
+                for a, b in groups.pairs]  # fmt: skip
     return np.stack(made, axis=1)
 
 
-def _bootstrap(x: FloatArray, codes: Orders, samples: int, seed: int) -> FloatArray:
+def _bootstrap(x: FloatArray, groups: Groups, samples: int, seed: int) -> FloatArray:
     """Return CR (samples,), mean over pairs of modules and rotations, of bootstrap samples of shapes (N, L, D).
 
     Samples are counts of shapes; all sums over the shapes of a sample follow from Gram matrices of the modules.
     """
-    n, m = len(x), int(codes.max()) + 1
+    n, m = len(x), len(groups.names)
     generator = np.random.default_rng([seed, _BOOTSTRAP_STREAM])
     counts = generator.multinomial(n, np.full(n, 1 / n), size=samples).astype(np.float64)
-    blocks = [x[:, codes == k].reshape(n, -1) for k in range(m)]
+    blocks = [x[:, groups.codes == k].reshape(n, -1) for k in range(m)]
     grams = [block @ block.T for block in blocks]
     means = [counts @ gram / n for gram in grams]
     sums = np.empty((samples, m, m))
@@ -319,5 +314,5 @@ def _bootstrap(x: FloatArray, codes: Orders, samples: int, seed: int) -> FloatAr
         sums[:, a, b] = sums[:, b, a] = products + totals  # M43
     centres = [counts @ x[:, :, a] for a in range(x.shape[2])]
     moments = [counts @ (x[:, :, a] * x[:, :, b]) - centres[a] * centres[b] / n for a, b in _moments(x)]
-    diagonal = _at(_indicator(codes[None], m) @ _squared_variances(moments), _BOOTSTRAP_ANGLES)
-    return np.nanmean(_ratios(sums, diagonal), axis=(1, 2))
+    diagonal = _at(groups.indicator.T @ _squared_variances(moments), _BOOTSTRAP_ANGLES)
+    return np.nanmean(_ratios(sums, diagonal, groups), axis=(1, 2))

@@ -13,9 +13,9 @@ import numpy as np
 from shapespace.cohort.cohort import Cohort
 from shapespace.errors import InputError
 from shapespace.statistics.compare_formula import columns_of, design_of
-from shapespace.statistics.compare_strata import span
+from shapespace.statistics.compare_strata import means_of, span
 from shapespace.statistics.dispersion import unequal_variances
-from shapespace.statistics.shape_tests.ordination import discriminant_components, group_means, principal_components
+from shapespace.statistics.shape_tests.ordination import discriminant_components, principal_components
 from shapespace.statistics.shape_tests.permutations import Groups, Orders, orders, permuted
 from shapespace.statistics.shape_tests.shape_test_result import (
     LEVEL,
@@ -332,7 +332,7 @@ class _MeanDistance:
 
 def _mean_distances(coefficients: FloatArray, groups: Groups, drawn: FloatArray) -> list[_MeanDistance]:
     """Return the distances of the means of each pair of groups; `drawn` is (B, N) of `Groups.resamples`."""
-    means, residual, counts = group_means(coefficients, groups), groups.residuals(coefficients), groups.counts
+    means, residual, counts = means_of(coefficients, groups.codes), groups.residuals(coefficients), groups.counts
     shares = drawn[:, None, :] * (groups.indicator / counts).T
     off = (shares.reshape(-1, len(residual)) @ (residual @ residual.T)).reshape(shares.shape)
     variances = shares @ (residual**2).sum(axis=1) - (shares * off).sum(axis=2)

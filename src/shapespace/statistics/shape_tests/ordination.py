@@ -17,6 +17,7 @@ from shapespace.cohort.cohort import Cohort
 from shapespace.errors import InputError
 from shapespace.io.trees import Tree, read_tree
 from shapespace.reprs import short_repr
+from shapespace.statistics.compare_strata import means_of
 from shapespace.statistics.shape_tests.permutations import Groups, Orders
 from shapespace.statistics.shape_tests.phylogenetic import ancestral_states, inverse_root, least_squares
 from shapespace.statistics.tolerances import RANK
@@ -89,7 +90,7 @@ class Ordination:
         if self.groups is None:
             raise InputError("There are no groups, so there is no share of variance between them; give a column.")
         centred = scores - scores.mean(axis=0)
-        means = group_means(centred, self.groups)
+        means = means_of(centred, self.groups.codes)
         return float(self.groups.counts @ (means**2).sum(axis=1) / (centred**2).sum())
 
 
@@ -164,13 +165,8 @@ def principal_components(coefficients: FloatArray) -> tuple[FloatArray, FloatArr
     return centre, _signed(u[:, known] * s[known], vt[known]), s[known] ** 2 / (len(coefficients) - 1)
 
 
-def group_means(values: FloatArray, groups: Groups) -> FloatArray:
-    """Return the (G, K) means of values (N, K)."""
-    return (groups.indicator / groups.counts).T @ values
-
-
 def _between_groups(coefficients: FloatArray, groups: Groups, make: _Make) -> Ordination:
-    means, counts = group_means(coefficients, groups), groups.counts
+    means, counts = means_of(coefficients, groups.codes), groups.counts
     centre, axes, squares = _between_axes(means, counts)
     known = squares > RANK**2 * float(((coefficients - centre) ** 2).sum())
     if not known.any():
@@ -219,7 +215,7 @@ def _canonical(coefficients: FloatArray, groups: Groups, components: int | None,
     used = discriminant_components(coefficients, groups, components)
     centre, all_axes, _ = principal_components(coefficients)
     values = (coefficients - centre) @ all_axes[:used].T
-    residual = values - group_means(values, groups)[groups.codes]
+    residual = values - means_of(values, groups.codes)[groups.codes]
     # M16
     _, s, vt = np.linalg.svd(residual / np.sqrt(n - n_groups), full_matrices=False)
     if s[-1] <= RANK * np.linalg.norm(values):
@@ -228,7 +224,7 @@ def _canonical(coefficients: FloatArray, groups: Groups, components: int | None,
             "each group are equal; take fewer with --components."
         )
     whitened = values @ (vt.T / s)
-    means = group_means(whitened, groups)
+    means = means_of(whitened, groups.codes)
     _, rotation, squares = _between_axes(means, counts)
     rotation = _signed(whitened @ rotation.T, rotation)
     validated, predicted = np.empty((n, len(rotation))), np.empty(n, dtype=np.int32)

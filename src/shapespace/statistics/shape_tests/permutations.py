@@ -10,7 +10,8 @@ import numpy.typing as npt
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.errors import InputError
-from shapespace.step_counter import StepCounter
+from shapespace.statistics.compare_strata import means_of
+from shapespace.step_counter import Progress, StepCounter
 from shapespace.types import FloatArray
 
 _BATCH = 50
@@ -41,7 +42,7 @@ def orders(n: int, permutations: int, seed: int, stream: int = _STREAM) -> Itera
 
 def permuted(
     n: int, permutations: int, seed: int, statistic: Callable[[Orders], FloatArray],
-    progress: Callable[[int, int], None] | None,
+    progress: Progress | None,
 ) -> FloatArray:  # fmt: skip
     """Return the (P, ...) statistics of all `orders`, of which `statistic` takes a batch."""
     step, batches = StepCounter(permutations, progress), list[FloatArray]()
@@ -94,8 +95,7 @@ class Groups:
     def residuals(self, values: FloatArray) -> FloatArray:
         """Return the (N, K) differences of values from group means, with a variance that is free of group size."""
         counts = self.counts[self.codes, None]
-        means = self.indicator.T @ values / self.counts[:, None]
-        return (values - means[self.codes]) * np.sqrt(counts / (counts - 1))
+        return (values - means_of(values, self.codes)[self.codes]) * np.sqrt(counts / (counts - 1))
 
     def resamples(self, draws: int, seed: int) -> FloatArray:
         """Return how often each shape is drawn (draws, N) in bootstrap samples of each group; in the first, once."""

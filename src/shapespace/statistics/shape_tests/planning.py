@@ -16,9 +16,10 @@ from scipy.stats import binomtest, norm
 from shapespace.cohort.cohort import Cohort
 from shapespace.errors import InputError
 from shapespace.schemas import CurvePart, Series
+from shapespace.statistics.compare_strata import means_of
 from shapespace.statistics.effect_size import permutation_p
 from shapespace.statistics.shape_tests.groups import groups_of
-from shapespace.statistics.shape_tests.ordination import group_means, principal_components
+from shapespace.statistics.shape_tests.ordination import principal_components
 from shapespace.statistics.shape_tests.permutations import Groups, Orders, orders
 from shapespace.statistics.shape_tests.shape_test_result import LEVEL, ShapeTestResult, Statistic, table_of
 from shapespace.step_counter import Progress, StepCounter
@@ -61,7 +62,7 @@ def plan_sample_size(
     if not sizes or min(sizes) < 2 or simulations < 1 or permutations < 1 / LEVEL:
         raise InputError("Planning needs sizes of 2 or more, 1 or more simulations and 20 or more permutations.")
     cohort, groups = groups_of(cohort, group, drop_missing, 3, "planning")
-    means, residual = group_means(cohort.coefficients, groups), groups.residuals(cohort.coefficients)
+    means, residual = means_of(cohort.coefficients, groups.codes), groups.residuals(cohort.coefficients)
     variances = np.bincount(groups.codes, (residual**2).sum(axis=1)) / groups.counts
     first, second = np.array(groups.pairs).T
     observed = math.sqrt(((means[first] - means[second]) ** 2).sum(axis=1).mean())
