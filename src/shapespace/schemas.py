@@ -625,6 +625,30 @@ class TablePart(Part, frozen=True, kw_only=True, tag="table"):
     columns: tuple[TableColumn, ...]
     rows: tuple[tuple[Any, ...], ...]
 
+    @staticmethod
+    def of(
+        title: str, columns: Sequence[str], rows: Sequence[tuple[Any, ...]], *, percent: Sequence[str] = (),
+        note: str = "", level: int | None = None,
+    ) -> TablePart:  # fmt: skip
+        """Return a table; the kind of a column is that of its first cell that is not None.
+
+        Args:
+            title: of the table.
+            columns: their names; `p` is the one of p values.
+            rows: of texts, integers, numbers and intervals.
+            percent: columns of shares.
+            note: of the table.
+            level: of the title.
+        """
+        kinds: dict[str, Any] = {"p": "p", **dict.fromkeys(percent, "percent")}
+        types: tuple[tuple[type, Any], ...] = ((str, "text"), (int, "count"), (tuple, "interval"), (object, "number"))
+        made: list[TableColumn] = []
+        for k, name in enumerate(columns):
+            cell = next((row[k] for row in rows if row[k] is not None), 0.0)
+            kind: Any = kinds.get(name) or next(one for own, one in types if isinstance(cell, own))
+            made.append(TableColumn(name=name, kind=kind))
+        return TablePart(title=title, columns=tuple(made), rows=tuple(rows), note=note, level=level)
+
 
 class ConfusionPart(Part, frozen=True, kw_only=True, tag="confusion"):
     """How many scans of each true class (rows) were taken for each class (columns)."""

@@ -266,16 +266,10 @@ def _region_table(change: ChangeResult, test: MapTest) -> Part:
     for k, name in enumerate(change.regions):
         own = volumes[:, k] / unit.mm3
         rows.append((name, float(own.mean()), *interval_of_mean(own), float(test.p[k])))
-    return TablePart(
-        title="Volumes swept",
-        columns=(
-            TableColumn(name="of"),
-            *(TableColumn(name=name, kind="number") for name in (f"mean, {unit.name}", "low", "high")),
-            TableColumn(name="p", kind="p"),
-        ),
-        rows=tuple(rows),
+    return TablePart.of(
+        "Volumes swept", ("of", f"mean, {unit.name}", "low", "high", "p"), rows,
         note="With the 95 % interval of the mean; p with the error over all parts held.",
-    )
+    )  # fmt: skip
 
 
 def _landmark_summary(change: ChangeResult, test: MapTest) -> tuple[Sequence[str], list[list[Any]]]:
@@ -356,14 +350,7 @@ def _noise_parts(change: ChangeResult, arrays: dict[str, npt.NDArray[Any]]) -> l
             "that is "
             f"smaller is noise.{few}",
         ),
-        TablePart(
-            title="Repeatability",
-            columns=(
-                TableColumn(name="of"), TableColumn(name="within-subject stddev", kind="number"),
-                TableColumn(name="smallest detectable change", kind="number"), TableColumn(name="ICC", kind="number"),
-            ),
-            rows=tuple(rows),
-        ),
+        TablePart.of("Repeatability", ("of", "within-subject stddev", "smallest detectable change", "ICC"), rows),
     ]  # fmt: skip
 
 

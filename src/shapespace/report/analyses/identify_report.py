@@ -18,7 +18,7 @@ from shapespace.report.analyses.identity import (
     without_empty,
 )
 from shapespace.report.analyses.shape_data import add_shape_data, model_hashes
-from shapespace.schemas import CurvePart, Part, Series, TableColumn, TablePart, TextPart
+from shapespace.schemas import CurvePart, Part, Series, TablePart, TextPart
 from shapespace.statistics.identity.identify import IdentificationRates, IdentificationResult
 
 
@@ -90,11 +90,8 @@ def _rows(one: IdentificationRates) -> list[Sequence[object]]:
 
 
 def _parts(result: IdentificationResult) -> tuple[Part, ...]:
-    columns = [TableColumn(name="score"), TableColumn(name="first", kind="percent"),
-               TableColumn(name="95 %", kind="interval")]  # fmt: skip
-    for rate in result.scores[0].fnir:
-        columns += [TableColumn(name=f"FNIR at FPIR {rate:g}", kind="percent"),
-                    TableColumn(name="95 %", kind="interval")]  # fmt: skip
+    rates = ["first", *(f"FNIR at FPIR {rate:g}" for rate in result.scores[0].fnir)]
+    columns = ["score", *(name for rate in rates for name in (rate, "95 %"))]
     rows = tuple(
         (score_label(one.name), one.rank_1.value, interval(one.rank_1),
          *(cell for estimate in one.fnir.values() for cell in (estimate.value, interval(estimate))))
@@ -102,12 +99,10 @@ def _parts(result: IdentificationResult) -> tuple[Part, ...]:
     )  # fmt: skip
     ranks = tuple(float(k) for k in range(1, result.enrolled + 1))
     return (
-        TablePart(
-            title="Identification rates",
+        TablePart.of(
+            "Identification rates", columns, rows, percent=rates,
             note="FPIR: searches for people who are not enrolled that return a person. FNIR: searches for "
             "enrolled people that do not return them first and above the threshold.",
-            columns=tuple(columns),
-            rows=rows,
         ),
         CurvePart(
             title="CMC curve",

@@ -12,7 +12,6 @@ from shapespace.schemas import (
     Dispersion,
     Methods,
     Part,
-    TableColumn,
     TablePart,
     TestScheme,
     TextPart,
@@ -208,43 +207,25 @@ def methods_parts(methods: Methods) -> tuple[Part, ...]:
 def _parts(methods: Methods) -> Iterator[Part]:
     yield TextPart(title="Methods", level=2, text=tuple(_sentences(methods)))
     if methods.sizes:
-        yield TablePart(
-            title="Sample sizes",
-            columns=(
-                TableColumn(name="variable"), TableColumn(name="class"), TableColumn(name="subjects", kind="count"),
-                TableColumn(name="shapes", kind="count"),
-            ),
-            rows=tuple(
-                (" × ".join(one.variables), " × ".join(one.classes), one.subjects, one.shapes) for one in methods.sizes
-            ),
-        )  # fmt: skip
+        sizes = [
+            (" × ".join(one.variables), " × ".join(one.classes), one.subjects, one.shapes) for one in methods.sizes
+        ]
+        yield TablePart.of("Sample sizes", ("variable", "class", "subjects", "shapes"), sizes)
     if methods.tests:
-        yield TablePart(
-            title="Tests",
-            columns=(
-                TableColumn(name="tested"), TableColumn(name="stratum"), TableColumn(name="statistic"),
-                TableColumn(name="p by"), TableColumn(name="arrangements", kind="count"),
-            ),
-            rows=tuple(
-                (", ".join(one.tested), one.stratum or "all", one.statistic, scheme_text(one), one.arrangements or None)
-                for one in methods.tests
-            ),
+        yield TablePart.of(
+            "Tests", ("tested", "stratum", "statistic", "p by", "arrangements"),
+            [(", ".join(one.tested), one.stratum or "all", one.statistic, scheme_text(one), one.arrangements or None)
+             for one in methods.tests],
             note="The observed data are one of the arrangements of a permutation or of sign flips.",
         )  # fmt: skip
     if methods.dispersions:
         unit = f", {methods.unit}" if methods.unit else ""
-        yield TablePart(
-            title="Equal dispersion of groups",
-            columns=(
-                TableColumn(name="variable"), TableColumn(name="stratum"), TableColumn(name="class"),
-                TableColumn(name="n", kind="count"), TableColumn(name=f"standard deviation{unit}", kind="number"),
-                TableColumn(name="F", kind="number"), TableColumn(name="p", kind="p"),
-            ),
-            rows=tuple(
-                (one.variable, one.stratum or "all", group, count, stddev, *((one.f, one.p) if not k else (None, None)))
-                for one in methods.dispersions
-                for k, (group, count, stddev) in enumerate(zip(one.groups, one.counts, one.stddev, strict=True))
-            ),
+        yield TablePart.of(
+            "Equal dispersion of groups",
+            ("variable", "stratum", "class", "n", f"standard deviation{unit}", "F", "p"),
+            [(one.variable, one.stratum or "all", group, count, stddev, *((one.f, one.p) if not k else (None, None)))
+             for one in methods.dispersions
+             for k, (group, count, stddev) in enumerate(zip(one.groups, one.counts, one.stddev, strict=True))],
             note="Standard deviations of shapes about the mean of their class, root mean square over vertices; p by "
             "permutation of the distances to the class mean, corrected for the size of the class.",
         )  # fmt: skip

@@ -12,7 +12,7 @@ from shapespace.errors import InputError
 from shapespace.report.analyses.analysis_report import AnalysisReport, Rows
 from shapespace.report.analyses.methods_section import methods_parts
 from shapespace.report.analyses.shape_data import add_shape_data, model_hashes, scree_part
-from shapespace.schemas import ConfusionPart, MorphospacePart, TableColumn, TablePart
+from shapespace.schemas import ConfusionPart, MorphospacePart, TablePart
 from shapespace.statistics.compare_shapes import CompareResult
 from shapespace.statistics.methods import methods_of, sample_sizes
 from shapespace.statistics.shape_tests.ordination import Ordination, OrdinationMethod, ordinate
@@ -179,12 +179,9 @@ def _confusion_parts(result: Ordination) -> Iterator[ConfusionPart]:
 def _eigenvalue_table(result: Ordination) -> TablePart:
     shares = result.explained_variance_ratio
     values = np.stack([result.eigenvalues, shares, shares.cumsum()], axis=1)
-    return TablePart(
-        title="Eigenvalues",
-        columns=(TableColumn(name="axis"), TableColumn(name="eigenvalue", kind="number"),
-                 TableColumn(name="share", kind="percent"), TableColumn(name="cumulative", kind="percent")),
-        rows=tuple((name, *map(float, row)) for name, row in zip(result.names, values, strict=True)),
-    )  # fmt: skip
+    rows = [(name, *map(float, row)) for name, row in zip(result.names, values, strict=True)]
+    columns = ("axis", "eigenvalue", "share", "cumulative")
+    return TablePart.of("Eigenvalues", columns, rows, percent=("share", "cumulative"))
 
 
 def _classes(result: Ordination, codes: npt.NDArray[Any]) -> list[str]:

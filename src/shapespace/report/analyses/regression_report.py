@@ -10,7 +10,7 @@ from shapespace.cohort.cohort import Cohort, subjects_of
 from shapespace.report.analyses.analysis_report import AnalysisReport, LengthFormat, Rows
 from shapespace.report.analyses.methods_section import methods_parts
 from shapespace.report.analyses.shape_data import add_shape_data, model_hashes, shape_change_parts
-from shapespace.schemas import CurvePart, Part, Series, SurfaceMapPart, TableColumn, TablePart, TextPart
+from shapespace.schemas import CurvePart, Part, Series, SurfaceMapPart, TablePart, TextPart
 from shapespace.statistics.methods import methods_of
 from shapespace.statistics.observation_weights import blank_where, weights_of
 from shapespace.statistics.predictor import Predictions, Predictor
@@ -156,8 +156,6 @@ def _observed_target(cohort: Cohort, target: str) -> Any:
 
 def _measures_part(result: RegressionResult) -> TablePart:
     level = f"{100 * result.confidence:.0f} %"
-    numbers = (TableColumn(name=name, kind="number") for name in ("value", "low", "high"))
-    columns = (TableColumn(name="measure"), *numbers)
     rows: list[tuple[object, ...]] = []
     for name, measure in result.measures.items():
         rows.append((_MEASURE_NAMES[name], *(_finite_or_none(v) for v in (measure.value, measure.low, measure.high))))
@@ -165,8 +163,8 @@ def _measures_part(result: RegressionResult) -> TablePart:
             rows.append((f"{_MEASURE_NAMES[name]} of the mean alone", getattr(result, f"baseline_{name}"), None, None))
     if result.p is not None:
         rows.append(("p of R², by permutation", result.p, None, None))
-    return TablePart(
-        title="On subjects left out", columns=columns, rows=tuple(rows),
+    return TablePart.of(
+        "On subjects left out", ("measure", "value", "low", "high"), rows,
         note=f"Nested cross-validation in {result.folds} folds of subjects, each of whom counts once; {level} "
         "intervals by bootstrap of subjects.",
     )  # fmt: skip
@@ -236,10 +234,6 @@ def _prediction_rows(cohort: Cohort, predictions: Predictions) -> Rows:
 
 def _prediction_part(predictor: Predictor, predictions: Predictions) -> Part:
     level = f"{100 * predictor.confidence:.0f} %"
-    columns = (
-        TableColumn(name="scan"), TableColumn(name="predicted", kind="number"), TableColumn(name="low", kind="number"),
-        TableColumn(name="high", kind="number"), TableColumn(name="outside"),
-    )  # fmt: skip
     rows = tuple(
         (
             predictions.names[k],
@@ -252,8 +246,8 @@ def _prediction_part(predictor: Predictor, predictions: Predictions) -> Part:
     )
     if not rows:
         return TextPart(title="New shapes", text="There are none.")
-    return TablePart(
-        title=f"{predictor.target} of new shapes", columns=columns, rows=rows,
+    return TablePart.of(
+        f"{predictor.target} of new shapes", ("scan", "predicted", "low", "high", "outside"), rows,
         note=f"With {level} intervals; all of them stand in new.csv.",
     )  # fmt: skip
 

@@ -19,7 +19,6 @@ from shapespace.schemas import (
     MorphPart,
     Part,
     Series,
-    TableColumn,
     TablePart,
     TextPart,
 )
@@ -234,10 +233,8 @@ def add_shape_data(report: AnalysisReport, cohort: Cohort) -> AnalysisReport:
     )
     if cohort.source.kind == "landmarks":
         title, note = "Estimated landmarks", "Share of the landmarks of a specimen that are estimates, largest first."
-    part = TablePart(
-        title=title,
+    part = TablePart.of(
+        title, ("shape", "estimated"), rows[:_MOST_ROWS], percent=("estimated",),
         note=f"{note} All of them are in {_FILE}.",
-        columns=(TableColumn(name="shape"), TableColumn(name="estimated", kind="percent")),
-        rows=tuple(rows[:_MOST_ROWS]),
-    )
+    )  # fmt: skip
     return replace(report, tables={**report.tables, _FILE: table}, parts=(*report.parts, part))

@@ -10,7 +10,7 @@ import numpy as np
 from shapespace.report.analyses.analysis_report import AnalysisReport, Rows
 from shapespace.report.analyses.methods_section import methods_parts, points_word
 from shapespace.report.analyses.shape_data import add_shape_data, model_hashes
-from shapespace.schemas import Counts, HistogramPart, Part, TableColumn, TablePart
+from shapespace.schemas import Counts, HistogramPart, Part, TablePart
 from shapespace.statistics.shape_tests.shape_test_result import ShapeTestResult, Statistic
 
 _BINS = 40  # bins of a histogram of thousands of permutations
@@ -72,16 +72,9 @@ def _sentence(one: Statistic, level: float) -> str:
 
 
 def _statistics_table(result: ShapeTestResult) -> TablePart:
-    return TablePart(
-        title="Statistics",
-        level=2,
-        note=f"{result.test.statistics[:1].upper()}{result.test.statistics[1:]}.",
-        columns=(
-            TableColumn(name="statistic"), TableColumn(name="tested"), TableColumn(name="value", kind="number"),
-            TableColumn(name="Z", kind="number"), TableColumn(name="p", kind="p"),
-        ),
-        rows=tuple((one.name, one.tested, one.value, one.z, one.p) for one in result.statistics),
-    )  # fmt: skip
+    rows = [(one.name, one.tested, one.value, one.z, one.p) for one in result.statistics]
+    note = f"{result.test.statistics[:1].upper()}{result.test.statistics[1:]}."
+    return TablePart.of("Statistics", ("statistic", "tested", "value", "Z", "p"), rows, note=note, level=2)
 
 
 def _histograms(result: ShapeTestResult) -> Iterator[Part]:

@@ -21,7 +21,7 @@ from shapespace.report.analyses.identity import (
     without_empty,
 )
 from shapespace.report.analyses.shape_data import add_shape_data, model_hashes
-from shapespace.schemas import Counts, CurvePart, HistogramPart, Part, Series, TableColumn, TablePart, TextPart
+from shapespace.schemas import Counts, CurvePart, HistogramPart, Part, Series, TablePart, TextPart
 from shapespace.statistics.identity.verify import FAR, GRID, VerificationRates, VerificationResult
 
 _LEAST_RATE = 1e-4  # lowest false accept rate of the plot, the end of `GRID`
@@ -150,11 +150,8 @@ def _parts(result: VerificationResult) -> tuple[Part, ...]:
 
 
 def _rates_table(result: VerificationResult) -> TablePart:
-    columns = [TableColumn(name="score"), TableColumn(name="EER", kind="percent"),
-               TableColumn(name="95 %", kind="interval")]  # fmt: skip
-    for far in FAR:
-        columns += [TableColumn(name=f"TAR at FAR {far:g}", kind="percent"), TableColumn(name="95 %", kind="interval")]
-    columns += [TableColumn(name="Cllr, bits", kind="number"), TableColumn(name="Cllr-min, bits", kind="number")]
+    rates = ["EER", *(f"TAR at FAR {far:g}" for far in FAR)]
+    columns = ["score", *(name for rate in rates for name in (rate, "95 %")), "Cllr, bits", "Cllr-min, bits"]
     rows: list[tuple[object, ...]] = []
     for one in result.scores:
         figure_cells = [
@@ -163,13 +160,11 @@ def _rates_table(result: VerificationResult) -> TablePart:
             for cell in (rate_estimate.value, interval(rate_estimate))
         ]
         rows.append((score_label(one.name), *figure_cells, one.cllr.value, one.cllr_min))
-    return TablePart(
-        title="Verification rates",
+    return TablePart.of(
+        "Verification rates", columns, rows, percent=rates,
         note="EER: error rate where false rejection and false acceptance are equal. TAR: pairs of one subject "
         "accepted, at a rate FAR of pairs of two accepted. Cllr: what the likelihood ratios miss, 0 to 1 and more.",
-        columns=tuple(columns),
-        rows=tuple(rows),
-    )
+    )  # fmt: skip
 
 
 def _det_curve(result: VerificationResult) -> CurvePart:
@@ -216,11 +211,8 @@ def _roc_curve(result: VerificationResult) -> CurvePart:
 
 
 def _subgroup_table(result: VerificationResult) -> TablePart:
-    columns = [TableColumn(name=result.config.by or ""), TableColumn(name="score"),
-               TableColumn(name="pairs of one", kind="count"), TableColumn(name="pairs of two", kind="count"),
-               TableColumn(name="EER", kind="percent"), TableColumn(name="95 %", kind="interval"),
-               TableColumn(name="TAR at FAR 0.01", kind="percent"),
-               TableColumn(name="95 %", kind="interval")]  # fmt: skip
+    rates = ("EER", "TAR at FAR 0.01")
+    columns = (result.config.by or "", "score", "pairs of one", "pairs of two", rates[0], "95 %", rates[1], "95 %")
     rows = [
         (value, score_label(one.name), part.genuine, part.impostor, part.eer.value, interval(part.eer),
          part.tar[1e-2].value, interval(part.tar[1e-2]))
@@ -228,7 +220,7 @@ def _subgroup_table(result: VerificationResult) -> TablePart:
         for one in result.scores
         for part in (one.by[value],)
     ]  # fmt: skip
-    return TablePart(title=f"By {result.config.by}", columns=tuple(columns), rows=tuple(rows))
+    return TablePart.of(f"By {result.config.by}", columns, rows, percent=rates)
 
 
 def _histogram(one: VerificationRates, result: VerificationResult) -> HistogramPart:

@@ -20,13 +20,12 @@ from shapespace.errors import FileFormatError, InputError
 from shapespace.io.files import read_bytes
 from shapespace.io.read_limits import LARGEST_LANDMARK_FILE_BYTES
 from shapespace.io.tables.table_io import read_rows
-from shapespace.schemas import CurvePart, Series
+from shapespace.schemas import CurvePart, Series, TablePart
 from shapespace.statistics.shape_tests.permutations import Groups, Orders, permuted
 from shapespace.statistics.shape_tests.shape_test_result import (
     ShapeTestResult,
     Statistic,
     pair_statistics,
-    table_of,
 )
 from shapespace.statistics.tolerances import RANK
 from shapespace.step_counter import Progress
@@ -98,11 +97,11 @@ def fit_pls(
     return replace(
         result,
         tables=(
-            table_of("Pairs of axes", ("axis", "singular value", "squared covariance", "r"),
-                     [(k, *map(float, row)) for k, row in enumerate(zip(s, share, r, strict=True), 1)],
-                     percent=("squared covariance",)),
-            table_of("Scores", ("shape", *names),
-                     [(name, *row) for name, row in zip(cohort.names, shown.tolist(), strict=True)]),
+            TablePart.of("Pairs of axes", ("axis", "singular value", "squared covariance", "r"),
+                         [(k, *map(float, row)) for k, row in enumerate(zip(s, share, r, strict=True), 1)],
+                         percent=("squared covariance",)),
+            TablePart.of("Scores", ("shape", *names),
+                         [(name, *row) for name, row in zip(cohort.names, shown.tolist(), strict=True)]),
         ),
         figures=(
             CurvePart(title="Scores of the first pair of axes", x=names[0], y=names[len(names) // 2],

@@ -12,6 +12,7 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.errors import InputError
+from shapespace.schemas import TablePart
 from shapespace.statistics.compare_formula import columns_of, design_of
 from shapespace.statistics.compare_strata import means_of, span
 from shapespace.statistics.dispersion import unequal_variances
@@ -22,7 +23,6 @@ from shapespace.statistics.shape_tests.shape_test_result import (
     ShapeTestResult,
     Statistic,
     pair_statistics,
-    table_of,
 )
 from shapespace.step_counter import Progress, StepCounter
 from shapespace.types import FloatArray
@@ -93,7 +93,7 @@ def compare_disparity(
         statistics=[*_pairs("difference of disparity", groups, differences), *limits],
         settings={"group": list(group), "formula": formula, "partial": partial, "correct_leverage": correct_leverage,
                   "permutations": permutations, "seed": seed},
-        tables=(table_of("Disparity", ("group", "shapes", name, "lower 95 %", "upper 95 %"), rows),),
+        tables=(TablePart.of("Disparity", ("group", "shapes", name, "lower 95 %", "upper 95 %"), rows),),
         reduced_model=tuple(term.label for term in design.terms) if design else (),
     )  # fmt: skip
 
@@ -272,7 +272,7 @@ def assess_equivalence(
     columns = ("pair", "Procrustes distance", "corrected distance", "upper 95 % bound", "margin", "p", "equivalent")
     return ShapeTestResult(
         name="equivalence", cohort=replace(cohort, notes=(*cohort.notes, *notes)), classes=group,
-        statistics=[*tests, *limits], tables=(table_of("Equivalence", columns, rows),),
+        statistics=[*tests, *limits], tables=(TablePart.of("Equivalence", columns, rows),),
         settings={"group": list(group), "margin": margin, "margin_sd": margin_sd, "permutations": permutations,
                   "seed": seed},
         assumptions=(
@@ -440,10 +440,10 @@ def discriminate(
         ],
         settings={"group": list(group), "components": used, "priors": priors, "permutations": permutations,
                   "seed": seed},
-        tables=(table_of("Classification", ("group", *(f"as {name}" for name in groups.names), "correct"), classified,
-                         percent=("correct",),
-                         note=f"Leave-one-out; by chance {np.exp(logs) @ counts / n:.1%} are correct."),
-                table_of("Posterior probabilities", ("shape", "group", "predicted", *groups.names), shapes)),
+        tables=(TablePart.of("Classification", ("group", *(f"as {name}" for name in groups.names), "correct"),
+                             classified, percent=("correct",),
+                             note=f"Leave-one-out; by chance {np.exp(logs) @ counts / n:.1%} are correct."),
+                TablePart.of("Posterior probabilities", ("shape", "group", "predicted", *groups.names), shapes)),
         assumptions=(
             f"Linear discriminants of {used} principal components, which do not depend on the groups; each shape is "
             "classified by components and discriminants of the others. They assume equal covariances of the groups. In "

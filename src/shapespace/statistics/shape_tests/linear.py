@@ -13,7 +13,7 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.errors import InputError
-from shapespace.schemas import CurvePart, Part, Series, SurfaceMapPart
+from shapespace.schemas import CurvePart, Part, Series, SurfaceMapPart, TablePart
 from shapespace.statistics.compare_formula import Design, design_of
 from shapespace.statistics.compare_shapes import CompareConfig, angles_between, complete_cohort, term_tests
 from shapespace.statistics.compare_strata import Stratum, independent_stratum, less, means_of
@@ -24,7 +24,6 @@ from shapespace.statistics.shape_tests.shape_test_result import (
     ShapeTestResult,
     Statistic,
     pair_statistics,
-    table_of,
 )
 from shapespace.step_counter import Progress, StepCounter
 from shapespace.types import FloatArray
@@ -253,9 +252,9 @@ def analyse_allometry(
     titles = ("regression score", "common allometric component", "predicted line")
     rows = list(zip(cohort.names, classes, *(one.tolist() for one in (x, *scores)), strict=True))
     tables = (
-        table_of("Analysis of variance", ("term", "df", "sum of squares", "R²", "F", "Z", "p"),
-                 [(t.term, t.df, t.squares, t.r2, t.f, t.z, t.p) for t in tests], percent=("R²",)),
-        table_of("Allometry scores", ("shape", "group", covariate, *titles), rows),
+        TablePart.of("Analysis of variance", ("term", "df", "sum of squares", "R²", "F", "Z", "p"),
+                     [(t.term, t.df, t.squares, t.r2, t.f, t.z, t.p) for t in tests], percent=("R²",)),
+        TablePart.of("Allometry scores", ("shape", "group", covariate, *titles), rows),
     )  # fmt: skip
     members = [indicator[:, k] > 0 for k in range(len(names))]
     figures = tuple(
@@ -360,7 +359,7 @@ def measure_repeatability(
     return ShapeTestResult(
         name="repeatability", cohort=cohort, statistics=statistics, classes=named[1:], subject=subject,
         settings={"subject": subject, "session": session, "permutations": permutations, "seed": seed},
-        tables=(table_of("Analysis of variance", ("source", "df", "sum of squares", "mean square"), rows),),
+        tables=(TablePart.of("Analysis of variance", ("source", "df", "sum of squares", "mean square"), rows),),
         figures=(SurfaceMapPart(title="Standard deviation of measurement", arrays="measurement_error.npz",
                                 signed=False, unit=cohort.unit),),
         arrays={"measurement_error.npz": {"vertices": cohort.reference, "faces": faces, "values": deviation}},
@@ -491,7 +490,7 @@ def _pairs_result(
     ]  # fmt: skip
     rows = [(one.name, one.tested, one.value, float(np.quantile(one.arrangements, 1 - LEVEL)), one.z, one.p)
             for one in statistics]  # fmt: skip
-    table = table_of("Pairs of groups", ("statistic", "groups", "value", "95 % limit", "Z", "p"), rows)
+    table = TablePart.of("Pairs of groups", ("statistic", "groups", "value", "95 % limit", "Z", "p"), rows)
     return ShapeTestResult(
         name=name, cohort=cohort, statistics=statistics, settings=settings, classes=classes, tables=(table,),
         figures=figures, reduced_model=reduced_model,

@@ -13,12 +13,13 @@ from threadpoolctl import threadpool_limits
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.io.trees import Tree, read_tree
+from shapespace.schemas import TablePart
 from shapespace.statistics.compare_formula import Term, design_of
 from shapespace.statistics.compare_shapes import CompareConfig, SquaresType, complete_cohort, term_tests
 from shapespace.statistics.compare_strata import Stratum, less, refuse_aliased, refuse_few
 from shapespace.statistics.methods import REDUCED_OF_EACH_TERM
 from shapespace.statistics.shape_tests.permutations import Orders, permuted
-from shapespace.statistics.shape_tests.shape_test_result import ShapeTestResult, Statistic, pair_statistics, table_of
+from shapespace.statistics.shape_tests.shape_test_result import ShapeTestResult, Statistic, pair_statistics
 from shapespace.statistics.tolerances import RANK
 from shapespace.step_counter import Progress, StepCounter
 from shapespace.types import FloatArray
@@ -97,8 +98,8 @@ def estimate_phylogenetic_signal(
         k = permuted(n, permutations, seed, ratios, progress)
     by_axis = pair_statistics("K", k.T[1:], [f"principal component {j}" for j in range(1, k.shape[1])])
     rows = [(one.tested, float(own), one.value, one.z, one.p) for one, own in zip(by_axis, share, strict=False)]
-    table = table_of("Phylogenetic signal of principal components", ("component", "variance", "K", "Z", "p"), rows,
-                     percent=("variance",))  # fmt: skip
+    table = TablePart.of("Phylogenetic signal of principal components", ("component", "variance", "K", "Z", "p"), rows,
+                         percent=("variance",))  # fmt: skip
     return ShapeTestResult(
         name="signal", cohort=cohort, statistics=[Statistic.of("K", k[:, 0], "shape")], tables=(table,),
         settings={"tree": tree.where, "permutations": permutations, "seed": seed},
@@ -147,7 +148,7 @@ def fit_pgls(
     rows = [*((one.term, one.df, one.squares, one.r2, one.f, one.z, one.p) for one in tests),
             ("residuals", stratum.df_error, left, left / total, None, None, None),
             ("total", n - 1, total, None, None, None, None)]  # fmt: skip
-    table = table_of("Phylogenetic analysis of variance", ("term", "df", "SS", "R²", "F", "Z", "p"), rows)
+    table = TablePart.of("Phylogenetic analysis of variance", ("term", "df", "SS", "R²", "F", "Z", "p"), rows)
     return ShapeTestResult(
         name="pgls", cohort=cohort, tables=(table,),
         statistics=[Statistic.of("F", one.arrangements, one.term) for one in tests],

@@ -15,13 +15,13 @@ from scipy.stats import binomtest, norm
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.errors import InputError
-from shapespace.schemas import CurvePart, Series
+from shapespace.schemas import CurvePart, Series, TablePart
 from shapespace.statistics.compare_strata import means_of
 from shapespace.statistics.effect_size import permutation_p
 from shapespace.statistics.shape_tests.groups import groups_of
 from shapespace.statistics.shape_tests.ordination import principal_components
 from shapespace.statistics.shape_tests.permutations import Groups, Orders, orders
-from shapespace.statistics.shape_tests.shape_test_result import LEVEL, ShapeTestResult, Statistic, table_of
+from shapespace.statistics.shape_tests.shape_test_result import LEVEL, ShapeTestResult, Statistic
 from shapespace.step_counter import Progress, StepCounter
 from shapespace.types import FloatArray
 
@@ -106,7 +106,7 @@ def plan_sample_size(
         name="power", cohort=replace(cohort, notes=(*cohort.notes, note)), statistics=powers, classes=group,
         settings={"group": list(group), "effect": effect, "distance": distance, "sizes": sorted(set(sizes)),
                   "simulations": simulations, "permutations": permutations, "seed": seed},
-        tables=(table_of("Power", ("shapes per group", *shares), rows, percent=shares),),
+        tables=(TablePart.of("Power", ("shapes per group", *shares), rows, percent=shares),),
         figures=(CurvePart(title="Power by sample size", series=(curve,), x="shapes per group", y="power"),),
         assumptions=(
             f"Power is the share of {simulations} simulated studies whose permutation test of the group means is "

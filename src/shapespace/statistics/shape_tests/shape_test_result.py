@@ -10,7 +10,7 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.reprs import list_briefly, short_repr
-from shapespace.schemas import Methods, Part, TableColumn, TablePart, TestScheme
+from shapespace.schemas import Methods, Part, TablePart, TestScheme
 from shapespace.statistics.analysis_result import AnalysisResult
 from shapespace.statistics.effect_size import EffectSize, effect_size, permutation_p
 from shapespace.statistics.methods import methods_of, sample_sizes
@@ -169,23 +169,3 @@ def pair_statistics(
 ) -> list[Statistic]:
     """Return the statistics of pairs from their arrangements (pairs, P)."""
     return [Statistic.of(name, one, pair, tail=tail) for one, pair in zip(values, pairs, strict=True)]
-
-
-def table_of(
-    title: str, columns: Sequence[str], rows: Sequence[tuple[Any, ...]], *, percent: Sequence[str] = (),
-    note: str = "",
-) -> TablePart:  # fmt: skip
-    """Return a table; the kind of a column is that of its cell in the first row.
-
-    Args:
-        title: of the table.
-        columns: their names; `p` is the one of p values.
-        rows: of texts, integers and numbers.
-        percent: columns of shares.
-        note: of the table.
-    """
-    kinds: dict[str, Any] = {"p": "p", **dict.fromkeys(percent, "percent")}
-    for name, cell in zip(columns, rows[0], strict=True):
-        kinds.setdefault(name, "text" if isinstance(cell, str) else "count" if isinstance(cell, int) else "number")
-    made = tuple(TableColumn(name=name, kind=kinds[name]) for name in columns)
-    return TablePart(title=title, columns=made, rows=tuple(rows), note=note)
