@@ -149,21 +149,22 @@ def _score_text(result: AsymmetryResult, subject: int) -> str:
 
 def _method_sentences(result: AsymmetryResult) -> tuple[str, ...]:
     sides = result.sides
-    if sides.classes:
-        first, second = sides.classes
-        return (
-            f"Each shape of the side {first} is compared with one of the side {second} of the same subject. The means "
-            f"of the two sides lie {100 * sides.off_share:.2f} % of their size from each other.",
-            f"Maps are positive where the side {first} stands further out.",
-        )
     pairs = f"{len(sides)} vertices, {sides.on_the_plane:.0f} of them on the plane" if sides.paired else (
         f"{len(sides)} vertices, each with the place nearest to its mirror image")  # fmt: skip
-    return (
+    measured, maps = (
         f"Every shape is laid on its own mirror image, all of them together; {pairs}. The mean lies "
         f"{100 * sides.off_share:.2f} % of its size from its mirror image. What a shape differs by from its image is "
         "how far its sides are apart; half of it is the asymmetric part of the shape.",
         "Maps are positive where a side stands further out than the other one.",
     )
+    if sides.classes:
+        first, second = sides.classes
+        measured, maps = (
+            f"Each shape of the side {first} is compared with one of the side {second} of the same subject. The means "
+            f"of the two sides lie {100 * sides.off_share:.2f} % of their size from each other.",
+            f"Maps are positive where the side {first} stands further out.",
+        )
+    return (measured,) if sides.faces is None else (measured, maps)
 
 
 def _limitation_notes(result: AsymmetryResult) -> list[str]:
@@ -199,19 +200,15 @@ def _p_text(effect: AnovaRow) -> str:
 def _anova_parts(result: AsymmetryResult) -> tuple[TablePart, ...]:
     lengths = _lengths(result)
     names = (lengths.label("SS", "²"), "df", lengths.label("MS", "²"), "R²", "F", "Z")
-    numbers = (TableColumn(name=name, kind="number") for name in names)
-    columns = (TableColumn(name="source"), *numbers, TableColumn(name="p", kind="p"))
+    columns = ("source", *names, "p")
     note = "df are those of subjects times dimensions."
     observed = "df are those of the observations."
     parts = [("Procrustes ANOVA", result.anova, note if result.degrees_of_freedom == "klingenberg" else observed)]
     if result.size_anova:
         parts.append(("ANOVA of centroid size", result.size_anova, observed))
     return tuple(
-        TablePart(
-            title=title,
-            columns=columns,
-            rows=tuple((e.source, e.ss, e.df, e.ms, e.r2, e.f, e.z, e.p) for e in anova),
-            note=text,
+        TablePart.of(
+            title, columns, [(e.source, e.ss, float(e.df), e.ms, e.r2, e.f, e.z, e.p) for e in anova], note=text
         )
         for title, anova, text in parts
     )
@@ -326,34 +323,19 @@ def _maps_and_morphs(result: AsymmetryResult, order: Any) -> tuple[Mapping[str, 
 
     faces = result.sides.faces
 
-    def morph(title: str, key: str, middle: FloatArray, part: FloatArray, note: str, low: str, high: str) -> None:
+    def add_morph(title: str, key: str, middle: FloatArray, part: FloatArray, note: str, low: str, high: str) -> None:
         most = float(np.linalg.norm(part, axis=1).max())
         wanted = max(1.0, _MORPH_SHARE * rms_size(middle) / most) if most > 0 else 1.0
         flips_at = min(flip_factor(middle, sign * part, faces) for sign in (1.0, -1.0))
         times = factor_to_draw(wanted, flips_at)
         arrays[f"{key}_low"], arrays[f"{key}_high"] = middle - times * part, middle + times * part
-        parts.append(
-            MorphPart(
-                title=title,
-                arrays=_FILE,
-                low=f"{key}_low",
-                high=f"{key}_high",
-                low_label=low,
-                high_label=high,
-                times=times,
-                note=note if times >= 1 else f"{note} {REDUCED_MORPH_NOTE}",
-            )
-        )
+        parts.append(MorphPart(
+            title=title, arrays=_FILE, low=f"{key}_low", high=f"{key}_high", low_label=low, high_label=high,
+            times=times, note=note if times >= 1 else f"{note} {REDUCED_MORPH_NOTE}",
+        ))  # fmt: skip
 
-    morph(
-        title="The asymmetric mean",
-        key="mean",
-        middle=result.mean,
-        part=half_difference,
-        note="From its mirror image to the mean.",
-        low="mirrored",
-        high="mean",
-    )
+    note = "From its mirror image to the mean."
+    add_morph("The asymmetric mean", "mean", result.mean, half_difference, note, low="mirrored", high="mean")
     try:
         pattern, share, _ = first_pattern(result)
     except InputError:
@@ -362,38 +344,18 @@ def _maps_and_morphs(result: AsymmetryResult, order: Any) -> tuple[Mapping[str, 
         note = (
             f"The first pattern, {100 * share:.0f} % of the fluctuating asymmetry; two standard deviations either way."
         )
-        morph(
-            title="What subjects differ by most",
-            key="pattern",
-            middle=result.mean,
-            part=pattern,
-            note=note,
-            low="two one way",
-            high="two the other",
-        )
+        add_morph("What subjects differ by most", "pattern", result.mean, pattern, note, "two one way", "two the other")
     for rank, k in enumerate(subjects, 1):
         name = result.subjects[k]
         hidden = _unobserved(result)
         arrays[f"subject_{rank}_mm"] = blank_where(result.maps[k], None if hidden is None else hidden[k])
-        parts.append(
-            SurfaceMapPart(
-                title=f"{name}: the sides",
-                level=2 if rank == 1 else None,
-                arrays=_FILE,
-                values=f"subject_{rank}_mm",
-                note=f"{_score_text(result, k)}.",
-            )
-        )
+        parts.append(SurfaceMapPart(
+            title=f"{name}: the sides", level=2 if rank == 1 else None, arrays=_FILE, values=f"subject_{rank}_mm",
+            note=f"{_score_text(result, k)}.",
+        ))  # fmt: skip
     k = subjects[0]
-    morph(
-        title=f"{result.subjects[k]} and its mirror image",
-        key="subject",
-        middle=result.symmetric[k],
-        part=result.difference[k] / 2.0,
-        note="The middle is the symmetric part.",
-        low="mirrored",
-        high="as it is",
-    )
+    add_morph(f"{result.subjects[k]} and its mirror image", "subject", result.symmetric[k], result.difference[k] / 2.0,
+              "The middle is the symmetric part.", low="mirrored", high="as it is")  # fmt: skip
     return arrays, parts
 
 
@@ -408,7 +370,7 @@ def _blank_note(result: AsymmetryResult) -> str:
 def _point_table(result: AsymmetryResult) -> TablePart:
     of = {vertex: name for name, vertex in (result.cohort.landmarks or SurfaceLandmarks()).items()}
     columns = (
-        TableColumn(name="point"), _lengths(result).column("directional"), TableColumn(name="p", kind="p"),
+        TableColumn(name="vertex"), _lengths(result).column("directional"), TableColumn(name="p", kind="p"),
         _lengths(result).column("fluctuating"),
     )  # fmt: skip
     rows = tuple(
@@ -416,7 +378,7 @@ def _point_table(result: AsymmetryResult) -> TablePart:
          float(result.fluctuating[k]))
         for k, v in enumerate(result.sides.vertices)
     )  # fmt: skip
-    return TablePart(title="Points", columns=columns, rows=rows, note="p is family-wise.")
+    return TablePart(title="Vertices", columns=columns, rows=rows, note="p is family-wise.")
 
 
 def _meshes(result: AsymmetryResult, order: Any) -> dict[str, Mesh]:
