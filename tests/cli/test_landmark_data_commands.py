@@ -97,6 +97,7 @@ def test_a_check_names_what_is_missing_duplicate_mirrored_swapped_and_in_another
     assert "n0 is an outlier" in facts["findings"][3] and len(facts["findings"]) == 6
     plain = run("landmarks", "check", path)
     assert plain.code == 1 and "missing by specimen: n1 2, n2 1" in plain.out and "n3 is mirrored" in plain.err
+    assert "n7 is 10" in run("align", path, "-o", tmp_path / "aligned").err
 
 
 @pytest.mark.parametrize("dimensions", [2, 3])

@@ -182,6 +182,12 @@ def test_numbers_other_words_numbered_words_and_names_are_no_misspellings(cells:
     assert all(note.startswith("Shapes in each class") for note in notes_on_classes("x", cells))
 
 
+def test_many_classes_are_counted_and_not_listed() -> None:
+    cells = [f"animal {k}" for k in range(20)] * 2
+    assert notes_on_classes("animal", cells) == ["Shapes in each class of animal: 2 in 20 classes."]
+    assert notes_on_classes("animal", cells + cells[:20:2]) == ["Shapes in each class of animal: 2 to 3 in 20 classes."]
+
+
 def test_groups_coded_as_two_numbers_are_counted() -> None:
     assert notes_on_classes("sex", ("0", *"11111", "")) == [
         "Shapes in each class of sex: 1 5, 0 1.",

@@ -164,7 +164,7 @@ def test_long_tables_have_a_row_for_each_landmark(tmp_path: Path) -> None:
     found = read_configurations(write(tmp_path, "a.csv", text))
     assert found.landmarks == ("nose", "chin") and dict(found.columns) == {"sex": ("f", "m")}
     np.testing.assert_array_equal(found.observed, [[True, False], [True, True]])
-    assert [note[:20] for note in found.notes] == ["The column note is l", "1 landmarks without "]
+    assert [note[:20] for note in found.notes] == ["The column note is l", "1 landmark without a"]
 
 
 def test_arrays_of_r_have_factors_and_sliders_beside(tmp_path: Path) -> None:

@@ -305,7 +305,7 @@ def test_landmarks_alone_will_do(thing: Symmetric, tmp_path: Path) -> None:
     assert len(found.sides) == 6 and found.normals is None
     assert "are left out" in found.sides.notes[0]
     answer = analysis_report(found)
-    points = next(p for p in answer.parts if p.title == "Points")
+    points = next(p for p in answer.parts if p.title == "Vertices")
     assert {row[0] for row in points.rows} >= {"left", "right", "chin"}  # type: ignore[attr-defined]
 
 

@@ -42,11 +42,11 @@ def notes_on_classes(column: str, cells: Sequence[str]) -> list[str]:
     has_names = 2 * len(counts) > total
     notes: list[str] = []
     if not has_names:
-        listed = counts.most_common(_LISTED)
-        others_note = f" and {len(counts) - _LISTED} more classes" if len(counts) > _LISTED else ""
-        notes.append(
-            f"Shapes in each class of {column}: {', '.join(f'{name} {n}' for name, n in listed)}{others_note}."
-        )
+        fewest, most = min(counts.values()), max(counts.values())
+        listed = ", ".join(f"{name} {n}" for name, n in counts.most_common())
+        if len(counts) > _LISTED:
+            listed = f"{fewest}{f' to {most}' if most > fewest else ''} in {len(counts)} classes"
+        notes.append(f"Shapes in each class of {column}: {listed}.")
         alone = [name for name, count in counts.items() if count == 1]
         if alone:
             quoted_names = ", ".join(repr(name[:40]) for name in alone[:3]) + (" ..." if len(alone) > 3 else "")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from shapespace.cohort.landmark_cohort import join_table, write_aligned
 from shapespace.cohort.table import Table
+from shapespace.commands.landmark_data import find_other_scales
 from shapespace.errors import FileFormatError, InputError
 from shapespace.geometry.landmark_alignment import AlignConfig, AlignedLandmarks, align_landmarks, find_outliers
 from shapespace.io.files import make_folder, write_text
@@ -75,7 +76,7 @@ def align(
         iterations=aligned.iterations,
         converged=aligned.converged,
         findings=tuple(AlignFinding(**asdict(finding)) for finding in findings),
-        notes=(*aligned.notes, *map(str, findings)),
+        notes=(*aligned.notes, *map(str, findings), *find_other_scales(raw)),
         version=__version__,
     )  # fmt: skip
     write_text(make_folder(folder) / METHODS_FILE, alignment_text(record))

@@ -67,7 +67,7 @@ def check_configurations(data: Path, sliders: Sequence[Path] = ()) -> dict[str, 
     """
     raw = read_configurations(data, sliders=sliders)
     absent = ~raw.observed
-    findings = [*_duplicates(raw), *_other_scales(raw)]
+    findings = [*_duplicates(raw), *find_other_scales(raw)]
     try:
         findings += map(str, find_outliers(align_landmarks(raw))) if len(raw) > 1 else ()
     except InputError as error:
@@ -106,7 +106,8 @@ def _duplicates(raw: LandmarkConfigurations) -> list[str]:
     return findings
 
 
-def _other_scales(raw: LandmarkConfigurations) -> list[str]:
+def find_other_scales(raw: LandmarkConfigurations) -> list[str]:
+    """Return a sentence on each specimen whose size differs so much that its unit or scale is another one."""
     # Root mean squares, which missing landmarks hardly change.
     known = [points[seen] for points, seen in zip(raw.points, raw.observed, strict=True)]
     sizes = np.array([float(np.sqrt(np.var(one - one.mean(axis=0)))) if len(one) > 1 else np.nan for one in known])

@@ -29,6 +29,6 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         show(f"{record.specimens} specimens with {record.landmarks} landmarks ({record.dimensions}-D) are aligned.")
         check = len({finding.specimen for finding in record.findings})
-        show(f"{counted(check, 'specimen')} to check." if check else "No specimens to check.")
+        show(f"{counted(check, 'specimen')} to check." if check else "No outliers, swaps or mirrored specimens.")
         show(f"Results are in {arguments.output}")
     return 0

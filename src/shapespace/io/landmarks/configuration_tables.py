@@ -127,7 +127,8 @@ def _long(header: Sequence[str], rows: Sequence[Sequence[str]], path: Path) -> L
                 notes.append(f"The column {head} is left out, since it differs between the landmarks of a specimen.")
     if absent:
         lacking = [name for name, count in Counter(name for name, _ in pairs).items() if count < len(labels)]
-        notes.append(f"{absent} landmarks without a row are missing ({first_names(lacking, _NAMED)}).")
+        nouns = "landmark without a row is" if absent == 1 else "landmarks without a row are"
+        notes.append(f"{absent} {nouns} missing ({first_names(lacking, _NAMED)}).")
     return LandmarkConfigurations(
         names=names, points=points, landmarks=labels, columns=columns, where=str(path), notes=tuple(notes)
     )
