@@ -80,7 +80,7 @@ class AsymmetryScores:
 
     Args:
         mm: (n,) less measurement error where that is known, which is what two images of a subject differ by.
-        low, high: (n,) its 95 % interval, by repeated shapes and by what fits know of themselves; NaN without either.
+        low, high: (n,) its 95 % interval, by repeated shapes and by the uncertainty of fits; NaN without either.
         raw_mm: (n,) as measured.
         error_mm: what the error alone would be taken for in one shape, RMS; NaN where it is not known.
     """
@@ -112,7 +112,7 @@ class AsymmetryResult(AnalysisResult):
         vertex_scores: over all directions.
         z: (n,) scores in standard deviations of the reference group, a member being compared with the others.
         z_low, z_high: (n,) with the interval of the scores.
-        in_reference: (n,) who is of that group.
+        in_reference: (n,) whether a subject is of that group.
         directional: (M,) mm, mean difference along the normals; its length, for points.
         directional_p: (M,) family-wise, by flipping signs.
         permutations: how many.
@@ -275,13 +275,13 @@ def measure_asymmetry(
         difference -= heights[:, None] * normals
     rng = np.random.default_rng(seed)
 
-    who = _SubjectMeans(codes, counts)
+    subjects = _Subjects(codes, counts)
     along = _along(difference, normals) if normals is not None else difference
-    own, own_difference = who.of(along), who.of(difference)
+    own, own_difference = subjects.means(along), subjects.means(difference)
     asymmetry = own[..., None] * normals if normals is not None else own
     fitted = cohort if side is None else replace(first, fitted=None)
-    scores = _scores(along, who, _shared_error(fitted, sides, mean, asymmetry, who))
-    vertex_scores = _scores(difference, who, _shared_error(fitted, sides, mean, own_difference, who))
+    scores = _scores(along, subjects, _shared_error(fitted, sides, mean, asymmetry, subjects))
+    vertex_scores = _scores(difference, subjects, _shared_error(fitted, sides, mean, own_difference, subjects))
     z, z_low, z_high = _standardised(scores, in_reference)
     steps = _Steps(4 * permutations, progress)
     parts = symmetric, difference
@@ -291,16 +291,16 @@ def measure_asymmetry(
     exchange = _exchanges_sides(sides, degrees_of_freedom)
     if degrees_of_freedom == "klingenberg":
         dimensions = sides.dimensions(scaled=cohort.gauge == "shape")
-        anova = _anova(*parts, who, dimensions, rng, steps, exchange_sides=exchange)
+        anova = _anova(*parts, subjects, dimensions, rng, steps, exchange_sides=exchange)
     else:
-        anova = _pooled_anova(*parts, who, rng, steps, exchange_sides=exchange)
+        anova = _pooled_anova(*parts, subjects, rng, steps, exchange_sides=exchange)
     size_anova: tuple[AnovaRow, ...] = ()
     if side is not None and np.isfinite(cohort.sizes_mm).all():
         one, other = cohort.sizes_mm[: len(first), None], cohort.sizes_mm[len(first) :, None]
         middle, own_rng, own_steps = (one + other) / 2, np.random.default_rng(seed), _Steps(4 * permutations, None)
-        size_anova = _pooled_anova(middle, one - other, who, own_rng, own_steps, exchange_sides=exchange)
+        size_anova = _pooled_anova(middle, one - other, subjects, own_rng, own_steps, exchange_sides=exchange)
     directional = own.mean(axis=0) if normals is not None else np.linalg.norm(own.mean(axis=0), axis=1)
-    observed = None if pairs_observed is None else who.of(pairs_observed.astype(np.float64)) >= _MOSTLY
+    observed = None if pairs_observed is None else subjects.means(pairs_observed.astype(np.float64)) >= _MOSTLY
     weight = None if observed is None else weights_of(observed.mean(axis=0))
     if heights is not None:
         # Signs do not change the weights, so permutations stay exchangeable.
@@ -309,7 +309,7 @@ def measure_asymmetry(
     p = _family_wise(own, rng, steps, weight)
     return AsymmetryResult(
         cohort=cohort, sides=sides, subjects=names, counts=counts, mean=mean, normals=normals,
-        symmetric=who.of(symmetric), difference=own_difference, observed=observed,
+        symmetric=subjects.means(symmetric), difference=own_difference, observed=observed,
         anova=anova, size_anova=size_anova, degrees_of_freedom=degrees_of_freedom,
         scores=scores, vertex_scores=vertex_scores, z=z, z_low=z_low, z_high=z_high, in_reference=in_reference,
         directional=read_only(directional), directional_p=p, permutations=permutations, seed=seed,
@@ -335,20 +335,20 @@ class _Steps(StepCounter):
 
 
 @dataclass(frozen=True, eq=False)
-class _SubjectMeans:
-    """Subjects by number: (N,) whose each shape is, and (n,) how many each has."""
+class _Subjects:
+    """Subjects by number: (N,) the subject of each shape, and (n,) the number of shapes of each."""
 
     codes: npt.NDArray[np.intp]
     counts: npt.NDArray[np.intp]
 
     @property
     def shares(self) -> FloatArray:
-        """(N, n) what each shape adds to the mean of each subject."""
+        """(N, n) weight of each shape in the mean of each subject."""
         out = np.zeros((len(self.codes), len(self.counts)))
         out[np.arange(len(self.codes)), self.codes] = 1.0 / self.counts[self.codes]
         return out
 
-    def of(self, rows: FloatArray) -> FloatArray:
+    def means(self, rows: FloatArray) -> FloatArray:
         """Return the means (n, ...) over the shapes of each subject."""
         if (self.counts == 1).all():
             return rows[np.argsort(self.codes)]
@@ -376,9 +376,10 @@ def _in_reference(
     inside = np.array([cell == value for cell in cohort.table.texts(column)])
     share = np.bincount(codes, weights=inside) / np.bincount(codes)
     if ((share > 0) & (share < 1)).any():
-        torn = names[int(np.flatnonzero((share > 0) & (share < 1))[0])]
-        raise InputError(f"{cohort.table.where}: some shapes of {torn} have {column} {value} and others not; give each "
-                         "subject one.")  # fmt: skip
+        mixed = names[int(np.flatnonzero((share > 0) & (share < 1))[0])]
+        raise InputError(
+            f"{cohort.table.where}: some shapes of {mixed} have {column} {value} and others not; give each subject one."
+        )
     if share.sum() < _FEWEST:
         raise InputError(
             f"{cohort.table.where}: {int(share.sum())} subjects have {column} {value}, and a reference group needs "
@@ -434,21 +435,21 @@ def _along(difference: FloatArray, normals: FloatArray | None) -> FloatArray:
 def _anova(
     symmetric: FloatArray,
     difference: FloatArray,
-    who: _SubjectMeans,
+    subjects: _Subjects,
     dimensions: tuple[float, float],
     rng: np.random.Generator,
     steps: _Steps,
     *,
     exchange_sides: bool,
 ) -> tuple[AnovaRow, ...]:
-    n, rows = len(who.counts), len(who.codes)
+    n, rows = len(subjects.counts), len(subjects.codes)
     flat_s = symmetric.reshape(rows, -1) - symmetric.reshape(rows, -1).mean(axis=0)
     flat_d = difference.reshape(rows, -1)
     mean_d = flat_d.mean(axis=0)
     gram_s, gram_d = flat_s @ flat_s.T, flat_d @ flat_d.T
     off = flat_d - mean_d
     gram_off = off @ off.T
-    between = who.shares @ (who.shares > 0).T
+    between = subjects.shares @ (subjects.shares > 0).T
     # A shape and its image lie half of their difference from the symmetric part, one on either side.
     individual = 2.0 * float((between * gram_s).sum())  # S32
     side = rows * float(mean_d @ mean_d) / 2.0  # S33
@@ -459,11 +460,11 @@ def _anova(
     repeated = rows > n
 
     sums = np.zeros((n, rows))
-    sums[who.codes, np.arange(rows)] = 1.0
+    sums[subjects.codes, np.arange(rows)] = 1.0
     p_side = _p_flipping(sums @ gram_d @ sums.T, 2.0 * rows * (side + both), rng, steps)
     p_both = _p_permuting(gram_off, between, rng, steps) if repeated else _UNTESTED
     if exchange_sides:
-        p_individual = _p_exchanging(who.of(flat_s), who.of(off) / 2.0, who.counts, rng, steps)
+        p_individual = _p_exchanging(subjects.means(flat_s), subjects.means(off) / 2.0, subjects.counts, rng, steps)
     else:
         p_individual = _p_permuting(gram_s, between, rng, steps) if repeated else _UNTESTED
     total = individual + side + both + error_s + error_d
@@ -488,11 +489,11 @@ def _anova(
 
 
 def _pooled_anova(
-    symmetric: FloatArray, difference: FloatArray, who: _SubjectMeans, rng: np.random.Generator, steps: _Steps, *,
+    symmetric: FloatArray, difference: FloatArray, subjects: _Subjects, rng: np.random.Generator, steps: _Steps, *,
     exchange_sides: bool,
 ) -> tuple[AnovaRow, ...]:  # fmt: skip
     """Return an ANOVA of one dimension with the errors of both parts pooled, as geomorph has it."""
-    anova = _anova(symmetric, difference, who, (1.0, 1.0), rng, steps, exchange_sides=exchange_sides)
+    anova = _anova(symmetric, difference, subjects, (1.0, 1.0), rng, steps, exchange_sides=exchange_sides)
     rows, errors = list(anova[:3]), anova[3:]
     if errors:
         ss, df = sum(row.ss for row in errors), sum(row.df for row in errors)
@@ -536,7 +537,7 @@ def _p_flipping(gram: FloatArray, total: float, rng: np.random.Generator, steps:
 
 
 def _p_permuting(gram: FloatArray, between: FloatArray, rng: np.random.Generator, steps: _Steps) -> _Tested:
-    """Test whether subjects differ by dealing out shapes anew; `gram` (N, N) is of centred shapes."""
+    """Test whether subjects differ by permutation of shapes; `gram` (N, N) is of centred shapes."""
 
     def draw(count: int) -> FloatArray:
         orders = [rng.permutation(len(gram)) for _ in range(count)]
@@ -610,9 +611,9 @@ def _family_wise(
 
 
 def _shared_error(
-    cohort: Cohort, sides: Sides, mean: FloatArray, asymmetry: FloatArray, who: _SubjectMeans
+    cohort: Cohort, sides: Sides, mean: FloatArray, asymmetry: FloatArray, subjects: _Subjects
 ) -> FloatArray | None:
-    """Return the variance (n,), mm^2, of the length of asymmetries (n, M, 3) by what their fits know of themselves.
+    """Return the variance (n,), mm^2, of the length of asymmetries (n, M, 3) by the uncertainty of their fits.
 
     All scans of a subject share most of this error, as the model lacks the same of each; None where nothing was fitted.
     """
@@ -627,10 +628,10 @@ def _shared_error(
     unit = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
     # An asymmetric field is minus its own image, so that a mode and its image do the same to it.
     along = 2.0 * scale * unit @ modes.reshape(unit.shape[1], -1)
-    return ((along[who.codes] * fitted.b_stddev) ** 2).sum(axis=1) @ who.shares
+    return ((along[subjects.codes] * fitted.b_stddev) ** 2).sum(axis=1) @ subjects.shares
 
 
-def _scores(fields: FloatArray, who: _SubjectMeans, shared: FloatArray | None) -> AsymmetryScores:
+def _scores(fields: FloatArray, subjects: _Subjects, shared: FloatArray | None) -> AsymmetryScores:
     """Return the RMS over the vertices of the subjects' means of `fields` (N, M) or (N, M, 3), less their error.
 
     The squared length of a mean is that of the truth, and the trace of the error's covariance, and scatters with
@@ -638,23 +639,23 @@ def _scores(fields: FloatArray, who: _SubjectMeans, shared: FloatArray | None) -
     the scans of a subject share, of variance `shared` (n,) along d, widens the interval and is not subtracted.
     """
     vertices, flat = fields.shape[1], fields.reshape(len(fields), -1)
-    own = who.of(flat)
+    own = subjects.means(flat)
     squares = np.einsum("nk,nk->n", own, own)
     raw = np.sqrt(squares / vertices)
     df = len(flat) - len(own)
     trace, squared, along = 0.0, 0.0, np.zeros(len(own))
     if df:
-        off = flat - own[who.codes]
+        off = flat - own[subjects.codes]
         gram = off @ off.T
         trace = float(np.trace(gram)) / df
         # What the sample covariance squared has too much of, with df degrees of freedom (Bai and Saranadasa 1996).
         squared = (float((gram**2).sum()) - df * trace**2) / max((df - 1) * (df + 2), 1)
         squared = max(squared, trace**2 / flat.shape[1])
         along = ((own @ off.T) ** 2).sum(axis=1) / df
-    of_mean, of_mean_squared = trace / who.counts, squared / who.counts**2
+    of_mean, of_mean_squared = trace / subjects.counts, squared / subjects.counts**2
     net = squares - of_mean  # S36
     # A mean lies partly along its own error, which scatters it less than it seems.
-    steep = np.maximum(along / who.counts - of_mean_squared, 0.0) / np.maximum(net, 1e-30)
+    steep = np.maximum(along / subjects.counts - of_mean_squared, 0.0) / np.maximum(net, 1e-30)
     steep = np.where(net > 0, np.minimum(steep, np.sqrt(of_mean_squared)), 0.0)
     steep = steep if shared is None else steep + shared
     normal = NormalDist().inv_cdf(0.5 + LEVEL / 2) ** 2
