@@ -1,4 +1,4 @@
-"""`shapespace asymmetry`: how symmetric are the objects of a cohort?"""
+"""`shapespace asymmetry`: asymmetry of the objects of a cohort."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ import argparse
 from pathlib import Path
 
 from shapespace.cli.answers.common import cohort_of, finish
+from shapespace.cli.options import given
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure the asymmetry of a cohort, and keep the answer."""
+    """Measure the asymmetry of a cohort, and write its report."""
     from shapespace.batch.progress import steps
     from shapespace.cohort.cohort import SUBJECT
     from shapespace.cohort.landmark_cohort import has_landmarks
@@ -29,17 +30,7 @@ def run(arguments: argparse.Namespace) -> int:
     wanted = [name for name in (subject, column, arguments.side) if name]
     cohort = cohort.complete(wanted, drop_missing=arguments.drop_missing)
     pairs = None if arguments.pairs is None else read_pairs(arguments.pairs, cohort)
+    options = given(arguments, measure_asymmetry, pairs=pairs, reference=(column, value) if column else None)
     with steps(None, "permuting", "shape", quiet=arguments.quiet) as step:
-        result = measure_asymmetry(
-            cohort,
-            subject=subject,
-            pairs=pairs,
-            where=str(arguments.pairs),
-            side=arguments.side,
-            degrees_of_freedom=arguments.degrees_of_freedom,
-            reference=(column, value) if column else None,
-            permutations=arguments.permutations,
-            seed=arguments.seed,
-            progress=step,
-        )
+        result = measure_asymmetry(cohort, **options, where=str(arguments.pairs), progress=step)
     return finish(asymmetry_report(result), arguments)
