@@ -129,6 +129,20 @@ def test_specimens_of_a_cohort_that_are_brought_to_its_mean_are_themselves(
     assert np.allclose(again.sizes_mm, cohort.sizes_mm[3:5])
 
 
+def test_landmarks_are_compared_by_their_names_in_any_order(tmp_path: Path) -> None:
+    names, given = tuple("abcdefgh"), configurations()
+    for file, order, named in (("known", names, names), ("new", names[::-1], names[::-1]), ("z", names, "zbcdefgh")):
+        rows = [names.index(name) for name in order]
+        changed = replace(given, points=given.points[:, rows], landmarks=tuple(named))
+        write_configurations(tmp_path / f"{file}.csv", changed)
+    cohort = read_cohort(tmp_path / "known.csv")
+    again = read_cohort(tmp_path / "new.csv", onto=cohort)
+    expected = read_cohort(tmp_path / "known.csv", onto=cohort)
+    np.testing.assert_allclose(again.coefficients, expected.coefficients, atol=1e-12)
+    with pytest.raises(InputError, match=r"not those of the shapes to compare with \(a, z\)"):
+        read_cohort(tmp_path / "z.csv", onto=cohort)
+
+
 def test_landmarks_of_surfaces_are_a_cohort_beside_that_of_the_surfaces(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     base = 50 * rng.normal(size=(40, 3))

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from shapespace.cohort.cohort import Cohort, padded
-from shapespace.cohort.table import Table, note_unmatched, numbers_as_text, read_table
+from shapespace.cohort.table import Table, list_names, note_unmatched, numbers_as_text, read_table
 from shapespace.errors import FileFormatError, InputError
 from shapespace.geometry.landmark_alignment import AlignConfig, AlignedLandmarks, align_landmarks
 from shapespace.geometry.procrustes import Gauge, centroid_size
@@ -132,11 +132,11 @@ def read_landmark_cohort(
     if isinstance(source, AlignedLandmarks):
         if onto is not None:
             coords = np.where(source.estimated[..., None], np.nan, source.forms)[rows]
-            return _onto(coords, covariates, onto, notes, source.sizes[rows])
+            return _onto(coords, source.landmarks, covariates, onto, notes, source.sizes[rows])
         cohort = Cohort.of_landmarks(source, gauge=gauge).take(rows)
         return replace(cohort, table=covariates, notes=(*notes, *cohort.notes))
     if onto is not None:
-        return _onto(source.points[rows], covariates, onto, [*source.notes, *notes])
+        return _onto(source.points[rows], source.landmarks, covariates, onto, [*source.notes, *notes])
     raw = replace(source, names=covariates.rows, points=source.points[rows], columns={})
     cohort = Cohort.of_landmarks(align_landmarks(raw, AlignConfig(gauge=gauge)), covariates)
     note = "The landmarks are aligned by generalised Procrustes analysis with default options."
@@ -144,13 +144,23 @@ def read_landmark_cohort(
 
 
 def _onto(
-    coords: FloatArray, table: Table, onto: Cohort, notes: Sequence[str], sizes: FloatArray | None = None
-) -> Cohort:
-    """Return the cohort of landmarks (N, L, D) in the pose and gauge of the mean of another."""
+    coords: FloatArray, landmarks: Sequence[str], table: Table, onto: Cohort, notes: Sequence[str],
+    sizes: FloatArray | None = None,
+) -> Cohort:  # fmt: skip
+    """Return the cohort of landmarks (N, L, D), of any order if they have names, in the pose of the mean of another."""
     if coords.shape[2] != onto.dimensions:
         raise InputError(
             f"{table.where}: {coords.shape[2]}-D landmarks cannot be compared with {onto.dimensions}-D ones."
         )
+    known = () if onto.landmarks is None else onto.landmarks.names
+    numbers = set(map(str, range(1, len(landmarks) + 1)))
+    if known and numbers not in (set(known), set(landmarks)):
+        if other := sorted({*known} ^ {*landmarks}):
+            raise InputError(
+                f"{table.where}: the landmarks are not those of the shapes to compare with ({list_names(other)}); give "
+                "both the same landmarks."
+            )
+        coords = coords[:, [list(landmarks).index(name) for name in known]]
     cohort = Cohort.of_shapes(padded(coords), {}, names=table.rows, onto=onto, unit=onto.unit)
     return replace(
         cohort,
@@ -185,7 +195,7 @@ def landmark_cohort(cohort: Cohort, onto: Cohort | None = None) -> Cohort:
     scale = np.where(np.isfinite(cohort.sizes_mm), cohort.sizes_mm / surface, 1.0)
     coords = coords * scale[:, None, None]
     if onto is not None:
-        return _onto(coords, cohort.table, onto, cohort.notes)
+        return _onto(coords, marks.names, cohort.table, onto, cohort.notes)
     names = tuple(marks.names)
     configurations = LandmarkConfigurations(
         names=cohort.names, points=coords, landmarks=names, unit=cohort.unit, where=cohort.table.where
