@@ -47,7 +47,7 @@ def test_tps_has_points_by_number_without_those_that_are_missing(write):
     ("text", "said"),
     [
         (TPS + TPS, "2 specimens"), ("LM=1\n1 2\nID=a\n", "two dimensions"), (TPS.replace("LM3=3", "LM3=4"), "3 rows"),
-        ("ID=a\n", "no LM3="),
+        ("ID=a\n", "does not begin with LM= or LM3="),
     ],
 )  # fmt: skip
 def test_other_tps_is_refused(text: str, said: str, write):

@@ -12,6 +12,7 @@ import numpy as np
 
 from shapespace.errors import InputError
 from shapespace.io.files import make_folder, write_text
+from shapespace.io.landmarks.tps_nts import tps_text
 from shapespace.io.tables.table_io import write_rows
 from shapespace.types import FloatArray
 
@@ -70,15 +71,11 @@ def write_skull_landmarks(folder: Path, *, count: int, seed: int = 0) -> Path:
     if not 8 <= count <= _MOST:
         raise InputError(f"The number of skulls must be between 8 and {_MOST}, not {count}.")
     make_folder(folder)
-    blocks: list[str] = []
-    rows: list[tuple[str, str, str]] = []
-    for k in range(count):
-        points, mm_per_pixel = skull_landmarks(seed, k)
-        name = f"skull_{k:03d}"
-        lines = [f"{x!r} {y!r}" for x, y in points.tolist()]
-        blocks.append("\n".join([f"LM={len(points)}", *lines, f"ID={name}", f"SCALE={mm_per_pixel!r}"]))
-        rows.append((name, SPECIES[k % 2], SITES[k // 2 % 2]))
-    write_text(folder / LANDMARKS_FILE, "\n".join(blocks) + "\n")
+    names = [f"skull_{k:03d}" for k in range(count)]
+    points, mm_per_pixel = zip(*(skull_landmarks(seed, k) for k in range(count)), strict=True)
+    text = tps_text(dict(zip(names, points, strict=True)), {"SCALE": list(map(repr, mm_per_pixel))})
+    write_text(folder / LANDMARKS_FILE, text)
+    rows = [(name, SPECIES[k % 2], SITES[k // 2 % 2]) for k, name in enumerate(names)]
     write_rows(folder / TABLE, ("specimen", "species", "site"), rows)
     write_rows(folder / LINKS, ("from", "to"), _LINKS)
     return folder

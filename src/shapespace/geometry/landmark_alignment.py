@@ -8,7 +8,7 @@ docs/morphometrics.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
@@ -145,17 +145,6 @@ class AlignedLandmarks:
             along = np.sqrt(np.maximum(1.0 - (away**2).sum(axis=(1, 2)), 0.0))
             coords = away + along[:, None, None] * self.mean
         return coords * self.sizes[:, None, None]
-
-    def take(self, rows: Sequence[int]) -> AlignedLandmarks:
-        """Return some specimens, in their order, in the same alignment."""
-        return replace(
-            self,
-            names=tuple(self.names[row] for row in rows),
-            coords=self.coords[list(rows)],
-            sizes=self.sizes[list(rows)],
-            estimated=self.estimated[list(rows)],
-            columns={name: tuple(cells[row] for row in rows) for name, cells in self.columns.items()},
-        )
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import RBFInterpolator
 from scipy.spatial.distance import cdist, pdist
 
 from shapespace.errors import InputError
@@ -17,26 +18,21 @@ from shapespace.types import FloatArray, read_only
 _RANK = 1e-9  # ratio of singular values; landmarks nearer to a line or a plane than rounding determine no affine map
 _SAME = 1e-12  # of the size; landmarks nearer to each other coincide up to float64 rounding
 _PSEUDO = 1.5e-8  # of the largest singular value; smaller ones of a singular system are 0: the root of float64 rounding
-_ROWS = 2**22  # kernel values in memory at once, 32 MiB
 
 
 @dataclass(frozen=True, eq=False)
 class ThinPlateSpline:
-    """The map of least bending energy that takes L source landmarks to their targets.
+    """The map of least bending energy that takes L source landmarks (L, D) to their targets (L, E), with D 2 or 3.
 
     Args:
-        source: (L, D) with D 2 or 3, centred and of unit centroid size, for accuracy.
-        centre: (D,) that was subtracted.
-        size: centroid size that was divided out.
-        weights: (L, E) of the kernel at each landmark.
-        affine: (D + 1, E) a constant, and a row for each axis of `source`.
+        centre: (D,) of the source landmarks.
+        size: centroid size of the source landmarks; the interpolator has them centred and of unit size, for accuracy.
+        interpolator: of scipy, from these to the targets.
     """
 
-    source: FloatArray
     centre: FloatArray
     size: float
-    weights: FloatArray
-    affine: FloatArray
+    interpolator: RBFInterpolator
 
     @staticmethod
     def fit(source: FloatArray, target: FloatArray) -> ThinPlateSpline:
@@ -54,19 +50,12 @@ class ThinPlateSpline:
             raise InputError(
                 f"A thin-plate spline needs {D + 1} or more different landmarks that do not lie on {place}."
             )
-        solution = np.linalg.solve(_system(x), np.vstack([target, np.zeros((D + 1, target.shape[1]))]))  # M8
-        return ThinPlateSpline(
-            read_only(x), read_only(centre), size, read_only(solution[: len(x)]), read_only(solution[len(x) :])
-        )
+        kernel = "linear" if D == 3 else "thin_plate_spline"
+        return ThinPlateSpline(read_only(centre), size, RBFInterpolator(x, target, kernel=kernel, degree=1))  # M8
 
     def apply(self, points: FloatArray) -> FloatArray:
         """Return the (M, E) places to which the spline maps points (M, D)."""
-        x = (points - self.centre) / self.size
-        out = self.affine[0] + x @ self.affine[1:]
-        step = max(1, _ROWS // len(self.source))
-        for start in range(0, len(x), step):
-            out[start : start + step] += _kernel(x[start : start + step], self.source) @ self.weights
-        return out
+        return np.asarray(self.interpolator((points - self.centre) / self.size), dtype=np.float64)
 
 
 def bending_energy_matrix(reference: FloatArray) -> FloatArray:
@@ -75,22 +64,12 @@ def bending_energy_matrix(reference: FloatArray) -> FloatArray:
     It is zero for affine maps. Landmarks that coincide have the same place in all maps.
     """
     size = max(float(np.linalg.norm(reference - reference.mean(axis=0))), 1e-300)
-    system = _system(reference)
-    L = len(reference)
+    L, D = reference.shape
+    r = cdist(reference, reference)
+    system = np.zeros((L + D + 1, L + D + 1))
+    system[:L, :L] = -r if D == 3 else r**2 * np.log(np.where(r > 0, r, 1.0))
+    system[:L, L], system[:L, L + 1 :] = 1.0, reference
+    system[L:, :L] = system[:L, L:].T
     if pdist(reference).min(initial=np.inf) < _SAME * size:
         return np.asarray(np.linalg.pinv(system, rcond=_PSEUDO, hermitian=True)[:L, :L], dtype=np.float64)
     return np.asarray(np.linalg.inv(system)[:L, :L], dtype=np.float64)  # M5
-
-
-def _kernel(points: FloatArray, source: FloatArray) -> FloatArray:
-    r = cdist(points, source)
-    return -r if source.shape[1] == 3 else r**2 * np.log(np.where(r > 0, r, 1.0))
-
-
-def _system(x: FloatArray) -> FloatArray:
-    L, D = x.shape
-    system = np.zeros((L + D + 1, L + D + 1))
-    system[:L, :L] = _kernel(x, x)
-    system[:L, L], system[:L, L + 1 :] = 1.0, x
-    system[L:, :L] = system[:L, L:].T
-    return system

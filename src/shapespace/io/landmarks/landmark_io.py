@@ -16,6 +16,7 @@ import numpy as np
 
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.files import read_bytes, write_text
+from shapespace.io.landmarks.tps_nts import tps_specimens
 from shapespace.io.parsing import damage_error, is_number, json_value, xml_root
 from shapespace.io.read_limits import LARGEST_LANDMARK_FILE_BYTES
 from shapespace.io.tables.table_io import MISSING, rows_text, unescape_formula
@@ -532,26 +533,14 @@ def fcsv_text(landmarks: Mapping[str, FloatArray], descriptions: Mapping[str, st
 
 
 def _read_tps(data: bytes, path: Path) -> Pairs:
-    lines = [line for line in _text_lines(data) if line]
-    heads = [re.fullmatch(r"LM(3?)\s*=\s*(\d{1,6})", line, re.IGNORECASE) for line in lines]
-    starts = [row for row, head in enumerate(heads) if head]
-    if len(starts) != 1:
-        problem = f"it has {len(starts)} specimens, so save each in a file of its own" if starts else "it has no LM3="
-        raise damage_error(path, problem)
-    head = heads[starts[0]]
-    if head is None or not head[1]:
+    specimens = list(tps_specimens(data.decode("utf-8-sig", "replace"), path))
+    if len(specimens) != 1:
+        raise damage_error(path, f"it has {len(specimens)} specimens, so save each in a file of its own")
+    [(parts, _)] = specimens
+    if any(len(row) == 2 for row in parts[0]):
         raise damage_error(path, "its landmarks are of two dimensions (LM=), and those of a surface have three (LM3=)")
-    body = lines[starts[0] + 1 :]
-    points = [line for line in body if "=" not in line]
-    if len(points) != int(head[2]):
-        raise damage_error(
-            path, f"it says {head[2]} landmarks, but {len(points)} rows follow; it is damaged or cut short"
-        )
-    return [
-        # NA is the value of geomorph and of tps programs.
-        (f"point_{i}", None if "NA" in line.upper().split() else _point(line.split(), f"point_{i}", path))
-        for i, line in enumerate(points)
-    ]
+    rows = [row for part in parts for row in part]
+    return [(f"point_{i}", None if np.isnan(p).any() else _point(p, f"point_{i}", path)) for i, p in enumerate(rows)]
 
 
 def _read_tlms(data: bytes, path: Path) -> Pairs:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise, takewhile
 from pathlib import Path
@@ -49,11 +49,7 @@ def parse_tps(text: str, path: Path) -> LandmarkConfigurations:
     The inner points of a curve slide between their neighbours. SCALE= is applied if all specimens have it, as in
     geomorph. IMAGE=, COMMENT= and other keys become columns. Outlines are left out.
     """
-    lines = "\n".join(line.strip() for line in text.splitlines() if line.strip())
-    start, *blocks = re.split(r"^(?=LM3?\s*=)", lines, flags=re.IGNORECASE | re.MULTILINE)
-    if start or not blocks:
-        raise damage_error(path, "it is no TPS file, since it does not begin with LM= or LM3=")
-    parts, values = zip(*(_specimen(block, number, path) for number, block in enumerate(blocks, 1)), strict=True)
+    parts, values = zip(*tps_specimens(text, path), strict=True)
     names = tuple(
         one.get("id") or re.sub(r"\.\w{1,5}$", "", one.get("image", "")) or f"specimen {k}"
         for k, one in enumerate(values, 1)
@@ -96,8 +92,17 @@ def parse_tps(text: str, path: Path) -> LandmarkConfigurations:
     return replace(raw, points=raw.points * scales[:, None, None])
 
 
+def tps_specimens(text: str, path: Path) -> Iterator[tuple[list[list[list[float]]], dict[str, str]]]:
+    """Yield the rows of coordinates of the landmarks and of each curve of a specimen, and the values of other keys."""
+    lines = "\n".join(line.strip() for line in text.splitlines() if line.strip())
+    start, *blocks = re.split(r"^(?=LM3?\s*=)", lines, flags=re.IGNORECASE | re.MULTILINE)
+    if start or not blocks:
+        raise damage_error(path, "it is no TPS file, since it does not begin with LM= or LM3=")
+    for number, block in enumerate(blocks, 1):
+        yield _specimen(block, number, path)
+
+
 def _specimen(block: str, number: int, path: Path) -> tuple[list[list[list[float]]], dict[str, str]]:
-    """Return the rows of coordinates of the landmarks and of each curve of a specimen, and the values of other keys."""
     lines, parts, values = block.splitlines(), list[list[list[float]]](), dict[str, str]()
     at, is_outline = 0, False
     while at < len(lines):
