@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from shapespace.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from shapespace.fit.completion.complete import Completion, CompletionConfig, QuantityEstimate, complete
     from shapespace.fit.diagnostics.evidence import FitEvidence
     from shapespace.fit.diagnostics.failure_model import ErrorEstimate
     from shapespace.fit.diagnostics.reasons import Reason, ReasonCode
@@ -19,21 +20,26 @@ if TYPE_CHECKING:
     from shapespace.fit.search.second_instance import SecondInstance
 
 __all__ = [
+    "Completion",
+    "CompletionConfig",
     "ErrorEstimate",
     "FitConfig",
     "FitEvidence",
     "FitResult",
     "OverlapDistances",
     "Paper",
+    "QuantityEstimate",
     "Reason",
     "ReasonCode",
     "Robust",
     "SecondInstance",
     "Stage",
+    "complete",
 ]
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
+        "fit.completion.complete": ("Completion", "CompletionConfig", "QuantityEstimate", "complete"),
         "fit.diagnostics.evidence": ("FitEvidence",),
         "fit.diagnostics.failure_model": ("ErrorEstimate",),
         "fit.diagnostics.reasons": ("Reason", "ReasonCode"),

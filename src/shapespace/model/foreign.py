@@ -103,6 +103,7 @@ def load_foreign(path: Path, mm: float | None = None, expressions: Path | None =
         "held_out": linear.held_out,
         "residuals": None,
         "regions": {},
+        "is_n_training_known": linear.n_training is not None,
     }
     return Foreign(fields, rotation, n_identity, model_format.title, tuple(notes))
 

@@ -49,6 +49,7 @@ class _FileAttributes(Struct, frozen=True):
     provenance: str
     licence: str
     variance_divisor: str = ""
+    n_training_known: bool = True
     regions: str = "{}"
 
 
@@ -70,6 +71,7 @@ class ModelFields(TypedDict):
     held_out: bool
     residuals: FloatArray | None
     regions: Mapping[str, IntArray]
+    is_n_training_known: bool
 
 
 def hash_of(model: ModelFields) -> str:
@@ -86,6 +88,8 @@ def save(
     """Write `model`, and what a larger model adds to it, to `path`, whole or not at all."""
     arrays, attributes = _contents(model)
     made_by: dict[str, Attribute] = {"model_hash": hash_of(model), "software_version": __version__}
+    if not model["is_n_training_known"]:  # no part of the hash, which files of earlier versions have without it
+        made_by["n_training_known"] = False
     write_hdf5(path, {**arrays, **(more_arrays or {})}, {**attributes, **(more_attributes or {}), **made_by})
 
 
@@ -188,6 +192,7 @@ def load(path: Path) -> ModelFields:
             "held_out": attributes_of_file.variance_divisor == _HELD_OUT,
             "residuals": owned.get(_RESIDUALS),
             "regions": _regions(attributes_of_file.regions, owned.get(_REGIONS)),
+            "is_n_training_known": attributes_of_file.n_training_known,
         }
     except (KeyError, ValueError) as error:
         reason = str(error)[:_LONGEST_DETAIL].replace("`", "").replace("Object missing", "missing")

@@ -96,5 +96,6 @@ def _part(full: ShapeModel, region: str | tuple[int, ...]) -> Part:
         gauge=full.gauge,
         landmarks=full.landmarks.renumbered(inside),
         held_out=full.held_out,
+        is_n_training_known=full.is_n_training_known,
     )
     return Part(model, inside, lift[significant].T)

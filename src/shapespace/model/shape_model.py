@@ -69,6 +69,8 @@ class ShapeModel:
         residuals: (K,) mm^2, |C v - lambda v| of each mode where it was found by passes over the shapes (PCA beyond
             memory); None where the modes are exact to rounding.
         regions: name -> (n,) int32, the vertices of a part of the surface that a fit can be held to.
+        is_n_training_known: False of a model of another tool whose file does not state the number of training shapes,
+            such as a Gaussian process; `n_training` is then K + 1.
         left_out: how many modes were found and not kept, since alignment or rounding made them; no file holds it.
 
     Raises:
@@ -90,6 +92,7 @@ class ShapeModel:
     held_out: bool = False
     residuals: FloatArray | None = None
     left_out: int = 0
+    is_n_training_known: bool = True
     regions: Mapping[str, IntArray] = field(default_factory=lambda: dict[str, IntArray]())
 
     __repr__ = short_repr

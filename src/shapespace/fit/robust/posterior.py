@@ -26,7 +26,7 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, SurfaceLandmarks
 
 # Chosen on the split "dev" of `benchmarks/calibration.py`, so that 68 % and 95 % of the truth lie where they should.
-_NOISE_TEMPERATURE = 1.7
+NOISE_TEMPERATURE = 1.7
 # independent patches of a completely observed surface, as neighbouring residuals are correlated (R20a)
 _PATCHES = 300.0
 _FEWEST_PATCHES = 100.0
@@ -100,7 +100,7 @@ def posterior(
 
     def covariance(patches: float) -> FloatArray:
         # What the model lacks is shared by all matches of a patch, and noise nearly independent from match to match.
-        temperature = _NOISE_TEMPERATURE + matches / patches * (beyond_model_mm / sigma_mm) ** 2  # R20
+        temperature = NOISE_TEMPERATURE + matches / patches * (beyond_model_mm / sigma_mm) ** 2  # R20
         scaled = H / temperature * np.outer(unit, unit)
         if equations.H_landmarks is not None:
             # Weighed up in a step by what matches are worth, they are what they are beside tempered ones.

@@ -71,6 +71,8 @@ _OTHER_TURN = math.cos(math.radians(40.0))  # alternatives to report differ by 4
 _CLEARLY_CLOSE, _CLEARLY_BETTER = 0.45, 0.75
 _SURE = 0.85  # score relative to the runner-up below which no more iterations are run
 _CLEARLY_WORSE, _WORTH = 0.93, 0.05  # how much worse an upright pose may score: ratio to the best, or share of the cap
+_PARTIAL, _PARTS = 0.7, 6
+"""A scan with less than this share of the model's area is also placed at so many parts of the model."""
 _MORE_ROUNDS = 3  # repetitions of the last step for ambiguous poses
 
 
@@ -282,13 +284,18 @@ class _Sides:
         return _distinct([first, *ranked], LONG.n_poses, _OTHER_TURN)
 
     def _placed(self, rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return two poses for each of `rotations` (N, 3, 3): centres together, and the model's front at the scan's."""
-        centre, towards = self.scan.mean(axis=0), rotations @ self.model.outward
-        translation = centre - rotations @ self.model.points.mean(axis=0)
+        """Return poses for each of `rotations` (N, 3, 3): centres together, and the model's front at the scan's.
+
+        The centre of a scan that shows a part of the model is also placed at those of parts all over the model.
+        """
+        centre, towards, points = self.scan.mean(axis=0), rotations @ self.model.outward, self.model.points
+        translation = centre - rotations @ points.mean(axis=0)
         front_offset = np.quantile((self.scan[:1000] - centre) @ towards.T, 0.95, axis=0) - self.model.front
-        return np.concatenate([rotations, rotations]), np.concatenate(
-            [translation, translation + front_offset[:, None] * towards]
-        )
+        translations = [translation, translation + front_offset[:, None] * towards]
+        share = len(self.scan) / len(points) * (_SCAN_CELL / _MODEL_CELL) ** 2
+        if share < _PARTIAL:
+            translations += [centre - rotations @ part for part in _parts(points, round(share * len(points)))]
+        return np.concatenate([rotations] * len(translations)), np.concatenate(translations)
 
     def _again(self, step: Step, pose: Pose) -> Pose:
         T = pose.T_scan_model
@@ -313,6 +320,15 @@ class _Sides:
         except np.linalg.LinAlgError:
             return Pose(start_pose, np.zeros(len(free)), math.inf, 0.0)
         return Pose(Similarity(scale, R, t), free, 0.5 * float(out[0] + out[1]), float(out[2]))
+
+
+def _parts(points: FloatArray, count: int) -> FloatArray:
+    """Return (P, 3) centres of parts of `count` points each, about points that lie far from each other."""
+    seeds = [int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmax())]
+    while len(seeds) < _PARTS:
+        seeds.append(int(np.linalg.norm(points[:, None] - points[seeds], axis=2).min(axis=1).argmax()))
+    distance = np.linalg.norm(points[:, None] - points[seeds], axis=2)
+    return np.stack([points[order[: max(count, 1)]].mean(axis=0) for order in distance.argsort(axis=0).T])
 
 
 def _best_distinct(poses: Sequence[Pose]) -> list[Pose]:

@@ -1,0 +1,399 @@
+"""Completion of a partial scan: the surface that follows the scan where it shows one, and its distribution elsewhere.
+
+Equation numbers are those of docs/completion.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
+from os import PathLike
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from shapespace.errors import FitError, InputError
+from shapespace.fit.completion.mirror import add_mirror_image
+from shapespace.fit.completion.shape_posterior import ShapePosterior, shape_posterior
+from shapespace.fit.dense.dense_fit import dense_surface
+from shapespace.fit.diagnostics.reason_text import sentence_of
+from shapespace.fit.diagnostics.reasons import Reason, ReasonCode
+from shapespace.fit.fit_scan import FitConfig, fit_scan
+from shapespace.fit.landmark_terms import SHARE, LandmarkConstraint
+from shapespace.fit.result import FitResult, Status
+from shapespace.fit.robust.kernels import Float32Array
+from shapespace.fit.robust.robust_settings import RobustSettings
+from shapespace.fit.scan_target import ScanTarget, mm_frame
+from shapespace.geometry.closest import build_engine
+from shapespace.geometry.normals import face_areas, part_of, rms_size
+from shapespace.geometry.procrustes import centroid_size
+from shapespace.io.interop import MeshLike
+from shapespace.io.landmarks.landmark_io import read_landmarks
+from shapespace.model.region import Part
+from shapespace.model.shape_model import ShapeModel
+from shapespace.reprs import describe_briefly
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
+
+KNOWLEDGE = ("observed", "estimated", "unknowable")
+"""Codes 0 to 2 of vertices: the scan shows them; it determines them in part; it does not reduce their variance."""
+OBSERVED, ESTIMATED, UNKNOWABLE = range(3)
+
+_FEWEST_SHAPES = 5  # training shapes; fewer determine no covariance
+_LEAST_OBSERVED = 0.05  # share of the vertices below which a completion would be the mean shape in an unknown pose
+_COMPLETE = 0.97  # share of the vertices from which on only the border of the scan is missing
+_LEAST_GAIN = 0.1  # share of its variance in the population that a scan removes from a vertex that it determines
+_IMPLAUSIBLE = (
+    3.0  # mean square of the coefficients in standard deviations of new shapes; 1 is usual, 1.5 the most seen
+)
+_OF_MISSING_PARTS = frozenset(
+    {
+        ReasonCode.EXPECTED_ERROR, ReasonCode.PROBABLY_FAILED, ReasonCode.MODEL_FAR_FROM_SCAN, ReasonCode.MODEL_UNSEEN,
+        ReasonCode.MODEL_UNMATCHED, ReasonCode.FEW_TRAINING_SHAPES, ReasonCode.MODEL_TOO_NARROW,
+        ReasonCode.MODE_IMPLAUSIBLE, ReasonCode.SHAPE_IMPLAUSIBLE, ReasonCode.LEADING_MODES_IMPLAUSIBLE,
+    }
+)  # fmt: skip
+"""Reasons to doubt a fit that follow from missing parts, and that the posterior accounts for or judges anew."""
+
+MirrorUse: TypeAlias = Literal["never", "combined", "alone"]
+Function: TypeAlias = Callable[[Mesh], float]
+
+
+@dataclass(frozen=True)
+class CompletionConfig:
+    """Settings of a completion.
+
+    Args:
+        samples: number of samples of the whole shape.
+        part: region of the model that is estimated even where the scan shows it, such as a diseased or damaged part;
+            None to follow all of the scan.
+        mirror: `combined` also uses the mirror image of the observed side of a symmetric object, weighted by how well
+            sides predict each other; `alone` uses the mirror image instead of the model where there is one.
+        with_doubtful: complete scans whose fit is doubtful too (default: refuse them).
+        seed: seed of the samples.
+        fit: settings of the fit.
+
+    Raises:
+        InputError: fewer than two samples, a `mirror` that does not exist, or a fit by another method than `robust`.
+    """
+
+    samples: int = 100
+    part: str | None = None
+    mirror: MirrorUse = "never"
+    with_doubtful: bool = False
+    seed: int = 0
+    fit: FitConfig = field(default_factory=FitConfig)
+
+    def __post_init__(self) -> None:
+        if self.samples < 2:
+            raise InputError(f"A distribution needs at least two samples, not {self.samples}.")
+        if self.mirror not in ("never", "combined", "alone"):
+            raise InputError(f"There is no mirror {self.mirror!r}; choose one of never, combined, alone.")
+        if self.fit.fitting.name != "robust" or self.fit.region is not None:
+            raise InputError("A completion needs a fit of the whole model by the robust method.")
+
+
+@dataclass(frozen=True)
+class QuantityEstimate:
+    """A quantity of the completed shape.
+
+    Args:
+        name: of the quantity.
+        unit: of its values, such as mm; empty for plain numbers.
+        value: of the completed surface.
+        mean: over the samples.
+        stddev: over the samples.
+        low: lower end of the interval,
+        high: upper end, between quantiles of the samples.
+        level: probability of the interval.
+    """
+
+    name: str
+    unit: str
+    value: float
+    mean: float
+    stddev: float
+    low: float
+    high: float
+    level: float
+
+
+@dataclass(frozen=True, eq=False)
+class Completion:
+    """A completed scan.
+
+    Args:
+        fit: the fit that it is based on.
+        status: `converged` or `doubtful`,
+        reasons: and why.
+        notes: sentences on the scan and the completion.
+        config: settings.
+        vertices: (V, 3) of the completed surface in the frame and unit of the scan.
+        knowledge: (V,) int32 code of each vertex in `KNOWLEDGE`.
+        stddev_mm: (V,) standard deviation of the position of each vertex, mm of the scan: the root of the sum of the
+            variances along three axes.
+        posterior: joint distribution of pose, coefficients and off-model variation.
+        T_scan_model: pose of the posterior, from the model's frame (mm) to the frame and unit of the scan.
+    """
+
+    fit: FitResult
+    status: Status
+    reasons: tuple[Reason, ...]
+    notes: tuple[str, ...]
+    config: CompletionConfig
+    vertices: FloatArray
+    knowledge: IntArray
+    stddev_mm: FloatArray
+    posterior: ShapePosterior = field(repr=False)
+    T_scan_model: Similarity = field(repr=False)
+
+    def __repr__(self) -> str:
+        return f"<Completion of {describe_briefly(self.scan_name)}: {self.status}. {self.reason}>"
+
+    @property
+    def scan_name(self) -> str:
+        """Name of the scan."""
+        return self.fit.scan_name
+
+    @property
+    def model(self) -> ShapeModel:
+        """The model."""
+        return self.fit.model
+
+    @property
+    def reason(self) -> str:
+        """One sentence on why it has its status."""
+        return sentence_of(self.status, self.reasons)
+
+    @property
+    def observed(self) -> BoolArray:
+        """(V,) True where the scan shows the vertex."""
+        return self.knowledge == OBSERVED
+
+    def surface(self) -> Mesh:
+        """Return the completed surface on the model's triangles, with its landmarks and mask of observed vertices."""
+        return self._mesh(self.vertices, self.observed)
+
+    def draw_samples(self, count: int | None = None) -> Float32Array:
+        """Return (count, V, 3) float32 whole shapes, in the frame and unit of the scan; None for `config.samples` (E6).
+
+        The same seed and count give the same samples.
+        """
+        rng = np.random.default_rng(self.config.seed)
+        moved = self.posterior.draw_displacements(count or self.config.samples, rng)
+        turn = (self.T_scan_model.scale * self.T_scan_model.rotation).astype(np.float32)
+        moved = moved @ turn.T
+        moved += self.vertices.astype(np.float32)
+        return moved
+
+    def estimate(self, function: Function, name: str = "", unit: str = "", *, level: float = 0.95) -> QuantityEstimate:
+        """Return the distribution of a function of the shape.
+
+        Args:
+            function: takes the mesh of a whole shape in the frame and unit of the scan, and returns a number.
+            name: of the quantity.
+            unit: of its values.
+            level: probability of the interval, between 0 and 1.
+
+        Raises:
+            InputError: a level outside 0 to 1, or values that are not finite.
+        """
+        if not 0 < level < 1:
+            raise InputError(f"The probability of an interval lies between 0 and 1, not {level:g}.")
+        value = float(function(self._mesh(self.vertices)))
+        values = np.array([function(self._mesh(x.astype(np.float64))) for x in self._samples], dtype=np.float64)
+        if not np.isfinite([value, *values]).all():
+            raise InputError(f"The quantity {name or 'of the shape'} is not finite for every sample.")
+        low, high = np.quantile(values, [(1 - level) / 2, (1 + level) / 2])
+        return QuantityEstimate(
+            name, unit, value, float(values.mean()), float(values.std(ddof=1)), float(low), float(high), level
+        )
+
+    def estimates(self, *, level: float = 0.95) -> tuple[QuantityEstimate, ...]:
+        """Return the volume (of a closed model), area, length, centroid size, and distances between landmarks.
+
+        The length is the extent along the longest axis of the completed surface. Distances are those between
+        successive landmarks of the model.
+        """
+        mm, size = self.fit.mm_per_scan_unit, self.vertices - self.vertices.mean(axis=0)
+        axis = np.linalg.svd(size, full_matrices=False)[2][0]
+        functions: dict[tuple[str, str], Function] = {}
+        if _is_closed(self.model):
+            functions["volume", "mm3"] = lambda mesh: _volume(mesh) * mm**3
+        functions["area", "mm2"] = lambda mesh: float(face_areas(mesh).sum()) * mm**2
+        functions["length", "mm"] = lambda mesh: float(np.ptp(mesh.vertices @ axis)) * mm
+        functions["centroid size", "mm"] = lambda mesh: centroid_size(mesh.vertices) * mm
+        names = list(self.model.landmarks)
+        for first, second in pairwise(names):
+            functions[f"{first} to {second}", "mm"] = _distance(first, second, mm)
+        return tuple(self.estimate(function, *name, level=level) for name, function in functions.items())
+
+    def landmark_stddev_mm(self) -> dict[str, FloatArray]:
+        """Return name -> (3,) standard deviation of each landmark along the axes of the scan's frame, mm."""
+        mm = self.fit.mm_per_scan_unit
+        spread = self.model.landmarks.interpolate(self._samples.transpose(1, 2, 0).astype(np.float64))
+        return dict(zip(self.model.landmarks, spread.std(axis=2, ddof=1) * mm, strict=True))
+
+    @cached_property
+    def _samples(self) -> Float32Array:
+        return self.draw_samples()
+
+    def _mesh(self, vertices: FloatArray, observed: BoolArray | None = None) -> Mesh:
+        landmarks = self.model.landmarks.positions(vertices)
+        return Mesh(vertices, self.model.faces, landmarks, self.scan_name, observed=observed)
+
+
+def complete(
+    model: ShapeModel | str | PathLike[str],
+    scan: MeshLike,
+    config: CompletionConfig | None = None,
+    *,
+    landmarks: Mapping[str, FloatArray] | str | PathLike[str] | None = None,
+    T_scan_model: Similarity | None = None,
+) -> Completion:
+    """Complete a partial scan, with the distribution of what it does not show.
+
+    Args:
+        model: the shape space, or the path of its file.
+        scan: a mesh or point cloud, in its own frame and unit, or its path.
+        config: settings; None for the defaults.
+        landmarks: as of `fit_scan`; they may lie on missing parts.
+        T_scan_model: a start, as of `fit_scan`.
+
+    Raises:
+        FitError: too little of the scan matches, or its fit is doubtful.
+        InputError: a model without triangles or of fewer than five shapes, no such region, or a mirror image of a
+            model that is not symmetric.
+    """
+    config = config or CompletionConfig()
+    model = model if isinstance(model, ShapeModel) else ShapeModel.load(Path(model))
+    if model.is_n_training_known and model.n_training < _FEWEST_SHAPES:
+        raise InputError(
+            f"The model was made of {model.n_training} shapes; a completion needs one of at least {_FEWEST_SHAPES}."
+        )
+    landmarks = read_landmarks(Path(landmarks)) if isinstance(landmarks, str | PathLike) else landmarks
+    fit = fit_scan(model, scan, config.fit, landmarks=landmarks, T_scan_model=T_scan_model)
+    if config.part is not None:
+        fit = fit_scan(
+            model, _without_part(fit, config.part), config.fit, landmarks=landmarks, T_scan_model=T_scan_model
+        )
+    T_mm_scan = mm_frame(fit.scan, fit.mm_per_scan_unit)
+    target = ScanTarget(fit.scan.with_vertices(T_mm_scan.apply(fit.scan.vertices)))
+    T = T_mm_scan @ fit.T_scan_model
+    marks = None
+    if landmarks:
+        stddev_mm = config.fit.landmark_stddev_mm or SHARE * rms_size(model.mean_vertices) * T.scale
+        marks_mm = {name: T_mm_scan.apply(point) for name, point in landmarks.items()}
+        marks = LandmarkConstraint.of(model, marks_mm, stddev_mm)
+    with_scale = config.fit.limits(model).with_scale
+    posterior = shape_posterior(
+        model, target, T, fit.b, _SETTINGS, with_scale=with_scale, seed=config.seed, marks=marks
+    )  # fmt: skip
+    T = posterior.T_scan_model
+    status, reasons = _judged(fit, posterior, config)
+    dense = dense_surface(model, target, T.apply(posterior.surface.vertices), T, config.fit.dense_settings)
+    observed = dense.seen.copy()
+    if config.part is not None:
+        observed[Part.of(model, config.part).inside] = False
+    notes = [*fit.notes, *_notes(model, fit, observed)]
+    completed = T.inverse().apply(dense.vertices_scan_mm)
+    variance = np.einsum("vii->v", posterior.vertex_covariance())
+    if config.mirror != "never":
+        weighed_by = variance if config.mirror == "combined" else None
+        completed, weight = add_mirror_image(model, completed, observed, weighed_by)
+        notes.append(
+            f"The mirror image of the observed side has a mean weight of {weight:.2f} where vertices are missing."
+        )
+    knowledge = np.where(variance > (1 - _LEAST_GAIN) * posterior.prior_vertex_variance(), UNKNOWABLE, ESTIMATED)
+    knowledge[observed] = OBSERVED
+    T_scan_model = T_mm_scan.inverse() @ T
+    return Completion(
+        fit, status, reasons, tuple(notes), config, T_scan_model.apply(completed), knowledge.astype(np.int32),
+        np.sqrt(variance) * T.scale, posterior, T_scan_model,
+    )  # fmt: skip
+
+
+_SETTINGS = RobustSettings(vertex_share=0.0)
+"""Of the posterior: vertices on flat triangles of the scan are matched inside of its curved surface."""
+
+
+def _judged(fit: FitResult, posterior: ShapePosterior, config: CompletionConfig) -> tuple[Status, tuple[Reason, ...]]:
+    """Return status and reasons, with what the posterior accounts for left out.
+
+    Raises:
+        FitError: there are reasons to doubt it, and `with_doubtful` is not set.
+    """
+    reasons = [reason for reason in fit.reasons if reason.code not in _OF_MISSING_PARTS]
+    z2 = posterior.mean_square_z(fit.model.n_modes)
+    if z2 > _IMPLAUSIBLE:
+        reasons.append(Reason(ReasonCode.SHAPE_IMPLAUSIBLE, {"z_rms": float(np.sqrt(z2))}))
+    if fit.status != "doubtful" and z2 <= _IMPLAUSIBLE:
+        return "converged", fit.reasons
+    if not reasons:
+        data = {"spread_mm": posterior.noise_mm, "model_matched_share": float(posterior.followed.mean())}
+        return "converged", (Reason(ReasonCode.CONVERGED, data),)
+    if not config.with_doubtful:
+        raise FitError(
+            f"{fit.scan_name}: {sentence_of('doubtful', reasons)} Its completion would look more certain than it is; "
+            "check scan, model and unit, give landmarks (--landmarks), or pass --with-doubtful."
+        )
+    return "doubtful", tuple(reasons)
+
+
+def _notes(model: ShapeModel, fit: FitResult, observed: BoolArray) -> list[str]:
+    """Return sentences on how much is missing.
+
+    Raises:
+        FitError: nearly everything is missing.
+    """
+    share = float(observed.mean())
+    if share < _LEAST_OBSERVED:
+        raise FitError(
+            f"{fit.scan_name}: it shows {100 * share:.1f} % of the model, and {100 * _LEAST_OBSERVED:g} % are needed "
+            "to complete it; give more of the object, or a model of the part that it shows."
+        )
+    notes = list[str]()
+    if share > _COMPLETE:
+        notes.append(
+            f"Nothing of the model is missing: the scan shows {100 * share:.0f} % of its vertices. Parts that the "
+            "model does not have cannot be completed."
+        )
+    if not model.is_n_training_known:
+        notes.append(
+            "The model does not state the number of its training shapes, so its variances are taken to be exact; if "
+            "it was made of few shapes, the standard deviations are too small."
+        )
+    return notes
+
+
+def _without_part(fit: FitResult, part: str) -> Mesh:
+    """Return the scan without what shows a region of the model.
+
+    Raises:
+        InputError: there is no such region.
+        FitError: nothing else is left.
+    """
+    inside = Part.of(fit.model, part).inside
+    surface = fit.surface()
+    near = build_engine(surface).query(fit.scan.vertices)
+    outside = ~inside[near.vertex]
+    if not outside.any():
+        raise FitError(f"{fit.scan_name}: it shows nothing but the region {part!r}; give more of the object.")
+    return part_of(fit.scan, outside)
+
+
+def _is_closed(model: ShapeModel) -> bool:
+    faces = np.asarray(model.faces)
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    return bool((np.unique(edges, axis=0, return_counts=True)[1] == 2).all())
+
+
+def _volume(mesh: Mesh) -> float:
+    corners = (mesh.vertices - mesh.vertices.mean(axis=0))[np.asarray(mesh.faces)]
+    return float(np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))) / 6.0
+
+
+def _distance(first: str, second: str, mm: float) -> Function:
+    return lambda mesh: float(np.linalg.norm(mesh.landmarks[first] - mesh.landmarks[second])) * mm

@@ -1,0 +1,272 @@
+"""Joint posterior of pose, coefficients and off-model variation given a scan, for the completion of what is missing.
+
+A fit chooses its prior for small errors where the scan shows the surface. Where it shows nothing, the estimate is a
+prediction, so here the prior has the variances of new shapes with full weight, the residual modes are always free, and
+the error of a covariance that was estimated from N shapes is added. Equation numbers are those of docs/completion.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve
+
+from shapespace.errors import FitError
+from shapespace.fit.dense.residual_modes import residual_modes
+from shapespace.fit.landmark_terms import LandmarkConstraint
+from shapespace.fit.robust.kernels import Float32Array
+from shapespace.fit.robust.matching import Matcher, MatchHint
+from shapespace.fit.robust.normal_equations import SCALE, Estimate
+from shapespace.fit.robust.posterior import NOISE_TEMPERATURE, lack_of_new_shapes, variance_of_new_shapes
+from shapespace.fit.robust.prepared_model import ModelSurface, prepare
+from shapespace.fit.robust.robust_icp import Iterate, Problem, WeightedMatches
+from shapespace.fit.robust.robust_settings import Level, RobustSettings
+from shapespace.fit.scan_target import ScanTarget
+from shapespace.geometry.normals import rms_size
+from shapespace.geometry.similarity import POSE, small_poses
+from shapespace.model.new_shapes import variances_of_new_shapes
+from shapespace.model.shape_model import ShapeModel
+from shapespace.types import BoolArray, FloatArray, Similarity
+
+_LEVEL = Level(modes=None, scan_points=20_000, vertices=None, triangles=True, iterations=15, stop_motion_mm=0.0)
+"""All vertices are matched, at most so many scan points, in at most so many steps."""
+_SETTLED = 2.5e-4  # share of the model's size; a step that moves no vertex further ends the iterations
+_LOOSE = 10.0
+"""Standard deviation of rotation (radians) and of translation (in units of the model's size): hardly a prior."""
+_AMPLITUDES = np.geomspace(1e-4, 100.0, 19)
+"""Variances of the off-model variation that are compared, in units of the one that the spectrum predicts."""
+_AMPLITUDE_STDDEV = 1.0  # of the logarithm of the amplitude; chosen by benchmarks/completion.py on faces and femora
+_REPLICATES = 20  # simulated training sets; their mean varies by 3 % in the standard deviations
+_FLOOR = 1e-3  # variance outside the simulated modes along the model's own, in units of that of the residual modes
+
+
+@dataclass(frozen=True, eq=False)
+class ShapePosterior:
+    """Normal distribution of pose, coefficients and off-model variation given a scan.
+
+    Args:
+        T_scan_model: mean pose, from the model's frame to the scan's mm frame.
+        surface: mean surface, mm of the model's frame, with the modes that were free (K of the model, R residual).
+        b: (K + R,) mean coefficients, mm.
+        covariance: (7 + K + R, 7 + K + R) of rotation (radians), translation (mm), log scale and the coefficients.
+        prior_variance: (7 + K + R,) before the scan was seen.
+        amplitude: variance of the off-model variation in units of the one that the spectrum predicts (E3).
+        noise_mm: robust standard deviation of the residuals, mm of the model's frame.
+        followed: (V,) True where a scan point is matched.
+    """
+
+    T_scan_model: Similarity
+    surface: ModelSurface
+    b: FloatArray
+    covariance: FloatArray
+    prior_variance: FloatArray
+    amplitude: float
+    noise_mm: float
+    followed: BoolArray
+
+    def vertex_covariance(self) -> FloatArray:
+        """Return (V, 3, 3) mm^2 of the positions of the vertices along the axes of the model's frame (E5)."""
+        rows = self._rows()
+        moved = (rows.reshape(-1, rows.shape[2]) @ self.covariance.astype(np.float32)).reshape(rows.shape)
+        return np.asarray(np.einsum("vip,vjp->vij", moved, rows), dtype=np.float64)
+
+    def prior_vertex_variance(self) -> FloatArray:
+        """Return (V,) mm^2: the variance of the positions of the vertices in the population, in a known pose."""
+        variance = self.prior_variance[POSE:].astype(np.float32)
+        return np.asarray(np.einsum("vip,p->v", self._rows()[:, :, POSE:] ** 2, variance), dtype=np.float64)
+
+    def mean_square_z(self, modes: int) -> float:
+        """Return the mean square of the first coefficients in standard deviations of new shapes."""
+        return float((self.b[:modes] ** 2 / self.prior_variance[POSE : POSE + modes]).mean())
+
+    def draw_displacements(self, count: int, rng: np.random.Generator) -> Float32Array:
+        """Return (count, V, 3) float32 displacements from the mean surface, mm of the model's frame (E6)."""
+        unit = np.sqrt(np.maximum(self.covariance.diagonal(), 1e-300))
+        value, vector = np.linalg.eigh(self.covariance / np.outer(unit, unit))
+        root = unit[:, None] * vector * np.sqrt(np.maximum(value, 0.0))
+        draws = (root @ rng.standard_normal((len(root), count))).astype(np.float32)
+        rows = self._rows()
+        return (rows.reshape(-1, len(root)) @ draws).T.reshape(count, *rows.shape[:2])
+
+    def _rows(self) -> Float32Array:
+        """Return (V, 3, 7 + K + R) float32 how each parameter moves each vertex."""
+        pose = small_poses(self.surface.vertices).reshape(-1, 3, POSE).astype(np.float32)
+        return np.concatenate([pose, self.surface.modes], axis=2)
+
+
+def shape_posterior(
+    model: ShapeModel, target: ScanTarget, T_scan_model: Similarity, b: FloatArray, settings: RobustSettings,
+    *, with_scale: bool, seed: int = 0, marks: LandmarkConstraint | None = None,
+) -> ShapePosterior:  # fmt: skip
+    """Return the posterior near a fit with the pose `T_scan_model` and the coefficients `b` (K,) mm.
+
+    Args:
+        model: the shape space, with triangles.
+        target: the scan in its mm frame.
+        T_scan_model: from the model's frame to that frame.
+        b: of the fit.
+        settings: of the matches and their weights.
+        with_scale: False holds the scale.
+        seed: of the simulated training sets.
+        marks: landmarks of the scan, if any.
+
+    Raises:
+        FitError: hardly anything of the scan matches, or the scan does not determine the pose.
+    """
+    extra = residual_modes(model, settings.residual)
+    # The strongest residual modes have all of the variance that new shapes have outside the model.
+    off_model = extra.stddev**2 * (lack_of_new_shapes(model) ** 2 * model.n_vertices / (extra.stddev**2).sum())
+    size_mm = rms_size(model.mean_vertices)
+    prior = np.concatenate(
+        [np.full(3, _LOOSE**2), np.full(3, (_LOOSE * size_mm) ** 2), [settings.scale_stddev**2 if with_scale else 0.0],
+         variance_of_new_shapes(model), off_model]
+    )  # fmt: skip
+    problem = Problem.of(prepare(model), target, settings, T_scan_model.scale, with_scale=with_scale, marks=marks)
+    coefficient_prior = replace(problem.prior, stddev=np.sqrt(prior[POSE:]), weight=0.0)
+    problem = replace(problem, prior=coefficient_prior, shape=replace(problem.shape, modes=extra.modes))
+    iterate = problem.iterate(Estimate(T_scan_model, np.pad(b, (0, len(extra.stddev)))))
+    matcher = problem.matcher(_LEVEL)
+    hint = matcher.first_hint(iterate.surface, iterate.T_scan_model, problem.prepared.tree)
+    try:
+        line = _Linearised.of(problem, matcher, iterate, hint, prior)
+        for _ in range(_LEVEL.iterations):
+            before = iterate.T_scan_model.apply(iterate.surface.vertices)
+            iterate = problem.iterate(iterate.estimate.moved_by(line.data.mean(line.variance) - line.theta))
+            moved_mm = float(np.abs(iterate.T_scan_model.apply(iterate.surface.vertices) - before).max())
+            if moved_mm < _SETTLED * size_mm * T_scan_model.scale:
+                break
+            line = _Linearised.of(problem, matcher, iterate, line.weighted.matches.hint, prior)
+        covariance = _expected_error(model, line.data, line.variance, seed)
+    except LinAlgError as error:
+        raise FitError(
+            f"{target.mesh.name}: what it shows does not determine the pose; give landmarks (--landmarks)."
+        ) from error
+    return ShapePosterior(
+        iterate.T_scan_model, iterate.surface, iterate.b, covariance, line.variance, line.amplitude,
+        line.weighted.sigma_mm, line.followed,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Linearised:
+    """Likelihood of the matches of an iterate.
+
+    Args:
+        weighted: the matches.
+        followed: (V,) True where a scan point is matched.
+        data: their likelihood,
+        theta: at these parameters (P,); the pose is relative to the iterate.
+        amplitude: likeliest one of the off-model variation (E3).
+        variance: (P,) of the prior with this amplitude.
+    """
+
+    weighted: WeightedMatches
+    followed: BoolArray
+    data: _Data
+    theta: FloatArray
+    amplitude: float
+    variance: FloatArray
+
+    @staticmethod
+    def of(problem: Problem, matcher: Matcher, iterate: Iterate, hint: MatchHint, prior: FloatArray) -> _Linearised:
+        """Return the likelihood near `iterate` (E2), and the amplitude given it (E3)."""
+        weighted = problem.match(matcher, iterate, hint)
+        gathered, equations = problem.equations(weighted, iterate, len(iterate.b))
+        precision = NOISE_TEMPERATURE * weighted.sigma_mm**2
+        H, pull = equations.H / precision, -equations.gradient / precision
+        if problem.marks is not None:
+            H_landmarks, gradient = problem.marks.equations(iterate.surface, iterate.T_scan_model, len(iterate.b))
+            H, pull = H + H_landmarks, pull - gradient
+        log_scale = np.log(iterate.T_scan_model.scale / problem.prior.start_scale)
+        theta = np.concatenate([np.zeros(SCALE), [log_scale], iterate.b])
+        data = _Data(H, pull + H @ theta)
+        first = POSE + problem.prepared.model.n_modes
+        amplitude = _likeliest_amplitude(data, prior, first)
+        return _Linearised(weighted, gathered.seen, data, theta, amplitude, _scaled(prior, first, amplitude))
+
+
+@dataclass(frozen=True, eq=False)
+class _Data:
+    """Precision and pull of the data: -theta^T H theta / 2 + pull^T theta is their log likelihood (E2).
+
+    Args:
+        H: (P, P).
+        pull: (P,).
+    """
+
+    H: FloatArray
+    pull: FloatArray
+
+    def factor(self, variance: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the Cholesky factor of the posterior precision in units of the prior, and these units (P,)."""
+        unit = np.sqrt(variance)
+        scaled = self.H * np.outer(unit, unit)
+        scaled[np.diag_indices_from(scaled)] += 1.0
+        return cho_factor(scaled, lower=True, overwrite_a=True)[0], unit
+
+    def mean(self, variance: FloatArray) -> FloatArray:
+        """Return the posterior mean (P,) with the prior variances `variance` (P,) (E2)."""
+        factor, unit = self.factor(variance)
+        return unit * cho_solve((factor, True), unit * self.pull)
+
+    def log_evidence(self, variance: FloatArray) -> float:
+        """Return the log evidence of the prior variances, up to a constant (E3)."""
+        factor, unit = self.factor(variance)
+        pull = unit * self.pull
+        return float(0.5 * pull @ cho_solve((factor, True), pull) - np.log(factor.diagonal()).sum())
+
+
+def _scaled(prior: FloatArray, first: int, amplitude: float) -> FloatArray:
+    """Return the prior variances with those from `first` on times `amplitude`."""
+    return np.concatenate([prior[:first], amplitude * prior[first:]])
+
+
+def _likeliest_amplitude(data: _Data, prior: FloatArray, first: int) -> float:
+    """Return the variance of the off-model variation that scan and spectrum make likeliest (E3)."""
+    score = [
+        data.log_evidence(_scaled(prior, first, a)) - 0.5 * (np.log(a) / _AMPLITUDE_STDDEV) ** 2 for a in _AMPLITUDES
+    ]
+    return float(_AMPLITUDES[int(np.argmax(score))])
+
+
+def _expected_error(model: ShapeModel, data: _Data, variance: FloatArray, seed: int) -> FloatArray:
+    """Return the covariance (P, P) of the error of the posterior mean, that of an estimated prior included (E4).
+
+    Training sets of N shapes are drawn from the prior. For each, the prior is estimated anew as the model's was, and
+    the covariance of the error of the posterior mean with that prior is computed. The mean over the sets is returned.
+    """
+    P, K, N = len(variance), model.n_modes, model.n_training
+    free = variance > 0
+    if not model.is_n_training_known:
+        factor, unit = data.factor(variance)
+        return cho_solve((factor, True), np.eye(P)) * np.outer(unit, unit)
+    H, rng, total = data.H[np.ix_(free, free)], np.random.default_rng(seed), np.zeros((int(free.sum()),) * 2)
+    truth = variance * (1.0 + 1.0 / N)
+    truth[:POSE] = 0.0  # the pose has no prior in effect, so its error does not depend on where it is
+    for _ in range(_REPLICATES):
+        estimated = np.zeros((P, P))
+        estimated[np.diag_indices(POSE)] = variance[:POSE]
+        estimated[POSE:, POSE:] = _estimated_covariance(variance[POSE:], K, N, rng)
+        estimated = estimated[np.ix_(free, free)]
+        kept = solve(np.eye(len(H)) + estimated @ H, np.eye(len(H)))  # of the prior's pull
+        gain = kept @ estimated
+        total += (kept * truth[free]) @ kept.T + gain @ H @ gain.T
+    out = np.zeros((P, P))
+    out[np.ix_(free, free)] = total / _REPLICATES
+    return out
+
+
+def _estimated_covariance(variance: FloatArray, modes: int, count: int, rng: np.random.Generator) -> FloatArray:
+    """Return the prior covariance (K + R, K + R) that a model of `count` simulated shapes gives."""
+    shapes = rng.standard_normal((count, len(variance))) * np.sqrt(variance)
+    shapes -= shapes.mean(axis=0)
+    _, singular, axes = np.linalg.svd(shapes, full_matrices=False)
+    spectrum = singular[: count - 1] ** 2 / (count - 1)
+    spectrum = spectrum[spectrum > 1e-12 * spectrum[0]][:modes]
+    V = axes[: len(spectrum)].T
+    new = np.maximum(spectrum, variances_of_new_shapes(spectrum, float((singular**2).sum()) / (count - 1), count))
+    outside = variance.copy()
+    outside[:modes] = _FLOOR * variance[modes:].max(initial=float(spectrum[-1]))
+    rest = np.sqrt(outside)[:, None] * (np.eye(len(V)) - V @ V.T)
+    return (V * new) @ V.T + rest.T @ rest
