@@ -11,7 +11,7 @@ import numpy.typing as npt
 from shapespace.errors import InputError
 from shapespace.report.analyses.analysis_report import AnalysisReport, Rows
 from shapespace.report.analyses.methods_section import methods_parts
-from shapespace.report.analyses.shape_data import add_shape_data, model_hashes, scree_part
+from shapespace.report.analyses.shape_data import add_shape_data, model_hashes, scree_part, tangent_parts
 from shapespace.schemas import ConfusionPart, MorphospacePart, TablePart
 from shapespace.statistics.compare_shapes import CompareResult
 from shapespace.statistics.methods import methods_of, sample_sizes
