@@ -870,7 +870,7 @@ COMMANDS: tuple[Command, ...] = (
         ("shapespace score patients -o scored --reference controls.csv",), score.run,
         (
             *_cohort("coefficients"),
-            basic("--reference", "DATA", "the population: a table or a folder of fits; its doubtful fits are excluded",
+            basic("--reference", "DATA", "the population: a table, fits or landmarks; its doubtful fits are excluded",
                   parse=Path, required=True),
             basic("--reference-shapes", "DIR", "its results of fits, or meshes (default: the folder of the reference)",
                   parse=Path),

@@ -537,7 +537,8 @@ def _align_to(shapes: FloatArray, onto: Cohort) -> None:
 
 def _refuse_other_vertices(shapes: FloatArray, onto: Cohort) -> None:
     if shapes.shape[1] != onto.n_vertices:
-        raise InputError(f"Shapes of {shapes.shape[1]} vertices cannot be compared with those of {onto.n_vertices}.")
+        noun = "landmarks" if onto.source.kind == "landmarks" else "vertices"
+        raise InputError(f"Shapes of {shapes.shape[1]} {noun} cannot be compared with those of {onto.n_vertices}.")
 
 
 def _complete_by(onto: Cohort, shapes: FloatArray, observed: BoolArray, names: Sequence[str]) -> FloatArray:

@@ -120,8 +120,8 @@ def find_sides(cohort: Cohort) -> Sides:
         InputError: it has no triangles, or it is not its own mirror image about any plane.
     """
     if cohort.faces is None:
-        raise InputError("Points without triangles show no plane of symmetry; name the points that mirror each other "
-                         "with --pairs, or the column of the sides of separate shapes with --side.")  # fmt: skip
+        raise InputError("Landmarks and other points without triangles need --pairs, which names those that mirror "
+                         "each other, or --side, the column of the sides of separate shapes.")  # fmt: skip
     # A model is made of more shapes than most cohorts hold, so its mean is the more symmetric one.
     mean = cohort.reference if cohort.fitted is None else cohort.fitted.model.mean_vertices
     mesh = Mesh(mean, cohort.faces, name="mean")
@@ -310,9 +310,8 @@ def read_pairs(path: Path, cohort: Cohort) -> tuple[tuple[int, int], ...]:
     unknown = sorted({cell for row in rows for cell in row if not is_place(cell)})
     if unknown:
         there = list_names(sorted(landmarks)) if landmarks else "none are known"
-        raise InputError(
-            f"{path}: {list_names(unknown)} is neither a vertex number nor a landmark (landmarks: {there})."
-        )
+        kind = "landmark" if first else "vertex or landmark"
+        raise InputError(f"{path}: no {kind} has the name or number {list_names(unknown)} (landmarks: {there}).")
     pairs = [tuple(landmarks[cell] if cell in landmarks else int(cell) - first for cell in row) for row in rows]
     return tuple((a, b) for a, b in pairs)
 
