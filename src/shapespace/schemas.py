@@ -822,6 +822,7 @@ class HistogramPart(Part, frozen=True, kw_only=True, tag="histogram"):
     edges: tuple[float, ...]
     series: tuple[Counts, ...]
     x: str = "value"
+    y: str = "count"
     observed: float | None = None
     observed_label: str = ""
 

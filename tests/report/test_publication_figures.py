@@ -86,6 +86,8 @@ def test_nothing_of_a_chart_is_cut_in_one_column() -> None:
             box, (width, height) = figure.get_tightbbox(), figure.get_size_inches()
             assert box.x0 > -0.01 and box.y0 > -0.01 and box.x1 < width + 0.01 and box.y1 < height + 0.01
             assert max(axes.title.get_window_extent().y1 for axes in figure.axes) < height * figure.dpi
+        shares = figures.histogram_figure([0, 1, 2], [("", [0.5, 0.5])], x="score", y="share")
+        assert [one.axes[0].get_ylabel() for one in (bars, shares)] == ["count", "share"]
         [axes] = bars.axes
         assert axes.transData.inverted().transform(axes.get_legend().get_window_extent())[0, 1] > 9
 

@@ -293,5 +293,6 @@ def test_a_confusion_matrix_frames_right_answers_and_tells_percent_and_counts() 
     figure = figures.confusion_figure([[8, 2], [0, 10]], ["a", "b"])
     (axes,) = figure.axes
     assert {text.get_text() for text in axes.texts} == {"80 %", "8", "20 %", "2", "100 %", "10"}
+    assert axes.get_ylabel() == "true class (count)"
     assert sum(patch.get_edgecolor()[:3] != (1, 1, 1) for patch in axes.patches) == 2
     assert "90 % of 20 answers are right; most often a is taken for b" in " ".join(t.get_text() for t in figure.texts)

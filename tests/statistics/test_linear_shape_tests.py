@@ -243,6 +243,7 @@ def test_the_map_of_measurement_error_is_the_deviation_within_subjects() -> None
     subject = np.repeat([f"s{k}" for k in range(40)], 3)
     result = measure_repeatability(simulate(rows, {"subject": subject}), permutations=50)
     deviation = result.arrays["measurement_error.npz"]["values"]
+    assert getattr(result.figures[0], "unit", None) == (result.cohort.unit or "units of the coordinates")
     centred = rows.reshape(40, 3, 5, 3) - rows.reshape(40, 3, 5, 3).mean(axis=1, keepdims=True)
     assert deviation == pytest.approx(np.sqrt((centred**2).sum(axis=(0, 1, 3)) / 80))
     icc = result.statistic("ICC")

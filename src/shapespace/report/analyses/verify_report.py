@@ -236,4 +236,5 @@ def _histogram(one: VerificationRates, result: VerificationResult) -> HistogramP
         edges=tuple(edges.tolist()),
         series=tuple(counts),
         x="score" if one.llr is None else "calibrated likelihood ratio, powers of ten",
+        y="share",
     )

@@ -228,6 +228,7 @@ def histogram_figure(
     series: Sequence[tuple[str, npt.ArrayLike]],
     *,
     x: str,
+    y: str = "count",
     observed: float | None = None,
     observed_label: str = "",
     title: str = "",
@@ -238,6 +239,7 @@ def histogram_figure(
         edges: (n + 1,) rising.
         series: for each its name, empty for none, and its (n,) counts.
         x: what the values are, with their unit.
+        y: what the counts are, such as `share` where they are divided by their sum.
         observed: where a line stands, such as a statistic among its permutations.
         observed_label: what it is.
         title: above the figure.
@@ -265,10 +267,10 @@ def histogram_figure(
         axes.axvline(observed, color=INK, lw=2.0, ls=(0, (4, 2)), label=escaped(short(observed_label, 40)) or None)
         low, high = min(low, observed), max(high, observed)
     room = 0.02 * (high - low)
-    axes.set(xlim=(low - room, high + room), xlabel=axis_label(x), ylabel="count")
+    axes.set(xlim=(low - room, high + room), xlabel=axis_label(x), ylabel=axis_label(y))
     # Room for the legend above the bars, on the side where the observed value is not.
     axes.set_ylim(0, axes.get_ylim()[1] * 1.3)
-    axes.yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
+    axes.yaxis.set_major_locator(MaxNLocator(nbins=6, integer=y == "count"))
     if any(name for name, _ in series) or (observed is not None and observed_label):
         on_left = observed is not None and 2 * observed > low + high
         legend(axes, loc="upper left" if on_left else "upper right", handlelength=2.4)

@@ -54,17 +54,17 @@ _SHARES = (
 
 
 def confusion_figure(counts: npt.ArrayLike, classes: Sequence[str], *, title: str = "") -> Figure:
-    """Draw a confusion matrix: a row a true class, in percent of its scans, with their number.
+    """Draw a confusion matrix: a row a true class, in percent of its samples, with their number.
 
-    Right answers lie in the framed cells of the diagonal; a cell without scans stays empty.
+    Right answers lie in the framed cells of the diagonal; a cell without samples stays empty.
 
     Args:
-        counts: (C, C) how many scans of the row's class were predicted to be of the column's class.
+        counts: (C, C) how many samples of the row's class were predicted to be of the column's class.
         classes: C names.
         title: above the figure; by default the accuracy.
 
     Raises:
-        InputError: counts of another shape or below 0, no scan at all, or more than 40 classes.
+        InputError: counts of another shape or below 0, no sample at all, or more than 40 classes.
     """
     table = _numbers(counts, "the counts of a confusion matrix", ndim=2)
     n = len(classes)
@@ -73,7 +73,7 @@ def confusion_figure(counts: npt.ArrayLike, classes: Sequence[str], *, title: st
     if table.shape != (n, n):
         raise InputError(f"A confusion matrix of {n} classes must have the shape ({n}, {n}), not {table.shape}.")
     if (table < 0).any() or not table.sum() > 0:
-        raise InputError("A confusion matrix needs counts that are not negative, and at least one scan.")
+        raise InputError("A confusion matrix needs counts that are not negative, and at least one sample.")
     per_class = table.sum(axis=1)
     shares = np.divide(table, per_class[:, None], out=np.zeros_like(table), where=per_class[:, None] > 0)
     rows = [f"{short(name, 18)} ({count:g})" for name, count in zip(classes, per_class, strict=True)]
@@ -93,13 +93,13 @@ def confusion_figure(counts: npt.ArrayLike, classes: Sequence[str], *, title: st
         across, up = 1 - 5 / wide, 1 - 5 / high
         axes.add_patch(Rectangle((r - across / 2, r - up / 2), across, up, fill=False, ec=INK, lw=1.8, zorder=4))
         if per_class[r] == 0:
-            axes.text((n - 1) / 2, r, "no scan", ha="center", va="center", fontsize=SMALL, color=GREY)
+            axes.text((n - 1) / 2, r, "none", ha="center", va="center", fontsize=SMALL, color=GREY)
         for c in range(n):
             if table[r, c] > 0 and n <= 2 * _MOST_CLASSES_IN_FULL:
                 _cell(axes, r, c, shares[r, c], table[r, c], n)
     axes.set_xticks(range(n), [escaped(text) for text in columns], rotation=90 if upright else 0)
     axes.set_yticks(range(n), [escaped(text) for text in rows])
-    axes.set(xlabel="predicted class", ylabel="true class (scans)")
+    axes.set(xlabel="predicted class", ylabel="true class (count)")
     finish(figure)
     axes.grid(False)
     axes.tick_params(length=0)

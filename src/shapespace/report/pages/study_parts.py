@@ -314,11 +314,11 @@ class StudyParts:
         from shapespace.report import figures
 
         figure = figures.histogram_figure(
-            part.edges, [(one.label, one.counts) for one in part.series], x=part.x, observed=part.observed,
+            part.edges, [(one.label, one.counts) for one in part.series], x=part.x, y=part.y, observed=part.observed,
             observed_label=part.observed_label or "observed",
         )  # fmt: skip
         many = [f"{one.label} {sum(one.counts):g}".strip() for one in part.series]
-        about = f"Counts: {listed(many)}."
+        about = f"Counts: {listed(many)}." if part.y == "count" else ""
         if part.observed is not None:
             about += f" Dashed line: {part.observed_label or 'observed'}, {part.observed:.3g}."
         alt = f"Histogram of {part.x} from {part.edges[0]:.3g} to {part.edges[-1]:.3g}. {about}"

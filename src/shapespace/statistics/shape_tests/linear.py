@@ -361,7 +361,7 @@ def measure_repeatability(
         settings={"subject": subject, "session": session, "permutations": permutations, "seed": seed},
         tables=(TablePart.of("Analysis of variance", ("source", "df", "sum of squares", "mean square"), rows),),
         figures=(SurfaceMapPart(title="Standard deviation of measurement", arrays="measurement_error.npz",
-                                signed=False, unit=cohort.unit),),
+                                signed=False, unit=cohort.unit or "units of the coordinates"),),
         arrays={"measurement_error.npz": {"vertices": cohort.reference, "faces": faces, "values": deviation}},
         reduced_model=REDUCED_OF_EACH_TERM if session else (),
     )  # fmt: skip
