@@ -92,7 +92,7 @@ def test_names_of_landmarks_are_kept_where_a_format_has_them(format: str, tmp_pa
 
 def test_tps_has_scale_curves_keys_and_missing_landmarks(tmp_path: Path) -> None:
     block = "lm=2\n1 2\n{}\nCURVES=1\nPOINTS=3\n0,5 0\n1 1\n2 3\nOUTLINES=1\nPOINTS=1\n9 9\n{}\n\n"
-    text = block.format("3 4", "IMAGE=first.jpg\nID=anna\nSCALE=0.5") + block.format(
+    text = block.format("3 4", "IMAGE=first.jpg\nID=anna\nSCALE=0,5") + block.format(
         "NA NA", "IMAGE = second.JPG\nCOMMENT=old\nSCALE=2"
     )
     found = read_configurations(write(tmp_path, "two.TPS", text))
@@ -272,7 +272,7 @@ def test_a_folder_of_tps_files_is_joined(tmp_path: Path) -> None:
         ("a.tps", "LM=1\n1 inf\nID=a\n", "coordinate that is infinite"),
         ("a.tps", "LM=1\n1 a\nID=a\n", "coordinate that is not a number ('a')"),
         ("a.tps", "LM=1\n1 2\nID=a\nSCALE=0\n", "a SCALE= is not above 0"),
-        ("a.tps", "LM=1\n1 2\nID=a\nSCALE=x\n", "SCALE= of a has a coordinate that is not a number"),
+        ("a.tps", "LM=1\n1 2\nID=a\nSCALE=x\n", "specimen 'a' has a SCALE= that is not a number ('x')"),
         ("a.tps", "LM=1\n1\n", "landmarks need 2 or 3 coordinates"),
         ("a.nts", "1 2 4 0\n1 2 3 4 5 6 7 8\n", "no NTS header with its dimensions"),
         ("a.nts", "1 2 5 0 DIM=2\n1 2 3 4 5 6 7 8 9 0\n", "are not landmarks with DIM=2"),
@@ -304,6 +304,8 @@ def test_two_specimens_of_one_name_are_refused(text: str, tmp_path: Path) -> Non
 
 
 def test_files_beyond_the_limit_and_absent_ones_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(FileError, match="it has no landmark files"):
+        read_configurations(write(tmp_path, "labels.csv", "file,sex\na.ply,f\n").parent)
     monkeypatch.setattr(configuration_io, "LARGEST_CONFIGURATIONS_FILE_BYTES", 8)
     with pytest.raises(FileError, match="thin or split it"):
         read_configurations(write(tmp_path, "a.tps", "LM=1\n1 2\nID=a\n"))

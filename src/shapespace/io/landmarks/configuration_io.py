@@ -14,10 +14,10 @@ from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.io.files import make_folder, read_bytes, write_text
 from shapespace.io.landmarks.configuration_tables import header_kind, long_text, morphoj_texts, parse_table, wide_text
 from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations, read_landmark_numbers
-from shapespace.io.landmarks.landmark_io import LANDMARK_FORMATS, READ_ONLY_LANDMARKS, read_landmarks
+from shapespace.io.landmarks.landmark_io import LANDMARK_FORMATS, READ_ONLY_LANDMARKS, csv_rows, read_landmarks
 from shapespace.io.landmarks.r_arrays import R_ENDINGS, parse_r
 from shapespace.io.landmarks.tps_nts import nts_text, parse_nts, parse_tps, tps_text
-from shapespace.io.parsing import damage_error
+from shapespace.io.parsing import damage_error, is_number
 from shapespace.io.read_limits import LARGEST_CONFIGURATIONS_FILE_BYTES
 from shapespace.io.tables.table_io import decoded_text, table_rows, table_text
 from shapespace.reprs import first_names
@@ -130,6 +130,12 @@ def _read_specimen(path: Path, ending: str) -> LandmarkConfigurations:
     )
 
 
+def _is_other_table(file: Path) -> bool:
+    """Return whether a CSV file is of something else than landmarks, such as covariates, by its first line."""
+    row = next(iter(csv_rows(read_bytes(file, LARGEST_CONFIGURATIONS_FILE_BYTES), file)), list[str]())
+    return bool(row) and not header_kind(row) and not any(map(is_number, row[1:4]))
+
+
 def _read_folder(folder: Path) -> LandmarkConfigurations:
     """Return the landmarks in the files of the most frequent ending, in the order of the first file."""
     if (folder / RECORD).is_file():
@@ -143,8 +149,8 @@ def _read_folder(folder: Path) -> LandmarkConfigurations:
         ending = next((ending for ending in endings if file.name.lower().endswith(ending)), None)
         if ending is not None and file.is_file() and not file.name.endswith((CURVE_SLIDERS, SURFACE_SLIDERS)):
             files.setdefault(ending, []).append(file)
-    if not files:
-        raise damage_error(folder, f"it has no landmark files, which end with {', '.join(endings)}")
+    if all(ending == ".csv" and all(map(_is_other_table, listed)) for ending, listed in files.items()):
+        raise damage_error(folder, f"it has no landmark files, which end with {', '.join(endings)} (.csv: name,x,y,z)")
     # Slicer's markups first among equally many: they mark missing landmarks.
     ending = max(files, key=lambda one: (len(files[one]), one == ".mrk.json"))
     others = [file.name for other, listed in files.items() if other != ending for file in listed]

@@ -26,19 +26,21 @@ _NTS_MISSING = -999.0
 """Written for missing coordinates, ten times as much where a coordinate is the same."""
 
 
-def coordinates(cells: Iterable[str], path: Path, describe: Callable[[int], str]) -> list[float]:
-    """Return the numbers in cells, not-a-number for missing ones; `describe` names a cell in messages."""
+def coordinates(
+    cells: Iterable[str], path: Path, describe: Callable[[int], str], noun: str = "coordinate"
+) -> list[float]:
+    """Return the numbers in cells, not-a-number for missing ones; `describe` names the owner of a cell in messages."""
     numbers: list[float] = []
     for at, cell in enumerate(cells):
         try:
             number = float(cell)
         except ValueError as error:
             if cell.lower() not in MISSING and cell != "?":
-                problem = f"{describe(at)} has a coordinate that is not a number ({cell[:20]!r})"
+                problem = f"{describe(at)} has a {noun} that is not a number ({cell[:20]!r})"
                 raise damage_error(path, problem) from error
             number = math.nan
         if math.isinf(number):
-            raise damage_error(path, f"{describe(at)} has a coordinate that is infinite, so correct it or write NA")
+            raise damage_error(path, f"{describe(at)} has a {noun} that is infinite, so correct it or write NA")
         numbers.append(number)
     return numbers
 
@@ -66,7 +68,8 @@ def parse_tps(text: str, path: Path) -> LandmarkConfigurations:
     notes, unscaled = list[str](), [name for name, one in zip(names, values, strict=True) if "scale" not in one]
     scales = np.ones(len(names))
     if not unscaled:
-        scales = np.array(coordinates((one["scale"] for one in values), path, lambda k: f"SCALE= of {names[k]}"))
+        cells = [one["scale"].replace(",", ".") for one in values]  # a decimal comma, as in coordinates
+        scales = np.array(coordinates(cells, path, lambda k: f"specimen {names[k]!r}", "SCALE="))
         if not (scales > 0).all():
             raise damage_error(path, "a SCALE= is not above 0, so correct it")
         notes.append("The coordinates are multiplied by the SCALE= of each specimen.")
