@@ -12,7 +12,18 @@ from pathlib import Path
 from typing import Any
 
 from shapespace.cli import run, values
-from shapespace.cli.answers import align, asymmetry, change, compare, identity, morphospace, regress, score, shape_tests
+from shapespace.cli.answers import (
+    align,
+    asymmetry,
+    change,
+    compare,
+    complete,
+    identity,
+    morphospace,
+    regress,
+    score,
+    shape_tests,
+)
 from shapespace.cli.options import Option, Source, advanced, basic
 from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS, ShapeTest
 
@@ -28,6 +39,8 @@ BUILD_FILES = Source("commands.build", "BuildFilesConfig")
 QUALITY = Source("model.model_quality", "QualityConfig")
 QUALITY_TARGETS = Source("commands.quality", "QualityOptions")
 FIT = Source("fit.fit_scan", "FitConfig")
+COMPLETION = Source("fit.completion.complete", "CompletionConfig")
+COMPLETION_FILES = Source("commands.complete", "CompletionFiles")
 PAPER = Source("fit.paper.paper_method", "Paper")
 IDENTITY = Source("statistics.identity.trial", "IdentityConfig")
 FIGURES = Source("commands.answers", "FigureConfig")
@@ -536,6 +549,39 @@ COMMANDS: tuple[Command, ...] = (
             "run at a time writes into a folder.",
         ),
         defaults=_GOES_ON,
+    ),
+    Command(
+        "complete", "complete partial scans: the missing part with its uncertainty, and samples of the whole shape",
+        ("shapespace complete model.h5 broken.ply -o completed",
+         "shapespace complete model.h5 scans -o completed --mirror combined --stl",
+         "shapespace compare completed -o compared --formula '~ group'"), complete.run,
+        (
+            basic("model", "MODEL.h5", "the shape model", parse=Path),
+            basic("scans", "SCAN", "scans, folders, patterns, addresses such as s3://bucket/x, or lists of these",
+                  nargs="+"),
+            _OUTPUT,
+            basic("--samples", "N", source=COMPLETION, parse=values.positive),
+            basic("--part", "REGION", source=COMPLETION),
+            basic("--mirror", source=COMPLETION),
+            basic("--landmarks", "FILE|DIR", source=COMPLETION_FILES, parse=Path),
+            basic("--unit", source=FIT, choices=("auto", *_UNITS)),
+            basic("--stl", source=COMPLETION_FILES),
+            basic("--with-doubtful", source=COMPLETION),
+            advanced("--recursive", source=COMPLETION_FILES),
+            advanced("--scale", source=FIT),
+            advanced("--landmark-std", "MM", source=FIT, field="landmark_stddev_mm", parse=values.std_mm),
+            advanced("--crop", "KIND:NUMBERS", source=FIT),
+            advanced("--seed", "S", source=COMPLETION, parse=values.natural),
+            *_figures(),
+        ),
+        (
+            "Writes for each scan NAME.ply, the completed surface with the vertices of the model and the property "
+            "observed, and NAME.samples.npz, samples of the whole shape in the same frame; completions.csv; "
+            "estimates.csv with intervals of volume, area, length and distances between landmarks; methods.txt, and "
+            "the report. compare, regress, asymmetry and score read the folder, and use the samples as multiple "
+            "imputations. A scan whose fit is doubtful is refused, as its completion would look more certain than it "
+            "is. The exit code is 1 if some scans have no completion, 2 if none has.",
+        ),
     ),
     Command(
         "report", "write one HTML report of the fits, correspondence or study in a folder",

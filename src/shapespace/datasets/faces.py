@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.datasets.loop import loop_operator
 from shapespace.datasets.warp import Warp
 from shapespace.errors import DataError, InputError
+from shapespace.geometry.loop import loop_operator
 from shapespace.geometry.normals import faces_of
 from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, IntArray, Mesh, read_only

@@ -6,7 +6,7 @@ Equation numbers are those of docs/completion.md.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from os import PathLike
@@ -28,6 +28,7 @@ from shapespace.fit.robust.kernels import Float32Array
 from shapespace.fit.robust.robust_settings import RobustSettings
 from shapespace.fit.scan_target import ScanTarget, mm_frame
 from shapespace.geometry.closest import build_engine
+from shapespace.geometry.loop import loop_operator
 from shapespace.geometry.normals import face_areas, part_of, rms_size
 from shapespace.geometry.procrustes import centroid_size
 from shapespace.io.interop import MeshLike
@@ -44,6 +45,7 @@ OBSERVED, ESTIMATED, UNKNOWABLE = range(3)
 _FEWEST_SHAPES = 5  # training shapes; fewer determine no covariance
 _LEAST_OBSERVED = 0.05  # share of the vertices below which a completion would be the mean shape in an unknown pose
 _COMPLETE = 0.97  # share of the vertices from which on only the border of the scan is missing
+_ON_SCAN = 5.0  # multiple of the noise within which a refined vertex is on the scan
 _LEAST_GAIN = 0.1  # share of its variance in the population that a scan removes from a vertex that it determines
 _IMPLAUSIBLE = (
     3.0  # mean square of the coefficients in standard deviations of new shapes; 1 is usual, 1.5 the most seen
@@ -57,7 +59,6 @@ _OF_MISSING_PARTS = frozenset(
 )  # fmt: skip
 """Reasons to doubt a fit that follow from missing parts, and that the posterior accounts for or judges anew."""
 
-MirrorUse: TypeAlias = Literal["never", "combined", "alone"]
 Function: TypeAlias = Callable[[Mesh], float]
 
 
@@ -81,7 +82,7 @@ class CompletionConfig:
 
     samples: int = 100
     part: str | None = None
-    mirror: MirrorUse = "never"
+    mirror: Literal["never", "combined", "alone"] = "never"
     with_doubtful: bool = False
     seed: int = 0
     fit: FitConfig = field(default_factory=FitConfig)
@@ -397,3 +398,22 @@ def _volume(mesh: Mesh) -> float:
 
 def _distance(first: str, second: str, mm: float) -> Function:
     return lambda mesh: float(np.linalg.norm(mesh.landmarks[first] - mesh.landmarks[second])) * mm
+
+
+def refine_surface(completion: Completion) -> Mesh:
+    """Return the completed surface with four times the triangles, for CAD: smooth, and on the scan where observed.
+
+    Loop subdivision keeps a closed surface closed. Normals point outwards.
+    """
+    model, scan = completion.model, completion.fit.scan
+    M, faces = loop_operator(model.n_vertices, np.asarray(model.faces))
+    x = completion.vertices
+    # Subdivision smooths; what it removes is given back beforehand, so that the vertices stay where they are.
+    smooth = np.asarray(M @ (2.0 * x - (M @ x)[: len(x)]))
+    near = build_engine(scan).query(smooth)
+    reach = _ON_SCAN * completion.posterior.noise_mm * completion.T_scan_model.scale
+    is_observed = (np.asarray(M @ completion.observed.astype(np.float64)) > 1.0 - 1e-9) & (near.distance < reach)
+    mesh = Mesh(np.where(is_observed[:, None], near.points, smooth), faces, name=completion.scan_name)
+    if _is_closed(model) and _volume(mesh) < 0:
+        return replace(mesh, faces=np.ascontiguousarray(faces[:, ::-1]))
+    return mesh

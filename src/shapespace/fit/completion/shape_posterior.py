@@ -82,12 +82,23 @@ class ShapePosterior:
 
     def draw_displacements(self, count: int, rng: np.random.Generator) -> Float32Array:
         """Return (count, V, 3) float32 displacements from the mean surface, mm of the model's frame (E6)."""
-        unit = np.sqrt(np.maximum(self.covariance.diagonal(), 1e-300))
-        value, vector = np.linalg.eigh(self.covariance / np.outer(unit, unit))
-        root = unit[:, None] * vector * np.sqrt(np.maximum(value, 0.0))
-        draws = (root @ rng.standard_normal((len(root), count))).astype(np.float32)
+        root = self._root()
+        draws = (root @ rng.standard_normal((root.shape[1], count))).astype(np.float32)
         rows = self._rows()
         return (rows.reshape(-1, len(root)) @ draws).T.reshape(count, *rows.shape[:2])
+
+    def main_mode(self) -> FloatArray:
+        """Return (V, 3) the displacement of one standard deviation along the first principal component, mm."""
+        rows, root = self._rows().reshape(-1, len(self.covariance)), self._root()
+        gram = root.T @ (rows.T @ rows).astype(np.float64) @ root
+        vector = np.linalg.eigh(gram)[1][:, -1]
+        return np.asarray(rows @ (root @ vector), dtype=np.float64).reshape(-1, 3)
+
+    def _root(self) -> FloatArray:
+        """Return a root R (P, P) of the covariance, R R^T; scaled, as angles and coefficients differ in size."""
+        unit = np.sqrt(np.maximum(self.covariance.diagonal(), 1e-300))
+        value, vector = np.linalg.eigh(self.covariance / np.outer(unit, unit))
+        return unit[:, None] * vector * np.sqrt(np.maximum(value, 0.0))
 
     def _rows(self) -> Float32Array:
         """Return (V, 3, 7 + K + R) float32 how each parameter moves each vertex."""

@@ -21,7 +21,7 @@ from shapespace.types import MM_PER_UNIT, FloatArray, Mesh, Similarity
 _SAME_TURN_TRACE = 1 + 2 * np.cos(np.radians(25.0))
 _TYPICAL_COVER = 1.2  # scan size over model size of a typical crop
 _INCH_IS_RARE = 0.5  # penalty in log size
-_PLAUSIBLE_COVER = (0.45, 2.6)  # scan size over model size that a unit may leave
+_PLAUSIBLE_COVER = (0.2, 2.6)  # scan size over model size that a unit may leave; 0.3 of a femur cut in half
 _LIKELIER_BY_FAR = 0.5  # difference in log size from which the second unit is ruled out
 _ONE_BASIN_DEG = 30.0  # rotation from which a refinement finds the pose of simulated scans
 _STANDS_OUT = 0.8  # score relative to that of the runner-up below which a start is unambiguous

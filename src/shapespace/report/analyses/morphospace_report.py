@@ -71,13 +71,17 @@ def morphospace_report(result: Ordination, first: tuple[int, int] = (1, 2)) -> A
     part, arrays = morphospace_part(result, first)
     cohort, eigenvalues = result.cohort, _eigenvalue_table(result)
     variables = [(result.variable, _classes(result, result.groups.codes))] if result.groups is not None else []
-    methods = methods_of(cohort, len(cohort), sizes=sample_sizes(cohort.names, variables))
+    assumptions = [f"The axes are {_AXES[result.method]}s."]
+    if result.edges is not None:
+        assumptions.append("Ancestral shapes follow from Brownian motion along the branches of the phylogeny.")
+    sizes = sample_sizes(cohort.names, variables)
+    methods = methods_of(cohort, len(cohort), sizes=sizes, assumptions=tuple(assumptions))
     report = AnalysisReport(
         question="morphospace",
         title=f"Morphospace: {_AXES[result.method]}s",
         summary=tuple(_summary(result)),
-        parts=(part, *_confusion_parts(result), scree_part(result.eigenvalues, axis=_AXES[result.method]), eigenvalues,
-               *methods_parts(methods)),
+        parts=(part, *_confusion_parts(result), scree_part(result.eigenvalues, axis=_AXES[result.method]),
+               *tangent_parts(cohort), eigenvalues, *methods_parts(methods)),
         tables=_tables(result, eigenvalues),
         arrays={FILE: arrays},
         notes=(*cohort.notes, *result.notes),

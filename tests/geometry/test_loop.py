@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from shapespace.datasets.loop import loop_operator
+from shapespace.geometry.loop import loop_operator
 from shapespace.errors import MeshError
 
 TETRAHEDRON = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])

@@ -1,0 +1,112 @@
+"""What `complete` does: a model and partial scans in files to completed surfaces and samples in a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from shapespace.batch.progress import progress
+from shapespace.batch.run import make_jobs
+from shapespace.commands.inputs import given_scans, with_ids
+from shapespace.commands.landmark_files import LandmarkFiles
+from shapespace.errors import InputError, ShapespaceError
+from shapespace.fit.completion.complete import Completion, CompletionConfig, complete, refine_surface
+from shapespace.io.containers.arrays import write_arrays
+from shapespace.io.files import make_folder, remove_file
+from shapespace.io.landmarks.landmark_io import read_landmarks
+from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
+from shapespace.model.shape_model import ShapeModel
+
+SAMPLES = ".samples.npz"
+"""Ending of the samples of NAME.ply: vertices (S, V, 3) float32, knowledge (V,), stddev_mm (V,)."""
+
+
+@dataclass(frozen=True)
+class CompletionFiles:
+    """Input files of completions, and what is written.
+
+    Args:
+        landmarks: landmarks of the one scan, or a folder with a file for each scan, named after it.
+        recursive: also search subfolders of the given folders.
+        stl: also write NAME.stl with four times the triangles, for CAD; closed where the model is.
+    """
+
+    landmarks: Path | None = None
+    recursive: bool = False
+    stl: bool = False
+
+
+def complete_scans(
+    model_path: Path,
+    scans: Sequence[str | Path],
+    folder: Path,
+    config: CompletionConfig,
+    files: CompletionFiles,
+    *,
+    quiet: bool,
+    say: Callable[[str], None],
+    on_completion: Callable[[str, Completion], None],
+) -> dict[str, str]:
+    """Write NAME.ply and NAME.samples.npz of each scan into `folder`; return NAME -> why, of scans that failed.
+
+    Args:
+        model_path: the model's file.
+        scans: files, folders, patterns, addresses and lists, as of `fit`.
+        folder: where results go.
+        config: settings.
+        files: landmarks, and what is written.
+        quiet: no progress.
+        say: called with what was not taken, and with why scans failed.
+        on_completion: called with NAME and completion of each scan.
+
+    Raises:
+        FileError: the model cannot be read, or the results not written.
+        InputError: one file of landmarks for more than one scan, or no scans.
+    """
+    given = given_scans(scans, folder, recursive=files.recursive, say=say)
+    single = files.landmarks if files.landmarks is not None and not files.landmarks.is_dir() else None
+    if single is not None and len(given) > 1:
+        raise InputError("--landmarks belongs to one scan, but several were given; give a folder with a file for each.")
+    many = LandmarkFiles.of(None if single is not None else files.landmarks)
+    model = ShapeModel.load(model_path)
+    make_folder(folder)
+    addresses = {one.path: one.address for one in given if one.address}
+    jobs = with_ids(make_jobs([one.path for one in given], single, folder, addresses), given)
+    failed: dict[str, str] = {}
+    with progress(len(jobs), "completing", "scan", quiet=quiet) as bar:
+        for job, one in zip(jobs, given, strict=True):
+            paths = {ending: folder / f"{job.name}{ending}" for ending in (".ply", SAMPLES, ".stl")}
+            if job.scan.resolve() in {path.resolve() for path in paths.values()}:
+                raise InputError(f"{job.scan} would be overwritten by its completion; give another output folder.")
+            landmarks = one.landmarks or job.landmarks or many.of_scan(job.scan)
+            for path in paths.values():  # results of an earlier run would contradict a failure
+                remove_file(path)
+            try:
+                with job.readable() as file:
+                    scan = read_mesh(file)
+                completion = complete(
+                    model, scan, config, landmarks=None if landmarks is None else read_landmarks(landmarks)
+                )
+            except ShapespaceError as error:
+                failed[job.name] = str(error)
+                bar.clear()
+                say(str(error))
+            else:
+                write_arrays(
+                    paths[SAMPLES],
+                    {
+                        "vertices": completion.draw_samples(),
+                        "knowledge": completion.knowledge,
+                        "stddev_mm": completion.stddev_mm.astype(np.float32),
+                    },
+                )
+                if files.stl:
+                    write_mesh(paths[".stl"], refine_surface(completion))
+                write_mesh(paths[".ply"], completion.surface())
+                on_completion(job.name, completion)
+            bar.update()
+    many.report_unused(say)
+    return failed

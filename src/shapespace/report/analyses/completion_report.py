@@ -1,0 +1,165 @@
+"""Report of completions: the surfaces, their uncertainty as colour, samples as morphs, and intervals of quantities."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.fit.completion.complete import ESTIMATED, OBSERVED, UNKNOWABLE, Completion, CompletionConfig
+from shapespace.report.analyses.analysis_report import AnalysisReport, Rows
+from shapespace.reprs import first_names
+from shapespace.schemas import MorphPart, Part, SurfaceMapPart, TablePart, TextPart
+from shapespace.types import FloatArray
+
+_MOST_SURFACES = 12  # scans whose surfaces are drawn; the files have all
+_MOST_SENTENCES, _MOST_ROWS = 12, 60
+_MORPH_STDDEV = 2.0  # ends of the morph, in standard deviations
+_FILE = "completion.npz"
+_CITATIONS = (
+    "Albrecht T., Luthi M., Gerig T., Vetter T. (2013) Posterior shape models. Medical Image Analysis 17, 959-973.",
+    "Rubin D.B. (1987) Multiple imputation for nonresponse in surveys. Wiley, New York.",
+)
+
+
+@dataclass(eq=False)
+class CompletionReport:
+    """Collects what the report shows of each completion, so that completions are not held in memory.
+
+    Args:
+        config: settings of the completions.
+    """
+
+    config: CompletionConfig
+    _rows: list[tuple[Any, ...]] = field(default_factory=list[tuple[Any, ...]], init=False)
+    _estimates: list[tuple[Any, ...]] = field(default_factory=list[tuple[Any, ...]], init=False)
+    _summary: list[str] = field(default_factory=list[str], init=False)
+    _notes: dict[str, list[str]] = field(default_factory=dict[str, list[str]], init=False)
+    _parts: list[Part] = field(default_factory=list[Part], init=False)
+    _arrays: dict[str, npt.NDArray[Any]] = field(default_factory=dict[str, npt.NDArray[Any]], init=False)
+    _hashes: set[str] = field(default_factory=set[str], init=False)
+
+    def add(self, name: str, completion: Completion) -> None:
+        """Add a completion with the name of its files."""
+        shares = [float((completion.knowledge == code).mean()) for code in (OBSERVED, ESTIMATED, UNKNOWABLE)]
+        missing = ~completion.observed
+        rms_mm = float(np.sqrt((completion.stddev_mm[missing] ** 2).mean())) if missing.any() else 0.0
+        estimates = completion.estimates()
+        self._rows.append((name, completion.status, *shares, rms_mm, completion.posterior.noise_mm))
+        self._estimates += [(name, e.name, e.unit, e.value, e.mean, e.stddev, e.low, e.high) for e in estimates]
+        self._hashes.add(completion.fit.model_hash)
+        for note in completion.notes:
+            self._notes.setdefault(note, []).append(name)
+        first = estimates[0]
+        self._summary.append(
+            f"{name}: {completion.status}; the scan shows {100 * shares[0]:.0f} % of the vertices, the others have a "
+            f"standard deviation of {rms_mm:.2f} mm; {first.name} {first.value:.4g} {first.unit} (95 % interval "
+            f"{first.low:.4g} to {first.high:.4g})."
+        )
+        if completion.status == "doubtful":
+            self._notes.setdefault(completion.reason, []).append(name)
+        if len(self._rows) <= _MOST_SURFACES:
+            self._draw(name, completion)
+
+    @property
+    def count(self) -> int:
+        """Number of completions."""
+        return len(self._rows)
+
+    def report(self, failed: int) -> AnalysisReport:
+        """Return the report; `failed` scans have no completion."""
+        settings = {"samples": self.config.samples, "seed": self.config.seed, "mirror": self.config.mirror,
+                    "part": self.config.part, "with_doubtful": self.config.with_doubtful}  # fmt: skip
+        count = len(self._rows)
+        quantities = TablePart.of(
+            "Quantities", ("scan", "quantity", "unit", "completed surface", "SD", "95 % interval"),
+            [(*row[:4], row[5], (row[6], row[7])) for row in self._estimates[:_MOST_ROWS]],
+            note=f"Over {self.config.samples} samples of the whole shape. All of them are in estimates.csv.",
+        )  # fmt: skip
+        columns = ("scan", "status", "observed", "estimated", "unknowable", "SD of missing vertices, mm", "noise, mm")
+        scans = TablePart.of(
+            "Scans", columns, self._rows[:_MOST_ROWS], percent=("observed", "estimated", "unknowable"),
+            note="Observed: the scan shows the vertex. Estimated: the scan reduces its variance by at least 10 %. "
+            "Unknowable: it does not.",
+        )  # fmt: skip
+        tables: dict[str, Rows] = {
+            "completions.csv": (
+                ("scan", "status", "observed_share", "estimated_share", "unknowable_share", "missing_stddev_mm",
+                 "noise_mm"), self._rows,
+            ),
+            "estimates.csv": (
+                ("scan", "quantity", "unit", "value", "mean", "stddev", "low_95", "high_95"), self._estimates,
+            ),
+        }  # fmt: skip
+        return AnalysisReport(
+            question="complete",
+            title=f"Completion of {count} partial scan{'' if count == 1 else 's'}",
+            summary=tuple(self._summary[:_MOST_SENTENCES]),
+            parts=(scans, quantities, *self._parts, TextPart(title="Method", level=2, text=self._method())),
+            tables=tables,
+            arrays={_FILE: self._arrays},
+            notes=tuple(self._note(note, names, count) for note, names in self._notes.items())
+            + ((f"{failed} scan{' has' if failed == 1 else 's have'} no completion.",) if failed else ()),
+            settings=settings,
+            model_hashes=tuple(sorted(self._hashes)),
+            citations=_CITATIONS,
+        )
+
+    def methods_text(self) -> str:
+        """Return the paragraph for methods.txt."""
+        return "\n\n".join([" ".join(self._method()), "References", *_CITATIONS]) + "\n"
+
+    def _method(self) -> tuple[str, ...]:
+        mirror = {
+            "never": (),
+            "combined": (
+                "Missing vertices were also moved towards the mirror image of the observed side, weighted by their "
+                "variance and by the asymmetry of pairs of which both sides were observed.",
+            ),
+            "alone": ("Missing vertices with an observed mirror image were taken from it.",),
+        }[self.config.mirror]
+        return (
+            "Partial scans were completed by the posterior of pose, coefficients and off-model variation of a shape "
+            "model given the scan (Albrecht et al. 2013), linearised at its mean.",
+            "The prior variances were those of new shapes, the variance of the off-model variation was estimated from "
+            "each scan, and the error of a covariance matrix estimated from the training shapes was included by "
+            "simulated training sets.",
+            "Where the scan shows the surface, the completed surface follows the scan.",
+            *mirror,
+            f"Intervals are quantiles of {self.config.samples} samples of the whole shape (seed {self.config.seed}); "
+            "the samples are multiple imputations (Rubin 1987).",
+        )
+
+    def _note(self, note: str, names: list[str], count: int) -> str:
+        if len(names) == count and count > 1:
+            return f"All scans: {note}"
+        return f"{first_names(names, 3)}: {note}"
+
+    def _draw(self, name: str, completion: Completion) -> None:
+        """Add the maps and the morph of a completion, in mm of the scan."""
+        k, mm, model = len(self._rows), completion.fit.mm_per_scan_unit, completion.model
+        vertices = completion.vertices * mm
+        turn = completion.T_scan_model.scale * mm * completion.T_scan_model.rotation
+        mode: FloatArray = _MORPH_STDDEV * completion.posterior.main_mode() @ turn.T
+        arrays = {
+            "vertices": vertices, "stddev": completion.stddev_mm, "missing": ~completion.observed,
+            "low": vertices - mode, "high": vertices + mode,
+        }  # fmt: skip
+        self._arrays.setdefault("faces", np.asarray(model.faces))
+        self._arrays.update({f"{key}_{k}": value.astype(np.float32) if value.dtype == np.float64 else value
+                             for key, value in arrays.items()})  # fmt: skip
+        self._parts += [
+            TextPart(title=name, level=2, text=(completion.reason,)),
+            SurfaceMapPart(
+                title="Standard deviation of the vertices", arrays=_FILE, vertices=f"vertices_{k}",
+                values=f"stddev_{k}", mask=f"missing_{k}", unit="mm", signed=False,
+                note="The observed part is pale.",
+            ),
+            MorphPart(
+                title="Main uncertainty", arrays=_FILE, low=f"low_{k}", high=f"high_{k}",
+                low_label=f"-{_MORPH_STDDEV:g} SD", high_label=f"+{_MORPH_STDDEV:g} SD",
+                note="The first principal component of the samples.",
+            ),
+        ]  # fmt: skip
