@@ -162,6 +162,7 @@ def test_the_interval_of_cr_is_that_of_resampled_coordinates(tmp_path: Path) -> 
     counts = np.random.default_rng([5, 40]).multinomial(20, np.full(20, 1 / 20), size=40)
     samples = [np.repeat(shapes, own, axis=0) for own in counts]
     plain = [np.mean([plain_cr(own, modules, t) for t in np.arange(-44, 45, 6)]) for own in samples]
+    assert "nearest to its mean over all rotations" in found.methods.assumptions[0]
     assert (found.statistics[0].low, found.statistics[0].high) == pytest.approx(
         tuple(np.percentile(plain, [2.5, 97.5])), rel=1e-6
     )

@@ -12,6 +12,7 @@ from shapespace.errors import InputError
 from shapespace.geometry.landmark_alignment import align_landmarks
 from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations
 from shapespace.io.trees import Tree
+from shapespace.report.analyses.morphospace_report import morphospace_report
 from shapespace.report.analyses.shape_test_report import shape_test_report
 from shapespace.statistics.shape_tests.ordination import OrdinationMethod, ordinate
 from shapespace.statistics.shape_tests.permutations import orders
@@ -177,6 +178,7 @@ def test_phylogenetic_components_are_eigenvectors_of_evolutionary_rates() -> Non
         np.testing.assert_allclose(first.ravel(), values[3], atol=1e-9)
         np.testing.assert_allclose(axes.axes @ axes.axes.T, np.eye(9), atol=1e-9)
         assert axes.ancestors is not None and axes.ancestors.shape == (14, 9)
+        assert "Brownian motion" in " ".join(getattr(morphospace_report(axes).methods, "assumptions", ()))
 
 
 @pytest.mark.parametrize("anova_type", ["I", "II", "III"])

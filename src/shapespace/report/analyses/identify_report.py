@@ -9,6 +9,7 @@ from shapespace.report.analyses.identity import (
     INTERVALS,
     config_settings,
     csv_cells,
+    identity_methods,
     interval,
     no_error_sentence,
     percent_text,
@@ -77,6 +78,7 @@ def identify_report(result: IdentificationResult) -> AnalysisReport:
         notes=notes,
         settings=config_settings(result.config),
         model_hashes=model_hashes(trial.cohort),
+        **identity_methods(trial, result.config, result.trained_on),
     )
     return add_shape_data(report, trial.cohort)
 

@@ -13,9 +13,11 @@ from shapespace.report.analyses.analysis_report import Rows
 from shapespace.schemas import Series
 from shapespace.statistics.identity.rates import RateEstimate
 from shapespace.statistics.identity.trial import IdentityConfig, Trial
+from shapespace.statistics.methods import methods_of
 from shapespace.types import FloatArray
 
 _POINTS = 300  # points of a drawn curve, more than its pixels show
+_PLDA = "Ioffe S. (2006) Probabilistic linear discriminant analysis. European Conference on Computer Vision, 531-542."
 SCORE_NAMES = {
     "plda": "PLDA score",
     "cosine": "cosine",
@@ -73,6 +75,14 @@ def subjects_sentence(trial: Trial, trained_on: int) -> str:
         f"{tested} subjects were tested in {len(trial.rounds)} folds, each compared within itself; scores and "
         f"calibration were trained on the other folds, of at least {trained_on} subjects."
     )
+
+
+def identity_methods(trial: Trial, config: IdentityConfig, trained_on: int) -> dict[str, Any]:
+    """Return `methods` and `citations` of an `AnalysisReport`: scores, training and intervals."""
+    scores = f"Two scans are compared by {', '.join(map(score_label, config.scores))}."
+    sentences = (scores, subjects_sentence(trial, trained_on), INTERVALS)
+    methods = methods_of(trial.cohort, len(set(trial.subjects)), assumptions=sentences)
+    return {"methods": methods, "citations": (_PLDA,) if "plda" in config.scores else ()}
 
 
 def config_settings(config: IdentityConfig) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from shapespace.report.analyses.identity import (
     INTERVALS,
     config_settings,
     csv_cells,
+    identity_methods,
     interval,
     no_error_sentence,
     percent_text,
@@ -90,6 +91,7 @@ def verify_report(result: VerificationResult) -> AnalysisReport:
         notes=notes,
         settings=config_settings(result.config),
         model_hashes=model_hashes(trial.cohort),
+        **identity_methods(trial, result.config, result.trained_on),
     )
     return add_shape_data(report, trial.cohort)
 

@@ -162,6 +162,8 @@ def estimate_modularity(
         name="modularity", cohort=cohort, statistics=(replace(first, low=low, high=high), *pairs),
         settings={"modules": str(modules), "rotation_degrees": float(np.degrees(angle[0])),
                   "mean_over_rotations": float(ratios.mean()), "permutations": permutations, "seed": seed},
+        assumptions=("CR depends on the axes; it is taken at the rotation about z at which it is nearest to its mean "
+                     "over all rotations. Its interval comes from a bootstrap of shapes.",),
     )  # fmt: skip
 
 
