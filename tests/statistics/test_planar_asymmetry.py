@@ -216,5 +216,5 @@ def test_mirror_images_and_impossible_sides_are_refused() -> None:
     with pytest.raises(InputError, match="no subject has both sides"):
         alone = replace(cohort.table, columns={**cohort.table.columns, "subject": cohort.names})
         measure_asymmetry(replace(cohort, table=alone), side="side")
-    with pytest.raises(InputError, match="need --pairs, .* or --side, the column of the sides"):
+    with pytest.raises(InputError, match=r"need --pairs, .* or --side, the column of the sides"):
         measure_asymmetry(cohort)
