@@ -45,6 +45,7 @@ PAGES = {
     "recognise verify": ["identity.md", "statistics.md"],
     "recognise identify": ["identity.md", "statistics.md"],
     "align": ["morphometrics.md", "tutorial-landmarks.md"],
+    "complete": ["completion.md"],
     "morphospace": ["morphometrics.md", "tutorial-landmarks.md"],
     "compare": ["compare.md", "statistics.md"],
     **{f"test {test.name}": ["morphometrics.md", "statistics.md"] for test in SHAPE_TESTS},

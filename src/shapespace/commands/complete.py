@@ -91,6 +91,8 @@ def complete_scans(
                     model, scan, config, landmarks=None if landmarks is None else read_landmarks(landmarks)
                 )
             except ShapespaceError as error:
+                if isinstance(error, InputError) and len(jobs) > 1 and not bar.counted:
+                    raise  # of the model and the settings, and therefore of all scans
                 failed[job.name] = str(error)
                 bar.clear()
                 say(str(error))

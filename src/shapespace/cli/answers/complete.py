@@ -6,7 +6,7 @@ import argparse
 
 from shapespace.cli.answers.common import finish
 from shapespace.cli.options import given
-from shapespace.cli.printing import say
+from shapespace.cli.printing import warn
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -23,7 +23,7 @@ def run(arguments: argparse.Namespace) -> int:
     files = CompletionFiles(**given(arguments, CompletionFiles))
     collected = CompletionReport(config)
     failed = complete_scans(
-        arguments.model, arguments.scans, arguments.output, config, files, quiet=arguments.quiet, say=say,
+        arguments.model, arguments.scans, arguments.output, config, files, quiet=arguments.quiet, say=warn,
         on_completion=collected.add,
     )  # fmt: skip
     if not collected.count:

@@ -6,6 +6,7 @@ Equation numbers are those of docs/completion.md.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -14,10 +15,11 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 import numpy as np
+from scipy.stats import chi2
 
 from shapespace.errors import FitError, InputError
 from shapespace.fit.completion.mirror import add_mirror_image
-from shapespace.fit.completion.shape_posterior import ShapePosterior, shape_posterior
+from shapespace.fit.completion.shape_posterior import REPLICATES, ShapePosterior, shape_posterior
 from shapespace.fit.dense.dense_fit import dense_surface
 from shapespace.fit.diagnostics.reason_text import sentence_of
 from shapespace.fit.diagnostics.reasons import Reason, ReasonCode
@@ -27,6 +29,7 @@ from shapespace.fit.result import FitResult, Status
 from shapespace.fit.robust.kernels import Float32Array
 from shapespace.fit.robust.robust_settings import RobustSettings
 from shapespace.fit.scan_target import ScanTarget, mm_frame
+from shapespace.fit.search.initialisation import start_from_any_pose
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.loop import loop_operator
 from shapespace.geometry.normals import face_areas, part_of, rms_size
@@ -43,13 +46,16 @@ KNOWLEDGE = ("observed", "estimated", "unknowable")
 OBSERVED, ESTIMATED, UNKNOWABLE = range(3)
 
 _FEWEST_SHAPES = 5  # training shapes; fewer determine no covariance
-_LEAST_OBSERVED = 0.05  # share of the vertices below which a completion would be the mean shape in an unknown pose
+_SURE = 0.5  # share of the vertices from which on a fit without doubts is in the only likely pose
+_AS_LIKELY, _OTHER_POSE = 3.0, 0.1
+"""Log density (a factor of 20) within which another pose is as likely, and share of the size by which it differs."""
+_LEAST_OBSERVED = 0.1  # share of the vertices below which a completion would be the mean shape in an unknown pose
 _COMPLETE = 0.97  # share of the vertices from which on only the border of the scan is missing
 _ON_SCAN = 5.0  # multiple of the noise within which a refined vertex is on the scan
 _LEAST_GAIN = 0.1  # share of its variance in the population that a scan removes from a vertex that it determines
-_IMPLAUSIBLE = (
-    3.0  # mean square of the coefficients in standard deviations of new shapes; 1 is usual, 1.5 the most seen
-)
+_IMPLAUSIBLE, _RARE = 3.0, 1e-5
+"""Mean square of the coefficients in standard deviations of new shapes (1.4 is the most measured with 51 modes or more), and
+the probability of a normal shape to be implausible, which decides for few modes."""
 _OF_MISSING_PARTS = frozenset(
     {
         ReasonCode.EXPECTED_ERROR, ReasonCode.PROBABLY_FAILED, ReasonCode.MODEL_FAR_FROM_SCAN, ReasonCode.MODEL_UNSEEN,
@@ -282,18 +288,27 @@ def complete(
         )
     T_mm_scan = mm_frame(fit.scan, fit.mm_per_scan_unit)
     target = ScanTarget(fit.scan.with_vertices(T_mm_scan.apply(fit.scan.vertices)))
-    T = T_mm_scan @ fit.T_scan_model
     marks = None
     if landmarks:
-        stddev_mm = config.fit.landmark_stddev_mm or SHARE * rms_size(model.mean_vertices) * T.scale
+        stddev_mm = config.fit.landmark_stddev_mm or SHARE * rms_size(model.mean_vertices)
         marks_mm = {name: T_mm_scan.apply(point) for name, point in landmarks.items()}
         marks = LandmarkConstraint.of(model, marks_mm, stddev_mm)
     with_scale = config.fit.limits(model).with_scale
-    posterior = shape_posterior(
-        model, target, T, fit.b, _SETTINGS, with_scale=with_scale, seed=config.seed, marks=marks
-    )  # fmt: skip
+
+    def posterior_at(fit: FitResult, replicates: int = REPLICATES) -> ShapePosterior:
+        return shape_posterior(
+            model, target, T_mm_scan @ fit.T_scan_model, fit.b, _SETTINGS, with_scale=with_scale, seed=config.seed,
+            marks=marks, replicates=replicates,
+        )  # fmt: skip
+
+    apart_mm = None
+    posterior = posterior_at(fit)
+    is_sure = fit.status != "doubtful" and float(posterior.followed.mean()) > _SURE
+    if not landmarks and T_scan_model is None and not is_sure:
+        fit, apart_mm = _likeliest_pose(fit, target, T_mm_scan.inverse(), config, lambda fit: posterior_at(fit, 0))
+        posterior = posterior_at(fit)
     T = posterior.T_scan_model
-    status, reasons = _judged(fit, posterior, config)
+    status, reasons = _judged(fit, posterior, apart_mm, config)
     dense = dense_surface(model, target, T.apply(posterior.surface.vertices), T, config.fit.dense_settings)
     observed = dense.seen.copy()
     if config.part is not None:
@@ -320,17 +335,66 @@ _SETTINGS = RobustSettings(vertex_share=0.0)
 """Of the posterior: vertices on flat triangles of the scan are matched inside of its curved surface."""
 
 
-def _judged(fit: FitResult, posterior: ShapePosterior, config: CompletionConfig) -> tuple[Status, tuple[Reason, ...]]:
+def _likeliest_pose(
+    fit: FitResult,
+    target: ScanTarget,
+    T_scan_mm: Similarity,
+    config: CompletionConfig,
+    posterior_at: Callable[[FitResult], ShapePosterior],
+) -> tuple[FitResult, float | None]:
+    """Return the likeliest of the fits from all poses of the search (E9), and how far another likely one is from it.
+
+    A small part of an object fits a model in several poses.
+
+    Args:
+        fit: from the best pose of the search.
+        target: the scan in its mm frame.
+        T_scan_mm: from that frame to the scan's.
+        config: settings.
+        posterior_at: returns the posterior at a fit.
+
+    Returns:
+        The fit, and the RMS distance between its vertices and those of the other one, mm; None where there is none.
+    """
+    model, fits = fit.model, [fit]
+    with_scale = config.fit.limits(model).with_scale
+    start = start_from_any_pose(model, target.mesh.vertices, seed=config.fit.seed, with_scale=with_scale)
+    for other in start.alternatives:
+        with suppress(FitError):
+            fits.append(fit_scan(model, fit.scan, config.fit, T_scan_model=T_scan_mm @ other.T_scan_model))
+    found: list[tuple[float, FitResult, FloatArray]] = []
+    for one in fits:
+        with suppress(FitError):
+            posterior = posterior_at(one)
+            vertices = posterior.T_scan_model.apply(posterior.surface.vertices)
+            found.append((posterior.log_density(model.n_modes), one, vertices))
+    if not found:
+        return fit, None
+    found.sort(key=lambda one: -one[0])
+    best = found[0]
+    for density, _, vertices in found[1:]:
+        apart_mm = float(np.sqrt(((vertices - best[2]) ** 2).sum(axis=1).mean()))
+        if density > best[0] - _AS_LIKELY and apart_mm > _OTHER_POSE * rms_size(model.mean_vertices):
+            return best[1], apart_mm
+    return best[1], None
+
+
+def _judged(
+    fit: FitResult, posterior: ShapePosterior, apart_mm: float | None, config: CompletionConfig
+) -> tuple[Status, tuple[Reason, ...]]:
     """Return status and reasons, with what the posterior accounts for left out.
 
     Raises:
         FitError: there are reasons to doubt it, and `with_doubtful` is not set.
     """
     reasons = [reason for reason in fit.reasons if reason.code not in _OF_MISSING_PARTS]
-    z2 = posterior.mean_square_z(fit.model.n_modes)
-    if z2 > _IMPLAUSIBLE:
+    modes = fit.model.n_modes
+    z2, limit = posterior.mean_square_z(modes), max(_IMPLAUSIBLE, float(chi2.isf(_RARE, modes)) / modes)
+    if apart_mm is not None:
+        reasons.append(Reason(ReasonCode.POSE_AMBIGUOUS, {"apart_mm": apart_mm}))
+    if z2 > limit:
         reasons.append(Reason(ReasonCode.SHAPE_IMPLAUSIBLE, {"z_rms": float(np.sqrt(z2))}))
-    if fit.status != "doubtful" and z2 <= _IMPLAUSIBLE:
+    if fit.status != "doubtful" and z2 <= limit and apart_mm is None:
         return "converged", fit.reasons
     if not reasons:
         data = {"spread_mm": posterior.noise_mm, "model_matched_share": float(posterior.followed.mean())}

@@ -15,7 +15,7 @@ from shapespace.io.memory_cache import cached_with_owner
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, IntArray
 
-_SYMMETRIC_SHARE = 0.05
+_SYMMETRIC_SHARE = 0.02
 """A mean whose mirror image lies within this share of its size may be completed by its other side."""
 _PATCHES, _PRIOR_PATCHES = 300.0, 10.0
 """Independent patches of a whole surface, as in R20a, and those that the asymmetry of the modes is worth."""

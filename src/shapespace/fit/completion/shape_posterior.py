@@ -16,9 +16,9 @@ from shapespace.errors import FitError
 from shapespace.fit.dense.residual_modes import residual_modes
 from shapespace.fit.landmark_terms import LandmarkConstraint
 from shapespace.fit.robust.kernels import Float32Array
-from shapespace.fit.robust.matching import Matcher, MatchHint
+from shapespace.fit.robust.matching import Matcher, MatchHint, choose_bulging
 from shapespace.fit.robust.normal_equations import SCALE, Estimate
-from shapespace.fit.robust.posterior import NOISE_TEMPERATURE, lack_of_new_shapes, variance_of_new_shapes
+from shapespace.fit.robust.posterior import NOISE_TEMPERATURE, PATCHES, lack_of_new_shapes, variance_of_new_shapes
 from shapespace.fit.robust.prepared_model import ModelSurface, prepare
 from shapespace.fit.robust.robust_icp import Iterate, Problem, WeightedMatches
 from shapespace.fit.robust.robust_settings import Level, RobustSettings
@@ -32,12 +32,15 @@ from shapespace.types import BoolArray, FloatArray, Similarity
 _LEVEL = Level(modes=None, scan_points=20_000, vertices=None, triangles=True, iterations=15, stop_motion_mm=0.0)
 """All vertices are matched, at most so many scan points, in at most so many steps."""
 _SETTLED = 2.5e-4  # share of the model's size; a step that moves no vertex further ends the iterations
+_FAR = 0.05  # share of the model's size; farther points count as points of something else
 _LOOSE = 10.0
 """Standard deviation of rotation (radians) and of translation (in units of the model's size): hardly a prior."""
 _AMPLITUDES = np.geomspace(1e-4, 100.0, 19)
 """Variances of the off-model variation that are compared, in units of the one that the spectrum predicts."""
-_AMPLITUDE_STDDEV = 1.0  # of the logarithm of the amplitude; chosen by benchmarks/completion.py on faces and femora
-_REPLICATES = 20  # simulated training sets; their mean varies by 3 % in the standard deviations
+_AMPLITUDE_STDDEV, _OF_UNKNOWN_MODEL = 1.0, 3.0
+"""Standard deviation of the logarithm of the amplitude, chosen by benchmarks/completion.py on faces and femora; the
+second for models that do not state their number of shapes, whose spectrum does not predict the amplitude."""
+REPLICATES = 20  # simulated training sets; their mean varies by 3 % in the standard deviations
 _FLOOR = 1e-3  # variance outside the simulated modes along the model's own, in units of that of the residual modes
 
 
@@ -54,6 +57,7 @@ class ShapePosterior:
         amplitude: variance of the off-model variation in units of the one that the spectrum predicts (E3).
         noise_mm: robust standard deviation of the residuals, mm of the model's frame.
         followed: (V,) True where a scan point is matched.
+        mismatch_mm: RMS distance of the scan's points from the surface, each up to 5 % of the model's size.
     """
 
     T_scan_model: Similarity
@@ -64,6 +68,12 @@ class ShapePosterior:
     amplitude: float
     noise_mm: float
     followed: BoolArray
+    mismatch_mm: float
+
+    def log_density(self, modes: int) -> float:
+        """Return the log density of scan and shape up to a constant, with as many observations as patches (E9)."""
+        patches = PATCHES * float(self.followed.mean()) / NOISE_TEMPERATURE
+        return -patches * float(np.log(self.mismatch_mm)) - 0.5 * modes * self.mean_square_z(modes)
 
     def vertex_covariance(self) -> FloatArray:
         """Return (V, 3, 3) mm^2 of the positions of the vertices along the axes of the model's frame (E5)."""
@@ -109,6 +119,7 @@ class ShapePosterior:
 def shape_posterior(
     model: ShapeModel, target: ScanTarget, T_scan_model: Similarity, b: FloatArray, settings: RobustSettings,
     *, with_scale: bool, seed: int = 0, marks: LandmarkConstraint | None = None,
+    replicates: int = REPLICATES,
 ) -> ShapePosterior:  # fmt: skip
     """Return the posterior near a fit with the pose `T_scan_model` and the coefficients `b` (K,) mm.
 
@@ -121,6 +132,7 @@ def shape_posterior(
         with_scale: False holds the scale.
         seed: of the simulated training sets.
         marks: landmarks of the scan, if any.
+        replicates: number of simulated training sets; 0 leaves their error out.
 
     Raises:
         FitError: hardly anything of the scan matches, or the scan does not determine the pose.
@@ -139,6 +151,7 @@ def shape_posterior(
     iterate = problem.iterate(Estimate(T_scan_model, np.pad(b, (0, len(extra.stddev)))))
     matcher = problem.matcher(_LEVEL)
     hint = matcher.first_hint(iterate.surface, iterate.T_scan_model, problem.prepared.tree)
+    matcher = choose_bulging(matcher, iterate.surface, iterate.T_scan_model, hint)
     try:
         line = _Linearised.of(problem, matcher, iterate, hint, prior)
         for _ in range(_LEVEL.iterations):
@@ -148,7 +161,7 @@ def shape_posterior(
             if moved_mm < _SETTLED * size_mm * T_scan_model.scale:
                 break
             line = _Linearised.of(problem, matcher, iterate, line.weighted.matches.hint, prior)
-        covariance = _expected_error(model, line.data, line.variance, seed)
+        covariance = _expected_error(model, line.data, line.variance, seed, replicates)
     except LinAlgError as error:
         raise FitError(
             f"{target.mesh.name}: what it shows does not determine the pose; give landmarks (--landmarks)."
@@ -156,6 +169,7 @@ def shape_posterior(
     return ShapePosterior(
         iterate.T_scan_model, iterate.surface, iterate.b, covariance, line.variance, line.amplitude,
         line.weighted.sigma_mm, line.followed,
+        float(np.sqrt((np.minimum(line.weighted.matches.points.distance, _FAR * size_mm) ** 2).mean())),
     )  # fmt: skip
 
 
@@ -192,8 +206,10 @@ class _Linearised:
         log_scale = np.log(iterate.T_scan_model.scale / problem.prior.start_scale)
         theta = np.concatenate([np.zeros(SCALE), [log_scale], iterate.b])
         data = _Data(H, pull + H @ theta)
-        first = POSE + problem.prepared.model.n_modes
-        amplitude = _likeliest_amplitude(data, prior, first)
+        model = problem.prepared.model
+        first = POSE + model.n_modes
+        stddev = _AMPLITUDE_STDDEV if model.is_n_training_known else _OF_UNKNOWN_MODEL
+        amplitude = _likeliest_amplitude(data, prior, first, stddev)
         return _Linearised(weighted, gathered.seen, data, theta, amplitude, _scaled(prior, first, amplitude))
 
 
@@ -233,15 +249,15 @@ def _scaled(prior: FloatArray, first: int, amplitude: float) -> FloatArray:
     return np.concatenate([prior[:first], amplitude * prior[first:]])
 
 
-def _likeliest_amplitude(data: _Data, prior: FloatArray, first: int) -> float:
+def _likeliest_amplitude(data: _Data, prior: FloatArray, first: int, stddev: float) -> float:
     """Return the variance of the off-model variation that scan and spectrum make likeliest (E3)."""
-    score = [
-        data.log_evidence(_scaled(prior, first, a)) - 0.5 * (np.log(a) / _AMPLITUDE_STDDEV) ** 2 for a in _AMPLITUDES
-    ]
+    score = [data.log_evidence(_scaled(prior, first, a)) - 0.5 * (np.log(a) / stddev) ** 2 for a in _AMPLITUDES]
     return float(_AMPLITUDES[int(np.argmax(score))])
 
 
-def _expected_error(model: ShapeModel, data: _Data, variance: FloatArray, seed: int) -> FloatArray:
+def _expected_error(
+    model: ShapeModel, data: _Data, variance: FloatArray, seed: int, replicates: int = REPLICATES
+) -> FloatArray:
     """Return the covariance (P, P) of the error of the posterior mean, that of an estimated prior included (E4).
 
     Training sets of N shapes are drawn from the prior. For each, the prior is estimated anew as the model's was, and
@@ -249,13 +265,13 @@ def _expected_error(model: ShapeModel, data: _Data, variance: FloatArray, seed: 
     """
     P, K, N = len(variance), model.n_modes, model.n_training
     free = variance > 0
-    if not model.is_n_training_known:
+    if not model.is_n_training_known or not replicates:
         factor, unit = data.factor(variance)
         return cho_solve((factor, True), np.eye(P)) * np.outer(unit, unit)
     H, rng, total = data.H[np.ix_(free, free)], np.random.default_rng(seed), np.zeros((int(free.sum()),) * 2)
     truth = variance * (1.0 + 1.0 / N)
     truth[:POSE] = 0.0  # the pose has no prior in effect, so its error does not depend on where it is
-    for _ in range(_REPLICATES):
+    for _ in range(replicates):
         estimated = np.zeros((P, P))
         estimated[np.diag_indices(POSE)] = variance[:POSE]
         estimated[POSE:, POSE:] = _estimated_covariance(variance[POSE:], K, N, rng)
@@ -264,7 +280,7 @@ def _expected_error(model: ShapeModel, data: _Data, variance: FloatArray, seed: 
         gain = kept @ estimated
         total += (kept * truth[free]) @ kept.T + gain @ H @ gain.T
     out = np.zeros((P, P))
-    out[np.ix_(free, free)] = total / _REPLICATES
+    out[np.ix_(free, free)] = total / replicates
     return out
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from shapespace.errors import FitError
 from shapespace.fit.dense.field_kernels import compare_triangles, solve_field
 from shapespace.fit.robust.kernels import normals_into
-from shapespace.fit.robust.matching import Matcher, Matches, MatchHint, Weights
+from shapespace.fit.robust.matching import Matcher, Matches, MatchHint, Weights, choose_bulging
 from shapespace.fit.robust.prepared_model import ModelSurface, Topology, prepare
 from shapespace.fit.robust.robust_settings import DenseSettings
 from shapespace.fit.robust.weights import spread
@@ -86,9 +86,8 @@ def dense_surface(
     start = T.inverse().apply(vertices_scan_mm)
     surface = ModelSurface.of(topology, start)
     up = surface.normals
-    matcher = _matcher(target, topology, settings)
     size_mm = rms_size(model.mean_vertices)
-    matches = _match(matcher, surface, T, matcher.first_hint(surface, T), settings)
+    matcher, matches = _first_matches(target, surface, T, settings)
     noise_mm, left_mm = matches.noise_mm, matches.unexplained_mm
     displacement = np.zeros_like(start)
     if left_mm > settings.least_unexplained_mm:
@@ -157,6 +156,20 @@ class WeightedMatches:
         return gathered.W / spread_mm**2, gathered.h / spread_mm**2
 
 
+def _first_matches(
+    target: ScanTarget, surface: ModelSurface, T: Similarity, settings: DenseSettings
+) -> tuple[Matcher, WeightedMatches]:
+    """Return the matcher, with triangles that are flat or stand for a smooth surface, and the first matches.
+
+    Raises:
+        FitError: hardly anything of the scan matches the surface.
+    """
+    matcher = _matcher(target, surface.topology, settings)
+    hint = matcher.first_hint(surface, T)
+    matcher = choose_bulging(matcher, surface, T, hint)
+    return matcher, _match(matcher, surface, T, hint, settings)
+
+
 def _matcher(target: ScanTarget, topology: Topology, settings: DenseSettings) -> Matcher:
     count = len(target.mesh.vertices)
     chosen = np.arange(count, dtype=np.int32)
@@ -168,7 +181,6 @@ def _matcher(target: ScanTarget, topology: Topology, settings: DenseSettings) ->
         vertex=topology.used,
         engine=target.engine,
         normal_cosine=settings.normal_cosine,
-        bulging=True,
     )
 
 

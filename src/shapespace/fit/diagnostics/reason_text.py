@@ -48,6 +48,10 @@ _TEXTS: Mapping[ReasonCode, Callable[[Mapping[str, Any]], str]] = MappingProxyTy
             f"the scan shows two overlapping instances, {d['second_instance_mm']:.0f} mm apart; crop it to one of them "
             "(--crop)"
         ),
+        ReasonCode.POSE_AMBIGUOUS: lambda d: (
+            f"the scan fits the model in two poses about equally well, {d['apart_mm']:.0f} mm apart; give landmarks "
+            "(--landmarks)"
+        ),
         ReasonCode.PARTS_DISPLACED: lambda d: (
             f"{100 * d['displaced_share']:.0f} % of the scan runs along the fitted surface at a distance from it, as "
             "where its parts differ in scale or position; check how the scan was assembled, or crop it (--crop)"

@@ -24,6 +24,7 @@ class ReasonCode(StrEnum):
     SCAN_MIRRORED = "scan_mirrored"
     SCAN_LAYERED = "scan_layered"  # layers_apart_mm
     INSTANCES_OVERLAP = "instances_overlap"  # second_instance_mm
+    POSE_AMBIGUOUS = "pose_ambiguous"  # apart_mm
     PARTS_DISPLACED = "parts_displaced"  # displaced_share
     POINTS_SCATTERED = "points_scattered"  # scattered_share
     # status doubtful: the model

@@ -6,13 +6,13 @@ vertex of the surface to the closest point of the scan. Equation numbers are tho
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from shapespace.fit.robust.kernels import compare_into, gather_into, on_scan_into
 from shapespace.fit.robust.prepared_model import ModelSurface
-from shapespace.fit.robust.weights import match_weights
+from shapespace.fit.robust.weights import match_weights, spread
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.geometry.closest import ClosestPointEngine, ClosestPoints
 from shapespace.geometry.kdtree import KdTree
@@ -252,6 +252,20 @@ class Matcher:
             normal_cosine=self.normal_cosine,
         )
         return Matches(points, vertices, winding)
+
+
+def choose_bulging(matcher: Matcher, surface: ModelSurface, T_scan_model: Similarity, hint: MatchHint) -> Matcher:
+    """Return the matcher with triangles that stand for a smooth surface, or flat ones, as those of a simulated scan.
+
+    The residuals of the right choice have no pattern within triangles, and therefore the smaller spread.
+    """
+    tried = [replace(matcher, bulging=bulging) for bulging in (True, False)]
+    spreads: list[float] = []
+    for one in tried:
+        points = one.match(surface, T_scan_model, hint).points
+        residual = points.residual[points.allowed]
+        spreads.append(spread(residual - np.median(residual)) if len(residual) else 0.0)
+    return tried[int(np.argmin(spreads))]
 
 
 def match_vertices(

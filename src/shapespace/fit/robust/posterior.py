@@ -28,7 +28,7 @@ from shapespace.types import FloatArray, SurfaceLandmarks
 # Chosen on the split "dev" of `benchmarks/calibration.py`, so that 68 % and 95 % of the truth lie where they should.
 NOISE_TEMPERATURE = 1.7
 # independent patches of a completely observed surface, as neighbouring residuals are correlated (R20a)
-_PATCHES = 300.0
+PATCHES = 300.0
 _FEWEST_PATCHES = 100.0
 
 """Of each model in use: it takes longer to find than the rest of the posterior."""
@@ -111,7 +111,7 @@ def posterior(
             inverse[SCALE], inverse[:, SCALE] = 0.0, 0.0
         return inverse * np.outer(unit, unit)
 
-    reported = covariance(max(_PATCHES * allowed_share**2, _FEWEST_PATCHES))  # R20a
+    reported = covariance(max(PATCHES * allowed_share**2, _FEWEST_PATCHES))  # R20a
     conservative = covariance(_FEWEST_PATCHES) if beyond_model_mm > 0 else reported
     off_mm2 = float((conservative * _gram(surface)).sum()) / len(surface.vertices)  # R22, first term
     return Posterior(reported, variance, float(np.sqrt(max(off_mm2, 0.0))))
