@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from shapespace.datasets.faces import load_faces
     from shapespace.datasets.simulated_scan import simulate_scan
     from shapespace.errors import ShapespaceError
+    from shapespace.fit.completion.complete import CompletionConfig, complete
     from shapespace.fit.fit_scan import FitConfig, fit_scan
     from shapespace.fit.result import FitResult
     from shapespace.geometry.distance import surface_distances
@@ -43,6 +44,7 @@ __all__ = [
     "BuildConfig",
     "Cohort",
     "CohortConfig",
+    "CompletionConfig",
     "CorrespondConfig",
     "FitConfig",
     "FitResult",
@@ -53,6 +55,7 @@ __all__ = [
     "__version__",
     "as_mesh",
     "build_model",
+    "complete",
     "correspond",
     "fit_scan",
     "load_faces",
@@ -119,6 +122,7 @@ _name, __dir__ = lazy_names(
         "datasets.faces": ("load_faces",),
         "datasets.simulated_scan": ("simulate_scan",),
         "errors": ("ShapespaceError",),
+        "fit.completion.complete": ("CompletionConfig", "complete"),
         "fit.fit_scan": ("FitConfig", "fit_scan"),
         "fit.result": ("FitResult",),
         "geometry.distance": ("surface_distances",),

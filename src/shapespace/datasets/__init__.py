@@ -6,10 +6,12 @@ from shapespace.lazy import lazy_names
 
 if TYPE_CHECKING:
     from shapespace.datasets.faces import FaceGenerator, load_faces
-    from shapespace.datasets.simulated_scan import SimulatedScan, simulate_scan
+    from shapespace.datasets.simulated_scan import Cut, Hole, SimulatedScan, simulate_scan
 
 __all__ = [
+    "Cut",
     "FaceGenerator",
+    "Hole",
     "SimulatedScan",
     "load_faces",
     "simulate_scan",
@@ -18,6 +20,6 @@ __getattr__, __dir__ = lazy_names(
     __name__,
     {
         "datasets.faces": ("FaceGenerator", "load_faces"),
-        "datasets.simulated_scan": ("SimulatedScan", "simulate_scan"),
+        "datasets.simulated_scan": ("Cut", "Hole", "SimulatedScan", "simulate_scan"),
     },
 )

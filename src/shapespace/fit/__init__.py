@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from shapespace.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from shapespace.fit.completion.complete import Completion, CompletionConfig, QuantityEstimate, complete
+    from shapespace.fit.completion.complete import Completion, QuantityEstimate
     from shapespace.fit.diagnostics.evidence import FitEvidence
     from shapespace.fit.diagnostics.failure_model import ErrorEstimate
     from shapespace.fit.diagnostics.reasons import Reason, ReasonCode
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Completion",
-    "CompletionConfig",
     "ErrorEstimate",
     "FitConfig",
     "FitEvidence",
@@ -34,12 +33,11 @@ __all__ = [
     "Robust",
     "SecondInstance",
     "Stage",
-    "complete",
 ]
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
-        "fit.completion.complete": ("Completion", "CompletionConfig", "QuantityEstimate", "complete"),
+        "fit.completion.complete": ("Completion", "QuantityEstimate"),
         "fit.diagnostics.evidence": ("FitEvidence",),
         "fit.diagnostics.failure_model": ("ErrorEstimate",),
         "fit.diagnostics.reasons": ("Reason", "ReasonCode"),
