@@ -302,6 +302,8 @@ def test_a_saved_model_loads_as_it_was(tmp_path: Path, gauge: str) -> None:
     assert len(loaded.landmarks) == 4
     assert loaded.licence == "CC0"
     assert loaded.noise_variance == model.noise_variance
+    replace(model, is_n_training_known=False).save(tmp_path / "m.h5")
+    assert loaded.is_n_training_known and not ShapeModel.load(tmp_path / "m.h5").is_n_training_known
 
 
 def test_landmarks_from_numpy_and_unicode_text_survive(tmp_path: Path) -> None:

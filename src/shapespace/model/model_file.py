@@ -49,7 +49,7 @@ class _FileAttributes(Struct, frozen=True):
     provenance: str
     licence: str
     variance_divisor: str = ""
-    n_training_known: bool = True
+    n_training_known: str = "yes"
     regions: str = "{}"
 
 
@@ -89,7 +89,7 @@ def save(
     arrays, attributes = _contents(model)
     made_by: dict[str, Attribute] = {"model_hash": hash_of(model), "software_version": __version__}
     if not model["is_n_training_known"]:  # no part of the hash, which files of earlier versions have without it
-        made_by["n_training_known"] = False
+        made_by["n_training_known"] = "no"
     write_hdf5(path, {**arrays, **(more_arrays or {})}, {**attributes, **(more_attributes or {}), **made_by})
 
 
@@ -192,7 +192,7 @@ def load(path: Path) -> ModelFields:
             "held_out": attributes_of_file.variance_divisor == _HELD_OUT,
             "residuals": owned.get(_RESIDUALS),
             "regions": _regions(attributes_of_file.regions, owned.get(_REGIONS)),
-            "is_n_training_known": attributes_of_file.n_training_known,
+            "is_n_training_known": attributes_of_file.n_training_known != "no",
         }
     except (KeyError, ValueError) as error:
         reason = str(error)[:_LONGEST_DETAIL].replace("`", "").replace("Object missing", "missing")

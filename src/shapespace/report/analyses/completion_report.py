@@ -55,8 +55,8 @@ class CompletionReport:
         first = estimates[0]
         self._summary.append(
             f"{name}: {completion.status}; the scan shows {100 * shares[0]:.0f} % of the vertices, the others have a "
-            f"standard deviation of {rms_mm:.2f} mm; {first.name} {first.value:.4g} {first.unit} (95 % interval "
-            f"{first.low:.4g} to {first.high:.4g})."
+            f"standard deviation of {rms_mm:.2f} mm; {first.name} {_number(first.value)} {first.unit} (95 % interval "
+            f"{_number(first.low)} to {_number(first.high)})."
         )
         if completion.status == "doubtful":
             self._notes.setdefault(completion.reason, []).append(name)
@@ -74,8 +74,8 @@ class CompletionReport:
                     "part": self.config.part, "with_doubtful": self.config.with_doubtful}  # fmt: skip
         count = len(self._rows)
         quantities = TablePart.of(
-            "Quantities", ("scan", "quantity", "unit", "completed surface", "SD", "95 % interval"),
-            [(*row[:4], row[5], (row[6], row[7])) for row in self._estimates[:_MOST_ROWS]],
+            "Quantities", ("scan", "quantity", "unit", "completed surface", "SD", "95 % from", "to"),
+            [(*row[:4], *row[5:]) for row in self._estimates[:_MOST_ROWS]],
             note=f"Over {self.config.samples} samples of the whole shape. All of them are in estimates.csv.",
         )  # fmt: skip
         columns = ("scan", "status", "observed", "estimated", "unknowable", "SD of missing vertices, mm", "noise, mm")
@@ -163,3 +163,7 @@ class CompletionReport:
                 note="The first principal component of the samples.",
             ),
         ]  # fmt: skip
+
+
+def _number(value: float) -> str:
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
