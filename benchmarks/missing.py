@@ -45,11 +45,16 @@ def faces() -> Draw:
     return lambda rng: generator.cut_to_face(generator.face(generator.draw_person(rng)))
 
 
-def femora() -> Draw:
+def femur_file() -> Path:
+    """Return the file of the open femur model."""
     path = Path(os.environ.get("SHAPESPACE_DATA", ".")) / "models" / "femur_gp_model_50-components.h5"
     if not path.is_file():
         raise SystemExit(f"{path} is not here; it comes from unibas-gravis/icp-proposal, data/femur.")
-    with h5py.File(path) as stored:
+    return path
+
+
+def femora() -> Draw:
+    with h5py.File(femur_file()) as stored:
         modes = np.asarray(stored["model/pcaBasis"][:] * np.sqrt(stored["model/pcaVariance"][:]), dtype=np.float64)
         mean = np.asarray(stored["model/mean"][:], dtype=np.float64)
         cells = np.ascontiguousarray(stored["representer/cells"][:].T, dtype=np.int32)
