@@ -1,6 +1,6 @@
 """Equations have the same numbers on pages and in code.
 
-P paper, R robust, C correspondence, S statistics, M morphometrics.
+P paper, R robust, E completion, C correspondence, S statistics, M morphometrics.
 
 On a page a number is the tag of an equation, in the code it stands in a comment or a docstring.
 """
@@ -21,12 +21,13 @@ PAGES = sorted((ROOT / "docs").glob("*.md"))
 HOMES = {
     "P": ("geometry", "model", "fit"),
     "R": ("fit",),
+    "E": ("fit",),
     "C": ("correspondence", "model", "geometry", "batch"),
     "S": ("statistics",),
     "M": ("statistics", "geometry", "report"),
 }
 """Folders of the code whose comments have the numbers of a prefix; elsewhere R2 and the like are other things."""
-NUMBER = r"[PRCSM]\d+[a-z]?"
+NUMBER = r"[PRECSM]\d+[a-z]?"
 RANGE = re.compile(rf"(?<![\w.^*])({NUMBER})(?:\s?[-–]\s?({NUMBER}))?(?![\w.*])")
 MATH = re.compile(r"^```math\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"(?<![\\$])\$([^$\n]+)\$")
@@ -49,7 +50,7 @@ def on_pages() -> frozenset[str]:
 
 
 def ordered(tag: str) -> tuple[str, int, str]:
-    match = re.fullmatch(r"([PRCSM])(\d+)([a-z]?)", tag)
+    match = re.fullmatch(r"([PRECSM])(\d+)([a-z]?)", tag)
     assert match
     return match[1], int(match[2]), match[3]
 

@@ -141,7 +141,7 @@ def shape_posterior(
     # The strongest residual modes have all of the variance that new shapes have outside the model.
     off_model = extra.stddev**2 * (lack_of_new_shapes(model) ** 2 * model.n_vertices / (extra.stddev**2).sum())
     size_mm = rms_size(model.mean_vertices)
-    prior = np.concatenate(
+    prior = np.concatenate(  # E1
         [np.full(3, _LOOSE**2), np.full(3, (_LOOSE * size_mm) ** 2), [settings.scale_stddev**2 if with_scale else 0.0],
          variance_of_new_shapes(model), off_model]
     )  # fmt: skip
