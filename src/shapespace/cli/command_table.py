@@ -179,6 +179,7 @@ def _cohort(surfaces: str = "auto") -> tuple[Option, ...]:
         advanced("--surfaces", source=COHORT, default=surfaces),
         advanced("--doubtful", source=COHORT),
         advanced("--geometry", source=COHORT),
+        advanced("--imputations", "M", source=COHORT),
         *_figures(),
     )  # fmt: skip
 

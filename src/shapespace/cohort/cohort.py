@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from shapespace.cohort.classes import class_notes
 from shapespace.cohort.incomplete import complete_by_population, completed_shapes
+from shapespace.cohort.shape_samples import ShapeSamples
 from shapespace.cohort.table import Table, list_names, numbers_as_text
 from shapespace.errors import CorrespondenceError, InputError
 from shapespace.geometry.landmark_alignment import AlignedLandmarks, project_to_tangent
@@ -142,6 +143,8 @@ class Cohort:
             nothing varies. None if all are analysed.
         position_std: (V,) RMS over the shapes read of `Mesh.position_std`, in the size of `reference`; None if a shape
             has none.
+        samples: N samples of the distribution of each completed shape, in any pose; None for shapes without. Empty if
+            no shape has any.
     """
 
     names: tuple[str, ...]
@@ -160,6 +163,7 @@ class Cohort:
     observed: BoolArray | None = None
     analysed: BoolArray | None = None
     position_std: FloatArray | None = None
+    samples: tuple[ShapeSamples | None, ...] = ()
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -174,7 +178,7 @@ class Cohort:
             and self.sizes_mm.shape == (n,)
             and len(self.table) == n
         )
-        if not agree:
+        if not agree or len(self.samples) not in (0, n):
             raise InputError("A cohort needs a row of coefficients, a size and a row of the table for each shape.")
         if self.landmarks is not None:
             object.__setattr__(self, "landmarks", SurfaceLandmarks.of(self.landmarks))
@@ -222,6 +226,47 @@ class Cohort:
         mask = self.observed if self.analysed is None else self.observed[:, self.analysed]
         return 1.0 - mask.mean(axis=1)
 
+    @property
+    def imputations(self) -> int:
+        """Number of imputations: the fewest samples of a completed shape; 0 if no shape has samples."""
+        return min((len(own) for own in self.samples if own is not None), default=0)
+
+    def imputation(self, k: int, onto: Cohort | None = None) -> Cohort:
+        """Return the cohort with sample `k`, from 0, of every completed shape; other shapes are the same in each.
+
+        Args:
+            k: number of the imputation.
+            onto: cohort to whose mean the samples are aligned; None for this one.
+
+        Raises:
+            InputError: there is no such imputation.
+            FileError: samples cannot be read.
+        """
+        if not 0 <= k < self.imputations:
+            raise InputError(f"The cohort has {self.imputations} imputations, and no number {k}.")
+        rows = [row for row, own in enumerate(self.samples) if own is not None]
+        drawn = np.stack([np.asarray(own[k], dtype=np.float64) for own in self.samples if own is not None])
+        shapes, sizes = np.stack([self.vertices(row) for row in range(len(self))]), self.sizes_mm.copy()
+        part = slice(None) if self.analysed is None else self.analysed
+        sizes[rows] = [centroid_size(sample[part]) for sample in drawn]
+        _align_to(drawn, onto or self)
+        shapes[rows] = drawn
+        observed = None if self.observed is None else self.observed.copy()
+        if observed is not None:
+            observed[rows] = True if self.analysed is None else self.analysed
+            observed = None if observed.all() else observed
+        reference = shapes.mean(axis=0)
+        basis, coefficients = _orthonormal((shapes - reference).reshape(len(shapes), -1))
+        return replace(
+            self,
+            reference=read_only(reference),
+            basis=basis,
+            coefficients=coefficients,
+            sizes_mm=read_only(sizes),
+            observed=observed,
+            samples=(),
+        )
+
     def observed_in(self, rows: Sequence[int]) -> BoolArray | None:
         """Return the mask (V,) of vertices that every shape observes; None if all shapes observe all vertices."""
         if self.observed is None and self.analysed is None:
@@ -259,6 +304,7 @@ class Cohort:
             table=self.table.take(rows),
             fitted=None if self.fitted is None else self.fitted.take(rows),
             observed=None if self.observed is None else self.observed[indices],
+            samples=tuple(self.samples[row] for row in rows) if self.samples else (),
             notes=(*self.notes, *notes),
         )
 
@@ -308,6 +354,7 @@ class Cohort:
         least: int = 2,
         unit: LengthUnit | None = None,
         observed: BoolArray | None = None,
+        samples: Sequence[ShapeSamples | None] = (),
     ) -> Cohort:
         """Return the cohort of shapes (N, V, 3) in correspondence, mm, after generalised Procrustes.
 
@@ -327,6 +374,8 @@ class Cohort:
             unit: of the coordinates: `mm`, or empty for none; None takes `mm`, unless all centroid sizes are 1, as
                 after a Procrustes superimposition, which divides the unit out.
             observed: (N, V) bool, False for vertices that are missing too; None if all others are observed.
+            samples: N, of shapes that are completed: their vertices that are not observed are used as they are. None
+                for a shape without.
 
         Raises:
             InputError: too few shapes, values that are infinite, hardly a vertex observed in a shape, columns of
@@ -340,7 +389,12 @@ class Cohort:
         shape_names = tuple(names) if names is not None else tuple(f"shape {k + 1}" for k in range(len(shapes)))
         cells = {name: tuple(_cell(value) for value in values) for name, values in columns.items()}
         is_observed: BoolArray = ~np.logical_or.reduce(np.isnan(shapes), axis=2)
-        is_observed = is_observed if observed is None else np.logical_and(is_observed, observed)
+        is_known = is_observed if observed is None else np.logical_and(is_observed, observed)
+        completed_rows = [row for row, own in enumerate(samples) if own is not None]
+        if not is_observed[completed_rows].all():
+            raise InputError("A vertex of a shape with samples is not a number; complete the shape again.")
+        is_observed = is_known.copy()
+        is_observed[completed_rows] = True
         mask, analysed = None if is_observed.all() else is_observed, None
         sizes = read_only([centroid_size(shape) for shape in shapes])
         if onto is not None:
@@ -374,8 +428,9 @@ class Cohort:
             gauge=gauge,
             faces=faces,
             landmarks=None if landmarks is None else SurfaceLandmarks.of(landmarks),
-            observed=mask,
+            observed=_combined(mask, is_known if completed_rows else None, analysed),
             analysed=analysed,
+            samples=tuple(samples) if completed_rows else (),
             unit=unit if unit is not None else "" if np.abs(sizes - 1.0).max() < _UNIT_SIZE else "mm",
         )
         refuse_twice(cohort)
@@ -425,9 +480,10 @@ class Cohort:
         gauge: Gauge = "shape",
         onto: Cohort | None = None,
         least: int = 2,
+        samples: Sequence[ShapeSamples | None] = (),
     ) -> Cohort:
-        """Return the cohort of meshes in correspondence, mm, after generalised Procrustes; `onto` and `least` as of
-        `of_shapes`.
+        """Return the cohort of meshes in correspondence, mm, after generalised Procrustes; `onto`, `least` and
+        `samples` as of `of_shapes`.
 
         Raises:
             CorrespondenceError: meshes that differ in vertices or triangles.
@@ -445,8 +501,9 @@ class Cohort:
         all_observed = np.ones(len(first.vertices), dtype=np.bool_)
         observed = np.stack([all_observed if mesh.observed is None else mesh.observed for mesh in meshes])
         cohort = Cohort.of_shapes(
-            shapes, {}, names=names, faces=first.faces, gauge=gauge, onto=onto, least=least, observed=observed
-        )
+            shapes, {}, names=names, faces=first.faces, gauge=gauge, onto=onto, least=least, observed=observed,
+            samples=samples,
+        )  # fmt: skip
         stds = [mesh.position_std for mesh in meshes if mesh.position_std is not None]
         if len(stds) < len(meshes):
             return replace(cohort, table=table)
@@ -512,6 +569,15 @@ class Cohort:
         )
         refuse_twice(cohort)
         return cohort
+
+
+def _combined(mask: BoolArray | None, known: BoolArray | None, analysed: BoolArray | None) -> BoolArray | None:
+    """Return the (N, V) observed vertices: those of `mask` that are also `known`, before shapes were completed."""
+    if known is None:
+        return mask
+    known = known if mask is None else np.logical_and(mask, known)
+    known = known if analysed is None else np.logical_and(known, analysed)
+    return None if known.all() else known
 
 
 def _align_to(shapes: FloatArray, onto: Cohort) -> None:

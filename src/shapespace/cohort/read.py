@@ -13,6 +13,7 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort, Fitted, ShapeSource
 from shapespace.cohort.landmark_cohort import has_landmarks, landmark_cohort, read_landmark_cohort
+from shapespace.cohort.shape_samples import ENDING, SampleFile, samples_beside
 from shapespace.cohort.table import Table, list_names, note_unmatched, read_table
 from shapespace.errors import InputError
 from shapespace.geometry.procrustes import Gauge
@@ -49,6 +50,8 @@ class CohortConfig:
         doubtful: include doubtful fits and corresponding surfaces (default: excluded, and counted).
         geometry: what is analysed of surfaces with landmarks: the `surface`, or the `landmarks` alone.
         least: shapes that there must be; one will do where it is compared with what is known already.
+        imputations: number of samples of each completed shape (NAME.samples.npz next to NAME.ply) that compare,
+            regress, asymmetry and score combine by Rubin's rules; 0 or 1 ignores samples.
     """
 
     shapes: Path | str | None = None
@@ -58,8 +61,11 @@ class CohortConfig:
     doubtful: bool = False
     geometry: Geometry = "surface"
     least: int = 2
+    imputations: int = 20
 
     def __post_init__(self) -> None:
+        if self.imputations < 0:
+            raise InputError("CohortConfig: the number of imputations must be 0 or more.")
         for name, path in (("shapes", self.shapes), ("model", self.model)):
             if path is not None and not isinstance(path, str | PathLike):  # pyright: ignore[reportUnnecessaryIsInstance]
                 raise InputError(f"CohortConfig: {name} is a path, not {type(path).__name__}; give a str or a Path.")
@@ -108,6 +114,11 @@ def read_cohort(
     if config.geometry == "landmarks":
         least = 1 if onto is not None else config.least
         surfaces = read_cohort(data, replace(config, geometry="surface", least=least), on_shape=on_shape)
+        if surfaces.samples:
+            note = (
+                "The samples of completed shapes are not used for landmarks, so p does not contain their uncertainty."
+            )
+            surfaces = replace(surfaces, notes=(*surfaces.notes, note))
         listed = (source if source.is_dir() else source.parent) / _LANDMARKS
         if surfaces.landmarks is None and listed.is_file():
             surfaces = replace(surfaces, landmarks=read_surface_landmarks(listed))
@@ -286,7 +297,12 @@ def _of_surfaces(
     notes = list(listing.notes)
     if config.gauge == "form":
         listing.refuse_mixed_units()
-    files = {surface_stem(file): file for file in listing.files if file.suffix.lower() != ".csv"}
+    # A completion may be written in several formats; its samples are of the vertices of the PLY file.
+    files = {
+        surface_stem(file): file
+        for file in listing.files
+        if file.suffix.lower() == ".ply" or not (file.suffix.lower() == ".csv" or file.with_suffix(ENDING).is_file())
+    }
     matched = [(files[key], row_index) for row_index, key in enumerate(keys) if key in files]
     note_unmatched(
         notes=notes,
@@ -303,16 +319,29 @@ def _of_surfaces(
             f"{folder}: {len(matched)} of its meshes are in {table.where}, and {_count_words(least)} the least."
         )
     meshes: list[Mesh] = []
+    samples: list[SampleFile | None] = []
     for n_read, (file, _) in enumerate(matched, 1):
         meshes.append(replace(listing.mesh(file), name=surface_stem(file)))
+        samples.append(samples_beside(file, meshes[-1], max(config.imputations, 1)))
         if on_shape is not None:
             on_shape(n_read, len(matched))
     cohort = Cohort.of_meshes(
-        meshes, table.take([row_index for _, row_index in matched]), config.gauge, onto, config.least
+        meshes, table.take([row_index for _, row_index in matched]), config.gauge, onto, config.least, samples
     )
+    notes += _sample_notes(cohort, config.imputations)
+    cohort = cohort if config.imputations > 1 else replace(cohort, samples=())
     corresponding = all(file.name.endswith(SURFACE) for file, _ in matched)
     source = ShapeSource("corresponding" if corresponding else "surfaces")
     return replace(cohort, notes=(*notes, *cohort.notes), source=source)
+
+
+def _sample_notes(cohort: Cohort, asked: int) -> list[str]:
+    completed = sum(own is not None for own in cohort.samples)
+    if completed and asked < 2:
+        return [f"The samples of {completed} completed shapes are ignored, so p does not contain their uncertainty."]
+    if completed and cohort.imputations < asked:
+        return [f"A completed shape has {cohort.imputations} samples, so there are as many imputations, not {asked}."]
+    return []
 
 
 def _by_key(rows: Sequence[_Row]) -> dict[str, _Row]:

@@ -28,6 +28,7 @@ from shapespace.schemas import Methods, SampleSize, TestScheme
 from shapespace.statistics.analysis_result import AnalysisResult
 from shapespace.statistics.effect_size import effect_size
 from shapespace.statistics.methods import methods_of
+from shapespace.statistics.multiple_imputation import Imputations, over_imputations
 from shapespace.statistics.observation_weights import weights_of
 from shapespace.statistics.sides import Sides, aligned_shapes, find_sides, given_sides, match_sides
 from shapespace.step_counter import Progress, StepCounter
@@ -122,6 +123,7 @@ class AsymmetryResult(AnalysisResult):
         size_anova: the same rows for the centroid sizes of separate sides, with the degrees of freedom of
             `observations`.
         degrees_of_freedom: of the ANOVA of shape.
+        imputations: those that p values combine; None without samples of completed shapes.
     """
 
     cohort: Cohort
@@ -146,6 +148,7 @@ class AsymmetryResult(AnalysisResult):
     observed: BoolArray | None = None
     size_anova: tuple[AnovaRow, ...] = ()
     degrees_of_freedom: DegreesOfFreedom = "klingenberg"
+    imputations: Imputations | None = None
 
     @property
     def observed_share(self) -> FloatArray:
@@ -233,6 +236,8 @@ def measure_asymmetry(
 ) -> AsymmetryResult:
     """Return what the sides of the objects of a cohort differ by.
 
+    If completed shapes have samples, each imputation is tested too, and p values combine them by Rubin's rules.
+
     Args:
         cohort: the shapes; in the gauge `form` millimetres are those of each object.
         subject: column of the subjects; several shapes of a subject measure the measurement error (default: `subject`,
@@ -257,12 +262,32 @@ def measure_asymmetry(
         raise InputError("The number of permutations and the seed must be 0 or more.")
     if degrees_of_freedom not in get_args(DegreesOfFreedom):
         raise InputError(f"There are no degrees of freedom {degrees_of_freedom!r}; choose klingenberg or observations.")
-    if side is None:
-        sides = find_sides(cohort) if pairs is None else given_sides(cohort, pairs, where)
-        first, both = cohort, _with_images(cohort, sides)
-    else:
+    if side is not None:
         cohort, sides = match_sides(cohort, subject, side)
+    else:
+        sides = find_sides(cohort) if pairs is None else given_sides(cohort, pairs, where)
+    return _measure_sides(
+        cohort, sides, subject, reference, degrees_of_freedom, permutations, seed, progress=progress
+    )  # fmt: skip
+
+
+@over_imputations(parts=("anova", "size_anova"))
+def _measure_sides(
+    cohort: Cohort,
+    sides: Sides,
+    subject: str | None,
+    reference: tuple[str, str] | None,
+    degrees_of_freedom: DegreesOfFreedom,
+    permutations: int,
+    seed: int,
+    *,
+    progress: Progress | None,
+) -> AsymmetryResult:
+    """Return what the given sides of the objects of a cohort differ by; arguments as of `measure_asymmetry`."""
+    if sides.classes:
         first, both = cohort.take(range(len(cohort) // 2)), np.stack([cohort.vertices(k) for k in range(len(cohort))])
+    else:
+        first, both = cohort, _with_images(cohort, sides)
     names, codes = _subjects(first, subject)
     in_reference = _in_reference(first, names, codes, reference)
     symmetric, difference, mean = _split(first, sides, both)
@@ -279,7 +304,7 @@ def measure_asymmetry(
     along = _along(difference, normals) if normals is not None else difference
     own, own_difference = subjects.means(along), subjects.means(difference)
     asymmetry = own[..., None] * normals if normals is not None else own
-    fitted = cohort if side is None else replace(first, fitted=None)
+    fitted = cohort if not sides.classes else replace(first, fitted=None)
     scores = _scores(along, subjects, _shared_error(fitted, sides, mean, asymmetry, subjects))
     vertex_scores = _scores(difference, subjects, _shared_error(fitted, sides, mean, own_difference, subjects))
     z, z_low, z_high = _standardised(scores, in_reference)
@@ -295,7 +320,7 @@ def measure_asymmetry(
     else:
         anova = _pooled_anova(*parts, subjects, rng, steps, exchange_sides=exchange)
     size_anova: tuple[AnovaRow, ...] = ()
-    if side is not None and np.isfinite(cohort.sizes_mm).all():
+    if sides.classes and np.isfinite(cohort.sizes_mm).all():
         one, other = cohort.sizes_mm[: len(first), None], cohort.sizes_mm[len(first) :, None]
         middle, own_rng, own_steps = (one + other) / 2, np.random.default_rng(seed), _Steps(4 * permutations, None)
         size_anova = _pooled_anova(middle, one - other, subjects, own_rng, own_steps, exchange_sides=exchange)

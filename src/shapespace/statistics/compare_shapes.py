@@ -14,6 +14,7 @@ from functools import cached_property
 from typing import Literal, TypeAlias
 
 import numpy as np
+from msgspec import structs
 
 from shapespace.cohort.cohort import Cohort, with_columns
 from shapespace.errors import InputError
@@ -36,6 +37,7 @@ from shapespace.statistics.compare_within import ModelStrata, RepeatedMeasures, 
 from shapespace.statistics.dispersion import DispersionTest
 from shapespace.statistics.effect_size import EFFECT_SIZES, EffectSize, effect_size, permutation_p
 from shapespace.statistics.methods import dispersion_record, methods_of, sample_sizes
+from shapespace.statistics.multiple_imputation import Imputations, over_imputations
 from shapespace.statistics.observation_weights import information, weights_of
 from shapespace.statistics.tolerances import TIE
 from shapespace.step_counter import StepCounter
@@ -247,6 +249,7 @@ class CompareResult(AnalysisResult):
         dispersions: tests of equal dispersion of the classes of each variable between subjects.
         methods: sample sizes, tests and assumptions.
         repeated_measures: how several shapes of a subject enter the tests; None where all shapes are independent.
+        imputations: those that p values combine; None without samples of completed shapes.
     """
 
     cohort: Cohort
@@ -260,6 +263,7 @@ class CompareResult(AnalysisResult):
     dispersions: tuple[DispersionTest, ...]
     methods: Methods
     repeated_measures: RepeatedMeasures | None
+    imputations: Imputations | None = None
 
     @cached_property
     def mean(self) -> FloatArray:
@@ -282,6 +286,20 @@ class CompareResult(AnalysisResult):
         return f"<CompareResult of {len(self.cohort)} shapes of {self.n_subjects} subjects; {terms}>"
 
 
+def _update(result: CompareResult) -> CompareResult:
+    """Return a comparison in which all that depends on p follows those of its tests."""
+    effects = tuple(
+        replace(effect, exploratory=_is_exploratory(effect, result.design, result.tests, result.config))
+        for effect in result.effects
+    )
+    records = tuple(dispersion_record(test, result.config.alpha) for test in result.dispersions)
+    return replace(result, effects=effects, methods=structs.replace(result.methods, dispersions=records))
+
+
+@over_imputations(
+    parts=("tests", "effects", "angles", "dispersions", "map", "along", "any_way", "bump"),
+    finish=_update,
+)
 def compare(
     cohort: Cohort,
     formula: str,
@@ -293,6 +311,8 @@ def compare(
 
     `size` and `log_size`, the centroid size in mm and its logarithm, may stand in the formula beside the columns of the
     table.
+
+    If completed shapes have samples, each imputation is tested too, and p values combine them by Rubin's rules.
 
     Args:
         cohort: the shapes and their table.

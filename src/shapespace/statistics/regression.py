@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -28,6 +28,7 @@ from shapespace.statistics.linear_regressors import (
     weighted_mean,
 )
 from shapespace.statistics.methods import SCAN_OF_SUBJECT, methods_of
+from shapespace.statistics.multiple_imputation import Imputations, over_imputations
 from shapespace.statistics.predictor import Predictions, Predictor, cv_plus, model_hash_of
 from shapespace.step_counter import StepCounter
 from shapespace.types import FloatArray, Mesh, read_only, require
@@ -76,6 +77,7 @@ class RegressionResult(AnalysisResult):
         draws: of subjects, for intervals of figures.
         seed: of folds, permutations and draws.
         subject: column of the subjects, as given; None for the default.
+        imputations: those that p, predictions and measures combine; None without samples of completed shapes.
     """
 
     cohort: Cohort
@@ -102,6 +104,7 @@ class RegressionResult(AnalysisResult):
     draws: int
     seed: int
     subject: str | None = None
+    imputations: Imputations | None = None
 
     @property
     def n_subjects(self) -> int:
@@ -157,6 +160,13 @@ class RegressionResult(AnalysisResult):
         )
 
 
+def _update(result: RegressionResult) -> RegressionResult:
+    """Return a regression whose combined interval of the coverage ends at 1."""
+    coverage = result.measures["coverage"]
+    return replace(result, measures={**result.measures, "coverage": replace(coverage, high=min(coverage.high, 1.0))})
+
+
+@over_imputations(parts=("measures",), finish=_update)
 def regress(
     cohort: Cohort,
     target: str,
@@ -170,6 +180,9 @@ def regress(
     progress: Callable[[int, int], None] | None = None,
 ) -> RegressionResult:
     """Learn a number from shape, and measure on subjects left out how well.
+
+    If completed shapes have samples, each imputation is analysed too; p, measures and predictions of the cohort combine
+    them by Rubin's rules.
 
     Args:
         cohort: the shapes.

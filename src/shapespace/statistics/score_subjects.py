@@ -24,6 +24,7 @@ from shapespace.reprs import list_briefly
 from shapespace.schemas import Methods, SampleSize, TestScheme
 from shapespace.statistics.analysis_result import AnalysisResult
 from shapespace.statistics.methods import methods_of
+from shapespace.statistics.multiple_imputation import Imputations, over_imputations
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, read_only, require
 
 FEWEST_PEOPLE, SMALL = 5, 30
@@ -36,6 +37,8 @@ _SHARE, _PEOPLE_PER_MODE, _MOST_FOLDS = 0.95, 5, 100
 _LEAST_SHRINKAGE, _EQUALLY_PRECISE = 1e-4, 0.95
 _VERTICES_AT_ONCE = 2000  # vertices at a time; bounds memory
 _SAME = 1e-6  # share of the size; two different scans never agree to rounding
+_MEANS = ("distance", "farther", "rest_mm", "rest_farther", "size_mm", "size_z", "z")
+"""Scores that are means over imputations."""
 _OUTSIDE = 0.01  # share of the reference beyond a subject from which it is reported as outside
 
 
@@ -91,7 +94,7 @@ class ScoreResult(AnalysisResult):
         size_mm: (M,) centroid sizes; NaN where not known.
         size_z: (M,) sizes in standard deviations of the reference's; NaN where not known.
         z: (M, V) displacement along the mean's normals in standard deviations, outwards positive; not-a-number where a
-            subject's vertex is an estimate.
+            subject's vertex is an estimate without samples.
         z_limit: |z| below which 95 % of the reference's people stay everywhere when left out; NaN for fewer than 19.
         nearest: for each subject those of the reference nearest to it.
         outside: for each subject sentences on how it lies outside what reference or model know; none where it does not.
@@ -100,6 +103,7 @@ class ScoreResult(AnalysisResult):
         subjects: the cohort of them.
         config: options of the scoring.
         notes: who was left out and why, and what should be known.
+        imputations: those that scores combine; None without samples of completed shapes.
     """
 
     names: tuple[str, ...]
@@ -126,6 +130,7 @@ class ScoreResult(AnalysisResult):
     subjects: Cohort
     config: ScoreConfig
     notes: tuple[str, ...]
+    imputations: Imputations | None = None
 
     @property
     def percentile(self) -> FloatArray:
@@ -185,6 +190,9 @@ def score(
     uncertainty: d^2 = y' (S (1 + 1 / P) + D)^-1 y. For the percentiles each person of the reference is left out, made
     as uncertain as the subject, and measured by the others; of more than 100 people, a hundredth at a time.
 
+    If completed shapes have samples, scores are means over the imputations, in the same number of modes, with a
+    standard deviation by Rubin's rules.
+
     Args:
         reference: N shapes.
         subjects: M shapes, read with `onto=reference`.
@@ -203,10 +211,29 @@ def score(
         reference = reference.complete([config.subject], drop_missing=config.drop_missing)
         subjects = subjects.complete([config.subject], drop_missing=config.drop_missing)
     _refuse_unlike(reference, subjects)
+    modes = _modes(reference, _people(reference, config.subject), config.modes)
+    return _score_shapes(reference, subjects, config, modes, progress=progress)
+
+
+def _update(result: ScoreResult) -> ScoreResult:
+    """Return scores whose sentences follow the combined ones."""
+    return replace(result, outside=tuple(tuple(_outside(result, k)) for k in range(len(result.names))))
+
+
+@over_imputations(means=_MEANS, finish=_update)
+def _score_shapes(
+    reference: Cohort,
+    subjects: Cohort,
+    config: ScoreConfig,
+    modes: int,
+    *,
+    progress: Callable[[int, int], None] | None,
+) -> ScoreResult:
+    """Return the scores in a given number of modes; arguments as of `score`."""
     people = _people(reference, config.subject)
     own, outside_basis = _in_basis_of(reference, subjects)
     _refuse_known(reference, subjects, own, outside_basis, config.subject)
-    population = _Population(reference, people, _modes(reference, people, config.modes))
+    population = _Population(reference, people, modes)
     theirs, ours = _FitUncertainty.of(reference), _FitUncertainty.of(subjects)
     notes = [*reference.notes, *(note for note in subjects.notes if note not in reference.notes)]
     if theirs is None or ours is None or not np.array_equal(theirs.prior, ours.prior):

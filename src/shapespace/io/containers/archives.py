@@ -88,21 +88,69 @@ def _members(stream: BinaryIO, size: int, member_names: Collection[str] | None) 
     """Yield name and content of each member, so that one at a time is in memory."""
     try:
         with zipfile.ZipFile(stream) as archive:
-            infos = archive.infolist()
-            names = [info.filename for info in infos]
-            if len(names) > _MOST_MEMBERS or len(set(names)) != len(names):
-                raise ValueError("it has too many or repeated members")
-            if sum(info.file_size for info in infos) > max(_SMALL, _MOST_PACKED * size):
-                raise ValueError("it would unpack to far more than its size")
-            if any(info.compress_type not in _PACKED for info in infos):
-                raise ValueError("it is packed in a way that we do not use")
-            for name in names:
+            for name in _checked_names(archive, size):
                 if member_names is None or name in member_names:
                     yield name, archive.read(name)
     except OSError:
         raise
     except Exception as error:  # a damaged archive may raise anything at all
         raise ValueError(" ".join(str(error).split())[:_TOLD] or "it is damaged") from error
+
+
+def _checked_names(archive: zipfile.ZipFile, size: int) -> list[str]:
+    """Return the names of the members of an archive of `size` bytes.
+
+    Raises:
+        ValueError: it has too many members, or would unpack to far more than its size.
+    """
+    infos = archive.infolist()
+    names = [info.filename for info in infos]
+    if len(names) > _MOST_MEMBERS or len(set(names)) != len(names):
+        raise ValueError("it has too many or repeated members")
+    if sum(info.file_size for info in infos) > max(_SMALL, _MOST_PACKED * size):
+        raise ValueError("it would unpack to far more than its size")
+    if any(info.compress_type not in _PACKED for info in infos):
+        raise ValueError("it is packed in a way that we do not use")
+    return names
+
+
+def read_row(path: Path, name: str, row: int, remedy: str) -> tuple[npt.NDArray[Any], int]:
+    """Return one row of an array of floats in an .npz file, and the number of rows; the others are never in memory.
+
+    Args:
+        path: of the file.
+        name: of the array.
+        row: along the first axis.
+        remedy: what a reader can do about a file that is wrong.
+
+    Raises:
+        FileError: it cannot be read.
+        FileFormatError: as of `read_arrays`, or it has no such array or row.
+    """
+    check_file(path, LARGEST_BYTES, remedy)
+    try:
+        with path.open("rb") as stream, zipfile.ZipFile(stream) as archive:
+            if f"{name}.npy" not in _checked_names(archive, path.stat().st_size):
+                raise ValueError(f"it has no {name}")
+            with archive.open(f"{name}.npy") as content:
+                shape, fortran, dtype = npy_header(content)
+                declared = math.prod(shape) * dtype.itemsize
+                held = archive.getinfo(f"{name}.npy").file_size - content.tell()
+                rows = shape[0] if len(shape) > 1 else 0
+                if dtype.kind != "f" or declared != held or fortran:
+                    raise ValueError(f"{name} is not the array of floats that its header says")
+                if not 0 <= row < rows:
+                    raise ValueError(f"{name} has {rows} rows, and not row {row}")
+                content.seek(content.tell() + row * (declared // rows))
+                data = content.read(declared // rows)
+                return np.frombuffer(data, dtype).reshape(shape[1:]).copy(), rows
+    except OSError as error:
+        raise read_error(path, error) from error
+    except Exception as error:  # a damaged archive may raise anything at all
+        problem = " ".join(str(error).split())[:_TOLD] or "it is damaged"
+        raise FileFormatError(
+            f"{path} is not an .npz file of arrays, or it is cut short ({problem}); {remedy}."
+        ) from error
 
 
 def npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:

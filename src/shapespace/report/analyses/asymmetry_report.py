@@ -79,7 +79,7 @@ def asymmetry_report(result: AsymmetryResult) -> AnalysisReport:
         model_hashes=model_hashes(cohort),
         methods=result.methods,
     )
-    return add_shape_data(report, cohort)
+    return add_shape_data(report, cohort, result.imputations)
 
 
 def _summary(result: AsymmetryResult, order: Any) -> tuple[str, ...]:

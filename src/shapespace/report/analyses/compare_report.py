@@ -92,7 +92,7 @@ def compare_report(result: CompareResult) -> AnalysisReport:
         model_hashes=model_hashes(result.cohort),
         methods=result.methods,
     )
-    return add_shape_data(report, result.cohort)
+    return add_shape_data(report, result.cohort, result.imputations)
 
 
 def _special_settings(result: CompareResult) -> Iterator[tuple[str, Any]]:

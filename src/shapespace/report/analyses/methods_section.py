@@ -30,7 +30,7 @@ _SOURCES = {
 _FITS = ("coefficients", "fitted", "dense")
 _STATED = frozenset((
     "gauge", "shapes", "subjects", "vertices", "level", "effect_size", "unequal_variances", "permutations",
-    "uncertainty", "modes", "variance_share",
+    "uncertainty", "modes", "variance_share", "imputations", "missing_information",
 ))  # fmt: skip
 """Settings that the record of the methods states, or that are results."""
 _SETTING_NAMES = {

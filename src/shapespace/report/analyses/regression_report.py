@@ -63,7 +63,7 @@ def regression_report(result: RegressionResult, new: tuple[Cohort, Predictions] 
         model_hashes=model_hashes(result.cohort),
         methods=result.methods,
     )  # fmt: skip
-    return add_shape_data(report, result.cohort)
+    return add_shape_data(report, result.cohort, result.imputations)
 
 
 def prediction_report(predictor: Predictor, cohort: Cohort, predictions: Predictions) -> AnalysisReport:

@@ -52,7 +52,7 @@ def score_report(result: ScoreResult) -> AnalysisReport:
         model_hashes=model_hashes(result.subjects),
         methods=result.methods,
     )
-    return add_shape_data(report, result.subjects)
+    return add_shape_data(report, result.subjects, result.imputations)
 
 
 def _order(result: ScoreResult) -> list[int]:
@@ -70,6 +70,11 @@ def _sentence(result: ScoreResult, k: int) -> str:
         "by "
         f"the F distribution p = {result.p_value[k]:.3g}. Nearest to it: {near}."
     )
+    if result.imputations is not None:
+        distance, farther = (result.imputations.stddev[name][k] for name in ("distance", "farther"))
+        sentence += (
+            f" The imputations vary by {distance:.2f} in the distance and by {100 * farther:.1f} % in the share (SD)."
+        )
     if not result.outside[k]:
         return sentence
     return f"{sentence} It lies outside what is known: {'; '.join(result.outside[k])}."
@@ -184,6 +189,8 @@ def _arrays(result: ScoreResult, order: list[int]) -> dict[str, npt.NDArray[Any]
     }
     for k in range(len(result.names)):
         arrays[f"z_{k + 1}"] = result.z[k].astype(np.float32)
+        if result.imputations is not None:
+            arrays[f"z_imputation_sd_{k + 1}"] = result.imputations.stddev["z"][k].astype(np.float32)
     for k in order[:_MOST_MORPHS]:
         arrays[f"shape_{k + 1}"] = result.subjects.vertices(k)
     return arrays
@@ -219,6 +226,10 @@ def _tables(result: ScoreResult) -> dict[str, Rows]:
         for name, references in zip(result.names, result.nearest, strict=True)
         for rank, one in enumerate(references, 1)
     ]
+    if result.imputations is not None:
+        std = result.imputations.stddev
+        head = (*head, "distance_imputation_sd", "percentile_imputation_sd")
+        rows = [(*row, std["distance"][k], 100 * std["farther"][k]) for k, row in enumerate(rows)]
     reference = zip(result.reference_names, result.reference_distance, result.reference_rest_mm, strict=True)
     return {
         "scores.csv": (head, rows),

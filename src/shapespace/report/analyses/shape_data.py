@@ -23,6 +23,7 @@ from shapespace.schemas import (
     TextPart,
 )
 from shapespace.statistics.methods import methods_of
+from shapespace.statistics.multiple_imputation import Imputations
 from shapespace.statistics.observation_weights import LEAST_INFORMATION
 from shapespace.types import FloatArray
 
@@ -33,6 +34,12 @@ _LANDMARK_WORDS = {"vertices": "landmarks", "vertex": "landmark", "Vertices": "L
 MOST_LANDMARKS = 500
 """Points of a shape without triangles up to which they are drawn as landmarks: more cover each other."""
 _MOST_PAIRS = 1000  # dots of a figure: more cover each other
+_IMPUTATION = (
+    "Rubin D. B. (1987) Multiple Imputation for Nonresponse in Surveys. Wiley, New York.",
+    "Barnard J., Rubin D. B. (1999) Small-sample degrees of freedom with multiple imputation. Biometrika 86, 948-955.",
+    "Licht C. (2010) New Methods for Generating Significance Levels from Multiply-Imputed Data. Dissertation, "
+    "University of Bamberg.",
+)
 _EQUAL = 1e-9  # relative difference of sizes that is rounding
 _MOST_SHAPES = 300  # of which all pairs take less than a second
 
@@ -146,7 +153,7 @@ def shape_notes(cohort: Cohort) -> tuple[str, ...]:
     share = cohort.estimated_share
     if share.any():
         worst = int(share.argmax())
-        points, method = "vertices", " (conditional mean by PCA with missing data)"
+        points, method = "vertices", _method_of_estimates(cohort)
         if cohort.source.kind == "landmarks":
             points, method = "landmarks", ""
         notes.append(
@@ -160,6 +167,27 @@ def shape_notes(cohort: Cohort) -> tuple[str, ...]:
             f"{count} of {cohort.n_vertices} vertices, which fewer than half of the shapes observe, are not analysed."
         )
     return tuple(notes)
+
+
+def _method_of_estimates(cohort: Cohort) -> str:
+    completed = sum(own is not None for own in cohort.samples)
+    if completed == int((cohort.estimated_share > 0).sum()):
+        return " (completed by a shape model, with samples)"
+    own = " (conditional mean by PCA with missing data"
+    return f"{own}; {completed} shapes are completed by a shape model, with samples)" if completed else f"{own})"
+
+
+def _imputation_sentence(cohort: Cohort, imputations: Imputations | None) -> str:
+    """Return whether an analysis contains the uncertainty of completed shapes; empty without their samples."""
+    count = sum(own is not None for own in cohort.samples)
+    shapes = f"{count} completed shape{'' if count == 1 else 's'}"
+    if imputations is None:
+        return f"The samples of {shapes} are not used; the results do not contain their uncertainty." if count else ""
+    missing = ", ".join(f"{_percent(own)} ({name})" for name, own in imputations.missing_information.items())
+    return (
+        f"The results combine {imputations.count} imputations of {shapes} by Rubin's rules, p values by their normal "
+        f"quantiles.{f' Fraction of missing information: {missing}.' if missing else ''}"
+    )
 
 
 def _percent(share: float) -> str:
@@ -211,14 +239,27 @@ def _in_landmarks(report: AnalysisReport) -> AnalysisReport:
     )
 
 
-def add_shape_data(report: AnalysisReport, cohort: Cohort) -> AnalysisReport:
-    """Return a report with its methods, the source of its shapes and the share of estimated vertices of each shape."""
+def add_shape_data(report: AnalysisReport, cohort: Cohort, imputations: Imputations | None = None) -> AnalysisReport:
+    """Return a report with its methods, the source of its shapes and the share of estimated vertices of each shape.
+
+    Args:
+        report: of an analysis.
+        cohort: its shapes.
+        imputations: those that the analysis combines; None for an analysis of the shapes as they are.
+    """
     share = cohort.estimated_share
     notes, settings = (*report.notes, *shape_notes(cohort)), {**report.settings, **shape_settings(cohort)}
+    sentence = _imputation_sentence(cohort, imputations)
     methods = report.methods
     if methods is None and len(cohort) > 1:
         methods = methods_of(cohort, len(set(subjects_of(cohort, report.settings.get("subject")))))
     report = replace(report, notes=notes, settings=settings, methods=methods)
+    if sentence and methods is not None:
+        methods = structs.replace(methods, assumptions=(*methods.assumptions, sentence))
+        report = replace(report, notes=(*notes, sentence), methods=methods)
+    if imputations is not None:
+        own = {"imputations": imputations.count, "missing_information": dict(imputations.missing_information)}
+        report = replace(report, citations=(*report.citations, *_IMPUTATION), settings={**settings, **own})
     if cohort.source.kind == "landmarks":
         report = _in_landmarks(report)
     if not share.any():
