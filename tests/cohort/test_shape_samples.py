@@ -10,6 +10,10 @@ from shapespace.cohort.read import CohortConfig, read_cohort
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.io.containers.archives import read_row
 from shapespace.io.meshes.mesh_io import write_mesh
+from shapespace.report.analyses.compare_report import compare_report
+from shapespace.report.analyses.morphospace_report import morphospace_report
+from shapespace.statistics.compare_shapes import CompareConfig, compare
+from shapespace.statistics.shape_tests.ordination import ordinate
 from shapespace.types import Mesh
 from synthetic_shapes import training_meshes
 
@@ -56,11 +60,14 @@ def test_samples_are_read_one_at_a_time_and_the_shape_is_not_estimated_again(tmp
     np.testing.assert_allclose(apart, np.linalg.norm(row[:10] - row[40], axis=1), rtol=1e-5)
 
 
-@pytest.mark.parametrize(("asked", "used"), [(0, 0), (1, 0), (3, 3)])
+@pytest.mark.parametrize(("asked", "used"), [(0, 1), (1, 1), (3, 3)])
 def test_the_number_of_imputations_is_an_option(tmp_path: Path, asked: int, used: int) -> None:
     made = read(folder(tmp_path), asked)
     assert made.imputations == used
-    assert any("are ignored" in note for note in made.notes) == (used == 0)
+    assert any("are not used" in note for note in morphospace_report(ordinate(made)).notes)
+    found = compare(made, "~ group", CompareConfig(permutations=20, maps=False))
+    assert (found.imputations is None) == (used == 1)
+    assert any("are not used" in note for note in compare_report(found).notes) == (used == 1)
 
 
 def test_compressed_samples_and_other_arrays_are_read(tmp_path: Path) -> None:

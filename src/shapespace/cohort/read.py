@@ -328,20 +328,14 @@ def _of_surfaces(
     cohort = Cohort.of_meshes(
         meshes, table.take([row_index for _, row_index in matched]), config.gauge, onto, config.least, samples
     )
-    notes += _sample_notes(cohort, config.imputations)
-    cohort = cohort if config.imputations > 1 else replace(cohort, samples=())
+    if 1 < cohort.imputations < config.imputations:
+        notes.append(
+            f"A completed shape has {cohort.imputations} samples, so there are as many imputations, not "
+            f"{config.imputations}."
+        )
     corresponding = all(file.name.endswith(SURFACE) for file, _ in matched)
     source = ShapeSource("corresponding" if corresponding else "surfaces")
     return replace(cohort, notes=(*notes, *cohort.notes), source=source)
-
-
-def _sample_notes(cohort: Cohort, asked: int) -> list[str]:
-    completed = sum(own is not None for own in cohort.samples)
-    if completed and asked < 2:
-        return [f"The samples of {completed} completed shapes are ignored, so p does not contain their uncertainty."]
-    if completed and cohort.imputations < asked:
-        return [f"A completed shape has {cohort.imputations} samples, so there are as many imputations, not {asked}."]
-    return []
 
 
 def _by_key(rows: Sequence[_Row]) -> dict[str, _Row]:
