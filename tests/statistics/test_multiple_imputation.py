@@ -237,6 +237,16 @@ def test_regression_combines_p_measures_and_predictions() -> None:
     assert combined.p == pytest.approx(float(pool_p_values(np.array([one.p for one in runs]), 1 / 20)[0]))
 
 
+def test_predictions_of_new_completed_shapes_have_wider_intervals() -> None:
+    predictor = regress(cohort(age=[float(k) for k in range(N)]), "age", folds=4, permutations=0, draws=50).predictor
+    rows = [2, 3]
+    new = cohort(spread=20.0).take(rows)
+    plain, combined = predictor.predict(replace(new, samples=())), predictor.predict(new)
+    assert combined.imputations is not None and combined.imputations.count == M and plain.imputations is None
+    wider = (combined.high - combined.low) - (plain.high - plain.low)
+    assert wider[0] > 1e-3 and abs(wider[1]) < 1e-6
+
+
 def test_scores_are_means_over_imputations_with_a_standard_deviation() -> None:
     made = cohort(6.0)
     rows = [k for k in range(N) if k not in (2, 3)]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -27,6 +27,7 @@ from shapespace.io.containers.json_files import plain_json
 from shapespace.lazy import lazy_import
 from shapespace.reprs import describe_briefly, short_repr
 from shapespace.statistics.linear_regressors import IndexArray
+from shapespace.statistics.multiple_imputation import Imputations, pool_intervals
 from shapespace.types import FloatArray, read_only
 
 FORMAT, VERSION = "shapespace predictor", 1
@@ -47,6 +48,7 @@ class Predictions:
         value: (n,).
         low, high: (n,) interval.
         outside: n sentences on what lies outside what was learned from; empty where nothing does.
+        imputations: those that predictions combine; None without samples of completed shapes.
     """
 
     names: tuple[str, ...]
@@ -54,6 +56,7 @@ class Predictions:
     low: FloatArray
     high: FloatArray
     outside: tuple[str, ...]
+    imputations: Imputations | None = None
 
     __repr__ = short_repr
 
@@ -110,11 +113,22 @@ class Predictor:
     def predict(self, cohort: Cohort) -> Predictions:
         """Return what is predicted of the shapes of a cohort, of subjects that were not learned from.
 
+        Predictions of completed shapes with samples combine the imputations by Rubin's rules.
+
         Raises:
             CorrespondenceError: shapes with other vertices, or fits by another model.
             InputError: another gauge.
         """
         self._check(cohort)
+        result = self._predict(cohort)
+        if cohort.imputations < 2:
+            return result
+        each = [self._predict(cohort.imputation(k)) for k in range(cohort.imputations)]
+        figures = np.stack([np.column_stack([one.value, one.low, one.high]) for one in each])
+        value, low, high = map(read_only, pool_intervals(figures, self.confidence).T)
+        return replace(result, value=value, low=low, high=high, imputations=Imputations(len(each), {}, {}))
+
+    def _predict(self, cohort: Cohort) -> Predictions:
         off = np.stack([self._placed(cohort.vertices(k)) for k in range(len(cohort))]) - self.mean
         all_ways = off.reshape(len(off), -1) @ self.weights.T + self.intercepts
         low, high = cv_plus(all_ways[:, 1:], self.residuals, self.fold - 1, self.share, self.confidence)

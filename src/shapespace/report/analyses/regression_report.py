@@ -89,7 +89,7 @@ def prediction_report(predictor: Predictor, cohort: Cohort, predictions: Predict
         ),
         model_hashes=(predictor.model_hash,) if predictor.model_hash else (),
     )  # fmt: skip
-    return add_shape_data(report, cohort)
+    return add_shape_data(report, cohort, predictions.imputations)
 
 
 def _summary(result: RegressionResult, new: tuple[Cohort, Predictions] | None) -> tuple[str, ...]:
