@@ -217,6 +217,7 @@ def has_examples(document: Path, *, needing_data: bool) -> bool:
 
 LONG = (
     "change.md",
+    "completion.md",
     "correspondence.md",
     "landmarks.md",
     "report.md",
@@ -300,12 +301,21 @@ def test_tutorials_of_many_scans_go_with_fewer_people(name: str, workplace: Path
     check_pictures(document, workplace)
 
 
-@pytest.mark.parametrize("document", [d for d in DOCUMENTS if has_examples(d, needing_data=True)], ids=named)
+@pytest.mark.parametrize(
+    "document",
+    [
+        pytest.param(document, marks=pytest.mark.long if document.name == "tutorial-broken-femur.md" else ())
+        for document in DOCUMENTS
+        if has_examples(document, needing_data=True)
+    ],
+    ids=named,
+)
 def test_examples_with_open_data_run_too(
     document: Path, workplace: Path, shared_data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("SHAPESPACE_DATA", str(shared_data))
     assert run(document, with_data=True) > 0
+    check_pictures(document, workplace)
 
 
 @pytest.mark.long

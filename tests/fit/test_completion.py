@@ -87,7 +87,8 @@ def test_intervals_of_a_function_are_quantiles_over_whole_shapes() -> None:
     height = completion.estimate(lambda mesh: float(np.ptp(mesh.vertices[:, 0])), "height", "mm", level=0.5)
     wide = completion.estimate(lambda mesh: float(np.ptp(mesh.vertices[:, 0])), "height", "mm", level=0.9)
     assert wide.low < height.low < height.high < wide.high
-    assert {"tip to top", "area", "length"} <= by_name.keys()
+    assert by_name.keys() == {"volume", "area", "length", "centroid size"}
+    assert all((stddev > 0).all() for stddev in completion.landmark_stddev_mm().values())
     with pytest.raises(InputError, match="between 0 and 1"):
         completion.estimate(lambda mesh: 1.0, level=1.0)
     with pytest.raises(InputError, match="not finite"):

@@ -567,7 +567,7 @@ COMMANDS: tuple[Command, ...] = (
             basic("--landmarks", "FILE|DIR", source=COMPLETION_FILES, parse=Path),
             basic("--unit", source=FIT, choices=("auto", *_UNITS)),
             basic("--stl", source=COMPLETION_FILES),
-            basic("--with-doubtful", source=COMPLETION),
+            advanced("--with-doubtful", source=COMPLETION),
             advanced("--recursive", source=COMPLETION_FILES),
             advanced("--scale", source=FIT),
             advanced("--landmark-std", "MM", source=FIT, field="landmark_stddev_mm", parse=values.std_mm),
@@ -578,10 +578,10 @@ COMMANDS: tuple[Command, ...] = (
         (
             "Writes for each scan NAME.ply, the completed surface with the vertices of the model and the property "
             "observed, and NAME.samples.npz, samples of the whole shape in the same frame; completions.csv; "
-            "estimates.csv with intervals of volume, area, length and distances between landmarks; methods.txt, and "
-            "the report. compare, regress, asymmetry and score read the folder, and use the samples as multiple "
-            "imputations. A scan whose fit is doubtful is refused, as its completion would look more certain than it "
-            "is. The exit code is 1 if some scans have no completion, 2 if none has.",
+            "estimates.csv with intervals of volume, area and length; landmarks.csv; methods.txt, and the report. "
+            "compare, regress, asymmetry and score read the folder, and use the samples as multiple imputations. A "
+            "scan whose fit is doubtful is refused, as its completion would look more certain than it is. The exit "
+            "code is 1 if some scans have no completion, 2 if none has.",
         ),
     ),
     Command(

@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
 from os import PathLike
 from pathlib import Path
 from typing import Literal, TypeAlias
@@ -46,7 +45,9 @@ KNOWLEDGE = ("observed", "estimated", "unknowable")
 OBSERVED, ESTIMATED, UNKNOWABLE = range(3)
 
 _FEWEST_SHAPES = 5  # training shapes; fewer determine no covariance
-_SURE = 0.5  # share of the vertices from which on a fit without doubts is in the only likely pose
+_SURE, _STANDS_OUT = 0.9, 0.8
+"""Share of the vertices from which on a fit without doubts is in the only likely pose; the same from half of it on, if
+the score of its start relative to that of other poses is below the second number, as in the choice of the unit."""
 _AS_LIKELY, _OTHER_POSE = 3.0, 0.1
 """Log density (a factor of 20) within which another pose is as likely, and share of the size by which it differs."""
 _LEAST_OBSERVED = 0.1  # share of the vertices below which a completion would be the mean shape in an unknown pose
@@ -54,7 +55,7 @@ _COMPLETE = 0.97  # share of the vertices from which on only the border of the s
 _ON_SCAN = 5.0  # multiple of the noise within which a refined vertex is on the scan
 _LEAST_GAIN = 0.1  # share of its variance in the population that a scan removes from a vertex that it determines
 _IMPLAUSIBLE, _RARE = 3.0, 1e-5
-"""Mean square of the coefficients in standard deviations of new shapes (1.4 is the most measured with 51 modes or more), and
+"""Mean square of the coefficients in standard deviations of new shapes (1.4 is the most measured, with 51 modes), and
 the probability of a normal shape to be implausible, which decides for few modes."""
 _OF_MISSING_PARTS = frozenset(
     {
@@ -74,8 +75,8 @@ class CompletionConfig:
 
     Args:
         samples: number of samples of the whole shape.
-        part: region of the model that is estimated even where the scan shows it, such as a diseased or damaged part;
-            None to follow all of the scan.
+        part: region of the model that is estimated even where the scan shows it, such as a diseased or damaged part
+            (default: none).
         mirror: `combined` also uses the mirror image of the observed side of a symmetric object, weighted by how well
             sides predict each other; `alone` uses the mirror image instead of the model where there is one.
         with_doubtful: complete scans whose fit is doubtful too (default: refuse them).
@@ -207,35 +208,43 @@ class Completion:
         Raises:
             InputError: a level outside 0 to 1, or values that are not finite.
         """
-        if not 0 < level < 1:
-            raise InputError(f"The probability of an interval lies between 0 and 1, not {level:g}.")
-        value = float(function(self._mesh(self.vertices)))
-        values = np.array([function(self._mesh(x.astype(np.float64))) for x in self._samples], dtype=np.float64)
-        if not np.isfinite([value, *values]).all():
-            raise InputError(f"The quantity {name or 'of the shape'} is not finite for every sample.")
-        low, high = np.quantile(values, [(1 - level) / 2, (1 + level) / 2])
-        return QuantityEstimate(
-            name, unit, value, float(values.mean()), float(values.std(ddof=1)), float(low), float(high), level
-        )
+        return self._estimates({(name, unit): function}, level)[0]
 
     def estimates(self, *, level: float = 0.95) -> tuple[QuantityEstimate, ...]:
-        """Return the volume (of a closed model), area, length, centroid size, and distances between landmarks.
+        """Return the volume (of a closed model), area, length and centroid size.
 
-        The length is the extent along the longest axis of the completed surface. Distances are those between
-        successive landmarks of the model.
+        The length is the extent along the longest axis of the completed surface.
         """
-        mm, size = self.fit.mm_per_scan_unit, self.vertices - self.vertices.mean(axis=0)
-        axis = np.linalg.svd(size, full_matrices=False)[2][0]
+        mm, centred = self.fit.mm_per_scan_unit, self.vertices - self.vertices.mean(axis=0)
+        axis = np.linalg.svd(centred, full_matrices=False)[2][0]
         functions: dict[tuple[str, str], Function] = {}
         if _is_closed(self.model):
             functions["volume", "mm3"] = lambda mesh: _volume(mesh) * mm**3
         functions["area", "mm2"] = lambda mesh: float(face_areas(mesh).sum()) * mm**2
         functions["length", "mm"] = lambda mesh: float(np.ptp(mesh.vertices @ axis)) * mm
         functions["centroid size", "mm"] = lambda mesh: centroid_size(mesh.vertices) * mm
-        names = list(self.model.landmarks)
-        for first, second in pairwise(names):
-            functions[f"{first} to {second}", "mm"] = _distance(first, second, mm)
-        return tuple(self.estimate(function, *name, level=level) for name, function in functions.items())
+        return self._estimates(functions, level)
+
+    def _estimates(self, functions: Mapping[tuple[str, str], Function], level: float) -> tuple[QuantityEstimate, ...]:
+        if not 0 < level < 1:
+            raise InputError(f"The probability of an interval lies between 0 and 1, not {level:g}.")
+        shapes = (self.vertices, *self._samples)
+        values = np.array(
+            [
+                [function(mesh) for function in functions.values()]
+                for mesh in (self._mesh(np.asarray(shape, dtype=np.float64)) for shape in shapes)
+            ],
+            dtype=np.float64,
+        )
+        out: list[QuantityEstimate] = []
+        for (name, unit), column in zip(functions, values.T, strict=True):
+            if not np.isfinite(column).all():
+                raise InputError(f"The quantity {name or 'of the shape'} is not finite for every sample.")
+            over = column[1:]
+            low, high = np.quantile(over, [(1 - level) / 2, (1 + level) / 2])
+            mean, stddev = float(over.mean()), float(over.std(ddof=1))
+            out.append(QuantityEstimate(name, unit, float(column[0]), mean, stddev, float(low), float(high), level))
+        return tuple(out)
 
     def landmark_stddev_mm(self) -> dict[str, FloatArray]:
         """Return name -> (3,) standard deviation of each landmark along the axes of the scan's frame, mm."""
@@ -303,7 +312,9 @@ def complete(
 
     apart_mm = None
     posterior = posterior_at(fit)
-    is_sure = fit.status != "doubtful" and float(posterior.followed.mean()) > _SURE
+    assert fit.evidence is not None
+    stands_out = fit.evidence.start_score_mm < _STANDS_OUT * fit.evidence.start_runner_up_score_mm
+    is_sure = fit.status != "doubtful" and posterior.followed.mean() > (_SURE / 2 if stands_out else _SURE)
     if not landmarks and T_scan_model is None and not is_sure:
         fit, apart_mm = _likeliest_pose(fit, target, T_mm_scan.inverse(), config, lambda fit: posterior_at(fit, 0))
         posterior = posterior_at(fit)
@@ -458,10 +469,6 @@ def _is_closed(model: ShapeModel) -> bool:
 def _volume(mesh: Mesh) -> float:
     corners = (mesh.vertices - mesh.vertices.mean(axis=0))[np.asarray(mesh.faces)]
     return float(np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))) / 6.0
-
-
-def _distance(first: str, second: str, mm: float) -> Function:
-    return lambda mesh: float(np.linalg.norm(mesh.landmarks[first] - mesh.landmarks[second])) * mm
 
 
 def refine_surface(completion: Completion) -> Mesh:

@@ -29,8 +29,8 @@ from shapespace.model.new_shapes import variances_of_new_shapes
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, Similarity
 
-_LEVEL = Level(modes=None, scan_points=20_000, vertices=None, triangles=True, iterations=15, stop_motion_mm=0.0)
-"""All vertices are matched, at most so many scan points, in at most so many steps."""
+_LEVEL = Level(modes=None, scan_points=20_000, vertices=500, triangles=True, iterations=15, stop_motion_mm=0.0)
+"""At most so many scan points are matched, in at most so many steps; vertices only add to the spread of residuals."""
 _SETTLED = 2.5e-4  # share of the model's size; a step that moves no vertex further ends the iterations
 _FAR = 0.05  # share of the model's size; farther points count as points of something else
 _LOOSE = 10.0

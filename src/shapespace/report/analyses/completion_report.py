@@ -35,6 +35,7 @@ class CompletionReport:
     config: CompletionConfig
     _rows: list[tuple[Any, ...]] = field(default_factory=list[tuple[Any, ...]], init=False)
     _estimates: list[tuple[Any, ...]] = field(default_factory=list[tuple[Any, ...]], init=False)
+    _landmarks: list[tuple[Any, ...]] = field(default_factory=list[tuple[Any, ...]], init=False)
     _summary: list[str] = field(default_factory=list[str], init=False)
     _notes: dict[str, list[str]] = field(default_factory=dict[str, list[str]], init=False)
     _parts: list[Part] = field(default_factory=list[Part], init=False)
@@ -49,6 +50,12 @@ class CompletionReport:
         estimates = completion.estimates()
         self._rows.append((name, completion.status, *shares, rms_mm, completion.posterior.noise_mm))
         self._estimates += [(name, e.name, e.unit, e.value, e.mean, e.stddev, e.low, e.high) for e in estimates]
+        mm = completion.fit.mm_per_scan_unit
+        places = completion.surface().landmarks
+        self._landmarks += [
+            (name, landmark, *(places[landmark] * mm), *stddev)
+            for landmark, stddev in completion.landmark_stddev_mm().items()
+        ]
         self._hashes.add(completion.fit.model_hash)
         for note in completion.notes:
             self._notes.setdefault(note, []).append(name)
@@ -93,6 +100,9 @@ class CompletionReport:
                 ("scan", "quantity", "unit", "value", "mean", "stddev", "low_95", "high_95"), self._estimates,
             ),
         }  # fmt: skip
+        if self._landmarks:
+            head = ("scan", "landmark", *(f"{axis}_mm" for axis in "xyz"), *(f"stddev_{axis}_mm" for axis in "xyz"))
+            tables["landmarks.csv"] = (head, self._landmarks)
         return AnalysisReport(
             question="complete",
             title=f"Completion of {count} partial scan{'' if count == 1 else 's'}",
