@@ -299,7 +299,8 @@ def complete(
     target = ScanTarget(fit.scan.with_vertices(T_mm_scan.apply(fit.scan.vertices)))
     marks = None
     if landmarks:
-        stddev_mm = config.fit.landmark_stddev_mm or SHARE * rms_size(model.mean_vertices)
+        scale = (T_mm_scan @ fit.T_scan_model).scale
+        stddev_mm = config.fit.landmark_stddev_mm or SHARE * rms_size(model.mean_vertices) * scale
         marks_mm = {name: T_mm_scan.apply(point) for name, point in landmarks.items()}
         marks = LandmarkConstraint.of(model, marks_mm, stddev_mm)
     with_scale = config.fit.limits(model).with_scale
@@ -311,13 +312,13 @@ def complete(
         )  # fmt: skip
 
     apart_mm = None
-    posterior = posterior_at(fit)
-    assert fit.evidence is not None
-    stands_out = fit.evidence.start_score_mm < _STANDS_OUT * fit.evidence.start_runner_up_score_mm
-    is_sure = fit.status != "doubtful" and posterior.followed.mean() > (_SURE / 2 if stands_out else _SURE)
+    evidence = fit.evidence
+    assert evidence is not None
+    stands_out = evidence.start_score_mm < _STANDS_OUT * evidence.start_runner_up_score_mm
+    is_sure = fit.status != "doubtful" and evidence.seen_share > (_SURE / 2 if stands_out else _SURE)
     if not landmarks and T_scan_model is None and not is_sure:
         fit, apart_mm = _likeliest_pose(fit, target, T_mm_scan.inverse(), config, lambda fit: posterior_at(fit, 0))
-        posterior = posterior_at(fit)
+    posterior = posterior_at(fit)
     T = posterior.T_scan_model
     status, reasons = _judged(fit, posterior, apart_mm, config)
     dense = dense_surface(model, target, T.apply(posterior.surface.vertices), T, config.fit.dense_settings)
