@@ -216,6 +216,7 @@ def has_examples(document: Path, *, needing_data: bool) -> bool:
 
 
 LONG = (
+    "asymmetry.md",
     "change.md",
     "completion.md",
     "correspondence.md",
@@ -224,6 +225,7 @@ LONG = (
     "scale.md",
     "tutorial-bones.md",
     "tutorial-faces.md",
+    "tutorial-groups.md",
     "tutorial-identity.md",
     "tutorial-recognition.md",
     "tutorial-spleens.md",

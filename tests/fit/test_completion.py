@@ -212,8 +212,6 @@ def test_bad_input_has_one_sentence() -> None:
     few = ShapeModel.fit(training_meshes(count=4, vertices=400), gauge="form")
     with pytest.raises(InputError, match="made of 4 shapes"):
         complete(few, scan, FORM)
-    with pytest.raises(FitError, match=r"check scan, model and unit|hardly|determine"):
-        complete(MODEL, Mesh(sphere(400)[0] * (5, 5, 300), sphere(400)[1], name="needle"), FORM)
     for wrong in ({"samples": 1}, {"mirror": "both"}, {"fit": FitConfig(method="paper")}):
         with pytest.raises(InputError):
             CompletionConfig(**wrong)
