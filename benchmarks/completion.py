@@ -203,7 +203,8 @@ def references(one: Case) -> dict[str, float]:
     free = POSE if with_scale else POSE - 1
     normals, pose = vertex_normals(Mesh(y, model.faces)), small_poses(y).reshape(-1, 3, POSE)[:, :, :free]
     extra = residual_modes(model, RobustSettings().residual)
-    off_model = (extra.stddev**2).sum() / (lack_of_new_shapes(model) ** 2 * model.n_vertices + 1e-9) / extra.stddev**2
+    lack = lack_of_new_shapes(model) if model.is_n_training_known else 0.0  # femora are in the span of their model
+    off_model = (extra.stddev**2).sum() / (lack**2 * model.n_vertices + 1e-9) / extra.stddev**2
     both = np.concatenate([pose, extra.modes.astype(np.float64)], axis=2)  # the model's modes, then others
     along = np.einsum("vd,vdk->vk", normals, both)[observed]
     seen = np.einsum("vd,vd->v", normals, y - mean)[observed]
