@@ -218,9 +218,12 @@ def has_examples(document: Path, *, needing_data: bool) -> bool:
 LONG = (
     "asymmetry.md",
     "change.md",
+    "compare.md",
     "completion.md",
     "correspondence.md",
+    "dense.md",
     "landmarks.md",
+    "quality.md",
     "report.md",
     "scale.md",
     "tutorial-bones.md",
