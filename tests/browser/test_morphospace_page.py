@@ -48,8 +48,8 @@ def opened(open_tab, report: Path, viewport: dict, scheme: str = "light"):
 
 def settled(tab, words: str, *, absent: str = "nothing") -> None:
     """Wait until the marker rests, which the widget announces after it has drawn the shape."""
-    said = "document.querySelector('.widget [aria-live]').innerText"
-    tab.until(f"{said}.includes({words!r}) && !{said}.includes({absent!r})")
+    announced = "document.querySelector('.widget [aria-live]').innerText"
+    tab.until(f"{announced}.includes({words!r}) && !{announced}.includes({absent!r})")
     tab.page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
 
 

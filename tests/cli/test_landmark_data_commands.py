@@ -111,7 +111,7 @@ def test_a_plot_has_a_number_for_each_landmark(run: Run, dimensions: int, tmp_pa
     assert outcome.code == 0 and "n0" in outcome.err
     text = (tmp_path / "a.svg").read_text()
     assert run("landmarks", "plot", path, "-o", tmp_path / "b.svg").code == 0
-    assert (tmp_path / "b.svg").read_text() == text, "links beside the data"
+    assert (tmp_path / "b.svg").read_text() == text, "links next to the data"
     panels = 1 if dimensions == 2 else 3
     for number in range(1, 10):
         assert text.count(f">{number}</text>") >= panels

@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 from shapespace.cohort.cohort import Cohort, Fitted
 from shapespace.cohort.table import Table
 from shapespace.errors import InputError
-from shapespace.geometry.normals import face_vectors, vertex_areas, vertex_normals
+from shapespace.geometry.normals import enclosed_volume, face_vectors, vertex_areas, vertex_normals
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.report.analyses.result_tables import analysis_report
 from shapespace.schemas import Analysis, MorphPart, SurfaceMapPart, TablePart, read, read_part
 from shapespace.statistics.change_align import align_by, align_robustly
-from shapespace.statistics.change_maps import align_visits, swept_mm3, volume_mm3
+from shapespace.statistics.change_maps import align_visits, swept_mm3
 from shapespace.statistics.change_result import ChangeConfig
 from shapespace.statistics.change_visits import visits_of
 from shapespace.statistics.map_tests import difference_test, mean_test
@@ -159,7 +159,7 @@ def test_the_volume_swept_is_the_difference_of_volumes_of_closed_surfaces_and_th
     one, faces = person(1), sphere(V)[1]
     other = person(2).vertices + rng.standard_normal((V, 3))
     swept = swept_mm3(one.vertices, other, faces)
-    assert swept.sum() == pytest.approx(volume_mm3(other, faces) - volume_mm3(one.vertices, faces), rel=1e-9)
+    assert swept.sum() == pytest.approx(enclosed_volume(other, faces) - enclosed_volume(one.vertices, faces), rel=1e-9)
     square = np.array([[0.0, 0, 0], [10, 0, 0], [10, 10, 0], [0, 10, 0]])
     sheet = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
     assert swept_mm3(square, square + np.array([3.0, 1.0, 2.0]), sheet).sum() == pytest.approx(200.0)
@@ -227,7 +227,7 @@ def test_the_smallest_detectable_change_is_the_formula_by_brute_force() -> None:
                 values = [float((scan[v] - base[v]) @ subject.normals[v]) for scan in scans]
                 squares[v] += sum((value - sum(values) / len(values)) ** 2 for value in values)
             moved += sum(((scan[TIP] - (scans[0][TIP] + scans[1][TIP]) / 2) ** 2).sum() for scan in scans)
-            own_volumes = [volume_mm3(scan, sphere(V)[1]) for scan in scans]
+            own_volumes = [enclosed_volume(scan, sphere(V)[1]) for scan in scans]
             volumes += sum((value - sum(own_volumes) / 2) ** 2 for value in own_volumes)
     factor = 1.96 * 2**0.5
     np.testing.assert_allclose(found.smallest_mm, factor * np.sqrt(squares / 6), rtol=1e-9)

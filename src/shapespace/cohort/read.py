@@ -13,7 +13,7 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort, Fitted, ShapeSource
 from shapespace.cohort.landmark_cohort import has_landmarks, landmark_cohort, read_landmark_cohort
-from shapespace.cohort.shape_samples import ENDING, SampleFile, samples_beside
+from shapespace.cohort.shape_samples import ENDING, SampleFile, find_samples
 from shapespace.cohort.table import Table, list_names, note_unmatched, read_table
 from shapespace.errors import InputError
 from shapespace.geometry.procrustes import Gauge
@@ -322,7 +322,7 @@ def _of_surfaces(
     samples: list[SampleFile | None] = []
     for n_read, (file, _) in enumerate(matched, 1):
         meshes.append(replace(listing.mesh(file), name=surface_stem(file)))
-        samples.append(samples_beside(file, meshes[-1], max(config.imputations, 1)))
+        samples.append(find_samples(file, meshes[-1], max(config.imputations, 1)))
         if on_shape is not None:
             on_shape(n_read, len(matched))
     cohort = Cohort.of_meshes(

@@ -58,7 +58,7 @@ class SampleFile:
         return sample
 
 
-def samples_beside(file: Path, mesh: Mesh, most: int) -> SampleFile | None:
+def find_samples(file: Path, mesh: Mesh, most: int) -> SampleFile | None:
     """Return the first `most` samples of the surface in NAME.ply, from NAME.samples.npz; None without such a file.
 
     Raises:

@@ -9,19 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from shapespace.batch.progress import progress
-from shapespace.batch.run import make_jobs
-from shapespace.commands.inputs import given_scans, with_ids
-from shapespace.commands.landmark_files import LandmarkFiles
+from shapespace.cohort.shape_samples import ENDING
+from shapespace.commands.fit import landmark_files, scan_jobs
+from shapespace.commands.inputs import given_scans
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.fit.completion.complete import Completion, CompletionConfig, complete, refine_surface
 from shapespace.io.containers.arrays import write_arrays
 from shapespace.io.files import make_folder, remove_file
-from shapespace.io.landmarks.landmark_io import read_landmarks
 from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
-
-SAMPLES = ".samples.npz"
-"""Ending of the samples of NAME.ply: vertices (S, V, 3) float32, knowledge (V,), stddev_mm (V,)."""
 
 
 @dataclass(frozen=True)
@@ -67,29 +63,22 @@ def complete_scans(
         InputError: one file of landmarks for more than one scan, or no scans.
     """
     given = given_scans(scans, folder, recursive=files.recursive, say=say)
-    single = files.landmarks if files.landmarks is not None and not files.landmarks.is_dir() else None
-    if single is not None and len(given) > 1:
-        raise InputError("--landmarks belongs to one scan, but several were given; give a folder with a file for each.")
-    many = LandmarkFiles.of(None if single is not None else files.landmarks)
+    one, many = landmark_files(files.landmarks, len(given))
     model = ShapeModel.load(model_path)
     make_folder(folder)
-    addresses = {one.path: one.address for one in given if one.address}
-    jobs = with_ids(make_jobs([one.path for one in given], single, folder, addresses), given)
+    jobs = scan_jobs(given, one, many, folder)
     failed: dict[str, str] = {}
     with progress(len(jobs), "completing", "scan", quiet=quiet) as bar:
-        for job, one in zip(jobs, given, strict=True):
-            paths = {ending: folder / f"{job.name}{ending}" for ending in (".ply", SAMPLES, ".stl")}
+        for job in jobs:
+            paths = {ending: folder / f"{job.name}{ending}" for ending in (".ply", ENDING, ".stl")}
             if job.scan.resolve() in {path.resolve() for path in paths.values()}:
                 raise InputError(f"{job.scan} would be overwritten by its completion; give another output folder.")
-            landmarks = one.landmarks or job.landmarks or many.of_scan(job.scan)
             for path in paths.values():  # results of an earlier run would contradict a failure
                 remove_file(path)
             try:
                 with job.readable() as file:
                     scan = read_mesh(file)
-                completion = complete(
-                    model, scan, config, landmarks=None if landmarks is None else read_landmarks(landmarks)
-                )
+                completion = complete(model, scan, config, landmarks=job.landmarks)
             except ShapespaceError as error:
                 if isinstance(error, InputError) and len(jobs) > 1 and not bar.counted:
                     raise  # of the model and the settings, and therefore of all scans
@@ -98,7 +87,7 @@ def complete_scans(
                 say(str(error))
             else:
                 write_arrays(
-                    paths[SAMPLES],
+                    paths[ENDING],
                     {
                         "vertices": completion.draw_samples(),
                         "knowledge": completion.knowledge,

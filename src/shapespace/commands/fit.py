@@ -90,12 +90,12 @@ def fit_scans(
         InputError: one file of landmarks for more than one scan, landmarks of no scan, or no scans.
     """
     given = _scans(scans, folder, recursive=settings.recursive, say=say)
-    one, many = _landmarks(settings.landmarks, len(given))
+    one, many = landmark_files(settings.landmarks, len(given))
     model = ShapeModel.load(model_path)
     make_folder(folder)
     write_bytes(folder / ".writable", b"")
     remove_file(folder / ".writable")
-    work = list({job.name: job for job in _jobs(given, one, many, folder)}.values())
+    work = list({job.name: job for job in scan_jobs(given, one, many, folder)}.values())
     many.report_unused(say)
     if len(work) < len(given):
         say(f"Scans given more than once are fitted once: {len(work)} of {len(given)}.")
@@ -182,7 +182,7 @@ def find_suspects(jobs: Sequence[Job], *, quiet: bool) -> set[str]:
     return suspects
 
 
-def _landmarks(landmarks: Path | None, scans: int) -> tuple[Path | None, LandmarkFiles]:
+def landmark_files(landmarks: Path | None, scans: int) -> tuple[Path | None, LandmarkFiles]:
     """Return the landmarks of the one scan there is, or those of many in a folder."""
     if landmarks is None or landmarks.is_dir():
         return None, LandmarkFiles.of(landmarks)
@@ -194,7 +194,7 @@ def _landmarks(landmarks: Path | None, scans: int) -> tuple[Path | None, Landmar
     return landmarks, LandmarkFiles.of(None)
 
 
-def _jobs(given: Sequence[Given], landmarks: Path | None, many: LandmarkFiles, folder: Path) -> list[Job]:
+def scan_jobs(given: Sequence[Given], landmarks: Path | None, many: LandmarkFiles, folder: Path) -> list[Job]:
     """Return a job for each scan; one that lies elsewhere is named by its address as by a path.
 
     Args:

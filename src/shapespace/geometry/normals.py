@@ -82,6 +82,12 @@ def vertex_areas(mesh: Mesh) -> FloatArray:
     return np.asarray(np.bincount(faces_of(mesh).ravel(), areas, len(mesh.vertices)), dtype=np.float64)
 
 
+def enclosed_volume(vertices: FloatArray, faces: IntArray) -> float:
+    """Return the volume that a closed surface encloses; negative if its normals point inwards."""
+    a, b, c = np.moveaxis((vertices - vertices.mean(axis=0))[faces], 1, 0)
+    return float(np.einsum("ij,ij->", a, np.cross(b, c))) / 6
+
+
 def boundary_edges(faces: IntArray) -> IntArray:
     """Return the edges (E, 2) that belong to exactly one triangle."""
     from shapespace.geometry.topology import single_edges  # compiled

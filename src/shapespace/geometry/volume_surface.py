@@ -19,7 +19,7 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from shapespace.errors import InputError, MeshError, ShapespaceError
-from shapespace.geometry.normals import boundary_edges
+from shapespace.geometry.normals import boundary_edges, enclosed_volume
 from shapespace.geometry.remesh import is_sheet
 from shapespace.lazy import lazy_import
 from shapespace.reprs import short_repr
@@ -142,7 +142,7 @@ def surface_of_volume(
         left_out=part.left_out,
         filled=part.filled,
         at_border=at_border,
-        volume_mm3=_volume(points, faces),
+        volume_mm3=enclosed_volume(points, faces),
         notes=(*volume.notes, *_notes(part, volume.voxel_mm, at_border, share)),
     )
 
@@ -463,7 +463,7 @@ def _level(field: _Field, voxels: int) -> float:
     levels = (low, low - _STEP)
     if not float(field.min()) < levels[1] < low < float(field.max()):
         return low
-    more, less = (_volume(*_marching_cubes(field, level)) for level in reversed(levels))
+    more, less = (enclosed_volume(*_marching_cubes(field, level)) for level in reversed(levels))
     return low + _STEP * min(max((less - voxels) / (more - less), -1.0), 1.0)
 
 
@@ -501,11 +501,6 @@ def _marching_cubes(field: _Field, level: float) -> tuple[FloatArray, IntArray]:
         ) from error
     points, faces, *_ = cast(Any, skimage.measure).marching_cubes(field, level, gradient_direction="ascent")
     return np.asarray(points, dtype=np.float64), np.asarray(faces, dtype=np.int32)
-
-
-def _volume(points: FloatArray, faces: IntArray) -> float:
-    a, b, c = np.moveaxis((points - points.mean(axis=0))[faces], 1, 0)
-    return float(np.einsum("ij,ij->", a, np.cross(b, c))) / 6
 
 
 def _notes(part: _Solid, voxel_mm: FloatArray, at_border: int, share: float) -> list[str]:

@@ -92,13 +92,6 @@ def swept_mm3(before: FloatArray, after: FloatArray, faces: IntArray) -> FloatAr
     return np.asarray(np.bincount(faces.ravel(), shares, len(before)), dtype=np.float64)
 
 
-def volume_mm3(vertices: FloatArray, faces: IntArray) -> float:
-    """Return the volume that a closed surface encloses."""
-    x = vertices - vertices.mean(axis=0)
-    corners: FloatArray = x[faces].sum(axis=1)
-    return float(np.vdot(face_vectors(x, faces), corners)) / 18.0
-
-
 def contrast(visits: Sequence[Visit], *, rate: bool) -> FloatArray:
     """Return (T,) with which visits sum to last minus first, or to the slope of a line by time."""
     if rate:

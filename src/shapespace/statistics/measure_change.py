@@ -13,7 +13,7 @@ from scipy.stats import t as student
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.table import list_names
 from shapespace.errors import InputError
-from shapespace.geometry.normals import boundary_edges, vertex_areas
+from shapespace.geometry.normals import boundary_edges, enclosed_volume, vertex_areas
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.shape_model import region_vertices
 from shapespace.statistics.change_align import stable_vertices
@@ -27,7 +27,6 @@ from shapespace.statistics.change_maps import (
     swept_mm3,
     uncertainty_from_fits,
     uncertainty_from_stable_part,
-    volume_mm3,
 )
 from shapespace.statistics.change_repeatability import Repeatability, RepeatabilityEstimator
 from shapespace.statistics.change_result import (
@@ -265,7 +264,7 @@ def _draft(problem: _Problem, name: str, subject: AlignedVisits) -> _SubjectDraf
         noise_factors=tuple(factors),
         stable=subject.weights > _COUNTED * area,
         area_mm2=area,
-        volume_before_mm3=volume_mm3(first, faces) if problem.is_closed else float("nan"),
+        volume_before_mm3=enclosed_volume(first, faces) if problem.is_closed else float("nan"),
         observed=subject.observed,
     )
 

@@ -31,7 +31,7 @@ from shapespace.fit.scan_target import ScanTarget, mm_frame
 from shapespace.fit.search.initialisation import start_from_any_pose
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.loop import loop_operator
-from shapespace.geometry.normals import face_areas, part_of, rms_size
+from shapespace.geometry.normals import enclosed_volume, face_areas, part_of, rms_size
 from shapespace.geometry.procrustes import centroid_size
 from shapespace.io.interop import MeshLike
 from shapespace.io.landmarks.landmark_io import read_landmarks
@@ -65,6 +65,9 @@ _OF_MISSING_PARTS = frozenset(
     }
 )  # fmt: skip
 """Reasons to doubt a fit that follow from missing parts, and that the posterior accounts for or judges anew."""
+
+_SETTINGS = RobustSettings(vertex_share=0.0)
+"""Of the posterior: vertices on flat triangles of the scan are matched inside of its curved surface."""
 
 Function: TypeAlias = Callable[[Mesh], float]
 
@@ -219,7 +222,7 @@ class Completion:
         axis = np.linalg.svd(centred, full_matrices=False)[2][0]
         functions: dict[tuple[str, str], Function] = {}
         if _is_closed(self.model):
-            functions["volume", "mm3"] = lambda mesh: _volume(mesh) * mm**3
+            functions["volume", "mm3"] = lambda mesh: enclosed_volume(mesh.vertices, np.asarray(mesh.faces)) * mm**3
         functions["area", "mm2"] = lambda mesh: float(face_areas(mesh).sum()) * mm**2
         functions["length", "mm"] = lambda mesh: float(np.ptp(mesh.vertices @ axis)) * mm
         functions["centroid size", "mm"] = lambda mesh: centroid_size(mesh.vertices) * mm
@@ -343,10 +346,6 @@ def complete(
     )  # fmt: skip
 
 
-_SETTINGS = RobustSettings(vertex_share=0.0)
-"""Of the posterior: vertices on flat triangles of the scan are matched inside of its curved surface."""
-
-
 def _likeliest_pose(
     fit: FitResult,
     target: ScanTarget,
@@ -467,11 +466,6 @@ def _is_closed(model: ShapeModel) -> bool:
     return bool((np.unique(edges, axis=0, return_counts=True)[1] == 2).all())
 
 
-def _volume(mesh: Mesh) -> float:
-    corners = (mesh.vertices - mesh.vertices.mean(axis=0))[np.asarray(mesh.faces)]
-    return float(np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))) / 6.0
-
-
 def refine_surface(completion: Completion) -> Mesh:
     """Return the completed surface with four times the triangles, for CAD: smooth, and on the scan where observed.
 
@@ -486,6 +480,6 @@ def refine_surface(completion: Completion) -> Mesh:
     reach = _ON_SCAN * completion.posterior.noise_mm * completion.T_scan_model.scale
     is_observed = (np.asarray(M @ completion.observed.astype(np.float64)) > 1.0 - 1e-9) & (near.distance < reach)
     mesh = Mesh(np.where(is_observed[:, None], near.points, smooth), faces, name=completion.scan_name)
-    if _is_closed(model) and _volume(mesh) < 0:
+    if _is_closed(model) and enclosed_volume(mesh.vertices, faces) < 0:
         return replace(mesh, faces=np.ascontiguousarray(faces[:, ::-1]))
     return mesh

@@ -276,9 +276,9 @@ def _expected_error(
         estimated[np.diag_indices(POSE)] = variance[:POSE]
         estimated[POSE:, POSE:] = _estimated_covariance(variance[POSE:], K, N, rng)
         estimated = estimated[np.ix_(free, free)]
-        kept = solve(np.eye(len(H)) + estimated @ H, np.eye(len(H)))  # of the prior's pull
-        gain = kept @ estimated
-        total += (kept * truth[free]) @ kept.T + gain @ H @ gain.T
+        B = solve(np.eye(len(H)) + estimated @ H, np.eye(len(H)))
+        gain = B @ estimated
+        total += (B * truth[free]) @ B.T + gain @ H @ gain.T
     out = np.zeros((P, P))
     out[np.ix_(free, free)] = total / replicates
     return out

@@ -135,9 +135,9 @@ def read_row(path: Path, name: str, row: int, remedy: str) -> tuple[npt.NDArray[
             with archive.open(f"{name}.npy") as content:
                 shape, fortran, dtype = npy_header(content)
                 declared = math.prod(shape) * dtype.itemsize
-                held = archive.getinfo(f"{name}.npy").file_size - content.tell()
+                stored = archive.getinfo(f"{name}.npy").file_size - content.tell()
                 rows = shape[0] if len(shape) > 1 else 0
-                if dtype.kind != "f" or declared != held or fortran:
+                if dtype.kind != "f" or declared != stored or fortran:
                     raise ValueError(f"{name} is not the array of floats that its header says")
                 if not 0 <= row < rows:
                     raise ValueError(f"{name} has {rows} rows, and not row {row}")
