@@ -40,6 +40,9 @@ _AMPLITUDES = np.geomspace(1e-4, 100.0, 19)
 _AMPLITUDE_STDDEV, _OF_UNKNOWN_MODEL = 1.0, 3.0
 """Standard deviation of the logarithm of the amplitude, chosen by benchmarks/completion.py on faces and femora; the
 second for models that do not state their number of shapes, whose spectrum does not predict the amplitude."""
+_RANGES = (0.4, 0.8, 1.6)
+"""Shares of the model's size over which the residual modes are damped; a scan chooses among them."""
+_AS_LIKELY = 3.0  # log evidence (a factor of 20) within which the shortest range is taken, the least certain one
 REPLICATES = 20  # simulated training sets; their mean varies by 3 % in the standard deviations
 _FLOOR = 1e-3  # variance outside the simulated modes along the model's own, in units of that of the residual modes
 
@@ -137,23 +140,14 @@ def shape_posterior(
     Raises:
         FitError: hardly anything of the scan matches, or the scan does not determine the pose.
     """
-    extra = residual_modes(model, settings.residual)
-    # The strongest residual modes have all of the variance that new shapes have outside the model.
-    off_model = extra.stddev**2 * (lack_of_new_shapes(model) ** 2 * model.n_vertices / (extra.stddev**2).sum())
     size_mm = rms_size(model.mean_vertices)
-    prior = np.concatenate(  # E1
-        [np.full(3, _LOOSE**2), np.full(3, (_LOOSE * size_mm) ** 2), [settings.scale_stddev**2 if with_scale else 0.0],
-         variance_of_new_shapes(model), off_model]
-    )  # fmt: skip
     problem = Problem.of(prepare(model), target, settings, T_scan_model.scale, with_scale=with_scale, marks=marks)
-    coefficient_prior = replace(problem.prior, stddev=np.sqrt(prior[POSE:]), weight=0.0)
-    problem = replace(problem, prior=coefficient_prior, shape=replace(problem.shape, modes=extra.modes))
-    iterate = problem.iterate(Estimate(T_scan_model, np.pad(b, (0, len(extra.stddev)))))
+    iterate = problem.iterate(Estimate(T_scan_model, b))
     matcher = problem.matcher(_LEVEL)
     hint = matcher.first_hint(iterate.surface, iterate.T_scan_model, problem.prepared.tree)
     matcher = choose_bulging(matcher, iterate.surface, iterate.T_scan_model, hint)
     try:
-        line = _Linearised.of(problem, matcher, iterate, hint, prior)
+        problem, prior, iterate, line = _likeliest_range(problem, matcher, iterate, hint)
         for _ in range(_LEVEL.iterations):
             before = iterate.T_scan_model.apply(iterate.surface.vertices)
             iterate = problem.iterate(iterate.estimate.moved_by(line.data.mean(line.variance) - line.theta))
@@ -173,6 +167,34 @@ def shape_posterior(
     )  # fmt: skip
 
 
+def _likeliest_range(
+    problem: Problem, matcher: Matcher, iterate: Iterate, hint: MatchHint
+) -> tuple[Problem, FloatArray, Iterate, _Linearised]:
+    """Return the problem with the residual modes that match the scan best, the prior variances (P,), and its start."""
+    starts: list[tuple[Problem, FloatArray, Iterate, _Linearised]] = []
+    for range_share in _RANGES:
+        free, prior = _with_residual_modes(problem, range_share)
+        start = free.iterate(Estimate(iterate.T_scan_model, np.pad(iterate.b, (0, len(prior) - POSE - len(iterate.b)))))
+        starts.append((free, prior, start, _Linearised.of(free, matcher, start, hint, prior)))
+    best = max(start[3].log_evidence for start in starts)
+    return next(start for start in starts if start[3].log_evidence > best - _AS_LIKELY)
+
+
+def _with_residual_modes(problem: Problem, range_share: float) -> tuple[Problem, FloatArray]:
+    """Return the problem with the residual modes of a range, and the prior variances of its parameters (P,) (E1)."""
+    model, settings = problem.prepared.model, problem.settings
+    extra = residual_modes(model, replace(settings.residual, range_share=range_share))
+    # The strongest residual modes have all of the variance that new shapes have outside the model.
+    off_model = extra.stddev**2 * (lack_of_new_shapes(model) ** 2 * model.n_vertices / (extra.stddev**2).sum())
+    size_mm = rms_size(model.mean_vertices)
+    scale = 0.0 if problem.prior.holds_scale else settings.scale_stddev**2
+    prior = np.concatenate(
+        [np.full(3, _LOOSE**2), np.full(3, (_LOOSE * size_mm) ** 2), [scale], variance_of_new_shapes(model), off_model]
+    )
+    coefficient_prior = replace(problem.prior, stddev=np.sqrt(prior[POSE:]), weight=0.0)
+    return replace(problem, prior=coefficient_prior, shape=replace(problem.shape, modes=extra.modes)), prior
+
+
 @dataclass(frozen=True, eq=False)
 class _Linearised:
     """Likelihood of the matches of an iterate.
@@ -184,6 +206,7 @@ class _Linearised:
         theta: at these parameters (P,); the pose is relative to the iterate.
         amplitude: likeliest one of the off-model variation (E3).
         variance: (P,) of the prior with this amplitude.
+        log_evidence: of it (E3).
     """
 
     weighted: WeightedMatches
@@ -192,6 +215,7 @@ class _Linearised:
     theta: FloatArray
     amplitude: float
     variance: FloatArray
+    log_evidence: float
 
     @staticmethod
     def of(problem: Problem, matcher: Matcher, iterate: Iterate, hint: MatchHint, prior: FloatArray) -> _Linearised:
@@ -209,8 +233,9 @@ class _Linearised:
         model = problem.prepared.model
         first = POSE + model.n_modes
         stddev = _AMPLITUDE_STDDEV if model.is_n_training_known else _OF_UNKNOWN_MODEL
-        amplitude = _likeliest_amplitude(data, prior, first, stddev)
-        return _Linearised(weighted, gathered.seen, data, theta, amplitude, _scaled(prior, first, amplitude))
+        amplitude, log_evidence = _likeliest_amplitude(data, prior, first, stddev)
+        variance = _scaled(prior, first, amplitude)
+        return _Linearised(weighted, gathered.seen, data, theta, amplitude, variance, log_evidence)
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,10 +274,11 @@ def _scaled(prior: FloatArray, first: int, amplitude: float) -> FloatArray:
     return np.concatenate([prior[:first], amplitude * prior[first:]])
 
 
-def _likeliest_amplitude(data: _Data, prior: FloatArray, first: int, stddev: float) -> float:
-    """Return the variance of the off-model variation that scan and spectrum make likeliest (E3)."""
+def _likeliest_amplitude(data: _Data, prior: FloatArray, first: int, stddev: float) -> tuple[float, float]:
+    """Return the variance of the off-model variation that scan and spectrum make likeliest, and its evidence (E3)."""
     score = [data.log_evidence(_scaled(prior, first, a)) - 0.5 * (np.log(a) / stddev) ** 2 for a in _AMPLITUDES]
-    return float(_AMPLITUDES[int(np.argmax(score))])
+    best = int(np.argmax(score))
+    return float(_AMPLITUDES[best]), score[best]
 
 
 def _expected_error(
