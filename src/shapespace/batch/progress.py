@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
+import os
 import sys
 import threading
 import time
 from collections.abc import Callable, Generator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
@@ -15,6 +19,9 @@ FIRST_LOG_LINE_S = 5.0
 """Seconds until the first log line of a step, if there is no terminal."""
 LONGEST_PAUSE_S = 60.0
 """Longest pause between two log lines of one step, s; pauses double up to it, so that logs stay short."""
+PROGRESS_VARIABLE = "SHAPESPACE_PROGRESS"
+"""Environment variable with the name of a JSON file that another program reads the progress from."""
+_WRITE_EVERY_S = 0.3  # at most so often
 
 
 if TYPE_CHECKING:
@@ -32,10 +39,20 @@ class Bar(_Tqdm):
     shown_description = ""
     """The description that was set last."""
 
+    _began, _written_at, _label = 0.0, 0.0, ""
+
     def update(self, n: float | None = 1) -> bool | None:
         """Count `n` more."""
         self.counted += n or 0
+        if self._label and time.time() - self._written_at > _WRITE_EVERY_S:
+            self._written_at = time.time()
+            _write_progress(self._label, self.counted, self.total, self._began)
         return super().update(n)
+
+    def write_to_file(self, label: str) -> None:
+        """Write the progress to the file of `PROGRESS_VARIABLE` from now on, with `label`."""
+        self._label, self._began = label, time.time()
+        _write_progress(label, 0, self.total, self._began)
 
     def set_description_str(self, desc: str | None = None, refresh: bool | None = True) -> None:
         """Set the description."""
@@ -57,6 +74,8 @@ def progress(total: int | None, doing: str, unit: str, *, quiet: bool) -> Genera
     label = f"{doing} {several}" if total is None else f"{doing} {total} {unit if total == 1 else several}"
     # disable=None is tqdm's way to ask whether there is a terminal.
     with Bar(total=total, desc=doing, unit=unit, leave=False, disable=True if quiet else None) as bar:
+        if not quiet:
+            bar.write_to_file(label)
 
         def state() -> str:
             text = f", {bar.shown_description}" if bar.shown_description else ""
@@ -81,11 +100,24 @@ def steps(total: int | None, doing: str, unit: str, *, quiet: bool) -> Generator
 @contextmanager
 def waiting(label: str, *, quiet: bool) -> Generator[None]:
     """Say on standard error what the user waits for while it cannot be counted, such as "finding the modes"."""
+    if not quiet:
+        _write_progress(label, 0, None, time.time())
     with (
         _logging_progress(label, lambda: "", quiet=quiet),
         tqdm(total=0, desc=f"{label} ...", bar_format="{desc}", leave=False, disable=True if quiet else None),
     ):
         yield
+
+
+def _write_progress(label: str, done: float, total: float | None, began: float) -> None:
+    file = os.environ.get(PROGRESS_VARIABLE)
+    if not file:
+        return
+    state = {"doing": label, "done": done, "total": total, "began": began}
+    temporary = Path(f"{file}.{os.getpid()}")
+    with contextlib.suppress(OSError):  # a full disk must not end the work whose progress it is
+        temporary.write_text(json.dumps(state), encoding="utf-8")
+        temporary.replace(file)
 
 
 def telling_of_compiling(*, quiet: bool) -> AbstractContextManager[None]:

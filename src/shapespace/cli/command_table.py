@@ -63,6 +63,7 @@ LANDMARKS_PLOT = Source("commands.landmark_data", "plot_configurations")
 TRAIN = Source("commands.recognise", "recognise_train")
 STUDY = Source("commands.recognise", "recognise_study")
 VIEW = Source("viewer.serve", "serve")
+STUDIO = Source("viewer.serve", "serve_studio")
 EXPORT = Source("commands.export", "export")
 EXPORT_COHORT = Source("commands.export", "export_cohort")
 CONVERT = Source("commands.convert", "convert")
@@ -611,6 +612,25 @@ COMMANDS: tuple[Command, ...] = (
         (
             "A scan that is dropped onto the page is fitted. The address that is printed contains a token, without "
             "which nothing is answered. Ctrl-C ends the viewer. Needs the extra view.",
+        ),
+        json=False,
+    ),
+    Command(
+        "studio", "do the whole work in the browser: scans, correspondence, model, fits, analyses",
+        ("shapespace studio teeth",), run.studio,
+        (
+            basic("project", "PROJECT", "folder of the project, created if it is new or empty (default: a page with "
+                  "the projects that were opened last)", parse=Path, nargs="?"),
+            basic("--no-open", help="do not open a browser"),
+            basic("--port", "N", source=STUDIO),
+            advanced("--host", "H", source=STUDIO),
+            advanced("--max-upload-mb", "N", source=STUDIO, parse=values.positive),
+        ),
+        (
+            "The project's folder contains project.json, the scans (or references to them), and the results, which all "
+            "commands can read; history.sh computes them anew. The address that is printed contains a token, without "
+            "which nothing is answered. Ctrl-C ends the studio; commands that it started go on. Needs the extras view "
+            "and report.",
         ),
         json=False,
     ),

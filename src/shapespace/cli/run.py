@@ -596,6 +596,16 @@ def view(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def studio(arguments: argparse.Namespace) -> int:
+    """Do the whole work in the browser."""
+    from shapespace.cli.forms import forms
+    from shapespace.viewer.serve import serve_studio
+
+    options = given(arguments, serve_studio)
+    serve_studio(arguments.project, forms(), **options, open_browser=not arguments.no_open, say=now)
+    return 0
+
+
 def export(arguments: argparse.Namespace) -> int:
     """Write fits of a store as single files, or all of them as a table."""
     from shapespace.commands.export import export

@@ -39,6 +39,16 @@ FRAMED_HEADERS: Mapping[str, str] = MappingProxyType(
     }
 )
 """The same headers for a page that notebooks on this machine may show in a frame."""
+OWN_FRAMES_HEADERS: Mapping[str, str] = MappingProxyType(
+    {
+        **SECURITY_HEADERS,
+        "X-Frame-Options": "SAMEORIGIN",
+        "Content-Security-Policy": SECURITY_HEADERS["Content-Security-Policy"].replace(
+            "frame-ancestors 'none'", "frame-src 'self'; frame-ancestors 'self'"
+        ),
+    }
+)
+"""The same headers for an application whose pages show others of it in frames."""
 _SECRET_BYTES = 32  # bytes, 256 bits: cannot be guessed
 _IGNORED_HEADERS = (b"range", b"if-range")
 """Partial responses are not supported."""
@@ -85,14 +95,19 @@ class Guard:
         cookie_name: browsers share cookies between ports, so the name should contain the port.
         loopback: whether only this machine can reach the server; requests for other host names are then refused.
         framed: whether notebooks on this machine may show the page in a frame.
+        frames: whether pages show others of the application in frames.
     """
 
-    def __init__(self, app: ASGIApp, *, access: Access, cookie_name: str, loopback: bool, framed: bool = False) -> None:
+    def __init__(
+        self, app: ASGIApp, *, access: Access, cookie_name: str, loopback: bool, framed: bool = False,
+        frames: bool = False,
+    ) -> None:  # fmt: skip
         self._app = app
         self._access = access
         self._cookie_name = cookie_name
         self._loopback = loopback
         self._framed = framed
+        self._headers = FRAMED_HEADERS if framed else OWN_FRAMES_HEADERS if frames else SECURITY_HEADERS
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handle one request."""
@@ -102,7 +117,9 @@ class Guard:
 
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
-                MutableHeaders(scope=message).update(FRAMED_HEADERS if self._framed else SECURITY_HEADERS)
+                headers = MutableHeaders(scope=message)
+                for name, value in self._headers.items():
+                    headers.setdefault(name, value)
             await send(message)
 
         await (self._early_response(Request(scope)) or self._app)(scope, receive, send_with_headers)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, JSONResponse, Response
-from starlette.routing import Route
+from starlette.routing import BaseRoute
 
 from shapespace.errors import ShapespaceError
 from shapespace.schemas import to_json
@@ -17,6 +17,9 @@ from shapespace.viewer.guard import refusal
 
 PAGES = Path(__file__).parent / "assets"
 _SHARED = Path(__file__).parents[1] / "report" / "assets"
+_STUDIO_SCRIPTS = ("studio.js", *(f"studio-{part}.js" for part in (
+    "texts", "store", "widgets", "start", "table", "specimens", "jobs", "steps", "questions", "results",
+)))  # fmt: skip
 ASSETS: Mapping[str, tuple[Path, str]] = {
     "viewer.css": (PAGES / "viewer.css", "text/css"),
     "page.js": (PAGES / "page.js", "text/javascript"),
@@ -24,6 +27,9 @@ ASSETS: Mapping[str, tuple[Path, str]] = {
     "fit-view.js": (PAGES / "fit-view.js", "text/javascript"),
     "viewer.js": (PAGES / "viewer.js", "text/javascript"),
     "surfaces.js": (PAGES / "surfaces.js", "text/javascript"),
+    "studio.css": (PAGES / "studio.css", "text/css"),
+    **{name: (PAGES / name, "text/javascript") for name in _STUDIO_SCRIPTS},
+    "preact-htm.min.js": (PAGES / "vendor" / "preact-htm.min.js", "text/javascript"),
     "theme.js": (_SHARED / "theme.js", "text/javascript"),
     "widgets.css": (_SHARED / "widgets.css", "text/css"),
     "scene.js": (_SHARED / "scene.js", "text/javascript"),
@@ -56,7 +62,7 @@ def binary(content: bytes, file_name: str | None = None) -> Response:
     return Response(content, media_type="application/octet-stream", headers=headers)
 
 
-def application(routes: list[Route], public: Callable[[str], str]) -> Starlette:
+def application(routes: Sequence[BaseRoute], public: Callable[[str], str]) -> Starlette:
     """Return an application of `routes`.
 
     Args:

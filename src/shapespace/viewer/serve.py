@@ -9,12 +9,12 @@ import signal
 import socket
 import threading
 import webbrowser
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import FrameType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from shapespace.batch.workers import start_loading
 from shapespace.errors import InputError, ShapespaceError
@@ -22,6 +22,8 @@ from shapespace.schemas import CorrespondenceRecord
 
 if TYPE_CHECKING:
     import uvicorn
+
+    from shapespace.viewer.guard import Access
 
 FIRST_PORT = 7860  # first port that is tried, not a privileged one, and the number of ports after it
 _PORTS_TRIED = 50  # as many viewers at once on one machine
@@ -96,15 +98,67 @@ def serve(
             scans = Scans(root, view.model, view.model_name, Limits(upload_bytes=max_upload_mb * 2**20))
             stack.callback(scans.close)
             app = make_app(view, scans, access, loopback=loopback, cookie_name=cookie_name)
-        say(f"The viewer is at {page_address(host, port, access.token)}")
-        if not loopback:
-            say("Anyone with this address can use the viewer, and the connection is not encrypted.")
-        say("Ctrl-C ends the viewer.")
-        if open_browser:
-            address = page_address(host, port, access.new_ticket())
-            threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
-        with contextlib.suppress(KeyboardInterrupt):
-            make_server(app).run(sockets=[listener])
+        _run(app, "viewer", access, host, listener, open_browser=open_browser, say=say)
+
+
+def serve_studio(
+    project: Path | None,
+    forms: Mapping[str, Mapping[str, Any]],
+    *,
+    host: str = "127.0.0.1",
+    port: int | None = None,
+    open_browser: bool = True,
+    max_upload_mb: int = 500,
+    say: Callable[[str], None] = print,
+) -> None:
+    """Show a project of the studio in the browser until Ctrl-C; running commands go on.
+
+    Args:
+        project: folder of the project, created if it is new or empty; None for the start page.
+        forms: of the commands that the page offers.
+        host: address to listen at.
+        port: port (default: the first free one from 7860).
+        open_browser: whether to open the page.
+        max_upload_mb: size limit of a scan that is dropped onto the page, in MB.
+        say: called with the address, which contains the token.
+
+    Raises:
+        ShapespaceError: the extras `view` and `report` are not installed, or the project cannot be opened.
+        InputError: the port is taken, or the host is not an address of this machine.
+    """
+    require_view_extra()
+    from shapespace.report.pages.write_html import require_report_extra
+    from shapespace.viewer.guard import LOOPBACK, Access
+    from shapespace.viewer.studio.app import Studio, make_studio
+
+    require_report_extra()
+    access, loopback = Access(), host in LOOPBACK
+    with _stopped_by_signals(), ExitStack() as stack:
+        studio = Studio(forms, project, max_upload_mb * 2**20)
+        stack.callback(studio.close)
+        listener = stack.enter_context(listen(host, port))
+        port = int(listener.getsockname()[1])
+        app = make_studio(studio, access, loopback=loopback, cookie_name=f"shapespace_{port}")
+        _run(app, "studio", access, host, listener, open_browser=open_browser, say=say)
+
+
+def _run(
+    app: object, what: str, access: Access, host: str, listener: socket.socket, *, open_browser: bool,
+    say: Callable[[str], None],
+) -> None:  # fmt: skip
+    """Print the address of the application, open it in a browser, and serve it until Ctrl-C."""
+    from shapespace.viewer.guard import LOOPBACK
+
+    port = int(listener.getsockname()[1])
+    say(f"The {what} is at {page_address(host, port, access.token)}")
+    if host not in LOOPBACK:
+        say(f"Anyone with this address can use the {what}, and the connection is not encrypted.")
+    say(f"Ctrl-C ends the {what}.")
+    if open_browser:
+        address = page_address(host, port, access.new_ticket())
+        threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
+    with contextlib.suppress(KeyboardInterrupt):
+        make_server(app).run(sockets=[listener])
 
 
 def make_server(app: object) -> uvicorn.Server:

@@ -48,7 +48,7 @@ def make_app(
     cookie_name: str = "shapespace",
     framed: bool = False,
 ) -> ASGIApp:
-    """Return the application.
+    """Return the application behind a guard.
 
     Args:
         view: the model and the saved fits.
@@ -58,8 +58,13 @@ def make_app(
         cookie_name: browsers share cookies between ports, so the name should contain the port.
         framed: whether notebooks on this machine may show the page in a frame.
     """
-    app = application(_Endpoints(view, scans).routes(), view.public)
+    app = model_app(view, scans)
     return Guard(app, access=access, cookie_name=cookie_name, loopback=loopback, framed=framed)
+
+
+def model_app(view: ModelView, scans: Scans) -> ASGIApp:
+    """Return the application of a model, its saved fits and the uploaded scans."""
+    return application(_Endpoints(view, scans).routes(), view.public)
 
 
 class _Endpoints:
@@ -174,7 +179,7 @@ class _Endpoints:
         return json_response([scan.facts() for scan in self._scans.all()])
 
     async def upload(self, request: Request) -> Response:
-        name, limits = _display_name(request.query_params.get("name", "")), self._scans.limits
+        name, limits = display_name(request.query_params.get("name", "")), self._scans.limits
         ending = Path(name).suffix.lower()
         if ending not in MESH_ENDINGS:
             raise HTTPException(415, f"{name} is not a scan that can be read; drop {', '.join(MESH_ENDINGS)}.")
@@ -190,7 +195,7 @@ class _Endpoints:
             # The user's file name never becomes a path.
             path = folder / f"upload-{secrets.token_hex(4)}{ending}"
             with path.open("xb") as file:
-                async with aclosing(_body(request, limits.upload_bytes, too_large)) as pieces:
+                async with aclosing(body_pieces(request, limits.upload_bytes, too_large)) as pieces:
                     async for piece in pieces:
                         file.write(piece)
             scan = self._scans.add(name, path, dense=request.query_params.get("dense") == "1")
@@ -254,7 +259,9 @@ class _Endpoints:
 
     async def _json(self, request: Request) -> Mapping[str, Any]:
         """Return the JSON object in the body of `request`."""
-        async with aclosing(_body(request, self._scans.limits.request_bytes, "The request is too long.")) as pieces:
+        async with aclosing(
+            body_pieces(request, self._scans.limits.request_bytes, "The request is too long.")
+        ) as pieces:
             body = b"".join([piece async for piece in pieces])
         try:
             content: object = json.loads(body)
@@ -265,7 +272,7 @@ class _Endpoints:
         return cast(Mapping[str, Any], content)
 
 
-async def _body(request: Request, max_bytes: int, too_large: str) -> AsyncGenerator[bytes]:
+async def body_pieces(request: Request, max_bytes: int, too_large: str) -> AsyncGenerator[bytes]:
     """Yield the body of `request`, and refuse it with 413 and the sentence `too_large` beyond `max_bytes`."""
     announced = request.headers.get("content-length", "")
     if len(announced) > 15 or (announced.isdigit() and announced.isascii() and int(announced) > max_bytes):
@@ -285,7 +292,7 @@ def _is_numbers(value: object) -> bool:
     return all(isinstance(x, (int, float)) and not isinstance(x, bool) and abs(x) < 1e9 for x in items)
 
 
-def _display_name(name: str) -> str:
+def display_name(name: str) -> str:
     """Return the last part of a file name, without unprintable characters."""
     last = name.replace("\\", "/").rpartition("/")[2]
     plain = "".join(c for c in unicodedata.normalize("NFC", last) if c.isprintable())

@@ -18,7 +18,7 @@ _MAX_QUERY = 2000  # characters; bounds the work of one request
 def make_surfaces_app(
     surfaces: Surfaces, access: Access, *, loopback: bool = True, cookie_name: str = "shapespace"
 ) -> ASGIApp:
-    """Return the application.
+    """Return the application behind a guard.
 
     Args:
         surfaces: the folder.
@@ -26,6 +26,11 @@ def make_surfaces_app(
         loopback: whether only this machine can reach the server.
         cookie_name: browsers share cookies between ports, so the name should contain the port.
     """
+    return Guard(surfaces_app(surfaces), access=access, cookie_name=cookie_name, loopback=loopback)
+
+
+def surfaces_app(surfaces: Surfaces) -> ASGIApp:
+    """Return the application."""
 
     def page(request: Request) -> Response:
         return FileResponse(PAGES / "surfaces.html", media_type="text/html")
@@ -60,5 +65,4 @@ def make_surfaces_app(
         Route("/api/surfaces/{name}", surface),
         Route("/api/places", positions),
     ]
-    app = application(routes, surfaces.public)
-    return Guard(app, access=access, cookie_name=cookie_name, loopback=loopback)
+    return application(routes, surfaces.public)

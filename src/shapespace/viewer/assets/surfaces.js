@@ -76,6 +76,8 @@
     }
     marks.push(vertex);
     drawAllMarks();
+    // The studio names landmarks by it.
+    if (window.parent !== window) window.parent.postMessage({ vertex }, location.origin);
   }
 
   function drawMarks(cell) {
@@ -116,7 +118,7 @@
     $("number").addEventListener("keydown", (event) => { if (event.key === "Enter") typed(); });
     $("clear").addEventListener("click", () => { marks = []; drawAllMarks(); });
     $("save").addEventListener("click", guarded(async () => {
-      const answer = await ask(`/api/places?vertices=${marks.join(",")}`);
+      const answer = await ask(`api/places?vertices=${marks.join(",")}`);
       save(await answer.blob(), `${about.name.replace(/[^\w.-]+/g, "_")}.places.csv`);
     }));
   }
@@ -148,7 +150,7 @@
       const cell = cells[k + 1];
       let arrays = null;
       try {
-        arrays = (await binary(`/api/surfaces/${encodeURIComponent(shown[k].name)}`)).arrays;
+        arrays = (await binary(`api/surfaces/${encodeURIComponent(shown[k].name)}`)).arrays;
       } catch (error) {
         problems.push(error.message);
       }
@@ -182,10 +184,10 @@
   }
 
   async function begin() {
-    about = await json("/api/about");
+    about = await json("api/about");
     document.title = `${about.name} \u2013 shapespace`;
     $("about").textContent = `${about.name}: ${about.corresponding} of ${about.scans} scans in correspondence, ${about.vertices.toLocaleString("en")} vertices`;
-    const unpacked = await binary("/api/mean");
+    const unpacked = await binary("api/mean");
     mean = unpacked.arrays;
     scans = unpacked.facts.scans;
     missing = Float32Array.from(mean.seen, (count) => (100 * (scans - count)) / Math.max(scans, 1));
@@ -200,7 +202,7 @@
     startMarks();
     startScans();
     $("loading").hidden = true;
-    rows = await json("/api/surfaces");
+    rows = await json("api/surfaces");
     window.shapespaceCells = cells;
     filterRows();
   }

@@ -25,7 +25,7 @@
   const download = guarded(async (question, kind, name) => {
     const { fit, scan, stage: at, z: shape } = question;
     const asked = fit !== undefined ? { fit, stage: at } : scan !== undefined ? { scan, stage: at } : { z: Array.from(shape) };
-    const answer = await ask(`/api/export?format=${kind}`, post(asked));
+    const answer = await ask(`api/export?format=${kind}`, post(asked));
     save(await answer.blob(), `${name.replace(/[^\w.-]+/g, "_").replace(/\.(ply|obj|stl|off|vtk|vtp|glb|gltf)(?=\.|$)/i, "")}.${kind}`);
   });
 
@@ -490,7 +490,7 @@
     $("fits-none").hidden = about.has_fits;
     $("fits-some").hidden = !about.has_fits;
     if (!about.has_fits) return;
-    listed = await json("/api/fits");
+    listed = await json("api/fits");
     fillChoices();
     $("fit-filter-label").hidden = listed.length <= FILTERED_FROM;
     $("fit-filter").addEventListener("input", filterFits);
@@ -558,7 +558,7 @@
     $("loading").textContent = "Loading the fit";
     $("loading").hidden = false;
     try {
-      const payload = await binary(`/api/fits/${encodeURIComponent(row.name)}`);
+      const payload = await binary(`api/fits/${encodeURIComponent(row.name)}`);
       if (selected !== index) return;
       fitView.show(payload, { fit: row.name });
     } finally {
@@ -623,7 +623,7 @@
           throw error;
         }
         // The oldest goes where there are too many, and the server decides which.
-        const kept = new Set((await json("/api/scans")).map((scan) => scan.id));
+        const kept = new Set((await json("api/scans")).map((scan) => scan.id));
         dropped.filter((one) => one.id && !kept.has(one.id)).forEach(drop);
         if (dropped.includes(mine)) follow(mine);
       }
@@ -637,7 +637,7 @@
   function upload(mine, file) {
     return new Promise((resolve, reject) => {
       const request = new XMLHttpRequest();
-      request.open("PUT", `/api/scans?name=${encodeURIComponent(file.name)}&dense=${mine.dense ? 1 : 0}`);
+      request.open("PUT", `api/scans?name=${encodeURIComponent(file.name)}&dense=${mine.dense ? 1 : 0}`);
       request.responseType = "json";
       request.upload.onprogress = (event) => { if (event.lengthComputable) say(mine, `Sending ${file.name}`, event.loaded / event.total); };
       request.onerror = () => reject(new Error(`${file.name} could not be sent; see whether shapespace view still runs, and try again.`));
@@ -686,7 +686,7 @@
   }
 
   async function drawPreview(mine) {
-    if (mine.previewed && !mine.preview) mine.preview = await binary(`/api/scans/${mine.id}/preview`);
+    if (mine.previewed && !mine.preview) mine.preview = await binary(`api/scans/${mine.id}/preview`);
     if (own === mine && mine.preview && !mine.verdict) drawScanStates();
   }
 
@@ -697,7 +697,7 @@
     const { run } = mine;
     mine.done = false;
     for (let after = 0; dropped.includes(mine) && mine.run === run;) {
-      const progress = await json(`/api/scans/${mine.id}/progress?after=${after}`);
+      const progress = await json(`api/scans/${mine.id}/progress?after=${after}`);
       after += progress.events.length;
       if (progress.state === "waiting") say(mine, progress.position > 1 ? `Waiting: ${progress.position - 1} before it` : "Waiting for a free place", null);
       else if (!after) say(mine, "Reading the scan", null);
@@ -798,12 +798,12 @@
     $("verdict").hidden = false;
     $("progress").hidden = true;
     const remove = h("button", { type: "button", "data-testid": "scan-remove", onclick: guarded(async () => {
-      await ask(`/api/scans/${mine.id}`, { method: "DELETE" });
+      await ask(`api/scans/${mine.id}`, { method: "DELETE" });
       drop(mine);
     }) }, "Remove from the server");
     if (!told.pictured) $("verdict").append(h("div", { class: "row" }, remove));
     if (!told.b) {
-      if (mine.previewed && !mine.preview) mine.preview = await binary(`/api/scans/${mine.id}/preview`);
+      if (mine.previewed && !mine.preview) mine.preview = await binary(`api/scans/${mine.id}/preview`);
       if (own !== mine) return;
       if (mine.preview) drawScanStates();
       else if (shown === "scan") nothing(`There is no picture of ${mine.name}`);
@@ -813,12 +813,12 @@
     const seconds = Object.values(told.seconds || {}).reduce((sum, value) => sum + value, 0);
     $("verdict").append(h("p", { class: "hint" }, `Started from ${start || told.start}; ${mine.states.length} states in ${seconds.toFixed(1)}\u00a0s.`));
     if (!told.pictured) return;
-    const payload = await binary(`/api/scans/${mine.id}/picture`);
+    const payload = await binary(`api/scans/${mine.id}/picture`);
     if (own !== mine || mine.placing) return;
     scanView.show(payload, { scan: mine.id, b: told.b, z: told.z, b_stddev: told.b_stddev });
     $("scan-detail").append(h("div", { class: "row" },
       h("button", { type: "button", "data-testid": "scan-record", onclick: guarded(async () => {
-        save(await (await ask(`/api/scans/${mine.id}/record`)).blob(), `${mine.name.replace(/\.[^.]*$/, "")}.fit.json`);
+        save(await (await ask(`api/scans/${mine.id}/record`)).blob(), `${mine.name.replace(/\.[^.]*$/, "")}.fit.json`);
       }) }, "Record (JSON)"), remove));
   }
 
@@ -964,7 +964,7 @@
       if (turn) mapping(turn, false)(Float64Array.from(point), there);
       landmarks[name] = Array.from(there, (value, i) => value / mine.unit + mine.origin[i]);
     }
-    await ask(`/api/scans/${mine.id}/landmarks`, post({ landmarks }));
+    await ask(`api/scans/${mine.id}/landmarks`, post({ landmarks }));
     $("scan-detail").hidden = false;
     scanView.active = shown === "scan";
     Object.assign(mine, fresh(), { run: mine.run + 1 });
@@ -978,7 +978,7 @@
     $("file").accept = about.formats.join(",");
     $("choose").addEventListener("click", () => $("file").click());
     $("file").addEventListener("change", () => { dropFiles(Array.from($("file").files)); $("file").value = ""; });
-    $("stop").addEventListener("click", guarded(async () => { if (own && own.id) await ask(`/api/scans/${own.id}/cancel`, post({})); }));
+    $("stop").addEventListener("click", guarded(async () => { if (own && own.id) await ask(`api/scans/${own.id}/cancel`, post({})); }));
     let depth = 0;
     const withFiles = (event) => event.dataTransfer && Array.from(event.dataTransfer.types).includes("Files");
     addEventListener("dragenter", (event) => { if (withFiles(event)) { event.preventDefault(); depth += 1; $("cover").hidden = false; } });
@@ -991,7 +991,7 @@
       $("cover").hidden = true;
       dropFiles(Array.from(event.dataTransfer.files));
     });
-    const earlier = await json("/api/scans");
+    const earlier = await json("api/scans");
     for (const { id, name, dense } of earlier) {
       const mine = { id, name, dense, ...fresh() };
       dropped.push(mine);
@@ -1067,8 +1067,8 @@
   }
 
   async function begin() {
-    about = await json("/api/about");
-    const unpacked = await binary("/api/model");
+    about = await json("api/about");
+    const unpacked = await binary("api/model");
     model = new Shapespace.Model(unpacked);
     stddev = about.stddev;
     share = unpacked.arrays.share;

@@ -1,0 +1,79 @@
+"""Forms of the commands for the studio, made of the table of commands."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, cast
+
+from shapespace.cli.command_table import COMMANDS, Command
+from shapespace.cli.options import NO_DEFAULT, Option
+
+_KINDS: Mapping[str, str] = {"identify": "recognise identify"}
+_FIRST: Mapping[str, tuple[str, ...]] = {
+    "correspond": ("--vertices", "--mirror", "--pose"),
+    "build": ("--modes", "--gauge", "--unit"),
+    "quality": ("--folds", "--samples", "--modes"),
+    "morphospace": ("--method", "--group", "--gauge"),
+    "fit": ("--dense", "--unit", "--jobs"),
+    "complete": ("--samples", "--mirror", "--stl"),
+    "compare": ("--formula", "--blocks", "--permutations"),
+    "change": ("--subject", "--time", "--order"),
+    "asymmetry": ("--subject", "--reference", "--gauge"),
+    "regress": ("--target", "--subject", "--seed"),
+    "score": ("--modes", "--nearest", "--subject"),
+    "identify": ("--subject", "--gallery", "--probe"),
+    "convert": ("--to",),
+    "export": (),
+    "report": (),
+}
+"""Command -> the options that its form shows; the others are folded."""
+_FILES = frozenset(
+    {
+        "--output", "--shapes", "--model", "--reference-shapes", "--table", "--labels", "--template", "--subjects",
+        "--add", "--redo", "--remove", "--update", "--recursive", "--dask", "--executor", "--predictor", "--predict",
+        "--new-shapes", "--no-open", "--json", "--quiet", "--all", "--formula-file", "--groups", "--surfaces",
+    }
+)  # fmt: skip
+"""Options that the studio sets itself, or that name files."""
+
+
+def forms() -> dict[str, dict[str, Any]]:
+    """Return command -> its summary and the options of its form."""
+    commands = {command.name: command for command in COMMANDS}
+    return {kind: _form(commands[_KINDS.get(kind, kind)], first) for kind, first in _FIRST.items()}
+
+
+def _form(command: Command, first: tuple[str, ...]) -> dict[str, Any]:
+    options = [
+        option
+        for option in command.options
+        if not option.is_positional and not option.hidden and not _FILES & set(option.spellings)
+        and not (command.name == "score" and "--reference" in option.spellings)
+    ]  # fmt: skip
+    order = {flag: place for place, flag in enumerate(first)}
+    described = [_described(option, visible=option.spellings[-1] in order) for option in options]
+    described.sort(key=lambda one: order.get(one["flag"], len(order)))
+    return {"summary": command.summary, "options": described}
+
+
+def _described(option: Option, *, visible: bool) -> dict[str, Any]:
+    initial = option.initial
+    known = initial is not NO_DEFAULT and initial not in (None, (), [], "") and not option.is_flag
+    words = " ".join(map(str, cast(tuple[Any, ...], initial))) if isinstance(initial, tuple) else str(initial)
+    return {
+        "flag": option.spellings[-1], "help": option.text.replace("`", ""), "kind": _kind(option),
+        "choices": list(option.accepted), "initial": words if known else None, "visible": visible,
+        "required": (option.required and not option.either) or option.spellings[-1] in ("--target", "--to"),
+    }  # fmt: skip
+
+
+def _kind(option: Option) -> str:
+    if option.is_flag:
+        return "flag"
+    if option.accepted:
+        return "choice"
+    if option.metavar == "FORMULA":
+        return "formula"
+    if option.metavar == "COLUMN":
+        return "column"
+    return "number" if option.metavar in ("N", "K", "S", "M") else "text"

@@ -1,0 +1,1 @@
+"""The studio: a project of scans, from files to reports, in the browser; what it computes are shapespace commands."""

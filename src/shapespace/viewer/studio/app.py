@@ -1,0 +1,458 @@
+"""The studio's application: its page, the state of the project, edits, jobs, and the pages of results."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import threading
+import zipfile
+from collections.abc import AsyncGenerator, Generator, Mapping
+from contextlib import aclosing
+from pathlib import Path
+from typing import Any, cast
+
+from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
+from starlette.routing import Mount, Route
+from starlette.types import ASGIApp
+
+from shapespace.batch.lock import LOCK, only_writer
+from shapespace.errors import FileError, InputError
+from shapespace.io.containers.json_files import plain_json
+from shapespace.io.files import atomic_path
+from shapespace.io.meshes.mesh_io import MESH_ENDINGS, MESH_FILE_ENDINGS
+from shapespace.version import __version__
+from shapespace.viewer.guard import Access, Guard, refusal
+from shapespace.viewer.responses import PAGES, application, asset, json_response
+from shapespace.viewer.server import body_pieces, display_name
+from shapespace.viewer.studio.job_commands import CORRESPONDENCES, QUESTIONS, Forms, checks, order, result_of
+from shapespace.viewer.studio.jobs import Job, Jobs, history, write_history
+from shapespace.viewer.studio.project import Project, Role, StaleError, change_of, join_table, recent_projects
+from shapespace.viewer.studio.specimen_checks import SpecimenChecks
+from shapespace.viewer.studio.views import Views, result_path, view_kind
+
+_TABLE_BYTES, _REQUEST_BYTES = 2**24, 2**20
+_EVENT_S = 0.4  # between events
+_MOST_LISTED = 2000  # folders and files of a listing
+
+
+class OpenProject:
+    """A project that is open: the owner of its locks, jobs, checks and pages.
+
+    Args:
+        folder: of the project.
+        create: whether it is new.
+        changed: called when anything changed.
+        upload_bytes: size limit of a scan.
+    """
+
+    def __init__(self, folder: Path, *, create: bool, changed: Any, upload_bytes: int) -> None:
+        self.project = Project.open(folder, create=create)
+        self._writer = only_writer(self.project.folder)
+        self._writer.__enter__()
+        self.jobs = Jobs(self.project.folder, changed)
+        self.checks = SpecimenChecks(self.project.folder, changed)
+        self.views = Views(upload_bytes)
+        self._ended: set[int] = set()
+
+    def close(self) -> None:
+        """Let go of the project; a running job goes on."""
+        self.jobs.close()
+        self.checks.close()
+        self.views.close()
+        self._writer.__exit__(None, None, None)
+
+    def facts(self) -> dict[str, Any]:
+        """Return the state for the page."""
+        project, state = self.project, self.project.state
+        jobs = self.jobs.all()
+        ended = {job.number for job in jobs if job.status == "done"}
+        if ended != self._ended:
+            self._ended = ended
+            write_history(project.folder, jobs)
+        self.views.find = {job.number: result_path(project.folder, job.output) for job in jobs if job.status == "done"}
+        specimens: list[dict[str, Any]] = []
+        for one in state.specimens:
+            facts = self.checks.facts(project.path(one)) or {"state": "waiting", "vertices": 0, "triangles": 0,
+                                                             "findings": []}  # fmt: skip
+            specimens.append({"id": one.id, "file": one.file, "set": one.role, "included": one.included,
+                              "cells": one.cells, **facts})  # fmt: skip
+        return {
+            "name": state.name, "folder": str(project.folder), "revision": project.revision,
+            "columns": list(state.columns), "specimens": specimens, "notes": state.notes(), "counts": state.counts(),
+            "undo": project.undo_text, "redo": project.redo_text, "landmarks": state.landmarks,
+            "jobs": [self._job(job) for job in jobs],
+        }  # fmt: skip
+
+    def _job(self, job: Job) -> dict[str, Any]:
+        progress = self.jobs.progress(job) if job.status == "running" else None
+        left_s = None if progress is None else progress.pop("left_s")
+        path = result_path(self.project.folder, job.output)
+        kind = view_kind(path) if job.status == "done" else None
+        words: dict[str, Any] = {"sentences": [], "methods": None}
+        if kind == "report" and path.name != "report.html":
+            words = _words(path)
+        return {
+            "number": job.number, "kind": job.kind, "command": job.command, "status": job.status,
+            "message": job.message, "progress": progress, "seconds": self.jobs.running_for(job), "left_s": left_s,
+            "output": job.output,
+            "views": [] if kind is None else [{"kind": kind, "href": f"/view/{job.number}/"}], **words,
+        }  # fmt: skip
+
+
+def _words(folder: Path) -> dict[str, Any]:
+    """Return the sentences and the methods paragraph of an analysis."""
+    words: dict[str, Any] = {"sentences": [], "methods": None}
+    try:
+        words["sentences"] = list(plain_json((folder / "analysis.json").read_bytes()).get("summary", []))
+        words["methods"] = (folder / "methods.txt").read_text(encoding="utf-8")
+    except (OSError, ValueError, AttributeError):
+        pass  # a report without an analysis
+    return words
+
+
+class Studio:
+    """The endpoints of the studio, and the owner of the project that is open.
+
+    Args:
+        forms: of the commands.
+        folder: of the project to open; None for the start page.
+        upload_bytes: size limit of a scan.
+    """
+
+    def __init__(self, forms: Forms, folder: Path | None, upload_bytes: int) -> None:
+        self._forms = forms
+        self._upload_bytes = upload_bytes
+        self._changes = 0
+        self._open: OpenProject | None = None
+        self._lock = threading.RLock()
+        if folder is not None:
+            self._switch(folder, create=not folder.exists() or (folder.is_dir() and not any(folder.iterdir())))
+
+    def app(self) -> ASGIApp:
+        """Return the application, without a guard."""
+        job = "/api/jobs/{number:int}"
+        routes = [
+            Route("/", self._page),
+            Route("/assets/{name}", asset),
+            Route("/api/project", self._state),
+            Route("/api/events", self._events),
+            Route("/api/forms", self._list_forms),
+            Route("/api/open", self._open_project, methods=["POST"]),
+            Route("/api/close", self._close_project, methods=["POST"]),
+            Route("/api/folders", self._folders),
+            Route("/api/specimens", self._upload, methods=["PUT"]),
+            Route("/api/import", self._take_files, methods=["POST"]),
+            Route("/api/thumbnails/{id}", self._thumbnail),
+            Route("/api/edit", self._edit, methods=["POST"]),
+            Route("/api/undo", self._undo, methods=["POST"]),
+            Route("/api/redo", self._redo, methods=["POST"]),
+            Route("/api/table", self._table, methods=["POST"]),
+            Route("/api/checks", self._check, methods=["POST"]),
+            Route("/api/jobs", self._add_job, methods=["POST"]),
+            Route(f"{job}/cancel", self._cancel, methods=["POST"]),
+            Route(f"{job}/continue", self._go_on, methods=["POST"]),
+            Route(f"{job}/log", self._log),
+            Route(f"{job}/files", self._files),
+            Route("/api/history", self._history),
+            Route("/files/{path:path}", self._file),
+            Route("/zip/{number:int}", self._zip),
+            Mount("/view", app=self._view),
+        ]
+        return application(routes, str)
+
+    def close(self) -> None:
+        """Let go of the project."""
+        with self._lock:
+            if self._open is not None:
+                self._open.close()
+                self._open = None
+
+    @property
+    def _project(self) -> OpenProject:
+        if self._open is None:
+            raise InputError("No project is open; open one first.")
+        return self._open
+
+    def _changed(self) -> None:
+        self._changes += 1
+
+    def _switch(self, folder: Path, *, create: bool) -> None:
+        with self._lock:
+            if self._open is not None and self._open.project.folder == folder.resolve():
+                return
+            opened = OpenProject(folder, create=create, changed=self._changed, upload_bytes=self._upload_bytes)
+            self.close()
+            self._open = opened
+            recent_projects(opened.project.folder)
+            self._changed()
+
+    # The state
+
+    def _page(self, request: Request) -> Response:
+        return FileResponse(PAGES / "studio.html", media_type="text/html")
+
+    def _list_forms(self, request: Request) -> Response:
+        return json_response(self._forms)
+
+    def _history(self, request: Request) -> Response:
+        return PlainTextResponse(history(self._project.jobs.all()))
+
+    def _state(self, request: Request) -> Response:
+        return json_response(
+            {
+                "version": __version__, "project": None if self._open is None else self._open.facts(),
+                "recent": recent_projects(), "formats": list(MESH_ENDINGS), "upload_bytes": self._upload_bytes,
+            }
+        )  # fmt: skip
+
+    async def _events(self, request: Request) -> Response:
+        async def stream() -> AsyncGenerator[str]:
+            sent = -1
+            while not await request.is_disconnected():
+                if sent != self._changes:
+                    sent = self._changes
+                    yield f"data: {json.dumps({'revision': sent})}\n\n"
+                await asyncio.sleep(_EVENT_S)
+
+        return StreamingResponse(stream(), media_type="text/event-stream")
+
+    async def _open_project(self, request: Request) -> Response:
+        content = await _json(request)
+        folder = _place(content.get("folder"))
+        await run_in_threadpool(self._switch, folder, create=bool(content.get("create")))
+        return json_response({})
+
+    async def _close_project(self, request: Request) -> Response:
+        await run_in_threadpool(self.close)
+        self._changed()
+        return json_response({})
+
+    def _folders(self, request: Request) -> Response:
+        path = _place(request.query_params.get("path") or str(Path.home()))
+        try:
+            entries = sorted(path.iterdir(), key=lambda one: one.name.casefold())
+            names = [one.name for one in entries if one.is_dir() and not one.name.startswith(".")]
+            scans = sum(one.name.lower().endswith(MESH_FILE_ENDINGS) for one in entries)
+        except OSError as error:
+            raise FileError(f"Cannot read {path}: {error.strerror or error}.") from error
+        return json_response(
+            {
+                "path": str(path), "parent": None if path.parent == path else str(path.parent),
+                "folders": names[:_MOST_LISTED], "scans": scans, "is_project": (path / Project.FILE).is_file(),
+            }
+        )  # fmt: skip
+
+    # Specimens
+
+    async def _upload(self, request: Request) -> Response:
+        name, role = display_name(request.query_params.get("name", "")), _role(request.query_params.get("set"))
+        if not name.lower().endswith(MESH_FILE_ENDINGS):
+            raise HTTPException(415, f"{name} is not a scan that can be read; drop {', '.join(MESH_ENDINGS)}.")
+        project = self._project.project
+        limit = f"{name} is larger than the {self._upload_bytes / 2**20:g} MB that the studio takes."
+        target = await run_in_threadpool(project.new_file, name)
+        with atomic_path(target) as path, path.open("wb") as file:
+            async with aclosing(body_pieces(request, self._upload_bytes, limit)) as pieces:
+                async for piece in pieces:
+                    file.write(piece)
+        added, same_as = await run_in_threadpool(project.add, target, role)
+        if same_as is not None:
+            target.unlink(missing_ok=True)
+        self._changed()
+        return json_response({"id": added, "same_as": same_as}, 201)
+
+    async def _take_files(self, request: Request) -> Response:
+        content = await _json(request)
+        place, role, copy = _place(content.get("path")), _role(content.get("set")), bool(content.get("copy"))
+        added, left_out = await run_in_threadpool(self._project.project.import_files, place, role, copy=copy)
+        self._changed()
+        return json_response({"added": added, "left_out": left_out})
+
+    def _thumbnail(self, request: Request) -> Response:
+        opened, wanted = self._project, request.path_params["id"]
+        for one in opened.project.state.specimens:
+            picture = opened.checks.picture(opened.project.path(one)) if one.id == wanted else None
+            if picture is not None and picture.is_file():
+                return FileResponse(picture, media_type="image/webp")
+        raise HTTPException(404, "There is no picture of this specimen.")
+
+    async def _edit(self, request: Request) -> Response:
+        content = await _json(request)
+        return self._edited(lambda: self._project.project.edit(_revision(content), change_of(content)))
+
+    async def _undo(self, request: Request) -> Response:
+        content = await _json(request)
+        return self._edited(lambda: self._project.project.undo(_revision(content)))
+
+    async def _redo(self, request: Request) -> Response:
+        content = await _json(request)
+        return self._edited(lambda: self._project.project.redo(_revision(content)))
+
+    def _edited(self, edit: Any) -> Response:
+        try:
+            edit()
+        except StaleError as error:
+            return refusal(409, str(error))
+        self._changed()
+        return json_response({"revision": self._project.project.revision})
+
+    async def _table(self, request: Request) -> Response:
+        async with aclosing(body_pieces(request, _TABLE_BYTES, "The table is too large.")) as pieces:
+            content = b"".join([piece async for piece in pieces])
+        project = self._project.project
+        await run_in_threadpool(project.edit, None, join_table(content))
+        self._changed()
+        return json_response({"matched": int((project.undo_text or "0 0").split()[-2]), "notes": project.state.notes()})
+
+    # Jobs
+
+    async def _add_job(self, request: Request) -> Response:
+        content = await _json(request)
+        kind, options, on = str(content.get("kind", "")), content.get("options"), content.get("on")
+        if not isinstance(options, dict) or not (on is None or isinstance(on, int)):
+            raise HTTPException(400, "A job needs options, and perhaps the number of another.")
+        opened = self._project
+
+        def make(number: int, before: list[Job]) -> tuple[tuple[str, ...], str]:
+            made = order(opened.project, before, self._forms, kind, cast(dict[str, Any], options), on, number)
+            return made.arguments, made.output
+
+        job = await run_in_threadpool(opened.jobs.add, kind, make)
+        return json_response({"number": job.number}, 201)
+
+    async def _check(self, request: Request) -> Response:
+        content = await _json(request)
+        kind, options, on = str(content.get("kind", "")), content.get("options"), content.get("on")
+        opened, shapes = self._project, None
+        kinds = (
+            ("fit",) if kind in ("score", "identify") else CORRESPONDENCES if on is None else (*CORRESPONDENCES, "fit")
+        )
+        if kind in QUESTIONS:
+            try:
+                shapes = result_of(opened.jobs.all(), kinds, on)
+            except InputError as error:
+                return json_response([{"level": "problem", "text": str(error)}])
+        given = cast(dict[str, Any], options) if isinstance(options, dict) else {}
+        return json_response(checks(opened.project, self._forms, kind, given, shapes))
+
+    def _cancel(self, request: Request) -> Response:
+        self._project.jobs.cancel(request.path_params["number"])
+        return json_response({})
+
+    def _go_on(self, request: Request) -> Response:
+        self._project.jobs.go_on(request.path_params["number"])
+        return json_response({})
+
+    def _log(self, request: Request) -> Response:
+        return PlainTextResponse(self._project.jobs.log(request.path_params["number"]))
+
+    # Results
+
+    def _files(self, request: Request) -> Response:
+        folder, paths = self._result_files(request.path_params["number"])
+        return json_response(
+            [{"path": path.relative_to(folder).as_posix(), "bytes": path.stat().st_size} for path in paths]
+        )
+
+    def _file(self, request: Request) -> Response:
+        folder = self._project.project.folder
+        path = result_path(folder, request.path_params["path"])
+        if not path.is_file() or path.name == LOCK:
+            raise HTTPException(404, "There is no such file in the project.")
+        # As a download: a page among the results must not run as a page of the studio.
+        return FileResponse(path, media_type="application/octet-stream", filename=path.name)
+
+    def _zip(self, request: Request) -> Response:
+        number = request.path_params["number"]
+        folder, paths = self._result_files(number)
+        name = f"{Path(self._project.jobs.get(number).output).name}.zip"
+        headers = {"Content-Disposition": f'attachment; filename="{name}"'}
+        return StreamingResponse(_zipped(folder, paths), media_type="application/zip", headers=headers)
+
+    async def _view(self, scope: Any, receive: Any, send: Any) -> None:
+        await self._project.views(scope, receive, send)
+
+    def _result_files(self, number: int) -> tuple[Path, list[Path]]:
+        folder = self._project.project.folder.resolve()
+        path = result_path(folder, self._project.jobs.get(number).output)
+        if path.is_file():
+            return folder, [path]
+        found = sorted(one for one in path.rglob("*") if one.is_file() and one.name != LOCK)
+        return folder, found[:_MOST_LISTED]
+
+
+class _Pieces:
+    """A file that is written to, and read piece by piece as it grows."""
+
+    def __init__(self) -> None:
+        self._pieces: list[bytes] = []
+
+    def write(self, piece: bytes) -> int:
+        self._pieces.append(bytes(piece))
+        return len(piece)
+
+    def flush(self) -> None:
+        """Do nothing; it has no buffer."""
+
+    def take(self) -> bytes:
+        taken, self._pieces = b"".join(self._pieces), []
+        return taken
+
+
+def _zipped(folder: Path, paths: list[Path]) -> Generator[bytes]:
+    """Yield a zip archive of files, without holding it in memory."""
+    pieces = _Pieces()
+    with zipfile.ZipFile(cast(Any, pieces), "w", zipfile.ZIP_DEFLATED) as archive:
+        for path in paths:
+            with (
+                path.open("rb") as source,
+                archive.open(path.relative_to(folder).as_posix(), "w", force_zip64=True) as to,
+            ):
+                while piece := source.read(2**20):
+                    to.write(piece)
+                    yield pieces.take()
+    yield pieces.take()
+
+
+async def _json(request: Request) -> Mapping[str, Any]:
+    async with aclosing(body_pieces(request, _REQUEST_BYTES, "The request is too long.")) as pieces:
+        body = b"".join([piece async for piece in pieces])
+    try:
+        content = plain_json(body)
+    except (ValueError, RecursionError):
+        content = None
+    if not isinstance(content, dict):
+        raise HTTPException(400, "The request is not a JSON object.")
+    return cast(Mapping[str, Any], content)
+
+
+def _revision(content: Mapping[str, Any]) -> int:
+    revision = content.get("revision")
+    if not isinstance(revision, int):
+        raise HTTPException(400, "An edit needs the revision that it was made on.")
+    return revision
+
+
+def _role(text: object) -> Role:
+    return "new" if text == "new" else "training"
+
+
+def _place(text: object) -> Path:
+    if not isinstance(text, str) or not text.strip() or "\0" in text:
+        raise InputError("Give the path of a folder or file on this machine.")
+    return Path(text.strip()).expanduser()
+
+
+def make_studio(studio: Studio, access: Access, *, loopback: bool = True, cookie_name: str = "shapespace") -> ASGIApp:
+    """Return the application behind a guard.
+
+    Args:
+        studio: the endpoints.
+        access: the secrets of this studio.
+        loopback: whether only this machine can reach the server.
+        cookie_name: browsers share cookies between ports, so the name should contain the port.
+    """
+    return Guard(studio.app(), access=access, cookie_name=cookie_name, loopback=loopback, frames=True)

@@ -1,0 +1,219 @@
+"""The commands of jobs: what the user chose on the page to the arguments of a shapespace command."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from shapespace.errors import InputError
+from shapespace.viewer.studio.jobs import Job
+from shapespace.viewer.studio.project import Project, Specimen
+
+Forms = Mapping[str, Mapping[str, Any]]
+"""Kind -> `summary` and `options`, each with `flag`, `help`, `kind`, `choices`, `initial`, `visible` and `required`."""
+
+WORDS: Mapping[str, tuple[str, ...]] = {"identify": ("recognise", "identify"), "redo": ("correspond",)}
+"""Kinds whose command has another name."""
+QUESTIONS = ("compare", "change", "asymmetry", "regress", "score", "identify", "morphospace")
+CORRESPONDENCES = ("correspond", "redo")
+_INPUTS = "inputs"
+
+
+@dataclass(frozen=True)
+class Order:
+    """A command to be run.
+
+    Args:
+        arguments: after `shapespace`, relative to the project's folder.
+        output: what it writes, relative to the folder.
+    """
+
+    arguments: tuple[str, ...]
+    output: str
+
+
+def order(
+    project: Project, jobs: Sequence[Job], forms: Forms, kind: str, options: Mapping[str, Any], on: int | None,
+    number: int,
+) -> Order:  # fmt: skip
+    """Return the command of a new job, and write the files that it reads.
+
+    Args:
+        project: with the specimens.
+        jobs: those before.
+        forms: of all kinds, whose options are accepted.
+        kind: of the job.
+        options: flag -> value, as the page sends them.
+        on: number of the job whose result it uses; None for the newest that succeeded.
+        number: of the new job.
+
+    Raises:
+        InputError: it cannot be run: no such kind or option, or a result or specimens are missing.
+        FileError: the files cannot be written.
+    """
+    words = (*WORDS.get(kind, (kind,)),)
+    given = [] if kind == "redo" else _given(forms, kind, options)
+    folder, stem = project.folder, f"{_INPUTS}/{number:04d}"
+    state, listed = project.state, f"{stem}.csv"
+    if kind == "correspond":
+        project.write_scans(folder / listed, _some(state.chosen("training"), "to bring into correspondence", 2))
+        output = f"correspondence-{number}"
+        return Order((*words, listed, "-o", output, *given), output)
+    if kind == "redo":
+        before = result_of(jobs, CORRESPONDENCES, on)
+        name = str(options.get("name", ""))
+        if name not in {one.id for one in state.specimens}:
+            raise InputError(f"There is no specimen {name[:40]!r}; choose one of the list.")
+        return Order((*words, "--redo", name, "-o", before.output), before.output)
+    if kind == "build":
+        before = result_of(jobs, CORRESPONDENCES, on)
+        output = f"model-{number}.h5"
+        marks: tuple[str, ...] = ()
+        if state.landmarks and "--landmarks" not in options:
+            project.write_landmarks(folder / f"{stem}-landmarks.csv")
+            marks = ("--landmarks", f"{stem}-landmarks.csv")
+        return Order((*words, *_surfaces(project, before), "-o", output, *marks, *given), output)
+    if kind == "quality":
+        output = f"quality-{number}"
+        return Order((*words, result_of(jobs, CORRESPONDENCES, on).output, "-o", output, *given), output)
+    if kind in ("fit", "complete"):
+        model = result_of(jobs, ("build",), on).output
+        project.write_scans(folder / listed, _some(state.chosen("new"), "to fit; drop new scans", 1))
+        output = f"{'fits' if kind == 'fit' else 'completed'}-{number}"
+        return Order((*words, model, listed, "-o", output, *given), output)
+    if kind == "report":
+        before = result_of(jobs, (*CORRESPONDENCES, "fit"), on)
+        return Order((*words, before.output, "--no-open", *given), f"{before.output}/report.html")
+    if kind == "convert":
+        model, to = result_of(jobs, ("build",), on).output, str(options.get("--to", ""))
+        output = f"exported-{number}{_model_ending(to)}"
+        return Order((*words, model, output, *given), output)
+    if kind == "export":
+        output = f"exported-{number}"
+        return Order((*words, result_of(jobs, ("fit",), on).output, "--all", "-o", output, *given), output)
+    if kind not in QUESTIONS:
+        raise InputError(f"There is no action {kind[:30]!r}; reload the page.")
+    return _question(project, jobs, kind, (*words,), given, on, number)
+
+
+def _question(
+    project: Project, jobs: Sequence[Job], kind: str, words: tuple[str, ...], given: Sequence[str], on: int | None,
+    number: int,
+) -> Order:  # fmt: skip
+    stem, output, state = f"{_INPUTS}/{number:04d}", f"{kind}-{number}", project.state
+    if kind == "score":
+        fits, reference = result_of(jobs, ("fit",), on), result_of(jobs, CORRESPONDENCES, None)
+        project.write_table(project.folder / f"{stem}.csv", _some(state.chosen("new"), "to score", 1))
+        project.write_table(project.folder / f"{stem}-reference.csv", _some(state.chosen("training"), "to compare", 2))
+        return Order(
+            (*words, f"{stem}.csv", "--shapes", fits.output, "--surfaces", "fitted", "--reference",
+             f"{stem}-reference.csv", "--reference-shapes", reference.output, "-o", output, *given),
+            output,
+        )  # fmt: skip
+    kinds = ("fit",) if kind == "identify" else (*CORRESPONDENCES, "fit")
+    shapes = result_of(jobs, CORRESPONDENCES if on is None and kind != "identify" else kinds, on)
+    role = "new" if shapes.kind == "fit" else "training"
+    project.write_table(project.folder / f"{stem}.csv", _some(state.chosen(role), "to analyse", 2))
+    return Order((*words, f"{stem}.csv", "--shapes", shapes.output, "-o", output, *given), output)
+
+
+def result_of(jobs: Sequence[Job], kinds: Sequence[str], on: int | None) -> Job:
+    """Return the job `on`, or the newest that succeeded, of some kinds.
+
+    Raises:
+        InputError: there is none.
+    """
+    for job in reversed(jobs):
+        if job.kind in kinds and job.status == "done" and on in (None, job.number):
+            return job
+    missing = {"correspond": "a correspondence", "build": "a model", "fit": "fits of new scans"}[
+        next(kind for kind in kinds if kind in ("correspond", "build", "fit"))
+    ]
+    raise InputError(f"This needs {missing}; run that first.")
+
+
+def checks(
+    project: Project, forms: Forms, kind: str, options: Mapping[str, Any], shapes: Job | None
+) -> list[dict[str, str]]:
+    """Return what can be said before a question is run: a level (`ok`, `warning`, `problem`) and a sentence each."""
+    role = "new" if kind in ("score", "identify") or (shapes is not None and shapes.kind == "fit") else "training"
+    chosen = project.state.chosen(role)
+    found = [{"level": "ok" if len(chosen) > 1 else "problem", "text": f"{len(chosen)} specimens take part."}]
+    formula = str(options.get("--formula", ""))
+    used = {str(value) for value in options.values() if isinstance(value, str)}
+    columns = [column for column in project.state.columns if column in used or _in_formula(column, formula)]
+    for column in columns:
+        cells = [one.cells.get(column, "") for one in chosen]
+        missing = cells.count("")
+        if missing:
+            text = f"{column} is missing for {missing} of {len(cells)} specimens; fill it in, or leave these out."
+            found.append({"level": "problem", "text": text})
+        classes = {cell: cells.count(cell) for cell in dict.fromkeys(cells) if cell}
+        if 0 < len(classes) <= 12:
+            few = min(classes.values()) < 3
+            text = f"{column}: {', '.join(f'{count} {name}' for name, count in classes.items())}."
+            found.append({"level": "warning" if few else "ok", "text": text})
+        if len(classes) == 1:
+            found.append({"level": "problem", "text": f"{column} has one value for all specimens; nothing can differ."})
+    for option in forms.get(kind, {}).get("options", ()):
+        if option["required"] and not options.get(option["flag"]):
+            found.append({"level": "problem", "text": f"Choose: {option['help'].partition(';')[0]}."})
+    return found
+
+
+def _in_formula(column: str, formula: str) -> bool:
+    words = "".join(c if c.isalnum() or c == "_" else " " for c in formula).split()
+    return column in words or f"Q({column!r})" in formula.replace('"', "'")
+
+
+def _given(forms: Forms, kind: str, options: Mapping[str, Any]) -> list[str]:
+    """Return the options as arguments.
+
+    Raises:
+        InputError: the kind has no such option, or a value is none.
+    """
+    known = {option["flag"]: option for option in forms.get(kind, {}).get("options", ())}
+    arguments: list[str] = []
+    for flag, value in options.items():
+        if flag not in known:
+            raise InputError(f"The action {kind[:30]!r} has no option {str(flag)[:40]!r}; reload the page.")
+        if isinstance(value, bool):
+            arguments += [flag] if value else []
+        elif value is not None and str(value).strip():
+            # One argument, so that a value that begins with a dash is not taken for an option.
+            arguments.append(f"{flag}={str(value).strip()}")
+    return arguments
+
+
+def _some(specimens: Sequence[Specimen], purpose: str, least: int) -> Sequence[Specimen]:
+    if len(specimens) < least:
+        raise InputError(f"There {'is no included specimen' if not specimens else 'is one specimen'} {purpose}.")
+    return specimens
+
+
+def _surfaces(project: Project, before: Job) -> list[str]:
+    """Return the folder in correspondence, or the surfaces of the included specimens where others are excluded."""
+    chosen = [f"{before.output}/{one.id}.ply" for one in project.state.chosen("training")]
+    there = [path for path in chosen if (project.folder / path).is_file()]
+    made = {path.stem for path in (project.folder / before.output).glob("*.ply")}
+    excluded = [one for one in project.state.specimens if not one.included and one.id in made]
+    if excluded:
+        return list(_some_files(there))
+    return [before.output]
+
+
+def _some_files(paths: Sequence[str]) -> Sequence[str]:
+    if len(paths) < 2:
+        raise InputError("Fewer than two included specimens are in correspondence; include more.")
+    return paths
+
+
+def _model_ending(name: str) -> str:
+    from shapespace.formats.registry import MODEL_FORMATS
+
+    if not name:
+        return ".h5"
+    if name not in MODEL_FORMATS:
+        raise InputError(f"There is no format {name[:30]!r}; choose one of {', '.join(MODEL_FORMATS)}.")
+    return next(iter(MODEL_FORMATS[name].suffixes), "")

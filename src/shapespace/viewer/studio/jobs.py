@@ -1,0 +1,278 @@
+"""The jobs of a project: commands that run one after the other in processes of their own, and what came of them."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shlex
+import threading
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from shapespace.errors import FileError, InputError
+from shapespace.io.files import atomic_path, make_folder
+from shapespace.schemas import json_text, read
+from shapespace.viewer.studio.run_job import CANCEL, EXIT, JOB, LOG, PROGRESS, is_running, start
+
+Status = Literal["waiting", "running", "done", "failed", "cancelled", "interrupted"]
+FOLDER = "jobs"
+_POLL_S = 0.3  # between looks at the running job
+_START_S = 30.0  # after which a process that does not lock its folder has failed to start
+_LOG_END = 4000  # bytes of the log in which the last message is searched
+_PARTLY = 1  # exit code of commands of which some scans failed
+_ENDED: tuple[Status, ...] = ("done", "failed", "cancelled", "interrupted")
+_NO_MESSAGE = "It ended without a message; look at its log."
+
+
+class Job(Struct, frozen=True, kw_only=True):
+    """A command of a project; `job.json` contains all but its status, which the files of its process tell.
+
+    Args:
+        number: from 1.
+        kind: what it does.
+        arguments: of the command, relative to the project's folder.
+        output: what it writes, relative to the folder.
+        wanted: whether it is to run, or has ended.
+        status: of it.
+        code: exit code, once it ended.
+        seconds: it took.
+        message: the last line of its log.
+    """
+
+    number: int
+    kind: str
+    arguments: tuple[str, ...]
+    output: str
+    wanted: bool = True
+    status: Status = "waiting"
+    code: int | None = None
+    seconds: float = 0.0
+    message: str = ""
+
+    @property
+    def command(self) -> str:
+        """The command line."""
+        return shlex.join(["shapespace", *self.arguments])
+
+
+class Jobs:
+    """The owner of the jobs of a project. A thread starts the next one when none runs.
+
+    Args:
+        folder: of the project.
+        changed: called when a job changed.
+    """
+
+    def __init__(self, folder: Path, changed: Callable[[], None]) -> None:
+        self._folder = folder / FOLDER
+        self._changed = changed
+        self._lock = threading.RLock()
+        self._jobs: dict[int, Job] = {}
+        self._started: dict[int, float] = {}
+        self._seen_progress = 0
+        self._stop = threading.Event()
+        for path in sorted(self._folder.glob(f"*/{JOB}")):
+            with contextlib.suppress(OSError, ValueError):
+                job = read(Job, json.loads(path.read_text(encoding="utf-8")), str(path), "remove it")
+                self._jobs[job.number] = self._looked_at(job)
+        self._thread = threading.Thread(target=self._work, name="studio jobs", daemon=True)
+        self._thread.start()
+
+    def all(self) -> list[Job]:
+        """Return all jobs, the oldest first."""
+        with self._lock:
+            return [self._jobs[number] for number in sorted(self._jobs)]
+
+    def get(self, number: int) -> Job:
+        """Return a job.
+
+        Raises:
+            InputError: there is no such job.
+        """
+        with self._lock:
+            if number not in self._jobs:
+                raise InputError(f"There is no job {number}; reload the page.")
+            return self._jobs[number]
+
+    def add(self, kind: str, make: Callable[[int, list[Job]], tuple[tuple[str, ...], str]]) -> Job:
+        """Add a job.
+
+        Args:
+            kind: what it does.
+            make: returns its arguments and its output, given its number and the jobs before.
+        """
+        with self._lock:
+            number = max(self._jobs, default=0) + 1
+            arguments, output = make(number, self.all())
+            job = Job(number=number, kind=kind, arguments=arguments, output=output)
+            make_folder(self.folder_of(job))
+            self._put(job)
+            return job
+
+    def cancel(self, number: int) -> None:
+        """Interrupt a running job, or take a waiting one out of the queue."""
+        with self._lock:
+            job = self.get(number)
+            if job.status == "running":
+                (self.folder_of(job) / CANCEL).touch()
+            elif job.status == "waiting":
+                self._put(replace(job, wanted=False, status="cancelled", message="It was cancelled before it began."))
+
+    def go_on(self, number: int) -> None:
+        """Queue a job that did not succeed again; commands go on from what is complete.
+
+        Raises:
+            InputError: it waits, runs or succeeded.
+        """
+        with self._lock:
+            job = self.get(number)
+            if job.status not in ("failed", "cancelled", "interrupted"):
+                raise InputError(f"Job {number} is {job.status}; only one that did not succeed can go on.")
+            self._started.pop(number, None)
+            for name in (EXIT, CANCEL, PROGRESS):
+                (self.folder_of(job) / name).unlink(missing_ok=True)
+            self._put(replace(job, wanted=True, status="waiting", code=None, message=""))
+
+    def log(self, number: int) -> str:
+        """Return what the command printed."""
+        try:
+            return (self.folder_of(self.get(number)) / LOG).read_text(encoding="utf-8", errors="replace")
+        except OSError:
+            return ""
+
+    def progress(self, job: Job) -> dict[str, Any] | None:
+        """Return what a running job does (`doing`, `done`, `total`, `left_s`), None where it does not say."""
+        try:
+            state = json.loads((self.folder_of(job) / PROGRESS).read_text(encoding="utf-8"))
+            done, total, began = float(state["done"]), float(state["total"] or 0), float(state["began"])
+        except (OSError, ValueError, TypeError, KeyError):
+            return None
+        left = (time.time() - began) * (total - done) / done if done and total else None
+        return {"doing": str(state["doing"]), "done": done, "total": total or None, "left_s": left}
+
+    def running_for(self, job: Job) -> float:
+        """Return for how many seconds a job has run."""
+        return time.time() - self._started.get(job.number, time.time()) if job.status == "running" else job.seconds
+
+    def folder_of(self, job: Job) -> Path:
+        """Return the folder of the files of a job."""
+        return self._folder / f"{job.number:04d}"
+
+    def close(self) -> None:
+        """End the thread; a running job goes on."""
+        self._stop.set()
+        self._thread.join()
+
+    def _put(self, job: Job) -> None:
+        stored = replace(job, status="waiting", message="", code=None, seconds=0.0)
+        with atomic_path(self.folder_of(job) / JOB) as path:
+            path.write_text(json_text(stored), encoding="utf-8")
+        self._jobs[job.number] = job
+        self._changed()
+
+    def _work(self) -> None:
+        while not self._stop.wait(_POLL_S):
+            with self._lock:
+                for job in self.all():
+                    if job.status == "running":
+                        self._set(self._looked_at(job))
+                jobs = self.all()
+                waiting = next((job for job in jobs if job.status == "waiting"), None)
+                if waiting is not None and all(job.status != "running" for job in jobs):
+                    self._start(waiting)
+
+    def _start(self, job: Job) -> None:
+        self._started[job.number] = time.time()
+        try:
+            start(self.folder_of(job))
+        except OSError as error:
+            self._put(replace(job, wanted=False, status="failed", message=f"It cannot be started: {error.strerror}."))
+        else:
+            self._set(replace(job, status="running"))
+
+    def _set(self, job: Job) -> None:
+        stamp = self._progress_stamp(job)
+        if job != self._jobs[job.number] or stamp != self._seen_progress:
+            self._seen_progress = stamp
+            self._jobs[job.number] = job
+            self._changed()
+
+    def _progress_stamp(self, job: Job) -> int:
+        try:
+            return (self.folder_of(job) / PROGRESS).stat().st_mtime_ns
+        except OSError:
+            return 0
+
+    def _looked_at(self, job: Job) -> Job:
+        """Return a job with the status that the files of its process tell."""
+        folder = self._folder / f"{job.number:04d}"
+        if not job.wanted:
+            return job if job.status in _ENDED else replace(job, status="cancelled")
+        ended = self._exit(folder)
+        if ended is not None:
+            code = int(ended.get("code", -1))
+            status: Status = "done" if code in (0, _PARTLY) else "cancelled" if ended.get("cancelled") else "failed"
+            seconds = float(ended.get("seconds", 0.0))
+            return replace(job, status=status, code=code, seconds=seconds, message=self._last_line(folder))
+        if is_running(folder):
+            self._started.setdefault(job.number, _modified(folder / JOB))
+            return replace(job, status="running")
+        if job.status == "running" and time.time() - self._started.get(job.number, 0.0) < _START_S:
+            # Its process is about to lock the folder, or has let go of it and is about to write how it ended.
+            return job
+        has_begun = job.status == "running" or (folder / LOG).exists()
+        message = "It ended without a result, as when the machine was switched off; it can go on." if has_begun else ""
+        return replace(job, status="interrupted" if has_begun else "waiting", message=message)
+
+    @staticmethod
+    def _exit(folder: Path) -> Mapping[str, Any] | None:
+        try:
+            return json.loads((folder / EXIT).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return None
+
+    @staticmethod
+    def _last_line(folder: Path) -> str:
+        try:
+            content = (folder / LOG).read_bytes()[-_LOG_END:].decode("utf-8", errors="replace")
+        except OSError:
+            return _NO_MESSAGE
+        lines = [line.strip() for line in content.splitlines() if line.strip()]
+        told = [line for line in lines if not line.startswith("next: ")]  # the page itself shows what comes next
+        return told[-1].removeprefix("shapespace: ") if told else _NO_MESSAGE
+
+
+def _modified(path: Path) -> float:
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return time.time()
+
+
+def history(jobs: list[Job]) -> str:
+    """Return a shell script that computes the results of all jobs that succeeded anew."""
+    lines = [
+        "#!/bin/sh",
+        "# Computes the results of this project anew, from its inputs, in the folder given: sh history.sh FOLDER",
+        "set -u",
+        'PROJECT=$(cd "$(dirname "$0")" && pwd)',
+        'mkdir -p "${1:?Give a new folder for the results.}" && cd "$1" || exit 2',
+        'run() { "$@"; code=$?; [ $code -le 1 ] || { echo "This command failed: $*" >&2; exit $code; }; }',
+    ]
+    for job in jobs:
+        if job.status == "done":
+            words = [f'"$PROJECT"/{shlex.quote(word)}' if word.startswith("inputs/") else shlex.quote(word)
+                     for word in job.arguments]  # fmt: skip
+            lines.append(" ".join(["run", "shapespace", *words]))
+    return "\n".join(lines) + "\n"
+
+
+def write_history(folder: Path, jobs: list[Job]) -> None:
+    """Write `history.sh` into the project's folder; a full disk does not keep a job from ending."""
+    with contextlib.suppress(FileError), atomic_path(folder / "history.sh") as path:
+        path.write_text(history(jobs), encoding="utf-8", newline="\n")

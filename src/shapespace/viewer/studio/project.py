@@ -1,0 +1,470 @@
+"""A project of the studio: its specimens, their table, landmarks, and the edits of these."""
+
+from __future__ import annotations
+
+import filecmp
+import json
+import re
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Literal, cast
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from shapespace.cohort.classes import notes_on_classes
+from shapespace.errors import FileError, FileFormatError, InputError
+from shapespace.io.containers.json_files import read_json
+from shapespace.io.files import atomic_path, make_folder
+from shapespace.io.meshes.mesh_folders import mesh_files
+from shapespace.io.meshes.mesh_io import MESH_FILE_ENDINGS, stem_of
+from shapespace.io.tables.table_io import key_column, table_rows, table_text
+from shapespace.schemas import json_text, read
+
+Role = Literal["training", "new"]
+
+_AGAIN = "restore it from a copy, or start a new project"
+_MOST_CLASSES = 12  # classes of a column that the page counts
+_MOST_UNDONE = 100  # edits that can be undone
+_LONGEST_ID, _LONGEST_CELL = 100, 1000  # characters
+_NO_FILE_NAME = re.compile(r'[/\\:*?"<>|\x00-\x1f]')
+STALE = "Another tab changed the project; look at it and do it again."
+
+
+class Specimen(Struct, frozen=True, kw_only=True):
+    """A specimen.
+
+    Args:
+        id: its name, by which files of results are called.
+        file: the scan, relative to the project's folder where it lies in it.
+        role: whether models are built of it, or it is new to them.
+        included: whether it takes part.
+        cells: column -> its cell in the table.
+    """
+
+    id: str
+    file: str
+    role: Role = "training"
+    included: bool = True
+    cells: dict[str, str] = {}
+
+
+class State(Struct, frozen=True, kw_only=True):
+    """What `project.json` contains.
+
+    Args:
+        name: of the project.
+        columns: of the table, besides the id.
+        specimens: in the order in which they were added.
+        landmarks: name -> vertex of the surfaces in correspondence.
+    """
+
+    FORMAT: ClassVar[str] = "shapespace-project"
+
+    format: str = FORMAT
+    format_version: int = 1
+    name: str
+    columns: tuple[str, ...] = ()
+    specimens: tuple[Specimen, ...] = ()
+    landmarks: dict[str, int] = {}
+
+    def chosen(self, role: Role) -> tuple[Specimen, ...]:
+        """Return the included specimens of a role."""
+        return tuple(one for one in self.specimens if one.included and one.role == role)
+
+    def notes(self) -> list[str]:
+        """Return sentences on classes of the table that may be misspelt."""
+        cells = {column: [one.cells.get(column, "") for one in self.specimens] for column in self.columns}
+        notes = [note for column in self.columns for note in notes_on_classes(column, cells[column])]
+        return [note for note in notes if not note.startswith("Shapes in each class")]
+
+    def counts(self) -> dict[str, dict[str, int]]:
+        """Return the number of included specimens of each class, of columns with few classes."""
+        counts = {
+            column: Counter(one.cells.get(column, "") for one in self.specimens if one.included)
+            for column in self.columns
+        }
+        return {column: dict(count) for column, count in counts.items() if 0 < len(count) <= _MOST_CLASSES}
+
+
+class Project:
+    """A project in a folder: the owner of its state, which is written with every edit.
+
+    Args:
+        folder: with `project.json`.
+        state: of it.
+    """
+
+    FILE = "project.json"
+
+    def __init__(self, folder: Path, state: State) -> None:
+        self.folder = folder
+        self.state = state
+        self.revision = 0
+        self._undo: list[tuple[str, State]] = []
+        self._redo: list[tuple[str, State]] = []
+        self._lock = threading.RLock()
+
+    @staticmethod
+    def open(folder: Path, *, create: bool = False) -> Project:
+        """Open the project in a folder, or create one in an empty or new folder.
+
+        Raises:
+            FileError: there is no project, or the folder cannot be read or written.
+            FileFormatError: `project.json` is damaged, or of a later version.
+            InputError: a project is to be created in a folder with other files.
+        """
+        folder = folder.resolve()
+        path = folder / Project.FILE
+        if path.is_file():
+            content: Any = read_json(path, _AGAIN)
+            if not isinstance(content, dict) or content.get("format") != State.FORMAT:
+                raise FileFormatError(f"{path} is not a project of the studio; give another folder.")
+            if content.get("format_version") != 1:
+                raise FileFormatError(f"{path} was written by a later version of shapespace; update shapespace.")
+            return Project(folder, read(State, cast(object, content), str(path), _AGAIN))
+        if not create:
+            raise FileError(f"{folder} contains no project; create one there, or give the folder of a project.")
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise InputError(f"{folder} is not empty; give a new folder for the project.")
+        make_folder(folder / "scans")
+        project = Project(folder, State(name=folder.name))
+        project._write()
+        return project
+
+    @property
+    def undo_text(self) -> str | None:
+        """What an undo would take back."""
+        return self._undo[-1][0] if self._undo else None
+
+    @property
+    def redo_text(self) -> str | None:
+        """What was undone last."""
+        return self._redo[-1][0] if self._redo else None
+
+    def path(self, specimen: Specimen) -> Path:
+        """Return the path of a scan."""
+        return self.folder / specimen.file
+
+    def edit(self, revision: int | None, change: Callable[[State], tuple[str, State]]) -> None:
+        """Apply an edit, which can be undone.
+
+        Args:
+            revision: of the state that the user saw; None for edits that any state allows.
+            change: returns what it does, in words, and the new state.
+
+        Raises:
+            InputError: another edit came in between, or `change` refuses it.
+            FileError: it cannot be written; the state stays as it was.
+        """
+        with self._lock:
+            self._check(revision)
+            text, state = change(self.state)
+            before = self.state
+            self._replace(state)
+            self._undo = [*self._undo[-_MOST_UNDONE + 1 :], (text, before)]
+            self._redo = []
+
+    def undo(self, revision: int) -> None:
+        """Take the last edit back; nothing happens without one."""
+        self._step(revision, self._undo, self._redo)
+
+    def redo(self, revision: int) -> None:
+        """Apply the edit that was undone last."""
+        self._step(revision, self._redo, self._undo)
+
+    def _step(self, revision: int, source: list[tuple[str, State]], other: list[tuple[str, State]]) -> None:
+        with self._lock:
+            self._check(revision)
+            if source:
+                text, state = source[-1]
+                other.append((text, self.state))
+                self._replace(state)
+                source.pop()
+
+    def _check(self, revision: int | None) -> None:
+        if revision is not None and revision != self.revision:
+            raise StaleError(STALE)
+
+    def _replace(self, state: State) -> None:
+        before, self.state = self.state, state
+        try:
+            self._write()
+        except BaseException:
+            self.state = before
+            raise
+        self.revision += 1
+
+    def _write(self) -> None:
+        with atomic_path(self.folder / self.FILE) as path:
+            path.write_text(json_text(self.state), encoding="utf-8")
+
+    # Scans
+
+    def new_file(self, name: str) -> Path:
+        """Return a path in the project for a scan that is uploaded as `name`; no file has it yet."""
+        stem, ending = _stem(name), _ending(name)
+        taken = {path.name.casefold() for path in (self.folder / "scans").glob("*")}
+        number, chosen = 1, f"{stem}{ending}"
+        while chosen.casefold() in taken:
+            number += 1
+            chosen = f"{stem}-{number}{ending}"
+        return self.folder / "scans" / chosen
+
+    def add(self, file: Path, role: Role) -> tuple[str, str | None]:
+        """Add a scan; return its id, and that of a specimen with the same file content, in which case it is not added.
+
+        Raises:
+            FileError: the scan cannot be read.
+        """
+        with self._lock:
+            try:
+                size = file.stat().st_size
+                for one in self.state.specimens:
+                    other = self.path(one)
+                    if other.is_file() and other.stat().st_size == size and filecmp.cmp(file, other, shallow=False):
+                        return one.id, one.id
+            except OSError as error:
+                raise FileError(f"Cannot read {file}: {error.strerror or error}.") from error
+            taken = {one.id.casefold() for one in self.state.specimens}
+            stem = _stem(file.name)
+            number, name = 1, stem
+            while name.casefold() in taken:
+                number += 1
+                name = f"{stem}-{number}"
+            inside = file.is_relative_to(self.folder)
+            place = file.relative_to(self.folder).as_posix() if inside else str(file)
+            specimen = Specimen(id=name, file=place, role=role)
+            self.edit(None, lambda state: (f"add {name}", replace(state, specimens=(*state.specimens, specimen))))
+            return name, None
+
+    def import_files(self, place: Path, role: Role, *, copy: bool) -> tuple[int, list[str]]:
+        """Add a scan or the scans of a folder on this machine; return how many, and sentences on what was not added.
+
+        Raises:
+            FileError: it cannot be read, or the copies not written.
+            InputError: a folder without scans.
+        """
+        import shutil
+
+        listed = mesh_files([place.resolve()])
+        notes, added = list(listed.left_out), 0
+        for file in listed.files:
+            target = file
+            if copy:
+                target = self.new_file(file.name)
+                with atomic_path(target) as path:
+                    shutil.copyfile(file, path)
+            _, same = self.add(target, role)
+            if same is not None:
+                notes.append(f"{file.name} is the same file as {same}; it was not added again.")
+                if copy:
+                    target.unlink(missing_ok=True)
+            added += same is None
+        return added, notes
+
+    # Files that commands read
+
+    def write_scans(self, path: Path, specimens: Iterable[Specimen]) -> None:
+        """Write a list of scans with their ids and cells, as `correspond` and `fit` read it."""
+        columns = self.state.columns
+        rows = [
+            (one.id, _relative(self.path(one), path.parent), *(one.cells.get(column, "") for column in columns))
+            for one in specimens
+        ]
+        self._write_table(path, ("id", "file", *columns), rows)
+
+    def write_table(self, path: Path, specimens: Iterable[Specimen]) -> None:
+        """Write the table of specimens, as `compare` reads it."""
+        columns = self.state.columns
+        rows = [(one.id, *(one.cells.get(column, "") for column in columns)) for one in specimens]
+        self._write_table(path, ("specimen", *columns), rows)
+
+    def write_landmarks(self, path: Path) -> None:
+        """Write the landmarks as a table of name and vertex."""
+        self._write_table(path, ("name", "vertex"), list(self.state.landmarks.items()))
+
+    def _write_table(self, path: Path, header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+        make_folder(path.parent)
+        with atomic_path(path) as temporary:
+            temporary.write_text(table_text(header, rows), encoding="utf-8")
+
+
+class StaleError(InputError):
+    """The project was changed after the user looked at it."""
+
+
+def change_of(request: Mapping[str, Any]) -> Callable[[State], tuple[str, State]]:
+    """Return the edit that a request of the page asks for.
+
+    Raises:
+        InputError: by the edit, where a specimen or column does not exist, or a name cannot be used.
+    """
+    what = str(request.get("what", ""))
+
+    def change(state: State) -> tuple[str, State]:
+        try:
+            return _EDITS[what](state, request)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise InputError(f"The edit {what[:30]!r} cannot be read; reload the page.") from error
+
+    return change
+
+
+def _cells(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
+    by_id: dict[str, dict[str, str]] = {}
+    for cell in request["cells"]:
+        _check_column(state, cell["column"])
+        by_id.setdefault(cell["id"], {})[cell["column"]] = str(cell["value"]).strip()[:_LONGEST_CELL]
+    edited = _edited(state, by_id, lambda one: replace(one, cells={**one.cells, **by_id[one.id]}))
+    count = sum(map(len, by_id.values()))
+    return f"edit {count} cell{'' if count == 1 else 's'}", edited
+
+
+def _include(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
+    ids, included = request["ids"], bool(request["included"])
+    edited = _edited(state, ids, lambda one: replace(one, included=included))
+    return f"{'include' if included else 'exclude'} {_count(ids)}", edited
+
+
+def _set(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
+    role: Role = "new" if request["set"] == "new" else "training"
+    return f"move {_count(request['ids'])}", _edited(state, request["ids"], lambda one: replace(one, role=role))
+
+
+def _remove(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
+    gone = set(request["ids"])
+    _edited(state, gone, lambda one: one)
+    return f"remove {_count(gone)}", replace(
+        state, specimens=tuple(one for one in state.specimens if one.id not in gone)
+    )
+
+
+def _rename(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
+    old, new = request["id"], str(request["to"]).strip()
+    if not new or len(new) > _LONGEST_ID or new.startswith(".") or _NO_FILE_NAME.search(new):
+        raise InputError(f"A specimen cannot be called {new[:40]!r}, as files of results are called so.")
+    if any(one.id.casefold() == new.casefold() for one in state.specimens if one.id != old):
+        raise InputError(f"There is a specimen {new} already; choose another name.")
+    return f"rename {old}", _edited(state, [old], lambda one: replace(one, id=new))
+
+
+def _add_column(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
+    column = str(request["column"]).strip()[:60]
+    if not column or key_column([column]) is not None or column in state.columns:
+        raise InputError(f"A column cannot be called {column!r}; choose a name that is not in use.")
+    return f"add the column {column}", replace(state, columns=(*state.columns, column))
+
+
+def _remove_column(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
+    column = request["column"]
+    _check_column(state, column)
+    specimens = tuple(
+        replace(one, cells={key: cell for key, cell in one.cells.items() if key != column}) for one in state.specimens
+    )
+    kept = tuple(one for one in state.columns if one != column)
+    return f"remove the column {column}", replace(state, columns=kept, specimens=specimens)
+
+
+def _landmarks(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
+    landmarks = {str(name).strip()[:60]: int(vertex) for name, vertex in request["landmarks"].items()}
+    if "" in landmarks or min(landmarks.values(), default=0) < 0:
+        raise InputError("A landmark needs a name and a vertex.")
+    return "change the landmarks", replace(state, landmarks=landmarks)
+
+
+_EDITS: Mapping[str, Callable[[State, Mapping[str, Any]], tuple[str, State]]] = {
+    "cells": _cells, "include": _include, "set": _set, "remove": _remove, "rename": _rename,
+    "add-column": _add_column, "remove-column": _remove_column, "landmarks": _landmarks,
+}  # fmt: skip
+
+
+def join_table(content: bytes) -> Callable[[State], tuple[str, State]]:
+    """Return the edit that takes the cells of a table (CSV, TSV or .xlsx), whose rows are named by id or file name.
+
+    Raises:
+        FileFormatError: by the edit, where it is no such table.
+        InputError: by the edit, where no row is of a specimen.
+    """
+
+    def change(state: State) -> tuple[str, State]:
+        try:
+            lines = table_rows(content)
+            header = next(lines)
+            rows = list(lines)
+        except (ValueError, StopIteration) as error:
+            raise FileFormatError(f"The table {error or 'is empty'}; save it as CSV or .xlsx with a header.") from error
+        key = key_column(header)
+        if key is None:
+            raise InputError("The table needs a column id, specimen, scan, file or name, with the names of the scans.")
+        columns = [head for k, head in enumerate(header) if head and k != key]
+        known = {one.id.casefold(): one.id for one in state.specimens}
+        cells: dict[str, dict[str, str]] = {}
+        for row in rows:
+            found = known.get(row[key].strip().casefold()) or known.get(_stem(row[key].strip()).casefold())
+            if found is not None:
+                cells[found] = {header[k]: row[k].strip()[:_LONGEST_CELL] for k in range(len(header))
+                                if header[k] and k != key}  # fmt: skip
+        if not cells:
+            first = rows[0][key][:40] if rows else ""
+            raise InputError(f"No row of the table is of a specimen; its first row is {first!r}.")
+        together = tuple(dict.fromkeys((*state.columns, *columns)))
+        edited = _edited(state, cells, lambda one: replace(one, cells={**one.cells, **cells[one.id]}))
+        return f"take a table of {len(cells)} specimens", replace(edited, columns=together)
+
+    return change
+
+
+def _edited(state: State, ids: Iterable[str], change: Callable[[Specimen], Specimen]) -> State:
+    wanted = set(ids)
+    if unknown := wanted - {one.id for one in state.specimens}:
+        raise InputError(f"There is no specimen {sorted(unknown)[0][:40]!r}; reload the page.")
+    return replace(state, specimens=tuple(change(one) if one.id in wanted else one for one in state.specimens))
+
+
+def _check_column(state: State, column: str) -> None:
+    if column not in state.columns:
+        raise InputError(f"The table has no column {str(column)[:40]!r}; add it first.")
+
+
+def _count(ids: Iterable[str]) -> str:
+    names = list(ids)
+    return names[0] if len(names) == 1 else f"{len(names)} specimens"
+
+
+def _ending(name: str) -> str:
+    return next((end for end in sorted(MESH_FILE_ENDINGS, key=len, reverse=True) if name.lower().endswith(end)), "")
+
+
+def _stem(name: str) -> str:
+    """Return a name for a scan in a file called `name`, which any file system can have."""
+    plain = _NO_FILE_NAME.sub("_", stem_of(Path(Path(name.replace("\\", "/")).name)))
+    return plain.strip(". ")[:_LONGEST_ID] or "scan"
+
+
+def _relative(path: Path, folder: Path) -> str:
+    """Return `path` relative to `folder` where both lie in the same project, else as it is."""
+    project = folder.parent
+    return f"../{path.relative_to(project).as_posix()}" if path.is_relative_to(project) else str(path)
+
+
+def recent_projects(add: Path | None = None) -> list[dict[str, Any]]:
+    """Return the projects that were opened last; `add` comes first from now on."""
+    from platformdirs import user_state_path
+
+    path = user_state_path("shapespace", appauthor=False) / "projects.json"
+    try:
+        folders = [str(one) for one in json.loads(path.read_text(encoding="utf-8"))]
+    except (OSError, ValueError, TypeError):
+        folders = []
+    if add is not None:
+        folders = [str(add), *(one for one in folders if one != str(add))][:10]
+        try:
+            make_folder(path.parent)
+            with atomic_path(path) as temporary:
+                temporary.write_text(json.dumps(folders), encoding="utf-8")
+        except FileError:
+            pass  # the list is a convenience; a read-only home must not keep a project from being opened
+    return [{"name": Path(one).name, "folder": one, "exists": (Path(one) / Project.FILE).is_file()} for one in folders]

@@ -1,0 +1,126 @@
+"""Checks and pictures of specimens, made in other processes and kept in the project."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import sys
+from collections.abc import Callable
+from concurrent.futures import Future, ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from shapespace.batch.workers import context
+from shapespace.errors import ShapespaceError
+
+_FOLDER = "checks"
+_MOST_PROCESSES = 4
+_MOST_TRIANGLES = 20_000  # of a picture of 176 by 232 pixels
+
+
+class SpecimenChecks:
+    """The owner of the checks of a project's scans. They are known again by path, size and time of change.
+
+    Args:
+        folder: of the project.
+        changed: called when a check was finished.
+    """
+
+    def __init__(self, folder: Path, changed: Callable[[], None]) -> None:
+        self._folder = folder / _FOLDER
+        self._changed = changed
+        self._asked: set[str] = set()
+        self._pool: ProcessPoolExecutor | None = None
+        self._known: dict[str, dict[str, Any]] = {}
+
+    def facts(self, scan: Path) -> dict[str, Any] | None:
+        """Return the facts of a scan, or None while it is checked; the first call asks for the check."""
+        key = _key(scan)
+        if key in self._known:
+            return self._known[key]
+        try:
+            facts = json.loads((self._folder / f"{key}.json").read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            self._ask(key, scan)
+            return None
+        self._known[key] = facts
+        return facts
+
+    def picture(self, scan: Path) -> Path:
+        """Return the path of the picture of a scan, which exists once it was checked and is usable."""
+        return self._folder / f"{_key(scan)}.webp"
+
+    def close(self) -> None:
+        """End the processes."""
+        if self._pool is not None:
+            self._pool.shutdown(wait=False, cancel_futures=True)
+
+    def _ask(self, key: str, scan: Path) -> None:
+        if key in self._asked:
+            return
+        self._asked.add(key)
+        self._folder.mkdir(parents=True, exist_ok=True)
+        if self._pool is None:
+            processes = min(_MOST_PROCESSES, max(1, (os.cpu_count() or 2) - 1))
+            self._pool = ProcessPoolExecutor(processes, mp_context=context(), initializer=_lower_priority)
+
+        def done(future: Future[dict[str, Any]]) -> None:
+            if future.cancelled():
+                return
+            if future.exception() is not None:
+                # Its process was killed, as for want of memory: the file is to blame, and is not tried again.
+                self._pool = None
+                text = "It cannot be checked: the memory does not suffice, or the check failed."
+                self._known[key] = _unusable(text)
+            self._changed()
+
+        self._pool.submit(check_scan, scan, self._folder / key).add_done_callback(done)
+
+
+def check_scan(scan: Path, stem: Path) -> dict[str, Any]:
+    """Write the facts and the picture of a scan next to `stem`, and return the facts."""
+    from shapespace.geometry.doctor import examine, repair
+    from shapespace.io.files import atomic_path
+    from shapespace.io.meshes.mesh_io import read_mesh
+    from shapespace.report.render.scene import decimate
+    from shapespace.report.render.thumbnails import mesh_still
+
+    try:
+        mesh = read_mesh(scan)
+        report = examine(mesh)
+        usable = all(finding.level != "refused" for finding in report.findings)
+        findings = [{"level": one.level, "text": f"{one.problem} {one.action}"} for one in report.findings]
+        facts = {
+            "state": "ready" if usable else "unusable", "vertices": report.vertices, "triangles": report.triangles,
+            "findings": findings,
+        }  # fmt: skip
+        if usable:
+            picture, _ = mesh_still(decimate(repair(mesh)[0], _MOST_TRIANGLES)[0])
+            with atomic_path(stem.with_suffix(".webp")) as path:
+                path.write_bytes(picture)
+    except ShapespaceError as error:
+        facts = _unusable(str(error).replace(f"{scan.parent}{os.sep}", ""))
+    with atomic_path(stem.with_suffix(".json")) as path:
+        path.write_text(json.dumps(facts), encoding="utf-8")
+    return facts
+
+
+def _unusable(text: str) -> dict[str, Any]:
+    return {"state": "unusable", "vertices": 0, "triangles": 0, "findings": [{"level": "refused", "text": text}]}
+
+
+def _key(scan: Path) -> str:
+    try:
+        stat = scan.stat()
+        text = f"{scan.name}|{stat.st_size}|{stat.st_mtime_ns}"  # without the folder: projects are moved
+    except OSError:
+        text = f"{scan}|missing"
+    return hashlib.sha256(text.encode(errors="surrogateescape")).hexdigest()[:24]
+
+
+def _lower_priority() -> None:
+    if sys.platform != "win32":
+        with contextlib.suppress(OSError):
+            os.nice(5)

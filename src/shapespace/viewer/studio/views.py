@@ -1,0 +1,125 @@
+"""The pages of results in the studio: those of the viewer, and the reports of analyses, under `/view/NUMBER/`."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from contextlib import ExitStack
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import anyio.to_thread
+from starlette._utils import get_route_path
+from starlette.responses import FileResponse
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from shapespace.errors import InputError, ShapespaceError
+from shapespace.schemas import CorrespondenceRecord
+from shapespace.viewer.corresponding_surfaces import Surfaces
+from shapespace.viewer.guard import refusal
+from shapespace.viewer.model_view import ModelView
+from shapespace.viewer.server import model_app
+from shapespace.viewer.surfaces_server import surfaces_app
+from shapespace.viewer.uploaded_scans import FOLDER_PREFIX, Limits, Scans
+
+REPORT = "report.html"
+_MOST_OPEN = 6  # pages whose data are in memory at a time
+REPORT_HEADERS = {
+    # A report is a page of its own: its scripts run, but cannot reach the studio.
+    "Content-Security-Policy": (
+        "sandbox allow-scripts allow-downloads allow-popups; default-src 'none'; script-src 'unsafe-inline' blob:; "
+        "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; frame-ancestors 'self'"
+    ),
+}
+
+
+def view_kind(path: Path) -> str | None:
+    """Return which page shows a result: `surfaces`, `model` or `report`; None where it has none."""
+    if path.name == REPORT and path.is_file():
+        return "report"
+    if path.suffix == ".h5" and path.is_file():
+        return "model"
+    if (path / CorrespondenceRecord.FILE).is_file():
+        return "surfaces"
+    if (path / REPORT).is_file():
+        return "report"
+    return "model" if next(path.glob("*.fit.json"), None) is not None else None
+
+
+class Views:
+    """ASGI application of the pages of results, opened when they are first asked for.
+
+    Args:
+        upload_bytes: size limit of scans that are dropped onto a model's page.
+
+    Attributes:
+        find: number of a job -> path of its result.
+    """
+
+    def __init__(self, upload_bytes: int) -> None:
+        self.find: dict[int, Path] = {}
+        self._upload_bytes = upload_bytes
+        self._open: OrderedDict[tuple[Path, int], tuple[ASGIApp, ExitStack]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one request of a page."""
+        number, _, rest = get_route_path(scope).lstrip("/").partition("/")
+        path = self.find.get(int(number)) if number.isdigit() and len(number) < 8 else None
+        kind = None if path is None else view_kind(path)
+        if path is None or kind is None:
+            await refusal(404, "There is no page of this result; reload the studio.")(scope, receive, send)
+        elif kind == "report":
+            file = path if path.name == REPORT else path / REPORT
+            await FileResponse(file, media_type="text/html", headers=REPORT_HEADERS)(scope, receive, send)
+        else:
+            try:
+                app = await anyio.to_thread.run_sync(self._app, path)
+            except ShapespaceError as error:
+                await refusal(422, str(error))(scope, receive, send)
+                return
+            inner = dict(scope, root_path=f"{scope.get('root_path', '')}/{number}")
+            if not rest:
+                # Of the page itself, whose addresses are relative to the folder.
+                inner["path"] = f"{inner['root_path']}/"
+            await app(inner, receive, send)
+
+    def close(self) -> None:
+        """Close all pages."""
+        with self._lock:
+            for _, stack in self._open.values():
+                stack.close()
+            self._open.clear()
+
+    def _app(self, path: Path) -> ASGIApp:
+        stamp = path if path.is_file() else next(iter(sorted(path.glob("correspondence.json"))), path)
+        key = (path, stamp.stat().st_mtime_ns)
+        with self._lock:
+            if key not in self._open:
+                stack = ExitStack()
+                self._open[key] = (self._made(path, stack), stack)
+            self._open.move_to_end(key)
+            while len(self._open) > _MOST_OPEN:
+                self._open.popitem(last=False)[1][1].close()
+            return self._open[key][0]
+
+    def _made(self, path: Path, stack: ExitStack) -> ASGIApp:
+        if (path / CorrespondenceRecord.FILE).is_file():
+            return surfaces_app(Surfaces(path))
+        view = ModelView.open(path)
+        root = Path(stack.enter_context(TemporaryDirectory(prefix=FOLDER_PREFIX, ignore_cleanup_errors=True)))
+        scans = Scans(root, view.model, view.model_name, Limits(upload_bytes=self._upload_bytes))
+        stack.callback(scans.close)
+        return model_app(view, scans)
+
+
+def result_path(folder: Path, output: str) -> Path:
+    """Return the path of a result in a project.
+
+    Raises:
+        InputError: it would lie elsewhere.
+    """
+    path = (folder / output).resolve()
+    if not path.is_relative_to(folder.resolve()):
+        raise InputError("This file is not in the project.")
+    return path
