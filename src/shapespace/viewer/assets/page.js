@@ -5,6 +5,9 @@
   const Viewer = (window.ShapespaceViewer = window.ShapespaceViewer || {});
   const $ = (id) => document.getElementById(id);
 
+  // Inside the studio, whose own header has the name and the theme.
+  try { if (parent !== window && parent.ShapespaceStudio) document.documentElement.dataset.inStudio = ""; } catch (refused) { /* a page of another origin */ }
+
   /** Return an element: h("button", {type: "button", onclick}, "text", child, ...). */
   const h = (Viewer.h = function (tag, properties, ...children) {
     const element = document.createElement(tag);

@@ -1,0 +1,196 @@
+/* Jobs: the form made from a command's options, its run with progress and log, and its results. */
+(function () {
+  "use strict";
+
+  const { html, useState, useEffect, useRef, useMemo } = window.Preact;
+  const Studio = window.ShapespaceStudio;
+  const T = window.ShapespaceTexts;
+  const J = T.jobs;
+  const { Button, CopyButton } = Studio;
+  const CHECK_AFTER = 400; // ms without a change of the form
+
+  const duration = (seconds) => seconds < 90 ? J.seconds(Math.max(1, Math.round(seconds))) : seconds < 5400 ? J.minutes(Math.round(seconds / 60)) : J.hours((seconds / 3600).toFixed(1));
+  const kindOf = (job) => J.kinds[job.kind] || job.kind;
+
+  // Forms -----------------------------------------------------------------------------------------------------------
+
+  const quoted = (column) => (/^[A-Za-z_]\w*$/.test(column) ? column : `\`${column}\``);
+  const terms = (formula) => formula.replace(/^\s*~/, "").split("+").map((term) => term.trim()).filter(Boolean);
+
+  /** A formula, built from ticked columns and editable. */
+  function Formula({ option, value, columns, onvalue }) {
+    const chosen = terms(value);
+    const toggle = (column) => {
+      const term = quoted(column), rest = chosen.filter((one) => one !== term);
+      const next = rest.length < chosen.length ? rest : [...chosen, term];
+      onvalue(next.length ? `~ ${next.join(" + ")}` : "");
+    };
+    const choices = [...columns.map((column) => [column, column]), ["log_size", T.questions.size]];
+    return html`
+      <fieldset class="choices"><legend>${T.questions.columns}</legend>
+        ${!columns.length && html`<p class="hint">${T.questions.noColumns}</p>`}
+        ${choices.map(([column, label]) => html`<label class="check" key=${column}><input type="checkbox" data-testid=${`term-${column}`} checked=${chosen.includes(quoted(column))} onchange=${() => toggle(column)} />${label}</label>`)}
+      </fieldset>
+      <label class="option"><span>${T.questions.formula}</span><input data-testid=${`option${option.flag}`} placeholder="~ sex + age" title=${option.help} value=${value} spellcheck=${false} oninput=${(event) => onvalue(event.target.value)} /></label>`;
+  }
+
+  function Option({ option, value, columns, onvalue }) {
+    const { flag, kind, choices, initial, required } = option;
+    const name = flag.replace(/^--/, "").replace(/-/g, " ");
+    const label = html`<span>${name}${required && html` <small>(${J.required})</small>`}</span>`;
+    const common = { "data-testid": `option${flag}`, "aria-describedby": `help${flag}`, required };
+    // The field shows the default already.
+    const text = option.help.replace(/\s*\(default: [^()]*\)\s*$/, "");
+    const help = html`<small class="hint" id=${`help${flag}`} title=${text}>${text}</small>`;
+    if (kind === "formula") return html`<${Formula} option=${option} value=${value || ""} columns=${columns} onvalue=${onvalue} />`;
+    if (kind === "flag") return html`<div class="option"><label class="check"><input type="checkbox" ...${common} checked=${value === true} onchange=${(event) => onvalue(event.target.checked)} />${name}</label>${help}</div>`;
+    if (kind === "choice" || kind === "column") {
+      const values = kind === "column" ? columns : choices;
+      return html`<label class="option">${label}<select ...${common} value=${value || ""} onchange=${(event) => onvalue(event.target.value)}>
+        ${!(initial && values.includes(initial)) && html`<option value="">${required ? "" : kind === "column" ? J.none : J.default}</option>`}
+        ${values.map((one) => html`<option key=${one} value=${one} selected=${one === value}>${one}</option>`)}</select>${help}</label>`;
+    }
+    return html`<label class="option">${label}<input ...${common} inputmode=${kind === "number" ? "decimal" : undefined} value=${value || ""} placeholder=${initial ? "" : J.default} oninput=${(event) => onvalue(event.target.value)} />${help}</label>`;
+  }
+
+  /** The options that differ from the initial ones. */
+  function changedOptions(form, values) {
+    const options = {};
+    for (const { flag, initial, required } of form.options) {
+      const value = typeof values[flag] === "string" ? values[flag].trim() : values[flag];
+      if (value === undefined || value === "" || value === false) continue;
+      if (required || value !== initial) options[flag] = value;
+    }
+    return options;
+  }
+
+  /** The form of a command with its checks and its button. */
+  function JobForm({ kind, sources = [], strong, checked, disabled, label, children }) {
+    const form = Studio.forms[kind];
+    const initial = useMemo(() => Object.fromEntries((form ? form.options : []).map((option) => [option.flag, option.initial === null ? "" : option.initial])), [form]);
+    const [values, setValues] = useState(initial);
+    const [on, setOn] = useState("");
+    const [checks, setChecks] = useState(null);
+    const [starting, setStarting] = useState(false);
+    const { columns, jobs, revision } = Studio.state.project;
+    const options = form ? changedOptions(form, values) : {};
+    const asked = JSON.stringify([options, on]);
+    useEffect(() => {
+      if (!checked) return undefined;
+      let current = true;
+      const timer = setTimeout(async () => {
+        let result = null;
+        try { result = await Studio.post("/api/checks", { kind, options, on: on ? Number(on) : null }); } catch (error) { result = [{ level: "problem", text: error.message }]; }
+        if (current) setChecks(result);
+      }, CHECK_AFTER);
+      return () => { current = false; clearTimeout(timer); };
+    }, [asked, revision, kind]);
+    if (!form) return null;
+    const possible = jobs.filter((job) => sources.includes(job.kind) && job.status === "done").reverse();
+    const show = (option) => html`<${Option} key=${option.flag} option=${option} value=${values[option.flag]} columns=${columns} onvalue=${(value) => setValues((before) => ({ ...before, [option.flag]: value }))} />`;
+    const folded = form.options.filter((option) => !option.visible);
+    const missing = form.options.some((option) => option.required && !options[option.flag]);
+    const problem = checks && checks.some((check) => check.level === "problem");
+    const run = async (event) => {
+      event.preventDefault();
+      setStarting(true);
+      await Studio.runJob(kind, options, on ? Number(on) : null);
+      setStarting(false);
+    };
+    const word = label || (jobs.some((job) => job.kind === kind) ? J.runAgain : J.runOf[kind] || J.run);
+    return html`
+      <form class="job-form" data-testid=${`form-${kind}`} onsubmit=${run} novalidate>
+        ${possible.length > 1 && html`<label class="option"><span>${J.source}</span><select data-testid="source" value=${on} onchange=${(event) => setOn(event.target.value)}>
+          <option value="">${J.newest}</option>${possible.map((job) => html`<option key=${job.number} value=${job.number}>${J.title(job)}</option>`)}</select></label>`}
+        ${form.options.filter((option) => option.visible).map(show)}
+        ${folded.length > 0 && html`<details data-testid="more-options"><summary>${J.more(folded.length)}</summary>${folded.map(show)}</details>`}
+        ${children}
+        ${checked && html`<div class="checks" role="status" aria-label=${T.questions.checks} data-testid="checks">
+          ${checks === null ? html`<p class="hint">${T.questions.checking}</p>` : checks.map((check) => html`<p class=${check.level}><b>${T.questions.levels[check.level]}</b> ${check.text}</p>`)}</div>`}
+        <button class=${strong ? "strong wide" : "wide"} data-testid=${`run-${kind}`} disabled=${disabled || starting || missing || problem}>${word}</button>
+      </form>`;
+  }
+
+  // A job -----------------------------------------------------------------------------------------------------------
+
+  function Log({ job }) {
+    const [open, setOpen] = useState(false);
+    const [text, setText] = useState("");
+    const box = useRef(null);
+    useEffect(() => {
+      if (!open) return;
+      Studio.ask(`/api/jobs/${job.number}/log`).then((answer) => answer.text()).then((log) => {
+        setText(log);
+        if (box.current && Studio.isActive(job)) box.current.scrollTop = box.current.scrollHeight;
+      }).catch((error) => setText(error.message));
+    }, [open, job]);
+    return html`<details data-testid=${`log-${job.number}`} ontoggle=${(event) => setOpen(event.target.open)}><summary>${J.log}</summary>
+      ${open && html`<pre ref=${box} class="log" tabindex="0" aria-label=${J.log}>${text || J.noLog}</pre>`}</details>`;
+  }
+
+  /** State, progress, log and command of a job. */
+  function JobPanel({ job }) {
+    const { progress, status } = job;
+    const active = Studio.isActive(job);
+    const facts = [J.statuses[status]];
+    if (status === "done" || status === "failed") facts.push(J.took(duration(job.seconds || 0)));
+    if (status === "running" && job.left_s !== null) facts.push(J.left(duration(job.left_s)));
+    return html`
+      <section class=${`job ${status}`} data-testid=${`job-${job.number}`} data-status=${status} aria-label=${`${kindOf(job)} ${job.number}`}>
+        <div class="row"><strong>${kindOf(job)}</strong><span class="hint">${facts.join(", ")}</span><span class="grow"></span>
+          ${active && html`<${Button} small testid=${`cancel-${job.number}`} onclick=${() => Studio.act(`/api/jobs/${job.number}/cancel`)}>${J.cancel}<//>`}
+          ${["cancelled", "failed", "interrupted"].includes(status) && html`<${Button} small testid=${`continue-${job.number}`} onclick=${() => Studio.act(`/api/jobs/${job.number}/continue`)}>${J.continue}<//>`}
+        </div>
+        ${active && html`<progress max=${progress ? progress.total : undefined} value=${progress ? progress.done : undefined} aria-label=${J.progressLabel(kindOf(job))} data-testid=${`progress-${job.number}`}></progress>`}
+        <p class="hint message" role="status">${active && progress ? J.progress(progress) : status === "done" ? "" : job.message}</p>
+        <${Log} job=${job} />
+        <details><summary>${J.command}</summary><pre class="log" tabindex="0" aria-label=${J.command}>${job.command}</pre><${CopyButton} text=${job.command} label=${J.copy} testid=${`copy-command-${job.number}`} /></details>
+      </section>`;
+  }
+
+  /** Result of a job in a frame; reports are documents of their own and run apart from this page. */
+  function ResultFrame({ job, frame }) {
+    const [at, setAt] = useState(0);
+    const view = job.views[Math.min(at, job.views.length - 1)];
+    if (!view) return null;
+    const sandbox = view.kind === "report" ? "allow-scripts allow-downloads allow-popups" : undefined;
+    return html`
+      <div class="frame" data-testid=${`result-${job.number}`}>
+        ${job.views.length > 1 && html`<div class="segments" role="group" aria-label=${J.view}>${job.views.map((one, k) => html`<button type="button" aria-pressed=${k === at} data-testid=${`view-${one.kind}`} onclick=${() => setAt(k)}>${J.views[one.kind]}</button>`)}</div>`}
+        <iframe key=${view.href} ref=${frame} src=${view.href} sandbox=${sandbox} data-testid="frame" title=${J.frame(J.views[view.kind] || view.kind, job.output)}></iframe>
+      </div>`;
+  }
+
+  /** The results of `kinds`, the newest first; returns the chosen job and the select. */
+  function useResult(kinds) {
+    const [chosen, setChosen] = useState(null);
+    const finished = Studio.jobsOf(kinds).filter((job) => job.status === "done");
+    const job = finished.find((one) => one.number === chosen) || finished[0] || null;
+    const newest = finished.length ? finished[0].number : null;
+    useEffect(() => { setChosen(null); }, [newest]);
+    const select = job && html`
+      <div class="row bar result-bar">
+        ${finished.length > 1 ? html`<label>${J.result} <select data-testid="result" value=${job.number} onchange=${(event) => setChosen(Number(event.target.value))}>
+          ${finished.map((one) => html`<option key=${one.number} value=${one.number} selected=${one === job}>${kindOf(one)}, ${J.title(one)}</option>`)}</select></label>` : html`<strong>${kindOf(job)}</strong>`}
+        <span class="grow"></span>
+        ${job.views.length > 0 && html`<a href=${job.views[0].href} target="_blank" rel="noopener" data-testid="open-result">${J.full}</a>`}
+      </div>`;
+    return [job, select];
+  }
+
+  /** A form, folded away once a job of its kinds was started. */
+  const Settings = ({ kinds, children }) => {
+    const started = Studio.jobsOf(kinds).length > 0;
+    return html`<details class=${started ? "settings" : "settings first"} open=${!started} data-testid="settings"><summary>${J.settings}</summary>${children}</details>`;
+  };
+
+  /** The jobs of `kinds` that are of interest beside their form: what runs, and the last one that ended. */
+  const Jobs = ({ kinds }) => {
+    const all = Studio.jobsOf(kinds);
+    const shown = all.filter(Studio.isActive);
+    if (all.length && !shown.includes(all[0])) shown.unshift(all[0]);
+    return shown.map((job) => html`<${JobPanel} key=${job.number} job=${job} />`);
+  };
+
+  Object.assign(Studio, { duration, kindOf, JobForm, JobPanel, ResultFrame, Settings, Jobs, useResult });
+})();

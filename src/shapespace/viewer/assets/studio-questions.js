@@ -1,0 +1,73 @@
+/* The screen of the questions: a card each, its form with checks, and the answer in words, figures and text. */
+(function () {
+  "use strict";
+
+  const { html, useState } = window.Preact;
+  const Studio = window.ShapespaceStudio;
+  const T = window.ShapespaceTexts;
+  const Q = T.questions;
+  const { Button, CopyButton, JobForm, Jobs, Settings, Step, useResult } = Studio;
+  const KINDS = ["compare", "change", "asymmetry", "regress", "score", "identify"];
+  const CORRESPONDENCES = ["correspond", "redo"];
+  const SOURCES = { score: ["fit"], identify: ["fit"] }; // others also take surfaces in correspondence
+  const sources = (kind) => SOURCES[kind] || [...CORRESPONDENCES, "fit"];
+
+  Studio.QUESTIONS = KINDS;
+
+  /** The options of a job's command, as arguments of the same form. */
+  Studio.optionsOf = function (job) {
+    const options = {};
+    const known = new Set((Studio.forms[job.kind] || { options: [] }).options.map((option) => option.flag));
+    const words = (job.command.match(/(?:'[^']*'|"[^"]*"|\\.|[^\s'"\\])+/g) || []).map((word) => word.replace(/'([^']*)'|"([^"]*)"|\\(.)/g, (_, a, b, c) => a ?? b ?? c));
+    for (const word of words) {
+      const [, flag, value] = /^(--[\w-]+)(?:=([^]*))?$/.exec(word) || [];
+      if (known.has(flag)) options[flag] = value === undefined ? true : value;
+    }
+    return options;
+  };
+
+  /** The shapes that a job used, by the folder in its command; null for the newest. */
+  Studio.sourceOf = function (job) {
+    const words = job.command.split(/\s+/);
+    const found = Studio.state.project.jobs.filter((one) => one.number < job.number && one.status === "done" && [...CORRESPONDENCES, "fit"].includes(one.kind) && words.includes(one.output)).pop();
+    return found ? found.number : null;
+  };
+
+  const Answer = ({ job }) => html`
+    <div class="answer" data-testid="answer">
+      ${job.sentences.length > 0 && html`<h3>${Q.findings}</h3><ul data-testid="sentences">${job.sentences.map((sentence) => html`<li>${sentence}</li>`)}</ul>`}
+      ${job.methods && html`<details data-testid="methods"><summary>${Q.paper}</summary><p>${job.methods}</p><${CopyButton} text=${job.methods} label=${Q.copyPaper} testid="copy-methods" /></details>`}
+      <div class="row"><${Button} small testid="figures" onclick=${() => Studio.runJob(job.kind, { ...Studio.optionsOf(job), "--format": "svg,pdf,png" }, Studio.sourceOf(job))}>${Q.figures}<//></div>
+    </div>`;
+
+  function Question({ kind, next, onback }) {
+    const [job, select] = useResult([kind]);
+    const ready = Boolean(Studio.newest(...sources(kind)));
+    const busy = Studio.jobsOf([kind]).some(Studio.isActive);
+    const controls = html`
+      <${Button} small testid="all-questions" onclick=${onback}>← ${Q.all}<//>
+      <h2>${T.jobs.kinds[kind]}</h2>
+      <p class="hint">${ready ? Q.hints[kind] : Q.none}</p>
+      <${Jobs} kinds=${[kind]} />
+      ${job && html`<${Button} class="wide" strong=${!busy} testid="next" onclick=${next}>${T.next.questions}<//>`}
+      <${Settings} key="settings" kinds=${[kind]}><${JobForm} kind=${kind} sources=${sources(kind)} strong=${!job && !busy} checked disabled=${!ready || busy} /><//>`;
+    return html`<${Step} name="question" title=${T.jobs.kinds[kind]} controls=${controls} select=${select} job=${job} empty=${Q.empty}>${job && html`<${Answer} job=${job} />`}<//>`;
+  }
+
+  Studio.Questions = function Questions({ next }) {
+    const [kind, setKind] = useState(null);
+    if (kind) return html`<${Question} key=${kind} kind=${kind} next=${next} onback=${() => setKind(null)} />`;
+    const earlier = Studio.jobsOf(KINDS);
+    return html`
+      <div class="fill scroll" data-testid="screen-questions">
+        <div class="row bar"><h2>${Q.title}</h2><span class="grow"></span>
+          ${earlier.some((job) => job.status === "done") && html`<${Button} strong testid="next" onclick=${next}>${T.next.questions}<//>`}</div>
+        <ul class="questions">
+          ${KINDS.filter((one) => Studio.forms[one]).map((one) => html`<li key=${one}><button type="button" data-testid=${`question-${one}`} onclick=${() => setKind(one)}><strong>${T.jobs.kinds[one]}</strong><span class="hint">${Q.hints[one]}</span></button></li>`)}
+        </ul>
+        ${earlier.length > 0 && html`<h3>${Q.earlier}</h3>
+          <ul class="recent">${earlier.map((job) => html`<li key=${job.number}><button type="button" data-testid=${`earlier-${job.number}`} onclick=${() => setKind(job.kind)}>
+            <strong>${Studio.kindOf(job)}</strong><span class="hint">${T.jobs.statuses[job.status]}${job.sentences.length ? `: ${job.sentences[0]}` : ""}</span></button></li>`)}</ul>`}
+      </div>`;
+  };
+})();

@@ -1,0 +1,163 @@
+/* The screen of the specimens: adding scans, cards or table, selection, counts and notes. */
+(function () {
+  "use strict";
+
+  const { html, useState, useMemo, useCallback, useRef } = window.Preact;
+  const Viewer = window.ShapespaceViewer;
+  const Studio = window.ShapespaceStudio;
+  const T = window.ShapespaceTexts;
+  const S = T.specimens;
+  const { Button, Confirm, FileButton, DropZone, UploadStatus, FolderBrowser } = Studio;
+  const SHOWN = 200; // specimens drawn at first, and by each "Show more"
+
+  /** Include or exclude; a refused edit restores the checkbox. */
+  const include = async (specimen, box) => {
+    const done = await Studio.edit({ what: "include", ids: [specimen.id], included: box.checked });
+    if (!done) box.checked = specimen.included;
+  };
+
+  Studio.Include = ({ specimen, label }) => html`<label class="include"><input type="checkbox" checked=${specimen.included} aria-label=${S.includeOne(specimen.id)} data-testid=${`include-${specimen.id}`}
+    disabled=${specimen.state === "unusable"} onchange=${(event) => include(specimen, event.target)} />${label && html`<span aria-hidden="true">${label}</span>`}</label>`;
+
+  Studio.Findings = ({ specimen }) => html`
+    ${specimen.state === "waiting" && html`<p class="finding">${S.states.waiting}</p>`}
+    ${specimen.findings.map((finding) => html`<p class=${`finding ${finding.level}`} title=${finding.text}>${S[finding.level]}${finding.text}</p>`)}`;
+
+  function Card({ specimen, selected, onselect }) {
+    return useMemo(() => html`
+      <li class=${`card ${specimen.included ? "" : "excluded"}`} data-testid=${`card-${specimen.id}`} data-state=${specimen.state}>
+        <button type="button" class="picture" aria-pressed=${selected} data-testid=${`select-${specimen.id}`} onclick=${(event) => onselect(specimen.id, event)}>
+          <span class="hidden">${S.selectOne(specimen.id)}</span>
+          ${specimen.state === "ready"
+            ? html`<img src=${`/api/thumbnails/${encodeURIComponent(specimen.id)}`} alt="" loading="lazy" />`
+            : html`<span>${S.states[specimen.state]}</span>`}
+        </button>
+        <div class="row"><${Studio.Include} specimen=${specimen} /><strong title=${specimen.id}>${specimen.id}</strong>${specimen.set === "new" && html`<span class="tag">${S.new}</span>`}</div>
+        <${Studio.Findings} specimen=${specimen} />
+      </li>`, [specimen, selected, onselect]);
+  }
+
+  /** Notes on the table, and the number of specimens of each class. */
+  const About = ({ project }) => html`
+    ${project.notes.length > 0 && html`<section class="notes" aria-label=${S.notes} data-testid="notes"><h3>${S.notes}</h3>${project.notes.map((note) => html`<p>${note}</p>`)}</section>`}
+    ${Object.keys(project.counts).length > 0 && html`
+      <section aria-label=${S.classes} class="counts" data-testid="counts">
+        ${Object.entries(project.counts).map(([column, classes]) => html`
+          <dl key=${column}><dt>${column}</dt>${Object.entries(classes).map(([name, number]) => html`<dd><span class=${name ? "" : "hint"}>${name || S.noClass}</span> <b>${number}</b>
+            <meter aria-hidden="true" min="0" max=${Math.max(...Object.values(classes))} value=${number}></meter></dd>`)}</dl>`)}
+      </section>`}`;
+
+  const AddFromHere = ({ onclose, set }) => {
+    const [copy, setCopy] = useState(false);
+    const add = Viewer.guarded(async (path) => {
+      const { added, left_out: leftOut } = await Studio.json("/api/import", Viewer.post({ path, copy, set }));
+      Studio.uploads = { total: added, done: added, added, notes: leftOut };
+      onclose();
+      await Studio.refresh();
+    });
+    return html`
+      <${FolderBrowser} title=${S.addTitle} onclose=${onclose}>
+        ${(listing) => html`
+          <fieldset class="choices"><legend class="hidden">${S.addHere}</legend>
+            ${[[false, S.byReference], [true, S.byCopy]].map(([value, text]) => html`<label class="check"><input type="radio" name="copy" checked=${copy === value} data-testid=${`copy-${value}`} onchange=${() => setCopy(value)} />${text}</label>`)}
+          </fieldset>
+          <div class="row end"><${Button} testid="folder-cancel" onclick=${onclose}>${T.cancel}<//>
+            <${Button} strong testid="add-folder" disabled=${!listing.scans} onclick=${() => add(listing.path)}>${S.addFolder}<//></div>`}
+      <//>`;
+  };
+
+  /** Buttons that add scans to `set`. */
+  const AddButtons = (Studio.AddButtons = function AddButtons({ set, strong, table }) {
+    const [browsing, setBrowsing] = useState(false);
+    const add = (files) => Studio.upload(files, set);
+    return html`
+      <${FileButton} strong=${strong} label=${S.chooseFiles} testid="choose-files" onfiles=${add} />
+      <${FileButton} folder label=${S.chooseFolder} testid="choose-folder" onfiles=${add} />
+      <${Button} testid="add-here" onclick=${() => setBrowsing(true)}>${S.addHere}<//>
+      ${table && html`<${FileButton} label=${S.importTable} testid="import-table" accept=".csv,.tsv,.xlsx" onfiles=${add} />`}
+      ${browsing && html`<${AddFromHere} set=${set} onclose=${() => setBrowsing(false)} />`}`;
+  });
+
+  const Empty = () => html`
+    <div class="empty" data-testid="empty">
+      <h2>${S.dropTitle}</h2><p class="hint">${S.dropHint(Studio.state.formats.join(", "))}</p>
+      <div class="row"><${AddButtons} set="training" strong /></div>
+    </div>`;
+
+  /** What is done with the selected specimens. */
+  function SelectionBar({ selected, onclear }) {
+    const [removing, setRemoving] = useState(false);
+    const ids = selected.map((one) => one.id);
+    const toNew = selected.some((one) => one.set === "training");
+    const include = (included) => Studio.edit({ what: "include", ids, included });
+    return html`
+      <div class="row selection" role="group" aria-label=${S.selected(ids.length)} data-testid="selection">
+        <strong role="status">${S.selected(ids.length)}</strong>
+        <${Button} small testid="include-selected" onclick=${() => include(true)}>${S.include}<//>
+        <${Button} small testid="exclude-selected" onclick=${() => include(false)}>${S.exclude}<//>
+        <${Button} small testid="set-selected" onclick=${() => Studio.edit({ what: "set", ids, set: toNew ? "new" : "training" })}>${toNew ? S.toNew : S.toTraining}<//>
+        <${Button} small testid="remove-selected" onclick=${() => setRemoving(true)}>${S.remove}<//>
+        <${Button} small testid="clear-selection" onclick=${onclear}>${S.clear}<//>
+        ${removing && html`<${Confirm} title=${S.removeTitle(ids.length)} text=${S.removeText} action=${S.remove} onclose=${() => setRemoving(false)}
+          onyes=${async () => { if (await Studio.edit({ what: "remove", ids })) onclear(); }} />`}
+      </div>`;
+  }
+
+  const matches = (specimen, words) => {
+    const text = [specimen.id, specimen.set === "new" ? S.new : "", ...Object.values(specimen.cells), ...specimen.findings.map((one) => one.text)].join(" ").toLowerCase();
+    return words.every((word) => text.includes(word));
+  };
+
+  Studio.Specimens = function Specimens({ project, next }) {
+    const [layout, setLayout] = useState(project.columns.length ? "table" : "cards");
+    const [filter, setFilter] = useState("");
+    const [limit, setLimit] = useState(SHOWN);
+    const [selection, setSelection] = useState(new Set());
+    const words = filter.toLowerCase().split(/\s+/).filter(Boolean);
+    const listed = project.specimens.filter((one) => matches(one, words));
+    const shown = listed.slice(0, limit);
+    const order = useRef({ listed, last: null });
+    order.current.listed = listed;
+    const select = useCallback((id, event) => setSelection((before) => {
+      const after = new Set(before), ids = order.current.listed.map((one) => one.id);
+      const from = ids.indexOf(order.current.last), to = ids.indexOf(id);
+      const range = event.shiftKey && from >= 0 ? ids.slice(Math.min(from, to), Math.max(from, to) + 1) : [id];
+      const add = !before.has(id);
+      for (const one of range) { if (add) after.add(one); else after.delete(one); }
+      order.current.last = id;
+      return after;
+    }), []);
+    const selected = project.specimens.filter((one) => selection.has(one.id));
+    const all = listed.length > 0 && listed.every((one) => selection.has(one.id));
+    const selectAll = () => setSelection(new Set(all ? [] : listed.map((one) => one.id)));
+    const included = project.specimens.filter((one) => one.included && one.state !== "unusable").length;
+    const unusable = project.specimens.filter((one) => one.state === "unusable").length;
+    const add = (files) => Studio.upload(files, "training");
+    if (!project.specimens.length) return html`<${DropZone} testid="drop-zone" class="fill" onfiles=${add}><${UploadStatus} /><${Empty} /><//>`;
+    return html`
+      <${DropZone} testid="drop-zone" class="fill scroll" onfiles=${add}>
+        <div class="row bar">
+          <h2 data-testid="specimens-summary">${S.summary(project.specimens.length, included, unusable)}</h2><span class="grow"></span>
+          <${AddButtons} set="training" table />
+          <${Button} strong=${included > 0} testid="next" onclick=${next}>${T.next.specimens}<//>
+        </div>
+        <${UploadStatus} />
+        <${About} project=${project} />
+        <div class="row bar">
+          <div class="segments" role="group" aria-label=${S.layout}>
+            ${["cards", "table"].map((name) => html`<button type="button" data-testid=${`layout-${name}`} aria-pressed=${layout === name} onclick=${() => setLayout(name)}>${S[name]}</button>`)}
+          </div>
+          <label class="filter">${S.filter} <input type="search" placeholder=${S.filterHint} data-testid="filter" value=${filter} oninput=${(event) => setFilter(event.target.value)} /></label>
+          <${Button} testid="undo" disabled=${!project.undo} title=${project.undo ? S.undoOf(project.undo) : S.undo} onclick=${Studio.undo}>${S.undo}<//>
+          <${Button} testid="redo" disabled=${!project.redo} title=${project.redo ? S.redoOf(project.redo) : S.redo} onclick=${Studio.redo}>${S.redo}<//>
+          ${layout === "table" ? html`<${Studio.AddColumn} />` : html`<${Button} testid="select-all" onclick=${selectAll}>${all ? S.clear : S.selectAll}<//>`}
+          ${selected.length > 0 && html`<${SelectionBar} selected=${selected} onclear=${() => setSelection(new Set())} />`}
+        </div>
+        ${!listed.length && html`<p class="hint">${S.nothing}</p>`}
+        ${layout === "cards"
+          ? html`<ul class="cards" data-testid="cards">${shown.map((one) => html`<${Card} key=${one.id} specimen=${one} selected=${selection.has(one.id)} onselect=${select} />`)}</ul>`
+          : html`<${Studio.Table} listed=${listed} shown=${shown} columns=${project.columns} selection=${selection} onselect=${select} onselectall=${selectAll} />`}
+        ${listed.length > limit && html`<${Button} class="more" testid="show-more" onclick=${() => setLimit(limit + SHOWN)}>${S.more(Math.min(SHOWN, listed.length - limit))}<//>`}
+      <//>`;
+  };
+})();

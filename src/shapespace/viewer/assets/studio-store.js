@@ -1,0 +1,200 @@
+/* The studio's state: the copy of the server's, its refreshes, edits in order, and uploads. */
+(function () {
+  "use strict";
+
+  const Viewer = window.ShapespaceViewer;
+  const T = window.ShapespaceTexts;
+  const UPLOADS_AT_ONCE = 3;
+  const ATTEMPTS = 5; // of an edit while uploads change the revision
+  const TABLES = [".csv", ".tsv", ".xlsx"];
+
+  const Studio = (window.ShapespaceStudio = {
+    state: null, // of /api/project
+    forms: {}, // of /api/forms
+    uploads: { total: 0, done: 0, added: 0, notes: [] },
+    changed: () => {}, // draws the page
+  });
+
+  // Requests --------------------------------------------------------------------------------------------------------
+
+  /** fetch, with the server's sentence as the error; after a conflict the state is read again. */
+  async function ask(path, options) {
+    let answer;
+    try {
+      answer = await fetch(path, options);
+    } catch (error) {
+      throw new Error(T.unreachable);
+    }
+    if (answer.ok) return answer;
+    let sentence = answer.status === 401 ? T.unauthorised : null;
+    try { sentence = sentence || (await answer.json()).error; } catch (error) { /* not JSON */ }
+    const error = new Error(sentence || T.serverError(answer.status));
+    error.status = answer.status;
+    if (answer.status === 409) await refresh();
+    throw error;
+  }
+
+  const json = async (path, options) => (await ask(path, options)).json();
+  const post = (path, content) => json(path, Viewer.post(content));
+
+  // State -----------------------------------------------------------------------------------------------------------
+
+  let reading = null; // the request in flight
+  let again = null; // the one that follows it
+
+  /** Read the state; at most one request is in flight, and one more waits for it. */
+  function refresh() {
+    if (!reading) {
+      reading = read().finally(() => { reading = null; });
+      return reading;
+    }
+    if (!again) again = reading.catch(() => {}).then(() => { again = null; return refresh(); });
+    return again;
+  }
+
+  async function read() {
+    const state = await json("/api/project");
+    reuse(state);
+    Studio.state = state;
+    Studio.changed();
+  }
+
+  /** Unchanged specimens stay the same objects, so that their rows and cards are not drawn again. */
+  function reuse(state) {
+    const before = Studio.state && Studio.state.project;
+    if (!before || !state.project) return;
+    const known = new Map(before.specimens.map((specimen) => [specimen.id, specimen]));
+    state.project.specimens = state.project.specimens.map((specimen) => {
+      const old = known.get(specimen.id);
+      return old && JSON.stringify(old) === JSON.stringify(specimen) ? old : specimen;
+    });
+    if (JSON.stringify(before.columns) === JSON.stringify(state.project.columns)) state.project.columns = before.columns;
+  }
+
+  function listen() {
+    const events = new EventSource("/api/events");
+    const offline = document.getElementById("offline");
+    events.onopen = () => { offline.hidden = true; refresh().catch(() => {}); };
+    events.onmessage = () => refresh().catch(() => {});
+    events.onerror = () => {
+      offline.textContent = T.offline;
+      offline.hidden = false;
+      // After an answer that is no stream, such as 401, the browser does not connect again.
+      if (events.readyState === EventSource.CLOSED) setTimeout(listen, 3000);
+    };
+  }
+
+  /** Do an action and read the state. */
+  const act = Viewer.guarded(async (path, content = {}) => {
+    const answer = await post(path, content);
+    await refresh();
+    return answer;
+  });
+
+  // Edits are sent one after another, each with the revision that the one before it made.
+  let edits = Promise.resolve();
+
+  const inOrder = (path, content) => {
+    const next = edits.then(async () => {
+      for (let attempt = 1; ; attempt++) {
+        try {
+          await post(path, { ...content, revision: Studio.state.project.revision });
+          break;
+        } catch (error) {
+          if (error.status !== 409 || !uploading() || attempt === ATTEMPTS) throw error;
+        }
+      }
+      await refresh();
+      return true;
+    });
+    edits = next.catch(() => {});
+    return next;
+  };
+  const edit = Viewer.guarded((content) => inOrder("/api/edit", content));
+  const undo = Viewer.guarded(() => inOrder("/api/undo", {}));
+  const redo = Viewer.guarded(() => inOrder("/api/redo", {}));
+
+  const runJob = Viewer.guarded(async (kind, options = {}, on = null) => {
+    const { number } = await post("/api/jobs", { kind, options, on });
+    await refresh();
+    return number;
+  });
+
+  // Uploads ---------------------------------------------------------------------------------------------------------
+
+  const ending = (name, endings) => endings.some((one) => name.toLowerCase().endsWith(one));
+  const uploading = () => Studio.uploads.done < Studio.uploads.total;
+
+  /** All files of a drop, with those in folders; its entries must be taken before the event ends. */
+  async function filesOfDrop(transfer) {
+    const entries = Array.from(transfer.items || []).map((item) => item.webkitGetAsEntry && item.webkitGetAsEntry()).filter(Boolean);
+    if (!entries.length) return Array.from(transfer.files);
+    const files = [];
+    const visit = async (entry) => {
+      if (entry.name.startsWith(".")) return;
+      if (entry.isFile) { files.push(await new Promise((resolve, reject) => entry.file(resolve, reject))); return; }
+      const reader = entry.createReader();
+      for (;;) {
+        // A reader returns at most 100 entries at a time.
+        const part = await new Promise((resolve, reject) => reader.readEntries(resolve, reject));
+        if (!part.length) return;
+        for (const child of part) await visit(child);
+      }
+    };
+    for (const entry of entries) await visit(entry);
+    return files;
+  }
+
+  const waiting = [];
+  let workers = 0;
+
+  /** Add scans, three at a time; tables follow, as their rows name the scans. */
+  function upload(files, set) {
+    if (!uploading()) Studio.uploads = { total: 0, done: 0, added: 0, notes: [] };
+    const tables = files.filter((file) => ending(file.name, TABLES));
+    for (const file of files.filter((one) => !tables.includes(one)).concat(tables)) waiting.push([file, set, tables.includes(file)]);
+    Studio.uploads.total += files.length;
+    Studio.changed();
+    for (let k = workers; k < UPLOADS_AT_ONCE && waiting.length; k++) work();
+  }
+
+  async function work() {
+    workers += 1;
+    while (waiting.length) {
+      if (waiting[0][2] && workers > 1) break;
+      const [file, set, isTable] = waiting.shift();
+      try {
+        if (isTable) await importTable(file);
+        else await uploadScan(file, set);
+      } catch (error) {
+        Studio.uploads.notes.push(error.message.includes(file.name) ? error.message : `${file.name}: ${error.message}`);
+      }
+      Studio.uploads.done += 1;
+      Studio.changed();
+    }
+    workers -= 1;
+    if (!uploading()) await refresh().catch(() => {});
+  }
+
+  async function uploadScan(file, set) {
+    const { formats, upload_bytes: most } = Studio.state;
+    if (!ending(file.name, formats)) throw new Error(T.uploads.format(file.name));
+    if (file.size > most) throw new Error(T.uploads.tooLarge(file.name, Math.round(most / 2 ** 20)));
+    const answer = await json(`/api/specimens?name=${encodeURIComponent(file.name)}&set=${set}`, { method: "PUT", body: file });
+    if (answer.same_as) Studio.uploads.notes.push(T.uploads.same(file.name, answer.same_as));
+    else Studio.uploads.added += 1;
+  }
+
+  async function importTable(file) {
+    const { matched, notes } = await json(`/api/table?name=${encodeURIComponent(file.name)}`, { method: "POST", body: file });
+    Studio.uploads.notes.push(T.uploads.table(file.name, matched), ...notes);
+  }
+
+  // What the screens ask of the state -------------------------------------------------------------------------------
+
+  const jobsOf = (kinds) => Studio.state.project.jobs.filter((job) => kinds.includes(job.kind)).sort((a, b) => b.number - a.number);
+  const newest = (...kinds) => jobsOf(kinds).find((job) => job.status === "done");
+  const isActive = (job) => job.status === "running" || job.status === "waiting";
+
+  Object.assign(Studio, { ask, json, post, refresh, listen, act, edit, undo, redo, runJob, upload, uploading, filesOfDrop, jobsOf, newest, isActive });
+})();

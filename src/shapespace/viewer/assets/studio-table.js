@@ -1,0 +1,119 @@
+/* The table of specimens, edited in place: typing, Enter, Tab, arrow keys, and blocks pasted from a spreadsheet. */
+(function () {
+  "use strict";
+
+  const { html, useState, useMemo, useRef, useEffect } = window.Preact;
+  const Studio = window.ShapespaceStudio;
+  const T = window.ShapespaceTexts;
+  const S = T.specimens;
+  const { Button, Confirm } = Studio;
+
+  /** Move to the cell `down` rows and `right` columns from `input`. */
+  function move(input, down, right) {
+    const row = Number(input.dataset.row) + down, column = Number(input.dataset.column) + right;
+    const next = input.closest("table").querySelector(`input[data-row="${row}"][data-column="${column}"]`);
+    if (next) { next.focus(); next.select(); }
+    return Boolean(next);
+  }
+
+  /** Rows and columns of pasted text, where a spreadsheet put quotation marks around cells with line breaks. */
+  const block = (text) => text.replace(/\r\n?/g, "\n").replace(/\n$/, "").split("\n").map((line) => line.split("\t").map((cell) => cell.replace(/^"(.*)"$/, "$1")));
+
+  /** A cell: its text is sent when it is left; Escape restores it. */
+  function Cell({ value, label, testid, row, column, onedit, onblock }) {
+    const [draft, setDraft] = useState(null);
+    const current = useRef(null); // the draft at once, as a key may follow before the next drawing
+    const set = (text) => { current.current = text; setDraft(text); };
+    const send = async () => {
+      const text = current.current;
+      if (text === null) return;
+      if (text.trim() !== value) await onedit(text.trim());
+      if (current.current === text) set(null);
+    };
+    const key = (event) => {
+      const input = event.target, caret = input.selectionStart === input.selectionEnd ? input.selectionStart : -1;
+      const all = input.selectionEnd - input.selectionStart === input.value.length;
+      if (event.key === "Escape") { set(null); return; }
+      const down = { Enter: event.shiftKey ? -1 : 1, ArrowDown: 1, ArrowUp: -1 }[event.key] || 0;
+      let right = 0;
+      if (event.key === "ArrowRight" && (all || caret === input.value.length)) right = 1;
+      if (event.key === "ArrowLeft" && (all || caret === 0)) right = -1;
+      if (!down && !right) return;
+      event.preventDefault();
+      if (!move(input, down, right) && event.key === "Enter") send();
+    };
+    const paste = (event) => {
+      const rows = block(event.clipboardData.getData("text/plain"));
+      if (!onblock || (rows.length === 1 && rows[0].length === 1)) return;
+      event.preventDefault();
+      set(null);
+      onblock(rows);
+    };
+    return html`<td><input class="cell" size="8" aria-label=${label} data-testid=${testid} data-row=${row} data-column=${column} value=${draft === null ? value : draft}
+      data-edited=${draft !== null} oninput=${(event) => set(event.target.value)} onblur=${send} onkeydown=${key} onpaste=${paste} /></td>`;
+  }
+
+  function Row({ specimen, row, columns, selected, onselect, onblock }) {
+    // Unchanged rows are not compared again; the state keeps unchanged specimens.
+    return useMemo(() => html`
+      <tr class=${`${specimen.included ? "" : "excluded"} ${selected ? "selected" : ""}`} data-testid=${`row-${specimen.id}`}>
+        <td class="tick"><input type="checkbox" checked=${selected} aria-label=${S.selectOne(specimen.id)} data-testid=${`select-${specimen.id}`} onclick=${(event) => onselect(specimen.id, event)} /></td>
+        <td class="tick"><${Studio.Include} specimen=${specimen} /></td>
+        <${Cell} value=${specimen.id} label=${S.rename(specimen.id)} testid=${`cell-${specimen.id}-id`} row=${row} column=${0}
+          onedit=${(to) => to && Studio.edit({ what: "rename", id: specimen.id, to })} />
+        ${columns.map((name, k) => html`<${Cell} key=${name} value=${specimen.cells[name] || ""} label=${S.cell(name, specimen.id)} testid=${`cell-${specimen.id}-${name}`} row=${row} column=${k + 1}
+          onedit=${(value) => Studio.edit({ what: "cells", cells: [{ id: specimen.id, column: name, value }] })} onblock=${(rows) => onblock(specimen.id, k, rows)} />`)}
+        <td>${specimen.set === "new" ? S.new : S.training}</td>
+        <td class="number">${specimen.triangles ? specimen.triangles.toLocaleString("en") : ""}</td>
+        <td class="findings"><${Studio.Findings} specimen=${specimen} /></td>
+      </tr>`, [specimen, row, columns, selected, onselect, onblock]);
+  }
+
+  function AddColumn() {
+    const [name, setName] = useState(null);
+    const ref = useRef(null);
+    useEffect(() => { if (ref.current) ref.current.focus(); }, [name === null]);
+    if (name === null) return html`<${Button} small testid="add-column" onclick=${() => setName("")}>${S.addColumn}<//>`;
+    return html`
+      <form class="row inline" onsubmit=${async (event) => { event.preventDefault(); if (await Studio.edit({ what: "add-column", column: name.trim() })) setName(null); }}>
+        <input ref=${ref} aria-label=${S.columnName} placeholder=${S.columnName} required data-testid="column-name" value=${name} oninput=${(event) => setName(event.target.value)}
+          onkeydown=${(event) => { if (event.key === "Escape") setName(null); }} />
+        <button class="small" data-testid="column-add">${S.add}</button>
+      </form>`;
+  }
+
+  Studio.AddColumn = AddColumn;
+
+  /** A table of `listed`; pasted blocks go on to specimens that are not shown yet. */
+  Studio.Table = function Table({ listed, shown, columns, selection, onselect, onselectall }) {
+    const [removing, setRemoving] = useState(null);
+    const order = useRef(listed);
+    order.current = listed;
+    const onblock = useMemo(() => (id, first, rows) => {
+      const from = order.current.findIndex((one) => one.id === id), cells = [];
+      rows.forEach((row, down) => row.forEach((value, right) => {
+        const specimen = order.current[from + down], column = columns[first + right];
+        if (specimen && column !== undefined) cells.push({ id: specimen.id, column, value: value.trim() });
+      }));
+      if (cells.length) Studio.edit({ what: "cells", cells });
+    }, [columns]);
+    const all = listed.length > 0 && listed.every((one) => selection.has(one.id));
+    return html`
+      <p class="hint">${S.pasteHint}</p>
+      <div class="table-box" role="region" aria-label=${S.tableLabel} tabindex="0">
+        <table data-testid="table">
+          <caption class="hidden">${S.tableLabel}</caption>
+          <thead><tr>
+            <th scope="col"><input type="checkbox" checked=${all} aria-label=${S.selectAll} data-testid="select-all" onclick=${onselectall} /></th>
+            <th scope="col">${S.columns.use}</th><th scope="col">${S.columns.id}</th>
+            ${columns.map((name) => html`<th scope="col" key=${name}><span class="head">${name}
+              <button type="button" class="small quiet" aria-label=${S.removeColumn(name)} data-testid=${`remove-column-${name}`} onclick=${() => setRemoving(name)}>×</button></span></th>`)}
+            <th scope="col">${S.columns.set}</th><th scope="col" class="number">${S.columns.size}</th><th scope="col">${S.columns.findings}</th>
+          </tr></thead>
+          <tbody>${shown.map((specimen, row) => html`<${Row} key=${specimen.id} specimen=${specimen} row=${row} columns=${columns} selected=${selection.has(specimen.id)} onselect=${onselect} onblock=${onblock} />`)}</tbody>
+        </table>
+      </div>
+      ${removing !== null && html`<${Confirm} title=${S.removeColumnTitle(removing)} text=${S.removeColumnText} action=${S.remove} onclose=${() => setRemoving(null)}
+        onyes=${() => Studio.edit({ what: "remove-column", column: removing })} />`}`;
+  };
+})();

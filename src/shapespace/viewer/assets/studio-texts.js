@@ -1,0 +1,110 @@
+/* All texts of the studio's page; a translation replaces this file. */
+(function () {
+  "use strict";
+
+  const count = (number, one, many) => `${number.toLocaleString("en")} ${number === 1 ? one : many || `${one}s`}`;
+
+  window.ShapespaceTexts = {
+    count,
+    offline: "The studio's server does not answer; see whether shapespace studio still runs. This page goes on when it is back.",
+    unreachable: "The studio's server does not answer; see whether shapespace studio still runs, then do it again.",
+    unauthorised: "This page is no longer signed in; open the address that shapespace studio printed.",
+    serverError: (status) => `The server answered with the error ${status}; reload the page.`,
+    close: "Close", cancel: "Cancel", closeProject: "Close project", loading: "Reading the project", done: "done", running: "running",
+    screens: {
+      specimens: "Specimens", correspondence: "Correspondence", model: "Model", fit: "Fit", questions: "Questions", export: "Export", history: "History",
+    },
+    screensLabel: "Screens",
+    next: { specimens: "Next: correspondence", correspondence: "Next: model", model: "Next: questions", fit: "Next: questions", questions: "Next: export" },
+    fitNext: "Fit new scans",
+
+    start: {
+      title: "Projects", intro: "A project is a folder on this machine with its scans, its table and all results. Nothing is uploaded elsewhere.",
+      new: "New project", open: "Open a project", recent: "Recent projects", none: "No project was opened yet.", moved: "not found",
+      newTitle: "Choose where to create the project", openTitle: "Choose the folder of a project",
+      newName: "Name of the new project", create: "Create", openThis: "Open this folder",
+    },
+    folders: {
+      label: "Folders", path: "Folder", go: "Go", up: "Up one folder", empty: "No folders in here.",
+      scans: (number) => number ? `${count(number, "scan")} in this folder` : "No scans directly in this folder",
+      isProject: "This folder is a project.",
+    },
+
+    specimens: {
+      dropTitle: "Drop scans or folders here", dropHint: (formats) => `Mesh and point cloud files (${formats}), and a table (CSV or XLSX) of what is known about them.`,
+      chooseFiles: "Choose files", chooseFolder: "Choose a folder", addHere: "Add from this machine", importTable: "Import a table",
+      addTitle: "Add scans from this machine", byReference: "Refer to the files where they are", byCopy: "Copy the files into the project",
+      addFolder: "Add this folder", added: (number) => `${count(number, "scan")} added.`,
+      cards: "Cards", table: "Table", layout: "Layout", filter: "Filter", filterHint: "name, class or finding",
+      undo: "Undo", redo: "Redo", undoOf: (text) => `Undo: ${text}`, redoOf: (text) => `Redo: ${text}`,
+      included: "Included", includeOne: (id) => `Include ${id}`, selectOne: (id) => `Select ${id}`, selectAll: "Select all that are listed", select: "Select",
+      selected: (number) => `${number} selected`, include: "Include", exclude: "Exclude", remove: "Remove", clear: "Clear selection",
+      toNew: "Use as new scans", toTraining: "Use for training",
+      removeTitle: (number) => `Remove ${count(number, "specimen")} from the project?`, removeText: "Their files are not deleted, and you can undo this.",
+      addColumn: "Add a column", columnName: "Name of the column", add: "Add", removeColumn: (name) => `Remove the column ${name}`,
+      removeColumnTitle: (name) => `Remove the column ${name} with its cells?`, removeColumnText: "You can undo this.",
+      columns: { id: "Specimen", use: "Use", set: "Set", size: "Triangles", findings: "Findings" },
+      cell: (column, id) => `${column} of ${id}`, rename: (id) => `Name of ${id}`, tableLabel: "Table of specimens",
+      pasteHint: "Click a cell to edit it; Enter and the arrow keys move. Paste a block of cells from a spreadsheet into its first cell.",
+      states: { waiting: "being checked", ready: "ready", unusable: "cannot be used" }, new: "new", training: "training",
+      summary: (all, included, unusable) => `${count(all, "specimen")}, ${included} included${unusable ? `, ${unusable} cannot be used` : ""}`,
+      notes: "Look at the table", classes: "Classes", noClass: "(empty)", more: (number) => `Show ${number} more`,
+      repaired: "Repaired: ", refused: "Refused: ", note: "", nothing: "No specimen matches the filter.",
+    },
+    uploads: {
+      progress: (done, total) => `Adding file ${Math.min(done + 1, total)} of ${total}`, finished: (added) => `${count(added, "file")} added.`,
+      leftOut: (number) => `${count(number, "file")} not added`, tooLarge: (name, limit) => `${name} is larger than ${limit} MB; add it from this machine instead.`,
+      format: (name) => `${name} is not a scan in a format that can be read.`, same: (name, other) => `${name} has the same content as ${other}.`,
+      table: (name, matched) => `${name}: cells of ${count(matched, "specimen")} read.`, dismiss: "Close the list",
+    },
+
+    jobs: {
+      kinds: {
+        correspond: "Correspondence", redo: "Correct one scan", build: "Build the model", quality: "Measure the quality", morphospace: "Draw the morphospace",
+        fit: "Fit the model", complete: "Complete partial scans", compare: "Do groups differ?", change: "Has it changed?", asymmetry: "Is it symmetric?",
+        regress: "Number from shape?", score: "How unusual is it?", identify: "Who is it?", report: "Report", convert: "Convert the model", export: "Export",
+      },
+      statuses: { waiting: "waiting", running: "running", done: "done", failed: "failed", cancelled: "cancelled", interrupted: "interrupted" },
+      settings: "Settings, and run again", run: "Run", runAgain: "Run again", runOf: { correspond: "Bring into correspondence", build: "Build the model", fit: "Fit the scans" },
+      more: (number) => `${count(number, "more option")}`, cancel: "Cancel", continue: "Continue", log: "Log", command: "Command", copy: "Copy", copied: "Copied",
+      noLog: "The log is empty.", result: "Result", noResult: "Results appear here.", required: "required", yes: "yes", none: "(none)", default: "(default)",
+      title: (job) => `${job.number}: ${job.output || job.kind}`, source: "Made from", newest: "newest result",
+      progress: ({ doing, done, total }) => total ? `${doing} (${done} of ${total})` : doing, progressLabel: (kind) => `Progress of: ${kind}`,
+      took: (time) => `took ${time}`, left: (time) => `about ${time} left`,
+      seconds: (value) => `${value} s`, minutes: (value) => `${value} min`, hours: (value) => `${value} h`,
+      frame: (kind, output) => `${kind}: ${output}`, full: "Open in a tab of its own", views: { surfaces: "Surfaces", model: "3-D view", report: "Report" }, view: "View",
+    },
+    correspondence: {
+      title: "Correspondence", intro: (number) => `${count(number, "included specimen")} for training. Each gets the same vertices, so that shapes can be compared.`,
+      redoTitle: "Correct one scan", redoHint: "Does one surface not match its scan? Redo only that one; all others stay as they are.", redoWhich: "Scan", redo: "Redo this one",
+      landmarksTitle: "Landmarks", landmarksHint: "Click a place on any surface to mark the same vertex on all, then name it. Commands use the names.",
+      landmark: "Name", vertex: "Vertex", addLandmark: "Add", removeLandmark: (name) => `Remove the landmark ${name}`, noLandmarks: "None yet.",
+      none: "Add specimens first; correspondence needs at least three.", empty: "After the run, all surfaces turn here together: check that the checkerboard lies the same way on each.",
+    },
+    model: { title: "Model", intro: "Mean shape and modes of variation of the surfaces in correspondence.", empty: "After the run, the model with a slider per mode is shown here.", none: "Bring the specimens into correspondence first." },
+    fit: {
+      title: "Fit", intro: "Fit the model to scans that it was not built from.", drop: "Drop new scans here", scans: (number) => `${count(number, "new scan")} to fit`,
+      empty: "After the run, each fit is shown here with its verdict, distances and position among the training set.", none: "Build a model first.", report: "Write report of the fits",
+    },
+    questions: {
+      title: "What do you want to know?", all: "All questions", earlier: "Earlier results", columns: "Columns", formula: "Formula", size: "size of the shapes", noColumns: "The table has no columns yet; add some under Specimens.",
+      checks: "Checks before the run", levels: { ok: "OK", warning: "Warning", problem: "Problem" }, checking: "Checking",
+      paper: "Text for the paper", copyPaper: "Copy the text", findings: "Result", figures: "Figures (SVG, PDF, PNG)", none: "Bring the specimens into correspondence first, or fit new scans.",
+      hints: {
+        compare: "Test whether shape is associated with sex, age, treatment or any other column.", change: "Measure the change between visits of the same subjects in millimetres.",
+        asymmetry: "Compare left with right: a score for each subject, and a map.", regress: "Predict a number, such as age, from shape, with its cross-validated accuracy.",
+        score: "Place each new shape in the distribution of a reference population.", identify: "Find the subject of a scan among the enrolled ones.",
+      },
+      empty: "After the run, the answer in words, the figures and the text for the paper are shown here.",
+    },
+    export: {
+      title: "Export", intro: "Download results, or write one report that opens in any browser.", report: "Write report", reportOf: "Report of", none: "There are no results yet.",
+      files: "Files", size: "Size", zip: "Download all (ZIP)", figures: "Figures in SVG, PDF and PNG", convert: "Model in another format", noFiles: "No files.", show: "Files",
+      result: "Result", actions: "Downloads", download: (path) => `Download ${path}`,
+    },
+    history: {
+      title: "History", intro: "Every action is a command. The file history.sh reproduces the project from its inputs.", copy: "Copy commands", download: "Download history.sh",
+      number: "No.", action: "Action", status: "Status", time: "Time", command: "Command", none: "Nothing was run yet.",
+    },
+  };
+})();

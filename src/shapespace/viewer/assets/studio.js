@@ -1,0 +1,95 @@
+/* The studio's page: start screen or the tabs of a project, keyboard shortcuts, and the connection to the server. */
+(function () {
+  "use strict";
+
+  const { html, render, useState, useEffect } = window.Preact;
+  const Viewer = window.ShapespaceViewer;
+  const Studio = window.ShapespaceStudio;
+  const T = window.ShapespaceTexts;
+  const { Button, Start, moveFocus } = Studio;
+  const SCREENS = {
+    specimens: Studio.Specimens, correspondence: Studio.Correspondence, model: Studio.Model, fit: Studio.Fit,
+    questions: Studio.Questions, export: Studio.Export, history: Studio.History,
+  };
+  const NAMES = Object.keys(SCREENS);
+  const KINDS = { correspondence: ["correspond", "redo"], model: ["build", "quality", "morphospace"], fit: ["fit", "complete"], questions: Studio.QUESTIONS, export: ["report", "convert", "export"] };
+  const AFTER = { specimens: "correspondence", correspondence: "model", model: "questions", fit: "questions", questions: "export" };
+
+  const ofAddress = () => (NAMES.includes(location.hash.slice(1)) ? location.hash.slice(1) : NAMES[0]);
+
+  /** Whether a screen's jobs run or have succeeded. */
+  function progressOf(name) {
+    const jobs = KINDS[name] ? Studio.jobsOf(KINDS[name]) : [];
+    if (jobs.some(Studio.isActive)) return "running";
+    return jobs.some((job) => job.status === "done") ? "done" : null;
+  }
+
+  function Project({ project }) {
+    const [screen, setScreen] = useState(ofAddress());
+    const go = (name) => { location.hash = name; setScreen(name); };
+    useEffect(() => {
+      const changed = () => setScreen(ofAddress());
+      addEventListener("hashchange", changed);
+      return () => removeEventListener("hashchange", changed);
+    }, []);
+    const next = () => { go(AFTER[screen]); document.getElementById(`tab-${AFTER[screen]}`).focus(); };
+    const Screen = SCREENS[screen];
+    return html`
+      <nav class="tabs">
+        <div role="tablist" aria-label=${T.screensLabel} onkeydown=${moveFocus}>
+          ${NAMES.map((name) => {
+            const progress = progressOf(name);
+            return html`<button type="button" role="tab" id=${`tab-${name}`} key=${name} data-testid=${`tab-${name}`} aria-controls="screen" aria-selected=${name === screen} tabindex=${name === screen ? 0 : -1} onclick=${() => go(name)}>
+              ${T.screens[name]}${progress && html` <span class=${`mark ${progress}`} role="img" aria-label=${T[progress]}>${progress === "done" ? "✓" : "…"}</span>`}</button>`;
+          })}
+        </div>
+        <${Button} small testid="close-project" onclick=${() => Studio.act("/api/close")}>${T.closeProject}<//>
+      </nav>
+      <main>
+        <div id="screen" role="tabpanel" tabindex="-1" aria-labelledby=${`tab-${screen}`} data-screen=${screen}><${Screen} key=${screen} project=${project} go=${go} next=${next} /></div>
+      </main>`;
+  }
+
+  function App() {
+    const { project, recent } = Studio.state;
+    return project ? html`<${Project} key=${project.folder} project=${project} />` : html`<${Start} recent=${recent} />`;
+  }
+
+  function draw() {
+    const { project } = Studio.state;
+    document.getElementById("about").textContent = project ? `${project.name}, ${project.folder}` : "";
+    document.title = project ? `${project.name}, shapespace studio` : "shapespace studio";
+    render(html`<${App} />`, document.getElementById("app"));
+    document.body.dataset.ready = "true";
+  }
+
+  /** Ctrl-Z and Ctrl-Shift-Z, unless text is being edited. */
+  function shortcut(event) {
+    if (!(event.ctrlKey || event.metaKey) || event.altKey || !["z", "y"].includes(event.key.toLowerCase())) return;
+    const field = event.target.closest && event.target.closest("input:not([type=checkbox]), textarea, dialog");
+    if (field && !(field.classList.contains("cell") && field.dataset.edited !== "true")) return;
+    const project = Studio.state && Studio.state.project;
+    if (!project) return;
+    event.preventDefault();
+    if (event.shiftKey || event.key.toLowerCase() === "y") { if (project.redo) Studio.redo(); } else if (project.undo) Studio.undo();
+  }
+
+  async function start() {
+    Studio.changed = draw;
+    Viewer.startMessages();
+    Viewer.startTheme(() => {
+      // Pages in frames take the theme when they are loaded; their own button, which is hidden there, switches it later.
+      for (const frame of document.querySelectorAll("iframe:not([sandbox])")) frame.contentDocument.getElementById("theme")?.click();
+    });
+    addEventListener("keydown", shortcut);
+    // A file that misses the drop zone would replace the page.
+    addEventListener("dragover", (event) => event.preventDefault());
+    addEventListener("drop", (event) => event.preventDefault());
+    addEventListener("beforeunload", (event) => { if (Studio.uploading()) event.preventDefault(); });
+    Studio.forms = await Studio.json("/api/forms");
+    await Studio.refresh();
+    Studio.listen();
+  }
+
+  Viewer.guarded(start)();
+})();
