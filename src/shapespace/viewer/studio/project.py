@@ -307,6 +307,8 @@ def change_of(request: Mapping[str, Any]) -> Callable[[State], tuple[str, State]
     def change(state: State) -> tuple[str, State]:
         try:
             return _EDITS[what](state, request)
+        except InputError:
+            raise
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise InputError(f"The edit {what[:30]!r} cannot be read; reload the page.") from error
 

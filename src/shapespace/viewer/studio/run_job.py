@@ -23,6 +23,8 @@ from shapespace.batch.progress import PROGRESS_VARIABLE
 
 JOB, LOG, EXIT, CANCEL, LOCK, PROGRESS = "job.json", "log.txt", "exit.json", "cancel", "lock", "progress.json"
 _NEW_GROUP = 0x200 if sys.platform == "win32" else 0  # CREATE_NEW_PROCESS_GROUP
+_started: list[subprocess.Popen[bytes]] = []
+"""Processes of this server; it asks for their end, as otherwise they stay in the list of the system."""
 _POLL_S, _PATIENCE_S = 0.1, 20.0  # between looks at the files; after an interruption until the command is killed
 
 
@@ -47,11 +49,13 @@ def start(folder: Path) -> None:
     """
     for name in (EXIT, CANCEL, PROGRESS):
         (folder / name).unlink(missing_ok=True)
-    subprocess.Popen(
+    _started[:] = [process for process in _started if process.poll() is None]
+    process = subprocess.Popen(
         [sys.executable, "-m", "shapespace.viewer.studio.run_job", str(folder)],
         stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=folder,
         start_new_session=True, creationflags=_NEW_GROUP,
     )  # fmt: skip
+    _started.append(process)
 
 
 def main(folder: Path) -> int:

@@ -1,0 +1,156 @@
+"""The project of the studio: what its edits do, what undo takes back, and what is refused."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shapespace.errors import FileError, FileFormatError, InputError
+from shapespace.io.meshes.mesh_io import write_mesh
+from shapespace.types import Mesh
+from shapespace.viewer.studio.project import Project, StaleError, change_of, join_table
+
+
+def tetrahedron(path: Path, size: float) -> Path:
+    corners = size * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    write_mesh(path, Mesh(corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], dtype=np.int32)))
+    return path
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Project:
+    made = Project.open(tmp_path / "teeth", create=True)
+    for k, name in enumerate(("anna", "ben", "carl")):
+        made.add(tetrahedron(made.new_file(f"{name}.ply"), 1.0 + k), "training")
+    return made
+
+
+def edit(project: Project, **request: object) -> None:
+    project.edit(project.revision, change_of(request))
+
+
+def ids(project: Project) -> list[str]:
+    return [one.id for one in project.state.specimens]
+
+
+def test_a_project_that_was_moved_opens_with_its_scans(project: Project, tmp_path: Path) -> None:
+    shutil.move(project.folder, tmp_path / "elsewhere")
+    moved = Project.open(tmp_path / "elsewhere")
+    assert moved.state == project.state
+    assert all(moved.path(one).is_file() for one in moved.state.specimens)
+
+
+def test_undo_takes_every_edit_back_and_redo_applies_it_again(project: Project) -> None:
+    states = [project.state]
+    for request in (
+        {"what": "add-column", "column": "sex"},
+        {"what": "cells", "cells": [{"id": "anna", "column": "sex", "value": "f"}]},
+        {"what": "include", "ids": ["ben"], "included": False},
+        {"what": "set", "ids": ["carl"], "set": "new"},
+        {"what": "rename", "id": "carl", "to": "carol"},
+        {"what": "landmarks", "landmarks": {"tip": 3}},
+        {"what": "remove", "ids": ["ben"]},
+        {"what": "remove-column", "column": "sex"},
+    ):
+        edit(project, **request)
+        states.append(project.state)
+    assert len({json.dumps(str(state)) for state in states}) == len(states)
+    for state in reversed(states[:-1]):
+        project.undo(project.revision)
+        assert project.state == state == Project.open(project.folder).state
+    for state in states[1:]:
+        project.redo(project.revision)
+        assert project.state == state
+
+
+def test_an_edit_of_a_state_that_another_tab_changed_is_refused(project: Project) -> None:
+    seen = project.revision
+    edit(project, what="add-column", column="age")
+    before = project.state
+    with pytest.raises(StaleError, match="Another tab changed the project"):
+        project.edit(seen, change_of({"what": "remove", "ids": ["anna"]}))
+    with pytest.raises(StaleError):
+        project.undo(seen)
+    assert project.state == before
+
+
+@pytest.mark.parametrize(("request_", "message"), [
+    ({"what": "cells", "cells": [{"id": "anna", "column": "age", "value": "3"}]}, "no column 'age'"),
+    ({"what": "include", "ids": ["nobody"], "included": True}, "no specimen 'nobody'"),
+    ({"what": "rename", "id": "anna", "to": "Ben"}, "a specimen Ben already"),
+    ({"what": "rename", "id": "anna", "to": "../anna"}, "cannot be called"),
+    ({"what": "add-column", "column": "File"}, "cannot be called"),
+    ({"what": "landmarks", "landmarks": {"tip": -1}}, "needs a name and a vertex"),
+    ({"what": "cells"}, "cannot be read"),
+    ({"what": "nonsense"}, "cannot be read"),
+    ({"what": "include", "ids": 5}, "cannot be read"),
+])  # fmt: skip
+def test_an_edit_that_cannot_be_is_refused_in_a_sentence(
+    project: Project, request_: dict[str, object], message: str
+) -> None:
+    before = project.state
+    with pytest.raises(InputError, match=message):
+        edit(project, **request_)
+    assert project.state == before and project.revision == 3
+
+
+def test_the_same_file_is_added_once_and_the_same_name_twice(project: Project, tmp_path: Path) -> None:
+    assert project.add(tetrahedron(tmp_path / "copy.ply", 2.0), "training") == ("ben", "ben")
+    assert project.add(tetrahedron(tmp_path / "anna.ply", 7.0), "new") == ("anna-2", None)
+    assert ids(project) == ["anna", "ben", "carl", "anna-2"]
+    assert project.state.specimens[-1].file == str(tmp_path / "anna.ply")
+
+
+def test_a_folder_is_imported_by_reference_or_as_copies(project: Project, tmp_path: Path) -> None:
+    (tmp_path / "scans").mkdir()
+    for k in range(3):
+        tetrahedron(tmp_path / "scans" / f"s{k}.ply", 2.0 + 10 * k)
+    added, notes = project.import_files(tmp_path / "scans", "training", copy=True)
+    assert added == 2 and notes == ["s0.ply is the same file as ben; it was not added again."]
+    assert sorted(path.name for path in (project.folder / "scans").iterdir()) == [
+        "anna.ply", "ben.ply", "carl.ply", "s1.ply", "s2.ply",
+    ]  # fmt: skip
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="holds no meshes"):
+        project.import_files(tmp_path / "empty", "training", copy=False)
+
+
+def test_a_table_is_joined_by_id_or_file_name_and_may_be_pasted(project: Project) -> None:
+    project.edit(None, join_table(b"file\tsex\tage\nanna.ply\tf\t12\nBEN\tm\t14\nnobody\tm\t1\n"))
+    assert project.state.columns == ("sex", "age")
+    assert [one.cells for one in project.state.specimens] == [{"sex": "f", "age": "12"}, {"sex": "m", "age": "14"}, {}]
+    for content, error in (
+        (b"x,y\n1,2\n", "needs a column id"),
+        (b"id,y\nz,2\n", "No row of the table"),
+        (b"", "table"),
+    ):
+        with pytest.raises((InputError, FileFormatError), match=error):
+            project.edit(None, join_table(content))
+
+
+def test_classes_are_counted_and_likely_misspellings_named(project: Project) -> None:
+    for k in range(2):
+        project.add(tetrahedron(project.new_file(f"more{k}.ply"), 20.0 + k), "training")
+    edit(project, what="add-column", column="sex")
+    cells = [{"id": name, "column": "sex", "value": "femal" if name == "carl" else "female"} for name in ids(project)]
+    edit(project, what="cells", cells=cells)
+    assert project.state.counts() == {"sex": {"female": 4, "femal": 1}}
+    assert any("'femal'" in note for note in project.state.notes())
+
+
+@pytest.mark.parametrize("content", ["{", "[]", '{"format": "other"}', '{"format": "shapespace-project"}',
+                                     '{"format": "shapespace-project", "format_version": 9, "name": "a"}'])  # fmt: skip
+def test_a_damaged_project_is_refused(tmp_path: Path, content: str) -> None:
+    (tmp_path / "project.json").write_text(content)
+    with pytest.raises((FileFormatError, FileError)):
+        Project.open(tmp_path)
+
+
+def test_a_project_is_not_created_among_other_files(tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").touch()
+    with pytest.raises(InputError, match="is not empty"):
+        Project.open(tmp_path, create=True)
+    with pytest.raises(FileError, match="contains no project"):
+        Project.open(tmp_path)

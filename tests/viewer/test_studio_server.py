@@ -1,0 +1,248 @@
+"""The studio's server: files to results over HTTP, jobs that outlive it, and requests that it refuses."""
+
+import subprocess
+import time
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from test_studio_project import tetrahedron
+from viewer_world import enter, sentence, served
+
+from shapespace.cli.forms import forms
+from shapespace.errors import FileError
+from shapespace.viewer.guard import Access
+from shapespace.viewer.studio import run_job
+from shapespace.viewer.studio.app import Studio, make_studio
+from shapespace.viewer.studio.jobs import Jobs
+
+
+@contextmanager
+def studio(folder: Path | None, upload_bytes: int = 10**6) -> Iterator[httpx.Client]:
+    made, access = Studio(forms(), folder, upload_bytes), Access()
+    try:
+        with served(make_studio(made, access)) as address, httpx.Client(base_url=address, timeout=60) as client:
+            enter(client, access)
+            yield client
+    finally:
+        made.close()
+
+
+@pytest.fixture(autouse=True)
+def own_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+
+
+def state(client: httpx.Client) -> dict[str, Any]:
+    return client.get("/api/project").json()["project"]
+
+
+def until(client: httpx.Client, true: Callable[[dict[str, Any]], bool], seconds: float = 120.0) -> dict[str, Any]:
+    end = time.monotonic() + seconds
+    while not true(now := state(client)):
+        assert time.monotonic() < end, now
+        time.sleep(0.1)
+    return now
+
+
+def ended(project: dict[str, Any]) -> bool:
+    return all(job["status"] not in ("waiting", "running") for job in project["jobs"])
+
+
+def upload(client: httpx.Client, tmp_path: Path, count: int, role: str = "training") -> None:
+    for k in range(count):
+        scan = tetrahedron(tmp_path / f"s{k}.ply", 1.0 + k)
+        answer = client.put("/api/specimens", params={"name": scan.name, "set": role}, content=scan.read_bytes())
+        assert answer.status_code == 201, answer.text
+
+
+def test_dropped_scans_are_checked_pictured_and_listed(tmp_path: Path) -> None:
+    with studio(tmp_path / "p") as client:
+        upload(client, tmp_path, 2)
+        client.put("/api/specimens", params={"name": "broken.ply"}, content=b"ply\nnonsense")
+        again = client.put("/api/specimens", params={"name": "copy.ply"}, content=(tmp_path / "s1.ply").read_bytes())
+        assert again.json() == {"id": "s1", "same_as": "s1"}
+        project = until(client, lambda now: all(one["state"] != "waiting" for one in now["specimens"]))
+        s0, _, broken = project["specimens"]
+        assert (s0["vertices"], s0["triangles"], s0["state"]) == (4, 4, "ready")
+        assert broken["state"] == "unusable" and str(tmp_path) not in broken["findings"][0]["text"]
+        assert client.get("/api/thumbnails/s0").content[8:12] == b"WEBP"
+        assert client.get("/api/thumbnails/broken").status_code == 404
+
+
+def test_what_cannot_be_taken_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    with studio(tmp_path / "p", upload_bytes=100) as client:
+        assert client.put("/api/specimens", params={"name": "a.exe"}, content=b"x").status_code == 415
+        assert client.put("/api/specimens", params={"name": "a.ply"}, content=b"x" * 200).status_code == 413
+        assert not list((tmp_path / "p" / "scans").iterdir())
+        for path, content in (
+            ("/api/edit", {"what": "remove"}), ("/api/edit", {"revision": 0, "what": "x"}), ("/api/jobs", {}),
+            ("/api/jobs", {"kind": "correspond", "options": {}}), ("/api/jobs", {"kind": "rm", "options": {}}),
+            ("/api/jobs", {"kind": "build", "options": {}}), ("/api/import", {"path": str(tmp_path / "nowhere")}),
+            ("/api/open", {"folder": str(tmp_path)}), ("/api/open", {"folder": ""}),
+            ("/api/jobs/7/cancel", {}), ("/api/jobs/7/continue", {}),
+        ):  # fmt: skip
+            answer = client.post(path, json=content)
+            assert 400 <= answer.status_code < 500 and sentence(answer), (path, answer.text)
+        for path in ("/files/../secret", "/files/%2e%2e/%2e%2e/etc/passwd", "/view/1/", "/zip/1", "/api/jobs/1/log"):
+            assert 400 <= client.get(path).status_code < 500, path
+        assert client.post("/api/edit", content=b"[" * 5000).status_code == 400
+
+
+def test_an_edit_of_an_old_state_is_a_conflict(tmp_path: Path) -> None:
+    with studio(tmp_path / "p") as client:
+        for column, status in (("age", 200), ("sex", 409)):
+            edit = {"revision": 0, "what": "add-column", "column": column}
+            assert client.post("/api/edit", json=edit).status_code == status
+        assert state(client)["columns"] == ["age"]
+        assert client.post("/api/undo", json={"revision": 1}).status_code == 200
+        assert state(client)["columns"] == [] and state(client)["redo"] == "add the column age"
+
+
+def test_an_option_that_the_form_does_not_have_never_reaches_a_command(tmp_path: Path) -> None:
+    with studio(tmp_path / "p") as client:
+        upload(client, tmp_path, 2)
+        for options in ({"--output": "/etc"}, {"-o": "x"}, {"--template": "/etc/passwd"}, {"; rm": True}):
+            answer = client.post("/api/jobs", json={"kind": "correspond", "options": options})
+            assert answer.status_code == 422 and "has no option" in sentence(answer)
+        assert state(client)["jobs"] == []
+
+
+def test_another_page_and_a_wrong_token_get_nothing(tmp_path: Path) -> None:
+    with studio(tmp_path / "p") as client:
+        foreign = {"Origin": "http://evil.example"}
+        assert client.post("/api/edit", json={"revision": 0}, headers=foreign).status_code == 403
+        assert client.put("/api/specimens?name=a.ply", content=b"x", headers=foreign).status_code == 403
+        client.cookies.clear()
+        assert client.get("/api/project").status_code == 401
+        assert client.get("/", params={"token": "guess"}).status_code == 401
+
+
+def test_two_studios_cannot_write_into_one_project(tmp_path: Path) -> None:
+    with studio(tmp_path / "p"), pytest.raises(FileError, match="is being written by another"):
+        Studio(forms(), tmp_path / "p", 1)
+
+
+def test_a_project_is_opened_from_the_page_and_is_among_the_recent_ones(tmp_path: Path) -> None:
+    with studio(None) as client:
+        assert client.get("/api/project").json()["project"] is None
+        assert client.post("/api/edit", json={"revision": 0, "what": "add-column", "column": "a"}).status_code == 422
+        folder = str(tmp_path / "new")
+        assert client.post("/api/open", json={"folder": folder, "create": True}).status_code == 200
+        assert state(client)["name"] == "new"
+        assert client.get("/api/folders", params={"path": str(tmp_path)}).json()["folders"] == ["new", "state"]
+        assert client.get("/api/project").json()["recent"][0] == {"name": "new", "folder": folder, "exists": True}
+        client.post("/api/close", json={})
+        assert client.get("/api/project").json()["project"] is None
+
+
+def command(jobs: Jobs, *arguments: str) -> int:
+    return jobs.add("data", lambda number, before: (arguments, f"out-{number}")).number
+
+
+def wait_for(jobs: Jobs, number: int, *statuses: str) -> Any:
+    end = time.monotonic() + 120
+    while jobs.get(number).status not in statuses:
+        assert time.monotonic() < end, (jobs.get(number), jobs.log(number))
+        time.sleep(0.05)
+    return jobs.get(number)
+
+
+def test_jobs_run_in_order_and_tell_how_they_ended(tmp_path: Path) -> None:
+    jobs = Jobs(tmp_path, lambda: None)
+    try:
+        first = command(jobs, "data", "bones", "--count", "2", "-o", "out-1")
+        second = command(jobs, "build", "nowhere", "-o", "m.h5")
+        cancelled = command(jobs, "data", "bones", "-o", "out-3")
+        jobs.cancel(cancelled)
+        assert wait_for(jobs, first, "done", "failed").status == "done"
+        assert (tmp_path / "out-1" / "bone_000.ply").is_file()
+        failed = wait_for(jobs, second, "done", "failed")
+        assert failed.status == "failed" and failed.code == 2 and "nowhere" in failed.message
+        assert jobs.get(cancelled).status == "cancelled" and not (tmp_path / "out-3").exists()
+    finally:
+        jobs.close()
+
+
+def test_a_job_goes_on_without_the_server_and_is_found_again(tmp_path: Path) -> None:
+    jobs = Jobs(tmp_path, lambda: None)
+    number = command(jobs, "data", "bones", "--count", "3", "-o", "out-1")
+    wait_for(jobs, number, "running", "done")
+    jobs.close()  # as a server that is killed: the thread ends, the process goes on
+    again = Jobs(tmp_path, lambda: None)
+    try:
+        assert wait_for(again, number, "done", "failed", "interrupted").status == "done"
+        assert len(list((tmp_path / "out-1").glob("*.ply"))) == 3
+    finally:
+        again.close()
+
+
+def test_a_cancelled_job_can_be_continued(tmp_path: Path) -> None:
+    jobs = Jobs(tmp_path, lambda: None)
+    try:
+        number = command(jobs, "data", "bones", "--count", "40", "-o", "out-1")
+        end = time.monotonic() + 60
+        while not list((tmp_path / "out-1").glob("*.ply")) and time.monotonic() < end:
+            time.sleep(0.05)
+        jobs.cancel(number)
+        assert wait_for(jobs, number, "cancelled", "done").status == "cancelled"
+        jobs.go_on(number)
+        assert wait_for(jobs, number, "done", "failed").status == "done"
+    finally:
+        jobs.close()
+
+
+def test_a_job_whose_process_was_killed_is_interrupted(tmp_path: Path) -> None:
+    jobs = Jobs(tmp_path, lambda: None)
+    number = command(jobs, "data", "bones", "--count", "40", "-o", "out-1")
+    wait_for(jobs, number, "running")
+    folder = jobs.folder_of(jobs.get(number))
+    end = time.monotonic() + 30
+    while not run_job.is_running(folder) and time.monotonic() < end:
+        time.sleep(0.02)
+    jobs.close()
+    subprocess.run(["pkill", "-9", "-f", f"run_job {folder}"], check=False)
+    subprocess.run(["pkill", "-9", "-f", "data bones --count 40 -o out-1"], check=False)
+    end = time.monotonic() + 30
+    while run_job.is_running(folder) and time.monotonic() < end:
+        time.sleep(0.02)
+    again = Jobs(tmp_path, lambda: None)
+    try:
+        assert again.get(number).status == "interrupted"
+        again.go_on(number)
+        assert wait_for(again, number, "done", "failed").status == "done"
+    finally:
+        again.close()
+
+
+def test_results_are_listed_and_downloaded_alone_and_together(tmp_path: Path) -> None:
+    with studio(tmp_path / "p") as client:
+        project = tmp_path / "p"
+        (project / "out-1").mkdir()
+        (project / "out-1" / "a.csv").write_text("1,2\n")
+        job = project / "jobs" / "0001"
+        job.mkdir(parents=True)
+        (job / "job.json").write_text('{"number": 1, "kind": "fit", "arguments": ["fit"], "output": "out-1"}')
+        (job / "exit.json").write_text('{"code": 0, "seconds": 1.5}')
+        (job / "log.txt").write_text("done\n")
+        client.post("/api/close", json={})
+        client.post("/api/open", json={"folder": str(project)})
+        assert state(client)["jobs"][0]["status"] == "done"
+        assert client.get("/api/jobs/1/files").json() == [{"path": "out-1/a.csv", "bytes": 4}]
+        answer = client.get("/files/out-1/a.csv")
+        assert answer.text == "1,2\n" and answer.headers["content-disposition"].startswith("attachment")
+        with zipfile.ZipFile(BytesIO(client.get("/zip/1").content)) as archive:
+            assert archive.read("out-1/a.csv") == b"1,2\n"
+        assert "run shapespace fit" in client.get("/api/history").text
+
+
+def test_a_result_outside_the_project_is_never_served(tmp_path: Path) -> None:
+    with studio(tmp_path / "p") as client:
+        (tmp_path / "secret.txt").write_text("x")
+        (tmp_path / "p" / "link").symlink_to(tmp_path / "secret.txt")
+        assert client.get("/files/link").status_code == 422
