@@ -12,6 +12,8 @@
   const duration = (seconds) => seconds < 90 ? J.seconds(Math.max(1, Math.round(seconds))) : seconds < 5400 ? J.minutes(Math.round(seconds / 60)) : J.hours((seconds / 3600).toFixed(1));
   const kindOf = (job) => J.kinds[job.kind] || job.kind;
 
+  Studio.fileAddress = (path) => `/files/${path.split("/").map(encodeURIComponent).join("/")}`;
+
   // Forms -----------------------------------------------------------------------------------------------------------
 
   const quoted = (column) => (/^[A-Za-z_]\w*$/.test(column) ? column : `\`${column}\``);
@@ -36,7 +38,8 @@
 
   function Option({ option, value, columns, onvalue }) {
     const { flag, kind, choices, initial, required } = option;
-    const name = flag.replace(/^--/, "").replace(/-/g, " ");
+    const words = flag.replace(/^--/, "").replace(/-/g, " ");
+    const name = words[0].toUpperCase() + words.slice(1);
     const label = html`<span>${name}${required && html` <small>(${J.required})</small>`}</span>`;
     const common = { "data-testid": `option${flag}`, "aria-describedby": `help${flag}`, required };
     // The field shows the default already.
@@ -50,7 +53,7 @@
         ${!(initial && values.includes(initial)) && html`<option value="">${required ? "" : kind === "column" ? J.none : J.default}</option>`}
         ${values.map((one) => html`<option key=${one} value=${one} selected=${one === value}>${one}</option>`)}</select>${help}</label>`;
     }
-    return html`<label class="option">${label}<input ...${common} inputmode=${kind === "number" ? "decimal" : undefined} value=${value || ""} placeholder=${initial ? "" : J.default} oninput=${(event) => onvalue(event.target.value)} />${help}</label>`;
+    return html`<label class="option">${label}<input ...${common} inputmode=${kind === "number" ? "decimal" : undefined} value=${value || ""} placeholder=${initial || required ? "" : J.default} oninput=${(event) => onvalue(event.target.value)} />${help}</label>`;
   }
 
   /** The options that differ from the initial ones. */
@@ -96,6 +99,7 @@
       setStarting(true);
       await Studio.runJob(kind, options, on ? Number(on) : null);
       setStarting(false);
+      event.target.closest(".side")?.scrollTo(0, 0);
     };
     const word = label || (jobs.some((job) => job.kind === kind) ? J.runAgain : J.runOf[kind] || J.run);
     return html`
@@ -142,17 +146,38 @@
           ${["cancelled", "failed", "interrupted"].includes(status) && html`<${Button} small testid=${`continue-${job.number}`} onclick=${() => Studio.act(`/api/jobs/${job.number}/continue`)}>${J.continue}<//>`}
         </div>
         ${active && html`<progress max=${progress ? progress.total : undefined} value=${progress ? progress.done : undefined} aria-label=${J.progressLabel(kindOf(job))} data-testid=${`progress-${job.number}`}></progress>`}
-        <p class="hint message" role="status">${active && progress ? J.progress(progress) : status === "done" ? "" : job.message}</p>
+        <p class="hint message" role="status">${active && progress ? J.progress(progress) : job.message}</p>
+        ${job.kind === "report" && job.views.length > 0 && html`<p><a href=${job.views[0].href} target="_blank" rel="noopener" data-testid=${`open-report-${job.number}`}>${J.openReport}</a></p>`}
         <${Log} job=${job} />
         <details><summary>${J.command}</summary><pre class="log" tabindex="0" aria-label=${J.command}>${job.command}</pre><${CopyButton} text=${job.command} label=${J.copy} testid=${`copy-command-${job.number}`} /></details>
       </section>`;
+  }
+
+  /** Pictures and log of a result without a page of its own. */
+  function Summary({ job }) {
+    const [log, setLog] = useState("");
+    const [pictures, setPictures] = useState([]);
+    useEffect(() => {
+      let addresses = [];
+      const load = async () => {
+        setLog(await (await Studio.ask(`/api/jobs/${job.number}/log`)).text());
+        const files = await Studio.json(`/api/jobs/${job.number}/files`);
+        const found = files.filter((file) => file.path.endsWith(".png")).slice(0, 12);
+        addresses = await Promise.all(found.map(async ({ path }) => URL.createObjectURL(new Blob([await (await Studio.ask(Studio.fileAddress(path))).blob()], { type: "image/png" }))));
+        setPictures(addresses.map((address, k) => [address, found[k].path]));
+      };
+      load().catch((error) => setLog(error.message));
+      return () => addresses.forEach((address) => URL.revokeObjectURL(address));
+    }, [job.number]);
+    const words = log.split("\n").filter((line) => !/^shapespace: .* \.\.\./.test(line)).join("\n");
+    return html`<div class="fill scroll" role="region" aria-label=${job.output} tabindex="0" data-testid=${`result-${job.number}`}>${pictures.map(([address, path]) => html`<img class="plot" key=${path} src=${address} alt=${path} />`)}<pre class="words">${words}</pre></div>`;
   }
 
   /** Result of a job in a frame; reports are documents of their own and run apart from this page. */
   function ResultFrame({ job, frame }) {
     const [at, setAt] = useState(0);
     const view = job.views[Math.min(at, job.views.length - 1)];
-    if (!view) return null;
+    if (!view) return html`<${Summary} job=${job} />`;
     const sandbox = view.kind === "report" ? "allow-scripts allow-downloads allow-popups" : undefined;
     return html`
       <div class="frame" data-testid=${`result-${job.number}`}>
@@ -161,13 +186,17 @@
       </div>`;
   }
 
-  /** The results of `kinds`, the newest first; returns the chosen job and the select. */
-  function useResult(kinds) {
-    const [chosen, setChosen] = useState(null);
+  /** The results of `kinds`, `first` or the newest at first; returns the chosen job and the select. */
+  function useResult(kinds, first = null) {
+    const [chosen, setChosen] = useState(first);
+    const seen = useRef(undefined);
     const finished = Studio.jobsOf(kinds).filter((job) => job.status === "done");
     const job = finished.find((one) => one.number === chosen) || finished[0] || null;
     const newest = finished.length ? finished[0].number : null;
-    useEffect(() => { setChosen(null); }, [newest]);
+    useEffect(() => {
+      if (seen.current !== undefined) setChosen(null); // a new result is shown
+      seen.current = newest;
+    }, [newest]);
     const select = job && html`
       <div class="row bar result-bar">
         ${finished.length > 1 ? html`<label>${J.result} <select data-testid="result" value=${job.number} onchange=${(event) => setChosen(Number(event.target.value))}>

@@ -40,8 +40,8 @@
       <div class="row"><${Button} small testid="figures" onclick=${() => Studio.runJob(job.kind, { ...Studio.optionsOf(job), "--format": "svg,pdf,png" }, Studio.sourceOf(job))}>${Q.figures}<//></div>
     </div>`;
 
-  function Question({ kind, next, onback }) {
-    const [job, select] = useResult([kind]);
+  function Question({ kind, first, next, onback }) {
+    const [job, select] = useResult([kind], first);
     const ready = Boolean(Studio.newest(...sources(kind)));
     const busy = Studio.jobsOf([kind]).some(Studio.isActive);
     const controls = html`
@@ -55,18 +55,18 @@
   }
 
   Studio.Questions = function Questions({ next }) {
-    const [kind, setKind] = useState(null);
-    if (kind) return html`<${Question} key=${kind} kind=${kind} next=${next} onback=${() => setKind(null)} />`;
+    const [{ kind, first }, setQuestion] = useState({});
+    if (kind) return html`<${Question} key=${kind} kind=${kind} first=${first} next=${next} onback=${() => setQuestion({})} />`;
     const earlier = Studio.jobsOf(KINDS);
     return html`
       <div class="fill scroll" data-testid="screen-questions">
         <div class="row bar"><h2>${Q.title}</h2><span class="grow"></span>
           ${earlier.some((job) => job.status === "done") && html`<${Button} strong testid="next" onclick=${next}>${T.next.questions}<//>`}</div>
         <ul class="questions">
-          ${KINDS.filter((one) => Studio.forms[one]).map((one) => html`<li key=${one}><button type="button" data-testid=${`question-${one}`} onclick=${() => setKind(one)}><strong>${T.jobs.kinds[one]}</strong><span class="hint">${Q.hints[one]}</span></button></li>`)}
+          ${KINDS.filter((one) => Studio.forms[one]).map((one) => html`<li key=${one}><button type="button" data-testid=${`question-${one}`} onclick=${() => setQuestion({ kind: one })}><strong>${T.jobs.kinds[one]}</strong><span class="hint">${Q.hints[one]}</span></button></li>`)}
         </ul>
         ${earlier.length > 0 && html`<h3>${Q.earlier}</h3>
-          <ul class="recent">${earlier.map((job) => html`<li key=${job.number}><button type="button" data-testid=${`earlier-${job.number}`} onclick=${() => setKind(job.kind)}>
+          <ul class="recent">${earlier.map((job) => html`<li key=${job.number}><button type="button" data-testid=${`earlier-${job.number}`} onclick=${() => setQuestion({ kind: job.kind, first: job.number })}>
             <strong>${Studio.kindOf(job)}</strong><span class="hint">${T.jobs.statuses[job.status]}${job.sentences.length ? `: ${job.sentences[0]}` : ""}</span></button></li>`)}</ul>`}
       </div>`;
   };

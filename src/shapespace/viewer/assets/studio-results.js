@@ -14,8 +14,6 @@
     return `${(number / 1000 ** step).toFixed(step && number / 1000 ** step < 10 ? 1 : 0)} ${UNITS[step]}`;
   }
 
-  const address = (path) => `/files/${path.split("/").map(encodeURIComponent).join("/")}`;
-
   // Export ----------------------------------------------------------------------------------------------------------
 
   function Files({ job }) {
@@ -24,7 +22,7 @@
     return html`
       <details ontoggle=${open} data-testid=${`files-${job.number}`}><summary>${T.export.show}</summary>
         ${files && !files.length && html`<p class="hint">${T.export.noFiles}</p>`}
-        ${files && files.length > 0 && html`<ul class="files">${files.slice(0, 500).map((file) => html`<li key=${file.path}><a href=${address(file.path)} download data-testid="download" aria-label=${T.export.download(file.path)}>${file.path}</a> <span class="hint">${bytes(file.bytes)}</span></li>`)}</ul>`}
+        ${files && files.length > 0 && html`<ul class="files">${files.slice(0, 500).map((file) => html`<li key=${file.path}><a href=${Studio.fileAddress(file.path)} download data-testid="download" aria-label=${T.export.download(file.path)}>${file.path}</a> <span class="hint">${bytes(file.bytes)}</span></li>`)}</ul>`}
       </details>`;
   }
 
@@ -53,6 +51,7 @@
         <div class="row bar"><div><h2>${T.export.title}</h2><p class="hint">${T.export.intro}</p></div><span class="grow"></span>
           <${Button} strong testid="write-report" disabled=${!source || busy} onclick=${() => Studio.runJob("report", {}, source.number)}>${T.export.report}<//></div>
         <${Jobs} kinds=${["report", "convert", "export"]} />
+        ${Studio.jobsOf(Studio.QUESTIONS).filter(Studio.isActive).map((job) => html`<${JobPanel} key=${job.number} job=${job} />`)}
         ${Studio.newest("build") && Studio.forms.convert && html`<details class="narrow" data-testid="convert"><summary>${T.export.convert}</summary><${JobForm} kind="convert" sources=${["build"]} /></details>`}
         ${!done.length ? html`<p class="hint">${T.export.none}</p>` : html`
           <div class="table-box" role="region" aria-label=${T.export.title} tabindex="0"><table class="plain">
@@ -80,8 +79,8 @@
               <tr key=${job.number} class=${job.status} data-testid=${`history-${job.number}`}>
                 <td class="number">${job.number}</td>
                 <th scope="row"><button type="button" class="small" aria-expanded=${open === job.number} data-testid=${`details-${job.number}`} onclick=${() => setOpen(open === job.number ? null : job.number)}>${Studio.kindOf(job)}</button></th>
-                <td><span class="dot" aria-hidden="true"></span> ${T.jobs.statuses[job.status]}</td>
-                <td>${job.seconds ? Studio.duration(job.seconds) : ""}</td>
+                <td class="short"><span class="dot" aria-hidden="true"></span> ${T.jobs.statuses[job.status]}</td>
+                <td class="short">${job.seconds ? Studio.duration(job.seconds) : ""}</td>
                 <td><code>${job.command}</code>${open === job.number && html`<${JobPanel} job=${job} />`}</td>
               </tr>`)}</tbody></table></div>`}
       </div>`;

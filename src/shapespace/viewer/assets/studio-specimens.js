@@ -20,7 +20,7 @@
     disabled=${specimen.state === "unusable"} onchange=${(event) => include(specimen, event.target)} />${label && html`<span aria-hidden="true">${label}</span>`}</label>`;
 
   Studio.Findings = ({ specimen }) => html`
-    ${specimen.state === "waiting" && html`<p class="finding">${S.states.waiting}</p>`}
+    ${specimen.state === "waiting" && html`<p class="finding waiting">${S.states.waiting}</p>`}
     ${specimen.findings.map((finding) => html`<p class=${`finding ${finding.level}`} title=${finding.text}>${S[finding.level]}${finding.text}</p>`)}`;
 
   function Card({ specimen, selected, onselect }) {

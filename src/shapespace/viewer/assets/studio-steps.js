@@ -5,6 +5,7 @@
   const { html, useState, useEffect, useRef } = window.Preact;
   const Studio = window.ShapespaceStudio;
   const T = window.ShapespaceTexts;
+  const LEAST = 2; // scans that can be brought into correspondence
   const { Button, JobForm, Jobs, Settings, ResultFrame, useResult, DropZone, UploadStatus } = Studio;
 
   /** Controls on the left, the result on the right. */
@@ -69,10 +70,10 @@
     const busy = isBusy("correspond", "redo");
     const controls = html`
       <h2>${T.correspondence.title}</h2>
-      <p class="hint">${training.length < 3 ? T.correspondence.none : T.correspondence.intro(training.length)}</p>
+      <p class="hint">${training.length < LEAST ? T.correspondence.none : T.correspondence.intro(training.length)}</p>
       <${Jobs} kinds=${["correspond", "redo"]} />
       ${job && html`<${Next} name="correspondence" next=${next} ready=${!busy} />`}
-      <${Settings} key="settings" kinds=${["correspond"]}><${JobForm} kind="correspond" strong=${!job && !busy} disabled=${training.length < 3 || busy} /><//>
+      <${Settings} key="settings" kinds=${["correspond"]}><${JobForm} kind="correspond" strong=${!job && !busy} disabled=${training.length < LEAST || busy} /><//>
       ${job && html`<${Redo} specimens=${training} /><${Landmarks} landmarks=${project.landmarks} clicked=${clicked} />`}`;
     return html`<${Step} name="correspondence" title=${T.correspondence.title} controls=${controls} select=${select} job=${job} empty=${T.correspondence.empty} frame=${frame} />`;
   };

@@ -5,6 +5,7 @@
   const Viewer = window.ShapespaceViewer;
   const T = window.ShapespaceTexts;
   const UPLOADS_AT_ONCE = 3;
+  const RECONNECT_AFTER = 3000; // ms
   const ATTEMPTS = 5; // of an edit while uploads change the revision
   const TABLES = [".csv", ".tsv", ".xlsx"];
 
@@ -39,6 +40,7 @@
 
   // State -----------------------------------------------------------------------------------------------------------
 
+  const byName = new Intl.Collator("en", { numeric: true }).compare;
   let reading = null; // the request in flight
   let again = null; // the one that follows it
 
@@ -54,6 +56,7 @@
 
   async function read() {
     const state = await json("/api/project");
+    if (state.project) state.project.specimens.sort((a, b) => byName(a.id, b.id));
     reuse(state);
     Studio.state = state;
     Studio.changed();
@@ -77,10 +80,12 @@
     events.onopen = () => { offline.hidden = true; refresh().catch(() => {}); };
     events.onmessage = () => refresh().catch(() => {});
     events.onerror = () => {
-      offline.textContent = T.offline;
-      offline.hidden = false;
+      const show = (sentence) => { offline.textContent = sentence; offline.hidden = false; };
+      show(T.offline);
+      if (events.readyState !== EventSource.CLOSED) return;
       // After an answer that is no stream, such as 401, the browser does not connect again.
-      if (events.readyState === EventSource.CLOSED) setTimeout(listen, 3000);
+      refresh().catch((error) => { if (error.status === 401) show(error.message); });
+      setTimeout(listen, RECONNECT_AFTER);
     };
   }
 
@@ -151,6 +156,7 @@
   /** Add scans, three at a time; tables follow, as their rows name the scans. */
   function upload(files, set) {
     if (!uploading()) Studio.uploads = { total: 0, done: 0, added: 0, notes: [] };
+    files.sort((a, b) => byName(a.name, b.name));
     const tables = files.filter((file) => ending(file.name, TABLES));
     for (const file of files.filter((one) => !tables.includes(one)).concat(tables)) waiting.push([file, set, tables.includes(file)]);
     Studio.uploads.total += files.length;

@@ -49,7 +49,7 @@
       set(null);
       onblock(rows);
     };
-    return html`<td><input class="cell" size="8" aria-label=${label} data-testid=${testid} data-row=${row} data-column=${column} value=${draft === null ? value : draft}
+    return html`<td><input class="entry" size="8" aria-label=${label} data-testid=${testid} data-row=${row} data-column=${column} value=${draft === null ? value : draft}
       data-edited=${draft !== null} oninput=${(event) => set(event.target.value)} onblur=${send} onkeydown=${key} onpaste=${paste} /></td>`;
   }
 
@@ -73,7 +73,7 @@
     const [name, setName] = useState(null);
     const ref = useRef(null);
     useEffect(() => { if (ref.current) ref.current.focus(); }, [name === null]);
-    if (name === null) return html`<${Button} small testid="add-column" onclick=${() => setName("")}>${S.addColumn}<//>`;
+    if (name === null) return html`<${Button} testid="add-column" onclick=${() => setName("")}>${S.addColumn}<//>`;
     return html`
       <form class="row inline" onsubmit=${async (event) => { event.preventDefault(); if (await Studio.edit({ what: "add-column", column: name.trim() })) setName(null); }}>
         <input ref=${ref} aria-label=${S.columnName} placeholder=${S.columnName} required data-testid="column-name" value=${name} oninput=${(event) => setName(event.target.value)}

@@ -67,7 +67,7 @@
   function shortcut(event) {
     if (!(event.ctrlKey || event.metaKey) || event.altKey || !["z", "y"].includes(event.key.toLowerCase())) return;
     const field = event.target.closest && event.target.closest("input:not([type=checkbox]), textarea, dialog");
-    if (field && !(field.classList.contains("cell") && field.dataset.edited !== "true")) return;
+    if (field && !(field.classList.contains("entry") && field.dataset.edited !== "true")) return;
     const project = Studio.state && Studio.state.project;
     if (!project) return;
     event.preventDefault();
