@@ -38,11 +38,12 @@
   }
 
   /** Notes on the table, and the number of specimens of each class. */
+  const isClasses = ([, classes]) => Object.entries(classes).some(([name, number]) => name && number > 1);
   const About = ({ project }) => html`
     ${project.notes.length > 0 && html`<section class="notes" aria-label=${S.notes} data-testid="notes"><h3>${S.notes}</h3>${project.notes.map((note) => html`<p>${note}</p>`)}</section>`}
-    ${Object.keys(project.counts).length > 0 && html`
+    ${Object.entries(project.counts).some(isClasses) && html`
       <section aria-label=${S.classes} class="counts" data-testid="counts">
-        ${Object.entries(project.counts).map(([column, classes]) => html`
+        ${Object.entries(project.counts).filter(isClasses).map(([column, classes]) => html`
           <dl key=${column}><dt>${column}</dt>${Object.entries(classes).map(([name, number]) => html`<dd><span class=${name ? "" : "hint"}>${name || S.noClass}</span> <b>${number}</b>
             <meter aria-hidden="true" min="0" max=${Math.max(...Object.values(classes))} value=${number}></meter></dd>`)}</dl>`)}
       </section>`}`;
