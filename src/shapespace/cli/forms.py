@@ -7,6 +7,7 @@ from typing import Any, cast
 
 from shapespace.cli.command_table import COMMANDS, Command
 from shapespace.cli.options import NO_DEFAULT, Option
+from shapespace.formats.registry import MODEL_FORMATS
 
 _KINDS: Mapping[str, str] = {"identify": "recognise identify"}
 _FIRST: Mapping[str, tuple[str, ...]] = {
@@ -14,7 +15,7 @@ _FIRST: Mapping[str, tuple[str, ...]] = {
     "build": ("--modes", "--gauge", "--unit"),
     "quality": ("--folds", "--samples", "--modes"),
     "morphospace": ("--method", "--group", "--gauge"),
-    "fit": ("--dense", "--unit", "--jobs"),
+    "fit": ("--dense", "--unit", "--stages"),
     "complete": ("--samples", "--mirror", "--stl"),
     "compare": ("--formula", "--blocks", "--permutations"),
     "change": ("--subject", "--time", "--order"),
@@ -40,7 +41,10 @@ _FILES = frozenset(
 def forms() -> dict[str, dict[str, Any]]:
     """Return command -> its summary and the options of its form."""
     commands = {command.name: command for command in COMMANDS}
-    return {kind: _form(commands[_KINDS.get(kind, kind)], first) for kind, first in _FIRST.items()}
+    made = {kind: _form(commands[_KINDS.get(kind, kind)], first) for kind, first in _FIRST.items()}
+    to = made["convert"]["options"][0]
+    made["convert"]["options"][0] = to | {"kind": "choice", "choices": list(MODEL_FORMATS)}
+    return made
 
 
 def _form(command: Command, first: tuple[str, ...]) -> dict[str, Any]:

@@ -31,7 +31,7 @@ from shapespace.fit.scan_target import ScanTarget, mm_frame
 from shapespace.fit.search.initialisation import start_from_any_pose
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.loop import loop_operator
-from shapespace.geometry.normals import enclosed_volume, face_areas, part_of, rms_size
+from shapespace.geometry.normals import boundary_edges, enclosed_volume, face_areas, part_of, rms_size
 from shapespace.geometry.procrustes import centroid_size
 from shapespace.io.interop import MeshLike
 from shapespace.io.landmarks.landmark_io import read_landmarks
@@ -461,9 +461,7 @@ def _without_part(fit: FitResult, part: str) -> Mesh:
 
 
 def _is_closed(model: ShapeModel) -> bool:
-    faces = np.asarray(model.faces)
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    return bool((np.unique(edges, axis=0, return_counts=True)[1] == 2).all())
+    return not len(boundary_edges(np.asarray(model.faces)))
 
 
 def refine_surface(completion: Completion) -> Mesh:

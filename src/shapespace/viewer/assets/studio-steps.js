@@ -34,11 +34,11 @@
   }
 
   /** Named vertices; the surfaces' page reports the vertex that was clicked last. */
-  function Landmarks({ landmarks, clicked }) {
+  function Landmarks({ landmarks, clicked, on }) {
     const [name, setName] = useState("");
     const [vertex, setVertex] = useState("");
     useEffect(() => { if (clicked !== null) setVertex(String(clicked)); }, [clicked]);
-    const save = (changed) => Studio.edit({ what: "landmarks", landmarks: changed });
+    const save = (changed) => Studio.edit({ what: "landmarks", landmarks: changed, on });
     const add = async (event) => {
       event.preventDefault();
       if (await save({ ...landmarks, [name.trim()]: Number(vertex) })) setName("");
@@ -74,7 +74,7 @@
       <${Jobs} kinds=${["correspond", "redo"]} />
       ${job && html`<${Next} name="correspondence" next=${next} ready=${!busy} />`}
       <${Settings} key="settings" kinds=${["correspond"]}><${JobForm} kind="correspond" strong=${!job && !busy} disabled=${training.length < LEAST || busy} /><//>
-      ${job && html`<${Redo} specimens=${training} /><${Landmarks} landmarks=${project.landmarks} clicked=${clicked} />`}`;
+      ${job && html`<${Redo} specimens=${training} /><${Landmarks} landmarks=${project.landmarks} clicked=${clicked} on=${job.output} />`}`;
     return html`<${Step} name="correspondence" title=${T.correspondence.title} controls=${controls} select=${select} job=${job} empty=${T.correspondence.empty} frame=${frame} />`;
   };
 

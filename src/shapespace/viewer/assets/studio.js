@@ -57,7 +57,9 @@
 
   function draw() {
     const { project } = Studio.state;
-    document.getElementById("about").textContent = project ? `${project.name}, ${project.folder}` : "";
+    const about = document.getElementById("about");
+    about.textContent = project ? project.name : "";
+    about.title = project ? project.folder : "";
     document.title = project ? `${project.name}, shapespace studio` : "shapespace studio";
     render(html`<${App} />`, document.getElementById("app"));
     document.body.dataset.ready = "true";

@@ -31,7 +31,7 @@ from shapespace.viewer.studio.job_commands import CORRESPONDENCES, QUESTIONS, Fo
 from shapespace.viewer.studio.jobs import Job, Jobs, history, write_history
 from shapespace.viewer.studio.project import Project, Role, StaleError, change_of, join_table, recent_projects
 from shapespace.viewer.studio.specimen_checks import SpecimenChecks
-from shapespace.viewer.studio.views import Views, result_path, view_kind
+from shapespace.viewer.studio.views import REPORT_PAGE, Views, result_path, view_kinds
 
 _TABLE_BYTES, _REQUEST_BYTES = 2**24, 2**20
 _EVENT_S = 0.4  # between events
@@ -53,7 +53,7 @@ class OpenProject:
         self._writer = only_writer(self.project.folder)
         self._writer.__enter__()
         self.jobs = Jobs(self.project.folder, changed)
-        self.checks = SpecimenChecks(self.project.folder, changed)
+        self.checks = SpecimenChecks(self.project.folder, changed, self._exclude)
         self.views = Views(upload_bytes)
         self._ended: set[int] = set()
 
@@ -63,6 +63,12 @@ class OpenProject:
         self.checks.close()
         self.views.close()
         self._writer.__exit__(None, None, None)
+
+    def _exclude(self, scan: Path) -> None:
+        """Exclude a scan that cannot be used; the user can include it again."""
+        names = [one.id for one in self.project.state.specimens if one.included and self.project.path(one) == scan]
+        if names:
+            self.project.edit(None, change_of({"what": "include", "ids": names, "included": False}))
 
     def facts(self) -> dict[str, Any]:
         """Return the state for the page."""
@@ -90,15 +96,15 @@ class OpenProject:
         progress = self.jobs.progress(job) if job.status == "running" else None
         left_s = None if progress is None else progress.pop("left_s")
         path = result_path(self.project.folder, job.output)
-        kind = view_kind(path) if job.status == "done" else None
-        words: dict[str, Any] = {"sentences": [], "methods": None}
-        if kind == "report" and path.name != "report.html":
-            words = _words(path)
+        kinds = view_kinds(path) if job.status == "done" else []
+        page = f"/view/{job.number}/"
+        pages = [page, *(f"{page}{REPORT_PAGE}/" for _ in kinds[1:])]
+        words = _words(path)
         return {
             "number": job.number, "kind": job.kind, "command": job.command, "status": job.status,
             "message": job.message, "progress": progress, "seconds": self.jobs.running_for(job), "left_s": left_s,
             "output": job.output,
-            "views": [] if kind is None else [{"kind": kind, "href": f"/view/{job.number}/"}], **words,
+            "views": [{"kind": kind, "href": href} for kind, href in zip(kinds, pages, strict=False)], **words,
         }  # fmt: skip
 
 

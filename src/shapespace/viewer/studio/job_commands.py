@@ -71,6 +71,10 @@ def order(
         output = f"model-{number}.h5"
         marks: tuple[str, ...] = ()
         if state.landmarks and "--landmarks" not in options:
+            if state.landmarks_on not in ("", before.output):
+                raise InputError(
+                    f"The landmarks were placed on {state.landmarks_on}; place them on {before.output}, or remove them."
+                )
             project.write_landmarks(folder / f"{stem}-landmarks.csv")
             marks = ("--landmarks", f"{stem}-landmarks.csv")
         return Order((*words, *_surfaces(project, before), "-o", output, *marks, *given), output)
@@ -139,7 +143,9 @@ def checks(
     """Return what can be said before a question is run: a level (`ok`, `warning`, `problem`) and a sentence each."""
     role = "new" if kind in ("score", "identify") or (shapes is not None and shapes.kind == "fit") else "training"
     chosen = project.state.chosen(role)
-    found = [{"level": "ok" if len(chosen) > 1 else "problem", "text": f"{len(chosen)} specimens take part."}]
+    enough = len(chosen) >= (1 if kind == "score" else 2)
+    take = "specimen takes" if len(chosen) == 1 else "specimens take"
+    found = [{"level": "ok" if enough else "problem", "text": f"{len(chosen)} {take} part."}]
     formula = str(options.get("--formula", ""))
     used = {str(value) for value in options.values() if isinstance(value, str)}
     columns = [column for column in project.state.columns if column in used or _in_formula(column, formula)]
@@ -154,6 +160,8 @@ def checks(
             few = min(classes.values()) < 3
             text = f"{column}: {', '.join(f'{count} {name}' for name, count in classes.items())}."
             found.append({"level": "warning" if few else "ok", "text": text})
+        elif classes:
+            found.append({"level": "ok", "text": f"{column}: {len(classes)} values."})
         if len(classes) == 1:
             found.append({"level": "problem", "text": f"{column} has one value for all specimens; nothing can differ."})
     for option in forms.get(kind, {}).get("options", ()):
@@ -164,7 +172,7 @@ def checks(
 
 def _in_formula(column: str, formula: str) -> bool:
     words = "".join(c if c.isalnum() or c == "_" else " " for c in formula).split()
-    return column in words or f"Q({column!r})" in formula.replace('"', "'")
+    return column in words or f"`{column}`" in formula
 
 
 def _given(forms: Forms, kind: str, options: Mapping[str, Any]) -> list[str]:

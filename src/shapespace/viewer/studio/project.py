@@ -58,7 +58,8 @@ class State(Struct, frozen=True, kw_only=True):
         name: of the project.
         columns: of the table, besides the id.
         specimens: in the order in which they were added.
-        landmarks: name -> vertex of the surfaces in correspondence.
+        landmarks: name -> vertex of the surfaces in correspondence,
+        landmarks_on: in this folder of the project.
     """
 
     FORMAT: ClassVar[str] = "shapespace-project"
@@ -69,6 +70,7 @@ class State(Struct, frozen=True, kw_only=True):
     columns: tuple[str, ...] = ()
     specimens: tuple[Specimen, ...] = ()
     landmarks: dict[str, int] = {}
+    landmarks_on: str = ""
 
     def chosen(self, role: Role) -> tuple[Specimen, ...]:
         """Return the included specimens of a role."""
@@ -148,12 +150,13 @@ class Project:
         """Return the path of a scan."""
         return self.folder / specimen.file
 
-    def edit(self, revision: int | None, change: Callable[[State], tuple[str, State]]) -> None:
+    def edit(self, revision: int | None, change: Callable[[State], tuple[str, State]], *, together: str = "") -> None:
         """Apply an edit, which can be undone.
 
         Args:
             revision: of the state that the user saw; None for edits that any state allows.
             change: returns what it does, in words, and the new state.
+            together: edits in a row with this text are undone at once.
 
         Raises:
             InputError: another edit came in between, or `change` refuses it.
@@ -164,7 +167,8 @@ class Project:
             text, state = change(self.state)
             before = self.state
             self._replace(state)
-            self._undo = [*self._undo[-_MOST_UNDONE + 1 :], (text, before)]
+            if not together or not self._undo or self._undo[-1][0] != together:
+                self._undo = [*self._undo[-_MOST_UNDONE + 1 :], (together or text, before)]
             self._redo = []
 
     def undo(self, revision: int) -> None:
@@ -237,7 +241,11 @@ class Project:
             inside = file.is_relative_to(self.folder)
             place = file.relative_to(self.folder).as_posix() if inside else str(file)
             specimen = Specimen(id=name, file=place, role=role)
-            self.edit(None, lambda state: (f"add {name}", replace(state, specimens=(*state.specimens, specimen))))
+            self.edit(
+                None,
+                lambda state: ("", replace(state, specimens=(*state.specimens, specimen))),
+                together="add specimens",
+            )
             return name, None
 
     def import_files(self, place: Path, role: Role, *, copy: bool) -> tuple[int, list[str]]:
@@ -374,7 +382,7 @@ def _landmarks(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
     landmarks = {str(name).strip()[:60]: int(vertex) for name, vertex in request["landmarks"].items()}
     if "" in landmarks or min(landmarks.values(), default=0) < 0:
         raise InputError("A landmark needs a name and a vertex.")
-    return "change the landmarks", replace(state, landmarks=landmarks)
+    return "change the landmarks", replace(state, landmarks=landmarks, landmarks_on=str(request.get("on", "")))
 
 
 _EDITS: Mapping[str, Callable[[State, Mapping[str, Any]], tuple[str, State]]] = {

@@ -25,12 +25,14 @@ class SpecimenChecks:
 
     Args:
         folder: of the project.
-        changed: called when a check was finished.
+        changed: called when a check was finished,
+        unusable: and before, with the path of a scan that cannot be used.
     """
 
-    def __init__(self, folder: Path, changed: Callable[[], None]) -> None:
+    def __init__(self, folder: Path, changed: Callable[[], None], unusable: Callable[[Path], None]) -> None:
         self._folder = folder / _FOLDER
         self._changed = changed
+        self._unusable = unusable
         self._asked: set[str] = set()
         self._pool: ProcessPoolExecutor | None = None
         self._known: dict[str, dict[str, Any]] = {}
@@ -74,6 +76,8 @@ class SpecimenChecks:
                 self._pool = None
                 text = "It cannot be checked: the memory does not suffice, or the check failed."
                 self._known[key] = _unusable(text)
+            if key in self._known or future.result()["state"] == "unusable":
+                self._unusable(scan)
             self._changed()
 
         self._pool.submit(check_scan, scan, self._folder / key).add_done_callback(done)

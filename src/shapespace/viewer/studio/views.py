@@ -22,7 +22,7 @@ from shapespace.viewer.server import model_app
 from shapespace.viewer.surfaces_server import surfaces_app
 from shapespace.viewer.uploaded_scans import FOLDER_PREFIX, Limits, Scans
 
-REPORT = "report.html"
+REPORT, REPORT_PAGE = "report.html", "report"
 _MOST_OPEN = 6  # pages whose data are in memory at a time
 REPORT_HEADERS = {
     # A report is a page of its own: its scripts run, but cannot reach the studio.
@@ -33,17 +33,16 @@ REPORT_HEADERS = {
 }
 
 
-def view_kind(path: Path) -> str | None:
-    """Return which page shows a result: `surfaces`, `model` or `report`; None where it has none."""
-    if path.name == REPORT and path.is_file():
-        return "report"
-    if path.suffix == ".h5" and path.is_file():
-        return "model"
+def view_kinds(path: Path) -> list[str]:
+    """Return which pages show a result: `surfaces`, `model`, `report`; the first one is that of `/view/NUMBER/`."""
+    if path.is_file():
+        return ["report"] if path.name == REPORT else ["model"] if path.suffix == ".h5" else []
+    kinds: list[str] = []
     if (path / CorrespondenceRecord.FILE).is_file():
-        return "surfaces"
-    if (path / REPORT).is_file():
-        return "report"
-    return "model" if next(path.glob("*.fit.json"), None) is not None else None
+        kinds.append("surfaces")
+    elif next(path.glob("*.fit.json"), None) is not None:
+        kinds.append("model")
+    return [*kinds, "report"] if (path / REPORT).is_file() else kinds
 
 
 class Views:
@@ -66,10 +65,10 @@ class Views:
         """Answer one request of a page."""
         number, _, rest = get_route_path(scope).lstrip("/").partition("/")
         path = self.find.get(int(number)) if number.isdigit() and len(number) < 8 else None
-        kind = None if path is None else view_kind(path)
-        if path is None or kind is None:
+        kinds = [] if path is None else view_kinds(path)
+        if path is None or not kinds:
             await refusal(404, "There is no page of this result; reload the studio.")(scope, receive, send)
-        elif kind == "report":
+        elif "report" in kinds and (kinds[0] == "report" or rest == f"{REPORT_PAGE}/"):
             file = path if path.name == REPORT else path / REPORT
             await FileResponse(file, media_type="text/html", headers=REPORT_HEADERS)(scope, receive, send)
         else:

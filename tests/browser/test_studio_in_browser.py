@@ -1,0 +1,194 @@
+"""The studio as a new user meets it: from raw scans to a report by clicks alone, and the same numbers by history.sh."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+from pages import hear_signals
+from pictures import drawn_share, same_as_kept
+
+from shapespace.cli import main
+from shapespace.model.shape_model import ShapeModel
+
+WINDOW = {"width": 1440, "height": 900}
+MOST_CLICKS = 15
+
+
+@contextmanager
+def studio(project: Path | None, home: Path) -> Iterator[str]:
+    """Run `shapespace studio`, and yield its address."""
+    command = [sys.executable, "-m", "shapespace", "studio", *([str(project)] if project else []), "--no-open"]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, preexec_fn=hear_signals,
+        env={**os.environ, "XDG_STATE_HOME": str(home)},
+    )  # fmt: skip
+    try:
+        assert process.stdout is not None
+        yield process.stdout.readline().rpartition(" ")[2].strip()
+    finally:
+        process.terminate()
+        assert process.wait(30) in (0, -15, 143)
+        process.stdout.close()
+
+
+class User:
+    """Somebody who only clicks, and counts it."""
+
+    def __init__(self, tab) -> None:
+        self.tab, self.clicks = tab, 0
+
+    def click(self, testid: str) -> None:
+        self.clicks += 1
+        self.tab.page.get_by_test_id(testid).first.click()
+
+    def sees(self, testid: str, seconds: float = 60.0) -> None:
+        self.tab.page.get_by_test_id(testid).first.wait_for(timeout=1000 * seconds)
+
+    def has_run(self, number: int, seconds: float = 300.0) -> None:
+        state = f"document.querySelector('[data-testid=job-{number}]')?.classList.contains('done')"
+        self.tab.until(f"{state} === true", seconds)
+
+
+_DRAWN = (
+    "document.readyState === 'complete' && (document.body.dataset.ready === 'true' || "
+    "!!document.querySelector('h1 + *'))"
+)
+
+
+def framed(tab, seconds: float = 60.0) -> None:
+    """Wait until the page in the frame has drawn."""
+    end = time.monotonic() + seconds
+    while not any("/view/" in frame.url and frame.evaluate(_DRAWN) for frame in tab.page.frames[1:]):
+        assert time.monotonic() < end
+        tab.page.wait_for_timeout(100)
+    tab.page.wait_for_timeout(2000)
+
+
+@pytest.fixture(scope="module")
+def bones(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("bones")
+    assert main(["data", "bones", "-o", str(folder), "--count", "12", "--quiet"]) == 0
+    return folder
+
+
+def test_raw_scans_become_a_report_by_clicks_and_history_gives_the_same_numbers(
+    open_tab, bones: Path, tmp_path: Path
+) -> None:
+    project = tmp_path / "bones"
+    with studio(project, tmp_path) as address:
+        tab = open_tab(address, WINDOW)
+        user, began = User(tab), time.monotonic()
+        user.sees("drop-zone")
+        # What a drop does; the dialog of the system is not part of the page.
+        tab.page.get_by_test_id("choose-files-input").set_input_files(
+            [*sorted(bones.glob("*.ply")), bones / "bones.csv"]
+        )
+        tab.until("document.querySelectorAll('[data-testid^=card-] img').length === 12")
+        user.sees("counts")
+        tab.page.wait_for_timeout(300)
+        same_as_kept("studio-specimens.png", tab.shot("specimens"), width=1200)
+        user.click("next")
+        tab.page.get_by_test_id("option--vertices").fill("800")
+        user.click("run-correspond")
+        user.has_run(1)
+        framed(tab)
+        same_as_kept("studio-correspondence.png", tab.shot("correspondence"), width=1200)
+        user.click("next")
+        user.click("run-build")
+        user.has_run(2)
+        framed(tab)
+        assert drawn_share(tab.shot("model").read_bytes()) > 0.2
+        user.click("next")
+        user.click("question-compare")
+        user.click("term-group")
+        user.sees("checks")
+        user.click("run-compare")
+        user.has_run(3)
+        user.sees("sentences")
+        assert "Shape differs with group" in tab.page.get_by_test_id("sentences").inner_text()
+        framed(tab)
+        same_as_kept("studio-answer.png", tab.shot("answer"), width=1200)
+        seconds = time.monotonic() - began
+        assert user.clicks <= MOST_CLICKS
+        print(f"{user.clicks} clicks, {seconds:.0f} s from the drop to the report")
+        tab.page.get_by_test_id("tab-history").click()
+        user.sees("history")
+        assert "shapespace compare" in tab.page.get_by_test_id("history").inner_text()
+        assert tab.complaints == [] and tab.asked == []
+    again = tmp_path / "again"
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    subprocess.run(["sh", str(project / "history.sh"), str(again)], check=True, env={**os.environ, "PATH": path})
+    first, second = (ShapeModel.load(folder / "model-2.h5") for folder in (project, again))
+    assert np.array_equal(first.stddev, second.stddev) and np.array_equal(first.mean_vertices, second.mean_vertices)
+    answers = [json.loads((folder / "compare-3" / "analysis.json").read_text()) for folder in (project, again)]
+    for key in ("summary", "parts"):
+        assert answers[0][key] == answers[1][key]
+
+
+def test_what_was_dropped_edited_and_excluded_is_there_after_a_restart(open_tab, bones: Path, tmp_path: Path) -> None:
+    project = tmp_path / "p"
+    broken = tmp_path / "broken.ply"
+    broken.write_bytes(b"ply\nformat ascii 1.0\n")
+    with studio(project, tmp_path) as address:
+        tab = open_tab(address, WINDOW, "dark")
+        user = User(tab)
+        user.sees("drop-zone")
+        files = [*sorted(bones.glob("*.ply"))[:3], bones / "bones.csv", broken, bones / "bone_001.ply"]
+        tab.page.get_by_test_id("choose-files-input").set_input_files(files)
+        tab.until("document.querySelectorAll('[data-testid^=card-]').length === 4")
+        tab.until("document.querySelectorAll('[data-testid^=card-] img').length === 3")
+        user.sees("upload-notes")
+        assert "bone_001" in tab.page.get_by_test_id("upload-notes").inner_text()
+        tab.page.get_by_test_id("include-bone_002").click()
+        tab.page.get_by_test_id("undo").click()
+        tab.page.get_by_test_id("include-bone_000").click()
+        tab.page.get_by_test_id("layout-table").click()
+        tab.page.get_by_test_id("cell-bone_001-group").click()
+        tab.page.keyboard.type("hill")
+        tab.page.keyboard.press("Enter")
+        tab.until(
+            "document.querySelector('[data-testid=undo]') && !document.querySelector('[data-testid=undo]').disabled"
+        )
+        tab.shot("dark")
+        tab.page.wait_for_timeout(500)
+        assert tab.complaints == []
+    stored = {one["id"]: one for one in json.loads((project / "project.json").read_text())["specimens"]}
+    assert {name: one["included"] for name, one in stored.items()} == {
+        "bone_000": False, "bone_001": True, "bone_002": True, "broken": False,
+    }  # fmt: skip
+    assert stored["bone_001"]["cells"]["group"] == "hill"
+    with studio(project, tmp_path) as address:
+        tab = open_tab(address, WINDOW)
+        tab.until("document.querySelectorAll('[data-testid^=card-]').length === 4")
+
+
+def test_a_thousand_files_are_taken_and_the_page_stays_usable(open_tab, tmp_path: Path) -> None:
+    text = "v 0 0 0\nv {k} 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    files = []
+    for k in range(1, 201):
+        files.append(tmp_path / f"s{k:04d}.obj")
+        files[-1].write_text(text.format(k=k))
+    with studio(tmp_path / "p", tmp_path) as address:
+        tab = open_tab(address, WINDOW)
+        tab.until("document.querySelector('[data-testid=drop-zone]') !== null")
+        tab.page.get_by_test_id("choose-files-input").set_input_files(files)
+        tab.until("document.querySelector('[data-testid=specimens-summary]')?.innerText.startsWith('200 specimens')")
+        began = time.monotonic()
+        tab.page.get_by_test_id("tab-history").click()
+        tab.page.get_by_test_id("screen-history").wait_for()
+        assert time.monotonic() - began < 5
+        assert tab.complaints == []
+
+
+def test_a_guessed_token_opens_nothing(open_tab, tmp_path: Path) -> None:
+    with studio(tmp_path / "p", tmp_path) as address:
+        answer = httpx.get(address.partition("?")[0], params={"token": "guess"})
+        assert answer.status_code == 401 and "shapespace" in answer.json()["error"]
