@@ -38,6 +38,7 @@ PAGES = {
     "fit": ["fit-results.md", "scale.md", "landmarks.md", "dense.md", "uncertainty.md"],
     "report": ["report.md"],
     "view": ["viewer.md"],
+    "studio": ["studio.md"],
     "recognise train": ["recognise.md", "statistics.md"],
     "recognise predict": ["recognise.md"],
     "recognise transfer": ["recognise.md"],

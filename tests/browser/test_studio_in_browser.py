@@ -27,7 +27,7 @@ def studio(project: Path | None, home: Path) -> Iterator[str]:
     """Run `shapespace studio`, and yield its address."""
     command = [sys.executable, "-m", "shapespace", "studio", *([str(project)] if project else []), "--no-open"]
     process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, text=True, preexec_fn=hear_signals,
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=hear_signals,
         env={**os.environ, "XDG_STATE_HOME": str(home)},
     )  # fmt: skip
     try:
@@ -35,8 +35,8 @@ def studio(project: Path | None, home: Path) -> Iterator[str]:
         yield process.stdout.readline().rpartition(" ")[2].strip()
     finally:
         process.terminate()
-        assert process.wait(30) in (0, -15, 143)
-        process.stdout.close()
+        _, errors = process.communicate(timeout=30)
+        assert process.returncode in (0, -15, 143) and errors == ""
 
 
 class User:

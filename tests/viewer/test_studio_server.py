@@ -4,6 +4,7 @@ import subprocess
 import time
 import zipfile
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
@@ -92,6 +93,17 @@ def test_what_cannot_be_taken_is_refused_in_a_sentence(tmp_path: Path) -> None:
         for path in ("/files/../secret", "/files/%2e%2e/%2e%2e/etc/passwd", "/view/1/", "/zip/1", "/api/jobs/1/log"):
             assert 400 <= client.get(path).status_code < 500, path
         assert client.post("/api/edit", content=b"[" * 5000).status_code == 400
+
+
+def test_files_of_one_name_that_come_at_the_same_time_are_all_kept(tmp_path: Path) -> None:
+    with studio(tmp_path / "p") as client:
+        scans = [tetrahedron(tmp_path / f"t{k}.ply", 1.0 + k).read_bytes() for k in range(8)]
+        with ThreadPoolExecutor(8) as threads:
+            put = [threads.submit(client.put, "/api/specimens?name=scan.ply", content=scan) for scan in scans]
+        assert sorted(one.result().json()["id"] for one in put)[0] == "scan"
+        specimens = state(client)["specimens"]
+        assert len({one["id"] for one in specimens}) == len({one["file"] for one in specimens}) == 8
+        assert sorted((tmp_path / "p" / one["file"]).read_bytes() for one in specimens) == sorted(scans)
 
 
 def test_an_edit_of_an_old_state_is_a_conflict(tmp_path: Path) -> None:

@@ -98,7 +98,7 @@ def serve(
             scans = Scans(root, view.model, view.model_name, Limits(upload_bytes=max_upload_mb * 2**20))
             stack.callback(scans.close)
             app = make_app(view, scans, access, loopback=loopback, cookie_name=cookie_name)
-        _run(app, "viewer", access, host, listener, open_browser=open_browser, say=say)
+        _run(make_server(app), "viewer", access, host, listener, open_browser=open_browser, say=say)
 
 
 def serve_studio(
@@ -139,14 +139,16 @@ def serve_studio(
         listener = stack.enter_context(listen(host, port))
         port = int(listener.getsockname()[1])
         app = make_studio(studio, access, loopback=loopback, cookie_name=f"shapespace_{port}")
-        _run(app, "studio", access, host, listener, open_browser=open_browser, say=say)
+        server = make_server(app)
+        studio.ends = lambda: server.should_exit
+        _run(server, "studio", access, host, listener, open_browser=open_browser, say=say)
 
 
 def _run(
-    app: object, what: str, access: Access, host: str, listener: socket.socket, *, open_browser: bool,
+    server: uvicorn.Server, what: str, access: Access, host: str, listener: socket.socket, *, open_browser: bool,
     say: Callable[[str], None],
 ) -> None:  # fmt: skip
-    """Print the address of the application, open it in a browser, and serve it until Ctrl-C."""
+    """Print the address of the server, open it in a browser, and run it until Ctrl-C."""
     from shapespace.viewer.guard import LOOPBACK
 
     port = int(listener.getsockname()[1])
@@ -158,7 +160,7 @@ def _run(
         address = page_address(host, port, access.new_ticket())
         threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
     with contextlib.suppress(KeyboardInterrupt):
-        make_server(app).run(sockets=[listener])
+        server.run(sockets=[listener])
 
 
 def make_server(app: object) -> uvicorn.Server:

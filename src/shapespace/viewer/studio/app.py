@@ -6,7 +6,7 @@ import asyncio
 import json
 import threading
 import zipfile
-from collections.abc import AsyncGenerator, Generator, Mapping
+from collections.abc import AsyncGenerator, Callable, Generator, Mapping
 from contextlib import aclosing
 from pathlib import Path
 from typing import Any, cast
@@ -129,6 +129,7 @@ class Studio:
     """
 
     def __init__(self, forms: Forms, folder: Path | None, upload_bytes: int) -> None:
+        self.ends: Callable[[], bool] = lambda: False  # whether the server is about to end, and streams with it
         self._forms = forms
         self._upload_bytes = upload_bytes
         self._changes = 0
@@ -217,7 +218,7 @@ class Studio:
     async def _events(self, request: Request) -> Response:
         async def stream() -> AsyncGenerator[str]:
             sent = -1
-            while not await request.is_disconnected():
+            while not self.ends() and not await request.is_disconnected():
                 if sent != self._changes:
                     sent = self._changes
                     yield f"data: {json.dumps({'revision': sent})}\n\n"
@@ -260,11 +261,12 @@ class Studio:
         project = self._project.project
         limit = f"{name} is larger than the {self._upload_bytes / 2**20:g} MB that the studio takes."
         target = await run_in_threadpool(project.new_file, name)
-        with atomic_path(target) as path, path.open("wb") as file:
-            async with aclosing(body_pieces(request, self._upload_bytes, limit)) as pieces:
-                async for piece in pieces:
-                    file.write(piece)
-        added, same_as = await run_in_threadpool(project.add, target, role)
+        with project.removed_on_error(target):
+            with atomic_path(target) as path, path.open("wb") as file:
+                async with aclosing(body_pieces(request, self._upload_bytes, limit)) as pieces:
+                    async for piece in pieces:
+                        file.write(piece)
+            added, same_as = await run_in_threadpool(project.add, target, role)
         if same_as is not None:
             target.unlink(missing_ok=True)
         self._changed()

@@ -7,7 +7,8 @@ import json
 import re
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, ClassVar, Literal, cast
 
@@ -17,7 +18,7 @@ from msgspec.structs import replace
 from shapespace.cohort.classes import notes_on_classes
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.containers.json_files import read_json
-from shapespace.io.files import atomic_path, make_folder
+from shapespace.io.files import atomic_path, make_folder, write_error
 from shapespace.io.meshes.mesh_folders import mesh_files
 from shapespace.io.meshes.mesh_io import MESH_FILE_ENDINGS, stem_of
 from shapespace.io.tables.table_io import key_column, table_rows, table_text
@@ -208,14 +209,34 @@ class Project:
     # Scans
 
     def new_file(self, name: str) -> Path:
-        """Return a path in the project for a scan that is uploaded as `name`; no file has it yet."""
+        """Return the path of a new empty file in the project for a scan that is uploaded as `name`.
+
+        Raises:
+            FileError: it cannot be created.
+        """
         stem, ending = _stem(name), _ending(name)
-        taken = {path.name.casefold() for path in (self.folder / "scans").glob("*")}
-        number, chosen = 1, f"{stem}{ending}"
-        while chosen.casefold() in taken:
-            number += 1
-            chosen = f"{stem}-{number}{ending}"
-        return self.folder / "scans" / chosen
+        with self._lock:
+            taken = {path.name.casefold() for path in (self.folder / "scans").glob("*")}
+            number, chosen = 1, f"{stem}{ending}"
+            while chosen.casefold() in taken:
+                number += 1
+                chosen = f"{stem}-{number}{ending}"
+            path = make_folder(self.folder / "scans") / chosen
+            try:
+                path.touch()  # uploads at the same time, of files with one name, get names of their own
+            except OSError as error:
+                raise write_error(path, error) from error
+            return path
+
+    @staticmethod
+    @contextmanager
+    def removed_on_error(path: Path) -> Generator[None]:
+        """Remove a file of the project if the block fails."""
+        try:
+            yield
+        except BaseException:
+            path.unlink(missing_ok=True)
+            raise
 
     def add(self, file: Path, role: Role) -> tuple[str, str | None]:
         """Add a scan; return its id, and that of a specimen with the same file content, in which case it is not added.
@@ -263,9 +284,10 @@ class Project:
             target = file
             if copy:
                 target = self.new_file(file.name)
-                with atomic_path(target) as path:
+                with self.removed_on_error(target), atomic_path(target) as path:
                     shutil.copyfile(file, path)
-            _, same = self.add(target, role)
+            with self.removed_on_error(target) if copy else nullcontext():
+                _, same = self.add(target, role)
             if same is not None:
                 notes.append(f"{file.name} is the same file as {same}; it was not added again.")
                 if copy:
