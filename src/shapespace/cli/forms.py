@@ -32,7 +32,7 @@ _FILES = frozenset(
     {
         "--output", "--shapes", "--model", "--reference-shapes", "--table", "--labels", "--template", "--subjects",
         "--add", "--redo", "--remove", "--update", "--recursive", "--dask", "--executor", "--predictor", "--predict",
-        "--new-shapes", "--no-open", "--json", "--quiet", "--all", "--formula-file", "--groups", "--surfaces",
+        "--new-shapes", "--no-open", "--json", "--quiet", "--all", "--groups", "--surfaces",
     }
 )  # fmt: skip
 """Options that the studio sets itself, or that name files."""

@@ -74,7 +74,7 @@ Message: TypeAlias = Mapping[str, Any]
 
 def fit_upload(pipe: Connection, upload: Upload) -> None:
     """Fit `upload` and send the scan, each iterate and the verdict through `pipe`; runs in a worker process."""
-    _lower_priority()
+    lower_priority()
     from msgspec import structs
 
     from shapespace.batch.fit_records import write_record
@@ -182,7 +182,7 @@ def _with_display_name(sentence: str, upload: Upload) -> str:
     return re.sub(own_names, lambda _: upload.display_name, sentence)
 
 
-def _lower_priority() -> None:
+def lower_priority() -> None:
     """Prefer the server: for processor time, and as the process that survives when memory runs out."""
     if sys.platform != "win32":
         os.nice(5)

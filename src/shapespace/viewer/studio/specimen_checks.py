@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import os
-import sys
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from pathlib import Path
@@ -14,6 +12,7 @@ from typing import Any
 
 from shapespace.batch.workers import context
 from shapespace.errors import ShapespaceError
+from shapespace.viewer.fitting import lower_priority
 
 _FOLDER = "checks"
 _MOST_PROCESSES = 4
@@ -66,7 +65,7 @@ class SpecimenChecks:
         self._folder.mkdir(parents=True, exist_ok=True)
         if self._pool is None:
             processes = min(_MOST_PROCESSES, max(1, (os.cpu_count() or 2) - 1))
-            self._pool = ProcessPoolExecutor(processes, mp_context=context(), initializer=_lower_priority)
+            self._pool = ProcessPoolExecutor(processes, mp_context=context(), initializer=lower_priority)
 
         def done(future: Future[dict[str, Any]]) -> None:
             if future.cancelled():
@@ -122,9 +121,3 @@ def _key(scan: Path) -> str:
     except OSError:
         text = f"{scan}|missing"
     return hashlib.sha256(text.encode(errors="surrogateescape")).hexdigest()[:24]
-
-
-def _lower_priority() -> None:
-    if sys.platform != "win32":
-        with contextlib.suppress(OSError):
-            os.nice(5)
