@@ -45,7 +45,7 @@ OUTPUT = "<!-- output of the commands above -->"
 """Before a block whose lines the commands since the last Python block print, in this order."""
 OUTPUT_BUT_NUMBERS = "<!-- output of the commands above; numbers differ between processors -->"
 """Before such a block whose numbers are not compared, since processors round differently."""
-# The demo takes minutes, and viewer and studio run until they are stopped; all have tests of their own. Here they are parsed.
+# The demo takes minutes, viewer and studio run until they are stopped; all have tests. Here they are parsed.
 PARSED_ONLY = ("demo", "studio", "view")
 BESIDE = ("dask",)
 """Programs that go on while the commands after them run."""

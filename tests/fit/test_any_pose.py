@@ -186,3 +186,17 @@ def test_thinning_leaves_one_point_in_each_cell_that_has_any_and_no_lone_point_f
     assert 7 not in kept
     assert (np.diff(kept) > 0).all()
     assert len(np.unique(cells[kept], axis=0)) == len(kept) == len(np.unique(np.delete(cells, 7, axis=0), axis=0))
+
+
+@pytest.mark.parametrize(
+    ("points", "share", "is_part"), [(700, 1.0, False), (20_000, 1.0, False), (700, 0.4, True), (20_000, 0.4, True)]
+)
+def test_a_sparse_scan_is_no_part_and_a_part_is_one_however_dense(points: int, share: float, is_part: bool) -> None:
+    ball = 50.0 * sphere(2000)[0]
+    model = ShapeModel.fit([Mesh(ball * (1 + 0.1 * k * np.array([1.0, 0.5, 0.2]))) for k in range(4)], gauge="form")
+    directions = np.random.default_rng(0).standard_normal((points, 3))
+    scan = np.asarray(model.mean_vertices).std() * np.sqrt(3) * directions / np.linalg.norm(directions, axis=1)[:, None]
+    scan = scan[scan[:, 2] >= np.quantile(scan[:, 2], 1 - share)]
+    sides = any_pose._Sides.of(model, scan, False, 0)
+    starts = len(sides._placed(np.eye(3)[None])[0])
+    assert starts == (8 if is_part else 2)

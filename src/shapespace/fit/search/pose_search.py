@@ -292,8 +292,8 @@ class _Sides:
         translation = centre - rotations @ points.mean(axis=0)
         front_offset = np.quantile((self.scan[:1000] - centre) @ towards.T, 0.95, axis=0) - self.model.front
         translations = [translation, translation + front_offset[:, None] * towards]
-        # Cells that the points of sparse scans fill too, so that their count tells the area.
-        cell, size = 2 * _MODEL_CELL * self.model.size, self.model.size
+        # Cells of four spacings, nearly all of which the points of a sparse scan fill too: their count tells the area.
+        cell, size = 4 / 1.5 * float(self.slack[0]), self.model.size
         share = len(_evenly(self.scan, cell, size)) / len(_evenly(points, cell, size))
         if share < _PARTIAL:
             translations += [centre - rotations @ part for part in _parts(points, round(share * len(points)))]
