@@ -233,6 +233,7 @@ LONG = (
     "tutorial-faces.md",
     "tutorial-groups.md",
     "tutorial-identity.md",
+    "tutorial-landmarks.md",
     "tutorial-recognition.md",
     "tutorial-spleens.md",
     "tutorial-surfaces-and-landmarks.md",

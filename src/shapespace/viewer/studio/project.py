@@ -333,10 +333,14 @@ def change_of(request: Mapping[str, Any]) -> Callable[[State], tuple[str, State]
         InputError: by the edit, where a specimen or column does not exist, or a name cannot be used.
     """
     what = str(request.get("what", ""))
+    edits = {
+        "cells": _cells, "include": _include, "set": _set, "remove": _remove, "rename": _rename,
+        "add-column": _add_column, "remove-column": _remove_column, "landmarks": _landmarks,
+    }  # fmt: skip
 
     def change(state: State) -> tuple[str, State]:
         try:
-            return _EDITS[what](state, request)
+            return edits[what](state, request)
         except InputError:
             raise
         except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -405,12 +409,6 @@ def _landmarks(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
     if "" in landmarks or min(landmarks.values(), default=0) < 0:
         raise InputError("A landmark needs a name and a vertex.")
     return "change the landmarks", replace(state, landmarks=landmarks, landmarks_on=str(request.get("on", "")))
-
-
-_EDITS: Mapping[str, Callable[[State, Mapping[str, Any]], tuple[str, State]]] = {
-    "cells": _cells, "include": _include, "set": _set, "remove": _remove, "rename": _rename,
-    "add-column": _add_column, "remove-column": _remove_column, "landmarks": _landmarks,
-}  # fmt: skip
 
 
 def join_table(content: bytes) -> Callable[[State], tuple[str, State]]:
