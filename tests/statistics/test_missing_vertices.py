@@ -55,7 +55,7 @@ def test_information_is_the_ratio_of_variances_of_the_estimate() -> None:
         for at, c in enumerate(np.column_stack([np.zeros(2), contrasts])):
             ratio = (c @ np.linalg.inv(X.T @ X) @ c) / (c @ np.linalg.inv(own.T @ own) @ c)
             assert abs(found[at, vertex] - ratio) < 1e-9
-    assert (found[:, 70] == 1).all() and found[0, 0] < 0.5
+    assert np.allclose(found[:, 70], 1, rtol=0, atol=1e-12) and found[0, 0] < 0.5  # processors round differently
 
 
 def test_no_information_is_where_a_group_observes_nothing() -> None:

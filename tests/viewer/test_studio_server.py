@@ -15,6 +15,7 @@ import pytest
 from test_studio_project import tetrahedron
 from viewer_world import enter, sentence, served
 
+from shapespace.cli.command_table import summaries_and_options
 from shapespace.cli.forms import forms
 from shapespace.errors import FileError
 from shapespace.viewer.guard import Access
@@ -22,10 +23,12 @@ from shapespace.viewer.studio import run_job
 from shapespace.viewer.studio.app import Studio, make_studio
 from shapespace.viewer.studio.jobs import Jobs
 
+FORMS = forms(summaries_and_options())
+
 
 @contextmanager
 def studio(folder: Path | None, upload_bytes: int = 10**6) -> Iterator[httpx.Client]:
-    made, access = Studio(forms(), folder, upload_bytes), Access()
+    made, access = Studio(FORMS, folder, upload_bytes), Access()
     try:
         with served(make_studio(made, access)) as address, httpx.Client(base_url=address, timeout=60) as client:
             enter(client, access)
@@ -137,7 +140,7 @@ def test_another_page_and_a_wrong_token_get_nothing(tmp_path: Path) -> None:
 
 def test_two_studios_cannot_write_into_one_project(tmp_path: Path) -> None:
     with studio(tmp_path / "p"), pytest.raises(FileError, match="is being written by another"):
-        Studio(forms(), tmp_path / "p", 1)
+        Studio(FORMS, tmp_path / "p", 1)
 
 
 def test_a_project_is_opened_from_the_page_and_is_among_the_recent_ones(tmp_path: Path) -> None:

@@ -633,6 +633,7 @@ COMMANDS: tuple[Command, ...] = (
             "and report.",
         ),
         json=False,
+        defaults={"commands": lambda: summaries_and_options()},
     ),
     Command(
         "landmarks transfer", "transfer landmarks from a few marked specimens to all scans in correspondence",
@@ -994,3 +995,8 @@ COMMANDS: tuple[Command, ...] = (
         ),
     ),
 )  # fmt: skip
+
+
+def summaries_and_options() -> dict[str, tuple[str, tuple[Option, ...]]]:
+    """Return name -> summary and options of all commands."""
+    return {command.name: (command.summary, command.options) for command in COMMANDS}

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
-from shapespace.cli.command_table import COMMANDS, Command
 from shapespace.cli.options import NO_DEFAULT, Option
 from shapespace.formats.registry import MODEL_FORMATS
 
@@ -38,26 +37,29 @@ _FILES = frozenset(
 """Options that the studio sets itself, or that name files."""
 
 
-def forms() -> dict[str, dict[str, Any]]:
-    """Return command -> its summary and the options of its form."""
-    commands = {command.name: command for command in COMMANDS}
-    made = {kind: _form(commands[_KINDS.get(kind, kind)], first) for kind, first in _FIRST.items()}
+def forms(commands: Mapping[str, tuple[str, Sequence[Option]]]) -> dict[str, dict[str, Any]]:
+    """Return kind -> the summary of its command, and the options of its form.
+
+    Args:
+        commands: name -> summary and options, of all commands.
+    """
+    made = {kind: _form(kind, *commands[_KINDS.get(kind, kind)], first) for kind, first in _FIRST.items()}
     to = made["convert"]["options"][0]
     made["convert"]["options"][0] = to | {"kind": "choice", "choices": list(MODEL_FORMATS)}
     return made
 
 
-def _form(command: Command, first: tuple[str, ...]) -> dict[str, Any]:
-    options = [
+def _form(kind: str, summary: str, options: Sequence[Option], first: tuple[str, ...]) -> dict[str, Any]:
+    offered = [
         option
-        for option in command.options
+        for option in options
         if not option.is_positional and not option.hidden and not _FILES & set(option.spellings)
-        and not (command.name == "score" and "--reference" in option.spellings)
+        and not (kind == "score" and "--reference" in option.spellings)
     ]  # fmt: skip
     order = {flag: place for place, flag in enumerate(first)}
-    described = [_described(option, visible=option.spellings[-1] in order) for option in options]
+    described = [_described(option, visible=option.spellings[-1] in order) for option in offered]
     described.sort(key=lambda one: order.get(one["flag"], len(order)))
-    return {"summary": command.summary, "options": described}
+    return {"summary": summary, "options": described}
 
 
 def _described(option: Option, *, visible: bool) -> dict[str, Any]:

@@ -602,7 +602,7 @@ def studio(arguments: argparse.Namespace) -> int:
     from shapespace.viewer.serve import serve_studio
 
     options = given(arguments, serve_studio)
-    serve_studio(arguments.project, forms(), **options, open_browser=not arguments.no_open, say=now)
+    serve_studio(arguments.project, forms(arguments.commands()), **options, open_browser=not arguments.no_open, say=now)
     return 0
 
 
