@@ -40,7 +40,7 @@ def studio(project: Path | None, home: Path) -> Iterator[str]:
 
 
 class User:
-    """Somebody who only clicks, and counts it."""
+    """A user who only clicks; the clicks are counted."""
 
     def __init__(self, tab) -> None:
         self.tab, self.clicks = tab, 0

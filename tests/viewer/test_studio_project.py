@@ -10,7 +10,7 @@ import pytest
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.types import Mesh
-from shapespace.viewer.studio.project import Project, StaleError, change_of, join_table
+from shapespace.viewer.studio.project import Project, StaleError, cells_of_table, change_of, with_cells
 
 
 def tetrahedron(path: Path, size: float) -> Path:
@@ -29,6 +29,10 @@ def project(tmp_path: Path) -> Project:
 
 def edit(project: Project, **request: object) -> None:
     project.edit(project.revision, change_of(request))
+
+
+def join_table(project: Project, content: bytes) -> None:
+    project.edit(None, with_cells(*cells_of_table(content, project.state)))
 
 
 def ids(project: Project) -> list[str]:
@@ -118,7 +122,7 @@ def test_a_folder_is_imported_by_reference_or_as_copies(project: Project, tmp_pa
 
 
 def test_a_table_is_joined_by_id_or_file_name_and_may_be_pasted(project: Project) -> None:
-    project.edit(None, join_table(b"file\tsex\tage\nanna.ply\tf\t12\nBEN\tm\t14\nnobody\tm\t1\n"))
+    join_table(project, b"file\tsex\tage\nanna.ply\tf\t12\nBEN\tm\t14\nnobody\tm\t1\n")
     assert project.state.columns == ("sex", "age")
     assert [one.cells for one in project.state.specimens] == [{"sex": "f", "age": "12"}, {"sex": "m", "age": "14"}, {}]
     for content, error in (
@@ -127,7 +131,7 @@ def test_a_table_is_joined_by_id_or_file_name_and_may_be_pasted(project: Project
         (b"", "table"),
     ):
         with pytest.raises((InputError, FileFormatError), match=error):
-            project.edit(None, join_table(content))
+            join_table(project, content)
 
 
 def test_classes_are_counted_and_likely_misspellings_named(project: Project) -> None:

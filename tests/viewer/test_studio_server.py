@@ -21,7 +21,7 @@ from shapespace.errors import FileError
 from shapespace.viewer.guard import Access
 from shapespace.viewer.studio import run_job
 from shapespace.viewer.studio.app import Studio, make_studio
-from shapespace.viewer.studio.jobs import Jobs
+from shapespace.viewer.studio.jobs import Jobs, Order
 
 FORMS = forms(summaries_and_options())
 
@@ -157,7 +157,7 @@ def test_a_project_is_opened_from_the_page_and_is_among_the_recent_ones(tmp_path
 
 
 def command(jobs: Jobs, *arguments: str) -> int:
-    return jobs.add("data", lambda number, before: (arguments, f"out-{number}")).number
+    return jobs.add("data", lambda number, before: Order(arguments, f"out-{number}")).number
 
 
 def wait_for(jobs: Jobs, number: int, *statuses: str) -> Any:

@@ -38,12 +38,15 @@ _FILES = frozenset(
 
 
 def forms(commands: Mapping[str, tuple[str, Sequence[Option]]]) -> dict[str, dict[str, Any]]:
-    """Return kind -> the summary of its command, and the options of its form.
+    """Return kind -> the words and the summary of its command, and the options of its form.
 
     Args:
         commands: name -> summary and options, of all commands.
     """
-    made = {kind: _form(kind, *commands[_KINDS.get(kind, kind)], first) for kind, first in _FIRST.items()}
+    made: dict[str, dict[str, Any]] = {}
+    for kind, first in _FIRST.items():
+        command = _KINDS.get(kind, kind)
+        made[kind] = {"command": tuple(command.split()), **_form(kind, *commands[command], first)}
     to = made["convert"]["options"][0]
     made["convert"]["options"][0] = to | {"kind": "choice", "choices": list(MODEL_FORMATS)}
     return made

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import secrets
 import shutil
 import tempfile
@@ -21,6 +20,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp
 
 from shapespace.errors import FileError
+from shapespace.io.containers.json_files import plain_json
 from shapespace.io.files import read_bytes
 from shapespace.io.landmarks.landmark_io import write_landmarks
 from shapespace.io.meshes.mesh_io import MESH_ENDINGS, read_mesh, write_mesh
@@ -258,18 +258,24 @@ class _Endpoints:
         return scan
 
     async def _json(self, request: Request) -> Mapping[str, Any]:
-        """Return the JSON object in the body of `request`."""
-        async with aclosing(
-            body_pieces(request, self._scans.limits.request_bytes, "The request is too long.")
-        ) as pieces:
-            body = b"".join([piece async for piece in pieces])
-        try:
-            content: object = json.loads(body)
-        except (ValueError, RecursionError):
-            content = None
-        if not isinstance(content, dict):
-            raise HTTPException(400, "The request is not a JSON object.")
-        return cast(Mapping[str, Any], content)
+        return await json_body(request, self._scans.limits.request_bytes)
+
+
+async def json_body(request: Request, max_bytes: int) -> Mapping[str, Any]:
+    """Return the JSON object in the body of `request`, and refuse anything else with 400 or 413."""
+    try:
+        content: object = plain_json(await whole_body(request, max_bytes, "The request is too long."))
+    except ValueError:
+        content = None
+    if not isinstance(content, dict):
+        raise HTTPException(400, "The request is not a JSON object.")
+    return cast(Mapping[str, Any], content)
+
+
+async def whole_body(request: Request, max_bytes: int, too_large: str) -> bytes:
+    """Return the body of `request`; arguments as of `body_pieces`."""
+    async with aclosing(body_pieces(request, max_bytes, too_large)) as pieces:
+        return b"".join([piece async for piece in pieces])
 
 
 async def body_pieces(request: Request, max_bytes: int, too_large: str) -> AsyncGenerator[bytes]:

@@ -18,7 +18,7 @@ from scipy.stats import chi2
 
 from shapespace.errors import FitError, InputError
 from shapespace.fit.completion.mirror import add_mirror_image
-from shapespace.fit.completion.shape_posterior import REPLICATES, ShapePosterior, shape_posterior
+from shapespace.fit.completion.shape_posterior import AS_LIKELY, REPLICATES, ShapePosterior, shape_posterior
 from shapespace.fit.dense.dense_fit import dense_surface
 from shapespace.fit.diagnostics.reason_text import sentence_of
 from shapespace.fit.diagnostics.reasons import Reason, ReasonCode
@@ -48,8 +48,7 @@ _FEWEST_SHAPES = 5  # training shapes; fewer determine no covariance
 _SURE, _STANDS_OUT = 0.9, 0.8
 """Share of the vertices from which on a fit without doubts is in the only likely pose; the same from half of it on, if
 the score of its start relative to that of other poses is below the second number, as in the choice of the unit."""
-_AS_LIKELY, _OTHER_POSE = 3.0, 0.1
-"""Log density (a factor of 20) within which another pose is as likely, and share of the size by which it differs."""
+_OTHER_POSE = 0.1  # share of the size by which another pose differs
 _LEAST_OBSERVED = 0.1  # share of the vertices below which a completion would be the mean shape in an unknown pose
 _COMPLETE = 0.97  # share of the vertices from which on only the border of the scan is missing
 _ON_SCAN = 5.0  # multiple of the noise within which a refined vertex is on the scan
@@ -385,7 +384,7 @@ def _likeliest_pose(
     best = found[0]
     for density, _, vertices in found[1:]:
         apart_mm = float(np.sqrt(((vertices - best[2]) ** 2).sum(axis=1).mean()))
-        if density > best[0] - _AS_LIKELY and apart_mm > _OTHER_POSE * rms_size(model.mean_vertices):
+        if density > best[0] - AS_LIKELY and apart_mm > _OTHER_POSE * rms_size(model.mean_vertices):
             return best[1], apart_mm
     return best[1], None
 

@@ -42,7 +42,7 @@ _AMPLITUDE_STDDEV, _OF_UNKNOWN_MODEL = 1.0, 3.0
 second for models that do not state their number of shapes, whose spectrum does not predict the amplitude."""
 _RANGES = (0.4, 0.8, 1.6)
 """Shares of the model's size over which the residual modes are damped; a scan chooses among them."""
-_AS_LIKELY = 3.0  # log evidence (a factor of 20) within which the shortest range is taken, the least certain one
+AS_LIKELY = 3.0  # log density (a factor of 20) within which two explanations of a scan count as equally likely
 REPLICATES = 20  # simulated training sets; their mean varies by 3 % in the standard deviations
 _FLOOR = 1e-3  # variance outside the simulated modes along the model's own, in units of that of the residual modes
 
@@ -177,7 +177,9 @@ def _likeliest_range(
         start = free.iterate(Estimate(iterate.T_scan_model, np.pad(iterate.b, (0, len(prior) - POSE - len(iterate.b)))))
         starts.append((free, prior, start, _Linearised.of(free, matcher, start, hint, prior)))
     best = max(start[3].log_evidence for start in starts)
-    return next(start for start in starts if start[3].log_evidence > best - _AS_LIKELY)
+    return next(
+        start for start in starts if start[3].log_evidence > best - AS_LIKELY
+    )  # the shortest: it is the least certain
 
 
 def _with_residual_modes(problem: Problem, range_share: float) -> tuple[Problem, FloatArray]:

@@ -292,7 +292,7 @@ class _Sides:
         translation = centre - rotations @ points.mean(axis=0)
         front_offset = np.quantile((self.scan[:1000] - centre) @ towards.T, 0.95, axis=0) - self.model.front
         translations = [translation, translation + front_offset[:, None] * towards]
-        # Cells of four spacings, nearly all of which the points of a sparse scan fill too: their count tells the area.
+        # Points fill nearly all cells of four spacings, also of a sparse scan: their number tells the area.
         cell, size = 4 / 1.5 * float(self.slack[0]), self.model.size
         share = len(_evenly(self.scan, cell, size)) / len(_evenly(points, cell, size))
         if share < _PARTIAL:

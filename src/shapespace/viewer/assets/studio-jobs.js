@@ -213,7 +213,7 @@
     return html`<details class=${started ? "settings" : "settings first"} open=${!started} data-testid="settings"><summary>${J.settings}</summary>${children}</details>`;
   };
 
-  /** The jobs of `kinds` that are of interest beside their form: what runs, and the last one that ended. */
+  /** The jobs of `kinds` that are shown with their form: those that run or wait, and the last one that ended. */
   const Jobs = ({ kinds }) => {
     const all = Studio.jobsOf(kinds);
     const shown = all.filter(Studio.isActive);

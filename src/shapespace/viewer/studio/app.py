@@ -7,7 +7,8 @@ import json
 import threading
 import zipfile
 from collections.abc import AsyncGenerator, Callable, Generator, Mapping
-from contextlib import aclosing
+from contextlib import ExitStack, aclosing
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, cast
 
@@ -26,10 +27,18 @@ from shapespace.io.meshes.mesh_io import MESH_ENDINGS, MESH_FILE_ENDINGS
 from shapespace.version import __version__
 from shapespace.viewer.guard import Access, Guard, refusal
 from shapespace.viewer.responses import PAGES, application, asset, json_response
-from shapespace.viewer.server import body_pieces, display_name
-from shapespace.viewer.studio.job_commands import CORRESPONDENCES, QUESTIONS, Forms, checks, order, result_of
-from shapespace.viewer.studio.jobs import Job, Jobs, history, write_history
-from shapespace.viewer.studio.project import Project, Role, StaleError, change_of, join_table, recent_projects
+from shapespace.viewer.server import body_pieces, display_name, json_body, whole_body
+from shapespace.viewer.studio.job_commands import QUESTIONS, Forms, checks, order, shapes_of
+from shapespace.viewer.studio.jobs import Job, Jobs, Order, history
+from shapespace.viewer.studio.project import (
+    Project,
+    Role,
+    StaleError,
+    cells_of_table,
+    change_of,
+    recent_projects,
+    with_cells,
+)
 from shapespace.viewer.studio.specimen_checks import SpecimenChecks
 from shapespace.viewer.studio.views import REPORT_PAGE, Views, result_path, view_kinds
 
@@ -48,21 +57,24 @@ class OpenProject:
         upload_bytes: size limit of a scan.
     """
 
-    def __init__(self, folder: Path, *, create: bool, changed: Any, upload_bytes: int) -> None:
+    def __init__(self, folder: Path, *, create: bool, changed: Callable[[], None], upload_bytes: int) -> None:
         self.project = Project.open(folder, create=create)
-        self._writer = only_writer(self.project.folder)
-        self._writer.__enter__()
+        self._resources = ExitStack()
+        self._resources.enter_context(only_writer(self.project.folder))
         self.jobs = Jobs(self.project.folder, changed)
         self.checks = SpecimenChecks(self.project.folder, changed, self._exclude)
-        self.views = Views(upload_bytes)
-        self._ended: set[int] = set()
+        self.views = Views(self._result, upload_bytes)
+        for resource in (self.views, self.checks, self.jobs):
+            self._resources.callback(resource.close)
 
     def close(self) -> None:
         """Let go of the project; a running job goes on."""
-        self.jobs.close()
-        self.checks.close()
-        self.views.close()
-        self._writer.__exit__(None, None, None)
+        self._resources.close()
+
+    def _result(self, number: int) -> Path | None:
+        """Return the path of the result of a job; None where it has none."""
+        job = next((one for one in self.jobs.all() if one.number == number and one.status == "done"), None)
+        return None if job is None else result_path(self.project.folder, job.output)
 
     def _exclude(self, scan: Path) -> None:
         """Exclude a scan that cannot be used; the user can include it again."""
@@ -73,12 +85,6 @@ class OpenProject:
     def facts(self) -> dict[str, Any]:
         """Return the state for the page."""
         project, state = self.project, self.project.state
-        jobs = self.jobs.all()
-        ended = {job.number for job in jobs if job.status == "done"}
-        if ended != self._ended:
-            self._ended = ended
-            write_history(project.folder, jobs)
-        self.views.find = {job.number: result_path(project.folder, job.output) for job in jobs if job.status == "done"}
         specimens: list[dict[str, Any]] = []
         for one in state.specimens:
             facts = self.checks.facts(project.path(one)) or {"state": "waiting", "vertices": 0, "triangles": 0,
@@ -89,34 +95,43 @@ class OpenProject:
             "name": state.name, "folder": str(project.folder), "revision": project.revision,
             "columns": list(state.columns), "specimens": specimens, "notes": state.notes(), "counts": state.counts(),
             "undo": project.undo_text, "redo": project.redo_text, "landmarks": state.landmarks,
-            "jobs": [self._job(job) for job in jobs],
+            "jobs": [self._job(job) for job in self.jobs.all()],
         }  # fmt: skip
 
     def _job(self, job: Job) -> dict[str, Any]:
         progress = self.jobs.progress(job) if job.status == "running" else None
         left_s = None if progress is None else progress.pop("left_s")
-        path = result_path(self.project.folder, job.output)
-        kinds = view_kinds(path) if job.status == "done" else []
+        path = self._result(job.number)
+        kinds = [] if path is None else view_kinds(path)
         page = f"/view/{job.number}/"
         pages = [page, *(f"{page}{REPORT_PAGE}/" for _ in kinds[1:])]
-        words = _words(path)
+        sentences, methods = ([], None) if path is None else _words(path)
         return {
             "number": job.number, "kind": job.kind, "command": job.command, "status": job.status,
             "message": job.message, "progress": progress, "seconds": self.jobs.running_for(job), "left_s": left_s,
             "output": job.output,
-            "views": [{"kind": kind, "href": href} for kind, href in zip(kinds, pages, strict=False)], **words,
+            "views": [{"kind": kind, "href": href} for kind, href in zip(kinds, pages, strict=False)],
+            "sentences": sentences, "methods": methods,
         }  # fmt: skip
 
 
-def _words(folder: Path) -> dict[str, Any]:
-    """Return the sentences and the methods paragraph of an analysis."""
-    words: dict[str, Any] = {"sentences": [], "methods": None}
+def _words(folder: Path) -> tuple[list[str], str | None]:
+    """Return the sentences and the methods paragraph of an analysis; none where the result is no analysis."""
+    analysis = folder / "analysis.json"
+    return _read_words(analysis, analysis.stat().st_mtime_ns) if analysis.is_file() else ([], None)
+
+
+@lru_cache(maxsize=256)
+def _read_words(analysis: Path, modified_ns: int) -> tuple[list[str], str | None]:
+    """Return the words of the analysis that was written at a time; the page asks for them again and again."""
     try:
-        words["sentences"] = list(plain_json((folder / "analysis.json").read_bytes()).get("summary", []))
-        words["methods"] = (folder / "methods.txt").read_text(encoding="utf-8")
+        sentences = list(plain_json(analysis.read_bytes()).get("summary", []))
     except (OSError, ValueError, AttributeError):
-        pass  # a report without an analysis
-    return words
+        return [], None
+    try:
+        return sentences, (analysis.parent / "methods.txt").read_text(encoding="utf-8")
+    except (OSError, ValueError):
+        return sentences, None
 
 
 class Studio:
@@ -227,7 +242,7 @@ class Studio:
         return StreamingResponse(stream(), media_type="text/event-stream")
 
     async def _open_project(self, request: Request) -> Response:
-        content = await _json(request)
+        content = await json_body(request, _REQUEST_BYTES)
         folder = _place(content.get("folder"))
         await run_in_threadpool(self._switch, folder, create=bool(content.get("create")))
         return json_response({})
@@ -261,19 +276,16 @@ class Studio:
         project = self._project.project
         limit = f"{name} is larger than the {self._upload_bytes / 2**20:g} MB that the studio takes."
         target = await run_in_threadpool(project.new_file, name)
-        with project.removed_on_error(target):
-            with atomic_path(target) as path, path.open("wb") as file:
-                async with aclosing(body_pieces(request, self._upload_bytes, limit)) as pieces:
-                    async for piece in pieces:
-                        file.write(piece)
-            added, same_as = await run_in_threadpool(project.add, target, role)
-        if same_as is not None:
-            target.unlink(missing_ok=True)
+        with project.removed_on_error(target), atomic_path(target) as path, path.open("wb") as file:
+            async with aclosing(body_pieces(request, self._upload_bytes, limit)) as pieces:
+                async for piece in pieces:
+                    file.write(piece)
+        added, same_as = await run_in_threadpool(project.add_stored, target, role)
         self._changed()
         return json_response({"id": added, "same_as": same_as}, 201)
 
     async def _take_files(self, request: Request) -> Response:
-        content = await _json(request)
+        content = await json_body(request, _REQUEST_BYTES)
         place, role, copy = _place(content.get("path")), _role(content.get("set")), bool(content.get("copy"))
         added, left_out = await run_in_threadpool(self._project.project.import_files, place, role, copy=copy)
         self._changed()
@@ -288,18 +300,18 @@ class Studio:
         raise HTTPException(404, "There is no picture of this specimen.")
 
     async def _edit(self, request: Request) -> Response:
-        content = await _json(request)
+        content = await json_body(request, _REQUEST_BYTES)
         return self._edited(lambda: self._project.project.edit(_revision(content), change_of(content)))
 
     async def _undo(self, request: Request) -> Response:
-        content = await _json(request)
+        content = await json_body(request, _REQUEST_BYTES)
         return self._edited(lambda: self._project.project.undo(_revision(content)))
 
     async def _redo(self, request: Request) -> Response:
-        content = await _json(request)
+        content = await json_body(request, _REQUEST_BYTES)
         return self._edited(lambda: self._project.project.redo(_revision(content)))
 
-    def _edited(self, edit: Any) -> Response:
+    def _edited(self, edit: Callable[[], None]) -> Response:
         try:
             edit()
         except StaleError as error:
@@ -308,39 +320,35 @@ class Studio:
         return json_response({"revision": self._project.project.revision})
 
     async def _table(self, request: Request) -> Response:
-        async with aclosing(body_pieces(request, _TABLE_BYTES, "The table is too large.")) as pieces:
-            content = b"".join([piece async for piece in pieces])
+        content = await whole_body(request, _TABLE_BYTES, "The table is too large.")
         project = self._project.project
-        await run_in_threadpool(project.edit, None, join_table(content))
+        columns, cells = await run_in_threadpool(cells_of_table, content, project.state)
+        await run_in_threadpool(project.edit, None, with_cells(columns, cells))
         self._changed()
-        return json_response({"matched": int((project.undo_text or "0 0").split()[-2]), "notes": project.state.notes()})
+        return json_response({"matched": len(cells), "notes": project.state.notes()})
 
     # Jobs
 
     async def _add_job(self, request: Request) -> Response:
-        content = await _json(request)
+        content = await json_body(request, _REQUEST_BYTES)
         kind, options, on = str(content.get("kind", "")), content.get("options"), content.get("on")
         if not isinstance(options, dict) or not (on is None or isinstance(on, int)):
             raise HTTPException(400, "A job needs options, and perhaps the number of another.")
         opened = self._project
 
-        def make(number: int, before: list[Job]) -> tuple[tuple[str, ...], str]:
-            made = order(opened.project, before, self._forms, kind, cast(dict[str, Any], options), on, number)
-            return made.arguments, made.output
+        def make(number: int, before: list[Job]) -> Order:
+            return order(opened.project, before, self._forms, kind, cast(dict[str, Any], options), on, number)
 
         job = await run_in_threadpool(opened.jobs.add, kind, make)
         return json_response({"number": job.number}, 201)
 
     async def _check(self, request: Request) -> Response:
-        content = await _json(request)
+        content = await json_body(request, _REQUEST_BYTES)
         kind, options, on = str(content.get("kind", "")), content.get("options"), content.get("on")
         opened, shapes = self._project, None
-        kinds = (
-            ("fit",) if kind in ("score", "identify") else CORRESPONDENCES if on is None else (*CORRESPONDENCES, "fit")
-        )
         if kind in QUESTIONS:
             try:
-                shapes = result_of(opened.jobs.all(), kinds, on)
+                shapes = shapes_of(opened.jobs.all(), kind, on)
             except InputError as error:
                 return json_response([{"level": "problem", "text": str(error)}])
         given = cast(dict[str, Any], options) if isinstance(options, dict) else {}
@@ -423,18 +431,6 @@ def _zipped(folder: Path, paths: list[Path]) -> Generator[bytes]:
                     to.write(piece)
                     yield pieces.take()
     yield pieces.take()
-
-
-async def _json(request: Request) -> Mapping[str, Any]:
-    async with aclosing(body_pieces(request, _REQUEST_BYTES, "The request is too long.")) as pieces:
-        body = b"".join([piece async for piece in pieces])
-    try:
-        content = plain_json(body)
-    except (ValueError, RecursionError):
-        content = None
-    if not isinstance(content, dict):
-        raise HTTPException(400, "The request is not a JSON object.")
-    return cast(Mapping[str, Any], content)
 
 
 def _revision(content: Mapping[str, Any]) -> int:

@@ -3,34 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from shapespace.errors import InputError
-from shapespace.viewer.studio.jobs import Job
+from shapespace.viewer.studio.jobs import Job, Order
 from shapespace.viewer.studio.project import Project, Specimen
 
 Forms = Mapping[str, Mapping[str, Any]]
-"""Kind -> `summary` and `options`, each with `flag`, `help`, `kind`, `choices`, `initial`, `visible` and `required`."""
+"""Kind -> `command` (its words), `summary`, and `options`, each with `flag`, `help`, `kind`, `choices`, `initial`,
+`visible` and `required`."""
 
-WORDS: Mapping[str, tuple[str, ...]] = {"identify": ("recognise", "identify"), "redo": ("correspond",)}
-"""Kinds whose command has another name."""
 QUESTIONS = ("compare", "change", "asymmetry", "regress", "score", "identify", "morphospace")
 CORRESPONDENCES = ("correspond", "redo")
 _INPUTS = "inputs"
-
-
-@dataclass(frozen=True)
-class Order:
-    """A command to be run.
-
-    Args:
-        arguments: after `shapespace`, relative to the project's folder.
-        output: what it writes, relative to the folder.
-    """
-
-    arguments: tuple[str, ...]
-    output: str
 
 
 def order(
@@ -52,7 +37,7 @@ def order(
         InputError: it cannot be run: no such kind or option, or a result or specimens are missing.
         FileError: the files cannot be written.
     """
-    words = (*WORDS.get(kind, (kind,)),)
+    words = forms.get("correspond" if kind == "redo" else kind, {}).get("command", ())
     given = [] if kind == "redo" else _given(forms, kind, options)
     folder, stem = project.folder, f"{_INPUTS}/{number:04d}"
     state, listed = project.state, f"{stem}.csv"
@@ -98,7 +83,7 @@ def order(
         return Order((*words, result_of(jobs, ("fit",), on).output, "--all", "-o", output, *given), output)
     if kind not in QUESTIONS:
         raise InputError(f"There is no action {kind[:30]!r}; reload the page.")
-    return _question(project, jobs, kind, (*words,), given, on, number)
+    return _question(project, jobs, kind, words, given, on, number)
 
 
 def _question(
@@ -106,20 +91,30 @@ def _question(
     number: int,
 ) -> Order:  # fmt: skip
     stem, output, state = f"{_INPUTS}/{number:04d}", f"{kind}-{number}", project.state
+    shapes = shapes_of(jobs, kind, on)
     if kind == "score":
-        fits, reference = result_of(jobs, ("fit",), on), result_of(jobs, CORRESPONDENCES, None)
+        reference = result_of(jobs, CORRESPONDENCES, None)
         project.write_table(project.folder / f"{stem}.csv", _some(state.chosen("new"), "to score", 1))
         project.write_table(project.folder / f"{stem}-reference.csv", _some(state.chosen("training"), "to compare", 2))
         return Order(
-            (*words, f"{stem}.csv", "--shapes", fits.output, "--surfaces", "fitted", "--reference",
+            (*words, f"{stem}.csv", "--shapes", shapes.output, "--surfaces", "fitted", "--reference",
              f"{stem}-reference.csv", "--reference-shapes", reference.output, "-o", output, *given),
             output,
         )  # fmt: skip
-    kinds = ("fit",) if kind == "identify" else (*CORRESPONDENCES, "fit")
-    shapes = result_of(jobs, CORRESPONDENCES if on is None and kind != "identify" else kinds, on)
     role = "new" if shapes.kind == "fit" else "training"
     project.write_table(project.folder / f"{stem}.csv", _some(state.chosen(role), "to analyse", 2))
     return Order((*words, f"{stem}.csv", "--shapes", shapes.output, "-o", output, *given), output)
+
+
+def shapes_of(jobs: Sequence[Job], kind: str, on: int | None) -> Job:
+    """Return the job whose shapes a question is about: fits, or surfaces in correspondence where they are not chosen.
+
+    Raises:
+        InputError: there is none.
+    """
+    if kind in ("score", "identify"):
+        return result_of(jobs, ("fit",), on)
+    return result_of(jobs, CORRESPONDENCES if on is None else (*CORRESPONDENCES, "fit"), on)
 
 
 def result_of(jobs: Sequence[Job], kinds: Sequence[str], on: int | None) -> Job:
@@ -140,8 +135,8 @@ def result_of(jobs: Sequence[Job], kinds: Sequence[str], on: int | None) -> Job:
 def checks(
     project: Project, forms: Forms, kind: str, options: Mapping[str, Any], shapes: Job | None
 ) -> list[dict[str, str]]:
-    """Return what can be said before a question is run: a level (`ok`, `warning`, `problem`) and a sentence each."""
-    role = "new" if kind in ("score", "identify") or (shapes is not None and shapes.kind == "fit") else "training"
+    """Return findings on a question before it is run: a level (`ok`, `warning`, `problem`) and a sentence each."""
+    role = "new" if shapes is not None and shapes.kind == "fit" else "training"
     chosen = project.state.chosen(role)
     enough = len(chosen) >= (1 if kind == "score" else 2)
     take = "specimen takes" if len(chosen) == 1 else "specimens take"

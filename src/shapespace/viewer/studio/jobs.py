@@ -1,4 +1,4 @@
-"""The jobs of a project: commands that run one after the other in processes of their own, and what came of them."""
+"""The jobs of a project: commands that run one after the other in processes of their own, and their results."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import shlex
 import threading
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,7 +16,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from shapespace.errors import FileError, InputError
-from shapespace.io.files import atomic_path, make_folder
+from shapespace.io.files import make_folder, write_text
 from shapespace.schemas import json_text, read
 from shapespace.viewer.studio.run_job import CANCEL, EXIT, JOB, LOG, PROGRESS, is_running, start
 
@@ -30,7 +31,7 @@ _NO_MESSAGE = "It ended without a message; look at its log."
 
 
 class Job(Struct, frozen=True, kw_only=True):
-    """A command of a project; `job.json` contains all but its status, which the files of its process tell.
+    """A command of a project; `job.json` contains all but its status, which follows from the files of its process.
 
     Args:
         number: from 1.
@@ -60,6 +61,19 @@ class Job(Struct, frozen=True, kw_only=True):
         return shlex.join(["shapespace", *self.arguments])
 
 
+@dataclass(frozen=True)
+class Order:
+    """A command to be run.
+
+    Args:
+        arguments: after `shapespace`, relative to the project's folder.
+        output: what it writes, relative to the folder.
+    """
+
+    arguments: tuple[str, ...]
+    output: str
+
+
 class Jobs:
     """The owner of the jobs of a project. A thread starts the next one when none runs.
 
@@ -80,6 +94,7 @@ class Jobs:
             with contextlib.suppress(OSError, ValueError):
                 job = read(Job, json.loads(path.read_text(encoding="utf-8")), str(path), "remove it")
                 self._jobs[job.number] = self._looked_at(job)
+        self._write_history()
         self._thread = threading.Thread(target=self._work, name="studio jobs", daemon=True)
         self._thread.start()
 
@@ -99,17 +114,17 @@ class Jobs:
                 raise InputError(f"There is no job {number}; reload the page.")
             return self._jobs[number]
 
-    def add(self, kind: str, make: Callable[[int, list[Job]], tuple[tuple[str, ...], str]]) -> Job:
+    def add(self, kind: str, make: Callable[[int, list[Job]], Order]) -> Job:
         """Add a job.
 
         Args:
             kind: what it does.
-            make: returns its arguments and its output, given its number and the jobs before.
+            make: returns its command, given its number and the jobs before.
         """
         with self._lock:
             number = max(self._jobs, default=0) + 1
-            arguments, output = make(number, self.all())
-            job = Job(number=number, kind=kind, arguments=arguments, output=output)
+            made = make(number, self.all())
+            job = Job(number=number, kind=kind, arguments=made.arguments, output=made.output)
             make_folder(self.folder_of(job))
             self._put(job)
             return job
@@ -170,8 +185,7 @@ class Jobs:
 
     def _put(self, job: Job) -> None:
         stored = replace(job, status="waiting", message="", code=None, seconds=0.0)
-        with atomic_path(self.folder_of(job) / JOB) as path:
-            path.write_text(json_text(stored), encoding="utf-8")
+        write_text(self.folder_of(job) / JOB, json_text(stored))
         self._jobs[job.number] = job
         self._changed()
 
@@ -200,7 +214,14 @@ class Jobs:
         if job != self._jobs[job.number] or stamp != self._seen_progress:
             self._seen_progress = stamp
             self._jobs[job.number] = job
+            if job.status == "done":
+                self._write_history()
             self._changed()
+
+    def _write_history(self) -> None:
+        """Write `history.sh` into the project's folder; a full disk does not keep a job from ending."""
+        with contextlib.suppress(FileError):
+            write_text(self._folder.parent / "history.sh", history(self.all()))
 
     def _progress_stamp(self, job: Job) -> int:
         try:
@@ -209,8 +230,8 @@ class Jobs:
             return 0
 
     def _looked_at(self, job: Job) -> Job:
-        """Return a job with the status that the files of its process tell."""
-        folder = self._folder / f"{job.number:04d}"
+        """Return a job with the status that follows from the files of its process."""
+        folder = self.folder_of(job)
         if not job.wanted:
             return job if job.status in _ENDED else replace(job, status="cancelled")
         ended = self._exit(folder)
@@ -243,8 +264,8 @@ class Jobs:
         except OSError:
             return _NO_MESSAGE
         lines = [line.strip() for line in content.splitlines() if line.strip()]
-        told = [line for line in lines if not line.startswith("next: ")]  # the page itself shows what comes next
-        return told[-1].removeprefix("shapespace: ") if told else _NO_MESSAGE
+        messages = [line for line in lines if not line.startswith("next: ")]  # the page itself shows what comes next
+        return messages[-1].removeprefix("shapespace: ") if messages else _NO_MESSAGE
 
 
 def _modified(path: Path) -> float:
@@ -270,9 +291,3 @@ def history(jobs: list[Job]) -> str:
                      for word in job.arguments]  # fmt: skip
             lines.append(" ".join(["run", "shapespace", *words]))
     return "\n".join(lines) + "\n"
-
-
-def write_history(folder: Path, jobs: list[Job]) -> None:
-    """Write `history.sh` into the project's folder; a full disk does not keep a job from ending."""
-    with contextlib.suppress(FileError), atomic_path(folder / "history.sh") as path:
-        path.write_text(history(jobs), encoding="utf-8", newline="\n")

@@ -8,7 +8,8 @@ import re
 import threading
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 from typing import Any, ClassVar, Literal, cast
 
@@ -18,7 +19,7 @@ from msgspec.structs import replace
 from shapespace.cohort.classes import notes_on_classes
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.containers.json_files import read_json
-from shapespace.io.files import atomic_path, make_folder, write_error
+from shapespace.io.files import atomic_path, make_folder, write_error, write_text
 from shapespace.io.meshes.mesh_folders import mesh_files
 from shapespace.io.meshes.mesh_io import MESH_FILE_ENDINGS, stem_of
 from shapespace.io.tables.table_io import key_column, table_rows, table_text
@@ -203,8 +204,7 @@ class Project:
         self.revision += 1
 
     def _write(self) -> None:
-        with atomic_path(self.folder / self.FILE) as path:
-            path.write_text(json_text(self.state), encoding="utf-8")
+        write_text(self.folder / self.FILE, json_text(self.state))
 
     # Scans
 
@@ -217,11 +217,7 @@ class Project:
         stem, ending = _stem(name), _ending(name)
         with self._lock:
             taken = {path.name.casefold() for path in (self.folder / "scans").glob("*")}
-            number, chosen = 1, f"{stem}{ending}"
-            while chosen.casefold() in taken:
-                number += 1
-                chosen = f"{stem}-{number}{ending}"
-            path = make_folder(self.folder / "scans") / chosen
+            path = make_folder(self.folder / "scans") / _free_name(stem, taken, ending)
             try:
                 path.touch()  # uploads at the same time, of files with one name, get names of their own
             except OSError as error:
@@ -254,11 +250,7 @@ class Project:
             except OSError as error:
                 raise FileError(f"Cannot read {file}: {error.strerror or error}.") from error
             taken = {one.id.casefold() for one in self.state.specimens}
-            stem = _stem(file.name)
-            number, name = 1, stem
-            while name.casefold() in taken:
-                number += 1
-                name = f"{stem}-{number}"
+            name = _free_name(_stem(file.name), taken)
             inside = file.is_relative_to(self.folder)
             place = file.relative_to(self.folder).as_posix() if inside else str(file)
             specimen = Specimen(id=name, file=place, role=role)
@@ -268,6 +260,14 @@ class Project:
                 together="add specimens",
             )
             return name, None
+
+    def add_stored(self, file: Path, role: Role) -> tuple[str, str | None]:
+        """Add a scan in the project's folder, as `add` does; its file is removed where the scan is not added."""
+        with self.removed_on_error(file):
+            name, same = self.add(file, role)
+        if same is not None:
+            file.unlink(missing_ok=True)
+        return name, same
 
     def import_files(self, place: Path, role: Role, *, copy: bool) -> tuple[int, list[str]]:
         """Add a scan or the scans of a folder on this machine; return how many, and sentences on what was not added.
@@ -286,12 +286,9 @@ class Project:
                 target = self.new_file(file.name)
                 with self.removed_on_error(target), atomic_path(target) as path:
                     shutil.copyfile(file, path)
-            with self.removed_on_error(target) if copy else nullcontext():
-                _, same = self.add(target, role)
+            _, same = self.add_stored(target, role) if copy else self.add(target, role)
             if same is not None:
                 notes.append(f"{file.name} is the same file as {same}; it was not added again.")
-                if copy:
-                    target.unlink(missing_ok=True)
             added += same is None
         return added, notes
 
@@ -318,8 +315,7 @@ class Project:
 
     def _write_table(self, path: Path, header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
         make_folder(path.parent)
-        with atomic_path(path) as temporary:
-            temporary.write_text(table_text(header, rows), encoding="utf-8")
+        write_text(path, table_text(header, rows))
 
 
 class StaleError(InputError):
@@ -411,37 +407,43 @@ def _landmarks(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
     return "change the landmarks", replace(state, landmarks=landmarks, landmarks_on=str(request.get("on", "")))
 
 
-def join_table(content: bytes) -> Callable[[State], tuple[str, State]]:
-    """Return the edit that takes the cells of a table (CSV, TSV or .xlsx), whose rows are named by id or file name.
+def cells_of_table(content: bytes, state: State) -> tuple[list[str], dict[str, dict[str, str]]]:
+    """Return the columns of a table (CSV, TSV or .xlsx), and the cells of each specimen that it has a row of.
+
+    Rows are named by id or file name.
 
     Raises:
-        FileFormatError: by the edit, where it is no such table.
-        InputError: by the edit, where no row is of a specimen.
+        FileFormatError: it is no such table.
+        InputError: no row is of a specimen.
     """
+    try:
+        lines = table_rows(content)
+        header = next(lines)
+        rows = list(lines)
+    except (ValueError, StopIteration) as error:
+        raise FileFormatError(f"The table {error or 'is empty'}; save it as CSV or .xlsx with a header.") from error
+    key = key_column(header)
+    if key is None:
+        raise InputError("The table needs a column id, specimen, scan, file or name, with the names of the scans.")
+    columns = {k: head for k, head in enumerate(header) if head and k != key}
+    known = {one.id.casefold(): one.id for one in state.specimens}
+    cells: dict[str, dict[str, str]] = {}
+    for row in rows:
+        found = known.get(row[key].strip().casefold()) or known.get(_stem(row[key].strip()).casefold())
+        if found is not None:
+            cells[found] = {head: row[k].strip()[:_LONGEST_CELL] for k, head in columns.items()}
+    if not cells:
+        first = rows[0][key][:40] if rows else ""
+        raise InputError(f"No row of the table is of a specimen; its first row is {first!r}.")
+    return list(columns.values()), cells
+
+
+def with_cells(columns: Sequence[str], cells: Mapping[str, Mapping[str, str]]) -> Callable[[State], tuple[str, State]]:
+    """Return the edit that takes the columns and cells of a table."""
 
     def change(state: State) -> tuple[str, State]:
-        try:
-            lines = table_rows(content)
-            header = next(lines)
-            rows = list(lines)
-        except (ValueError, StopIteration) as error:
-            raise FileFormatError(f"The table {error or 'is empty'}; save it as CSV or .xlsx with a header.") from error
-        key = key_column(header)
-        if key is None:
-            raise InputError("The table needs a column id, specimen, scan, file or name, with the names of the scans.")
-        columns = [head for k, head in enumerate(header) if head and k != key]
-        known = {one.id.casefold(): one.id for one in state.specimens}
-        cells: dict[str, dict[str, str]] = {}
-        for row in rows:
-            found = known.get(row[key].strip().casefold()) or known.get(_stem(row[key].strip()).casefold())
-            if found is not None:
-                cells[found] = {header[k]: row[k].strip()[:_LONGEST_CELL] for k in range(len(header))
-                                if header[k] and k != key}  # fmt: skip
-        if not cells:
-            first = rows[0][key][:40] if rows else ""
-            raise InputError(f"No row of the table is of a specimen; its first row is {first!r}.")
-        together = tuple(dict.fromkeys((*state.columns, *columns)))
         edited = _edited(state, cells, lambda one: replace(one, cells={**one.cells, **cells[one.id]}))
+        together = tuple(dict.fromkeys((*state.columns, *columns)))
         return f"take a table of {len(cells)} specimens", replace(edited, columns=together)
 
     return change
@@ -474,6 +476,12 @@ def _stem(name: str) -> str:
     return plain.strip(". ")[:_LONGEST_ID] or "scan"
 
 
+def _free_name(stem: str, taken: set[str], ending: str = "") -> str:
+    """Return the first of stem, stem-2, stem-3, ... that is not `taken` (in lower case) with its ending."""
+    numbered = (f"{stem}{'' if number == 1 else f'-{number}'}{ending}" for number in count(1))
+    return next(name for name in numbered if name.casefold() not in taken)
+
+
 def _relative(path: Path, folder: Path) -> str:
     """Return `path` relative to `folder` where both lie in the same project, else as it is."""
     project = folder.parent
@@ -493,8 +501,7 @@ def recent_projects(add: Path | None = None) -> list[dict[str, Any]]:
         folders = [str(add), *(one for one in folders if one != str(add))][:10]
         try:
             make_folder(path.parent)
-            with atomic_path(path) as temporary:
-                temporary.write_text(json.dumps(folders), encoding="utf-8")
+            write_text(path, json.dumps(folders))
         except FileError:
             pass  # the list is a convenience; a read-only home must not keep a project from being opened
     return [{"name": Path(one).name, "folder": one, "exists": (Path(one) / Project.FILE).is_file()} for one in folders]

@@ -20,6 +20,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from shapespace.batch.progress import PROGRESS_VARIABLE
+from shapespace.io.files import write_text
 
 JOB, LOG, EXIT, CANCEL, LOCK, PROGRESS = "job.json", "log.txt", "exit.json", "cancel", "lock", "progress.json"
 _NEW_GROUP = 0x200 if sys.platform == "win32" else 0  # CREATE_NEW_PROCESS_GROUP
@@ -47,8 +48,6 @@ def start(folder: Path) -> None:
     Raises:
         OSError: it cannot be started.
     """
-    for name in (EXIT, CANCEL, PROGRESS):
-        (folder / name).unlink(missing_ok=True)
     _started[:] = [process for process in _started if process.poll() is None]
     process = subprocess.Popen(
         [sys.executable, "-m", "shapespace.viewer.studio.run_job", str(folder)],
@@ -70,9 +69,7 @@ def main(folder: Path) -> int:
         began = time.time()
         code = _run(folder, list(job["arguments"]))
         done = {"code": code, "seconds": round(time.time() - began, 1), "cancelled": (folder / CANCEL).exists()}
-        temporary = folder / f"{EXIT}.new"
-        temporary.write_text(json.dumps(done), encoding="utf-8")
-        temporary.replace(folder / EXIT)
+        write_text(folder / EXIT, json.dumps(done))
     return 0
 
 

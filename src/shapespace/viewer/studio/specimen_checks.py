@@ -85,7 +85,7 @@ class SpecimenChecks:
 def check_scan(scan: Path, stem: Path) -> dict[str, Any]:
     """Write the facts and the picture of a scan next to `stem`, and return the facts."""
     from shapespace.geometry.doctor import examine, repair
-    from shapespace.io.files import atomic_path
+    from shapespace.io.files import write_bytes, write_text
     from shapespace.io.meshes.mesh_io import read_mesh
     from shapespace.report.render.scene import decimate
     from shapespace.report.render.thumbnails import mesh_still
@@ -101,12 +101,10 @@ def check_scan(scan: Path, stem: Path) -> dict[str, Any]:
         }  # fmt: skip
         if usable:
             picture, _ = mesh_still(decimate(repair(mesh)[0], _MOST_TRIANGLES)[0])
-            with atomic_path(stem.with_suffix(".webp")) as path:
-                path.write_bytes(picture)
+            write_bytes(stem.with_suffix(".webp"), picture)
     except ShapespaceError as error:
         facts = _unusable(str(error).replace(f"{scan.parent}{os.sep}", ""))
-    with atomic_path(stem.with_suffix(".json")) as path:
-        path.write_text(json.dumps(facts), encoding="utf-8")
+    write_text(stem.with_suffix(".json"), json.dumps(facts))
     return facts
 
 

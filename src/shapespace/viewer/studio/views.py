@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -49,14 +50,12 @@ class Views:
     """ASGI application of the pages of results, opened when they are first asked for.
 
     Args:
+        result: returns the path of the result of a job; None where it has none.
         upload_bytes: size limit of scans that are dropped onto a model's page.
-
-    Attributes:
-        find: number of a job -> path of its result.
     """
 
-    def __init__(self, upload_bytes: int) -> None:
-        self.find: dict[int, Path] = {}
+    def __init__(self, result: Callable[[int], Path | None], upload_bytes: int) -> None:
+        self._result = result
         self._upload_bytes = upload_bytes
         self._open: OrderedDict[tuple[Path, int], tuple[ASGIApp, ExitStack]] = OrderedDict()
         self._lock = threading.Lock()
@@ -64,7 +63,7 @@ class Views:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request of a page."""
         number, _, rest = get_route_path(scope).lstrip("/").partition("/")
-        path = self.find.get(int(number)) if number.isdigit() and len(number) < 8 else None
+        path = self._result(int(number)) if number.isdigit() and len(number) < 8 else None
         kinds = [] if path is None else view_kinds(path)
         if path is None or not kinds:
             await refusal(404, "There is no page of this result; reload the studio.")(scope, receive, send)
@@ -91,8 +90,8 @@ class Views:
             self._open.clear()
 
     def _app(self, path: Path) -> ASGIApp:
-        stamp = path if path.is_file() else next(iter(sorted(path.glob("correspondence.json"))), path)
-        key = (path, stamp.stat().st_mtime_ns)
+        record = path / CorrespondenceRecord.FILE
+        key = (path, (record if record.is_file() else path).stat().st_mtime_ns)
         with self._lock:
             if key not in self._open:
                 stack = ExitStack()
