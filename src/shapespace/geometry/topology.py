@@ -10,9 +10,6 @@ import numpy.typing as npt
 from shapespace.compiled import compiled
 from shapespace.types import BoolArray, FloatArray, IntArray
 
-# Insertion sort is quickest for the few edges of a usual vertex, and quadratic for the hub of a fan.
-_FEW = 48
-
 
 @compiled
 def first_of_equal(rows: npt.NDArray[Any]) -> IntArray:
@@ -52,33 +49,31 @@ def sorted_edges(faces: IntArray, vertices: int) -> tuple[npt.NDArray[np.int64],
         (V + 1,) where the edges of each lower vertex start; (3F,) the upper vertex of each; (3F,) which side of which
         triangle it is: side k of triangle f, from corner k to the next, is 3 f + k.
     """
-    start = np.zeros(vertices + 1, dtype=np.int64)
+    # Sorted by counting, by the upper vertex first: the second pass keeps the order of the first.
+    edges = 3 * len(faces)
+    start, rank = np.zeros(vertices + 1, dtype=np.int64), np.zeros(vertices + 1, dtype=np.int64)
     for f in range(len(faces)):
         for k in range(3):
             a, b = faces[f, k], faces[f, k - 2]
-            start[(a if a < b else b) + 1] += 1
+            start[min(a, b) + 1] += 1
+            rank[max(a, b) + 1] += 1
     for v in range(vertices):
         start[v + 1] += start[v]
-    upper, side = np.empty(3 * len(faces), dtype=np.int32), np.empty(3 * len(faces), dtype=np.int32)
-    filled = start[:-1].copy()
+        rank[v + 1] += rank[v]
+    by_upper = np.empty(edges, dtype=np.int32)
     for f in range(len(faces)):
         for k in range(3):
-            a, b = faces[f, k], faces[f, k - 2]
-            low, high = (a, b) if a < b else (b, a)
-            upper[filled[low]], side[filled[low]] = high, 3 * f + k
-            filled[low] += 1
-    for v in range(vertices):
-        low, high = start[v], start[v + 1]
-        if high - low > _FEW:
-            order = np.argsort(upper[low:high], kind="mergesort")
-            upper[low:high], side[low:high] = upper[low:high][order], side[low:high][order]
-            continue
-        for i in range(low + 1, high):
-            u, s, j = upper[i], side[i], i
-            while j > low and upper[j - 1] > u:
-                upper[j], side[j] = upper[j - 1], side[j - 1]
-                j -= 1
-            upper[j], side[j] = u, s
+            high = max(faces[f, k], faces[f, k - 2])
+            by_upper[rank[high]] = 3 * f + k
+            rank[high] += 1
+    upper, side = np.empty(edges, dtype=np.int32), np.empty(edges, dtype=np.int32)
+    filled = start[:-1].copy()
+    for i in range(edges):
+        f, k = by_upper[i] // 3, by_upper[i] % 3
+        a, b = faces[f, k], faces[f, k - 2]
+        low = min(a, b)
+        upper[filled[low]], side[filled[low]] = max(a, b), by_upper[i]
+        filled[low] += 1
     return start, upper, side
 
 

@@ -34,12 +34,39 @@ class ShapePoints(NamedTuple):
     tree: KdArrays
 
 
+# Loops instead of NumPy's functions of matrices, whose compilation takes half a minute.
+
+
 @compiled
-def _turn(v: FloatArray) -> FloatArray:
-    """Return the rotation (3, 3) about `v` by its length, rad, by Rodrigues' formula."""
-    K = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-    angle = max(np.sqrt((v * v).sum()), 1e-9)
-    return np.eye(3) + np.sin(angle) / angle * K + (1.0 - np.cos(angle)) / angle**2 * (K @ K)
+def _turn_about(R: FloatArray, v: FloatArray) -> None:
+    """Replace R (3, 3) by R times the rotation about `v` by its length, rad, by Rodrigues' formula."""
+    angle = max(np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]), 1e-9)
+    along, across = (1.0 - np.cos(angle)) / angle**2, np.sin(angle) / angle
+    for k in range(3):
+        x, y, z = R[k, 0], R[k, 1], R[k, 2]
+        dot = along * (x * v[0] + y * v[1] + z * v[2])
+        for m in range(3):
+            R[k, m] = np.cos(angle) * R[k, m] + dot * v[m]
+        R[k, 0] += across * (y * v[2] - z * v[1])
+        R[k, 1] += across * (z * v[0] - x * v[2])
+        R[k, 2] += across * (x * v[1] - y * v[0])
+
+
+@compiled
+def _solve(A: FloatArray, g: FloatArray) -> None:
+    """Replace g (N,) by the solution of A x = g, for a positive definite A (N, N), whose lower half is overwritten."""
+    for p in range(len(g)):
+        for r in range(p + 1):
+            for k in range(r):
+                A[p, r] -= A[p, k] * A[r, k]
+            A[p, r] = np.sqrt(A[p, p]) if r == p else A[p, r] / A[r, r]
+        for k in range(p):
+            g[p] -= A[p, k] * g[k]
+        g[p] /= A[p, p]
+    for p in range(len(g) - 1, -1, -1):
+        for k in range(p + 1, len(g)):
+            g[p] -= A[k, p] * g[k]
+        g[p] /= A[p, p]
 
 
 @compiled
@@ -189,14 +216,13 @@ def shape_search(
             g[6] += prior_weight * nu * scale_precision * np.log(scale)
         for p in range(6):
             A[p, p] += 1e-6 * (A[p, p] + 1.0)
-        for p in range(size):
-            for r in range(p):
-                A[r, p] = A[p, r]
-        g[:] = np.linalg.solve(A, g)
+        _solve(A, g)
         angle = np.sqrt(g[0] ** 2 + g[1] ** 2 + g[2] ** 2)
         # A step of Gauss-Newton is only good nearby.
         shrink = min(1.0, 0.35 / max(angle, 1e-12))
-        R[:] = R @ _turn(-shrink * g[:3])
+        for k in range(3):
+            y[k] = -shrink * g[k]
+        _turn_about(R, y)
         if not is_scale_fixed:
             scale *= np.exp(max(min(-g[6] * shrink, 0.1), -0.1))
             scale = max(min(scale, 1.6), 0.6)

@@ -96,17 +96,23 @@
     return answer;
   });
 
-  // Edits are sent one after another, each with the revision that the one before it made.
+  // Edits are sent one after another, each with the revision that the one before it made. Where one is refused, those that
+  // wait were made on a state that never was, and are dropped: an undo would take back another edit.
   let edits = Promise.resolve();
+  let refusals = 0;
 
   const inOrder = (path, content) => {
+    const before = refusals;
     const next = edits.then(async () => {
+      if (refusals !== before) return false;
       for (let attempt = 1; ; attempt++) {
         try {
           await post(path, { ...content, revision: Studio.state.project.revision });
           break;
         } catch (error) {
-          if (error.status !== 409 || !uploading() || attempt === ATTEMPTS) throw error;
+          if (error.status === 409 && uploading() && attempt < ATTEMPTS) continue;
+          refusals += 1;
+          throw error;
         }
       }
       await refresh();
@@ -128,7 +134,7 @@
   // Uploads ---------------------------------------------------------------------------------------------------------
 
   const ending = (name, endings) => endings.some((one) => name.toLowerCase().endsWith(one));
-  const uploading = () => Studio.uploads.done < Studio.uploads.total;
+  const uploading = () => workers > 0;
 
   /** All files of a drop, with those in folders; its entries must be taken before the event ends. */
   async function filesOfDrop(transfer) {
@@ -166,8 +172,7 @@
 
   async function work() {
     workers += 1;
-    while (waiting.length) {
-      if (waiting[0][2] && workers > 1) break;
+    while (waiting.length && !(waiting[0][2] && workers > 1)) {
       const [file, set, isTable] = waiting.shift();
       try {
         if (isTable) await importTable(file);
@@ -177,9 +182,11 @@
       }
       Studio.uploads.done += 1;
       Studio.changed();
+      // Uploads have ended when the page knows the revision that they made.
+      if (!waiting.length && workers === 1) await refresh().catch(() => {});
     }
     workers -= 1;
-    if (!uploading()) await refresh().catch(() => {});
+    Studio.changed();
   }
 
   async function uploadScan(file, set) {

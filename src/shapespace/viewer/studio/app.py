@@ -62,7 +62,7 @@ class OpenProject:
         self._resources = ExitStack()
         self._resources.enter_context(only_writer(self.project.folder))
         self.jobs = Jobs(self.project.folder, changed)
-        self.checks = SpecimenChecks(self.project.folder, changed, self._exclude)
+        self.checks = SpecimenChecks(self.project.folder, changed, self.project.exclude)
         self.views = Views(self._result, upload_bytes)
         for resource in (self.views, self.checks, self.jobs):
             self._resources.callback(resource.close)
@@ -75,12 +75,6 @@ class OpenProject:
         """Return the path of the result of a job; None where it has none."""
         job = next((one for one in self.jobs.all() if one.number == number and one.status == "done"), None)
         return None if job is None else result_path(self.project.folder, job.output)
-
-    def _exclude(self, scan: Path) -> None:
-        """Exclude a scan that cannot be used; the user can include it again."""
-        names = [one.id for one in self.project.state.specimens if one.included and self.project.path(one) == scan]
-        if names:
-            self.project.edit(None, change_of({"what": "include", "ids": names, "included": False}))
 
     def facts(self) -> dict[str, Any]:
         """Return the state for the page."""

@@ -173,6 +173,24 @@ class Project:
                 self._undo = [*self._undo[-_MOST_UNDONE + 1 :], (together or text, before)]
             self._redo = []
 
+    def exclude(self, file: Path) -> None:
+        """Exclude a scan that cannot be used, also in the states that an undo brings back.
+
+        This is no edit of the user's: those on the revision before remain possible.
+
+        Raises:
+            FileError: it cannot be written.
+        """
+
+        def without(state: State) -> State:
+            specimens = (replace(one, included=False) if self.path(one) == file else one for one in state.specimens)
+            return replace(state, specimens=tuple(specimens))
+
+        with self._lock:
+            self._replace(without(self.state), is_edit=False)
+            self._undo = [(text, without(state)) for text, state in self._undo]
+            self._redo = [(text, without(state)) for text, state in self._redo]
+
     def undo(self, revision: int) -> None:
         """Take the last edit back; nothing happens without one."""
         self._step(revision, self._undo, self._redo)
@@ -194,14 +212,14 @@ class Project:
         if revision is not None and revision != self.revision:
             raise StaleError(STALE)
 
-    def _replace(self, state: State) -> None:
+    def _replace(self, state: State, *, is_edit: bool = True) -> None:
         before, self.state = self.state, state
         try:
             self._write()
         except BaseException:
             self.state = before
             raise
-        self.revision += 1
+        self.revision += is_edit
 
     def _write(self) -> None:
         write_text(self.folder / self.FILE, json_text(self.state))
