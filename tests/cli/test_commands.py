@@ -149,6 +149,27 @@ def test_check_tells_what_is_there(run: Run, world: World) -> None:
     assert report["vertices"] == 1000 and report["components"] == 1
 
 
+def test_check_writes_repaired_meshes_in_mm_and_their_mirror_images(run: Run, world: World, tmp_path: Path) -> None:
+    bad = tmp_path / "bad.ply"
+    bad.write_text("nonsense")
+    (tmp_path / "out").mkdir()
+    stale = tmp_path / "out" / "bad.ply"
+    stale.write_text("of an earlier run")
+    reports = run("check", world.scan, bad, "-o", tmp_path / "out", "--unit", "cm", "--mirror", "--json").facts
+    wanted, written = read_mesh(world.scan), read_mesh(Path(reports[0]["written"]))
+    assert "written" not in reports[1] and not stale.exists()
+    assert np.array_equal(written.vertices, wanted.vertices * [-10.0, 10.0, 10.0])
+    assert wanted.faces is not None and np.array_equal(written.faces, wanted.faces[:, ::-1])
+
+
+def test_check_overwrites_no_mesh_that_it_reads(run: Run, world: World, tmp_path: Path) -> None:
+    scan = tmp_path / "scan.ply"
+    scan.write_bytes(world.scan.read_bytes())
+    assert "would be overwritten" in run("check", scan, "-o", tmp_path).sentence()
+    assert "give the folder" in run("check", scan, "--mirror").sentence()
+    assert scan.read_bytes() == world.scan.read_bytes()
+
+
 def test_check_of_several_files_exits_with_1_when_some_are_bad_and_2_when_all_are(
     run: Run, world: World, tmp_path: Path
 ) -> None:

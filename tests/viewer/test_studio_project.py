@@ -7,9 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from shapespace.cli import main
+from shapespace.cli.command_table import summaries_and_options
+from shapespace.cli.forms import forms
+from shapespace.commands.inputs import given_scans
 from shapespace.errors import FileError, FileFormatError, InputError
-from shapespace.io.meshes.mesh_io import write_mesh
+from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.types import Mesh
+from shapespace.viewer.studio.job_commands import order
+from shapespace.viewer.studio.jobs import Job, Order, history
 from shapespace.viewer.studio.project import Project, StaleError, cells_of_table, change_of, with_cells
 
 
@@ -87,6 +93,7 @@ def test_an_edit_of_a_state_that_another_tab_changed_is_refused(project: Project
     ({"what": "rename", "id": "anna", "to": "../anna"}, "cannot be called"),
     ({"what": "add-column", "column": "File"}, "cannot be called"),
     ({"what": "landmarks", "landmarks": {"tip": -1}}, "needs a name and a vertex"),
+    ({"what": "unit", "ids": ["anna"], "unit": "mile"}, "no unit 'mile'"),
     ({"what": "cells"}, "cannot be read"),
     ({"what": "nonsense"}, "cannot be read"),
     ({"what": "include", "ids": 5}, "cannot be read"),
@@ -132,6 +139,29 @@ def test_a_table_is_joined_by_id_or_file_name_and_may_be_pasted(project: Project
     ):
         with pytest.raises((InputError, FileFormatError), match=error):
             join_table(project, content)
+
+
+def test_scans_in_another_unit_or_mirrored_are_written_in_mm_for_the_commands(
+    project: Project, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    edit(project, what="unit", ids=["anna", "ben"], unit="cm")
+    edit(project, what="mirror", ids=["ben"], mirrored=True)
+    made = order(project, [], forms(summaries_and_options()), "correspond", {}, None, 1)
+    monkeypatch.chdir(project.folder)
+    for words in made.before:
+        assert main(list(words)) == 0
+    given = given_scans([made.arguments[1]], project.folder / made.output, recursive=False, say=pytest.fail)
+    corner = {one.called: read_mesh(one.path).vertices.sum(axis=0) for one in given}
+    assert {name: point.tolist() for name, point in corner.items()} == {
+        "anna": [10.0, 10.0, 10.0], "ben": [-20.0, 20.0, 20.0], "carl": [3.0, 3.0, 3.0],
+    }  # fmt: skip
+    lines = [line for line in history([job_of(made)]).splitlines() if line.startswith("run shapespace check")]
+    assert len(lines) == 2 and all('"$PROJECT"/scans/' in line and '"$PROJECT"/inputs/' in line for line in lines)
+
+
+def job_of(made: Order) -> Job:
+    return Job(number=1, kind="correspond", arguments=made.arguments, output=made.output, before=made.before,
+               status="done")  # fmt: skip
 
 
 def test_classes_are_counted_and_likely_misspellings_named(project: Project) -> None:

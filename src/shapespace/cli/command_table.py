@@ -362,9 +362,13 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command(
         "check",
-        "check meshes: contents, defects, and their repair before a fit", ("shapespace check scan.obj",), run.check,
+        "check meshes: contents, defects, and their repair before a fit",
+        ("shapespace check scan.obj", "shapespace check left_bones -o mirrored --mirror --unit cm"), run.check,
         (
             basic("files", "FILE", "mesh files, or folders of them", nargs="+", parse=Path),
+            basic("-o --output", "DIR", "output folder for the repaired meshes in mm, as NAME.ply", parse=Path),
+            basic("--unit", "UNIT", "unit of the files, for -o (default: mm)", choices=_UNITS),
+            basic("--mirror", help="write mirror images, such as of left bones among right ones"),
             basic("--recursive", help="also search subfolders of the given folders"),
             basic("--strict", help=_STRICT_HELP),
         ),

@@ -164,7 +164,10 @@ def check(arguments: argparse.Namespace) -> int:
     """What is in each mesh, and what fitting will do about it."""
     from shapespace.commands.look import check
 
-    reports = check(arguments.files, recursive=arguments.recursive, strict=arguments.strict, say=warn)
+    reports = check(
+        arguments.files, recursive=arguments.recursive, strict=arguments.strict, output=arguments.output,
+        unit=arguments.unit, mirror=arguments.mirror, say=warn,
+    )  # fmt: skip
     if arguments.json:
         show_json(reports)
     else:

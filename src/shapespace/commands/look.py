@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,21 +11,32 @@ import numpy as np
 
 from shapespace.batch.fit_records import read_record
 from shapespace.batch.fit_work import naming
-from shapespace.errors import FileError, ShapespaceError
-from shapespace.geometry.doctor import examine
+from shapespace.batch.result_folder import names_for
+from shapespace.errors import FileError, InputError, ShapespaceError
+from shapespace.geometry.doctor import examine, repair
+from shapespace.geometry.mirror_plane import mirror_image
 from shapespace.geometry.normals import faces_of
+from shapespace.io.files import make_folder, remove_file
 from shapespace.io.meshes.mesh_folders import mesh_files
-from shapespace.io.meshes.mesh_io import read_mesh
+from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.model.additive import load_model
 from shapespace.model.foreign import looks_like_model
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, read, to_json
 from shapespace.store.corresponding import json_of
 from shapespace.store.results import Results, mesh_at, modes_of, results_at
+from shapespace.types import MM_PER_UNIT
 
 
 def check(
-    paths: Sequence[Path], *, recursive: bool, strict: bool = False, say: Callable[[str], None]
+    paths: Sequence[Path],
+    *,
+    recursive: bool,
+    strict: bool = False,
+    output: Path | None = None,
+    unit: str | None = None,
+    mirror: bool = False,
+    say: Callable[[str], None],
 ) -> list[dict[str, Any]]:
     """Return what is in each mesh file, what is wrong with it, and what fitting will do about it.
 
@@ -35,15 +46,35 @@ def check(
         paths: files and folders.
         recursive: whether to take what lies in folders below these too.
         strict: whether a mesh with triangles that use vertices with non-finite coordinates is not usable.
+        output: folder in which the repaired meshes are written in mm, as NAME.ply (default: none is written).
+        unit: of the files, a name of `MM_PER_UNIT` (default: mm).
+        mirror: write mirror images, such as of left bones among right ones.
         say: called with each message on skipped files.
+
+    Raises:
+        InputError: `unit` or `mirror` without `output`, or `output` contains the files.
+        FileError: `output` cannot be written.
     """
+    if output is None and (unit is not None or mirror):
+        raise InputError("--unit and --mirror change what is written; give the folder for it with -o.")
     reports: list[dict[str, Any]] = []
-    listed = mesh_files(paths, recursive=recursive)
+    listed = mesh_files(paths, recursive=recursive, apart_from=output)
     for sentence in listed.left_out:
         say(sentence)
+    targets: dict[Path, Path] = {}
+    if output is not None:
+        targets = {
+            path: output / f"{name}.ply" for path, name in zip(listed.files, names_for(listed.files), strict=True)
+        }
+        if {path.resolve() for path in targets.values()} & {path.resolve() for path in listed.files}:
+            raise InputError(f"The meshes in {output} would be overwritten; give another folder with -o.")
+        make_folder(output)
     for path in listed.files:
+        if path in targets:
+            remove_file(targets[path])  # one of an earlier run may contradict the report
         try:
-            report = examine(read_mesh(path), strict=strict)
+            mesh = read_mesh(path)
+            report = examine(mesh, strict=strict)
         except ShapespaceError as error:
             reports.append({"file": str(path), "usable": False, "error": naming(path, str(error))})
             continue
@@ -54,6 +85,11 @@ def check(
         usable = not any(finding.level == "refused" for finding in report.findings)
         findings = [{"level": one.level, "what": one.problem, "action": one.action} for one in report.findings]
         reports.append({"file": str(path), "usable": usable, **asdict(report), "findings": findings})
+        if usable and path in targets:
+            repaired = repair(mesh, strict=strict)[0]
+            written = replace(repaired, vertices=MM_PER_UNIT[unit or "mm"] * repaired.vertices, landmarks={})
+            write_mesh(targets[path], mirror_image(written) if mirror else written)
+            reports[-1]["written"] = str(targets[path])
     return reports
 
 

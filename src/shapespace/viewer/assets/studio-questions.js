@@ -14,30 +14,11 @@
 
   Studio.QUESTIONS = KINDS;
 
-  /** The options of a job's command, as arguments of the same form. */
-  Studio.optionsOf = function (job) {
-    const options = {};
-    const known = new Set((Studio.forms[job.kind] || { options: [] }).options.map((option) => option.flag));
-    const words = (job.command.match(/(?:'[^']*'|"[^"]*"|\\.|[^\s'"\\])+/g) || []).map((word) => word.replace(/'([^']*)'|"([^"]*)"|\\(.)/g, (_, a, b, c) => a ?? b ?? c));
-    for (const word of words) {
-      const [, flag, value] = /^(--[\w-]+)(?:=([^]*))?$/.exec(word) || [];
-      if (known.has(flag)) options[flag] = value === undefined ? true : value;
-    }
-    return options;
-  };
-
-  /** The shapes that a job used, by the folder in its command; null for the newest. */
-  Studio.sourceOf = function (job) {
-    const words = job.command.split(/\s+/);
-    const found = Studio.state.project.jobs.filter((one) => one.number < job.number && one.status === "done" && [...CORRESPONDENCES, "fit"].includes(one.kind) && words.includes(one.output)).pop();
-    return found ? found.number : null;
-  };
-
   const Answer = ({ job }) => html`
     <div class="answer" data-testid="answer">
       ${job.sentences.length > 0 && html`<h3>${Q.findings}</h3><ul data-testid="sentences">${job.sentences.map((sentence) => html`<li>${sentence}</li>`)}</ul>`}
       ${job.methods && html`<details data-testid="methods"><summary>${Q.paper}</summary><p>${job.methods}</p><${CopyButton} text=${job.methods} label=${Q.copyPaper} testid="copy-methods" /></details>`}
-      <div class="row"><${Button} small testid="figures" onclick=${() => Studio.runJob(job.kind, { ...Studio.optionsOf(job), "--format": "svg,pdf,png" }, Studio.sourceOf(job))}>${Q.figures}<//></div>
+      <div class="row"><${Button} small testid="figures" onclick=${() => Studio.runJob(job.kind, { ...job.options, "--format": "svg,pdf,png" }, job.on)}>${Q.figures}<//></div>
     </div>`;
 
   function Question({ kind, first, next, onback }) {

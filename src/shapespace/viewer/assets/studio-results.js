@@ -28,7 +28,7 @@
 
   function ExportRow({ job }) {
     const isQuestion = Studio.QUESTIONS.includes(job.kind);
-    const figures = () => Studio.runJob(job.kind, { ...Studio.optionsOf(job), "--format": "svg,pdf,png" }, Studio.sourceOf(job));
+    const figures = () => Studio.runJob(job.kind, { ...job.options, "--format": "svg,pdf,png" }, job.on);
     return html`
       <tr data-testid=${`export-${job.number}`}>
         <th scope="row"><strong>${Studio.kindOf(job)}</strong><span class="hint">${job.output}</span></th>

@@ -29,10 +29,11 @@
         <button type="button" class="picture" aria-pressed=${selected} data-testid=${`select-${specimen.id}`} onclick=${(event) => onselect(specimen.id, event)}>
           <span class="hidden">${S.selectOne(specimen.id)}</span>
           ${specimen.state === "ready"
-            ? html`<img src=${`/api/thumbnails/${encodeURIComponent(specimen.id)}`} alt="" loading="lazy" />`
+            ? html`<img class=${specimen.mirrored ? "mirrored" : ""} src=${`/api/thumbnails/${encodeURIComponent(specimen.id)}`} alt="" loading="lazy" />`
             : html`<span>${S.states[specimen.state]}</span>`}
         </button>
-        <div class="row"><${Studio.Include} specimen=${specimen} /><strong title=${specimen.id}>${specimen.id}</strong>${specimen.set === "new" && html`<span class="tag">${S.new}</span>`}</div>
+        <div class="row"><${Studio.Include} specimen=${specimen} /><strong title=${specimen.id}>${specimen.id}</strong>${specimen.set === "new" && html`<span class="tag">${S.new}</span>`}
+          ${specimen.mirrored && html`<span class="tag">${S.mirrored}</span>`}${specimen.unit && html`<span class="tag">${S.unit(specimen.unit)}</span>`}</div>
         <${Studio.Findings} specimen=${specimen} />
       </li>`, [specimen, selected, onselect]);
   }
@@ -89,7 +90,7 @@
   function SelectionBar({ selected, onclear }) {
     const [removing, setRemoving] = useState(false);
     const ids = selected.map((one) => one.id);
-    const toNew = selected.some((one) => one.set === "training");
+    const toNew = selected.some((one) => one.set === "training"), mirrored = selected.some((one) => !one.mirrored);
     const include = (included) => Studio.edit({ what: "include", ids, included });
     return html`
       <div class="row selection" role="group" aria-label=${S.selected(ids.length)} data-testid="selection">
@@ -97,6 +98,9 @@
         <${Button} small testid="include-selected" onclick=${() => include(true)}>${S.include}<//>
         <${Button} small testid="exclude-selected" onclick=${() => include(false)}>${S.exclude}<//>
         <${Button} small testid="set-selected" onclick=${() => Studio.edit({ what: "set", ids, set: toNew ? "new" : "training" })}>${toNew ? S.toNew : S.toTraining}<//>
+        <${Button} small testid="mirror-selected" onclick=${() => Studio.edit({ what: "mirror", ids, mirrored })}>${mirrored ? S.mirror : S.unmirror}<//>
+        <label>${S.columns.unit} <select aria-label=${S.setUnit} data-testid="unit-selected" value=${selected.every((one) => one.unit === selected[0].unit) ? selected[0].unit : ""}
+          onchange=${(event) => Studio.edit({ what: "unit", ids, unit: event.target.value })}>${["", ...Studio.state.units].map((unit) => html`<option value=${unit}>${S.unit(unit)}</option>`)}</select></label>
         <${Button} small testid="remove-selected" onclick=${() => setRemoving(true)}>${S.remove}<//>
         <${Button} small testid="clear-selection" onclick=${onclear}>${S.clear}<//>
         ${removing && html`<${Confirm} title=${S.removeTitle(ids.length)} text=${S.removeText} action=${S.remove} onclose=${() => setRemoving(false)}

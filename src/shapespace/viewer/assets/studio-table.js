@@ -53,6 +53,14 @@
       data-edited=${draft !== null} oninput=${(event) => set(event.target.value)} onblur=${send} onkeydown=${key} onpaste=${paste} /></td>`;
   }
 
+  /** An edit of one specimen by a control; a refused edit restores it. */
+  const setUnit = async (specimen, select) => {
+    if (!(await Studio.edit({ what: "unit", ids: [specimen.id], unit: select.value }))) select.value = specimen.unit;
+  };
+  const setMirror = async (specimen, box) => {
+    if (!(await Studio.edit({ what: "mirror", ids: [specimen.id], mirrored: box.checked }))) box.checked = specimen.mirrored;
+  };
+
   function Row({ specimen, row, columns, selected, onselect, onblock }) {
     // Unchanged rows are not compared again; the state keeps unchanged specimens.
     return useMemo(() => html`
@@ -64,6 +72,10 @@
         ${columns.map((name, k) => html`<${Cell} key=${name} value=${specimen.cells[name] || ""} label=${S.cell(name, specimen.id)} testid=${`cell-${specimen.id}-${name}`} row=${row} column=${k + 1}
           onedit=${(value) => Studio.edit({ what: "cells", cells: [{ id: specimen.id, column: name, value }] })} onblock=${(rows) => onblock(specimen.id, k, rows)} />`)}
         <td>${specimen.set === "new" ? S.new : S.training}</td>
+        <td><select aria-label=${S.unitOf(specimen.id)} data-testid=${`unit-${specimen.id}`} value=${specimen.unit} onchange=${(event) => setUnit(specimen, event.target)}>
+          ${["", ...Studio.state.units].map((unit) => html`<option value=${unit}>${S.unit(unit)}</option>`)}</select></td>
+        <td class="tick"><input type="checkbox" checked=${specimen.mirrored} aria-label=${S.mirrorOne(specimen.id)} data-testid=${`mirror-${specimen.id}`} onchange=${(event) => setMirror(specimen, event.target)} /></td>
+        <td class="number">${specimen.extent ? specimen.extent.toLocaleString("en", { maximumSignificantDigits: 3 }) : ""}</td>
         <td class="number">${specimen.triangles ? specimen.triangles.toLocaleString("en") : ""}</td>
         <td class="findings"><${Studio.Findings} specimen=${specimen} /></td>
       </tr>`, [specimen, row, columns, selected, onselect, onblock]);
@@ -108,7 +120,8 @@
             <th scope="col">${S.columns.use}</th><th scope="col">${S.columns.id}</th>
             ${columns.map((name) => html`<th scope="col" key=${name}><span class="head">${name}
               <button type="button" class="small quiet" aria-label=${S.removeColumn(name)} data-testid=${`remove-column-${name}`} onclick=${() => setRemoving(name)}>×</button></span></th>`)}
-            <th scope="col">${S.columns.set}</th><th scope="col" class="number">${S.columns.size}</th><th scope="col">${S.columns.findings}</th>
+            <th scope="col">${S.columns.set}</th><th scope="col">${S.columns.unit}</th><th scope="col">${S.columns.mirror}</th>
+            <th scope="col" class="number">${S.columns.extent}</th><th scope="col" class="number">${S.columns.size}</th><th scope="col">${S.columns.findings}</th>
           </tr></thead>
           <tbody>${shown.map((specimen, row) => html`<${Row} key=${specimen.id} specimen=${specimen} row=${row} columns=${columns} selected=${selection.has(specimen.id)} onselect=${onselect} onblock=${onblock} />`)}</tbody>
         </table>

@@ -24,6 +24,7 @@ from shapespace.errors import FileError, InputError
 from shapespace.io.containers.json_files import plain_json
 from shapespace.io.files import atomic_path
 from shapespace.io.meshes.mesh_io import MESH_ENDINGS, MESH_FILE_ENDINGS
+from shapespace.types import MM_PER_UNIT
 from shapespace.version import __version__
 from shapespace.viewer.guard import Access, Guard, refusal
 from shapespace.viewer.responses import PAGES, application, asset, json_response
@@ -82,9 +83,9 @@ class OpenProject:
         specimens: list[dict[str, Any]] = []
         for one in state.specimens:
             facts = self.checks.facts(project.path(one)) or {"state": "waiting", "vertices": 0, "triangles": 0,
-                                                             "findings": []}  # fmt: skip
+                                                             "extent": 0.0, "findings": []}  # fmt: skip
             specimens.append({"id": one.id, "file": one.file, "set": one.role, "included": one.included,
-                              "cells": one.cells, **facts})  # fmt: skip
+                              "unit": one.unit, "mirrored": one.mirrored, "cells": one.cells, **facts})  # fmt: skip
         return {
             "name": state.name, "folder": str(project.folder), "revision": project.revision,
             "columns": list(state.columns), "specimens": specimens, "notes": state.notes(), "counts": state.counts(),
@@ -103,7 +104,7 @@ class OpenProject:
         return {
             "number": job.number, "kind": job.kind, "command": job.command, "status": job.status,
             "message": job.message, "progress": progress, "seconds": self.jobs.running_for(job), "left_s": left_s,
-            "output": job.output,
+            "output": job.output, "options": job.options, "on": job.on,
             "views": [{"kind": kind, "href": href} for kind, href in zip(kinds, pages, strict=False)],
             "sentences": sentences, "methods": methods,
         }  # fmt: skip
@@ -221,6 +222,7 @@ class Studio:
             {
                 "version": __version__, "project": None if self._open is None else self._open.facts(),
                 "recent": recent_projects(), "formats": list(MESH_ENDINGS), "upload_bytes": self._upload_bytes,
+                "units": list(MM_PER_UNIT),
             }
         )  # fmt: skip
 
@@ -333,7 +335,7 @@ class Studio:
         def make(number: int, before: list[Job]) -> Order:
             return order(opened.project, before, self._forms, kind, cast(dict[str, Any], options), on, number)
 
-        job = await run_in_threadpool(opened.jobs.add, kind, make)
+        job = await run_in_threadpool(opened.jobs.add, kind, make, cast(dict[str, Any], options))
         return json_response({"number": job.number}, 201)
 
     async def _check(self, request: Request) -> Response:

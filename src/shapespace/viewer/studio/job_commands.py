@@ -42,9 +42,10 @@ def order(
     folder, stem = project.folder, f"{_INPUTS}/{number:04d}"
     state, listed = project.state, f"{stem}.csv"
     if kind == "correspond":
-        project.write_scans(folder / listed, _some(state.chosen("training"), "to bring into correspondence", 2))
+        chosen = _some(state.chosen("training"), "to bring into correspondence", 2)
+        prepared = project.write_scans(folder / listed, chosen)
         output = f"correspondence-{number}"
-        return Order((*words, listed, "-o", output, *given), output)
+        return Order((*words, listed, "-o", output, *given), output, prepared)
     if kind == "redo":
         before = result_of(jobs, CORRESPONDENCES, on)
         name = str(options.get("name", ""))
@@ -68,9 +69,10 @@ def order(
         return Order((*words, result_of(jobs, CORRESPONDENCES, on).output, "-o", output, *given), output)
     if kind in ("fit", "complete"):
         model = result_of(jobs, ("build",), on).output
-        project.write_scans(folder / listed, _some(state.chosen("new"), "to fit; drop new scans", 1))
+        chosen = _some(state.chosen("new"), "to fit; drop new scans", 1)
+        prepared = project.write_scans(folder / listed, chosen)
         output = f"{'fits' if kind == 'fit' else 'completed'}-{number}"
-        return Order((*words, model, listed, "-o", output, *given), output)
+        return Order((*words, model, listed, "-o", output, *given), output, prepared)
     if kind == "report":
         before = result_of(jobs, (*CORRESPONDENCES, "fit"), on)
         return Order((*words, before.output, "--no-open", *given), f"{before.output}/report.html")
@@ -99,11 +101,11 @@ def _question(
         return Order(
             (*words, f"{stem}.csv", "--shapes", shapes.output, "--surfaces", "fitted", "--reference",
              f"{stem}-reference.csv", "--reference-shapes", reference.output, "-o", output, *given),
-            output,
+            output, on=shapes.number,
         )  # fmt: skip
     role = "new" if shapes.kind == "fit" else "training"
     project.write_table(project.folder / f"{stem}.csv", _some(state.chosen(role), "to analyse", 2))
-    return Order((*words, f"{stem}.csv", "--shapes", shapes.output, "-o", output, *given), output)
+    return Order((*words, f"{stem}.csv", "--shapes", shapes.output, "-o", output, *given), output, on=shapes.number)
 
 
 def shapes_of(jobs: Sequence[Job], kind: str, on: int | None) -> Job:

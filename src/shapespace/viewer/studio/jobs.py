@@ -18,14 +18,13 @@ from msgspec.structs import replace
 from shapespace.errors import FileError, InputError
 from shapespace.io.files import make_folder, write_text
 from shapespace.schemas import json_text, read
-from shapespace.viewer.studio.run_job import CANCEL, EXIT, JOB, LOG, PROGRESS, is_running, start
+from shapespace.viewer.studio.run_job import CANCEL, EXIT, JOB, LOG, PARTLY, PROGRESS, is_running, start
 
 Status = Literal["waiting", "running", "done", "failed", "cancelled", "interrupted"]
 FOLDER = "jobs"
 _POLL_S = 0.3  # between looks at the running job
 _START_S = 30.0  # after which a process that does not lock its folder has failed to start
 _LOG_END = 4000  # bytes of the log in which the last message is searched
-_PARTLY = 1  # exit code of commands of which some scans failed
 _ENDED: tuple[Status, ...] = ("done", "failed", "cancelled", "interrupted")
 _NO_MESSAGE = "It ended without a message; look at its log."
 
@@ -38,6 +37,9 @@ class Job(Struct, frozen=True, kw_only=True):
         kind: what it does.
         arguments: of the command, relative to the project's folder.
         output: what it writes, relative to the folder.
+        before: arguments of the commands that write what it reads, in order.
+        options: flag -> value, as the user chose them.
+        on: number of the job whose shapes a question is about.
         wanted: whether it is to run, or has ended.
         status: of it.
         code: exit code, once it ended.
@@ -49,6 +51,9 @@ class Job(Struct, frozen=True, kw_only=True):
     kind: str
     arguments: tuple[str, ...]
     output: str
+    before: tuple[tuple[str, ...], ...] = ()
+    options: dict[str, Any] = {}
+    on: int | None = None
     wanted: bool = True
     status: Status = "waiting"
     code: int | None = None
@@ -57,8 +62,8 @@ class Job(Struct, frozen=True, kw_only=True):
 
     @property
     def command(self) -> str:
-        """The command line."""
-        return shlex.join(["shapespace", *self.arguments])
+        """The command line; a line each of several commands."""
+        return "\n".join(shlex.join(["shapespace", *words]) for words in (*self.before, self.arguments))
 
 
 @dataclass(frozen=True)
@@ -68,10 +73,14 @@ class Order:
     Args:
         arguments: after `shapespace`, relative to the project's folder.
         output: what it writes, relative to the folder.
+        before: arguments of the commands that write what it reads, in order.
+        on: number of the job whose shapes a question is about.
     """
 
     arguments: tuple[str, ...]
     output: str
+    before: tuple[tuple[str, ...], ...] = ()
+    on: int | None = None
 
 
 class Jobs:
@@ -114,17 +123,21 @@ class Jobs:
                 raise InputError(f"There is no job {number}; reload the page.")
             return self._jobs[number]
 
-    def add(self, kind: str, make: Callable[[int, list[Job]], Order]) -> Job:
+    def add(self, kind: str, make: Callable[[int, list[Job]], Order], options: Mapping[str, Any] | None = None) -> Job:
         """Add a job.
 
         Args:
             kind: what it does.
             make: returns its command, given its number and the jobs before.
+            options: flag -> value, as the user chose them.
         """
         with self._lock:
             number = max(self._jobs, default=0) + 1
             made = make(number, self.all())
-            job = Job(number=number, kind=kind, arguments=made.arguments, output=made.output)
+            job = Job(
+                number=number, kind=kind, arguments=made.arguments, output=made.output, before=made.before,
+                options=dict(options or {}), on=made.on,
+            )  # fmt: skip
             make_folder(self.folder_of(job))
             self._put(job)
             return job
@@ -237,7 +250,7 @@ class Jobs:
         ended = self._exit(folder)
         if ended is not None:
             code = int(ended.get("code", -1))
-            status: Status = "done" if code in (0, _PARTLY) else "cancelled" if ended.get("cancelled") else "failed"
+            status: Status = "done" if code in (0, PARTLY) else "cancelled" if ended.get("cancelled") else "failed"
             seconds = float(ended.get("seconds", 0.0))
             return replace(job, status=status, code=code, seconds=seconds, message=self._last_line(folder))
         if is_running(folder):
@@ -285,9 +298,8 @@ def history(jobs: list[Job]) -> str:
         'mkdir -p "${1:?Give a new folder for the results.}" && cd "$1" || exit 2',
         'run() { "$@"; code=$?; [ $code -le 1 ] || { echo "This command failed: $*" >&2; exit $code; }; }',
     ]
-    for job in jobs:
-        if job.status == "done":
-            words = [f'"$PROJECT"/{shlex.quote(word)}' if word.startswith("inputs/") else shlex.quote(word)
-                     for word in job.arguments]  # fmt: skip
-            lines.append(" ".join(["run", "shapespace", *words]))
+    for arguments in (words for job in jobs if job.status == "done" for words in (*job.before, job.arguments)):
+        words = [f'"$PROJECT"/{shlex.quote(word)}' if word.startswith(("inputs/", "scans/")) else shlex.quote(word)
+                 for word in arguments]  # fmt: skip
+        lines.append(" ".join(["run", "shapespace", *words]))
     return "\n".join(lines) + "\n"

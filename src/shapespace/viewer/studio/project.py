@@ -16,6 +16,7 @@ from typing import Any, ClassVar, Literal, cast
 from msgspec import Struct
 from msgspec.structs import replace
 
+from shapespace.batch.result_folder import names_for
 from shapespace.cohort.classes import notes_on_classes
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.containers.json_files import read_json
@@ -24,6 +25,7 @@ from shapespace.io.meshes.mesh_folders import mesh_files
 from shapespace.io.meshes.mesh_io import MESH_FILE_ENDINGS, stem_of
 from shapespace.io.tables.table_io import key_column, table_rows, table_text
 from shapespace.schemas import json_text, read
+from shapespace.types import MM_PER_UNIT
 
 Role = Literal["training", "new"]
 
@@ -43,6 +45,8 @@ class Specimen(Struct, frozen=True, kw_only=True):
         file: the scan, relative to the project's folder where it lies in it.
         role: whether models are built of it, or it is new to them.
         included: whether it takes part.
+        unit: of the scan, a name of `MM_PER_UNIT`; empty where commands take it as it is.
+        mirrored: whether its mirror image is used.
         cells: column -> its cell in the table.
     """
 
@@ -50,6 +54,8 @@ class Specimen(Struct, frozen=True, kw_only=True):
     file: str
     role: Role = "training"
     included: bool = True
+    unit: str = ""
+    mirrored: bool = False
     cells: dict[str, str] = {}
 
 
@@ -312,14 +318,29 @@ class Project:
 
     # Files that commands read
 
-    def write_scans(self, path: Path, specimens: Iterable[Specimen]) -> None:
-        """Write a list of scans with their ids and cells, as `correspond` and `fit` read it."""
-        columns = self.state.columns
-        rows = [
-            (one.id, _relative(self.path(one), path.parent), *(one.cells.get(column, "") for column in columns))
-            for one in specimens
-        ]
+    def write_scans(self, path: Path, specimens: Sequence[Specimen]) -> tuple[tuple[str, ...], ...]:
+        """Write a list of scans with their ids and cells, as `correspond` and `fit` read it.
+
+        Args:
+            path: of the list, in a folder of the project.
+            specimens: that it lists.
+
+        Returns:
+            The commands that write scans in mm and their mirror images; the list names what they write.
+        """
+        columns, commands = self.state.columns, list[tuple[str, ...]]()
+        files = {one.id: _relative(self.path(one), path.parent) for one in specimens}
+        for unit, mirrored in sorted({(one.unit, one.mirrored) for one in specimens} - {("", False)}):
+            group = [one for one in specimens if (one.unit, one.mirrored) == (unit, mirrored)]
+            folder = f"{path.stem}-{unit or 'scans'}{'-mirrored' if mirrored else ''}"
+            paths = [self.path(one) for one in group]
+            files |= {one.id: f"{folder}/{name}.ply" for one, name in zip(group, names_for(paths), strict=True)}
+            scans = [one.file for one in group]
+            options = [*([f"--unit={unit}"] if unit else []), *(["--mirror"] if mirrored else [])]
+            commands.append(("check", *scans, "-o", f"{path.parent.name}/{folder}", *options, "--quiet"))
+        rows = [(one.id, files[one.id], *(one.cells.get(column, "") for column in columns)) for one in specimens]
         self._write_table(path, ("id", "file", *columns), rows)
+        return tuple(commands)
 
     def write_table(self, path: Path, specimens: Iterable[Specimen]) -> None:
         """Write the table of specimens, as `compare` reads it."""
@@ -349,7 +370,8 @@ def change_of(request: Mapping[str, Any]) -> Callable[[State], tuple[str, State]
     what = str(request.get("what", ""))
     edits = {
         "cells": _cells, "include": _include, "set": _set, "remove": _remove, "rename": _rename,
-        "add-column": _add_column, "remove-column": _remove_column, "landmarks": _landmarks,
+        "unit": _unit, "mirror": _mirror, "add-column": _add_column, "remove-column": _remove_column,
+        "landmarks": _landmarks,
     }  # fmt: skip
 
     def change(state: State) -> tuple[str, State]:
@@ -377,6 +399,18 @@ def _include(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
     ids, included = request["ids"], bool(request["included"])
     edited = _edited(state, ids, lambda one: replace(one, included=included))
     return f"{'include' if included else 'exclude'} {_count(ids)}", edited
+
+
+def _unit(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
+    ids, unit = request["ids"], request["unit"]
+    if unit and unit not in MM_PER_UNIT:
+        raise InputError(f"There is no unit {unit!r:.30}; choose one of {', '.join(MM_PER_UNIT)}.")
+    return f"set the unit of {_count(ids)}", _edited(state, ids, lambda one: replace(one, unit=unit))
+
+
+def _mirror(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
+    ids, mirrored = request["ids"], bool(request["mirrored"])
+    return f"mirror {_count(ids)}", _edited(state, ids, lambda one: replace(one, mirrored=mirrored))
 
 
 def _set(state: State, request: Mapping[str, Any]) -> tuple[str, State]:

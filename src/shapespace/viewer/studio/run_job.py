@@ -26,6 +26,7 @@ JOB, LOG, EXIT, CANCEL, LOCK, PROGRESS = "job.json", "log.txt", "exit.json", "ca
 _NEW_GROUP = 0x200 if sys.platform == "win32" else 0  # CREATE_NEW_PROCESS_GROUP
 _started: list[subprocess.Popen[bytes]] = []
 """Processes of this server; it asks for their end, as otherwise they stay in the list of the system."""
+PARTLY = 1  # exit code of commands of which some scans failed
 _POLL_S, _PATIENCE_S = 0.1, 20.0  # between looks at the files; after an interruption until the command is killed
 
 
@@ -67,7 +68,11 @@ def main(folder: Path) -> int:
     with lock:
         job = json.loads((folder / JOB).read_text(encoding="utf-8"))
         began = time.time()
-        code = _run(folder, list(job["arguments"]))
+        code = 0
+        for arguments in (*job.get("before", ()), job["arguments"]):
+            code = _run(folder, list(arguments))
+            if code not in (0, PARTLY):
+                break
         done = {"code": code, "seconds": round(time.time() - began, 1), "cancelled": (folder / CANCEL).exists()}
         write_text(folder / EXIT, json.dumps(done))
     return 0

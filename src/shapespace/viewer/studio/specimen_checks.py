@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from shapespace.batch.workers import context
-from shapespace.errors import ShapespaceError
+from shapespace.errors import FileError, ShapespaceError
 from shapespace.viewer.fitting import lower_priority
 
 _FOLDER = "checks"
@@ -62,7 +63,8 @@ class SpecimenChecks:
         if key in self._asked:
             return
         self._asked.add(key)
-        self._folder.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(OSError):  # the check reports what cannot be written
+            self._folder.mkdir(parents=True, exist_ok=True)
         if self._pool is None:
             processes = min(_MOST_PROCESSES, max(1, (os.cpu_count() or 2) - 1))
             self._pool = ProcessPoolExecutor(processes, mp_context=context(), initializer=lower_priority)
@@ -71,15 +73,21 @@ class SpecimenChecks:
             if future.cancelled():
                 return
             if future.exception() is not None:
-                # Its process was killed, as for want of memory: the file is to blame, and is not tried again.
-                self._pool = None
-                text = "It cannot be checked: the memory does not suffice, or the check failed."
-                self._known[key] = _unusable(text)
+                self._known[key] = self._failed(future.exception())
             if key in self._known or future.result()["state"] == "unusable":
-                self._unusable(scan)
+                # On a full disk the scan stays included; commands refuse it.
+                with contextlib.suppress(FileError):
+                    self._unusable(scan)
             self._changed()
 
         self._pool.submit(check_scan, scan, self._folder / key).add_done_callback(done)
+
+    def _failed(self, error: BaseException | None) -> dict[str, Any]:
+        """Return the facts of a scan whose check ended with an error; it is not tried again."""
+        if isinstance(error, ShapespaceError):
+            return _unusable(f"It cannot be checked: {error}")
+        self._pool = None  # its process was killed, as for want of memory: the file is to blame
+        return _unusable("It cannot be checked: the memory does not suffice, or the check failed.")
 
 
 def check_scan(scan: Path, stem: Path) -> dict[str, Any]:
@@ -97,7 +105,7 @@ def check_scan(scan: Path, stem: Path) -> dict[str, Any]:
         findings = [{"level": one.level, "text": f"{one.problem} {one.action}"} for one in report.findings]
         facts = {
             "state": "ready" if usable else "unusable", "vertices": report.vertices, "triangles": report.triangles,
-            "findings": findings,
+            "extent": float(report.extent.max()) if usable else 0.0, "findings": findings,
         }  # fmt: skip
         if usable:
             picture, _ = mesh_still(decimate(repair(mesh)[0], _MOST_TRIANGLES)[0])
@@ -109,7 +117,8 @@ def check_scan(scan: Path, stem: Path) -> dict[str, Any]:
 
 
 def _unusable(text: str) -> dict[str, Any]:
-    return {"state": "unusable", "vertices": 0, "triangles": 0, "findings": [{"level": "refused", "text": text}]}
+    findings = [{"level": "refused", "text": text}]
+    return {"state": "unusable", "vertices": 0, "triangles": 0, "extent": 0.0, "findings": findings}
 
 
 def _key(scan: Path) -> str:
