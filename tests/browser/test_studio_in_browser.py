@@ -72,6 +72,39 @@ def framed(tab, seconds: float = 60.0) -> None:
     tab.page.wait_for_timeout(2000)
 
 
+def place_and_drag(tab, project: Path) -> None:
+    """Name a vertex that is clicked on one surface, and drag the landmark on another one."""
+
+    def stored(seconds: float = 30.0) -> int:
+        end = time.monotonic() + seconds
+        while not (marks := json.loads((project / "project.json").read_text())["landmarks"]):
+            assert time.monotonic() < end
+            tab.page.wait_for_timeout(100)
+        return marks["tip"]
+
+    frame = tab.page.frame_locator("[data-testid=frame]")
+    tab.page.get_by_test_id("landmarks").locator("summary").click()
+    box = frame.get_by_test_id("view-1").bounding_box()
+    tab.page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    tab.page.get_by_test_id("landmark-name").fill("tip")
+    tab.page.get_by_test_id("landmark-add").click()
+    before = stored()
+    frame.get_by_test_id("clear").click()
+    tab.page.wait_for_timeout(500)
+    cell = next(one for one in tab.page.frames if "/view/" in one.url)
+    x, y = cell.evaluate(
+        "(() => { const v = window.shapespaceCells[2].view, b = v.canvas.getBoundingClientRect();"
+        "const [x, y] = v.project(v._marks.get('marks')[0].position); return [b.left + x, b.top + y]; })()"
+    )
+    outer = tab.page.get_by_test_id("frame").bounding_box()
+    tab.page.mouse.move(outer["x"] + x, outer["y"] + y)
+    tab.page.mouse.down()
+    tab.page.mouse.move(outer["x"] + x, outer["y"] + y + 25, steps=4)
+    tab.page.mouse.up()
+    tab.until(f"document.querySelector('[data-testid=landmark-vertex-tip]').value !== '{before}'")
+    assert stored() != before
+
+
 def write_bones(folder: Path, count: int) -> Path:
     assert main(["data", "bones", "-o", str(folder), "--count", str(count), "--quiet"]) == 0
     return folder
@@ -106,6 +139,8 @@ def test_raw_scans_become_a_report_by_clicks_and_history_gives_the_same_numbers(
         shot = tab.shot("correspondence")
         if count == 12:
             same_as_kept("screen-correspondence.png", shot, width=1200)
+        if count == 6:
+            place_and_drag(tab, project)
         user.click("next")
         user.click("run-build")
         user.has_run(2)

@@ -64,6 +64,27 @@ def test_a_click_on_one_surface_marks_the_same_vertex_on_all(
     assert tab.complaints == [] and tab.asked == []
 
 
+def test_a_mark_that_is_dragged_on_one_surface_moves_on_all_and_nothing_turns(open_tab, address: str) -> None:
+    tab = ready(open_tab(address))
+    click(tab, 1, 0.5, 0.5)
+    (before,) = marked(tab, 1)
+    box = tab.page.get_by_test_id("view-1").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    yaw = "window.shapespaceCells[1].view._camera.yaw"
+    tab.page.mouse.move(x, y)
+    tab.page.mouse.down()
+    tab.page.mouse.move(x + box["width"] / 6, y, steps=4)
+    tab.page.mouse.up()
+    (after,) = marked(tab, 1)
+    assert after != before and all(marked(tab, k) == [after] for k in range(12)) and tab.page.evaluate(yaw) == 0
+    tab.page.mouse.move(x, y - box["height"] / 5)
+    tab.page.mouse.down()
+    tab.page.mouse.move(x + box["width"] / 6, y - box["height"] / 5, steps=4)
+    tab.page.mouse.up()
+    assert marked(tab, 1) == [after] and tab.page.evaluate(yaw) != 0  # beside a mark the surface turns
+    assert tab.complaints == []
+
+
 def test_a_vertex_that_a_scan_does_not_show_is_told_and_not_marked_there(open_tab, address: str) -> None:
     tab = ready(open_tab(address))
     gone = tab.page.evaluate(

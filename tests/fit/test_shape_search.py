@@ -79,3 +79,14 @@ def test_machine_code_and_python_agree() -> None:
         ends.append(np.concatenate([R.ravel(), t, b, out, [s]]))
     assert np.allclose(*ends)
     assert not np.allclose(ends[0][9:12], 0.0)
+
+
+def test_normal_equations_are_solved_and_singular_ones_refused() -> None:
+    rng = np.random.default_rng(4)
+    root = rng.normal(size=(9, 9))
+    A, g = root @ root.T + np.eye(9), rng.normal(size=9)
+    wanted, x = np.linalg.solve(A, g), g.copy()
+    assert search._solve(A.copy(), x)
+    assert np.allclose(x, wanted)
+    assert not search._solve(np.zeros((3, 3)), np.ones(3))
+    assert not search._solve(np.full((3, 3), np.nan), np.ones(3))

@@ -603,10 +603,12 @@ COMMANDS: tuple[Command, ...] = (
         ("Runs no fit. The report is one file that needs no network. Needs the extra report.",),
     ),
     Command(
-        "view", "view a shape model, fits or surfaces in correspondence in the browser", ("shapespace view model.h5",),
+        "view", "view a shape model, fits, surfaces in correspondence or a project in the browser",
+        ("shapespace view model.h5",),
         run.view,
         (
-            basic("path", "MODEL.h5|DIR", "a model, or a folder that fit or correspond wrote", parse=Path),
+            basic("path", "MODEL.h5|DIR", "a model, a folder that fit or correspond wrote, or a project of the studio",
+                  parse=Path),
             basic("--model", "MODEL.h5", source=VIEW),
             basic("--no-open", help="do not open a browser"),
             basic("--port", "N", source=VIEW),
@@ -614,8 +616,9 @@ COMMANDS: tuple[Command, ...] = (
             advanced("--max-upload-mb", "N", source=VIEW, parse=values.positive),
         ),
         (
-            "A scan that is dropped onto the page is fitted. The address that is printed contains a token, without "
-            "which nothing is answered. Ctrl-C ends the viewer. Needs the extra view.",
+            "A scan that is dropped onto the page of a model is fitted. A project is shown as in the studio, which "
+            "may run at the same time; nothing is written into it. The address that is printed contains a token, "
+            "without which nothing is answered. Ctrl-C ends the viewer. Needs the extra view.",
         ),
         json=False,
     ),

@@ -11,6 +11,7 @@ import threading
 import webbrowser
 from collections.abc import Callable, Generator, Mapping
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import FrameType
@@ -22,8 +23,7 @@ from shapespace.schemas import CorrespondenceRecord
 
 if TYPE_CHECKING:
     import uvicorn
-
-    from shapespace.viewer.guard import Access
+    from starlette.types import ASGIApp
 
 FIRST_PORT = 7860  # first port that is tried, not a privileged one, and the number of ports after it
 _PORTS_TRIED = 50  # as many viewers at once on one machine
@@ -54,10 +54,10 @@ def serve(
     quiet: bool = False,
     say: Callable[[str], None] = print,
 ) -> None:
-    """Show a model, the fits of a folder, or surfaces in correspondence in the browser until Ctrl-C.
+    """Show a model, the fits of a folder, surfaces in correspondence, or a project in the browser until Ctrl-C.
 
     Args:
-        path: a model file, or a folder that `shapespace fit` or `shapespace correspond` wrote.
+        path: a model file, a folder that `shapespace fit` or `shapespace correspond` wrote, or a project of the studio.
         model: model file of the fits in the folder (default: the one that their records name).
         host: address to listen at.
         port: port (default: the first free one from 7860).
@@ -72,33 +72,35 @@ def serve(
         InputError: the port is taken, the host is not an address of this machine, or a model is given with surfaces.
     """
     require_view_extra()
-    has_surfaces = (path / CorrespondenceRecord.FILE).is_file()
-    if has_surfaces and model is not None:
-        raise InputError(f"{path} is a correspondence without fits; leave --model out.")
+    has_surfaces, is_project = (path / CorrespondenceRecord.FILE).is_file(), _is_project(path)
+    if (has_surfaces or is_project) and model is not None:
+        what = "a correspondence" if has_surfaces else "a project"
+        raise InputError(f"{path} is {what} without fits; leave --model out.")
+    if is_project:
+        serve_studio(
+            path, {}, host=host, port=port, open_browser=open_browser, max_upload_mb=max_upload_mb, read_only=True,
+            say=say,
+        )  # fmt: skip
+        return
     if not has_surfaces:
         # While this process imports its own code.
         start_loading(tell=not quiet)
     from shapespace.viewer.corresponding_surfaces import Surfaces
-    from shapespace.viewer.guard import LOOPBACK, Access
     from shapespace.viewer.model_view import ModelView
     from shapespace.viewer.server import make_app
     from shapespace.viewer.surfaces_server import make_surfaces_app
     from shapespace.viewer.uploaded_scans import FOLDER_PREFIX, Limits, Scans
 
-    access, loopback = Access(), host in LOOPBACK
     with _stopped_by_signals(), ExitStack() as stack:
-        view = Surfaces(path) if has_surfaces else ModelView.open(path, model)
-        listener = stack.enter_context(listen(host, port))
-        port = int(listener.getsockname()[1])
-        cookie_name = f"shapespace_{port}"
-        if isinstance(view, Surfaces):
-            app = make_surfaces_app(view, access, loopback=loopback, cookie_name=cookie_name)
+        if has_surfaces:
+            make = partial(make_surfaces_app, Surfaces(path))
         else:
+            view = ModelView.open(path, model)
             root = Path(stack.enter_context(TemporaryDirectory(prefix=FOLDER_PREFIX, ignore_cleanup_errors=True)))
             scans = Scans(root, view.model, view.model_name, Limits(upload_bytes=max_upload_mb * 2**20))
             stack.callback(scans.close)
-            app = make_app(view, scans, access, loopback=loopback, cookie_name=cookie_name)
-        _run(make_server(app), "viewer", access, host, listener, open_browser=open_browser, say=say)
+            make = partial(make_app, view, scans)
+        _run(make, "viewer", host, port, open_browser=open_browser, say=say)
 
 
 def serve_studio(
@@ -109,6 +111,7 @@ def serve_studio(
     port: int | None = None,
     open_browser: bool = True,
     max_upload_mb: int = 500,
+    read_only: bool = False,
     say: Callable[[str], None] = print,
 ) -> None:
     """Show a project of the studio in the browser until Ctrl-C; running commands go on.
@@ -120,6 +123,7 @@ def serve_studio(
         port: port (default: the first free one from 7860).
         open_browser: whether to open the page.
         max_upload_mb: size limit of a scan that is dropped onto the page, in MB.
+        read_only: show the project, and refuse edits and jobs.
         say: called with the address, which contains the token.
 
     Raises:
@@ -128,39 +132,52 @@ def serve_studio(
     """
     require_view_extra()
     from shapespace.report.pages.write_html import require_report_extra
-    from shapespace.viewer.guard import LOOPBACK, Access
     from shapespace.viewer.studio.app import Studio, make_studio
 
     require_report_extra()
-    access, loopback = Access(), host in LOOPBACK
     with _stopped_by_signals(), ExitStack() as stack:
-        studio = Studio(forms, project, max_upload_mb * 2**20)
+        studio = Studio(forms, project, max_upload_mb * 2**20, read_only=read_only)
         stack.callback(studio.close)
-        listener = stack.enter_context(listen(host, port))
-        port = int(listener.getsockname()[1])
-        app = make_studio(studio, access, loopback=loopback, cookie_name=f"shapespace_{port}")
-        server = make_server(app)
-        studio.ends = lambda: server.should_exit
-        _run(server, "studio", access, host, listener, open_browser=open_browser, say=say)
+        what = "viewer" if read_only else "studio"
+
+        def started(server: uvicorn.Server) -> None:
+            studio.ends = lambda: server.should_exit
+
+        _run(partial(make_studio, studio), what, host, port, open_browser=open_browser, started=started, say=say)
+
+
+def _is_project(path: Path) -> bool:
+    from shapespace.viewer.studio.project import Project, State
+
+    try:
+        with (path / Project.FILE).open("rb") as file:
+            return State.FORMAT.encode() in file.read(200)
+    except OSError:
+        return False
 
 
 def _run(
-    server: uvicorn.Server, what: str, access: Access, host: str, listener: socket.socket, *, open_browser: bool,
-    say: Callable[[str], None],
+    make: Callable[..., ASGIApp], what: str, host: str, port: int | None, *, open_browser: bool,
+    started: Callable[[uvicorn.Server], None] | None = None, say: Callable[[str], None],
 ) -> None:  # fmt: skip
-    """Print the address of the server, open it in a browser, and run it until Ctrl-C."""
-    from shapespace.viewer.guard import LOOPBACK
+    """Run the application that `make` returns until Ctrl-C: print its address, and open it in a browser."""
+    from shapespace.viewer.guard import LOOPBACK, Access
 
-    port = int(listener.getsockname()[1])
-    say(f"The {what} is at {page_address(host, port, access.token)}")
-    if host not in LOOPBACK:
-        say(f"Anyone with this address can use the {what}, and the connection is not encrypted.")
-    say(f"Ctrl-C ends the {what}.")
-    if open_browser:
-        address = page_address(host, port, access.new_ticket())
-        threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
-    with contextlib.suppress(KeyboardInterrupt):
-        server.run(sockets=[listener])
+    access, loopback = Access(), host in LOOPBACK
+    with contextlib.closing(listen(host, port)) as listener:
+        port = int(listener.getsockname()[1])
+        server = make_server(make(access, loopback=loopback, cookie_name=f"shapespace_{port}"))
+        if started is not None:
+            started(server)
+        say(f"The {what} is at {page_address(host, port, access.token)}")
+        if not loopback:
+            say(f"Anyone with this address can use the {what}, and the connection is not encrypted.")
+        say(f"Ctrl-C ends the {what}.")
+        if open_browser:
+            address = page_address(host, port, access.new_ticket())
+            threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
+        with contextlib.suppress(KeyboardInterrupt):
+            server.run(sockets=[listener])
 
 
 def make_server(app: object) -> uvicorn.Server:

@@ -314,12 +314,11 @@ class _Sides:
         if b is not None:
             free[: len(b)] = b[: len(free)]
         counts = np.array([min(step.points, len(shape.points)), min(step.points, len(self.scan))], dtype=np.int32)
-        try:
-            scale = shape_search(
-                R, t, scale, free, shape, self.scan, self.tree.arrays, counts, step.reaches(self.model.size), _PRIOR,
-                1.0 / _SCALE_STDDEV**2 if self.with_scale else math.inf, self.slack, _CAP * self.model.size, out,
-            )  # fmt: skip
-        except np.linalg.LinAlgError:
+        scale = shape_search(
+            R, t, scale, free, shape, self.scan, self.tree.arrays, counts, step.reaches(self.model.size), _PRIOR,
+            1.0 / _SCALE_STDDEV**2 if self.with_scale else math.inf, self.slack, _CAP * self.model.size, out,
+        )  # fmt: skip
+        if not np.isfinite(out).all():
             return Pose(start_pose, np.zeros(len(free)), math.inf, 0.0)
         return Pose(Similarity(scale, R, t), free, 0.5 * float(out[0] + out[1]), float(out[2]))
 

@@ -53,13 +53,21 @@ def _turn_about(R: FloatArray, v: FloatArray) -> None:
 
 
 @compiled
-def _solve(A: FloatArray, g: FloatArray) -> None:
-    """Replace g (N,) by the solution of A x = g, for a positive definite A (N, N), whose lower half is overwritten."""
+def _solve(A: FloatArray, g: FloatArray) -> bool:
+    """Replace g (N,) by the solution of A x = g, and return whether there is one.
+
+    A (N, N) is positive definite, and its lower half is overwritten (Cholesky).
+    """
     for p in range(len(g)):
         for r in range(p + 1):
             for k in range(r):
                 A[p, r] -= A[p, k] * A[r, k]
-            A[p, r] = np.sqrt(A[p, p]) if r == p else A[p, r] / A[r, r]
+            if r < p:
+                A[p, r] /= A[r, r]
+            elif not A[p, p] > 0.0:
+                return False
+            else:
+                A[p, p] = np.sqrt(A[p, p])
         for k in range(p):
             g[p] -= A[p, k] * g[k]
         g[p] /= A[p, p]
@@ -67,6 +75,7 @@ def _solve(A: FloatArray, g: FloatArray) -> None:
         for k in range(p + 1, len(g)):
             g[p] -= A[k, p] * g[k]
         g[p] /= A[p, p]
+    return True
 
 
 @compiled
@@ -107,7 +116,7 @@ def shape_search(
         slack: (2,) how far a match may lie sideways, model to scan and back, mm.
         cap: distance beyond which a match counts no more in the score, mm.
         out: (3,) replaced by: score of the model to the scan, of the scan to the model, mm, and the share of the
-            model's points that have the scan where they are.
+            model's points that have the scan where they are; infinite where a step has no solution.
     """
     n_modes = len(b)
     size = 7 + n_modes
@@ -216,7 +225,9 @@ def shape_search(
             g[6] += prior_weight * nu * scale_precision * np.log(scale)
         for p in range(6):
             A[p, p] += 1e-6 * (A[p, p] + 1.0)
-        _solve(A, g)
+        if not _solve(A, g):
+            out[:] = np.inf
+            break
         angle = np.sqrt(g[0] ** 2 + g[1] ** 2 + g[2] ** 2)
         # A step of Gauss-Newton is only good nearby.
         shrink = min(1.0, 0.35 / max(angle, 1e-12))

@@ -142,8 +142,8 @@
     return html`
       <section class=${`job ${status}`} data-testid=${`job-${job.number}`} data-status=${status} aria-label=${`${kindOf(job)} ${job.number}`}>
         <div class="row"><strong>${kindOf(job)}</strong><span class="hint">${facts.join(", ")}</span><span class="grow"></span>
-          ${active && html`<${Button} small testid=${`cancel-${job.number}`} onclick=${() => Studio.act(`/api/jobs/${job.number}/cancel`)}>${J.cancel}<//>`}
-          ${["cancelled", "failed", "interrupted"].includes(status) && html`<${Button} small testid=${`continue-${job.number}`} onclick=${() => Studio.act(`/api/jobs/${job.number}/continue`)}>${J.continue}<//>`}
+          ${active && html`<${Button} edits small testid=${`cancel-${job.number}`} onclick=${() => Studio.act(`/api/jobs/${job.number}/cancel`)}>${J.cancel}<//>`}
+          ${["cancelled", "failed", "interrupted"].includes(status) && html`<${Button} edits small testid=${`continue-${job.number}`} onclick=${() => Studio.act(`/api/jobs/${job.number}/continue`)}>${J.continue}<//>`}
         </div>
         ${active && html`<progress max=${progress ? progress.total : undefined} value=${progress ? progress.done : undefined} aria-label=${J.progressLabel(kindOf(job))} data-testid=${`progress-${job.number}`}></progress>`}
         <p class="hint message" role="status">${active && progress ? J.progress(progress) : job.message}</p>
@@ -210,6 +210,7 @@
   /** A form, folded away once a job of its kinds was started. */
   const Settings = ({ kinds, children }) => {
     const started = Studio.jobsOf(kinds).length > 0;
+    if (Studio.state.read_only) return null;
     return html`<details class=${started ? "settings" : "settings first"} open=${!started} data-testid="settings"><summary>${J.settings}</summary>${children}</details>`;
   };
 

@@ -17,7 +17,7 @@
   };
 
   Studio.Include = ({ specimen, label }) => html`<label class="include"><input type="checkbox" checked=${specimen.included} aria-label=${S.includeOne(specimen.id)} data-testid=${`include-${specimen.id}`}
-    disabled=${specimen.state === "unusable"} onchange=${(event) => include(specimen, event.target)} />${label && html`<span aria-hidden="true">${label}</span>`}</label>`;
+    disabled=${specimen.state === "unusable" || Studio.state.read_only} onchange=${(event) => include(specimen, event.target)} />${label && html`<span aria-hidden="true">${label}</span>`}</label>`;
 
   Studio.Findings = ({ specimen }) => html`
     ${specimen.state === "waiting" && html`<p class="finding waiting">${S.states.waiting}</p>`}
@@ -72,6 +72,7 @@
   const AddButtons = (Studio.AddButtons = function AddButtons({ set, strong, table }) {
     const [browsing, setBrowsing] = useState(false);
     const add = (files) => Studio.upload(files, set);
+    if (Studio.state.read_only) return null;
     return html`
       <${FileButton} strong=${strong} label=${S.chooseFiles} testid="choose-files" onfiles=${add} />
       <${FileButton} folder label=${S.chooseFolder} testid="choose-folder" onfiles=${add} />
@@ -89,6 +90,7 @@
   /** What is done with the selected specimens. */
   function SelectionBar({ selected, onclear }) {
     const [removing, setRemoving] = useState(false);
+    if (Studio.state.read_only) return null;
     const ids = selected.map((one) => one.id);
     const toNew = selected.some((one) => one.set === "training"), mirrored = selected.some((one) => !one.mirrored);
     const include = (included) => Studio.edit({ what: "include", ids, included });
@@ -153,8 +155,8 @@
             ${["cards", "table"].map((name) => html`<button type="button" data-testid=${`layout-${name}`} aria-pressed=${layout === name} onclick=${() => setLayout(name)}>${S[name]}</button>`)}
           </div>
           <label class="filter">${S.filter} <input type="search" placeholder=${S.filterHint} data-testid="filter" value=${filter} oninput=${(event) => setFilter(event.target.value)} /></label>
-          <${Button} testid="undo" disabled=${!project.undo} title=${project.undo ? S.undoOf(project.undo) : S.undo} onclick=${Studio.undo}>${S.undo}<//>
-          <${Button} testid="redo" disabled=${!project.redo} title=${project.redo ? S.redoOf(project.redo) : S.redo} onclick=${Studio.redo}>${S.redo}<//>
+          <${Button} edits testid="undo" disabled=${!project.undo} title=${project.undo ? S.undoOf(project.undo) : S.undo} onclick=${Studio.undo}>${S.undo}<//>
+          <${Button} edits testid="redo" disabled=${!project.redo} title=${project.redo ? S.redoOf(project.redo) : S.redo} onclick=${Studio.redo}>${S.redo}<//>
           ${layout === "table" ? html`<${Studio.AddColumn} />` : html`<${Button} testid="select-all" onclick=${selectAll}>${all ? S.clear : S.selectAll}<//>`}
           ${selected.length > 0 && html`<${SelectionBar} selected=${selected} onclear=${() => setSelection(new Set())} />`}
         </div>

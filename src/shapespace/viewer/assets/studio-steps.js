@@ -24,6 +24,7 @@
 
   function Redo({ specimens }) {
     const [name, setName] = useState("");
+    if (Studio.state.read_only) return null;
     return html`
       <details data-testid="redo-panel"><summary>${T.correspondence.redoTitle}</summary>
         <p class="hint">${T.correspondence.redoHint}</p>
@@ -33,12 +34,11 @@
       </details>`;
   }
 
-  /** Named vertices; the surfaces' page reports the vertex that was clicked last. */
-  function Landmarks({ landmarks, clicked, on }) {
+  /** Named vertices; the surfaces' page reports the vertex that was clicked last, and landmarks that were dragged. */
+  function Landmarks({ landmarks, elsewhere, clicked, save }) {
     const [name, setName] = useState("");
     const [vertex, setVertex] = useState("");
     useEffect(() => { if (clicked !== null) setVertex(String(clicked)); }, [clicked]);
-    const save = (changed) => Studio.edit({ what: "landmarks", landmarks: changed, on });
     const add = async (event) => {
       event.preventDefault();
       if (await save({ ...landmarks, [name.trim()]: Number(vertex) })) setName("");
@@ -47,13 +47,15 @@
     return html`
       <details data-testid="landmarks"><summary>${T.correspondence.landmarksTitle} (${Object.keys(landmarks).length})</summary>
         <p class="hint">${T.correspondence.landmarksHint}</p>
-        <ul class="landmarks">${Object.entries(landmarks).map(([one, number]) => html`<li key=${one} data-testid=${`landmark-${one}`}><strong>${one}</strong> ${number}
-          <${Button} small testid=${`landmark-remove-${one}`} aria-label=${T.correspondence.removeLandmark(one)} onclick=${() => save(without(one))}>×<//></li>`)}</ul>
-        <form class="row" onsubmit=${add}>
+        ${elsewhere && html`<p class="hint">${T.correspondence.landmarksElsewhere(elsewhere)}</p>`}
+        <ul class="landmarks">${Object.entries(landmarks).map(([one, number]) => html`<li key=${one} data-testid=${`landmark-${one}`}><strong>${one}</strong>
+          <input type="number" min="0" step="1" aria-label=${T.correspondence.vertexOf(one)} data-testid=${`landmark-vertex-${one}`} readonly=${Studio.state.read_only} value=${number} onchange=${(event) => save({ ...landmarks, [one]: Number(event.target.value) })} />
+          <${Button} edits small testid=${`landmark-remove-${one}`} aria-label=${T.correspondence.removeLandmark(one)} onclick=${() => save(without(one))}>×<//></li>`)}</ul>
+        ${!Studio.state.read_only && html`<form class="row" onsubmit=${add}>
           <label>${T.correspondence.landmark} <input size="9" data-testid="landmark-name" value=${name} oninput=${(event) => setName(event.target.value)} /></label>
           <label>${T.correspondence.vertex} <input type="number" min="0" step="1" data-testid="landmark-vertex" value=${vertex} oninput=${(event) => setVertex(event.target.value)} /></label>
           <button class="small" data-testid="landmark-add" disabled=${!name.trim() || vertex === ""}>${T.correspondence.addLandmark}</button>
-        </form>
+        </form>`}
       </details>`;
   }
 
@@ -61,11 +63,29 @@
     const frame = useRef(null);
     const [clicked, setClicked] = useState(null);
     const [job, select] = useResult(["correspond", "redo"]);
+    // Landmarks belong to the surfaces that they were placed on.
+    const elsewhere = job && Object.keys(project.landmarks).length && ![job.output, ""].includes(project.landmarks_on) ? project.landmarks_on : "";
+    const landmarks = elsewhere ? {} : project.landmarks;
+    const show = () => {
+      const list = Object.entries(landmarks).map(([name, vertex]) => ({ name, vertex }));
+      if (frame.current) frame.current.contentWindow.postMessage({ landmarks: list }, location.origin);
+    };
+    const save = async (changed) => {
+      const done = !Studio.state.read_only && (await Studio.edit({ what: "landmarks", landmarks: changed, on: job.output }));
+      if (!done) show();
+      return done;
+    };
+    useEffect(show, [JSON.stringify(landmarks)]);
     useEffect(() => {
-      const take = (event) => { if (frame.current && event.source === frame.current.contentWindow && event.origin === location.origin && event.data && Number.isInteger(event.data.vertex)) setClicked(event.data.vertex); };
+      const take = ({ source, origin, data }) => {
+        if (!frame.current || source !== frame.current.contentWindow || origin !== location.origin || !data) return;
+        if (data.ready) show();
+        else if (data.landmark !== undefined) save({ ...landmarks, [data.landmark]: data.vertex });
+        else if (Number.isInteger(data.vertex)) setClicked(data.vertex);
+      };
       addEventListener("message", take);
       return () => removeEventListener("message", take);
-    }, []);
+    });
     const training = project.specimens.filter((one) => one.included && one.set === "training" && one.state !== "unusable");
     const busy = isBusy("correspond", "redo");
     const controls = html`
@@ -74,7 +94,7 @@
       <${Jobs} kinds=${["correspond", "redo"]} />
       ${job && html`<${Next} name="correspondence" next=${next} ready=${!busy} />`}
       <${Settings} key="settings" kinds=${["correspond"]}><${JobForm} kind="correspond" strong=${!job && !busy} disabled=${training.length < LEAST || busy} /><//>
-      ${job && html`<${Redo} specimens=${training} /><${Landmarks} landmarks=${project.landmarks} clicked=${clicked} on=${job.output} />`}`;
+      ${job && html`<${Redo} specimens=${training} /><${Landmarks} landmarks=${landmarks} elsewhere=${elsewhere} clicked=${clicked} save=${save} />`}`;
     return html`<${Step} name="correspondence" title=${T.correspondence.title} controls=${controls} select=${select} job=${job} empty=${T.correspondence.empty} frame=${frame} />`;
   };
 
@@ -111,12 +131,12 @@
       <h2>${T.fit.title}</h2>
       <p class="hint">${ready ? T.fit.intro : T.fit.none}</p>
       <${DropZone} testid="drop-new" class="small-drop" onfiles=${(files) => Studio.upload(files, "new")}>
-        <strong>${T.fit.drop}</strong><div class="row"><${Studio.AddButtons} set="new" /></div>
+        ${!Studio.state.read_only && html`<strong>${T.fit.drop}</strong>`}<div class="row"><${Studio.AddButtons} set="new" /></div>
         <p data-testid="new-scans" class="hint">${T.fit.scans(scans.length)}${scans.length ? `: ${scans.slice(0, 8).map((one) => one.id).join(", ")}${scans.length > 8 ? " \u2026" : ""}` : ""}</p>
         <${UploadStatus} />
       <//>
       <${Jobs} kinds=${kinds} />
-      ${fitted && html`<${Next} name="fit" next=${next} ready=${!busy} /><${Button} class="wide" testid="report-fits" disabled=${isBusy("report")} onclick=${() => Studio.runJob("report", {}, fitted.number)}>${T.fit.report}<//>`}
+      ${fitted && html`<${Next} name="fit" next=${next} ready=${!busy} /><${Button} edits class="wide" testid="report-fits" disabled=${isBusy("report")} onclick=${() => Studio.runJob("report", {}, fitted.number)}>${T.fit.report}<//>`}
       <${Settings} key="settings" kinds=${["fit"]}><${JobForm} kind="fit" sources=${["build"]} strong=${ready && scans.length > 0 && !fitted && !busy} disabled=${!ready || !scans.length || busy} /><//>
       ${ready && scans.length > 0 && html`<${More} kind="complete" sources=${["build"]} disabled=${isBusy("complete")} />`}`;
     return html`<${Step} name="fit" title=${T.fit.title} controls=${controls} select=${select} job=${job} empty=${T.fit.empty} />`;

@@ -49,7 +49,7 @@
       set(null);
       onblock(rows);
     };
-    return html`<td><input class="entry" size="8" aria-label=${label} data-testid=${testid} data-row=${row} data-column=${column} value=${draft === null ? value : draft}
+    return html`<td><input class="entry" size="8" aria-label=${label} data-testid=${testid} data-row=${row} data-column=${column} value=${draft === null ? value : draft} readonly=${Studio.state.read_only}
       data-edited=${draft !== null} oninput=${(event) => set(event.target.value)} onblur=${send} onkeydown=${key} onpaste=${paste} /></td>`;
   }
 
@@ -72,9 +72,9 @@
         ${columns.map((name, k) => html`<${Cell} key=${name} value=${specimen.cells[name] || ""} label=${S.cell(name, specimen.id)} testid=${`cell-${specimen.id}-${name}`} row=${row} column=${k + 1}
           onedit=${(value) => Studio.edit({ what: "cells", cells: [{ id: specimen.id, column: name, value }] })} onblock=${(rows) => onblock(specimen.id, k, rows)} />`)}
         <td>${specimen.set === "new" ? S.new : S.training}</td>
-        <td><select aria-label=${S.unitOf(specimen.id)} data-testid=${`unit-${specimen.id}`} value=${specimen.unit} onchange=${(event) => setUnit(specimen, event.target)}>
+        <td><select aria-label=${S.unitOf(specimen.id)} data-testid=${`unit-${specimen.id}`} disabled=${Studio.state.read_only} value=${specimen.unit} onchange=${(event) => setUnit(specimen, event.target)}>
           ${["", ...Studio.state.units].map((unit) => html`<option value=${unit}>${S.unit(unit)}</option>`)}</select></td>
-        <td class="tick"><input type="checkbox" checked=${specimen.mirrored} aria-label=${S.mirrorOne(specimen.id)} data-testid=${`mirror-${specimen.id}`} onchange=${(event) => setMirror(specimen, event.target)} /></td>
+        <td class="tick"><input type="checkbox" checked=${specimen.mirrored} aria-label=${S.mirrorOne(specimen.id)} data-testid=${`mirror-${specimen.id}`} disabled=${Studio.state.read_only} onchange=${(event) => setMirror(specimen, event.target)} /></td>
         <td class="number">${specimen.extent ? specimen.extent.toLocaleString("en", { maximumSignificantDigits: 3 }) : ""}</td>
         <td class="number">${specimen.triangles ? specimen.triangles.toLocaleString("en") : ""}</td>
         <td class="findings"><${Studio.Findings} specimen=${specimen} /></td>
@@ -85,7 +85,7 @@
     const [name, setName] = useState(null);
     const ref = useRef(null);
     useEffect(() => { if (ref.current) ref.current.focus(); }, [name === null]);
-    if (name === null) return html`<${Button} testid="add-column" onclick=${() => setName("")}>${S.addColumn}<//>`;
+    if (name === null) return html`<${Button} edits testid="add-column" onclick=${() => setName("")}>${S.addColumn}<//>`;
     return html`
       <form class="row inline" onsubmit=${async (event) => { event.preventDefault(); if (await Studio.edit({ what: "add-column", column: name.trim() })) setName(null); }}>
         <input ref=${ref} aria-label=${S.columnName} placeholder=${S.columnName} required data-testid="column-name" value=${name} oninput=${(event) => setName(event.target.value)}
@@ -111,7 +111,7 @@
     }, [columns]);
     const all = listed.length > 0 && listed.every((one) => selection.has(one.id));
     return html`
-      <p class="hint">${S.pasteHint}</p>
+      ${!Studio.state.read_only && html`<p class="hint">${S.pasteHint}</p>`}
       <div class="table-box" role="region" aria-label=${S.tableLabel} tabindex="0">
         <table data-testid="table">
           <caption class="hidden">${S.tableLabel}</caption>
@@ -119,7 +119,7 @@
             <th scope="col"><input type="checkbox" checked=${all} aria-label=${S.selectAll} data-testid="select-all" onclick=${onselectall} /></th>
             <th scope="col">${S.columns.use}</th><th scope="col">${S.columns.id}</th>
             ${columns.map((name) => html`<th scope="col" key=${name}><span class="head">${name}
-              <button type="button" class="small quiet" aria-label=${S.removeColumn(name)} data-testid=${`remove-column-${name}`} onclick=${() => setRemoving(name)}>×</button></span></th>`)}
+              <${Button} edits small class="quiet" aria-label=${S.removeColumn(name)} testid=${`remove-column-${name}`} onclick=${() => setRemoving(name)}>×<//></span></th>`)}
             <th scope="col">${S.columns.set}</th><th scope="col">${S.columns.unit}</th><th scope="col">${S.columns.mirror}</th>
             <th scope="col" class="number">${S.columns.extent}</th><th scope="col" class="number">${S.columns.size}</th><th scope="col">${S.columns.findings}</th>
           </tr></thead>

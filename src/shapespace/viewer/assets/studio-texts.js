@@ -10,7 +10,7 @@
     unreachable: "The studio's server does not answer; see whether shapespace studio still runs, then do it again.",
     unauthorised: "This page is no longer signed in; open the address that shapespace studio printed.",
     serverError: (status) => `The server answered with the error ${status}; reload the page.`,
-    close: "Close", cancel: "Cancel", closeProject: "Close project", loading: "Reading the project", done: "done", running: "running",
+    close: "Close", cancel: "Cancel", closeProject: "Close project", loading: "Reading the project", readOnly: " (read only)", done: "done", running: "running",
     screens: {
       specimens: "Specimens", correspondence: "Correspondence", model: "Model", fit: "Fit", questions: "Questions", export: "Export", history: "History",
     },
@@ -79,8 +79,8 @@
     correspondence: {
       title: "Correspondence", intro: (number) => `${count(number, "included specimen")} for training. Each gets the same vertices, so that shapes can be compared.`,
       redoTitle: "Correct one scan", redoHint: "Does one surface not match its scan? Redo only that one; all others stay as they are.", redoWhich: "Scan", redo: "Redo this one",
-      landmarksTitle: "Landmarks", landmarksHint: "Click a place on any surface to mark the same vertex on all, then name it. Commands use the names.",
-      landmark: "Name", vertex: "Vertex", addLandmark: "Add", removeLandmark: (name) => `Remove the landmark ${name}`, noLandmarks: "None yet.",
+      landmarksTitle: "Landmarks", landmarksHint: "Click a place on any surface to mark the same vertex on all, then name it. Drag a landmark on one surface to move it on all. Commands use the names.",
+      landmark: "Name", vertex: "Vertex", landmarksElsewhere: (output) => `The landmarks of this project were placed on ${output}, whose vertices are others; those that you add here replace them.`, vertexOf: (name) => `Vertex of ${name}`, addLandmark: "Add", removeLandmark: (name) => `Remove the landmark ${name}`, noLandmarks: "None yet.",
       none: "Add specimens first; correspondence needs at least two.", empty: "After the run, all surfaces turn here together: check that the checkerboard lies the same way on each.",
     },
     model: { title: "Model", intro: "Mean shape and modes of variation of the surfaces in correspondence.", empty: "After the run, the model with a slider per mode is shown here.", none: "Bring the specimens into correspondence first." },

@@ -7,8 +7,8 @@
   const Studio = window.ShapespaceStudio;
   const T = window.ShapespaceTexts;
 
-  /** A button; properties as of the element. */
-  const Button = ({ strong, small, testid, children, class: extra = "", ...rest }) => html`
+  /** A button; properties as of the element. One that `edits` the project is not there where it is only shown. */
+  const Button = ({ strong, small, testid, edits, children, class: extra = "", ...rest }) => edits && Studio.state.read_only ? null : html`
     <button type="button" class=${`${strong ? "strong" : ""} ${small ? "small" : ""} ${extra}`} data-testid=${testid} ...${rest}>${children}</button>`;
 
   /** A modal dialog; Escape closes it. */
@@ -40,6 +40,11 @@
 
   /** Its content, which takes dropped files and folders. */
   function DropZone({ onfiles, testid, class: extra = "", children }) {
+    if (Studio.state.read_only) return html`<div class=${extra} data-testid=${testid}>${children}</div>`;
+    return html`<${Droppable} onfiles=${onfiles} testid=${testid} class=${extra}>${children}<//>`;
+  }
+
+  function Droppable({ onfiles, testid, class: extra, children }) {
     const [over, setOver] = useState(0);
     const hasFiles = (event) => Array.from(event.dataTransfer.types).includes("Files");
     const drop = Viewer.guarded(async (event) => { onfiles(await Studio.filesOfDrop(event.dataTransfer)); });

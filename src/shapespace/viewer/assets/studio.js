@@ -43,7 +43,7 @@
               ${T.screens[name]}${progress && html` <span class=${`mark ${progress}`} role="img" aria-label=${T[progress]}>${progress === "done" ? "✓" : "…"}</span>`}</button>`;
           })}
         </div>
-        <${Button} small testid="close-project" onclick=${() => Studio.act("/api/close")}>${T.closeProject}<//>
+        <${Button} edits small testid="close-project" onclick=${() => Studio.act("/api/close")}>${T.closeProject}<//>
       </nav>
       <main>
         <div id="screen" role="tabpanel" tabindex="-1" aria-labelledby=${`tab-${screen}`} data-screen=${screen}><${Screen} key=${screen} project=${project} go=${go} next=${next} /></div>
@@ -58,7 +58,7 @@
   function draw() {
     const { project } = Studio.state;
     const about = document.getElementById("about");
-    about.textContent = project ? project.name : "";
+    about.textContent = project ? `${project.name}${Studio.state.read_only ? T.readOnly : ""}` : "";
     about.title = project ? project.folder : "";
     document.title = project ? `${project.name}, shapespace studio` : "shapespace studio";
     render(html`<${App} />`, document.getElementById("app"));

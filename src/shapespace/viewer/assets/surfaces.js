@@ -15,6 +15,7 @@
   let first = 0; // number of the first one that is shown
   let cells = []; // the mean shape, then one a scan
   let marks = []; // numbers of vertices
+  let named = []; // landmarks of the studio's project: {name, vertex}
   let colour = "squares";
   let turn = 0; // a page that is still on its way is not shown when another was asked for
 
@@ -28,11 +29,12 @@
       const name = h("strong", {}), note = h("span", { class: "note", "data-testid": `note-${k}` });
       const box = h("div", { class: "cell", "data-testid": `cell-${k}` }, canvas, note, h("p", {}, name));
       $("grid").append(box);
-      const cell = { box, name, note, positions: null, std: null, view: new Shapespace.View(canvas, { label: "A surface in 3-D" }) };
+      const cell = { box, name, note, marked: [], positions: null, std: null, view: new Shapespace.View(canvas, { label: "A surface in 3-D" }) };
       cell.view.on("click", (event) => {
         const hit = cell.view.pick(event.clientX, event.clientY, ["surface"]);
         if (hit) addMark(hit.vertex);
       });
+      startDragging(cell, canvas);
       cells.push(cell);
     }
   }
@@ -76,16 +78,62 @@
     }
     marks.push(vertex);
     drawAllMarks();
-    // The studio names landmarks by it.
-    if (window.parent !== window) window.parent.postMessage({ vertex }, location.origin);
+    tellStudio({ vertex });
+  }
+
+  /** The studio names landmarks by the vertex that was marked last, and stores those that were moved. */
+  function tellStudio(message) {
+    if (window.parent !== window) window.parent.postMessage(message, location.origin);
+  }
+
+  function startNamed() {
+    addEventListener("message", (event) => {
+      if (event.source !== window.parent || event.origin !== location.origin || !Array.isArray(event.data?.landmarks)) return;
+      named = event.data.landmarks.filter((one) => one.vertex < about.vertices);
+      drawAllMarks();
+    });
+    tellStudio({ ready: true });
+  }
+
+  /** A mark follows the pointer that takes it, on all surfaces at once. */
+  function startDragging(cell, canvas) {
+    let taken = null;
+    const during = (action) => (event) => {
+      if (!taken) return;
+      event.stopPropagation(); // the surface does not turn
+      action(event);
+    };
+    canvas.addEventListener("pointerdown", (event) => {
+      const hit = event.button === 0 && cell.marked.length ? cell.view.pick(event.clientX, event.clientY, ["marks", "surface"]) : null;
+      if (!hit || hit.id !== "marks") return;
+      event.stopPropagation();
+      taken = cell.marked[hit.vertex];
+      canvas.setPointerCapture(event.pointerId);
+    }, true);
+    canvas.addEventListener("pointermove", during((event) => {
+      const hit = cell.view.pick(event.clientX, event.clientY, ["surface"]);
+      if (!hit || hit.vertex === taken.vertex || marks.includes(hit.vertex)) return;
+      if (taken.name === undefined) marks[marks.indexOf(taken.vertex)] = hit.vertex;
+      else named.find((one) => one.name === taken.name).vertex = hit.vertex;
+      taken = { ...taken, vertex: hit.vertex };
+      drawAllMarks();
+    }), true);
+    const end = during(() => {
+      tellStudio(taken.name === undefined ? { vertex: taken.vertex } : { landmark: taken.name, vertex: taken.vertex });
+      taken = null;
+    });
+    for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, end, true);
   }
 
   function drawMarks(cell) {
-    const shown = [], gone = [];
-    marks.forEach((vertex, k) => {
-      const position = Array.from(cell.positions.subarray(3 * vertex, 3 * vertex + 3));
-      if (position.every(Number.isFinite)) shown.push({ position, label: String(vertex), colour: markColour(k) });
-      else gone.push(vertex);
+    const gone = [];
+    cell.marked = [];
+    const shown = [];
+    [...marks.map((vertex) => ({ vertex })), ...named].forEach((mark, k) => {
+      const position = Array.from(cell.positions.subarray(3 * mark.vertex, 3 * mark.vertex + 3));
+      if (!position.every(Number.isFinite)) { gone.push(mark.name ?? mark.vertex); return; }
+      cell.marked.push(mark);
+      shown.push({ position, label: mark.name ?? String(mark.vertex), colour: markColour(k) });
     });
     cell.view.marks("marks", shown);
     cell.note.textContent = gone.length ? `${gone.length > 3 ? `${gone.length} marked vertices` : gone.join(", ")} not shown` : "";
@@ -200,6 +248,7 @@
     Viewer.startTheme(() => cells.forEach((cell) => cell.view.request()));
     Viewer.startMessages();
     startMarks();
+    startNamed();
     startScans();
     $("loading").hidden = true;
     rows = await json("api/surfaces");

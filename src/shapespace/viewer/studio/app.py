@@ -56,14 +56,18 @@ class OpenProject:
         create: whether it is new.
         changed: called when anything changed.
         upload_bytes: size limit of a scan.
+        read_only: nothing is written into the folder, in which a studio may run.
     """
 
-    def __init__(self, folder: Path, *, create: bool, changed: Callable[[], None], upload_bytes: int) -> None:
+    def __init__(
+        self, folder: Path, *, create: bool, changed: Callable[[], None], upload_bytes: int, read_only: bool = False
+    ) -> None:
         self.project = Project.open(folder, create=create)
         self._resources = ExitStack()
-        self._resources.enter_context(only_writer(self.project.folder))
-        self.jobs = Jobs(self.project.folder, changed)
-        self.checks = SpecimenChecks(self.project.folder, changed, self.project.exclude)
+        if not read_only:
+            self._resources.enter_context(only_writer(self.project.folder))
+        self.jobs = Jobs(self.project.folder, changed, read_only=read_only)
+        self.checks = SpecimenChecks(self.project.folder, changed, self.project.exclude, read_only=read_only)
         self.views = Views(self._result, upload_bytes)
         for resource in (self.views, self.checks, self.jobs):
             self._resources.callback(resource.close)
@@ -90,6 +94,7 @@ class OpenProject:
             "name": state.name, "folder": str(project.folder), "revision": project.revision,
             "columns": list(state.columns), "specimens": specimens, "notes": state.notes(), "counts": state.counts(),
             "undo": project.undo_text, "redo": project.redo_text, "landmarks": state.landmarks,
+            "landmarks_on": state.landmarks_on,
             "jobs": [self._job(job) for job in self.jobs.all()],
         }  # fmt: skip
 
@@ -136,17 +141,20 @@ class Studio:
         forms: of the commands.
         folder: of the project to open; None for the start page.
         upload_bytes: size limit of a scan.
+        read_only: show the project, and refuse edits and jobs.
     """
 
-    def __init__(self, forms: Forms, folder: Path | None, upload_bytes: int) -> None:
+    def __init__(self, forms: Forms, folder: Path | None, upload_bytes: int, *, read_only: bool = False) -> None:
         self.ends: Callable[[], bool] = lambda: False  # whether the server is about to end, and streams with it
         self._forms = forms
         self._upload_bytes = upload_bytes
+        self._read_only = read_only
         self._changes = 0
         self._open: OpenProject | None = None
         self._lock = threading.RLock()
         if folder is not None:
-            self._switch(folder, create=not folder.exists() or (folder.is_dir() and not any(folder.iterdir())))
+            is_new = not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
+            self._switch(folder, create=is_new and not read_only)
 
     def app(self) -> ASGIApp:
         """Return the application, without a guard."""
@@ -178,6 +186,8 @@ class Studio:
             Route("/zip/{number:int}", self._zip),
             Mount("/view", app=self._view),
         ]
+        if self._read_only:
+            routes = [one for one in routes if isinstance(one, Mount) or "GET" in (one.methods or ())]
         return application(routes, str)
 
     def close(self) -> None:
@@ -200,10 +210,13 @@ class Studio:
         with self._lock:
             if self._open is not None and self._open.project.folder == folder.resolve():
                 return
-            opened = OpenProject(folder, create=create, changed=self._changed, upload_bytes=self._upload_bytes)
+            opened = OpenProject(
+                folder, create=create, changed=self._changed, upload_bytes=self._upload_bytes, read_only=self._read_only
+            )
             self.close()
             self._open = opened
-            recent_projects(opened.project.folder)
+            if not self._read_only:
+                recent_projects(opened.project.folder)
             self._changed()
 
     # The state
@@ -222,7 +235,7 @@ class Studio:
             {
                 "version": __version__, "project": None if self._open is None else self._open.facts(),
                 "recent": recent_projects(), "formats": list(MESH_ENDINGS), "upload_bytes": self._upload_bytes,
-                "units": list(MM_PER_UNIT),
+                "units": list(MM_PER_UNIT), "read_only": self._read_only,
             }
         )  # fmt: skip
 

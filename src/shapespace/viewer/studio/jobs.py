@@ -89,9 +89,10 @@ class Jobs:
     Args:
         folder: of the project.
         changed: called when a job changed.
+        read_only: look at the jobs alone; nothing is started or written.
     """
 
-    def __init__(self, folder: Path, changed: Callable[[], None]) -> None:
+    def __init__(self, folder: Path, changed: Callable[[], None], *, read_only: bool = False) -> None:
         self._folder = folder / FOLDER
         self._changed = changed
         self._lock = threading.RLock()
@@ -103,9 +104,10 @@ class Jobs:
             with contextlib.suppress(OSError, ValueError):
                 job = read(Job, json.loads(path.read_text(encoding="utf-8")), str(path), "remove it")
                 self._jobs[job.number] = self._looked_at(job)
-        self._write_history()
         self._thread = threading.Thread(target=self._work, name="studio jobs", daemon=True)
-        self._thread.start()
+        if not read_only:
+            self._write_history()
+            self._thread.start()
 
     def all(self) -> list[Job]:
         """Return all jobs, the oldest first."""
@@ -194,7 +196,8 @@ class Jobs:
     def close(self) -> None:
         """End the thread; a running job goes on."""
         self._stop.set()
-        self._thread.join()
+        if self._thread.is_alive():
+            self._thread.join()
 
     def _put(self, job: Job) -> None:
         stored = replace(job, status="waiting", message="", code=None, seconds=0.0)

@@ -29,10 +29,13 @@ class SpecimenChecks:
         unusable: and before, with the path of a scan that cannot be used.
     """
 
-    def __init__(self, folder: Path, changed: Callable[[], None], unusable: Callable[[Path], None]) -> None:
+    def __init__(
+        self, folder: Path, changed: Callable[[], None], unusable: Callable[[Path], None], *, read_only: bool = False
+    ) -> None:
         self._folder = folder / _FOLDER
         self._changed = changed
         self._unusable = unusable
+        self._read_only = read_only
         self._asked: set[str] = set()
         self._pool: ProcessPoolExecutor | None = None
         self._known: dict[str, dict[str, Any]] = {}
@@ -60,7 +63,7 @@ class SpecimenChecks:
             self._pool.shutdown(wait=False, cancel_futures=True)
 
     def _ask(self, key: str, scan: Path) -> None:
-        if key in self._asked:
+        if key in self._asked or self._read_only:
             return
         self._asked.add(key)
         with contextlib.suppress(OSError):  # the check reports what cannot be written
