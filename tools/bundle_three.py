@@ -1,4 +1,4 @@
-"""Make report/assets/vendor/three.min.js: the part of three.js that scene.js needs, as one classic script.
+"""Make report/assets/vendor/three.min.js: the part of three.js that the scripts of scenes need, as one classic script.
 
 For developers, when three.js is updated; needs npm and the network. Users need neither.
 
@@ -83,7 +83,7 @@ def main() -> None:
 def readme(script: bytes) -> str:
     return f"""# three.min.js
 
-The part of [three.js](https://threejs.org) that `scene.js` draws with. three.js is under the MIT licence, in `LICENSE`.
+The part of [three.js](https://threejs.org) that `scene-*.js` use. three.js is under the MIT licence, in `LICENSE`.
 
 | | |
 |---|---|
@@ -94,7 +94,7 @@ The part of [three.js](https://threejs.org) that `scene.js` draws with. three.js
 
 The file is a classic script with the global `THREE`, so that it can stand inside a page that is opened from disk. It
 holds only the names listed in the tool, with what they need. The shaders of the built-in materials are left out, as
-`scene.js` brings its own. Do not edit it; run the tool again.
+`scene-material.js` has its own. Do not edit it; run the tool again.
 """
 
 

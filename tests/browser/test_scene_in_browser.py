@@ -1,4 +1,4 @@
-"""What scene.js and widgets.js make of packed arrays, in a real browser with software WebGL."""
+"""What the scripts of scenes and widgets make of packed arrays, in a real browser with software WebGL."""
 
 import base64
 import io

@@ -17,12 +17,13 @@ from shapespace.errors import InputError
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.report.inputs.staged_fit import StagedFit
 from shapespace.report.render import scene
+from shapespace.report.render.scene_scripts import SCENE_SCRIPTS, WIDGET_SCRIPTS
 from shapespace.types import Mesh, SurfaceLandmarks
 from synthetic_shapes import blob_model, raw_scan
 
 
 def unpack(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The reader of scene.js, in NumPy."""
+    """The reader of scene-data.js, in NumPy."""
     (length,) = struct.unpack("<I", data[:4])
     header = json.loads(data[4 : 4 + length])
     start = -(-(4 + length) // 8) * 8
@@ -318,6 +319,13 @@ def test_the_scripts_can_stand_inside_a_page() -> None:
     assert "</script" not in text.lower() and "<!--" not in text
     assert not re.search(r"\b(import|export)\s*[({*]", text.split("three.js", 1)[0])
     assert ".ss-widget" in scene.style()
+
+
+def test_every_script_of_scenes_and_widgets_is_listed_once_and_short() -> None:
+    folder = files("shapespace.report").joinpath("assets")
+    present = [entry.name for entry in folder.iterdir() if re.match(r"(scene|widget).*\.js$", entry.name)]
+    assert sorted(present) == sorted(SCENE_SCRIPTS + WIDGET_SCRIPTS)
+    assert all(len(folder.joinpath(name).read_text("utf-8").splitlines()) <= 300 for name in present)
 
 
 def test_three_js_is_the_file_that_its_readme_records() -> None:

@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,9 +16,11 @@ from viewer_world import enter, served, unpacked
 
 from same_blobs import ASIDE, FAR, FOLDED, HIDDEN, NAMES, VERTICES, surface, write_same
 from shapespace.errors import FileFormatError, InputError
+from shapespace.report.render.scene_scripts import SCENE_SCRIPTS
 from shapespace.viewer import corresponding_surfaces as module
 from shapespace.viewer.corresponding_surfaces import Surfaces
 from shapespace.viewer.guard import SECURITY_HEADERS, Access
+from shapespace.viewer.responses import ASSETS, PAGES
 from shapespace.viewer.serve import serve
 from shapespace.viewer.surfaces_server import make_surfaces_app
 
@@ -99,6 +102,15 @@ def test_what_is_not_there_is_refused_in_a_sentence(client: httpx.Client, path: 
     answer = client.get(path)
     assert answer.status_code == 404 and answer.json()["error"].endswith(".")
     assert client.get("/assets/../serve.py").status_code == 404
+
+
+@pytest.mark.parametrize("page", ["viewer.html", "surfaces.html"])
+def test_the_assets_of_a_page_are_served_and_those_of_scenes_are_loaded_in_order(page: str) -> None:
+    html = (PAGES / page).read_text("utf-8")
+    names = re.findall(r'<script src="/assets/(.+?)">', html)
+    assert all(ASSETS[name][0].is_file() for name in names)
+    first = names.index("three.min.js") + 1
+    assert tuple(names[first : first + len(SCENE_SCRIPTS)]) == SCENE_SCRIPTS
 
 
 def test_only_its_own_page_may_ask_and_only_read(client: httpx.Client) -> None:

@@ -32,7 +32,7 @@ VERTICES = 400
 
 
 def unpacked(content: bytes) -> tuple[dict, dict[str, np.ndarray]]:
-    """As scene.js reads it."""
+    """As scene-data.js reads it."""
     (length,) = struct.unpack("<I", content[:4])
     header = json.loads(content[4 : 4 + length])
     start, arrays = 8 * -(-(4 + length) // 8), {}

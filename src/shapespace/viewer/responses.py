@@ -12,6 +12,7 @@ from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import BaseRoute
 
 from shapespace.errors import ShapespaceError
+from shapespace.report.render.scene_scripts import SCENE_SCRIPTS
 from shapespace.schemas import to_json
 from shapespace.viewer.guard import refusal
 
@@ -32,7 +33,7 @@ ASSETS: Mapping[str, tuple[Path, str]] = {
     "preact-htm.min.js": (PAGES / "vendor" / "preact-htm.min.js", "text/javascript"),
     "theme.js": (_SHARED / "theme.js", "text/javascript"),
     "widgets.css": (_SHARED / "widgets.css", "text/css"),
-    "scene.js": (_SHARED / "scene.js", "text/javascript"),
+    **{name: (_SHARED / name, "text/javascript") for name in SCENE_SCRIPTS},
     "three.min.js": (_SHARED / "vendor" / "three.min.js", "text/javascript"),
 }
 """Path and media type of each static file, by name."""

@@ -157,7 +157,7 @@ class Turning:
     """What turns where the browser can, and is a still on paper and without a script.
 
     Args:
-        widget: a name of `Shapespace.widgets` in widgets.js.
+        widget: a name of `Shapespace.widgets`, which the scripts `widget-*.js` define.
         payload: the id of what it shows.
         poster: the still.
         caption: of both.

@@ -40,7 +40,7 @@ from shapespace.types import FloatArray, IntArray, Mesh
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")  # in the order of those of widgets.js
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")  # in the order of those of widget-morphospace-drawing.js
 _ELLIPSE = 0.95  # probability
 _SPARSE = 5  # every fifth point of a grid line is kept, so that the page is small
 _MOST_GRID = 400

@@ -1,7 +1,7 @@
-"""Interactive 3-D views for the browser: arrays packed for scene.js, and the scripts that draw them.
+"""Interactive 3-D views for the browser: packed arrays, and the scripts that draw them.
 
 The bytes of `pack` are a uint32 (little-endian) with the length of a JSON header, the header, zeros up to a multiple of
-8, then the arrays, each at a multiple of 8. `Shapespace.unpack` of scene.js reads them back.
+8, then the arrays, each at a multiple of 8. `Shapespace.unpack` of scene-data.js reads them back.
 """
 
 from __future__ import annotations
@@ -23,15 +23,13 @@ import numpy.typing as npt
 from shapespace.errors import InputError
 from shapespace.report.inputs.staged_fit import StagedFit, measured_mm
 from shapespace.report.render.decimate import decimate
+from shapespace.report.render.scene_scripts import SCENE_SCRIPTS, WIDGET_SCRIPTS
 from shapespace.schemas import FitRecord, to_json
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 
 if TYPE_CHECKING:
     from shapespace.model.shape_model import ShapeModel
     from shapespace.report.figures.morphospace_figures import Morphospace
-
-SCRIPTS = ("vendor/three.min.js", "scene.js", "widgets.js")
-"""The scripts of `assets` that a page with scenes needs, in this order; the colours come before the last."""
 
 _DTYPES = ("float32", "int32", "uint32", "uint16", "int16", "uint8")
 _UNKNOWN = -32768  # smallest int16
@@ -432,9 +430,11 @@ def scripts() -> str:
         "unknown": list(colours.UNKNOWN_COLOUR),
         "signal": list(colours.BEYOND_COLOUR),
     }
-    texts = [folder.joinpath(name).read_text(encoding="utf-8") for name in SCRIPTS]
-    texts.insert(-1, f"Shapespace.colours = {json.dumps(shared)};\n")
-    return "\n".join(texts)
+    scenes, widgets = (
+        [folder.joinpath(name).read_text(encoding="utf-8") for name in names]
+        for names in (("vendor/three.min.js", *SCENE_SCRIPTS), WIDGET_SCRIPTS)
+    )
+    return "\n".join([*scenes, f"Shapespace.colours = {json.dumps(shared)};\n", *widgets])
 
 
 def style() -> str:
