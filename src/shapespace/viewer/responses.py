@@ -29,6 +29,8 @@ ASSETS: Mapping[str, tuple[Path, str]] = {
     "studio.css": (PAGES / "studio.css", "text/css"),
     **{name: (PAGES / name, "text/javascript") for name in (*_VIEWER_SCRIPTS, *_STUDIO_SCRIPTS)},
     "preact-htm.min.js": (PAGES / "vendor" / "preact-htm.min.js", "text/javascript"),
+    "uPlot.iife.min.js": (PAGES / "vendor" / "uPlot.iife.min.js", "text/javascript"),
+    "uPlot.min.css": (PAGES / "vendor" / "uPlot.min.css", "text/css"),
     "theme.js": (_SHARED / "theme.js", "text/javascript"),
     "widgets.css": (_SHARED / "widgets.css", "text/css"),
     "scene.js": (_SHARED / "scene.js", "text/javascript"),
