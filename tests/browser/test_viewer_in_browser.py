@@ -4,6 +4,7 @@ import base64
 import csv
 import io
 import json
+import re
 import shutil
 import signal
 from collections.abc import Iterator
@@ -166,6 +167,68 @@ def test_saved_fits_come_doubtful_ones_first_and_step_through(open_tab, address:
         "e => { e.value = 0; e.dispatchEvent(new Event('input', {bubbles: true})); }"
     )
     assert change(shown, view(tab)) > 0.01
+    assert tab.complaints == []
+
+
+DRAWN = """(chart) => {
+  const canvas = chart.querySelector("canvas"), accent = getComputedStyle(chart).getPropertyValue("--accent").trim();
+  const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext("2d", { willReadFrequently: true });
+  copy.drawImage(canvas, 0, 0);
+  const { data } = copy.getImageData(0, 0, canvas.width, canvas.height);
+  const [r, g, b] = [1, 3, 5].map((i) => parseInt(accent.slice(i, i + 2), 16));
+  let inked = 0;
+  for (let i = 0; i < data.length; i += 4) if (data[i] === r && data[i + 1] === g && data[i + 2] === b) inked += 1;
+  return { accent, inked, sharp: canvas.width / canvas.clientWidth };
+}"""
+"""The colour of a chart's lines and points, how many of its pixels have it, and device pixels per pixel."""
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_charts_show_the_iterations_and_the_coefficients(open_tab, address: str, world: World, scheme: str) -> None:
+    tab = ready(open_tab(address, scheme=scheme, device_scale_factor=2), "fits")
+    tab.page.locator('[data-testid="fit"][data-name="plain"]').click()
+    tab.until("document.getElementById('caption-a').textContent.startsWith('plain')")
+    detail, moment = tab.page.get_by_test_id("fit-detail"), tab.page.get_by_test_id("fit-moment")
+    rms, bars = detail.get_by_role("img", name="RMS distance by"), detail.get_by_role("img", name="Coefficients in")
+    last = int(moment.get_attribute("max"))
+    assert rms.get_attribute("data-points") == str(last + 1) and rms.get_attribute("data-now") == str(last)
+    at_last = rms.screenshot()
+    moment.evaluate(MOVE, 2)
+    assert rms.get_attribute("data-now") == "2"
+    assert change(at_last, rms.screenshot()) > 0.001
+    record = read_record(world.fits / "plain.fit.json")
+    K = min(len(record.b), 20)
+    assert bars.get_attribute("data-points") == str(K)
+    for chart in (rms, bars):
+        before = chart.evaluate(DRAWN)
+        assert before["inked"] > 300 and before["sharp"] == 2
+
+    bars.scroll_into_view_if_needed()
+    tab.page.wait_for_timeout(50)
+    x0, y0, x1, y1 = box(bars.locator(".u-over"))
+    tab.page.mouse.move(x0 + 2.5 / K * (x1 - x0), (y0 + y1) / 2)
+    told = bars.locator(".tip")
+    told.wait_for()
+    tab.shot(scheme)
+    assert re.fullmatch(r"mode 3: [+\u2212]\d\.\d\d \u00b1 \d\.\d\d", told.inner_text())
+    assert told.inner_text().split()[2] == f"{record.z[2]:+.2f}".replace("-", "\u2212")
+    tab.page.mouse.move(x0, y0 - 200)
+    assert told.is_hidden()
+
+    tab.page.get_by_test_id("theme").click()
+    tab.until("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))")
+    for chart in (rms, bars):
+        after = chart.evaluate(DRAWN)
+        assert after["inked"] > 300 and after["accent"] != before["accent"]
+    tab.page.get_by_test_id("tab-compare").click()
+    tab.page.get_by_test_id("compare-a").select_option("fit plain")
+    both = tab.page.get_by_role("img", name="Coefficients in standard deviations, from and to")
+    assert both.get_attribute("data-points") == str(2 * K)
+    assert both.locator(".u-legend .u-label").all_inner_texts() == ["from", "to"]
+    tab.page.set_viewport_size(PHONE)
+    chart = "document.getElementById('compare-chart')"
+    tab.until(f"{chart}.querySelector('canvas').clientWidth === {chart}.clientWidth")
+    tab.shot(f"phone-{scheme}")
     assert tab.complaints == []
 
 

@@ -18,19 +18,20 @@ from shapespace.viewer.guard import refusal
 
 PAGES = Path(__file__).parent / "assets"
 _SHARED = Path(__file__).parents[1] / "report" / "assets"
+_VIEWER_SCRIPTS = (
+    "page.js", "charts.js", "coefficients-csv.js", "fit-controls.js", "fit-view.js", "viewer.js", "surfaces.js",
+    *(f"viewer-{part}.js" for part in ("stage", "model", "compare", "fits", "scan", "uploads", "landmarks")),
+)  # fmt: skip
 _STUDIO_SCRIPTS = ("studio.js", *(f"studio-{part}.js" for part in (
     "texts", "store", "widgets", "start", "table", "specimens", "jobs", "steps", "questions", "results",
 )))  # fmt: skip
 ASSETS: Mapping[str, tuple[Path, str]] = {
     "viewer.css": (PAGES / "viewer.css", "text/css"),
-    "page.js": (PAGES / "page.js", "text/javascript"),
-    "charts.js": (PAGES / "charts.js", "text/javascript"),
-    "fit-view.js": (PAGES / "fit-view.js", "text/javascript"),
-    "viewer.js": (PAGES / "viewer.js", "text/javascript"),
-    "surfaces.js": (PAGES / "surfaces.js", "text/javascript"),
     "studio.css": (PAGES / "studio.css", "text/css"),
-    **{name: (PAGES / name, "text/javascript") for name in _STUDIO_SCRIPTS},
+    **{name: (PAGES / name, "text/javascript") for name in (*_VIEWER_SCRIPTS, *_STUDIO_SCRIPTS)},
     "preact-htm.min.js": (PAGES / "vendor" / "preact-htm.min.js", "text/javascript"),
+    "uPlot.iife.min.js": (PAGES / "vendor" / "uPlot.iife.min.js", "text/javascript"),
+    "uPlot.min.css": (PAGES / "vendor" / "uPlot.min.css", "text/css"),
     "theme.js": (_SHARED / "theme.js", "text/javascript"),
     "widgets.css": (_SHARED / "widgets.css", "text/css"),
     **{name: (_SHARED / name, "text/javascript") for name in SCENE_SCRIPTS},
