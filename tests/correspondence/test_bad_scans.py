@@ -225,6 +225,7 @@ def test_a_scan_of_quite_another_size_is_named(say: Callable[..., str]) -> None:
     assert said.count("times as large") == 1 and "another unit" not in said
 
 
+@pytest.mark.long
 def test_a_scan_that_its_surface_hardly_follows_is_named_whatever_its_unit(say: Callable[..., str]) -> None:
     rough = raw_blob(2, points=1200, noise_mm=4.0).scan
     metres = SCANS[1].with_vertices(1e-3 * SCANS[1].vertices)
@@ -233,6 +234,7 @@ def test_a_scan_that_its_surface_hardly_follows_is_named_whatever_its_unit(say: 
     assert said.count("as is usual") == 1
 
 
+@pytest.mark.long
 def test_point_clouds_among_meshes_are_registered_as_their_meshes_are(say: Callable[..., str], tmp_path: Path) -> None:
     names = "abcd"
     said = say("--template", mesh_file(tmp_path, SCANS[3]), **dict(zip(names, SCANS, strict=True)))

@@ -215,6 +215,7 @@ def test_shapes_that_are_wrongly_placed_do_not_move_landmarks() -> None:
     np.testing.assert_allclose(found, mean.vertices[[7, 150, 30]], atol=1e-6)
 
 
+@pytest.mark.long
 def test_a_model_to_begin_with_gives_its_triangles_and_what_it_knows(blobs: list[RawBlob]) -> None:
     model = ss.ShapeModel.fit(training_meshes())
     scans = [one.scan for one in blobs]

@@ -89,6 +89,7 @@ def test_another_kind_is_excluded_as_a_group(mixed: list[Mesh]) -> None:
     assert [scan.reason for scan in made.scans] == [""] * 9 + [reason] * 6
 
 
+@pytest.mark.long
 def test_each_group_gets_its_own_folder(
     mixed: list[Mesh], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -80,6 +80,7 @@ def test_mirrored_scans_are_reflected_and_the_majority_keeps_its_side(mirrored: 
     assert dispersion_mm(BLOBS, sides) < 7.0  # mm; scans of the wrong side are 40 mm off or more
 
 
+@pytest.mark.long
 def test_mirrored_scans_are_excluded_on_request_and_files_are_trusted_on_request() -> None:
     made = correspond(mixed(), replace(CONFIG, mirror="ask"))
     assert [scan.reason.startswith("mirrored: its mirror image") for scan in made.scans] == [

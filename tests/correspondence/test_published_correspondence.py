@@ -116,6 +116,7 @@ def test_each_set_is_as_good_as_published(name: str) -> None:
     assert_as_good_as_published(name, measured(ss.correspond(of.scans, replace(CONFIG, mirror="never")), of))
 
 
+@pytest.mark.long
 def test_mirrored_scans_are_found_and_as_good_as_published() -> None:
     of = drawn(blob, 6)
     scans = [mirror_image(scan) if k in MIRRORED else scan for k, scan in enumerate(of.scans)]

@@ -49,6 +49,7 @@ def test_what_all_scans_have_in_common_does_not_make_them_doubtful() -> None:
     assert judge(replace(SURE, relief_agreement=0.2, usual_relief_agreement=0.2)).status == "converged"
 
 
+@pytest.mark.long
 def test_a_mirrored_scan_whose_file_is_trusted_is_doubtful_and_no_other() -> None:
     bones = drawn(bone, 5).scans
     made = correspond([mirror_image(one) if k == MIRRORED else one for k, one in enumerate(bones)], CONFIG)
