@@ -81,6 +81,7 @@ def test_a_damaged_file_is_made_again(scans: list[Mesh], placed: list[int], tmp_
     assert len(placed) == 1
 
 
+@pytest.mark.long
 def test_other_settings_find_nothing(scans: list[Mesh], placed: list[int], tmp_path: Path) -> None:
     one = CorrespondConfig(vertices=400, rounds=1, mirror="never", first=QUICK)
     correspond(scans, one, run=kept(tmp_path))
@@ -160,6 +161,7 @@ def test_each_field_of_a_task_is_part_of_its_key(scans: list[Mesh], placed: list
     assert len(placed) == len(others)
 
 
+@pytest.mark.long
 def test_colours_and_subjects_reach_other_processes(scans: list[Mesh], tmp_path: Path) -> None:
     painted = [replace(scan, colours=np.uint8(255) * (scan.vertices > scan.vertices.mean(axis=0))) for scan in scans]
     here = correspond(painted, SETTINGS, subjects=["a", "a", "b"])

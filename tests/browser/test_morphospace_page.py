@@ -127,3 +127,35 @@ def test_without_a_script_the_still_is_seen(open_tab, reports: dict[str, Path]) 
     poster = tab.page.locator("figure.turning .poster img")
     poster.scroll_into_view_if_needed()
     assert poster.is_visible() and drawn_share(poster.screenshot()) > 0.05
+
+
+def test_a_line_around_shapes_selects_them_and_the_list_selects_by_keyboard(open_tab, reports: dict[str, Path]) -> None:
+    tab, widget = opened(open_tab, reports["planar"], DESKTOP)
+    places = {shape: place_of(tab, widget, shape) for shape in (2, 3)}
+    chosen = widget.get_by_role("status")
+    widget.get_by_role("button", name="Select", exact=True).click()
+    box = widget.locator(".ss-plot canvas").bounding_box()
+
+    def around(shape: int) -> None:
+        x, y = box["x"] + places[shape]["x"], box["y"] + places[shape]["y"]
+        tab.page.mouse.move(x - 4, y - 4)
+        tab.page.mouse.down()
+        for dx, dy in ((4, -4), (4, 4), (-4, 4)):
+            tab.page.mouse.move(x + dx, y + dy, steps=2)
+        tab.page.mouse.up()
+
+    around(2)
+    assert "shape 2" in chosen.inner_text()
+    around(3)
+    assert "shape 3" in chosen.inner_text() and "shape 2" not in chosen.inner_text()
+    tab.page.keyboard.down("Shift")
+    around(2)
+    tab.page.keyboard.up("Shift")
+    assert {"shape 2", "shape 3"} <= set(chosen.inner_text().partition(": ")[2].split(", "))
+    widget.get_by_role("button", name="Clear selection").click()
+    assert chosen.inner_text() == ""
+    widget.locator("select").nth(2).select_option("7")
+    widget.get_by_role("button", name="Select this shape").press("Enter")
+    assert chosen.inner_text() == "1 selected: shape 7"
+    tab.shot("selected")
+    assert tab.complaints == []

@@ -274,6 +274,7 @@ def test_a_dropped_scan_is_fitted_as_the_command_line_fits_it(
     assert tab.complaints == []
 
 
+@pytest.mark.long
 def test_of_several_files_a_broken_one_gives_one_sentence_and_the_others_go_on(
     open_tab, address: str, world: World
 ) -> None:
@@ -450,6 +451,7 @@ def test_the_names_of_files_keep_their_letters(open_tab, address: str) -> None:
     assert shown == ["a"]
 
 
+@pytest.mark.long
 def test_a_reload_keeps_the_scans(open_tab, address: str, world: World) -> None:
     tab = ready(open_tab(address))
     drop(tab, world.scan)

@@ -119,6 +119,7 @@ def test_an_added_scan_changes_no_other_file_and_is_registered_once(
     assert files(same) == after_it
 
 
+@pytest.mark.long
 def test_an_added_surface_is_near_that_of_all_scans_together(
     run: Run, finished: Path, raw: Path, tmp_path: Path
 ) -> None:
@@ -135,6 +136,7 @@ def test_an_added_surface_is_near_that_of_all_scans_together(
     assert apart[0] < 1.1 * apart[1]
 
 
+@pytest.mark.long
 def test_odd_scans_are_added_or_excluded_as_in_a_run_and_none_by_the_others(
     run: Run, same: Path, tmp_path: Path
 ) -> None:

@@ -100,6 +100,7 @@ def test_a_disk_that_is_full_in_round_two_is_one_sentence_and_costs_nothing_that
     assert surfaces(tmp_path / "same") == whole
 
 
+@pytest.mark.long
 def test_a_scan_that_changed_since_the_interrupt_counts_as_it_is_now(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -130,6 +131,7 @@ def test_results_that_are_not_all_written_are_not_taken(
     assert run("build", same, "-o", model).code == 0
 
 
+@pytest.mark.long
 def test_a_finished_run_is_repeated_only_for_other_inputs_or_damaged_results(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -210,6 +210,7 @@ def test_what_is_odd_about_a_scan_is_said_and_kept(say: Callable[..., str], tmp_
     assert '"notes": [\n  "It has 2 separate pieces' in (tmp_path / "same" / "c.correspond.json").read_text("utf-8")
 
 
+@pytest.mark.long
 def test_an_object_of_another_kind_among_few_is_named(say: Callable[..., str]) -> None:
     directions, faces = sphere(1200)
     box = Mesh(80 * np.sign(directions) * np.abs(directions) ** 0.2, faces)

@@ -82,6 +82,7 @@ def mixed() -> list[Mesh]:
     return [*(raw_blob(k, points=700).scan for k in range(9)), *(other_blob(k, 700) for k in range(6))]
 
 
+@pytest.mark.long
 def test_another_kind_is_excluded_as_a_group(mixed: list[Mesh]) -> None:
     made = ss.correspond(mixed, CONFIG)
     assert made.groups == (tuple(f"blob{k}" for k in range(9)), tuple(f"other{k}" for k in range(6)))

@@ -104,6 +104,7 @@ def test_of_symmetric_objects_no_scan_is_reflected() -> None:
     assert not made.sides_decided and not any(scan.mirrored for scan in made.scans)
 
 
+@pytest.mark.long
 def test_landmarks_of_mirrored_scans_are_reflected_with_them() -> None:
     scans = [mirror_image(marked(one)) if k in MIRRORED else marked(one) for k, one in enumerate(BLOBS)]
     made = correspond(scans, CONFIG)

@@ -57,6 +57,7 @@ def test_a_mirrored_scan_whose_file_is_trusted_is_doubtful_and_no_other() -> Non
     assert made.scans[MIRRORED].probability < 0.1
 
 
+@pytest.mark.long
 def test_an_added_scan_has_a_status_of_its_own() -> None:
     made = correspond(drawn(bone, 5).scans, CONFIG)
     finished = FinishedCorrespondence(made.template, made.landmarks, made.meshes())

@@ -114,6 +114,7 @@ def test_a_scan_with_inner_surfaces_is_no_template_where_others_have_none() -> N
     assert np.isfinite(everywhere.nearness).all()
 
 
+@pytest.mark.long
 def test_outer_registers_the_scans_without_their_shells() -> None:
     quick = ElasticSettings(harmonics=100, points=500, iterations=10)
     config = CorrespondConfig(vertices=300, rounds=1, first=quick, next=quick)

@@ -165,6 +165,7 @@ def killed_when(command: list[str], there: Callable[[], bool]) -> None:
     assert process.wait(60) == -signal.SIGKILL
 
 
+@pytest.mark.long
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGKILL")
 def test_a_killed_build_started_again_goes_on_and_comes_to_the_same(folder: Path, tmp_path: Path) -> None:
     plan = ["build", str(folder / "old"), "--modes", "4", "--out-of-core", "--provenance", "killed"]

@@ -168,6 +168,7 @@ def holed(mesh: Mesh, share: float, seed: int) -> Mesh:
     return mesh.with_vertices(np.where((apart < np.quantile(apart, share))[:, None], np.nan, x))
 
 
+@pytest.mark.long
 def test_missing_vertices_leave_the_measures_what_they_are(measured: ModelQuality) -> None:
     found = measure_quality([holed(m, 0.15, k) for k, m in enumerate(blobs(30, noise_mm=0.1))], FEW)
     assert found.missing_share == pytest.approx(0.15, abs=0.01) and found.left_out_vertices == 0

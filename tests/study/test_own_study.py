@@ -57,6 +57,7 @@ def test_the_model_parts_who_and_what(world: Path) -> None:
     assert len(model.shape.landmarks) > 10
 
 
+@pytest.mark.long
 def test_everybody_has_a_prediction_or_counts_as_wrong(studied: Path) -> None:
     made = json.loads((studied / "recognition.json").read_text())
     confusion = next(part for part in made["parts"] if part["kind"] == "confusion")
@@ -69,11 +70,13 @@ def test_everybody_has_a_prediction_or_counts_as_wrong(studied: Path) -> None:
     assert {row[1] for row in rows} == {"unknown", "known"}
 
 
+@pytest.mark.long
 def test_it_ends_in_a_report(studied: Path) -> None:
     page = (studied / "report.html").read_text(encoding="utf-8")
     assert "Classifiers on unseen people" in page and 'class="broken"' not in page
 
 
+@pytest.mark.long
 def test_fits_that_are_there_are_kept(world: Path, studied: Path) -> None:
     fit = studied / "fits" / "subject_000_smile.fit.json"
     before = fit.stat().st_mtime_ns

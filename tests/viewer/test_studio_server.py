@@ -1,5 +1,7 @@
 """The studio's server: files to results over HTTP, jobs that outlive it, and requests that it refuses."""
 
+import errno
+import os
 import subprocess
 import time
 import zipfile
@@ -27,8 +29,8 @@ FORMS = forms(summaries_and_options())
 
 
 @contextmanager
-def studio(folder: Path | None, upload_bytes: int = 10**6) -> Iterator[httpx.Client]:
-    made, access = Studio(FORMS, folder, upload_bytes), Access()
+def studio(folder: Path | None, upload_bytes: int = 10**6, *, read_only: bool = False) -> Iterator[httpx.Client]:
+    made, access = Studio(FORMS, folder, upload_bytes, read_only=read_only), Access()
     try:
         with served(make_studio(made, access)) as address, httpx.Client(base_url=address, timeout=60) as client:
             enter(client, access)
@@ -141,6 +143,53 @@ def test_another_page_and_a_wrong_token_get_nothing(tmp_path: Path) -> None:
 def test_two_studios_cannot_write_into_one_project(tmp_path: Path) -> None:
     with studio(tmp_path / "p"), pytest.raises(FileError, match="is being written by another"):
         Studio(FORMS, tmp_path / "p", 1)
+
+
+def test_a_read_only_studio_shows_a_project_beside_another_one_and_writes_nothing(tmp_path: Path) -> None:
+    folder = tmp_path / "p"
+    with studio(folder) as client:
+        upload(client, tmp_path, 1)
+        until(client, lambda now: all(one["state"] != "waiting" for one in now["specimens"]))
+
+        def files() -> dict[Path, bytes]:
+            return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file() and path.name != "lock"}
+
+        before = files()
+        with studio(folder, read_only=True) as viewer:
+            shown = viewer.get("/api/project").json()
+            assert shown["read_only"] and [one["id"] for one in shown["project"]["specimens"]] == ["s0"]
+            assert viewer.get("/api/thumbnails/s0").status_code == 200
+            for path in ("/api/edit", "/api/undo", "/api/jobs", "/api/table", "/api/close", "/api/open"):
+                assert viewer.post(path, json={"revision": 0}).status_code == 405, path
+            assert viewer.put("/api/specimens?name=a.ply", content=b"x").status_code == 405
+        assert files() == before
+
+
+def test_on_a_full_disk_nothing_is_lost_and_the_reason_is_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "p"
+    with studio(folder) as client:
+        upload(client, tmp_path, 2)
+        until(client, lambda now: all(one["state"] != "waiting" for one in now["specimens"]))
+        before = (folder / "project.json").read_bytes()
+
+        def full(*_: object) -> None:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+        monkeypatch.setattr(os, "replace", full)
+        answers = [
+            client.put("/api/specimens?name=more.ply", content=(tmp_path / "s0.ply").read_bytes() + b"\n"),
+            client.post("/api/edit", json={"revision": state(client)["revision"], "what": "remove", "ids": ["s0"]}),
+            client.post("/api/jobs", json={"kind": "correspond", "options": {}}),
+        ]
+        for answer in answers:
+            assert answer.status_code in (422, 507) and "the disk is full" in sentence(answer)
+        assert (folder / "project.json").read_bytes() == before
+        assert sorted(path.name for path in (folder / "scans").iterdir()) == ["s0.ply", "s1.ply"]
+        assert [one["id"] for one in state(client)["specimens"]] == ["s0", "s1"] and state(client)["jobs"] == []
+        monkeypatch.undo()
+        assert client.post("/api/jobs", json={"kind": "correspond", "options": {}}).json()["number"] == 1
 
 
 def test_a_project_is_opened_from_the_page_and_is_among_the_recent_ones(tmp_path: Path) -> None:

@@ -34,6 +34,12 @@
       .map(([u, v]) => [mx + a * u, my + b * u + c * v]);
   }
 
+  /** Whether a point lies in a polygon, by the parity of its crossings to the right. */
+  const isInside = ([x, y], corners) => corners.reduce((inside, [x1, y1], k) => {
+    const [x2, y2] = corners[(k + 1) % corners.length];
+    return y1 > y !== y2 > y && x < x1 + ((y - y1) * (x2 - x1)) / (y2 - y1) ? !inside : inside;
+  }, false);
+
   /** An empty canvas of the size of its element: its context and sizes in CSS pixels, and a function that draws a line. */
   function cleared(canvas) {
     const ratio = Math.min(window.devicePixelRatio || 1, 2), { clientWidth: width, clientHeight: height } = canvas;
@@ -83,5 +89,5 @@
     } };
   }
 
-  Object.assign(Shapespace.widgetParts, { MARKERS, css, hullOf, ellipseOf, cleared, shapePicture });
+  Object.assign(Shapespace.widgetParts, { MARKERS, css, hullOf, ellipseOf, isInside, cleared, shapePicture });
 })();

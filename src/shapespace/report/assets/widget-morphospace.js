@@ -5,7 +5,7 @@
   const Shapespace = window.Shapespace;
   const {
     colours, make, signed, button, tick, select, niceCeiling, quantile, lazily,
-    MARKERS, css, hullOf, ellipseOf, cleared, shapePicture,
+    MARKERS, css, hullOf, ellipseOf, isInside, cleared, shapePicture,
   } = Shapespace.widgetParts;
 
   /** Shapes as points in the plane of two axes of an ordination; the shape at the marker is drawn next to the mean. */
@@ -87,6 +87,13 @@
           context.fill(path);
           context.stroke(path);
         });
+        for (const v of selected) {
+          context.beginPath();
+          context.arc(...pixels(at(v)), radius + 4, 0, 7);
+          Object.assign(context, { strokeStyle: style.color, lineWidth: 2 });
+          context.stroke();
+        }
+        if (lasso.length) line(lasso, style.color, 1.5, css(colours().unknown, 0.2));
       }
       const request = (changed) => {
         Object.assign(stale, changed);
@@ -134,6 +141,34 @@
         }, 150);
         request({ shape: true });
       };
+      // The selection: by a line around points, or from the list.
+      const selected = new Set(), chosen = make("span", { role: "status" });
+      let lasso = [], selects = false;
+      function changeSelection() {
+        const marked = Array.from(selected, (v) => names[v]);
+        chosen.textContent = marked.length ? `${marked.length} selected: ${marked.slice(0, 6).join(", ")}${marked.length > 6 ? " \u2026" : ""}` : "";
+        for (const one of [copy, clear]) one.hidden = !marked.length;
+        request({ plot: true });
+        // The studio offers to exclude or to group them; names are no secret to a page that shows the report.
+        if (window.parent !== window) window.parent.postMessage({ selected: marked }, "*");
+      }
+      const selector = button("Select", () => {
+        selects = !selects;
+        selector.setAttribute("aria-pressed", String(selects));
+      }, { "aria-pressed": "false", title: "Draw a line around shapes to select them; with Shift, add to the selection" });
+      const copy = button("Copy names", () => {
+        const marked = Array.from(selected, (v) => names[v]);
+        // Without access to the clipboard, as in a frame, the names are shown to be copied by hand.
+        navigator.clipboard.writeText(marked.join("\n")).catch(() => { chosen.textContent = marked.join(", "); });
+      }, { hidden: true });
+      const clear = button("Clear selection", () => { selected.clear(); changeSelection(); }, { hidden: true });
+      const selectOne = button("Select this shape", () => { if (list.value !== "") { selected.add(Number(list.value)); changeSelection(); } });
+      function endLasso(event) {
+        if (!event.shiftKey) selected.clear();
+        for (let v = 0; v < n; v++) if (!hidden.has(arrays.groups[v]) && isInside(pixels(at(v)), lasso)) selected.add(v);
+        lasso = [];
+        changeSelection();
+      }
       let drags = false;
       const point = (event) => {
         let least = event.pointerType === "touch" ? 256 : 81; // square of the distance within which a shape is meant, pixels
@@ -149,10 +184,20 @@
       canvas.addEventListener("pointerdown", (event) => {
         drags = event.button === 0;
         if (drags) canvas.setPointerCapture(event.pointerId);
-        point(event);
+        if (drags && selects) lasso = [[event.offsetX, event.offsetY]];
+        else point(event);
       });
-      canvas.addEventListener("pointermove", point);
-      for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, () => { drags = false; });
+      canvas.addEventListener("pointermove", (event) => {
+        if (!lasso.length) return point(event);
+        lasso.push([event.offsetX, event.offsetY]);
+        request({ plot: true });
+      });
+      for (const name of ["pointerup", "pointercancel"]) {
+        canvas.addEventListener(name, (event) => {
+          drags = false;
+          if (lasso.length) endLasso(event);
+        });
+      }
       canvas.addEventListener("pointerleave", () => { over = null; request({}); });
       canvas.addEventListener("keydown", (event) => {
         const step = ((event.shiftKey ? 0.1 : 0.02) * canvas.clientWidth) / scale;
@@ -188,7 +233,8 @@
       const ticks = [["Convex hulls", "hulls", groups.length], ["95 % ellipses", "ellipses", groups.length], ["Phylogeny", "phylogeny", arrays.edges.length],
         ["Leave-one-out scores", "validated", arrays.cross_validated], ["Colour by distance from the mean", "coloured", !facts.planar]];
       controls.append(legend, make("div", { class: "ss-buttons" }, ...ticks.filter((one) => one[2]).map(([text, key]) =>
-        tick(text, shown[key], (on) => { shown[key] = on; redraw(); }))), bar, make("div", { class: "ss-choices" }, ...choices, specimens), said);
+        tick(text, shown[key], (on) => { shown[key] = on; redraw(); }))), bar, make("div", { class: "ss-choices" }, ...choices, specimens),
+        make("div", { class: "ss-buttons" }, selector, selectOne, copy, clear, chosen), said);
       document.addEventListener("shapespace:theme", redraw);
       new ResizeObserver(redraw).observe(plot);
       drawPlot();

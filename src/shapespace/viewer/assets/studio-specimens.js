@@ -87,9 +87,31 @@
       <div class="row"><${AddButtons} set="training" strong /></div>
     </div>`;
 
+  /** Write one class into a column of the selected specimens, which is added where it is new. */
+  function Group({ ids, onclose }) {
+    const { columns } = Studio.state.project;
+    const [column, setColumn] = useState(columns[0] || S.groupColumn);
+    const [value, setValue] = useState("");
+    const save = async (event) => {
+      event.preventDefault();
+      const name = column.trim();
+      const isThere = columns.includes(name) || (await Studio.edit({ what: "add-column", column: name }));
+      if (isThere && (await Studio.edit({ what: "cells", cells: ids.map((id) => ({ id, column: name, value })) }))) onclose();
+    };
+    return html`
+      <form class="row inline" data-testid="group-form" onsubmit=${save}>
+        <label>${S.groupIn} <input list="group-columns" required size="10" data-testid="group-column" value=${column} oninput=${(event) => setColumn(event.target.value)} /></label>
+        <datalist id="group-columns">${columns.map((name) => html`<option value=${name}></option>`)}</datalist>
+        <label>${S.groupName} <input required size="10" data-testid="group-value" value=${value} oninput=${(event) => setValue(event.target.value)} /></label>
+        <button class="small strong" data-testid="group-save" disabled=${!column.trim() || !value.trim()}>${S.add}</button>
+        <${Button} small testid="group-cancel" onclick=${onclose}>${T.cancel}<//>
+      </form>`;
+  }
+
   /** What is done with the selected specimens. */
-  function SelectionBar({ selected, onclear }) {
+  Studio.SelectionBar = function SelectionBar({ selected, onclear }) {
     const [removing, setRemoving] = useState(false);
+    const [grouping, setGrouping] = useState(false);
     if (Studio.state.read_only) return null;
     const ids = selected.map((one) => one.id);
     const toNew = selected.some((one) => one.set === "training"), mirrored = selected.some((one) => !one.mirrored);
@@ -100,6 +122,7 @@
         <${Button} small testid="include-selected" onclick=${() => include(true)}>${S.include}<//>
         <${Button} small testid="exclude-selected" onclick=${() => include(false)}>${S.exclude}<//>
         <${Button} small testid="set-selected" onclick=${() => Studio.edit({ what: "set", ids, set: toNew ? "new" : "training" })}>${toNew ? S.toNew : S.toTraining}<//>
+        ${grouping ? html`<${Group} ids=${ids} onclose=${() => setGrouping(false)} />` : html`<${Button} small testid="group-selected" onclick=${() => setGrouping(true)}>${S.group}<//>`}
         <${Button} small testid="mirror-selected" onclick=${() => Studio.edit({ what: "mirror", ids, mirrored })}>${mirrored ? S.mirror : S.unmirror}<//>
         <label>${S.columns.unit} <select aria-label=${S.setUnit} data-testid="unit-selected" value=${selected.every((one) => one.unit === selected[0].unit) ? selected[0].unit : ""}
           onchange=${(event) => Studio.edit({ what: "unit", ids, unit: event.target.value })}>${["", ...Studio.state.units].map((unit) => html`<option value=${unit}>${S.unit(unit)}</option>`)}</select></label>
@@ -108,7 +131,7 @@
         ${removing && html`<${Confirm} title=${S.removeTitle(ids.length)} text=${S.removeText} action=${S.remove} onclose=${() => setRemoving(false)}
           onyes=${async () => { if (await Studio.edit({ what: "remove", ids })) onclear(); }} />`}
       </div>`;
-  }
+  };
 
   const matches = (specimen, words) => {
     const text = [specimen.id, specimen.set === "new" ? S.new : "", ...Object.values(specimen.cells), ...specimen.findings.map((one) => one.text)].join(" ").toLowerCase();
@@ -158,7 +181,7 @@
           <${Button} edits testid="undo" disabled=${!project.undo} title=${project.undo ? S.undoOf(project.undo) : S.undo} onclick=${Studio.undo}>${S.undo}<//>
           <${Button} edits testid="redo" disabled=${!project.redo} title=${project.redo ? S.redoOf(project.redo) : S.redo} onclick=${Studio.redo}>${S.redo}<//>
           ${layout === "table" ? html`<${Studio.AddColumn} />` : html`<${Button} testid="select-all" onclick=${selectAll}>${all ? S.clear : S.selectAll}<//>`}
-          ${selected.length > 0 && html`<${SelectionBar} selected=${selected} onclear=${() => setSelection(new Set())} />`}
+          ${selected.length > 0 && html`<${Studio.SelectionBar} selected=${selected} onclear=${() => setSelection(new Set())} />`}
         </div>
         ${!listed.length && html`<p class="hint">${S.nothing}</p>`}
         ${layout === "cards"

@@ -102,9 +102,22 @@
 
   const More = ({ kind, ...rest }) => Studio.forms[kind] ? html`<details data-testid=${`more-${kind}`}><summary>${T.jobs.kinds[kind]}</summary><p class="hint">${Studio.forms[kind].summary}</p><${JobForm} kind=${kind} ...${rest} /></details>` : null;
 
-  Studio.Model = function Model({ next, go }) {
+  /** The specimens that are selected in a frame's morphospace. */
+  function useSelected(frame, specimens) {
+    const [names, setNames] = useState([]);
+    useEffect(() => {
+      const take = ({ source, data }) => { if (frame.current && source === frame.current.contentWindow && Array.isArray(data?.selected)) setNames(data.selected); };
+      addEventListener("message", take);
+      return () => removeEventListener("message", take);
+    }, []);
+    return [specimens.filter((one) => names.includes(one.id)), () => setNames([])];
+  }
+
+  Studio.Model = function Model({ project, next, go }) {
     const kinds = ["build", "quality", "morphospace"];
+    const frame = useRef(null);
     const [job, select] = useResult(kinds);
+    const [selected, clear] = useSelected(frame, project.specimens);
     const ready = Boolean(Studio.newest("correspond", "redo"));
     const built = Boolean(Studio.newest("build"));
     const sources = ["correspond", "redo"];
@@ -115,7 +128,8 @@
       ${built && html`<div class="row nexts"><${Next} name="model" next=${next} ready=${!isBusy("build")} /><${Button} class="wide" testid="go-fit" onclick=${() => go("fit")}>${T.fitNext}<//></div>`}
       <${Settings} key="settings" kinds=${["build"]}><${JobForm} kind="build" sources=${sources} strong=${ready && !built && !isBusy("build")} disabled=${!ready || isBusy("build")} /><//>
       ${ready && html`<${More} kind="quality" sources=${sources} disabled=${isBusy("quality")} /><${More} kind="morphospace" sources=${sources} disabled=${isBusy("morphospace")} />`}`;
-    return html`<${Step} name="model" title=${T.model.title} controls=${controls} select=${select} job=${job} empty=${T.model.empty} />`;
+    return html`<${Step} name="model" title=${T.model.title} controls=${controls} select=${select} job=${job} empty=${T.model.empty} frame=${frame}>
+      ${selected.length > 0 && html`<${Studio.SelectionBar} selected=${selected} onclear=${clear} />`}<//>`;
   };
 
   // Fit -------------------------------------------------------------------------------------------------------------

@@ -45,6 +45,7 @@
       removeColumnTitle: (name) => `Remove the column ${name} with its cells?`, removeColumnText: "You can undo this.",
       columns: { id: "Specimen", use: "Use", set: "Set", unit: "Unit", mirror: "Mirror", extent: "Extent", size: "Triangles", findings: "Findings" },
       unit: (name) => ({ "": "as it is", um: "\u00b5m" })[name] || name, unitOf: (id) => `Unit of ${id}`, setUnit: "Set the unit", mirrorOne: (id) => `Use the mirror image of ${id}`,
+      group: "Make a group", groupIn: "Column", groupName: "Group", groupColumn: "group",
       mirror: "Mirror", unmirror: "Do not mirror", mirrored: "mirrored",
       cell: (column, id) => `${column} of ${id}`, rename: (id) => `Name of ${id}`, tableLabel: "Table of specimens",
       pasteHint: "Click a cell to edit it; Enter and the arrow keys move. Paste a block of cells from a spreadsheet into its first cell.",
