@@ -85,6 +85,7 @@ def test_fits_that_are_there_are_kept(world: Path, studied: Path) -> None:
     assert again == 0 and fit.stat().st_mtime_ns == before
 
 
+@pytest.mark.long
 def test_an_expression_is_put_on_somebody_else_from_the_command_line(
     world: Path, studied: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -97,6 +98,7 @@ def test_an_expression_is_put_on_somebody_else_from_the_command_line(
     assert "failed, so there is nothing to transfer" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_a_fit_of_another_model_is_not_transferred(
     world: Path, studied: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -121,6 +123,7 @@ def test_too_few_people_are_one_sentence(world: Path, tmp_path: Path, capsys: py
     assert code == 2 and "at least 4 people" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_two_folds_do_and_one_is_refused(
     world: Path, studied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
