@@ -72,6 +72,7 @@ def test_what_was_done_before_an_interruption_is_not_done_again(
         np.testing.assert_array_equal(one.vertices, other.vertices)
 
 
+@pytest.mark.long
 def test_a_damaged_file_is_made_again(scans: list[Mesh], placed: list[int], tmp_path: Path) -> None:
     correspond(scans, SETTINGS, run=kept(tmp_path))
     placed.clear()

@@ -182,7 +182,7 @@ def test_raw_scans_become_a_report_by_clicks_and_history_gives_the_same_numbers(
         assert tab.complaints == [] and tab.asked == []
         with studio(project, tmp_path, "view") as place:
             seen = open_tab(place, WINDOW, "dark")
-            User(seen).sees("card-bone_001")
+            User(seen).sees("row-bone_001")
             assert seen.page.get_by_test_id("choose-files").count() == 0
             seen.page.get_by_test_id("tab-questions").click()
             seen.page.get_by_test_id("earlier-3").click()

@@ -103,6 +103,7 @@ def add(run: Run, same: Path, *scans: Path, options: tuple[object, ...] = ()) ->
     return run("correspond", *scans, "--add", "-o", same, *QUIET, *options)
 
 
+@pytest.mark.long
 def test_an_added_scan_changes_no_other_file_and_is_registered_once(
     run: Run, same: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

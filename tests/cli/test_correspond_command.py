@@ -104,6 +104,7 @@ def test_bad_input_is_one_sentence(run: Run, raw: Path, tmp_path: Path) -> None:
     assert gone.code == 2 and "no.ply" in gone.sentence()
 
 
+@pytest.mark.long
 def test_subjects_are_a_column_without_missing_values(run: Run, raw: Path, tmp_path: Path) -> None:
     rows = [f"{raw / f'blob{k}.ply'},{'anna' if k < 2 else ''}" for k in range(SCANS)]
     (tmp_path / "list.csv").write_text("\n".join(["file,person", *rows]), "utf-8")
@@ -119,6 +120,7 @@ def test_subjects_are_a_column_without_missing_values(run: Run, raw: Path, tmp_p
     assert run(*command, "person").code == 0
 
 
+@pytest.mark.long
 def test_a_later_run_leaves_no_surface_of_another_template(run: Run, raw: Path, tmp_path: Path) -> None:
     scans = [raw / f"blob{k}.ply" for k in range(3)]
     assert run("correspond", *scans, "-o", tmp_path, *QUICK).code == 0

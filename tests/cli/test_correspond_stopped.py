@@ -114,6 +114,7 @@ def test_a_scan_that_changed_since_the_interrupt_counts_as_it_is_now(
     assert surfaces(tmp_path / "same") == surfaces(tmp_path / "fresh")
 
 
+@pytest.mark.long
 def test_results_that_are_not_all_written_are_not_taken(
     run: Run, raw: Path, whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -273,6 +273,7 @@ def cmdline(pid: int) -> bytes:
 
 
 @LINUX
+@pytest.mark.long
 def test_a_batch_that_is_killed_again_and_again_ends_as_if_nothing_had_been(
     world: World, undisturbed: tuple[Path, list[dict[str, str]]], tmp_path: Path
 ) -> None:

@@ -219,6 +219,7 @@ def test_an_object_of_another_kind_among_few_is_named(say: Callable[..., str]) -
     assert not any(line.startswith(("shapespace: a:", "shapespace: b:")) for line in said.splitlines())
 
 
+@pytest.mark.long
 def test_a_scan_of_quite_another_size_is_named(say: Callable[..., str]) -> None:
     large = SCANS[2].with_vertices(2.6 * SCANS[2].vertices)
     said = say(a=SCANS[0], b=SCANS[1], large=large, d=SCANS[3])
@@ -262,6 +263,7 @@ def test_a_template_of_another_kind_is_named(say: Callable[..., str], tmp_path: 
     assert "rod.ply had to change by" in said and "hardly an object of their kind" in said
 
 
+@pytest.mark.long
 def test_mixed_units_are_said_and_build_brings_them_together(
     say: Callable[..., str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

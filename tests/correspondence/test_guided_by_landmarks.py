@@ -60,6 +60,7 @@ def even(directions: FloatArray) -> FloatArray:
     return 0.5 * (blob(directions, np.zeros(5)) + blob(side, np.zeros(5)) * FLIP)
 
 
+@pytest.mark.long
 def test_landmarks_bring_their_places_together_as_far_as_they_are_believed(blobs: list[RawBlob]) -> None:
     scans = [marked(one) for one in blobs[:4]]
     off = [
@@ -241,6 +242,7 @@ def test_a_model_of_splines_guides_with_its_shapes_and_one_of_points_is_refused(
         first_template(scans, None, SETTINGS, points)
 
 
+@pytest.mark.long
 def test_a_scan_that_lacks_a_part_is_no_template(blobs: list[RawBlob]) -> None:
     scans = [cut(one, 0.3) if k % 2 else one.scan for k, one in enumerate(blobs)]
     assert choose_template(scans, 0).index % 2 == 0

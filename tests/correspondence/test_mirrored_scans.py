@@ -113,6 +113,7 @@ def test_landmarks_of_mirrored_scans_are_reflected_with_them() -> None:
     assert all(scan.landmarks < 0.05 * size for scan in made.scans)
 
 
+@pytest.mark.long
 def test_surfaces_of_mirrored_scans_are_in_their_frames_and_build_reflects_them(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -48,6 +48,7 @@ def make_fits() -> None:
         Path(f"fits/{name}.fit.json").write_text(json.dumps(told))
 
 
+@pytest.mark.long
 def test_the_tutorial_on_identity_goes_from_saved_fits(workplace_of_documents: Path) -> None:
     instead = {TYPED: make_scans, "shapespace fit model.h5 scans -o fits": make_fits}
     assert run(ROOT / "docs" / "tutorial-identity.md", with_data=False, instead=instead) == 5

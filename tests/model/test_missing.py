@@ -135,6 +135,7 @@ def test_with_hardly_anything_missing_the_model_is_nearly_that_of_the_whole() ->
     assert np.abs(model.mean - whole.mean).max() < 0.02
 
 
+@pytest.mark.long
 def test_poses_do_not_matter_and_the_same_meshes_give_the_same_model() -> None:
     meshes = noisy(count=20, vertices=300)
     given = holed(meshes, patches(meshes))

@@ -33,6 +33,7 @@ def test_james_is_fitted_within_millimetres(shared_data, seed, method, mean_mm, 
     assert np.linalg.norm(fit_similarity(fitted, marked).apply(fitted) - marked, axis=1).mean() < 5.0
 
 
+@pytest.mark.long
 def test_james_is_no_stranger_to_bundled_people_who_vary_widely(shared_data):
     faces = load_faces()
     people = [faces.draw_person(np.random.default_rng([0, k]), wide=True) for k in range(100)]

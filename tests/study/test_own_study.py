@@ -45,6 +45,7 @@ def studied(world: Path) -> Path:
     return world / "study"
 
 
+@pytest.mark.long
 def test_raw_scans_are_not_in_correspondence(world: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert not (world / "scans" / "landmarks.csv").exists()
     assert command("build", str(world / "scans"), "-o", str(world / "no.h5")) == 2

@@ -187,7 +187,11 @@ class Studio:
             Mount("/view", app=self._view),
         ]
         if self._read_only:
-            routes = [one for one in routes if isinstance(one, Mount) or "GET" in (one.methods or ())]
+            routes = [
+                one if isinstance(one, Mount) or "GET" in (one.methods or ())
+                else Route(one.path, _refuse_change, methods=list(one.methods or ()))
+                for one in routes
+            ]  # fmt: skip
         return application(routes, str)
 
     def close(self) -> None:
@@ -407,6 +411,10 @@ class Studio:
             return folder, [path]
         found = sorted(one for one in path.rglob("*") if one.is_file() and one.name != LOCK)
         return folder, found[:_MOST_LISTED]
+
+
+def _refuse_change(request: Request) -> Response:
+    return refusal(403, "This page only shows the project; run shapespace studio to change it.")
 
 
 class _Pieces:
