@@ -114,6 +114,15 @@ def test_the_same_file_is_added_once_and_the_same_name_twice(project: Project, t
     assert project.state.specimens[-1].file == str(tmp_path / "anna.ply")
 
 
+def test_a_file_that_comes_twice_at_the_same_time_is_called_as_the_user_calls_it(project: Project) -> None:
+    first, second = project.new_file("dora.ply"), project.new_file("dora.ply")
+    for path in (first, second):
+        tetrahedron(path, 9.0)
+    assert project.add_stored(second, "training", "dora.ply") == ("dora", None)
+    assert project.add_stored(first, "training", "dora.ply") == ("dora", "dora")
+    assert not first.exists() and project.path(project.state.specimens[-1]) == second
+
+
 def test_a_folder_is_imported_by_reference_or_as_copies(project: Project, tmp_path: Path) -> None:
     (tmp_path / "scans").mkdir()
     for k in range(3):

@@ -46,11 +46,12 @@ def client(template: Path) -> Iterator[httpx.Client]:
         yield one
 
 
-def test_the_mean_shape_says_how_many_scans_show_each_vertex(client: httpx.Client) -> None:
-    facts, arrays = unpacked(client.get("/api/mean").content)
+def test_the_population_has_how_many_scans_show_each_vertex_of_the_mean_shape(client: httpx.Client) -> None:
+    facts, population = unpacked(client.get("/api/population").content)
+    _, arrays = unpacked(client.get("/api/mean").content)
     hidden = np.isnan(surface(HIDDEN, NAMES.index(HIDDEN))[0].vertices).any(axis=1)
     assert facts["scans"] == 6
-    np.testing.assert_array_equal(arrays["seen"], np.where(hidden, 5, 6))
+    np.testing.assert_array_equal(population["seen"], np.where(hidden, 5, 6))
     assert arrays["positions"].shape == (VERTICES, 3) and arrays["places"].shape == (VERTICES, 2)
     np.testing.assert_allclose(arrays["positions"].mean(axis=0), 0, atol=1e-3)
 
@@ -63,6 +64,24 @@ def test_a_surface_lies_on_the_mean_shape_and_misses_what_its_scan_does(client: 
     off = np.linalg.norm(arrays["positions"] - mean["positions"], axis=1)
     assert facts["name"] == HIDDEN and np.nanmean(off) < 6
     assert len(client.get(f"/api/surfaces/{HIDDEN}").content) < 6 * VERTICES + 500  # two bytes a number
+
+
+def test_of_a_large_folder_names_and_surfaces_come_before_all_surfaces_are_read(
+    template: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shapespace.viewer.corresponding_surfaces._LARGE", 1000)
+    monkeypatch.setattr("shapespace.viewer.corresponding_surfaces._MOST_DRAWN", 300)
+    monkeypatch.setattr("shapespace.report.inputs.correspondence_folder.Corresponded.population", None)
+    with opened(Surfaces(template)) as client:
+        assert client.get("/api/about").json()["is_large"]
+        assert {row["name"]: row["status"] for row in client.get("/api/names").json()} == {
+            **dict.fromkeys(NAMES, "converged"), ASIDE: "excluded",
+        }  # fmt: skip
+        _, mean = unpacked(client.get("/api/mean").content)
+        # Fewer triangles are drawn, between vertices of the surface, and all vertices keep their numbers.
+        assert len(mean["faces"]) <= 300 and mean["faces"].max() < len(mean["positions"]) == VERTICES
+        _, able = unpacked(client.get("/api/surfaces/able").content)
+        assert len(able["positions"]) == VERTICES
 
 
 def test_scans_are_listed_with_what_speaks_against_them_first(client: httpx.Client) -> None:
@@ -178,7 +197,7 @@ def test_a_surface_that_is_damaged_is_one_sentence_and_the_others_stay(template:
         assert answer.status_code == 422 and "able.corresponding.ply" in answer.json()["error"]
         assert str(tmp_path) not in answer.text and str(tmp_path) not in one.get("/api/surfaces").text
         assert one.get("/api/surfaces/baker").status_code == 200
-        assert unpacked(one.get("/api/mean").content)[0]["scans"] == 5
+        assert unpacked(one.get("/api/population").content)[0]["scans"] == 5
         places = one.get("/api/places?vertices=3").text
         assert "able,3,,," in places
 

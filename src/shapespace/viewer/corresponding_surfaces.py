@@ -13,12 +13,14 @@ import numpy as np
 
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.geometry.mirror_plane import FLIP
+from shapespace.geometry.normals import faces_of
 from shapespace.io.tables.table_io import table_text
 from shapespace.report.blocks.wording import without_folders
-from shapespace.report.inputs.correspondence_folder import Corresponded
+from shapespace.report.inputs.correspondence_folder import Corresponded, Population
 from shapespace.report.inputs.triage import Concern, concerns_of, distance_share, scan_status, sentence
 from shapespace.report.render import palette as colours
 from shapespace.report.render.checkerboard import SQUARES, checker_places
+from shapespace.report.render.decimate import decimate
 from shapespace.report.render.scene import pack, quantise
 from shapespace.version import __version__
 
@@ -26,6 +28,8 @@ MAX_MARKED = 100
 """Vertices whose positions can be asked for at a time."""
 
 _PAGE, _PAGE_BYTES = 11, 24 * 2**20  # surfaces on a page, and bytes that a page may send
+_MOST_DRAWN = 20_000  # triangles of a surface, of which twelve turn together without a graphics card
+_LARGE = 4_000_000  # vertices of all surfaces together, which take about 2 s to read
 _BYTES_PER_VERTEX = 10  # bytes; three coordinates of 16 bits, one number of 32
 _STATUS_ORDER = ("unreadable", "excluded", "doubtful", "look", "converged")
 
@@ -44,6 +48,7 @@ class Surfaces:
     def __init__(self, folder: Path) -> None:
         self._corresponded = Corresponded(folder)
         self._lock = Lock()
+        self._summary_lock = Lock()
         self._packed_mean: bytes | None = None
         self.packed_surface = lru_cache(maxsize=2 * _PAGE)(self._pack_surface)
 
@@ -59,6 +64,7 @@ class Surfaces:
             "vertices": len(self._corresponded.mean.vertices),
             "rounds": list(run.rounds),
             "page": max(1, min(_PAGE, page)),
+            "is_large": len(self._corresponded.corresponding) * len(self._corresponded.mean.vertices) > _LARGE,
             "most_marked": MAX_MARKED,
             "clay": colours.CLAY,
             "unknown_colour": colours.UNKNOWN_COLOUR,
@@ -68,31 +74,50 @@ class Surfaces:
         }
 
     def packed_mean(self) -> bytes:
-        """Return the mean shape, upright, its checkerboard, the number of scans that show each vertex, and the RMS
-        standard deviation of its position along the surface, percent of the size, where files have it."""
+        """Return the mean shape, upright, its checkerboard, and the triangles that are drawn."""
         with self._lock:
             if self._packed_mean is None:
                 self._packed_mean = self._pack_mean()
             return self._packed_mean
 
     def _pack_mean(self) -> bytes:
-        population = self._corresponded.population()
+        self._corresponded.stand_upright()
         mean = self._corresponded.mean
         along, across = checker_places(mean)
+        drawn, kept = decimate(mean, _MOST_DRAWN)
         arrays = {
             "positions": mean.vertices,
-            "faces": np.asarray(mean.faces, dtype=np.uint32),
+            "faces": np.asarray(kept[faces_of(drawn)], dtype=np.uint32),
             "places": np.stack([along, across], axis=1),
-            "seen": population.seen_count.astype(np.int32),
         }
+        return pack(arrays, {})
+
+    def packed_population(self) -> bytes:
+        """Return the number of scans that show each vertex, and the RMS standard deviation of its position along the
+        surface, percent of the size, where files have it; all surfaces are read for it."""
+        population = self._population()
+        arrays = {"seen": population.seen_count.astype(np.int32)}
         if population.position_std is not None:
             arrays["std"] = 100 * population.position_std
         return pack(arrays, {"scans": len(population.names), "std_limit": population.position_std_limit})
 
+    def _population(self) -> Population:
+        with self._lock:
+            self._corresponded.stand_upright()
+        with self._summary_lock:  # surfaces are sent in the meantime
+            return self._corresponded.population()
+
+    def names(self) -> list[dict[str, Any]]:
+        """Return the list of scans as their records have them, without reading surfaces."""
+        return [
+            {"name": name, "status": scan_status(record, {name: Concern()}), "reason": self.public(sentence(record.reason)),
+             "mirrored": record.mirrored}
+            for name, record in self._corresponded.records.items()
+        ]  # fmt: skip
+
     def rows(self) -> list[dict[str, Any]]:
         """Return the list of scans, those with concerns first."""
-        with self._lock:
-            population = self._corresponded.population()
+        population = self._population()
         concerns = concerns_of(self._corresponded)
         sizes = dict(zip(population.names, population.sizes.tolist(), strict=True))
         rows: list[dict[str, Any]] = [
@@ -134,7 +159,7 @@ class Surfaces:
         if self._corresponded.records[name].is_excluded:
             raise KeyError(name)
         with self._lock:
-            self._corresponded.population()
+            self._corresponded.stand_upright()
         placed = self._corresponded.placed(name)
         arrays: dict[str, Any] = {"positions": quantise(placed.vertices, coded=True)}
         if placed.position_std is not None:

@@ -41,6 +41,12 @@ def surfaces_app(surfaces: Surfaces) -> ASGIApp:
     def mean(request: Request) -> Response:
         return binary(surfaces.packed_mean())
 
+    def population(request: Request) -> Response:
+        return binary(surfaces.packed_population())
+
+    def names(request: Request) -> Response:
+        return json_response(surfaces.names())
+
     def surface_list(request: Request) -> Response:
         return json_response(surfaces.rows())
 
@@ -61,6 +67,8 @@ def surfaces_app(surfaces: Surfaces) -> ASGIApp:
         Route("/assets/{name}", asset),
         Route("/api/about", about),
         Route("/api/mean", mean),
+        Route("/api/population", population),
+        Route("/api/names", names),
         Route("/api/surfaces", surface_list),
         Route("/api/surfaces/{name}", surface),
         Route("/api/places", positions),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -33,6 +34,7 @@ from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
 _FEWEST_VERTICES = 3  # a triangle
 _ONE_UNIT = 5.0  # ratio of scales; mm, cm and m differ by 10 or more
 _POSED_ALIKE = 0.8  # strength of the mean rotation above which the scans share a pose
+_POSES = 24  # surfaces that tell how the scans stand
 _OPEN_SHARE = 0.15  # share of the area that faces one way in an open surface
 
 
@@ -103,6 +105,7 @@ class Corresponded:
         records = [record for file in self._record_files() if (record := self._record(file)) is not None]
         self.records = {record.name: record for record in records}
         self.turn = np.eye(3)
+        self._is_upright = False
         self._population: Population | None = None
 
     @property
@@ -194,17 +197,27 @@ class Corresponded:
         except ShapespaceError as error:
             raise FileFormatError("the scan cannot be read.") from error
 
+    def stand_upright(self) -> None:
+        """Bring the mean shape upright, by the poses of some of the surfaces."""
+        if self._is_upright:
+            return
+        turns: list[FloatArray] = []
+        for record in self.corresponding[:: max(1, len(self.corresponding) // _POSES)]:
+            with contextlib.suppress(ShapespaceError):  # `population` reports what cannot be read
+                turns.append(self.placed(record.name).T_scan_mean.rotation)
+        self.turn, self._is_upright = upright(self._mean, turns), True
+
     def population(self, on_scan: Callable[[str], None] | None = None) -> Population:
-        """Summarise all surfaces, and bring the mean shape upright; each surface is read once.
+        """Summarise all surfaces, and bring the mean shape upright.
 
         Args:
             on_scan: called after each scan.
         """
         if self._population is None:
+            self.stand_upright()
             counts = np.zeros(len(self._mean.vertices), dtype=np.int64)
             names: list[str] = []
             sizes: list[float] = []
-            turns: list[FloatArray] = []
             unread: dict[str, str] = {}
             size, squares = rms_size(self._mean.vertices), np.zeros(len(counts))
             for record in self.corresponding:
@@ -220,8 +233,6 @@ class Corresponded:
                 squares += np.nan if placed.position_std is None else placed.seen * placed.position_std**2
                 names.append(record.name)
                 sizes.append(placed.T_scan_mean.scale * size)
-                turns.append(placed.T_scan_mean.rotation)
-            self.turn = upright(self._mean, turns)
             std = np.sqrt(squares / np.maximum(counts, 1)) if names and np.isfinite(squares).all() else None
             self._population = Population(tuple(names), counts, np.array(sizes), unread, std)
         return self._population

@@ -178,8 +178,8 @@
             ${["cards", "table"].map((name) => html`<button type="button" data-testid=${`layout-${name}`} aria-pressed=${layout === name} onclick=${() => setLayout(name)}>${S[name]}</button>`)}
           </div>
           <label class="filter">${S.filter} <input type="search" placeholder=${S.filterHint} data-testid="filter" value=${filter} oninput=${(event) => setFilter(event.target.value)} /></label>
-          <${Button} edits testid="undo" disabled=${!project.undo} title=${project.undo ? S.undoOf(project.undo) : S.undo} onclick=${Studio.undo}>${S.undo}<//>
-          <${Button} edits testid="redo" disabled=${!project.redo} title=${project.redo ? S.redoOf(project.redo) : S.redo} onclick=${Studio.redo}>${S.redo}<//>
+          <${Button} edits testid="undo" disabled=${!project.undo || Studio.uploading()} title=${project.undo ? S.undoOf(project.undo) : S.undo} onclick=${Studio.undo}>${S.undo}<//>
+          <${Button} edits testid="redo" disabled=${!project.redo || Studio.uploading()} title=${project.redo ? S.redoOf(project.redo) : S.redo} onclick=${Studio.redo}>${S.redo}<//>
           ${layout === "table" ? html`<${Studio.AddColumn} />` : html`<${Button} testid="select-all" onclick=${selectAll}>${all ? S.clear : S.selectAll}<//>`}
           ${selected.length > 0 && html`<${Studio.SelectionBar} selected=${selected} onclear=${() => setSelection(new Set())} />`}
         </div>

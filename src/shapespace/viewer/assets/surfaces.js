@@ -142,10 +142,10 @@
   function drawAllMarks() {
     for (const cell of cells) if (cell.positions) drawMarks(cell);
     $("marks").replaceChildren(...marks.map((vertex, k) => {
-      const seen = mean.seen[vertex];
+      const seen = mean.seen?.[vertex];
       const dot = h("span", { class: "dot" });
       dot.style.background = `rgb(${markColour(k).map((c) => Math.round(255 * c)).join(",")})`;
-      const told = `shown by ${seen === scans ? `all ${scans}` : `${seen} of ${scans}`} scans`;
+      const told = seen === undefined ? "" : `shown by ${seen === scans ? `all ${scans}` : `${seen} of ${scans}`} scans`;
       return h("p", { "data-testid": `marked-${vertex}` }, dot, h("strong", {}, `Vertex ${vertex}`), h("span", {}, told), h("button", {
         type: "button", class: "small quiet", "aria-label": `Remove the mark of vertex ${vertex}`, onclick: () => { marks = marks.filter((one) => one !== vertex); drawAllMarks(); },
       }, "\u00d7"));
@@ -182,7 +182,7 @@
     wanted = found.filter(pictured);
     $("list").replaceChildren(...found.slice(0, 500).map((row) => h("p", { class: DOTS[row.status], "data-testid": `row-${row.name}` },
       h("span", { class: "dot" }), h("span", {}, h("strong", {}, row.name), ` ${words(row)}`, row.status === "converged" ? null : h("small", {}, row.reason)))));
-    showPage(0);
+    return showPage(0);
   }
 
   const showPage = guarded(async (from) => {
@@ -235,13 +235,8 @@
     about = await json("api/about");
     document.title = `${about.name} \u2013 shapespace`;
     $("about").textContent = `${about.name}: ${about.corresponding} of ${about.scans} scans in correspondence, ${about.vertices.toLocaleString("en")} vertices`;
-    const unpacked = await binary("api/mean");
-    mean = unpacked.arrays;
-    scans = unpacked.facts.scans;
-    missing = Float32Array.from(mean.seen, (count) => (100 * (scans - count)) / Math.max(scans, 1));
+    mean = (await binary("api/mean")).arrays;
     makeCells();
-    stdLimit = unpacked.facts.std_limit;
-    $("colours").querySelector("[data-colour=std]").hidden = !mean.std;
     put(cells[0], "Mean shape", mean);
     cells[0].view.frame(["surface"], 1.2); // scans are larger than the mean shape in some directions
     for (const cell of cells.slice(1)) cells[0].view.link(cell.view);
@@ -251,9 +246,27 @@
     startNamed();
     startScans();
     $("loading").hidden = true;
-    rows = await json("api/surfaces");
     window.shapespaceCells = cells;
-    filterRows();
+    if (!about.is_large) await summarise();
+    rows = await json(about.is_large ? "api/names" : "api/surfaces");
+    await filterRows();
+    if (!about.is_large) return;
+    // All surfaces are read for what follows; those of the page are shown first.
+    await summarise();
+    rows = await json("api/surfaces");
+    if (first === 0) filterRows();
+  }
+
+  /** Which vertices scans show, and how certain their positions are. */
+  async function summarise() {
+    const { facts, arrays } = await binary("api/population");
+    Object.assign(mean, arrays);
+    ({ scans, std_limit: stdLimit } = facts);
+    missing = Float32Array.from(mean.seen, (count) => (100 * (scans - count)) / Math.max(scans, 1));
+    cells[0].std = mean.std;
+    $("colours").querySelector("[data-colour=missing]").hidden = false;
+    $("colours").querySelector("[data-colour=std]").hidden = !mean.std;
+    drawAllMarks();
   }
 
   guarded(begin)();

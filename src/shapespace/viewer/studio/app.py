@@ -293,7 +293,7 @@ class Studio:
             async with aclosing(body_pieces(request, self._upload_bytes, limit)) as pieces:
                 async for piece in pieces:
                     file.write(piece)
-        added, same_as = await run_in_threadpool(project.add_stored, target, role)
+        added, same_as = await run_in_threadpool(project.add_stored, target, role, name)
         self._changed()
         return json_response({"id": added, "same_as": same_as}, 201)
 

@@ -258,8 +258,13 @@ class Project:
             path.unlink(missing_ok=True)
             raise
 
-    def add(self, file: Path, role: Role) -> tuple[str, str | None]:
+    def add(self, file: Path, role: Role, called: str = "") -> tuple[str, str | None]:
         """Add a scan; return its id, and that of a specimen with the same file content, in which case it is not added.
+
+        Args:
+            file: the scan.
+            role: of the specimen.
+            called: what the user calls the file (default: as it is called).
 
         Raises:
             FileError: the scan cannot be read.
@@ -274,7 +279,7 @@ class Project:
             except OSError as error:
                 raise FileError(f"Cannot read {file}: {error.strerror or error}.") from error
             taken = {one.id.casefold() for one in self.state.specimens}
-            name = _free_name(_stem(file.name), taken)
+            name = _free_name(_stem(called or file.name), taken)
             inside = file.is_relative_to(self.folder)
             place = file.relative_to(self.folder).as_posix() if inside else str(file)
             specimen = Specimen(id=name, file=place, role=role)
@@ -285,10 +290,10 @@ class Project:
             )
             return name, None
 
-    def add_stored(self, file: Path, role: Role) -> tuple[str, str | None]:
+    def add_stored(self, file: Path, role: Role, called: str) -> tuple[str, str | None]:
         """Add a scan in the project's folder, as `add` does; its file is removed where the scan is not added."""
         with self.removed_on_error(file):
-            name, same = self.add(file, role)
+            name, same = self.add(file, role, called)
         if same is not None:
             file.unlink(missing_ok=True)
         return name, same
@@ -310,7 +315,7 @@ class Project:
                 target = self.new_file(file.name)
                 with self.removed_on_error(target), atomic_path(target) as path:
                     shutil.copyfile(file, path)
-            _, same = self.add_stored(target, role) if copy else self.add(target, role)
+            _, same = self.add_stored(target, role, file.name) if copy else self.add(target, role)
             if same is not None:
                 notes.append(f"{file.name} is the same file as {same}; it was not added again.")
             added += same is None
