@@ -1,4 +1,3 @@
-import gc
 import json
 import os
 import shutil
@@ -61,12 +60,6 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> "LoadScopeSc
 
     config.option.loadscopereorder = False
     return Units(config, log)
-
-
-def pytest_collection_finish(session: pytest.Session) -> None:
-    """Let the garbage collector leave out what stays, or it goes through all imported modules again and again."""
-    gc.collect()
-    gc.freeze()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
