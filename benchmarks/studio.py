@@ -142,7 +142,7 @@ def measure(folder: Path) -> None:
         began = time.monotonic()
         page.evaluate("document.querySelector('[data-testid=tab-correspondence]').click()")
         while not (frames := [one for one in page.frames if "/view/" in one.url]):
-            time.sleep(0.02)
+            page.wait_for_timeout(20)
         frame = frames[0]
         until(frame, "!!(window.shapespaceCells && window.shapespaceCells[0].positions)")
         print(f"first surface in correspondence: {time.monotonic() - began:.1f} s")

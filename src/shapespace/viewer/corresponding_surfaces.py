@@ -28,7 +28,7 @@ MAX_MARKED = 100
 """Vertices whose positions can be asked for at a time."""
 
 _PAGE, _PAGE_BYTES = 11, 24 * 2**20  # surfaces on a page, and bytes that a page may send
-_MOST_DRAWN = 20_000  # triangles of a surface, of which twelve turn together without a graphics card
+_MOST_DRAWN = 8_000  # triangles of a surface, whose edges are then about 4 pixels of a picture on the page
 _LARGE = 4_000_000  # vertices of all surfaces together, which take about 2 s to read
 _BYTES_PER_VERTEX = 10  # bytes; three coordinates of 16 bits, one number of 32
 _STATUS_ORDER = ("unreadable", "excluded", "doubtful", "look", "converged")
@@ -96,7 +96,7 @@ class Surfaces:
         """Return the number of scans that show each vertex, and the RMS standard deviation of its position along the
         surface, percent of the size, where files have it; all surfaces are read for it."""
         population = self._population()
-        arrays = {"seen": population.seen_count.astype(np.int32)}
+        arrays: dict[str, Any] = {"seen": population.seen_count.astype(np.int32)}
         if population.position_std is not None:
             arrays["std"] = 100 * population.position_std
         return pack(arrays, {"scans": len(population.names), "std_limit": population.position_std_limit})
@@ -110,8 +110,8 @@ class Surfaces:
     def names(self) -> list[dict[str, Any]]:
         """Return the list of scans as their records have them, without reading surfaces."""
         return [
-            {"name": name, "status": scan_status(record, {name: Concern()}), "reason": self.public(sentence(record.reason)),
-             "mirrored": record.mirrored}
+            {"name": name, "status": scan_status(record, {name: Concern()}), "mirrored": record.mirrored,
+             "reason": self.public(sentence(record.reason))}
             for name, record in self._corresponded.records.items()
         ]  # fmt: skip
 

@@ -8,6 +8,7 @@ import json
 import os
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,8 @@ class SpecimenChecks:
         self._asked: set[str] = set()
         self._pool: ProcessPoolExecutor | None = None
         self._known: dict[str, dict[str, Any]] = {}
+        if not read_only:
+            self._processes().submit(_import)  # before the first scan comes
 
     def facts(self, scan: Path) -> dict[str, Any] | None:
         """Return the facts of a scan, or None while it is checked; the first call asks for the check."""
@@ -68,9 +71,6 @@ class SpecimenChecks:
         self._asked.add(key)
         with contextlib.suppress(OSError):  # the check reports what cannot be written
             self._folder.mkdir(parents=True, exist_ok=True)
-        if self._pool is None:
-            processes = min(_MOST_PROCESSES, max(1, (os.cpu_count() or 2) - 1))
-            self._pool = ProcessPoolExecutor(processes, mp_context=context(), initializer=lower_priority)
 
         def done(future: Future[dict[str, Any]]) -> None:
             if future.cancelled():
@@ -83,7 +83,13 @@ class SpecimenChecks:
                     self._unusable(scan)
             self._changed()
 
-        self._pool.submit(check_scan, scan, self._folder / key).add_done_callback(done)
+        self._processes().submit(check_scan, scan, self._folder / key).add_done_callback(done)
+
+    def _processes(self) -> ProcessPoolExecutor:
+        if self._pool is None:
+            processes = min(_MOST_PROCESSES, max(1, (os.cpu_count() or 2) - 1))
+            self._pool = ProcessPoolExecutor(processes, mp_context=context(), initializer=lower_priority)
+        return self._pool
 
     def _failed(self, error: BaseException | None) -> dict[str, Any]:
         """Return the facts of a scan whose check ended with an error; it is not tried again."""
@@ -91,6 +97,12 @@ class SpecimenChecks:
             return _unusable(f"It cannot be checked: {error}")
         self._pool = None  # its process was killed, as for want of memory: the file is to blame
         return _unusable("It cannot be checked: the memory does not suffice, or the check failed.")
+
+
+def _import() -> None:
+    """Import what a check needs."""
+    for name in ("geometry.doctor", "io.meshes.mesh_io", "report.render.thumbnails"):
+        import_module(f"shapespace.{name}")
 
 
 def check_scan(scan: Path, stem: Path) -> dict[str, Any]:
