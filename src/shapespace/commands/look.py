@@ -13,7 +13,7 @@ from shapespace.batch.fit_records import read_record
 from shapespace.batch.fit_work import naming
 from shapespace.batch.result_folder import names_for
 from shapespace.errors import FileError, InputError, ShapespaceError
-from shapespace.geometry.doctor import examine, repair
+from shapespace.geometry.doctor import examine, examine_and_repair
 from shapespace.geometry.mirror_plane import mirror_image
 from shapespace.geometry.normals import faces_of
 from shapespace.io.files import make_folder, remove_file
@@ -73,8 +73,7 @@ def check(
         if path in targets:
             remove_file(targets[path])  # one of an earlier run may contradict the report
         try:
-            mesh = read_mesh(path)
-            report = examine(mesh, strict=strict)
+            report, repaired = examine_and_repair(read_mesh(path), strict=strict)
         except ShapespaceError as error:
             reports.append({"file": str(path), "usable": False, "error": naming(path, str(error))})
             continue
@@ -82,11 +81,9 @@ def check(
             short = f"{path}: not enough memory to read it; thin the scan first, as by MeshLab."
             reports.append({"file": str(path), "usable": False, "error": short})
             continue
-        usable = not any(finding.level == "refused" for finding in report.findings)
         findings = [{"level": one.level, "what": one.problem, "action": one.action} for one in report.findings]
-        reports.append({"file": str(path), "usable": usable, **asdict(report), "findings": findings})
-        if usable and path in targets:
-            repaired = repair(mesh, strict=strict)[0]
+        reports.append({"file": str(path), "usable": repaired is not None, **asdict(report), "findings": findings})
+        if repaired is not None and path in targets:
             written = replace(repaired, vertices=MM_PER_UNIT[unit or "mm"] * repaired.vertices, landmarks={})
             write_mesh(targets[path], mirror_image(written) if mirror else written)
             reports[-1]["written"] = str(targets[path])

@@ -135,6 +135,13 @@ def repair(mesh: Mesh, *, strict: bool = False) -> tuple[Mesh, tuple[Finding, ..
     return state.repaired(mesh), state.report.findings
 
 
+def examine_and_repair(mesh: Mesh, *, strict: bool = False) -> tuple[MeshReport, Mesh | None]:
+    """Return the report of `examine`, and the mesh of `repair`, None where that refuses it, computed once."""
+    state = _examine_and_repair(mesh, strict=strict)
+    is_refused = any(finding.level == "refused" for finding in state.report.findings)
+    return state.report, None if is_refused else state.repaired(mesh)
+
+
 @dataclass(frozen=True, eq=False)
 class _RepairState:
     """A mesh between two repairs, and the report so far; each step returns a new state.

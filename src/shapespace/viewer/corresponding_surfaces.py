@@ -81,7 +81,7 @@ class Surfaces:
             return self._packed_mean
 
     def _pack_mean(self) -> bytes:
-        self._corresponded.stand_upright()
+        self._corresponded.turn_upright()
         mean = self._corresponded.mean
         along, across = checker_places(mean)
         drawn, kept = decimate(mean, _MOST_DRAWN)
@@ -103,7 +103,7 @@ class Surfaces:
 
     def _population(self) -> Population:
         with self._lock:
-            self._corresponded.stand_upright()
+            self._corresponded.turn_upright()
         with self._summary_lock:  # surfaces are sent in the meantime
             return self._corresponded.population()
 
@@ -159,7 +159,7 @@ class Surfaces:
         if self._corresponded.records[name].is_excluded:
             raise KeyError(name)
         with self._lock:
-            self._corresponded.stand_upright()
+            self._corresponded.turn_upright()
         placed = self._corresponded.placed(name)
         arrays: dict[str, Any] = {"positions": quantise(placed.vertices, coded=True)}
         if placed.position_std is not None:

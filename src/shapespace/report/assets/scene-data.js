@@ -9,7 +9,7 @@
     float32: Float32Array, int32: Int32Array, uint32: Uint32Array, uint16: Uint16Array, int16: Int16Array,
     uint8: Uint8Array,
   };
-  const UNKNOWN = -32768; // the int16 that stands for NaN
+  const UNKNOWN = -32768; // int16 of missing coordinates
 
   /** Return {facts, arrays} of the bytes that shapespace.report.render.scene.pack made. */
   Shapespace.unpack = function (buffer) {

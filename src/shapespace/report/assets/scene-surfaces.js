@@ -168,7 +168,7 @@
       this.request();
     }
 
-    /** Show small balls with names: [{position, label, colour}]; names stand beside them while there are few. */
+    /** Show small balls with names: [{position, label, colour}]; names are written beside them while there are few. */
     marks(id, marks) {
       if (!this.works) return;
       this.remove(id);

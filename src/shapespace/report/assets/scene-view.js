@@ -204,7 +204,7 @@
       return parts.pick(this, clientX, clientY, ids);
     }
 
-    /** The picture as it stands, as PNG, on the page's own background. */
+    /** The current picture as PNG, on the page's own background. */
     png() {
       if (!this.works) return Promise.reject(new Error(NO_WEBGL));
       clearTimeout(this._later);

@@ -30,7 +30,7 @@
 
       const bar = make("div", { class: "ss-bar" }), legend = make("div", { class: "ss-bar" });
       legend.append(swatches(REGIONS.map((name) => [REGION_WORDS[name], colours().regions[name]])));
-      const said = make("p", { class: "ss-said", "aria-live": "polite" });
+      const announcement = make("p", { class: "ss-said", "aria-live": "polite" });
 
       const values = () =>
         state.map === "model" ? arrays[`model_to_scan_${state.stage}`]
@@ -57,8 +57,8 @@
         bar.hidden = limit.hidden = !distances;
         beyond.row.hidden = !distances || state.threshold === null;
         legend.hidden = state.map !== "regions";
-        said.textContent = distances ? sentence() : state.map === "regions" ? regions() : state.map === "colour" ? "Grey: vertices where the fit does not follow the scan." : facts.without_scan ? facts.without_scan : "Where scan and model overlap, the nearer one is shown.";
-        said.hidden = !said.textContent;
+        announcement.textContent = distances ? sentence() : state.map === "regions" ? regions() : state.map === "colour" ? "Grey: vertices where the fit does not follow the scan." : facts.without_scan ? facts.without_scan : "Where scan and model overlap, the nearer one is shown.";
+        announcement.hidden = !announcement.textContent;
       }
 
       // Figures are of all vertices, also where fewer are drawn.
@@ -134,7 +134,7 @@
           model.show(key === "scan" ? 0 : 100);
           paint();
         }).row,
-        bar, legend, limit, beyond.row, said
+        bar, legend, limit, beyond.row, announcement
       );
       if (facts.thinned) {
         controls.append(make("p", { class: "ss-hint", text: "Drawn with fewer triangles than there are; the numbers are of all." }));

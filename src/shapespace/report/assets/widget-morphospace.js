@@ -18,7 +18,7 @@
       const canvas = make("canvas", { tabindex: 0, role: "application" }), tip = make("div", { class: "ss-tip", hidden: true });
       const marker = make("span", { class: "ss-marker" }), ring = make("span", { class: "ss-ring", hidden: true });
       const plot = make("div", { class: "ss-plate ss-plot" }, canvas, ring, marker, tip), shapes = make("div", { class: "ss-shapes" });
-      const said = make("p", { class: "ss-said", "aria-live": "polite" }), bar = make("div", { class: "ss-bar", hidden: true });
+      const announcement = make("p", { class: "ss-said", "aria-live": "polite" }), bar = make("div", { class: "ss-bar", hidden: true });
       const controls = make("div", { class: "ss-controls" });
       element.classList.add("ss-morphospace");
       element.append(plot, shapes, controls);
@@ -137,7 +137,7 @@
         later = setTimeout(() => {
           const digits = Math.max(0, Math.ceil(Math.log10(scale))), values = [x, y].map((value, k) => `${facts.axes[axes[k]]} ${signed(value, digits)}`);
           list.value = v === null ? "" : String(v);
-          said.textContent = `Marker at ${values.join(", ")}${v === null ? "" : `, the place of ${title(v)}`}.`;
+          announcement.textContent = `Marker at ${values.join(", ")}${v === null ? "" : `, the place of ${title(v)}`}.`;
         }, 150);
         request({ shape: true });
       };
@@ -234,7 +234,7 @@
         ["Leave-one-out scores", "validated", arrays.cross_validated], ["Colour by distance from the mean", "coloured", !facts.planar]];
       controls.append(legend, make("div", { class: "ss-buttons" }, ...ticks.filter((one) => one[2]).map(([text, key]) =>
         tick(text, shown[key], (on) => { shown[key] = on; redraw(); }))), bar, make("div", { class: "ss-choices" }, ...choices, specimens),
-        make("div", { class: "ss-buttons" }, selector, selectOne, copy, clear, chosen), said);
+        make("div", { class: "ss-buttons" }, selector, selectOne, copy, clear, chosen), announcement);
       document.addEventListener("shapespace:theme", redraw);
       new ResizeObserver(redraw).observe(plot);
       drawPlot();

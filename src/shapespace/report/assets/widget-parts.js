@@ -19,7 +19,7 @@
 
   const signed = (value, digits) => (value > 0 ? "+" : value < 0 ? "\u2212" : "") + Math.abs(value).toFixed(digits);
 
-  /** A named range input with its value beside it. */
+  /** A labelled range input and its value. */
   function slider({ label, note = "", min, max, step, value, show, input }) {
     const id = `ss-${++counted}`;
     const output = make("output", { for: id, text: show(value) });

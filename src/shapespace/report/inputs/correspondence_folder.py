@@ -197,24 +197,31 @@ class Corresponded:
         except ShapespaceError as error:
             raise FileFormatError("the scan cannot be read.") from error
 
-    def stand_upright(self) -> None:
+    def turn_upright(self) -> None:
         """Bring the mean shape upright, by the poses of some of the surfaces."""
         if self._is_upright:
             return
         turns: list[FloatArray] = []
-        for record in self.corresponding[:: max(1, len(self.corresponding) // _POSES)]:
+        for record in self._of_known_pose():
             with contextlib.suppress(ShapespaceError):  # `population` reports what cannot be read
                 turns.append(self.placed(record.name).T_scan_mean.rotation)
+        self._turn_by(turns)
+
+    def _of_known_pose(self) -> list[CorrespondRecord]:
+        """Return the records of the surfaces whose poses turn the mean shape upright."""
+        return self.corresponding[:: max(1, len(self.corresponding) // _POSES)]
+
+    def _turn_by(self, turns: Sequence[FloatArray]) -> None:
         self.turn, self._is_upright = upright(self._mean, turns), True
 
     def population(self, on_scan: Callable[[str], None] | None = None) -> Population:
-        """Summarise all surfaces, and bring the mean shape upright.
+        """Summarise all surfaces, and bring the mean shape upright; each surface is read once.
 
         Args:
             on_scan: called after each scan.
         """
         if self._population is None:
-            self.stand_upright()
+            turns, posed = list[FloatArray](), {record.name for record in self._of_known_pose()}
             counts = np.zeros(len(self._mean.vertices), dtype=np.int64)
             names: list[str] = []
             sizes: list[float] = []
@@ -233,6 +240,10 @@ class Corresponded:
                 squares += np.nan if placed.position_std is None else placed.seen * placed.position_std**2
                 names.append(record.name)
                 sizes.append(placed.T_scan_mean.scale * size)
+                if record.name in posed:
+                    turns.append(placed.T_scan_mean.rotation)
+            if not self._is_upright:
+                self._turn_by(turns)
             std = np.sqrt(squares / np.maximum(counts, 1)) if names and np.isfinite(squares).all() else None
             self._population = Population(tuple(names), counts, np.array(sizes), unread, std)
         return self._population

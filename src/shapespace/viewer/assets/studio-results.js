@@ -28,7 +28,6 @@
 
   function ExportRow({ job }) {
     const isQuestion = Studio.QUESTIONS.includes(job.kind);
-    const figures = () => Studio.runJob(job.kind, { ...job.options, "--format": "svg,pdf,png" }, job.on);
     return html`
       <tr data-testid=${`export-${job.number}`}>
         <th scope="row"><strong>${Studio.kindOf(job)}</strong><span class="hint">${job.output}</span></th>
@@ -36,7 +35,7 @@
         <td><div class="row">
           <a class="button" href=${`/zip/${job.number}`} download data-testid=${`zip-${job.number}`}>${T.export.zip}</a>
           ${["correspond", "redo", "fit"].includes(job.kind) && html`<${Button} edits small testid=${`report-${job.number}`} onclick=${() => Studio.runJob("report", {}, job.number)}>${T.export.report}<//>`}
-          ${isQuestion && html`<${Button} edits small testid=${`figures-${job.number}`} onclick=${figures}>${T.export.figures}<//>`}
+          ${isQuestion && html`<${Button} edits small testid=${`figures-${job.number}`} onclick=${() => Studio.runFigures(job)}>${T.export.figures}<//>`}
           ${job.views.some((view) => view.kind === "report") && html`<a class="button" href=${`/view/${job.number}/`} target="_blank" rel="noopener" data-testid=${`open-${job.number}`}>${T.jobs.full}</a>`}
         </div></td>
       </tr>`;

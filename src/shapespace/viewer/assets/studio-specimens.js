@@ -10,14 +10,14 @@
   const { Button, Confirm, FileButton, DropZone, UploadStatus, FolderBrowser } = Studio;
   const SHOWN = 200; // specimens drawn at first, and by each "Show more"
 
-  /** Include or exclude; a refused edit restores the checkbox. */
-  const include = async (specimen, box) => {
-    const done = await Studio.edit({ what: "include", ids: [specimen.id], included: box.checked });
-    if (!done) box.checked = specimen.included;
-  };
+  const include = (specimen, box) => Studio.editBy({ what: "include", ids: [specimen.id], included: box.checked }, () => { box.checked = specimen.included; });
 
   Studio.Include = ({ specimen, label }) => html`<label class="include"><input type="checkbox" checked=${specimen.included} aria-label=${S.includeOne(specimen.id)} data-testid=${`include-${specimen.id}`}
     disabled=${specimen.state === "unusable" || Studio.state.read_only} onchange=${(event) => include(specimen, event.target)} />${label && html`<span aria-hidden="true">${label}</span>`}</label>`;
+
+  /** A select of units; the first one leaves scans as they are. */
+  Studio.Unit = ({ value, onunit, ...rest }) => html`<select value=${value} onchange=${(event) => onunit(event.target)} ...${rest}>
+    ${["", ...Studio.state.units].map((unit) => html`<option value=${unit}>${S.unit(unit)}</option>`)}</select>`;
 
   Studio.Findings = ({ specimen }) => html`
     ${specimen.state === "waiting" && html`<p class="finding waiting">${S.states.waiting}</p>`}
@@ -124,8 +124,8 @@
         <${Button} small testid="set-selected" onclick=${() => Studio.edit({ what: "set", ids, set: toNew ? "new" : "training" })}>${toNew ? S.toNew : S.toTraining}<//>
         ${grouping ? html`<${Group} ids=${ids} onclose=${() => setGrouping(false)} />` : html`<${Button} small testid="group-selected" onclick=${() => setGrouping(true)}>${S.group}<//>`}
         <${Button} small testid="mirror-selected" onclick=${() => Studio.edit({ what: "mirror", ids, mirrored })}>${mirrored ? S.mirror : S.unmirror}<//>
-        <label>${S.columns.unit} <select aria-label=${S.setUnit} data-testid="unit-selected" value=${selected.every((one) => one.unit === selected[0].unit) ? selected[0].unit : ""}
-          onchange=${(event) => Studio.edit({ what: "unit", ids, unit: event.target.value })}>${["", ...Studio.state.units].map((unit) => html`<option value=${unit}>${S.unit(unit)}</option>`)}</select></label>
+        <label>${S.columns.unit} <${Studio.Unit} aria-label=${S.setUnit} data-testid="unit-selected" value=${selected.every((one) => one.unit === selected[0].unit) ? selected[0].unit : ""}
+          onunit=${(select) => Studio.edit({ what: "unit", ids, unit: select.value })} /></label>
         <${Button} small testid="remove-selected" onclick=${() => setRemoving(true)}>${S.remove}<//>
         <${Button} small testid="clear-selection" onclick=${onclear}>${S.clear}<//>
         ${removing && html`<${Confirm} title=${S.removeTitle(ids.length)} text=${S.removeText} action=${S.remove} onclose=${() => setRemoving(false)}

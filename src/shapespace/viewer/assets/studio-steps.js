@@ -20,6 +20,15 @@
   const Next = ({ name, next, ready }) => html`<${Button} class="wide" strong=${ready} testid="next" onclick=${next}>${T.next[name]}<//>`;
   const isBusy = (...kinds) => Studio.jobsOf(kinds).some(Studio.isActive);
 
+  /** Take the messages of the page in a frame; a report in it has no origin. */
+  function useMessages(frame, take) {
+    useEffect(() => {
+      const listen = (event) => { if (frame.current && event.source === frame.current.contentWindow && event.data) take(event); };
+      addEventListener("message", listen);
+      return () => removeEventListener("message", listen);
+    });
+  }
+
   // Correspondence --------------------------------------------------------------------------------------------------
 
   function Redo({ specimens }) {
@@ -76,15 +85,11 @@
       return done;
     };
     useEffect(show, [JSON.stringify(landmarks)]);
-    useEffect(() => {
-      const take = ({ source, origin, data }) => {
-        if (!frame.current || source !== frame.current.contentWindow || origin !== location.origin || !data) return;
-        if (data.ready) show();
-        else if (data.landmark !== undefined) save({ ...landmarks, [data.landmark]: data.vertex });
-        else if (Number.isInteger(data.vertex)) setClicked(data.vertex);
-      };
-      addEventListener("message", take);
-      return () => removeEventListener("message", take);
+    useMessages(frame, ({ origin, data }) => {
+      if (origin !== location.origin) return;
+      if (data.ready) show();
+      else if (data.landmark !== undefined) save({ ...landmarks, [data.landmark]: data.vertex });
+      else if (Number.isInteger(data.vertex)) setClicked(data.vertex);
     });
     const training = project.specimens.filter((one) => one.included && one.set === "training" && one.state !== "unusable");
     const busy = isBusy("correspond", "redo");
@@ -105,11 +110,7 @@
   /** The specimens that are selected in a frame's morphospace. */
   function useSelected(frame, specimens) {
     const [names, setNames] = useState([]);
-    useEffect(() => {
-      const take = ({ source, data }) => { if (frame.current && source === frame.current.contentWindow && Array.isArray(data?.selected)) setNames(data.selected); };
-      addEventListener("message", take);
-      return () => removeEventListener("message", take);
-    }, []);
+    useMessages(frame, ({ data }) => { if (Array.isArray(data.selected)) setNames(data.selected); });
     return [specimens.filter((one) => names.includes(one.id)), () => setNames([])];
   }
 

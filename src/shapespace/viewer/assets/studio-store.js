@@ -122,6 +122,10 @@
     return next;
   };
   const edit = Viewer.guarded((content) => inOrder("/api/edit", content));
+  /** An edit by a control, which shows again what it showed before where the edit is refused. */
+  const editBy = async (content, restore) => { if (!(await edit(content))) restore(); };
+  /** The figures of a question for print: it is run again with the same shapes and options. */
+  const runFigures = (job) => runJob(job.kind, { ...job.options, "--format": "svg,pdf,png" }, job.on);
   const undo = Viewer.guarded(() => inOrder("/api/undo", {}));
   const redo = Viewer.guarded(() => inOrder("/api/redo", {}));
 
@@ -209,5 +213,5 @@
   const newest = (...kinds) => jobsOf(kinds).find((job) => job.status === "done");
   const isActive = (job) => job.status === "running" || job.status === "waiting";
 
-  Object.assign(Studio, { ask, json, post, refresh, listen, act, edit, undo, redo, runJob, upload, uploading, filesOfDrop, jobsOf, newest, isActive });
+  Object.assign(Studio, { ask, json, post, refresh, listen, act, edit, editBy, runFigures, undo, redo, runJob, upload, uploading, filesOfDrop, jobsOf, newest, isActive });
 })();

@@ -53,13 +53,8 @@
       data-edited=${draft !== null} oninput=${(event) => set(event.target.value)} onblur=${send} onkeydown=${key} onpaste=${paste} /></td>`;
   }
 
-  /** An edit of one specimen by a control; a refused edit restores it. */
-  const setUnit = async (specimen, select) => {
-    if (!(await Studio.edit({ what: "unit", ids: [specimen.id], unit: select.value }))) select.value = specimen.unit;
-  };
-  const setMirror = async (specimen, box) => {
-    if (!(await Studio.edit({ what: "mirror", ids: [specimen.id], mirrored: box.checked }))) box.checked = specimen.mirrored;
-  };
+  const setUnit = (specimen, select) => Studio.editBy({ what: "unit", ids: [specimen.id], unit: select.value }, () => { select.value = specimen.unit; });
+  const setMirror = (specimen, box) => Studio.editBy({ what: "mirror", ids: [specimen.id], mirrored: box.checked }, () => { box.checked = specimen.mirrored; });
 
   function Row({ specimen, row, columns, selected, onselect, onblock }) {
     // Unchanged rows are not compared again; the state keeps unchanged specimens.
@@ -72,8 +67,7 @@
         ${columns.map((name, k) => html`<${Cell} key=${name} value=${specimen.cells[name] || ""} label=${S.cell(name, specimen.id)} testid=${`cell-${specimen.id}-${name}`} row=${row} column=${k + 1}
           onedit=${(value) => Studio.edit({ what: "cells", cells: [{ id: specimen.id, column: name, value }] })} onblock=${(rows) => onblock(specimen.id, k, rows)} />`)}
         <td>${specimen.set === "new" ? S.new : S.training}</td>
-        <td><select aria-label=${S.unitOf(specimen.id)} data-testid=${`unit-${specimen.id}`} disabled=${Studio.state.read_only} value=${specimen.unit} onchange=${(event) => setUnit(specimen, event.target)}>
-          ${["", ...Studio.state.units].map((unit) => html`<option value=${unit}>${S.unit(unit)}</option>`)}</select></td>
+        <td><${Studio.Unit} aria-label=${S.unitOf(specimen.id)} data-testid=${`unit-${specimen.id}`} disabled=${Studio.state.read_only} value=${specimen.unit} onunit=${(select) => setUnit(specimen, select)} /></td>
         <td class="tick"><input type="checkbox" checked=${specimen.mirrored} aria-label=${S.mirrorOne(specimen.id)} data-testid=${`mirror-${specimen.id}`} disabled=${Studio.state.read_only} onchange=${(event) => setMirror(specimen, event.target)} /></td>
         <td class="number">${specimen.extent ? specimen.extent.toLocaleString("en", { maximumSignificantDigits: 3 }) : ""}</td>
         <td class="number">${specimen.triangles ? specimen.triangles.toLocaleString("en") : ""}</td>

@@ -78,21 +78,21 @@
     }
     marks.push(vertex);
     drawAllMarks();
-    tellStudio({ vertex });
+    postToStudio({ vertex });
   }
 
   /** The studio names landmarks by the vertex that was marked last, and stores those that were moved. */
-  function tellStudio(message) {
+  function postToStudio(message) {
     if (window.parent !== window) window.parent.postMessage(message, location.origin);
   }
 
-  function startNamed() {
+  function startLandmarks() {
     addEventListener("message", (event) => {
       if (event.source !== window.parent || event.origin !== location.origin || !Array.isArray(event.data?.landmarks)) return;
       named = event.data.landmarks.filter((one) => one.vertex < about.vertices);
       drawAllMarks();
     });
-    tellStudio({ ready: true });
+    postToStudio({ ready: true });
   }
 
   /** A mark follows the pointer that takes it, on all surfaces at once. */
@@ -119,16 +119,15 @@
       drawAllMarks();
     }), true);
     const end = during(() => {
-      tellStudio(taken.name === undefined ? { vertex: taken.vertex } : { landmark: taken.name, vertex: taken.vertex });
+      postToStudio(taken.name === undefined ? { vertex: taken.vertex } : { landmark: taken.name, vertex: taken.vertex });
       taken = null;
     });
     for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, end, true);
   }
 
   function drawMarks(cell) {
-    const gone = [];
+    const shown = [], gone = [];
     cell.marked = [];
-    const shown = [];
     [...marks.map((vertex) => ({ vertex })), ...named].forEach((mark, k) => {
       const position = Array.from(cell.positions.subarray(3 * mark.vertex, 3 * mark.vertex + 3));
       if (!position.every(Number.isFinite)) { gone.push(mark.name ?? mark.vertex); return; }
@@ -145,8 +144,8 @@
       const seen = mean.seen?.[vertex];
       const dot = h("span", { class: "dot" });
       dot.style.background = `rgb(${markColour(k).map((c) => Math.round(255 * c)).join(",")})`;
-      const told = seen === undefined ? "" : `shown by ${seen === scans ? `all ${scans}` : `${seen} of ${scans}`} scans`;
-      return h("p", { "data-testid": `marked-${vertex}` }, dot, h("strong", {}, `Vertex ${vertex}`), h("span", {}, told), h("button", {
+      const shownBy = seen === undefined ? "" : `shown by ${seen === scans ? `all ${scans}` : `${seen} of ${scans}`} scans`;
+      return h("p", { "data-testid": `marked-${vertex}` }, dot, h("strong", {}, `Vertex ${vertex}`), h("span", {}, shownBy), h("button", {
         type: "button", class: "small quiet", "aria-label": `Remove the mark of vertex ${vertex}`, onclick: () => { marks = marks.filter((one) => one !== vertex); drawAllMarks(); },
       }, "\u00d7"));
     }));
@@ -243,7 +242,7 @@
     Viewer.startTheme(() => cells.forEach((cell) => cell.view.request()));
     Viewer.startMessages();
     startMarks();
-    startNamed();
+    startLandmarks();
     startScans();
     $("loading").hidden = true;
     window.shapespaceCells = cells;

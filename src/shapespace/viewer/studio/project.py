@@ -338,7 +338,7 @@ class Project:
         for unit, mirrored in sorted({(one.unit, one.mirrored) for one in specimens} - {("", False)}):
             group = [one for one in specimens if (one.unit, one.mirrored) == (unit, mirrored)]
             folder = f"{path.stem}-{unit or 'scans'}{'-mirrored' if mirrored else ''}"
-            paths = [self.path(one) for one in group]
+            paths = [self.path(one) for one in group]  # `check` names its files by them
             files |= {one.id: f"{folder}/{name}.ply" for one, name in zip(group, names_for(paths), strict=True)}
             scans = [one.file for one in group]
             options = [*([f"--unit={unit}"] if unit else []), *(["--mirror"] if mirrored else [])]

@@ -107,23 +107,22 @@ def _import() -> None:
 
 def check_scan(scan: Path, stem: Path) -> dict[str, Any]:
     """Write the facts and the picture of a scan next to `stem`, and return the facts."""
-    from shapespace.geometry.doctor import examine, repair
+    from shapespace.geometry.doctor import examine_and_repair
     from shapespace.io.files import write_bytes, write_text
     from shapespace.io.meshes.mesh_io import read_mesh
     from shapespace.report.render.scene import decimate
     from shapespace.report.render.thumbnails import mesh_still
 
     try:
-        mesh = read_mesh(scan)
-        report = examine(mesh)
-        usable = all(finding.level != "refused" for finding in report.findings)
+        report, repaired = examine_and_repair(read_mesh(scan))
         findings = [{"level": one.level, "text": f"{one.problem} {one.action}"} for one in report.findings]
         facts = {
-            "state": "ready" if usable else "unusable", "vertices": report.vertices, "triangles": report.triangles,
-            "extent": float(report.extent.max()) if usable else 0.0, "findings": findings,
+            "state": "unusable" if repaired is None else "ready",
+            "vertices": report.vertices, "triangles": report.triangles,
+            "extent": 0.0 if repaired is None else float(report.extent.max()), "findings": findings,
         }  # fmt: skip
-        if usable:
-            picture, _ = mesh_still(decimate(repair(mesh)[0], _MOST_TRIANGLES)[0])
+        if repaired is not None:
+            picture, _ = mesh_still(decimate(repaired, _MOST_TRIANGLES)[0])
             write_bytes(stem.with_suffix(".webp"), picture)
     except ShapespaceError as error:
         facts = _unusable(str(error).replace(f"{scan.parent}{os.sep}", ""))
