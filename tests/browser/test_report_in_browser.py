@@ -121,7 +121,7 @@ def test_without_script_it_can_still_be_read(open_tab, report: Path) -> None:
 def test_the_navigation_stays_and_links_open_what_is_folded(open_tab, report: Path) -> None:
     tab = open_tab(report.as_uri(), PHONE)
     tab.page.locator("a", has_text="All pictures of").first.click()
-    assert tab.page.locator("details.part[open] figure.turning").first.is_visible()
+    tab.page.locator("details.part[open] figure.turning").first.wait_for()
     nav = tab.page.locator("nav")
     tab.until("document.querySelector('nav [aria-current]').textContent === 'Fits'")
     assert nav.bounding_box()["y"] == 0
