@@ -20,6 +20,10 @@ WINDOWS = (
     pytest.param(PHONE, "dark", id="phone-dark"),
 )
 """Each size and each scheme in every run, and in `make test-all` each with each."""
+ONE_WINDOW = tuple(
+    pytest.param(*one.values, id=one.id, marks=pytest.mark.pairs) if one.id == "phone-dark" else one for one in WINDOWS
+)
+"""One of them in .ci/run, where another test of the same page has the other one."""
 
 WICKED = "</script><script>window.wicked = true</script>"
 """A label that stays text."""

@@ -51,6 +51,7 @@ def settled(tab, words: str, *, absent: str = "nothing") -> None:
     announced = "document.querySelector('.widget [aria-live]').innerText"
     tab.until(f"{announced}.includes({words!r}) && !{announced}.includes({absent!r})")
     tab.page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    tab.until("[...window.Shapespace.sceneParts.views].every((view) => view.rests)")
 
 
 def place_of(tab, widget, shape: int) -> dict[str, float]:

@@ -10,6 +10,7 @@ from pictures import IMAGES, same_as_kept
 ROOT = Path(__file__).resolve().parents[2]
 
 
+@pytest.mark.long
 def test_the_picture_of_the_methods_is_what_they_do(
     shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import httpx
 import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
@@ -68,7 +67,8 @@ class User:
 
 _DRAWN = (
     "document.readyState === 'complete' && (document.body.dataset.ready === 'true' || "
-    "!!document.querySelector('h1 + *'))"
+    "!!document.querySelector('h1 + *')) && "
+    "[...(window.Shapespace?.sceneParts?.views || [])].every((view) => view.rests)"
 )
 
 
@@ -78,7 +78,6 @@ def framed(tab, seconds: float = 60.0) -> None:
     while not any("/view/" in frame.url and frame.evaluate(_DRAWN) for frame in tab.page.frames[1:]):
         assert time.monotonic() < end
         tab.page.wait_for_timeout(100)
-    tab.page.wait_for_timeout(2000)
 
 
 def place_and_drag(tab, project: Path) -> None:
@@ -119,7 +118,7 @@ def write_bones(folder: Path, count: int) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("count", [5, pytest.param(12, marks=pytest.mark.long)])
+@pytest.mark.parametrize("count", [4, pytest.param(12, marks=pytest.mark.long)])
 def test_raw_scans_become_a_report_by_clicks_and_history_gives_the_same_numbers(
     open_tab, tmp_path: Path, count: int
 ) -> None:
@@ -142,14 +141,14 @@ def test_raw_scans_become_a_report_by_clicks_and_history_gives_the_same_numbers(
             same_as_kept("screen-specimens.png", shot, width=1200)
         assert barriers(tab) == []
         user.click("next")
-        tab.page.get_by_test_id("option--vertices").fill("800" if count == 12 else "400")
+        tab.page.get_by_test_id("option--vertices").fill("800" if count == 12 else "300")
         user.click("run-correspond")
         user.has_run(1)
         framed(tab)
         shot = tab.shot("correspondence")
         if count == 12:
             same_as_kept("screen-correspondence.png", shot, width=1200)
-        if count == 5:
+        if count == 4:
             place_and_drag(tab, project)
         user.click("next")
         user.click("run-build")
@@ -262,9 +261,3 @@ def test_many_files_are_taken_and_the_page_stays_usable(open_tab, tmp_path: Path
         tab.page.get_by_test_id("screen-history").wait_for()
         assert time.monotonic() - began < 5
         assert tab.complaints == []
-
-
-def test_a_guessed_token_opens_nothing(open_tab, tmp_path: Path) -> None:
-    with studio(tmp_path / "p", tmp_path) as address:
-        answer = httpx.get(address.partition("?")[0], params={"token": "guess"})
-        assert answer.status_code == 401 and "shapespace" in answer.json()["error"]

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from pages import WINDOWS, viewer
+from pages import ONE_WINDOW, WINDOWS, viewer
 from pictures import change, drawn_share
 
 from same_blobs import HIDDEN, NAMES, write_same
@@ -146,7 +146,7 @@ def test_all_surfaces_turn_together(open_tab, address: str) -> None:
     assert set(tab.page.evaluate(yaw)) == {0}
 
 
-@pytest.mark.parametrize(("viewport", "scheme"), WINDOWS)
+@pytest.mark.parametrize(("viewport", "scheme"), ONE_WINDOW)
 def test_every_figure_of_the_report_is_drawn(open_tab, same: Path, viewport: dict, scheme: str) -> None:
     page = same.parent / "report.html"
     if not page.exists():

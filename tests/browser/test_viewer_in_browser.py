@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pages import DESKTOP, PHONE, WINDOWS, World, viewer
+from pages import DESKTOP, ONE_WINDOW, PHONE, World, viewer
 from pictures import change, drawn_share, same_as_kept
 
 from shapespace.batch.fit_records import read_record
@@ -70,7 +70,7 @@ def verdict(tab) -> str:
     return card.get_attribute("data-status")
 
 
-@pytest.mark.parametrize(("viewport", "scheme"), WINDOWS)
+@pytest.mark.parametrize(("viewport", "scheme"), ONE_WINDOW)
 def test_the_model_is_shown_and_a_slider_changes_it(open_tab, address: str, viewport: dict, scheme: str) -> None:
     tab = ready(open_tab(address, viewport, scheme))
     mean = view(tab)
@@ -183,7 +183,7 @@ DRAWN = """(chart) => {
 """The colour of a chart's lines and points, how many of its pixels have it, and device pixels per pixel."""
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.pairs)])
 def test_charts_show_the_iterations_and_the_coefficients(open_tab, address: str, world: World, scheme: str) -> None:
     tab = ready(open_tab(address, scheme=scheme, device_scale_factor=2), "fits")
     tab.page.locator('[data-testid="fit"][data-name="plain"]').click()
@@ -369,7 +369,7 @@ def box(locator) -> tuple[float, float, float, float]:
     return found["x"], found["y"], found["x"] + found["width"], found["y"] + found["height"]
 
 
-@pytest.mark.parametrize("viewport", [DESKTOP, PHONE], ids=["desktop", "phone"])
+@pytest.mark.parametrize("viewport", [pytest.param(DESKTOP, marks=pytest.mark.pairs), PHONE], ids=["desktop", "phone"])
 def test_a_message_covers_nothing_and_goes(open_tab, address: str, tmp_path: Path, viewport: dict) -> None:
     tab = ready(open_tab(address, viewport))
     tab.page.get_by_test_id("map").check()

@@ -98,7 +98,14 @@ def hear_hangups() -> None:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for one process")
-@pytest.mark.parametrize(("jobs", "by"), [(1, "SIGINT"), (2, "SIGINT"), (2, "SIGTERM"), (1, "SIGHUP")])
+@pytest.mark.parametrize(
+    ("jobs", "by"),
+    [
+        (2, "SIGINT"),
+        (1, "SIGTERM"),
+        *(pytest.param(*one, marks=pytest.mark.long) for one in ((1, "SIGINT"), (2, "SIGTERM"), (1, "SIGHUP"))),
+    ],
+)
 def test_ended_in_a_batch_it_leaves_whole_files_that_the_same_command_takes_up(
     jobs: int, by: str, world: World, tmp_path: Path
 ) -> None:

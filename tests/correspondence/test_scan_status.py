@@ -82,7 +82,7 @@ def test_build_leaves_doubtful_surfaces_out_with_a_note_and_includes_them_on_req
     for one in BLOBS:
         write_mesh(tmp_path / "scans" / f"{one.scan.name}.ply", one.scan)
     same = str(tmp_path / "same")
-    given = ["--vertices", "300", "--rounds", "2", "--jobs", "1", "--quiet", "--mirror", "never"]
+    given = ["--vertices", "200", "--rounds", "1", "--jobs", "1", "--quiet", "--mirror", "never"]
     assert main(["correspond", str(tmp_path / "scans"), "-o", same, *given]) == 0
     output = capsys.readouterr()
     summary = json.loads((tmp_path / "same" / "correspondence.json").read_text())

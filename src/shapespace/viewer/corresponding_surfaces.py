@@ -29,6 +29,7 @@ MAX_MARKED = 100
 
 _PAGE, _PAGE_BYTES = 11, 24 * 2**20  # surfaces on a page, and bytes that a page may send
 _MOST_DRAWN = 8_000  # triangles of a surface, whose edges are then about 4 pixels of a picture on the page
+_MOST_TURNING = 1_500  # while it turns and the processor draws, about 10 pixels
 _LARGE = 4_000_000  # vertices of all surfaces together, which take about 2 s to read
 _BYTES_PER_VERTEX = 10  # bytes; three coordinates of 16 bits, one number of 32
 _STATUS_ORDER = ("unreadable", "excluded", "doubtful", "look", "converged")
@@ -85,9 +86,11 @@ class Surfaces:
         mean = self._corresponded.mean
         along, across = checker_places(mean)
         drawn, kept = decimate(mean, _MOST_DRAWN)
+        turning, kept_turning = decimate(drawn, _MOST_TURNING)
         arrays = {
             "positions": mean.vertices,
             "faces": np.asarray(kept[faces_of(drawn)], dtype=np.uint32),
+            "draft": np.asarray(kept[kept_turning][faces_of(turning)], dtype=np.uint32),
             "places": np.stack([along, across], axis=1),
         }
         return pack(arrays, {})

@@ -70,7 +70,7 @@
     scheduled = 0;
     const now = Array.from(waiting);
     waiting.clear();
-    now.forEach((view) => view._draw());
+    now.forEach((view) => view._draw(now.length));
   }
 
   // Another resolution of the screen, or another theme behind the names.
@@ -79,9 +79,17 @@
   window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redrawAll);
   new MutationObserver(redrawAll).observe(document.documentElement, { attributes: true });
 
-  /** Draw the surfaces of a view; height: of the picture in pixels, ratio: pixels per CSS pixel. */
-  function drawSurfaces(view, renderer, height, ratio) {
+  /** Draw the surfaces of a view; height: of the picture in pixels, ratio: pixels per CSS pixel, isDraft: coarse ones. */
+  function drawSurfaces(view, renderer, height, ratio, isDraft) {
     const all = Array.from(view._things.values());
+    const coarse = isDraft ? all.filter((thing) => thing.draft) : [];
+    const swap = () => {
+      for (const thing of coarse) {
+        const { geometry } = thing.object, { index } = geometry;
+        geometry.setIndex(thing.draft);
+        thing.draft = index;
+      }
+    };
     const shown = all.filter((thing) => thing.visible && thing.opacity > 0.004);
     const solid = shown.filter((thing) => thing.opacity > 0.996 || thing.isMarks);
     const clear = shown.filter((thing) => !solid.includes(thing));
@@ -103,6 +111,7 @@
       }
       renderer.render(view._scene, view._eye);
     };
+    swap();
     renderer.clear(true, true, false);
     pass(solid, true, false);
     // Of a clear surface only the nearest layer is seen: its depth first, on top of that of the solid ones.
@@ -114,6 +123,7 @@
       pass([thing], false, false);
       pass([thing], true, true);
     });
+    swap(); // picks meet the fine triangles
   }
 
   /** Write the names of marks and the texts of a view on the canvas over its picture. */

@@ -20,11 +20,14 @@
       if (works) this._scene = new THREE.Scene();
     }
 
-    /** Show a surface, or points where faces is null; positions Float32Array(3V), faces Uint32Array(3F). */
-    setSurface(id, { positions, faces = null, colour = CLAY, opacity = 1, visible = true, size = null }) {
+    /**
+     * Show a surface, or points where faces is null; positions Float32Array(3V), faces Uint32Array(3F). draft: fewer
+     * triangles between some of the same vertices, drawn while the surface moves where the processor draws.
+     */
+    setSurface(id, { positions, faces = null, draft = null, colour = CLAY, opacity = 1, visible = true, size = null }) {
       if (!this.works) return;
       this.remove(id);
-      const thing = { id, colour, opacity, visible, faces: null, given: faces, positions, paint: null, size };
+      const thing = { id, colour, opacity, visible, faces: null, given: { faces, draft }, positions, paint: null, size };
       const geometry = new THREE.BufferGeometry();
       const known = new Float32Array(positions);
       const bad = replaceUnknown(known);
@@ -38,6 +41,7 @@
       const isPoints = !(faces && faces.length);
       if (!isPoints) {
         geometry.setIndex(new THREE.BufferAttribute(thing.faces, 1));
+        if (draft) thing.draft = new THREE.BufferAttribute(usable(draft, known.length / 3, bad), 1);
         geometry.setAttribute("normal", dynamic(normalsOf(known, thing.faces, new Float32Array(known.length)), 3));
       } else if (bad) {
         const keep = [];
@@ -64,7 +68,7 @@
       for (let i = 0; i < positions.length; i++) sum += positions[i];
       if (positions.length !== attribute.array.length || !Number.isFinite(sum)) {
         const { colour, opacity, visible, given, paint, size } = thing;
-        this.setSurface(id, { positions, faces: given, colour, opacity, visible, size });
+        this.setSurface(id, { positions, ...given, colour, opacity, visible, size });
         const each = paint && paint.options.squares ? 2 : 1;
         if (paint && paint.values.length === (each * positions.length) / 3) this.paint(id, paint.values, paint.options);
         return;

@@ -7,7 +7,7 @@
   const { copyCamera, gpu, views, waiting } = parts;
 
   const NO_WEBGL = "This browser shows no 3-D pictures here, because WebGL is switched off or missing.";
-  const DRAFT_PIXELS = 3.2e5, STILL_PIXELS = 3e6, RESTS_MS = 160; // where the processor draws
+  const DRAFT_PIXELS = 3.2e5, STILL_PIXELS = 3e6, RESTS_MS = 160; // where the processor draws: of all views, of one
 
   /**
    * A canvas in `element` that shows surfaces and points, turned by mouse, touch and keys; drawn only when it changed.
@@ -150,11 +150,12 @@
     redraw() {
       if (!this.works) return NaN;
       const start = performance.now();
-      this._draw(true);
+      this._draw(1, true);
       return performance.now() - start;
     }
 
-    _draw(wait) {
+    /** together: number of views that are drawn with the same frame. */
+    _draw(together, wait) {
       const page = gpu();
       waiting.delete(this);
       clearTimeout(this._later);
@@ -165,16 +166,16 @@
       let ratio = Math.min(window.devicePixelRatio || 1, 2);
       if (page.bySoftware) {
         // What moves is drawn coarser, and again at twice the resolution once it rests.
-        ratio = Math.min(ratio, Math.max(Math.sqrt(DRAFT_PIXELS / area), 0.5));
+        ratio = Math.min(ratio, Math.max(Math.sqrt(DRAFT_PIXELS / (together * area)), 0.5));
         this._later = setTimeout(() => {
           this._later = 0;
           if (this._near) this._present(Math.min(2, Math.sqrt(STILL_PIXELS / area)));
         }, RESTS_MS);
       }
-      this._present(ratio, wait);
+      this._present(ratio, page.bySoftware, wait);
     }
 
-    _present(ratio, wait) {
+    _present(ratio, isDraft, wait) {
       const page = gpu();
       if (!page || page.lost || this._disposed) return;
       const width = Math.round(this._frame.clientWidth * ratio), height = Math.round(this._frame.clientHeight * ratio);
@@ -183,7 +184,7 @@
       this._size = [width, height];
       if (page.canvas.width !== width || page.canvas.height !== height) page.renderer.setSize(width, height, false);
       this._camera.aim(this._eye, width, height);
-      parts.drawSurfaces(this, page.renderer, height, ratio);
+      parts.drawSurfaces(this, page.renderer, height, ratio, isDraft);
       if (wait) page.context.readPixels(0, 0, 1, 1, page.context.RGBA, page.context.UNSIGNED_BYTE, new Uint8Array(4));
       this._shown.transferFromImageBitmap(page.canvas.transferToImageBitmap());
       parts.writeNames(this);

@@ -44,7 +44,7 @@
     cell.std = std;
     cell.name.textContent = name;
     cell.view.label = `${name} in 3-D`;
-    cell.view.setSurface("surface", { positions, faces: mean.faces, colour: about.clay });
+    cell.view.setSurface("surface", { positions, faces: mean.faces, draft: mean.draft, colour: about.clay });
     paint(cell);
     drawMarks(cell);
   }
