@@ -71,6 +71,7 @@ def test_of_a_large_folder_names_and_surfaces_come_before_all_surfaces_are_read(
 ) -> None:
     monkeypatch.setattr("shapespace.viewer.corresponding_surfaces._LARGE", 1000)
     monkeypatch.setattr("shapespace.viewer.corresponding_surfaces._MOST_DRAWN", 300)
+    monkeypatch.setattr("shapespace.viewer.corresponding_surfaces._MOST_TURNING", 100)
     monkeypatch.setattr("shapespace.report.inputs.correspondence_folder.Corresponded.population", None)
     with opened(Surfaces(template)) as client:
         assert client.get("/api/about").json()["is_large"]
@@ -80,6 +81,7 @@ def test_of_a_large_folder_names_and_surfaces_come_before_all_surfaces_are_read(
         _, mean = unpacked(client.get("/api/mean").content)
         # Fewer triangles are drawn, between vertices of the surface, and all vertices keep their numbers.
         assert len(mean["faces"]) <= 300 and mean["faces"].max() < len(mean["positions"]) == VERTICES
+        assert 0 < len(mean["draft"]) <= 100 and np.isin(mean["draft"], mean["faces"]).all()
         _, able = unpacked(client.get("/api/surfaces/able").content)
         assert len(able["positions"]) == VERTICES
 

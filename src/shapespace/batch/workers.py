@@ -11,7 +11,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 from shapespace.batch import messages
@@ -50,15 +50,27 @@ def start_loading(*, tell: bool) -> None:
 
         warm_up(tell=tell)
         return
+    load_ahead(("shapespace.batch.warm_server",), {WARM_UP: "tell" if tell else "quiet", messages.MARK: mark})
+
+
+def load_ahead(modules: Sequence[str], environment: Mapping[str, str] | None = None) -> None:
+    """Import `modules` in the background for workers that are copies; do nothing where they start from nothing.
+
+    Args:
+        modules: names.
+        environment: variables of the server alone.
+    """
+    if not COPIED:
+        return
     from multiprocessing import forkserver  # not on Windows
 
     # One worker is one core: threads of BLAS would spread it over all.
-    wanted = dict.fromkeys(_BLAS_THREADS, "1") | {WARM_UP: "tell" if tell else "quiet", messages.MARK: mark}
+    wanted = dict.fromkeys(_BLAS_THREADS, "1") | dict(environment or {})
     before = {name: os.environ.get(name) for name in wanted}
     os.environ.update(wanted)
     try:
         with interrupts_ignored():
-            forkserver.set_forkserver_preload(["shapespace.batch.warm_server"])
+            forkserver.set_forkserver_preload(list(modules))
             forkserver.ensure_running()
     finally:
         for name, value in before.items():

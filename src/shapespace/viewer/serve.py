@@ -17,7 +17,7 @@ from tempfile import TemporaryDirectory
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from shapespace.batch.workers import start_loading
+from shapespace.batch.workers import load_ahead, start_loading
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.schemas import CorrespondenceRecord
 
@@ -131,6 +131,9 @@ def serve_studio(
         InputError: the port is taken, or the host is not an address of this machine.
     """
     require_view_extra()
+    if not read_only:
+        # While this process imports its own code.
+        load_ahead(("shapespace.viewer.studio.specimen_checks",))
     from shapespace.report.pages.write_html import require_report_extra
     from shapespace.viewer.studio.app import Studio, make_studio
 

@@ -8,17 +8,22 @@ import json
 import os
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from shapespace.batch.workers import context
 from shapespace.errors import FileError, ShapespaceError
+from shapespace.geometry.doctor import examine_and_repair
+from shapespace.io.files import write_bytes, write_text
+from shapespace.io.meshes.mesh_io import read_mesh
+from shapespace.report.render.thumbnails import mesh_still
+from shapespace.types import Mesh
 from shapespace.viewer.fitting import lower_priority
 
 _FOLDER = "checks"
 _MOST_PROCESSES = 4
-_MOST_TRIANGLES = 20_000  # of a picture of 176 by 232 pixels
 
 
 class SpecimenChecks:
@@ -41,7 +46,7 @@ class SpecimenChecks:
         self._pool: ProcessPoolExecutor | None = None
         self._known: dict[str, dict[str, Any]] = {}
         if not read_only:
-            self._processes().submit(_import)  # before the first scan comes
+            self._processes().submit(_load_code)  # before the first scan comes
 
     def facts(self, scan: Path) -> dict[str, Any] | None:
         """Return the facts of a scan, or None while it is checked; the first call asks for the check."""
@@ -99,20 +104,17 @@ class SpecimenChecks:
         return _unusable("It cannot be checked: the memory does not suffice, or the check failed.")
 
 
-def _import() -> None:
-    """Import what a check needs."""
-    for name in ("geometry.doctor", "io.meshes.mesh_io", "report.render.thumbnails"):
-        import_module(f"shapespace.{name}")
+def _load_code() -> None:
+    """Check and draw a tetrahedron, for which the compiled code is loaded."""
+    vertices = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], dtype=np.int32)
+    _, repaired = examine_and_repair(Mesh(vertices, faces))
+    if repaired is not None:
+        mesh_still(repaired)
 
 
 def check_scan(scan: Path, stem: Path) -> dict[str, Any]:
     """Write the facts and the picture of a scan next to `stem`, and return the facts."""
-    from shapespace.geometry.doctor import examine_and_repair
-    from shapespace.io.files import write_bytes, write_text
-    from shapespace.io.meshes.mesh_io import read_mesh
-    from shapespace.report.render.scene import decimate
-    from shapespace.report.render.thumbnails import mesh_still
-
     try:
         report, repaired = examine_and_repair(read_mesh(scan))
         findings = [{"level": one.level, "text": f"{one.problem} {one.action}"} for one in report.findings]
@@ -122,7 +124,7 @@ def check_scan(scan: Path, stem: Path) -> dict[str, Any]:
             "extent": 0.0 if repaired is None else float(report.extent.max()), "findings": findings,
         }  # fmt: skip
         if repaired is not None:
-            picture, _ = mesh_still(decimate(repaired, _MOST_TRIANGLES)[0])
+            picture, _ = mesh_still(repaired)
             write_bytes(stem.with_suffix(".webp"), picture)
     except ShapespaceError as error:
         facts = _unusable(str(error).replace(f"{scan.parent}{os.sep}", ""))
