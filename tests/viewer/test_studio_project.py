@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shapespace.cli import main
+from shapespace.cli import main, parser
 from shapespace.cli.command_table import summaries_and_options
 from shapespace.cli.forms import forms
 from shapespace.commands.inputs import given_scans
@@ -197,3 +197,29 @@ def test_a_project_is_not_created_among_other_files(tmp_path: Path) -> None:
         Project.open(tmp_path, create=True)
     with pytest.raises(FileError, match="contains no project"):
         Project.open(tmp_path)
+
+
+@pytest.mark.parametrize("kind", sorted(forms(summaries_and_options())))
+def test_each_action_is_a_command_line_that_the_parser_takes(project: Project, tmp_path: Path, kind: str) -> None:
+    for k, name in enumerate(("dora", "emil")):
+        project.add(tetrahedron(project.new_file(f"{name}.ply"), 5.0 + k), "new")
+    join_table(project, b"id,group,age\nanna,a,1\nben,a,2\ncarl,b,3\ndora,a,4\nemil,b,5\n")
+    made = (("correspond", "correspondence-1"), ("build", "model-2.h5"), ("fit", "fits-3"))
+    done = [
+        Job(number=1 + k, kind=one, arguments=(one,), output=output, status="done")
+        for k, (one, output) in enumerate(made)
+    ]
+    chosen = {"column": "group", "class": "group=a", "formula": "~ group"}
+    described = forms(summaries_and_options())
+    options = {
+        one["flag"]: chosen.get(one["kind"]) or (one["choices"] or ["age"])[0]
+        for one in described[kind]["options"]
+        if one["required"] or one["kind"] in ("class", "formula")
+    }
+    ordered = order(project, done, described, kind, options, None, 4)
+    arguments = parser().parse_args(ordered.arguments)
+    assert callable(arguments.run)
+    if kind == "score":
+        written = {path.name: path.read_text() for path in (project.folder / "inputs").glob("*.csv")}
+        assert "anna" in written["0004-reference.csv"] and "carl" not in written["0004-reference.csv"]
+        assert "carl" in written["0004.csv"] and "anna" not in written["0004.csv"]

@@ -33,13 +33,13 @@ def run(client: httpx.Client, kind: str, options: dict[str, Any] | None = None, 
 
 @pytest.mark.long
 def test_every_action_of_the_page_ends_with_a_result_that_is_shown(tmp_path: Path) -> None:
-    """Eight subjects in two visits, and four of them scanned again for the model."""
+    """Eight subjects in two visits, and new scans, two of each subject."""
     bones = tmp_path / "bones"
-    assert main(["data", "bones", "-o", str(bones), "--count", "20", "--quiet"]) == 0
+    assert main(["data", "bones", "-o", str(bones), "--count", "28", "--quiet"]) == 0
     scans = sorted(bones.glob("*.ply"))
     lines = ["id,person,visit,group,age"]
     for k, scan in enumerate(scans):
-        person = k // 2 if k < 16 else k - 16
+        person = k // 2 if k < 16 else (k - 16) // 2
         lines.append(f"{scan.stem},p{person},{1 + k % 2 if k < 16 else 3},{'ab'[person % 2]},{20 + 3 * person}")
     with studio(tmp_path / "p", 10**8) as client:
         for k, scan in enumerate(scans):
@@ -62,10 +62,10 @@ def test_every_action_of_the_page_ends_with_a_result_that_is_shown(tmp_path: Pat
         run(client, "compare", {"--formula": "~ group", "--permutations": "200"})
         run(client, "change", {"--subject": "person", "--time": "visit"})
         run(client, "asymmetry", {"--subject": "person"})
-        run(client, "regress", {"--target": "age", "--subject": "person"})
+        run(client, "regress", {"--target": "age"})
         fits = run(client, "fit", {"--dense": True})["number"]
-        run(client, "score", {"--subject": "person"})
-        run(client, "identify", {"--subject": "person"}, fits)
+        run(client, "score", {"--reference": "group=a"})
+        run(client, "identify", {"--subject": "person", "--doubtful": True}, fits)
         run(client, "complete", {"--samples": "10"})
         run(client, "convert", {"--to": "statismo"})
         run(client, "export")

@@ -20,7 +20,7 @@ _FIRST: Mapping[str, tuple[str, ...]] = {
     "change": ("--subject", "--time", "--order"),
     "asymmetry": ("--subject", "--reference", "--gauge"),
     "regress": ("--target", "--subject", "--seed"),
-    "score": ("--modes", "--nearest", "--subject"),
+    "score": ("--reference", "--subject", "--nearest"),
     "identify": ("--subject", "--gallery", "--probe"),
     "convert": ("--to",),
     "export": (),
@@ -46,19 +46,20 @@ def forms(commands: Mapping[str, tuple[str, Sequence[Option]]]) -> dict[str, dic
     made: dict[str, dict[str, Any]] = {}
     for kind, first in _FIRST.items():
         command = _KINDS.get(kind, kind)
-        made[kind] = {"command": tuple(command.split()), **_form(kind, *commands[command], first)}
+        made[kind] = {"command": tuple(command.split()), **_form(*commands[command], first)}
     to = made["convert"]["options"][0]
     made["convert"]["options"][0] = to | {"kind": "choice", "choices": list(MODEL_FORMATS)}
+    reference = made["score"]["options"][0]
+    made["score"]["options"][0] = reference | {"kind": "class", "help": "class that the others are compared with"}
     return made
 
 
-def _form(kind: str, summary: str, options: Sequence[Option], first: tuple[str, ...]) -> dict[str, Any]:
+def _form(summary: str, options: Sequence[Option], first: tuple[str, ...]) -> dict[str, Any]:
     offered = [
         option
         for option in options
         if not option.is_positional and not option.hidden and not _FILES & set(option.spellings)
-        and not (kind == "score" and "--reference" in option.spellings)
-    ]  # fmt: skip
+    ]
     order = {flag: place for place, flag in enumerate(first)}
     described = [_described(option, visible=option.spellings[-1] in order) for option in offered]
     described.sort(key=lambda one: order.get(one["flag"], len(order)))
@@ -83,6 +84,6 @@ def _kind(option: Option) -> str:
         return "choice"
     if option.metavar == "FORMULA":
         return "formula"
-    if option.metavar == "COLUMN":
-        return "column"
+    if option.metavar in ("COLUMN", "COLUMN=VALUE"):
+        return "column" if option.metavar == "COLUMN" else "class"
     return "number" if option.metavar in ("N", "K", "S", "M") else "text"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import importlib.util
+import logging
 import signal
 import socket
 import threading
@@ -179,8 +180,17 @@ def _run(
         if open_browser:
             address = page_address(host, port, access.new_ticket())
             threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
-        with contextlib.suppress(KeyboardInterrupt):
-            server.run(sockets=[listener])
+
+        def is_running(_: logging.LogRecord) -> bool:
+            return not server.should_exit
+
+        log = logging.getLogger("uvicorn.error")
+        log.addFilter(is_running)  # a request that Ctrl-C cuts off is no error
+        try:
+            with contextlib.suppress(KeyboardInterrupt):
+                server.run(sockets=[listener])
+        finally:
+            log.removeFilter(is_running)
 
 
 def make_server(app: object) -> uvicorn.Server:

@@ -8,6 +8,7 @@
   const J = T.jobs;
   const { Button, CopyButton } = Studio;
   const CHECK_AFTER = 400; // ms without a change of the form
+  const MOST_CLASSES = 12; // of a column
 
   const duration = (seconds) => seconds < 90 ? J.seconds(Math.max(1, Math.round(seconds))) : seconds < 5400 ? J.minutes(Math.round(seconds / 60)) : J.hours((seconds / 3600).toFixed(1));
   const kindOf = (job) => J.kinds[job.kind] || job.kind;
@@ -36,6 +37,14 @@
       <label class="option"><span>${T.questions.formula}</span><input data-testid=${`option${option.flag}`} placeholder="~ sex + age" title=${option.help} value=${value} spellcheck=${false} oninput=${(event) => onvalue(event.target.value)} /></label>`;
   }
 
+  /** The classes of columns with few values: `column=value`. */
+  function classesOf({ columns, specimens }) {
+    return columns.flatMap((column) => {
+      const values = [...new Set(specimens.map((one) => one.cells[column]).filter(Boolean))];
+      return values.length <= MOST_CLASSES ? values.map((value) => `${column}=${value}`) : [];
+    });
+  }
+
   function Option({ option, value, columns, onvalue }) {
     const { flag, kind, choices, initial, required } = option;
     const words = flag.replace(/^--/, "").replace(/-/g, " ");
@@ -47,10 +56,10 @@
     const help = html`<small class="hint" id=${`help${flag}`} title=${text}>${text}</small>`;
     if (kind === "formula") return html`<${Formula} option=${option} value=${value || ""} columns=${columns} onvalue=${onvalue} />`;
     if (kind === "flag") return html`<div class="option"><label class="check"><input type="checkbox" ...${common} checked=${value === true} onchange=${(event) => onvalue(event.target.checked)} />${name}</label>${help}</div>`;
-    if (kind === "choice" || kind === "column") {
-      const values = kind === "column" ? columns : choices;
+    if (kind === "choice" || kind === "column" || kind === "class") {
+      const values = kind === "choice" ? choices : kind === "column" ? columns : classesOf(Studio.state.project);
       return html`<label class="option">${label}<select ...${common} value=${value || ""} onchange=${(event) => onvalue(event.target.value)}>
-        ${!(initial && values.includes(initial)) && html`<option value="">${required ? "" : kind === "column" ? J.none : J.default}</option>`}
+        ${!(initial && values.includes(initial)) && html`<option value="">${required ? "" : kind === "choice" ? J.default : J.none}</option>`}
         ${values.map((one) => html`<option key=${one} value=${one} selected=${one === value}>${one}</option>`)}</select>${help}</label>`;
     }
     return html`<label class="option">${label}<input ...${common} inputmode=${kind === "number" ? "decimal" : undefined} value=${value || ""} placeholder=${initial || required ? "" : J.default} oninput=${(event) => onvalue(event.target.value)} />${help}</label>`;

@@ -9,7 +9,7 @@
   const { Button, CopyButton, JobForm, Jobs, Settings, Step, useResult } = Studio;
   const KINDS = ["compare", "change", "asymmetry", "regress", "score", "identify"];
   const CORRESPONDENCES = ["correspond", "redo"];
-  const SOURCES = { score: ["fit"], identify: ["fit"] }; // others also take surfaces in correspondence
+  const SOURCES = { identify: ["fit"] }; // others also take surfaces in correspondence
   const sources = (kind) => SOURCES[kind] || [...CORRESPONDENCES, "fit"];
 
   Studio.QUESTIONS = KINDS;

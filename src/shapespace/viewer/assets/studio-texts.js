@@ -96,7 +96,7 @@
       hints: {
         compare: "Test whether shape is associated with sex, age, treatment or any other column.", change: "Measure the change between visits of the same subjects in millimetres.",
         asymmetry: "Compare left with right: a score for each subject, and a map.", regress: "Predict a number, such as age, from shape, with its cross-validated accuracy.",
-        score: "Place each new shape in the distribution of a reference population.", identify: "Find the subject of a scan among the enrolled ones.",
+        score: "Compare each shape with a class, such as the controls: a percentile, and a map.", identify: "Find the subject of a scan among the enrolled ones.",
       },
       empty: "After the run, the answer in words, the figures and the text for the paper are shown here.",
     },

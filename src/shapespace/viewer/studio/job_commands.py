@@ -85,26 +85,27 @@ def order(
         return Order((*words, result_of(jobs, ("fit",), on).output, "--all", "-o", output, *given), output)
     if kind not in QUESTIONS:
         raise InputError(f"There is no action {kind[:30]!r}; reload the page.")
-    return _question(project, jobs, kind, words, given, on, number)
+    return _question(project, jobs, kind, words, given, options, on, number)
 
 
 def _question(
-    project: Project, jobs: Sequence[Job], kind: str, words: tuple[str, ...], given: Sequence[str], on: int | None,
-    number: int,
+    project: Project, jobs: Sequence[Job], kind: str, words: tuple[str, ...], given: Sequence[str],
+    options: Mapping[str, Any], on: int | None, number: int,
 ) -> Order:  # fmt: skip
     stem, output, state = f"{_INPUTS}/{number:04d}", f"{kind}-{number}", project.state
     shapes = shapes_of(jobs, kind, on)
+    chosen = state.chosen("new" if shapes.kind == "fit" else "training")
     if kind == "score":
-        reference = result_of(jobs, CORRESPONDENCES, None)
-        project.write_table(project.folder / f"{stem}.csv", _some(state.chosen("new"), "to score", 1))
-        project.write_table(project.folder / f"{stem}-reference.csv", _some(state.chosen("training"), "to compare", 2))
+        reference, others = _by_class(chosen, options.get("--reference"))
+        project.write_table(project.folder / f"{stem}.csv", _some(others, "to score", 1))
+        project.write_table(project.folder / f"{stem}-reference.csv", _some(reference, "in the reference", 2))
+        given = [one for one in given if not one.startswith("--reference=")]
         return Order(
-            (*words, f"{stem}.csv", "--shapes", shapes.output, "--surfaces", "fitted", "--reference",
-             f"{stem}-reference.csv", "--reference-shapes", reference.output, "-o", output, *given),
+            (*words, f"{stem}.csv", "--shapes", shapes.output, "--reference", f"{stem}-reference.csv",
+             "--reference-shapes", shapes.output, "-o", output, *given),
             output, on=shapes.number,
         )  # fmt: skip
-    role = "new" if shapes.kind == "fit" else "training"
-    project.write_table(project.folder / f"{stem}.csv", _some(state.chosen(role), "to analyse", 2))
+    project.write_table(project.folder / f"{stem}.csv", _some(chosen, "to analyse", 2))
     return Order((*words, f"{stem}.csv", "--shapes", shapes.output, "-o", output, *given), output, on=shapes.number)
 
 
@@ -114,9 +115,16 @@ def shapes_of(jobs: Sequence[Job], kind: str, on: int | None) -> Job:
     Raises:
         InputError: there is none.
     """
-    if kind in ("score", "identify"):
+    if kind == "identify":
         return result_of(jobs, ("fit",), on)
     return result_of(jobs, CORRESPONDENCES if on is None else (*CORRESPONDENCES, "fit"), on)
+
+
+def _by_class(specimens: Sequence[Specimen], named: Any) -> tuple[Sequence[Specimen], Sequence[Specimen]]:
+    """Return the specimens of the class `column=value`, and the others."""
+    column, _, value = str(named or "").partition("=")
+    members = [one for one in specimens if value and one.cells.get(column) == value]
+    return members, [one for one in specimens if one not in members]
 
 
 def result_of(jobs: Sequence[Job], kinds: Sequence[str], on: int | None) -> Job:
@@ -140,9 +148,14 @@ def checks(
     """Return findings on a question before it is run: a level (`ok`, `warning`, `problem`) and a sentence each."""
     role = "new" if shapes is not None and shapes.kind == "fit" else "training"
     chosen = project.state.chosen(role)
-    enough = len(chosen) >= (1 if kind == "score" else 2)
+    enough = len(chosen) >= 2
     take = "specimen takes" if len(chosen) == 1 else "specimens take"
     found = [{"level": "ok" if enough else "problem", "text": f"{len(chosen)} {take} part."}]
+    if kind == "score" and options.get("--reference"):
+        members, others = map(len, _by_class(chosen, options["--reference"]))
+        level = "problem" if members < 2 or not others else "warning" if members < 20 else "ok"
+        text = f"{members} in the reference, {others} to score; percentiles have steps of 1 in {members + 1}."
+        found.append({"level": level, "text": text})
     formula = str(options.get("--formula", ""))
     used = {str(value) for value in options.values() if isinstance(value, str)}
     columns = [column for column in project.state.columns if column in used or _in_formula(column, formula)]
