@@ -580,8 +580,9 @@ def _outside(scores: ScoreResult, k: int) -> list[str]:
 
     rest = f"{scores.rest_mm[k]:.2f} mm" if scores.subjects.unit else f"{scores.rest_mm[k]:.4f}"
     if scores.rest_farther[k] <= rare:
+        modes = f"{scores.modes} modes of the reference leave" if scores.modes > 1 else "mode of the reference leaves"
         out.append(
-            f"the {scores.modes} modes of the reference leave {rest} of its shape (RMS), more than "
+            f"the {modes} {rest} of its shape (RMS), more than "
             f"of {beyond(float(scores.rest_farther[k]))} of the reference"
         )
     if scores.beyond_farther[k] <= rare:

@@ -139,7 +139,7 @@ def surface_files(paths: Sequence[Path], *, recursive: bool = False) -> SurfaceF
             mirrored |= reflected.intersection(files)
             doubtful |= {folder / f"{name}{SURFACE}" for name in summary.doubtful}.intersection(files)
     if mirrored:
-        of = "mesh is a mirror image" if len(mirrored) == 1 else "meshes are mirror images"
+        of = "meshes is a mirror image" if len(mirrored) == 1 else "meshes are mirror images"
         names = first_names([file.name for file in files if file in mirrored], _NAMED)
         notes.append(f"{len(mirrored)} of {len(files)} {of} of the others ({names}) and reflected.")
     return SurfaceFiles(tuple(files), ratios, frozenset(mirrored), frozenset(doubtful), tuple(notes))

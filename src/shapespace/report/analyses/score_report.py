@@ -11,6 +11,7 @@ import numpy.typing as npt
 from shapespace.report.analyses.analysis_report import AnalysisReport, LengthFormat, Rows
 from shapespace.report.analyses.methods_section import methods_parts
 from shapespace.report.analyses.shape_data import add_shape_data, model_hashes, shape_change_parts
+from shapespace.report.blocks.wording import counted
 from shapespace.schemas import Counts, HistogramPart, Part, SurfaceMapPart, TableColumn, TablePart, TextPart
 from shapespace.statistics.score_subjects import SMALL, ScoreResult
 
@@ -66,9 +67,8 @@ def _sentence(result: ScoreResult, k: int) -> str:
     small = " (a small reference)" if result.people < SMALL else ""
     sentence = (
         f"{result.names[k]} lies {result.distance[k]:.1f} standard deviations from the reference's mean in "
-        f"{result.modes} modes, farther out than {result.percentile[k]:.0f} % of its {result.people} subjects{small}; "
-        "by "
-        f"the F distribution p = {result.p_value[k]:.3g}. Nearest to it: {near}."
+        f"{counted(result.modes, 'mode')}, farther out than {result.percentile[k]:.0f} % of its {result.people} "
+        f"subjects{small}; by the F distribution p = {result.p_value[k]:.3g}. Nearest to it: {near}."
     )
     if result.imputations is not None:
         distance, farther = (result.imputations.stddev[name][k] for name in ("distance", "farther"))
@@ -88,7 +88,7 @@ def _method_sentences(result: ScoreResult) -> tuple[str, ...]:
     )
     unsure = "" if result.subjects.fitted is None else " and each fit's own uncertainty"
     return (
-        f"Distances are Mahalanobis distances in the {result.modes} modes of the reference that hold "
+        f"Distances are Mahalanobis distances in {counted(result.modes, 'mode')} of the reference with "
         f"{100 * result.variance_share:.0f} % of its variance, by its covariance{unsure}.",
         "Percentiles are found by leaving out the reference's subjects in turn, and hold whatever the distribution; p "
         "is by the F distribution of normal shapes, which is too large where the reference is small.",
