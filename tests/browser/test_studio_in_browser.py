@@ -113,6 +113,25 @@ def place_and_drag(tab, project: Path) -> None:
     assert stored() != before
 
 
+def exclude_in_morphospace(tab, user: User, project: Path) -> None:
+    """Select a specimen in the morphospace in the frame, and exclude it by the bar of the page."""
+    tab.page.get_by_test_id("tab-model").click()
+    tab.page.get_by_test_id("more-morphospace").locator("summary").first.click()
+    user.click("run-morphospace")
+    user.has_run(4)
+    framed(tab)
+    widget = tab.page.frame_locator("[data-testid=frame]").locator("figure.turning .widget")
+    widget.scroll_into_view_if_needed()
+    widget.locator("select").nth(2).select_option("7")
+    widget.get_by_role("button", name="Select this shape").press("Enter")
+    user.sees("selection")
+    user.click("exclude-selected")
+    end = time.monotonic() + 30
+    while all(one["included"] for one in json.loads((project / "project.json").read_text())["specimens"]):
+        assert time.monotonic() < end
+        tab.page.wait_for_timeout(100)
+
+
 def write_bones(folder: Path, count: int) -> Path:
     assert main(["data", "bones", "-o", str(folder), "--count", str(count), "--quiet"]) == 0
     return folder
@@ -136,7 +155,7 @@ def test_raw_scans_become_a_report_by_clicks_and_history_gives_the_same_numbers(
         tab.until("document.querySelectorAll('[data-testid^=card-] img').length === " + str(count))
         user.sees("counts")
         tab.page.wait_for_timeout(300)
-        shot = tab.shot("specimens")
+        shot = tab.shot("specimens", clip={"x": 0, "y": 0, "width": 1440, "height": 740})  # below is nothing
         if count == 12:
             same_as_kept("screen-specimens.png", shot, width=1200)
         assert barriers(tab) == []
@@ -178,6 +197,8 @@ def test_raw_scans_become_a_report_by_clicks_and_history_gives_the_same_numbers(
             assert barriers(tab) == [], screen
         user.sees("history")
         assert "shapespace compare" in tab.page.get_by_test_id("history").inner_text()
+        if count == 12:
+            exclude_in_morphospace(tab, user, project)
         assert tab.complaints == [] and tab.asked == []
         with studio(project, tmp_path, "view") as place:
             seen = open_tab(place, WINDOW, "dark")
@@ -219,6 +240,15 @@ def test_what_was_dropped_edited_and_excluded_is_there_after_a_restart(open_tab,
         tab.page.get_by_test_id("include-bone_002").click()
         tab.page.get_by_test_id("undo").click()
         tab.page.get_by_test_id("include-bone_000").click()
+        for name in ("bone_001", "bone_002"):
+            tab.page.get_by_test_id(f"select-{name}").click()
+        tab.page.get_by_test_id("unit-selected").select_option("cm")
+        tab.page.get_by_test_id("mirror-selected").click()
+        tab.page.get_by_test_id("group-selected").click()
+        tab.page.get_by_test_id("group-column").fill("place")
+        tab.page.get_by_test_id("group-value").fill("north")
+        tab.page.get_by_test_id("group-save").click()
+        tab.page.get_by_test_id("clear-selection").click()
         tab.page.get_by_test_id("layout-table").click()
         tab.page.get_by_test_id("cell-bone_001-group").click()
         tab.page.keyboard.press("ControlOrMeta+a")
@@ -236,6 +266,9 @@ def test_what_was_dropped_edited_and_excluded_is_there_after_a_restart(open_tab,
         "bone_000": False, "bone_001": True, "bone_002": True, "broken": False,
     }  # fmt: skip
     assert stored["bone_001"]["cells"]["group"] == "hill"
+    for name in ("bone_001", "bone_002"):
+        one = stored[name]
+        assert (one["unit"], one["mirrored"], one["cells"]["place"]) == ("cm", True, "north")
     with studio(project, tmp_path) as address:
         tab = open_tab(address, WINDOW)
         tab.until("document.querySelectorAll('[data-testid^=row-]').length === 4")
@@ -260,4 +293,37 @@ def test_many_files_are_taken_and_the_page_stays_usable(open_tab, tmp_path: Path
         tab.page.get_by_test_id("tab-history").click()
         tab.page.get_by_test_id("screen-history").wait_for()
         assert time.monotonic() - began < 5
+        assert tab.complaints == []
+
+
+@pytest.mark.long
+def test_a_run_goes_on_when_the_server_is_killed_and_the_tab_closed(open_tab, tmp_path: Path) -> None:
+    bones, project = write_bones(tmp_path / "scans", 4), tmp_path / "p"
+    command = [sys.executable, "-m", "shapespace", "studio", str(project), "--no-open"]
+    server = subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, env={**os.environ, "XDG_STATE_HOME": str(tmp_path)}
+    )
+    assert server.stdout is not None
+    tab = open_tab(server.stdout.readline().rpartition(" ")[2].strip(), WINDOW)
+    user = User(tab)
+    user.sees("drop-zone")
+    tab.page.get_by_test_id("choose-files-input").set_input_files(sorted(bones.glob("*.ply")))
+    tab.until("document.querySelectorAll('[data-testid^=card-] img').length === 4")
+    user.click("next")
+    tab.page.get_by_test_id("option--vertices").fill("300")
+    user.click("run-correspond")
+    user.sees("progress-1")
+    tab.until("document.querySelector('[data-testid=progress-1]').hasAttribute('value')")
+    server.kill()
+    server.communicate(timeout=30)  # its processes hold the pipe, and end with it
+    tab.page.locator("#offline").wait_for()
+    assert "does not answer" in tab.page.locator("#offline").inner_text()
+    tab.page.close()
+    with studio(project, tmp_path) as address:
+        tab = open_tab(address, WINDOW)
+        User(tab).sees("tab-correspondence")
+        tab.page.get_by_test_id("tab-correspondence").click()
+        User(tab).has_run(1)
+        framed(tab)
+        assert tab.page.get_by_test_id("job-1").get_attribute("data-status") == "done"
         assert tab.complaints == []

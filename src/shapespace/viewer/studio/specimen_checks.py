@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import multiprocessing
 import os
+import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from pathlib import Path
@@ -93,7 +95,7 @@ class SpecimenChecks:
     def _processes(self) -> ProcessPoolExecutor:
         if self._pool is None:
             processes = min(_MOST_PROCESSES, max(1, (os.cpu_count() or 2) - 1))
-            self._pool = ProcessPoolExecutor(processes, mp_context=context(), initializer=lower_priority)
+            self._pool = ProcessPoolExecutor(processes, mp_context=context(), initializer=_start_process)
         return self._pool
 
     def _failed(self, error: BaseException | None) -> dict[str, Any]:
@@ -102,6 +104,19 @@ class SpecimenChecks:
             return _unusable(f"It cannot be checked: {error}")
         self._pool = None  # its process was killed, as for want of memory: the file is to blame
         return _unusable("It cannot be checked: the memory does not suffice, or the check failed.")
+
+
+def _start_process() -> None:
+    """Give way to the server, and end with it even if it is killed: the queue of the pool would be waited for on."""
+    lower_priority()
+    if (server := multiprocessing.parent_process()) is None:
+        return
+
+    def end_with_server() -> None:
+        server.join()
+        os._exit(1)
+
+    threading.Thread(target=end_with_server, daemon=True).start()
 
 
 def _load_code() -> None:
