@@ -67,7 +67,7 @@ class User:
 
 _DRAWN = (
     "document.readyState === 'complete' && (document.body.dataset.ready === 'true' || "
-    "!!document.querySelector('h1 + *')) && "
+    "!document.getElementById('loading') && !!document.querySelector('h1 + *')) && "
     "[...(window.Shapespace?.sceneParts?.views || [])].every((view) => view.rests)"
 )
 
