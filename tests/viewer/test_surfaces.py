@@ -20,6 +20,7 @@ from shapespace.report.render.scene_scripts import SCENE_SCRIPTS
 from shapespace.viewer import corresponding_surfaces as module
 from shapespace.viewer.corresponding_surfaces import Surfaces
 from shapespace.viewer.guard import SECURITY_HEADERS, Access
+from shapespace.viewer.model_view import ModelView
 from shapespace.viewer.responses import ASSETS, PAGES
 from shapespace.viewer.serve import serve
 from shapespace.viewer.surfaces_server import make_surfaces_app
@@ -210,3 +211,9 @@ def test_a_folder_that_cannot_be_shown_is_one_sentence(template: Path, tmp_path:
     (tmp_path / "correspondence.json").write_text("{")
     with pytest.raises(FileFormatError, match=r"correspondence\.json"):
         serve(tmp_path, open_browser=False)
+
+
+def test_a_folder_of_an_analysis_is_refused_with_its_report(tmp_path: Path) -> None:
+    (tmp_path / "report.html").write_text("<html></html>", encoding="utf-8")
+    with pytest.raises(InputError, match=r"is an analysis without fits; open .*report\.html in a browser\.$"):
+        ModelView.open(tmp_path)

@@ -86,6 +86,8 @@ class ModelView:
             return ModelView(ShapeModel.load(path), path.name)
         if not has_fits(Folder(path)) and (deeper := next(path.glob("*/**/*.fit.json"), None)):
             raise InputError(f"{path} holds no fits itself; give the folder that does, such as {deeper.parent}.")
+        if not has_fits(Folder(path)) and (report := path / "report.html").is_file():
+            raise InputError(f"{path} is an analysis without fits; open {report} in a browser.")
         folder = Folder(path)
         fits = listed_fits(folder)
         fitted_model = model_of(folder, fits, model)
