@@ -198,7 +198,7 @@ def _no_progress(what: str, done: int, total: int) -> None:
 
 
 def _pool(workers: int) -> Executor:
-    start_loading(tell=False)
+    start_loading(notify=False)
     wait_until_loaded()
     folder = present_folder("ict-facekit", "ICT-FaceKit")
     return ProcessPoolExecutor(workers, mp_context=context(), initializer=_begin, initargs=(folder,))

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from shapespace.batch import messages
-from shapespace.batch.warm import COMPILING, tell_compiling
+from shapespace.batch.warm import COMPILING, notify_compiling
 
 
 def printed_by_another(mark: Path) -> str:
-    code = "from shapespace.batch.warm import tell_compiling; tell_compiling(); tell_compiling()"
+    code = "from shapespace.batch.warm import notify_compiling; notify_compiling(); notify_compiling()"
     env = {**os.environ, messages.MARK: str(mark)}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, env=env, check=True)
     return done.stderr
@@ -25,7 +25,7 @@ def test_the_command_and_its_server_print_it_once(
     mark = tmp_path / "printed"
     monkeypatch.setattr(messages._Mark, "path", str(mark))
     other = printed_by_another(mark) if first == "server" else ""
-    tell_compiling()
+    notify_compiling()
     other += printed_by_another(mark) if first == "command" else ""
     assert (other + capsys.readouterr().err).count(COMPILING) == 1
 
@@ -34,5 +34,5 @@ def test_without_a_server_it_is_always_printed(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(messages._Mark, "path", "")
-    tell_compiling()
+    notify_compiling()
     assert capsys.readouterr().err == COMPILING + "\n"

@@ -35,7 +35,7 @@ sys.path.insert(0, {str(tmp_path)!r})
 from shapespace.batch import workers
 if __name__ == "__main__":
     before = dict(os.environ)
-    workers.start_loading(tell=False)
+    workers.start_loading(notify=False)
     assert dict(os.environ) == before and "numpy" not in sys.modules
     workers.wait_until_loaded()
     from concurrent.futures import ProcessPoolExecutor
@@ -98,7 +98,7 @@ import numpy as np
 from shapespace.batch.warm import warm_up, _hill
 from shapespace.compiled import notify_compilation
 from numba.core.dispatcher import Dispatcher
-warm_up(tell=False)
+warm_up(notify=False)
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh

@@ -8,12 +8,13 @@ import pytest
 from test_studio_server import ended, own_home, state, studio, until
 
 from shapespace.cli import main
+from shapespace.viewer.studio.job_commands import QUESTIONS
 
 __all__ = ["own_home"]  # a fixture
 
 
 def run(client: httpx.Client, kind: str, options: dict[str, Any] | None = None, on: int | None = None) -> dict:
-    if kind in ("compare", "change", "asymmetry", "regress", "score", "identify"):
+    if kind in QUESTIONS:
         found = client.post("/api/checks", json={"kind": kind, "options": options or {}, "on": on}).json()
         assert [one for one in found if one["level"] == "problem"] == [], kind
     answer = client.post("/api/jobs", json={"kind": kind, "options": options or {}, "on": on})

@@ -119,7 +119,7 @@ def model() -> ShapeModel:
 @pytest.fixture
 def start(model: ShapeModel) -> Iterator[Start]:
     """Start a viewer of `model` or of another view."""
-    start_loading(tell=False)
+    start_loading(notify=False)
     with ExitStack() as stack:
 
         def start(

@@ -129,7 +129,7 @@ class Team:
         self._assignments: dict[Worker, _Assignment] = {}
         self._idle: list[Worker] = []
         self._failed_starts = 0
-        start_loading(tell=not quiet)
+        start_loading(notify=not quiet)
         wait_until_loaded()
         self._stack = ExitStack()
         self._life = self._stack.enter_context(life_line())

@@ -124,10 +124,10 @@ def telling_of_compiling(*, quiet: bool) -> AbstractContextManager[None]:
     """Return a block in which a line on standard error says why the user waits while code is compiled."""
     if quiet:
         return nullcontext()
-    from shapespace.batch.warm import tell_compiling
+    from shapespace.batch.warm import notify_compiling
     from shapespace.compiled import notify_compilation
 
-    return notify_compilation(tell_compiling)
+    return notify_compilation(notify_compiling)
 
 
 @contextmanager

@@ -22,15 +22,15 @@ from shapespace.types import Mesh
 COMPILING = "shapespace: compiling, once on this machine; this takes a while ..."
 
 
-def tell_compiling() -> None:
+def notify_compiling() -> None:
     """Print on standard error that code is being compiled, unless another process of the command has done so."""
     if is_first():
         print(COMPILING, file=sys.stderr, flush=True)
 
 
-def warm_up(*, tell: bool) -> None:
-    """Fit a small model to small surfaces and to points, from no start; with `tell` say so if that compiles."""
-    with notify_compilation(tell_compiling if tell else lambda: None):
+def warm_up(*, notify: bool) -> None:
+    """Fit a small model to small surfaces and to points, from no start; with `notify` print a line if that compiles."""
+    with notify_compilation(notify_compiling if notify else lambda: None):
         _small_fits()
 
 

@@ -11,4 +11,4 @@ from shapespace.batch.workers import WARM_UP
 if how := os.environ.get(WARM_UP):
     # What fails here is said by the fits to come, and by name.
     with contextlib.suppress(Exception):
-        warm_up(tell=how == "tell")
+        warm_up(notify=how == "notify")

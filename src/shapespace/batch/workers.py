@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from multiprocessing.context import ForkServerContext, SpawnContext
 
 WARM_UP = "SHAPESPACE_WARM_UP"
-"""Set for the server alone: `tell` if it may say on standard error that it compiles, else `quiet`."""
+"""Set for the server alone: `notify` if it may print on standard error that it compiles, else `quiet`."""
 COPIED = sys.platform == "linux"
 """Whether workers are copies of one server. Apple's BLAS does not survive a fork, and Windows has none."""
 _BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
@@ -38,22 +38,22 @@ def context() -> ForkServerContext | SpawnContext:
     return multiprocessing.get_context("forkserver") if COPIED else multiprocessing.get_context("spawn")
 
 
-def start_loading(*, tell: bool) -> None:
+def start_loading(*, notify: bool) -> None:
     """Load the code of the workers in the background; where they start from nothing, see that it is compiled.
 
     Args:
-        tell: whether a line on standard error may say that the code is being compiled.
+        notify: whether a line on standard error may state that the code is being compiled.
     """
-    mark = messages.share_mark() if tell else messages.remove_mark()
+    mark = messages.share_mark() if notify else messages.remove_mark()
     if not COPIED:
         from shapespace.batch.warm import warm_up
 
-        warm_up(tell=tell)
+        warm_up(notify=notify)
         return
-    load_ahead(("shapespace.batch.warm_server",), {WARM_UP: "tell" if tell else "quiet", messages.MARK: mark})
+    preload(("shapespace.batch.warm_server",), {WARM_UP: "notify" if notify else "quiet", messages.MARK: mark})
 
 
-def load_ahead(modules: Sequence[str], environment: Mapping[str, str] | None = None) -> None:
+def preload(modules: Sequence[str], environment: Mapping[str, str] | None = None) -> None:
     """Import `modules` in the background for workers that are copies; do nothing where they start from nothing.
 
     Args:
@@ -169,12 +169,18 @@ def _children_allowed() -> Generator[None]:
             config["daemon"] = daemon
 
 
-def _live(serve: Callable[..., None], line: Connection, life: Connection, arguments: tuple[Any, ...]) -> None:
-    def end_with_parent() -> None:
-        life.poll(None)
+def end_after(wait: Callable[[], object]) -> None:
+    """End this process when `wait`, which waits for the end of its parent, returns."""
+
+    def end() -> None:
+        wait()
         os._exit(1)
 
-    threading.Thread(target=end_with_parent, daemon=True).start()
+    threading.Thread(target=end, daemon=True).start()
+
+
+def _live(serve: Callable[..., None], line: Connection, life: Connection, arguments: tuple[Any, ...]) -> None:
+    end_after(lambda: life.poll(None))
     serve(line, *arguments)
 
 

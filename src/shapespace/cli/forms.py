@@ -47,10 +47,8 @@ def forms(commands: Mapping[str, tuple[str, Sequence[Option]]]) -> dict[str, dic
     for kind, first in _FIRST.items():
         command = _KINDS.get(kind, kind)
         made[kind] = {"command": tuple(command.split()), **_form(*commands[command], first)}
-    to = made["convert"]["options"][0]
-    made["convert"]["options"][0] = to | {"kind": "choice", "choices": list(MODEL_FORMATS)}
-    reference = made["score"]["options"][0]
-    made["score"]["options"][0] = reference | {"kind": "class", "help": "class that the others are compared with"}
+    made["convert"]["options"][0] |= {"kind": "choice", "choices": list(MODEL_FORMATS)}
+    made["score"]["options"][0] |= {"kind": "class", "help": "class that the others are compared with"}
     return made
 
 
@@ -84,6 +82,8 @@ def _kind(option: Option) -> str:
         return "choice"
     if option.metavar == "FORMULA":
         return "formula"
-    if option.metavar in ("COLUMN", "COLUMN=VALUE"):
-        return "column" if option.metavar == "COLUMN" else "class"
+    if option.metavar == "COLUMN":
+        return "column"
+    if option.metavar == "COLUMN=VALUE":
+        return "class"
     return "number" if option.metavar in ("N", "K", "S", "M") else "text"

@@ -204,7 +204,7 @@ def correspond(arguments: argparse.Namespace) -> int:
     if arguments.jobs != 1 and arguments.executor == "local":
         from shapespace.batch.workers import start_loading
 
-        start_loading(tell=not arguments.quiet)
+        start_loading(notify=not arguments.quiet)
     from shapespace.commands.correspond import CorrespondFiles, correspond_files, correspond_groups
     from shapespace.commands.correspond_changes import Change, change_correspondence
     from shapespace.correspondence.settings import CorrespondConfig
@@ -343,7 +343,7 @@ def fit(arguments: argparse.Namespace) -> int:
         from shapespace.batch.workers import start_loading
 
         # While this process loads its own code; half of the time that many scans take to start.
-        start_loading(tell=not arguments.quiet)
+        start_loading(notify=not arguments.quiet)
     from shapespace.commands.fit import BatchSettings, fit_scans
     from shapespace.fit.fit_scan import FitConfig
     from shapespace.fit.method_choices import method_named

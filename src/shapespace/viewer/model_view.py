@@ -84,11 +84,12 @@ class ModelView:
                     f"{path} is no model (.h5) and no folder; give the model, or the folder that shapespace fit wrote."
                 )
             return ModelView(ShapeModel.load(path), path.name)
-        if not has_fits(Folder(path)) and (deeper := next(path.glob("*/**/*.fit.json"), None)):
-            raise InputError(f"{path} holds no fits itself; give the folder that does, such as {deeper.parent}.")
-        if not has_fits(Folder(path)) and (report := path / "report.html").is_file():
-            raise InputError(f"{path} is an analysis without fits; open {report} in a browser.")
         folder = Folder(path)
+        if not has_fits(folder):
+            if deeper := next(path.glob("*/**/*.fit.json"), None):
+                raise InputError(f"{path} holds no fits itself; give the folder that does, such as {deeper.parent}.")
+            if (report := path / "report.html").is_file():
+                raise InputError(f"{path} is an analysis without fits; open {report} in a browser.")
         fits = listed_fits(folder)
         fitted_model = model_of(folder, fits, model)
         name = next(fit.record.model.name for fit in fits if fit.record.model.hash)

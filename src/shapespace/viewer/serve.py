@@ -18,7 +18,7 @@ from tempfile import TemporaryDirectory
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from shapespace.batch.workers import load_ahead, start_loading
+from shapespace.batch.workers import preload, start_loading
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.schemas import CorrespondenceRecord
 
@@ -85,7 +85,7 @@ def serve(
         return
     if not has_surfaces:
         # While this process imports its own code.
-        start_loading(tell=not quiet)
+        start_loading(notify=not quiet)
     from shapespace.viewer.corresponding_surfaces import Surfaces
     from shapespace.viewer.model_view import ModelView
     from shapespace.viewer.server import make_app
@@ -134,7 +134,7 @@ def serve_studio(
     require_view_extra()
     if not read_only:
         # While this process imports its own code.
-        load_ahead(("shapespace.viewer.studio.specimen_checks",))
+        preload(("shapespace.viewer.studio.specimen_checks",))
     from shapespace.report.pages.write_html import require_report_extra
     from shapespace.viewer.studio.app import Studio, make_studio
 

@@ -7,8 +7,9 @@
   const { copyCamera, gpu, views, waiting } = parts;
 
   const NO_WEBGL = "This browser shows no 3-D pictures here, because WebGL is switched off or missing.";
-  const DRAFT_PIXELS = 3.2e5, STILL_PIXELS = 3e6, RESTS_MS = 160; // where the processor draws: of all views, of one
-  const MANY = 4; // views; to show more of them takes as long as to draw them
+  // Where the processor draws: pixels of all views that move together, of a view at rest, and the time until it rests.
+  const DRAFT_PIXELS = 3.2e5, STILL_PIXELS = 3e6, RESTS_MS = 160;
+  const MANY = 4; // views; more take as long to show as to draw, and share half of the pixels
 
   /**
    * A canvas in `element` that shows surfaces and points, turned by mouse, touch and keys; drawn only when it changed.
@@ -167,8 +168,8 @@
       let ratio = Math.min(window.devicePixelRatio || 1, 2);
       if (page.bySoftware) {
         // What moves is drawn coarser, and again at twice the resolution once it rests.
-        const shares = together > MANY ? 2 * together : together;
-        ratio = Math.min(ratio, Math.max(Math.sqrt(DRAFT_PIXELS / (shares * area)), 0.5));
+        const pixels = (together > MANY ? DRAFT_PIXELS / 2 : DRAFT_PIXELS) / together;
+        ratio = Math.min(ratio, Math.max(Math.sqrt(pixels / area), 0.5));
         this._later = setTimeout(() => {
           this._later = 0;
           if (this._near) this._present(Math.min(2, Math.sqrt(STILL_PIXELS / area)));

@@ -8,7 +8,6 @@
   const J = T.jobs;
   const { Button, CopyButton } = Studio;
   const CHECK_AFTER = 400; // ms without a change of the form
-  const MOST_CLASSES = 12; // of a column
 
   const duration = (seconds) => seconds < 90 ? J.seconds(Math.max(1, Math.round(seconds))) : seconds < 5400 ? J.minutes(Math.round(seconds / 60)) : J.hours((seconds / 3600).toFixed(1));
   const kindOf = (job) => J.kinds[job.kind] || job.kind;
@@ -37,13 +36,8 @@
       <label class="option"><span>${T.questions.formula}</span><input data-testid=${`option${option.flag}`} placeholder="~ sex + age" title=${option.help} value=${value} spellcheck=${false} oninput=${(event) => onvalue(event.target.value)} /></label>`;
   }
 
-  /** The classes of columns with few values: `column=value`. */
-  function classesOf({ columns, specimens }) {
-    return columns.flatMap((column) => {
-      const values = [...new Set(specimens.map((one) => one.cells[column]).filter(Boolean))];
-      return values.length <= MOST_CLASSES ? values.map((value) => `${column}=${value}`) : [];
-    });
-  }
+  /** The classes that are counted, as `column=value`. */
+  const classesOf = ({ counts }) => Object.entries(counts).flatMap(([column, classes]) => Object.keys(classes).filter(Boolean).map((value) => `${column}=${value}`));
 
   function Option({ option, value, columns, onvalue }) {
     const { flag, kind, choices, initial, required } = option;

@@ -92,9 +92,9 @@ def _question(
     project: Project, jobs: Sequence[Job], kind: str, words: tuple[str, ...], given: Sequence[str],
     options: Mapping[str, Any], on: int | None, number: int,
 ) -> Order:  # fmt: skip
-    stem, output, state = f"{_INPUTS}/{number:04d}", f"{kind}-{number}", project.state
+    stem, output = f"{_INPUTS}/{number:04d}", f"{kind}-{number}"
     shapes = shapes_of(jobs, kind, on)
-    chosen = state.chosen("new" if shapes.kind == "fit" else "training")
+    chosen = _specimens_of(project, shapes)
     if kind == "score":
         reference, others = _by_class(chosen, options.get("--reference"))
         project.write_table(project.folder / f"{stem}.csv", _some(others, "to score", 1))
@@ -120,11 +120,19 @@ def shapes_of(jobs: Sequence[Job], kind: str, on: int | None) -> Job:
     return result_of(jobs, CORRESPONDENCES if on is None else (*CORRESPONDENCES, "fit"), on)
 
 
+def _specimens_of(project: Project, shapes: Job | None) -> Sequence[Specimen]:
+    """Return the included specimens that a job with shapes has: fits are of new scans."""
+    return project.state.chosen("new" if shapes is not None and shapes.kind == "fit" else "training")
+
+
 def _by_class(specimens: Sequence[Specimen], named: Any) -> tuple[Sequence[Specimen], Sequence[Specimen]]:
     """Return the specimens of the class `column=value`, and the others."""
     column, _, value = str(named or "").partition("=")
-    members = [one for one in specimens if value and one.cells.get(column) == value]
-    return members, [one for one in specimens if one not in members]
+    members: list[Specimen] = []
+    others: list[Specimen] = []
+    for one in specimens:
+        (members if value and one.cells.get(column) == value else others).append(one)
+    return members, others
 
 
 def result_of(jobs: Sequence[Job], kinds: Sequence[str], on: int | None) -> Job:
@@ -146,8 +154,7 @@ def checks(
     project: Project, forms: Forms, kind: str, options: Mapping[str, Any], shapes: Job | None
 ) -> list[dict[str, str]]:
     """Return findings on a question before it is run: a level (`ok`, `warning`, `problem`) and a sentence each."""
-    role = "new" if shapes is not None and shapes.kind == "fit" else "training"
-    chosen = project.state.chosen(role)
+    chosen = _specimens_of(project, shapes)
     enough = len(chosen) >= 2
     take = "specimen takes" if len(chosen) == 1 else "specimens take"
     found = [{"level": "ok" if enough else "problem", "text": f"{len(chosen)} {take} part."}]

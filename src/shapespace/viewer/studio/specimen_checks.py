@@ -7,7 +7,6 @@ import hashlib
 import json
 import multiprocessing
 import os
-import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from shapespace.batch.workers import context
+from shapespace.batch.workers import context, end_after
 from shapespace.errors import FileError, ShapespaceError
 from shapespace.geometry.doctor import examine_and_repair
 from shapespace.io.files import write_bytes, write_text
@@ -107,16 +106,10 @@ class SpecimenChecks:
 
 
 def _start_process() -> None:
-    """Give way to the server, and end with it even if it is killed: the queue of the pool would be waited for on."""
+    """Prefer the server, and end with it also when it is killed; a process of a pool would wait for its queue."""
     lower_priority()
-    if (server := multiprocessing.parent_process()) is None:
-        return
-
-    def end_with_server() -> None:
-        server.join()
-        os._exit(1)
-
-    threading.Thread(target=end_with_server, daemon=True).start()
+    if (server := multiprocessing.parent_process()) is not None:
+        end_after(server.join)
 
 
 def _load_code() -> None:
