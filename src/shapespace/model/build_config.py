@@ -35,6 +35,8 @@ class BuildConfig:
         out_of_core: stream the meshes, each loaded once and not held, through a file of single precision as large as
             they are: the same model but for that rounding, with `ShapeModel.residuals`. None does so where a model of
             vertices would need more than four fifths of the free memory.
+        without_training_shapes: omit the training shapes, from which their surfaces can be reconstructed, from the
+            model, such as before sharing it; then intervals and statuses cannot be calibrated on them.
     """
 
     modes: int | float | Literal["auto"] | None = None
@@ -49,3 +51,4 @@ class BuildConfig:
     licence: str = ""
     seed: int = 0
     out_of_core: bool | None = None
+    without_training_shapes: bool = False

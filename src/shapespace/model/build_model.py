@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +12,7 @@ import numpy as np
 
 from shapespace.errors import InputError
 from shapespace.geometry.normals import without_estimates
-from shapespace.geometry.procrustes import Gauge, align_in_place, scale_to_tangent
+from shapespace.geometry.procrustes import Gauge, align_in_place, centroid_size, scale_to_tangent
 from shapespace.io.interop import MeshLike, as_meshes
 from shapespace.model.build_config import BuildConfig
 from shapespace.model.choose_modes import choose_modes
@@ -33,6 +33,7 @@ from shapespace.model.streamed import (
     refuse_without_extent,
     too_large,
 )
+from shapespace.model.training_shapes import TrainingShapes
 from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks, common_faces, require
 
 
@@ -97,7 +98,12 @@ def build_model(
         faces, alignment_vertices = meshes[0].faces, observed.indices(alignment_vertices)
     shapes, names = _training_shapes(meshes, faces, fill=kind.takes_holes), [mesh.name for mesh in meshes]
     rounding = rounding_mm(np.nan_to_num(meshes[0].vertices, posinf=0.0, neginf=0.0))
+    observed = np.isfinite(shapes).all(axis=2)
+    sizes = np.array([centroid_size(shape[own]) for shape, own in zip(shapes, observed, strict=True)])
     shapes, completed = _aligned(shapes, names, config.gauge, align=align, alignment_vertices=alignment_vertices)
+    sizes /= [centroid_size(shape[own]) for shape, own in zip(shapes, observed, strict=True)]
+    # Coding overwrites the shapes of B-splines.
+    aligned = shapes if kind is Vertices or config.without_training_shapes else shapes.copy()
     coder = kind.of(Mesh(shapes.mean(axis=0), faces, name="The mean of the meshes"), config.control_points)
     if completed is not None:
         pc = completed.components(config.modes, config.seed)
@@ -105,7 +111,7 @@ def build_model(
         pc = _components(coder.encode(shapes), config.modes, config.seed)
     else:
         pc = _components_of_codes(coder, shapes, config.modes, config.seed)
-    return _of_components(
+    model = _of_components(
         pc,
         coder,
         rounding=rounding,
@@ -118,6 +124,7 @@ def build_model(
         provenance=config.provenance,
         licence=config.licence,
     )
+    return _with_training(model, aligned.__getitem__, sizes, config)
 
 
 def extend_model(
@@ -196,9 +203,28 @@ def _of_streamed(
             provenance=config.provenance,
             licence=config.licence,
         )
+        model = _with_training(model, aligned.shape, training.sizes if training.align else training.sizes**0, config)
         if keep_shapes is not None:
             aligned.keep(keep_shapes, model.content_hash)
     return model
+
+
+def _with_training(
+    model: ShapeModel, shape: Callable[[int], FloatArray], sizes: FloatArray, config: BuildConfig
+) -> ShapeModel:
+    """Return the model with its training shapes, whose vertices (V, 3) `shape` returns, unless `config` omits them.
+
+    Args:
+        model: without them.
+        shape: returns an aligned shape by its index.
+        sizes: (N,) before alignment, relative to those after it.
+        config: options.
+    """
+    if config.without_training_shapes:
+        return model
+    sizes = sizes if model.gauge == "shape" else np.ones(len(sizes))
+    training = TrainingShapes.of(shape, sizes, model.mean_vertices, model.vertex_basis)
+    return replace(model, training=training)
 
 
 def _of_components(

@@ -16,10 +16,11 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from shapespace.errors import FileFormatError, ModelFileError
+from shapespace.errors import FileFormatError, InputError, ModelFileError
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.containers.hdf5 import Attribute, content_hash, read_hdf5, write_hdf5
 from shapespace.io.containers.json_files import plain_json
+from shapespace.model.training_shapes import TrainingShapes
 from shapespace.types import FloatArray, IntArray, SurfaceLandmarks
 from shapespace.version import __version__
 
@@ -31,7 +32,11 @@ _HELD_OUT = "held out"
 _RESIDUALS = "residuals"
 _REGIONS = "regions"
 _CORNERS, _BARYCENTRIC, _DISTANCE = "landmark_corners", "landmark_barycentric", "landmark_distance_mm"
-_EVERY_MODEL = ("mean", "basis", "stddev", "faces", _RESIDUALS, _REGIONS, _CORNERS, _BARYCENTRIC, _DISTANCE)
+_TRAINING, _TRAINING_REST, _TRAINING_SIZE = "training", "training_rest", "training_log_scale"
+_EVERY_MODEL = (
+    "mean", "basis", "stddev", "faces", _RESIDUALS, _REGIONS, _CORNERS, _BARYCENTRIC, _DISTANCE, _TRAINING,
+    _TRAINING_REST, _TRAINING_SIZE,
+)  # fmt: skip
 """What is not of one representation."""
 _UNIT_TOLERANCE = 1e-3  # length of a mode off 1; float32 rounding over millions of coordinates is smaller
 _LONGEST_DETAIL = 200  # characters of a library's error that a message repeats
@@ -72,6 +77,7 @@ class ModelFields(TypedDict):
     residuals: FloatArray | None
     regions: Mapping[str, IntArray]
     is_n_training_known: bool
+    training: TrainingShapes | None
 
 
 def hash_of(model: ModelFields) -> str:
@@ -90,6 +96,9 @@ def save(
     made_by: dict[str, Attribute] = {"model_hash": hash_of(model), "software_version": __version__}
     if not model["is_n_training_known"]:  # no part of the hash, which files of earlier versions have without it
         made_by["n_training_known"] = "no"
+    if (training := model["training"]) is not None:  # no part of the hash: a shared model without them is the same
+        arrays |= {_TRAINING: training.coefficients, _TRAINING_SIZE: training.log_scale}
+        arrays |= {_TRAINING_REST: training.rest} if training.rest.size else {}
     write_hdf5(path, {**arrays, **(more_arrays or {})}, {**attributes, **(more_attributes or {}), **made_by})
 
 
@@ -144,6 +153,13 @@ def _landmarks(vertices: Mapping[str, int], arrays: Mapping[str, npt.NDArray[Any
     return landmarks
 
 
+def _training_shapes(arrays: Mapping[str, npt.NDArray[Any]]) -> TrainingShapes | None:
+    if _TRAINING not in arrays:
+        return None
+    rest = arrays.get(_TRAINING_REST, np.zeros((arrays["mean"].size, 0)))
+    return TrainingShapes(arrays[_TRAINING], rest, arrays[_TRAINING_SIZE])
+
+
 def load(path: Path) -> ModelFields:
     """Return the fields of the `ShapeModel` in `path`.
 
@@ -193,7 +209,8 @@ def load(path: Path) -> ModelFields:
             "residuals": owned.get(_RESIDUALS),
             "regions": _regions(attributes_of_file.regions, owned.get(_REGIONS)),
             "is_n_training_known": attributes_of_file.n_training_known != "no",
+            "training": _training_shapes(owned),
         }
-    except (KeyError, ValueError) as error:
+    except (KeyError, ValueError, InputError) as error:
         reason = str(error)[:_LONGEST_DETAIL].replace("`", "").replace("Object missing", "missing")
         raise ModelFileError(f"{path} is a shapespace model but a part of it is missing or wrong: {reason}.") from error

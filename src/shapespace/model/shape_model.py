@@ -24,6 +24,7 @@ from shapespace.model.build_config import BuildConfig
 from shapespace.model.foreign import Foreign, as_linear, is_foreign, load_foreign
 from shapespace.model.missing import MIN_SEEN
 from shapespace.model.representation import REPRESENTATIONS, Representation
+from shapespace.model.training_shapes import TrainingShapes
 from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks, read_only, require_path
 
@@ -72,6 +73,9 @@ class ShapeModel:
         is_n_training_known: False of a model of another tool whose file does not state the number of training shapes,
             such as a Gaussian process; `n_training` is then K + 1.
         left_out: how many modes were found and not kept, since alignment or rounding made them; no file holds it.
+        training: the training shapes, by which results are calibrated (docs/uncertainty.md); None of models of other
+            tools, and without `training` when the model is shared. The content hash does not depend on them, and
+            copies and other processes do not have them.
 
     Raises:
         InputError: arrays whose shapes do not belong together, or standard deviations that cannot be.
@@ -94,6 +98,7 @@ class ShapeModel:
     left_out: int = 0
     is_n_training_known: bool = True
     regions: Mapping[str, IntArray] = field(default_factory=lambda: dict[str, IntArray]())
+    training: TrainingShapes | None = field(default=None, repr=False)
 
     __repr__ = short_repr
 
@@ -131,6 +136,10 @@ class ShapeModel:
         object.__setattr__(self, "coding", MappingProxyType(dict(self._coder.arrays())))
         checked = Mesh(self._coder.decode(mean), self.faces, name="model")
         _refuse_impossible(stddev, checked.vertices)
+        if self.training is not None:
+            rows, rest = self.training.rest.shape
+            if (rest and rows != checked.vertices.size) or self.training.coefficients.shape[1] != k + rest:
+                raise InputError(f"The training shapes do not belong to a model of {k} modes.")
         object.__setattr__(self, "faces", checked.faces)
         self.landmarks.check(len(checked.vertices))
         regions = {
@@ -142,7 +151,7 @@ class ShapeModel:
         # For copies, other processes and skops, none of which takes read-only mappings.
         plain = {name: dict(getattr(self, name)) for name in ("coding", "regions", "landmarks")}
         places = None if self.landmarks.are_vertices else self.landmarks.__getstate__()
-        return {**self.fields(), **plain, _PLACES: places}
+        return {**self.fields(), **plain, _PLACES: places, "training": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         fields = dict(state)  # without places in states of earlier versions
@@ -365,7 +374,25 @@ class ShapeModel:
         if not 1 <= modes <= self.n_modes:
             raise InputError(f"This model has {self.n_modes} modes, so it cannot be cut to {modes}.")
         residuals = None if self.residuals is None else self.residuals[:modes]
-        return dataclasses.replace(self, basis=self.basis[:, :modes], stddev=self.stddev[:modes], residuals=residuals)
+        training = None if self.training is None else self.training.truncated(self.vertex_basis, modes)
+        return dataclasses.replace(
+            self, basis=self.basis[:, :modes], stddev=self.stddev[:modes], residuals=residuals, training=training
+        )
+
+    @cached_property
+    def with_all_modes(self) -> ShapeModel:
+        """The model of the vertices with all modes of its training shapes; itself where it has no others."""
+        training = self.training
+        if training is None or not training.rest.shape[1]:
+            return self
+        rest = training.coefficients[:, self.n_modes :]
+        stddev = np.sqrt((rest**2).sum(axis=0) / (len(rest) - 1))
+        return dataclasses.replace(
+            self, mean=self.mean_vertices.ravel(), basis=np.concatenate([self.vertex_basis, training.rest], axis=1),
+            stddev=np.concatenate([self.stddev, stddev]), representation="vertices", coding={}, residuals=None,
+            total_variance=max(self.total_variance, float((self.stddev**2).sum() + (stddev**2).sum())),
+            training=dataclasses.replace(training, rest=training.rest[:, :0]),
+        )  # fmt: skip
 
     def fields(self) -> model_file.ModelFields:
         """Return what the model is made of, by the names of its arguments."""

@@ -210,6 +210,10 @@ class Aligned:
         mean = pc.mean + self.training.template.reshape(-1)
         return PrincipalComponents(mean, pc.basis, pc.variance, pc.total_variance, pc.n_samples, pc.residuals)
 
+    def shape(self, index: int) -> FloatArray:
+        """Return the vertices (V, 3), mm, of one aligned shape."""
+        return self.shapes.rows_from(index, index + 1).reshape(-1, 3) + self.training.template
+
     def keep(self, folder: Path, model_hash: str) -> None:
         """Move the shapes to `folder`, for later shapes to be added to theirs.
 

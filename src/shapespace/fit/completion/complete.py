@@ -293,6 +293,7 @@ def complete(
         )
     landmarks = read_landmarks(Path(landmarks)) if isinstance(landmarks, str | PathLike) else landmarks
     fit = fit_scan(model, scan, config.fit, landmarks=landmarks, T_scan_model=T_scan_model)
+    model = model.with_all_modes
     if config.part is not None:
         fit = fit_scan(
             model, _without_part(fit, config.part), config.fit, landmarks=landmarks, T_scan_model=T_scan_model
@@ -309,7 +310,7 @@ def complete(
 
     def posterior_at(fit: FitResult, replicates: int = REPLICATES) -> ShapePosterior:
         return shape_posterior(
-            model, target, T_mm_scan @ fit.T_scan_model, fit.b, _SETTINGS, with_scale=with_scale, seed=config.seed,
+            model, target, T_mm_scan @ fit.T_scan_model, np.pad(fit.b, (0, model.n_modes - len(fit.b))), _SETTINGS, with_scale=with_scale, seed=config.seed,
             marks=marks, replicates=replicates,
         )  # fmt: skip
 

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve
 
 from shapespace.errors import FitError
+from shapespace.fit.completion.leave_one_out import LeftOutErrors, leave_one_out
 from shapespace.fit.dense.residual_modes import residual_modes
 from shapespace.fit.landmark_terms import LandmarkConstraint
 from shapespace.fit.robust.kernels import Float32Array
@@ -35,12 +36,13 @@ _SETTLED = 2.5e-4  # share of the model's size; a step that moves no vertex furt
 _FAR = 0.05  # share of the model's size; farther points count as points of something else
 _LOOSE = 10.0
 """Standard deviation of rotation (radians) and of translation (in units of the model's size): hardly a prior."""
-_AMPLITUDES = np.geomspace(1e-4, 100.0, 19)
+_AMPLITUDES = np.array([1.0])
 """Variances of the off-model variation that are compared, in units of the one that the spectrum predicts."""
 _AMPLITUDE_STDDEV, _OF_UNKNOWN_MODEL = 1.0, 3.0
 """Standard deviation of the logarithm of the amplitude, chosen by benchmarks/completion.py on faces and femora; the
 second for models that do not state their number of shapes, whose spectrum does not predict the amplitude."""
-_RANGES = (0.4, 0.8, 1.6)
+RANGE=[0.8]
+_RANGES = (1.6,)
 """Shares of the model's size over which the residual modes are damped; a scan chooses among them."""
 AS_LIKELY = 3.0  # log density (a factor of 20) within which two explanations of a scan count as equally likely
 REPLICATES = 20  # simulated training sets; their mean varies by 3 % in the standard deviations
@@ -72,6 +74,7 @@ class ShapePosterior:
     noise_mm: float
     followed: BoolArray
     mismatch_mm: float
+    left_out: LeftOutErrors | None
 
     def log_density(self, modes: int) -> float:
         """Return the log density of scan and shape up to a constant, with as many observations as patches (E9)."""
@@ -146,16 +149,18 @@ def shape_posterior(
     matcher = problem.matcher(_LEVEL)
     hint = matcher.first_hint(iterate.surface, iterate.T_scan_model, problem.prepared.tree)
     matcher = choose_bulging(matcher, iterate.surface, iterate.T_scan_model, hint)
+    own = problem.match(matcher, iterate, hint)
+    beyond_mm2 = max(problem.unexplained_variance(own), 0.0)  # R17
     try:
-        problem, prior, iterate, line = _likeliest_range(problem, matcher, iterate, hint)
+        problem, prior, iterate, line = _likeliest_range(problem, matcher, iterate, hint, beyond_mm2)
         for _ in range(_LEVEL.iterations):
             before = iterate.T_scan_model.apply(iterate.surface.vertices)
             iterate = problem.iterate(iterate.estimate.moved_by(line.data.mean(line.variance) - line.theta))
             moved_mm = float(np.abs(iterate.T_scan_model.apply(iterate.surface.vertices) - before).max())
             if moved_mm < _SETTLED * size_mm * T_scan_model.scale:
                 break
-            line = _Linearised.of(problem, matcher, iterate, line.weighted.matches.hint, prior)
-        covariance = _expected_error(model, line.data, line.variance, seed, replicates)
+            line = _Linearised.of(problem, matcher, iterate, line.weighted.matches.hint, prior, beyond_mm2)
+        covariance, left_out = _expected_error(model, line, problem, seed)
     except LinAlgError as error:
         raise FitError(
             f"{target.mesh.name}: what it shows does not determine the pose; give landmarks (--landmarks)."
@@ -164,18 +169,20 @@ def shape_posterior(
         iterate.T_scan_model, iterate.surface, iterate.b, covariance, line.variance, line.amplitude,
         line.weighted.sigma_mm, line.followed,
         float(np.sqrt((np.minimum(line.weighted.matches.points.distance, _FAR * size_mm) ** 2).mean())),
+        left_out,
     )  # fmt: skip
 
 
 def _likeliest_range(
-    problem: Problem, matcher: Matcher, iterate: Iterate, hint: MatchHint
+    problem: Problem, matcher: Matcher, iterate: Iterate, hint: MatchHint, beyond_mm2: float
 ) -> tuple[Problem, FloatArray, Iterate, _Linearised]:
     """Return the problem with the residual modes that match the scan best, the prior variances (P,), and its start."""
     starts: list[tuple[Problem, FloatArray, Iterate, _Linearised]] = []
     for range_share in _RANGES:
         free, prior = _with_residual_modes(problem, range_share)
         start = free.iterate(Estimate(iterate.T_scan_model, np.pad(iterate.b, (0, len(prior) - POSE - len(iterate.b)))))
-        starts.append((free, prior, start, _Linearised.of(free, matcher, start, hint, prior)))
+        starts.append((free, prior, start, _Linearised.of(free, matcher, start, hint, prior, beyond_mm2)))
+    RANGE[0] = _RANGES[0]
     best = max(start[3].log_evidence for start in starts)
     return next(
         start for start in starts if start[3].log_evidence > best - AS_LIKELY
@@ -220,11 +227,13 @@ class _Linearised:
     log_evidence: float
 
     @staticmethod
-    def of(problem: Problem, matcher: Matcher, iterate: Iterate, hint: MatchHint, prior: FloatArray) -> _Linearised:
+    def of(problem: Problem, matcher: Matcher, iterate: Iterate, hint: MatchHint, prior: FloatArray, beyond_mm2: float) -> _Linearised:
         """Return the likelihood near `iterate` (E2), and the amplitude given it (E3)."""
         weighted = problem.match(matcher, iterate, hint)
         gathered, equations = problem.equations(weighted, iterate, len(iterate.b))
-        precision = NOISE_TEMPERATURE * weighted.sigma_mm**2
+        matches = float(weighted.weights.points.sum()) + float(weighted.weights.vertices.sum())
+        patches = PATCHES * float(gathered.seen.mean())
+        precision = NOISE_TEMPERATURE * weighted.sigma_mm**2 + matches / patches * beyond_mm2  # R20
         H, pull = equations.H / precision, -equations.gradient / precision
         if problem.marks is not None:
             H_landmarks, gradient = problem.marks.equations(iterate.surface, iterate.T_scan_model, len(iterate.b))
@@ -284,44 +293,15 @@ def _likeliest_amplitude(data: _Data, prior: FloatArray, first: int, stddev: flo
 
 
 def _expected_error(
-    model: ShapeModel, data: _Data, variance: FloatArray, seed: int, replicates: int = REPLICATES
-) -> FloatArray:
-    """Return the covariance (P, P) of the error of the posterior mean, that of an estimated prior included (E4).
-
-    Training sets of N shapes are drawn from the prior. For each, the prior is estimated anew as the model's was, and
-    the covariance of the error of the posterior mean with that prior is computed. The mean over the sets is returned.
-    """
-    P, K, N = len(variance), model.n_modes, model.n_training
-    free = variance > 0
-    if not model.is_n_training_known or not replicates:
-        factor, unit = data.factor(variance)
-        return cho_solve((factor, True), np.eye(P)) * np.outer(unit, unit)
-    H, rng, total = data.H[np.ix_(free, free)], np.random.default_rng(seed), np.zeros((int(free.sum()),) * 2)
-    truth = variance * (1.0 + 1.0 / N)
-    truth[:POSE] = 0.0  # the pose has no prior in effect, so its error does not depend on where it is
-    for _ in range(replicates):
-        estimated = np.zeros((P, P))
-        estimated[np.diag_indices(POSE)] = variance[:POSE]
-        estimated[POSE:, POSE:] = _estimated_covariance(variance[POSE:], K, N, rng)
-        estimated = estimated[np.ix_(free, free)]
-        B = solve(np.eye(len(H)) + estimated @ H, np.eye(len(H)))
-        gain = B @ estimated
-        total += (B * truth[free]) @ B.T + gain @ H @ gain.T
-    out = np.zeros((P, P))
-    out[np.ix_(free, free)] = total / replicates
-    return out
-
-
-def _estimated_covariance(variance: FloatArray, modes: int, count: int, rng: np.random.Generator) -> FloatArray:
-    """Return the prior covariance (K + R, K + R) that a model of `count` simulated shapes gives."""
-    shapes = rng.standard_normal((count, len(variance))) * np.sqrt(variance)
-    shapes -= shapes.mean(axis=0)
-    _, singular, axes = np.linalg.svd(shapes, full_matrices=False)
-    spectrum = singular[: count - 1] ** 2 / (count - 1)
-    spectrum = spectrum[spectrum > 1e-12 * spectrum[0]][:modes]
-    V = axes[: len(spectrum)].T
-    new = np.maximum(spectrum, variances_of_new_shapes(spectrum, float((singular**2).sum()) / (count - 1), count))
-    outside = variance.copy()
-    outside[:modes] = _FLOOR * variance[modes:].max(initial=float(spectrum[-1]))
-    rest = np.sqrt(outside)[:, None] * (np.eye(len(V)) - V @ V.T)
-    return (V * new) @ V.T + rest.T @ rest
+    model: ShapeModel, line: _Linearised, problem: Problem, seed: int
+) -> tuple[FloatArray, LeftOutErrors | None]:
+    """Return the covariance (P, P) of the error of the posterior mean, and the errors of left-out shapes (E4)."""
+    data, variance = line.data, line.variance
+    factor, unit = data.factor(variance)
+    posterior = cho_solve((factor, True), np.eye(len(variance))) * np.outer(unit, unit)
+    if model.training is None:
+        return posterior, None
+    C = model.training.coefficients
+    extra = residual_modes(model, replace(problem.settings.residual, range_share=RANGE[0]))
+    left = leave_one_out(C, data.H, data.pull, data.mean(variance), variance, extra)
+    return left.covariance(), left

@@ -31,7 +31,7 @@ from shapespace.model.local_modes import (
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray
 
-_ALGORITHM_VERSION = 1
+_ALGORITHM_VERSION = 2
 """Part of the key of the disk cache: raise it whenever `_make`, `local_modes` or `mirror` compute other modes."""
 _LEAST_VALUE = 1e-8  # share of the largest eigenvalue; below are float32 rounding and linear dependence
 _SYMMETRIC_SHARE = 0.01
@@ -45,10 +45,13 @@ class ResidualModes:
     Args:
         modes: (V, 3, K + R) float32, the model's modes and then R more, orthogonal to them.
         stddev: (R,) mm.
+        inside: (K, K + R) mm^2, covariance of the undamped... of the local and mirrored modes along the model's modes, with themselves and with the
+            R modes: what is projected out of the span of the model.
     """
 
     modes: Float32Array
     stddev: FloatArray
+    inside: FloatArray
 
 
 @cached_with_owner()
@@ -61,10 +64,10 @@ def residual_modes(model: ShapeModel, settings: ResidualSettings) -> ResidualMod
         return _make(model, settings)
     key = disk_cache.key("residual", _ALGORITHM_VERSION, model.content_hash, settings)
     arrays = disk_cache.recall(key)
-    if arrays is not None and {"modes", "stddev_mm"} <= arrays.keys():
-        return ResidualModes(arrays["modes"], arrays["stddev_mm"])
+    if arrays is not None and {"modes", "stddev_mm", "inside_mm2"} <= arrays.keys():
+        return ResidualModes(arrays["modes"], arrays["stddev_mm"], arrays["inside_mm2"])
     made = _make(model, settings)
-    disk_cache.keep(key, {"modes": made.modes, "stddev_mm": made.stddev})
+    disk_cache.keep(key, {"modes": made.modes, "stddev_mm": made.stddev, "inside_mm2": made.inside})
     return made
 
 
@@ -99,12 +102,13 @@ def _make(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
     significant = value > _LEAST_VALUE * value[0]
     stddev_mm = np.sqrt(value[significant])
     mix = (vector[:, significant] / stddev_mm).astype(np.float32)
+    among = inside @ inside.T
     inside = inside @ mix
     together = np.empty((*modes.shape[:2], modes.shape[2] + len(stddev_mm)), dtype=np.float32)
     together[:, :, : modes.shape[2]] = modes
     for P, rows in zip(own, blocks, strict=True):
         together[rows, :, modes.shape[2] :] = (products(rows) @ mix - P @ inside).reshape(-1, 3, len(stddev_mm))
-    return ResidualModes(together, stddev_mm)
+    return ResidualModes(together, stddev_mm, np.concatenate([among, inside * stddev_mm**2], axis=1, dtype=np.float64))
 
 
 def _mirror(model: ShapeModel) -> Callable[[Float32Array], Float32Array] | None:

@@ -1,0 +1,112 @@
+"""Errors of completions of the training shapes, each by the model of the others: the calibration of a completion.
+
+The training shapes are the only sample of its population that a model has. Each one in turn is observed as the scan
+was: at the same vertices, along their normals, in a free pose. It is completed by the model of the others, which is
+linear algebra in the coefficients of the shapes. Equation numbers are those of docs/completion.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from shapespace.fit.dense.residual_modes import ResidualModes
+from shapespace.geometry.similarity import POSE
+from shapespace.model.new_shapes import variances_of_new_shapes
+from shapespace.types import FloatArray
+
+MOST_LEFT_OUT = 50  # shapes; standard deviations are then known to 10 %, and the time is seconds for 500 modes
+_OFF_MODEL = 60  # residual modes, the strongest, that vary together with what a shape has outside the others' span
+_ROUNDING = 1e-12  # share of the largest variance
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOutErrors:
+    """Errors of the completions of n training shapes, each by the model of the others (E4).
+
+    The P parameters are those of the completion: pose, coefficients and off-model variation.
+
+    Args:
+        coefficients: (n, K) of the shapes, mm.
+        errors: (n, P) of the parameters, without noise of the scan.
+        noise: (P, P) covariance of the errors by noise of the scan.
+        shifts: (n, P) from the completion of the scan to the one by the model without the shape.
+    """
+
+    coefficients: FloatArray
+    errors: FloatArray
+    noise: FloatArray
+    shifts: FloatArray
+
+    def covariance(self) -> FloatArray:
+        """Return the covariance (P, P) of the predictive distribution of the error (E4)."""
+        n = len(self.errors)
+        # Of n errors about zero a t distribution of n - 1 degrees of freedom follows.
+        return (self.errors.T @ self.errors) * ((n + 1) / (n * max(n - 3, 1))) + self.noise
+
+
+def leave_one_out(
+    coefficients: FloatArray, H: FloatArray, pull: FloatArray, mean: FloatArray, variance: FloatArray,
+    extra: ResidualModes,
+) -> LeftOutErrors:  # fmt: skip
+    """Return the errors of the completions of training shapes, each by the model of the others (E4).
+
+    Args:
+        coefficients: (n, K) of the shapes in all modes of the model, mm.
+        H: (P, P) precision of the data.
+        pull: (P,) of the data.
+        mean: (P,) of the posterior of the scan.
+        variance: (P,) of the prior; zero holds a parameter.
+        extra: the residual modes.
+    """
+    n, K = coefficients.shape
+    size = K + min(_OFF_MODEL, len(variance) - POSE - K)
+    kept = np.arange(POSE, POSE + size)
+    # The prior of pose and faint modes is the same for all shapes, so they are eliminated once.
+    other = np.setdiff1d(np.flatnonzero(variance > 0), kept)
+    factor = cho_factor(H[np.ix_(other, other)] + np.diag(1.0 / variance[other]), lower=True)
+    slaved, pull_other = cho_solve(factor, H[np.ix_(other, kept)]), cho_solve(factor, pull[other])
+    H_kept = H[np.ix_(kept, kept)] - H[np.ix_(kept, other)] @ slaved
+    pull_kept = pull[kept] - H[np.ix_(kept, other)] @ pull_other
+    inside = extra.inside[:, :size] * (variance[POSE + K :].sum() / (extra.stddev**2).sum())
+    prior, mu, theta = np.diag(variance[kept]), np.zeros(size), np.zeros(size)
+    chosen = np.arange(n)
+    if n > MOST_LEFT_OUT:
+        chosen = np.sort(np.random.default_rng(0).choice(n, MOST_LEFT_OUT, replace=False))
+    errors, shifts = np.zeros((2, len(chosen), len(variance)))
+    for row, i in enumerate(chosen):
+        others = np.delete(coefficients, i, axis=0)
+        mu[:K], theta[:K] = others.mean(axis=0), coefficients[i]
+        prior[:K, :K], outside = _prior_of(others - mu[:K])
+        # What leaves the span of the others has the prior of the residual modes, with which it varies together.
+        off_model = outside @ inside
+        prior[:K, :K] += off_model[:, :K] @ outside
+        prior[:K, K:], prior[K:, :K] = off_model[:, K:], off_model[:, K:].T
+        both = np.column_stack([mu - theta, prior @ pull_kept + mu])
+        solved = np.linalg.solve(np.eye(size) + prior @ H_kept, both)
+        errors[row, kept], shifts[row, kept] = solved.T
+    errors[:, other] = -errors[:, kept] @ slaved.T
+    shifts[:, other] = pull_other - shifts[:, kept] @ slaved.T
+    return LeftOutErrors(coefficients[chosen], errors, _noise(H, variance), shifts - mean)
+
+
+def _noise(H: FloatArray, variance: FloatArray) -> FloatArray:
+    """Return the covariance (P, P) of the posterior mean by noise of the data."""
+    free = np.flatnonzero(variance > 0)
+    H = H[np.ix_(free, free)]
+    gain = np.linalg.inv(H + np.diag(1.0 / variance[free]))
+    out = np.zeros((len(variance), len(variance)))
+    out[np.ix_(free, free)] = gain @ H @ gain
+    return out
+
+
+def _prior_of(others: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the prior covariance (K, K) of the model of centred shapes (m, K), and the projection outside of it."""
+    m = len(others)
+    value, vector = np.linalg.eigh(others.T @ others / (m - 1))
+    kept = np.flatnonzero(value > _ROUNDING * value[-1])[::-1][: m - 1]
+    sample, axes = value[kept], vector[:, kept]
+    new = np.maximum(sample, variances_of_new_shapes(sample, float(sample.sum()), m))
+    return (axes * new) @ axes.T, np.eye(len(vector)) - axes @ axes.T
