@@ -70,7 +70,8 @@ def leave_one_out(
     slaved, pull_other = cho_solve(factor, H[np.ix_(other, kept)]), cho_solve(factor, pull[other])
     H_kept = H[np.ix_(kept, kept)] - H[np.ix_(kept, other)] @ slaved
     pull_kept = pull[kept] - H[np.ix_(kept, other)] @ pull_other
-    inside = extra.inside[:, :size] * (variance[POSE + K :].sum() / (extra.stddev**2).sum())
+    share = variance[POSE + K :].sum() / (extra.stddev**2).sum()
+    z = coefficients / np.sqrt((coefficients**2).sum(axis=0) / (n - 1))
     prior, mu, theta = np.diag(variance[kept]), np.zeros(size), np.zeros(size)
     chosen = np.arange(n)
     if n > MOST_LEFT_OUT:
@@ -81,7 +82,7 @@ def leave_one_out(
         mu[:K], theta[:K] = others.mean(axis=0), coefficients[i]
         prior[:K, :K], outside = _prior_of(others - mu[:K])
         # What leaves the span of the others has the prior of the residual modes, with which it varies together.
-        off_model = outside @ inside
+        off_model = share * extra.covariance_outside(outside, z[i], n)[:, :size]
         prior[:K, :K] += off_model[:, :K] @ outside
         prior[:K, K:], prior[K:, :K] = off_model[:, K:], off_model[:, K:].T
         both = np.column_stack([mu - theta, prior @ pull_kept + mu])

@@ -10,7 +10,7 @@ own, so that b keeps its meaning.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from shapespace.model.local_modes import (
     vertex_blocks,
 )
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import FloatArray
+from shapespace.types import FloatArray, IntArray
 
 _ALGORITHM_VERSION = 2
 """Part of the key of the disk cache: raise it whenever `_make`, `local_modes` or `mirror` compute other modes."""
@@ -45,13 +45,29 @@ class ResidualModes:
     Args:
         modes: (V, 3, K + R) float32, the model's modes and then R more, orthogonal to them.
         stddev: (R,) mm.
-        inside: (K, K + R) mm^2, covariance of the undamped... of the local and mirrored modes along the model's modes, with themselves and with the
-            R modes: what is projected out of the span of the model.
+        products: (K + R, C) mm of the C local and mirrored modes along all of these modes.
+        mode: (C,) mode of the model of which each one was made.
+        field: (C,) field, or mirror image, by which it was made.
     """
 
     modes: Float32Array
     stddev: FloatArray
-    inside: FloatArray
+    products: Float32Array
+    mode: IntArray
+    field: IntArray
+
+    def covariance_outside(self, outside: FloatArray, z: FloatArray, count: int) -> FloatArray:
+        """Return the covariance (K, K + R), mm^2, of what shapes have outside the span of all training shapes but one.
+
+        Args:
+            outside: (K, K) projection outside that span.
+            z: (K,) coefficients of the one, in standard deviations; no local mode is made of it.
+            count: number of shapes.
+        """
+        own = np.zeros((int(self.field.max()) + 1, len(self.products)))
+        np.add.at(own, self.field, self.products.T * z[self.mode, None])
+        along = outside @ self.products[: len(outside)]
+        return along @ self.products.T - (outside @ own[:, : len(outside)].T) @ own / (count - 1)
 
 
 @cached_with_owner()
@@ -64,10 +80,11 @@ def residual_modes(model: ShapeModel, settings: ResidualSettings) -> ResidualMod
         return _make(model, settings)
     key = disk_cache.key("residual", _ALGORITHM_VERSION, model.content_hash, settings)
     arrays = disk_cache.recall(key)
-    if arrays is not None and {"modes", "stddev_mm", "inside_mm2"} <= arrays.keys():
-        return ResidualModes(arrays["modes"], arrays["stddev_mm"], arrays["inside_mm2"])
+    names = [item.name for item in fields(ResidualModes)]
+    if arrays is not None and set(names) <= arrays.keys():
+        return ResidualModes(*(arrays[name] for name in names))
     made = _make(model, settings)
-    disk_cache.keep(key, {"modes": made.modes, "stddev_mm": made.stddev, "inside_mm2": made.inside})
+    disk_cache.keep(key, {name: getattr(made, name) for name in names})
     return made
 
 
@@ -76,11 +93,11 @@ def _make(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
     modes = np.asarray(prepare(model).modes)
     mirror = _mirror(model)
     sources = [modes] if mirror is None else [modes, mirror(modes)]
-    fields = smooth_fields(x, settings.range_share * rms_size(x))  # R17b
+    smooth = smooth_fields(x, settings.range_share * rms_size(x))  # R17b
     mode, field_of_product = strongest_products(
-        model.stddev, np.linalg.norm(fields, axis=0), MOST_PRODUCTS // len(sources)
+        model.stddev, np.linalg.norm(smooth, axis=0), MOST_PRODUCTS // len(sources)
     )
-    field = (np.sqrt(settings.local_share) * fields).astype(np.float32)[:, field_of_product] * stddev[mode]
+    field = (np.sqrt(settings.local_share) * smooth).astype(np.float32)[:, field_of_product] * stddev[mode]
     mirrored = np.float32(np.sqrt(settings.mirror_share)) * stddev
 
     def products(rows: slice) -> Float32Array:
@@ -102,13 +119,23 @@ def _make(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
     significant = value > _LEAST_VALUE * value[0]
     stddev_mm = np.sqrt(value[significant])
     mix = (vector[:, significant] / stddev_mm).astype(np.float32)
-    among = inside @ inside.T
+    # The products along the residual modes are what the eigenvectors of their Gram matrix say.
+    along = np.concatenate([inside, stddev_mm[:, None] * vector[:, significant].T])
     inside = inside @ mix
     together = np.empty((*modes.shape[:2], modes.shape[2] + len(stddev_mm)), dtype=np.float32)
     together[:, :, : modes.shape[2]] = modes
     for P, rows in zip(own, blocks, strict=True):
         together[rows, :, modes.shape[2] :] = (products(rows) @ mix - P @ inside).reshape(-1, 3, len(stddev_mm))
-    return ResidualModes(together, stddev_mm, np.concatenate([among, inside * stddev_mm**2], axis=1, dtype=np.float64))
+    local, count = len(mode), len(sources)
+    of_mode = np.concatenate([np.tile(mode, count), np.tile(np.arange(len(stddev)), count - 1)])
+    first = int(field_of_product.max()) + 1
+    of_field = np.concatenate(
+        [field_of_product + first * k for k in range(count)] + [np.full(len(stddev), first * count)] * (count - 1)
+    )
+    assert len(of_mode) == along.shape[1] == local * count + len(stddev) * (count - 1)
+    return ResidualModes(
+        together, stddev_mm, along.astype(np.float32), of_mode.astype(np.int32), of_field.astype(np.int32)
+    )
 
 
 def _mirror(model: ShapeModel) -> Callable[[Float32Array], Float32Array] | None:
