@@ -17,8 +17,9 @@ import numpy as np
 from scipy.stats import chi2
 
 from shapespace.errors import FitError, InputError
+from shapespace.fit.completion.calibration import SurfaceCalibration, calibrate
 from shapespace.fit.completion.mirror import add_mirror_image
-from shapespace.fit.completion.shape_posterior import AS_LIKELY, REPLICATES, ShapePosterior, shape_posterior
+from shapespace.fit.completion.shape_posterior import AS_LIKELY, ShapePosterior, shape_posterior
 from shapespace.fit.dense.dense_fit import dense_surface
 from shapespace.fit.diagnostics.reason_text import sentence_of
 from shapespace.fit.diagnostics.reasons import Reason, ReasonCode
@@ -26,6 +27,7 @@ from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.landmark_terms import SHARE, LandmarkConstraint
 from shapespace.fit.result import FitResult, Status
 from shapespace.fit.robust.kernels import Float32Array
+from shapespace.fit.robust.normal_equations import SCALE
 from shapespace.fit.robust.robust_settings import RobustSettings
 from shapespace.fit.scan_target import ScanTarget, mm_frame
 from shapespace.fit.search.initialisation import start_from_any_pose
@@ -33,6 +35,7 @@ from shapespace.geometry.closest import build_engine
 from shapespace.geometry.loop import loop_operator
 from shapespace.geometry.normals import boundary_edges, enclosed_volume, face_areas, part_of, rms_size
 from shapespace.geometry.procrustes import centroid_size
+from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.interop import MeshLike
 from shapespace.io.landmarks.landmark_io import read_landmarks
 from shapespace.model.region import Part
@@ -52,7 +55,11 @@ _OTHER_POSE = 0.1  # share of the size by which another pose differs
 _LEAST_OBSERVED = 0.1  # share of the vertices below which a completion would be the mean shape in an unknown pose
 _COMPLETE = 0.97  # share of the vertices from which on only the border of the scan is missing
 _ON_SCAN = 5.0  # multiple of the noise within which a refined vertex is on the scan
-_LEAST_GAIN = 0.1  # share of its variance in the population that a scan removes from a vertex that it determines
+_LEAST_GAIN = 0.1  # share of a vertex's variance that a scan removes, of models without training shapes
+_UNEXPLAINED = 2.0
+"""Multiple of the largest distance of left-out training shapes from their completions beyond which the model does not
+explain a scan: 24 femora reach 1.3, other objects scaled to their size 4 and more (benchmarks/completion.py)."""
+_OTHER_SIZE = 4.0  # standard deviations of the training shapes' size
 _IMPLAUSIBLE, _RARE = 3.0, 1e-5
 """Mean square of the coefficients in standard deviations of new shapes (1.4 is the most measured, with 51 modes), and
 the probability of a normal shape to be implausible, which decides for few modes."""
@@ -61,9 +68,17 @@ _OF_MISSING_PARTS = frozenset(
         ReasonCode.EXPECTED_ERROR, ReasonCode.PROBABLY_FAILED, ReasonCode.MODEL_FAR_FROM_SCAN, ReasonCode.MODEL_UNSEEN,
         ReasonCode.MODEL_UNMATCHED, ReasonCode.FEW_TRAINING_SHAPES, ReasonCode.MODEL_TOO_NARROW,
         ReasonCode.MODE_IMPLAUSIBLE, ReasonCode.SHAPE_IMPLAUSIBLE, ReasonCode.LEADING_MODES_IMPLAUSIBLE,
+        ReasonCode.SCALE_IMPLAUSIBLE,
     }
 )  # fmt: skip
-"""Reasons to doubt a fit that follow from missing parts, and that the posterior accounts for or judges anew."""
+"""Reasons to doubt a fit that follow from missing parts, and that tests of the completion replace."""
+_BY_TRAINING_SHAPES = frozenset(
+    {
+        ReasonCode.PROBABLY_FAILED, ReasonCode.MODEL_FAR_FROM_SCAN, ReasonCode.FEW_TRAINING_SHAPES,
+        ReasonCode.RESIDUAL_SPREAD, ReasonCode.NORMALS_DISAGREE,
+    }
+)  # fmt: skip
+"""Those of them whose tests need the training shapes of the model."""
 
 _SETTINGS = RobustSettings(vertex_share=0.0)
 """Of the posterior: vertices on flat triangles of the scan are matched inside of its curved surface."""
@@ -113,11 +128,13 @@ class QuantityEstimate:
         name: of the quantity.
         unit: of its values, such as mm; empty for plain numbers.
         value: of the completed surface.
-        mean: over the samples.
-        stddev: over the samples.
-        low: lower end of the interval,
-        high: upper end, between quantiles of the samples.
+        mean: of its predictive distribution.
+        stddev: of that distribution.
+        low: lower end of the interval.
+        high: upper end of the interval.
         level: probability of the interval.
+        calibrated_on: number of training shapes left out in turn from which mean, standard deviation and interval are
+            estimated; 0 if they are those of the samples, and not calibrated.
     """
 
     name: str
@@ -128,6 +145,7 @@ class QuantityEstimate:
     low: float
     high: float
     level: float
+    calibrated_on: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,6 +164,8 @@ class Completion:
             variances along three axes.
         posterior: joint distribution of pose, coefficients and off-model variation.
         T_scan_model: pose of the posterior, from the model's frame (mm) to the frame and unit of the scan.
+        calibration: completions of the training shapes by models of the others, from which intervals, skill and status
+            are estimated; None if the model has no training shapes, whose results are not calibrated.
     """
 
     fit: FitResult
@@ -158,6 +178,7 @@ class Completion:
     stddev_mm: FloatArray
     posterior: ShapePosterior = field(repr=False)
     T_scan_model: Similarity = field(repr=False)
+    calibration: SurfaceCalibration | None = field(repr=False)
 
     def __repr__(self) -> str:
         return f"<Completion of {describe_briefly(self.scan_name)}: {self.status}. {self.reason}>"
@@ -230,23 +251,29 @@ class Completion:
     def _estimates(self, functions: Mapping[tuple[str, str], Function], level: float) -> tuple[QuantityEstimate, ...]:
         if not 0 < level < 1:
             raise InputError(f"The probability of an interval lies between 0 and 1, not {level:g}.")
-        shapes = (self.vertices, *self._samples)
-        values = np.array(
-            [
-                [function(mesh) for function in functions.values()]
-                for mesh in (self._mesh(np.asarray(shape, dtype=np.float64)) for shape in shapes)
-            ],
-            dtype=np.float64,
+        return tuple(
+            self._quantity(function, name, unit, level) for (name, unit), function in functions.items()
         )
-        out: list[QuantityEstimate] = []
-        for (name, unit), column in zip(functions, values.T, strict=True):
-            if not np.isfinite(column).all():
-                raise InputError(f"The quantity {name or 'of the shape'} is not finite for every sample.")
-            over = column[1:]
-            low, high = np.quantile(over, [(1 - level) / 2, (1 + level) / 2])
-            mean, stddev = float(over.mean()), float(over.std(ddof=1))
-            out.append(QuantityEstimate(name, unit, float(column[0]), mean, stddev, float(low), float(high), level))
-        return tuple(out)
+
+    def _quantity(self, function: Function, name: str, unit: str, level: float) -> QuantityEstimate:
+        def of(vertices: FloatArray) -> float:
+            value = float(function(self._mesh(np.asarray(vertices, dtype=np.float64))))
+            if not np.isfinite(value):
+                raise InputError(f"The quantity {name or 'of the shape'} is not finite for every shape.")
+            return value
+
+        value = of(self.vertices)
+        if self.calibration is not None:
+            T = self.T_scan_model
+            mean, stddev, low, high = self.calibration.interval(
+                lambda vertices: of(T.apply(np.asarray(vertices, dtype=np.float64))),
+                T.inverse().apply(self.vertices), level,
+            )  # fmt: skip
+            return QuantityEstimate(name, unit, value, mean, stddev, low, high, level, len(self.calibration))
+        over = np.array([of(sample) for sample in self._samples])
+        low, high = np.quantile(over, [(1 - level) / 2, (1 + level) / 2])
+        mean, stddev = float(over.mean()), float(over.std(ddof=1))
+        return QuantityEstimate(name, unit, value, mean, stddev, float(low), float(high), level, 0)
 
     def landmark_stddev_mm(self) -> dict[str, FloatArray]:
         """Return name -> (3,) standard deviation of each landmark along the axes of the scan's frame, mm."""
@@ -308,10 +335,10 @@ def complete(
         marks = LandmarkConstraint.of(model, marks_mm, stddev_mm)
     with_scale = config.fit.limits(model).with_scale
 
-    def posterior_at(fit: FitResult, replicates: int = REPLICATES) -> ShapePosterior:
+    def posterior_at(fit: FitResult, *, calibrated: bool = True) -> ShapePosterior:
         return shape_posterior(
-            model, target, T_mm_scan @ fit.T_scan_model, np.pad(fit.b, (0, model.n_modes - len(fit.b))), _SETTINGS, with_scale=with_scale, seed=config.seed,
-            marks=marks, replicates=replicates,
+            model, target, T_mm_scan @ fit.T_scan_model, np.pad(fit.b, (0, model.n_modes - len(fit.b))), _SETTINGS, with_scale=with_scale,
+            marks=marks, calibrated=calibrated,
         )  # fmt: skip
 
     apart_mm = None
@@ -320,29 +347,38 @@ def complete(
     stands_out = evidence.start_score_mm < _STANDS_OUT * evidence.start_runner_up_score_mm
     is_sure = fit.status != "doubtful" and evidence.seen_share > (_SURE / 2 if stands_out else _SURE)
     if not landmarks and T_scan_model is None and not is_sure:
-        fit, apart_mm = _likeliest_pose(fit, target, T_mm_scan.inverse(), config, lambda fit: posterior_at(fit, 0))
+        fit, apart_mm = _likeliest_pose(fit, target, T_mm_scan.inverse(), config, lambda fit: posterior_at(fit, calibrated=False))
     posterior = posterior_at(fit)
     T = posterior.T_scan_model
-    status, reasons = _judged(fit, posterior, apart_mm, config)
-    dense = dense_surface(model, target, T.apply(posterior.surface.vertices), T, config.fit.dense_settings)
+    start = T.apply(posterior.surface.vertices)
+    dense = dense_surface(model, target, start, T, config.fit.dense_settings)
     observed = dense.seen.copy()
     if config.part is not None:
         observed[Part.of(model, config.part).inside] = False
-    notes = [*fit.notes, *_notes(model, fit, observed)]
+    calibration = calibrate(posterior, model, ~observed)
+    status, reasons = _judged(fit, posterior, calibration, dense.noise_mm, apart_mm, config)
+    notes = [*fit.notes, *_notes(model, fit, observed, with_scale=with_scale)]
     completed = T.inverse().apply(dense.vertices_scan_mm)
     variance = np.einsum("vii->v", posterior.vertex_covariance())
+    if calibration is None:
+        is_unknowable = variance > (1 - _LEAST_GAIN) * posterior.prior_vertex_variance()
+    else:
+        is_unknowable = calibration.skill <= 0
+        weight = np.where(observed, 0.0, calibration.mean_weight)[:, None]
+        pose = fit_similarity(model.mean_vertices[observed], completed[observed], with_scale=with_scale)
+        completed = completed + weight * (pose.apply(model.mean_vertices) - completed)  # E10
     if config.mirror != "never":
         weighed_by = variance if config.mirror == "combined" else None
         completed, weight = add_mirror_image(model, completed, observed, weighed_by)
         notes.append(
             f"The mirror image of the observed side has a mean weight of {weight:.2f} where vertices are missing."
         )
-    knowledge = np.where(variance > (1 - _LEAST_GAIN) * posterior.prior_vertex_variance(), UNKNOWABLE, ESTIMATED)
+    knowledge = np.where(is_unknowable, UNKNOWABLE, ESTIMATED)
     knowledge[observed] = OBSERVED
     T_scan_model = T_mm_scan.inverse() @ T
     return Completion(
         fit, status, reasons, tuple(notes), config, T_scan_model.apply(completed), knowledge.astype(np.int32),
-        np.sqrt(variance) * T.scale, posterior, T_scan_model,
+        np.sqrt(variance) * T.scale, posterior, T_scan_model, calibration,
     )  # fmt: skip
 
 
@@ -391,34 +427,63 @@ def _likeliest_pose(
 
 
 def _judged(
-    fit: FitResult, posterior: ShapePosterior, apart_mm: float | None, config: CompletionConfig
+    fit: FitResult,
+    posterior: ShapePosterior,
+    calibration: SurfaceCalibration | None,
+    noise_mm: float,
+    apart_mm: float | None,
+    config: CompletionConfig,
 ) -> tuple[Status, tuple[Reason, ...]]:
-    """Return status and reasons, with what the posterior accounts for left out.
+    """Return status and reasons: doubts of the fit that no test of the completion replaces, then those of the tests.
 
     Raises:
         FitError: there are reasons to doubt it, and `with_doubtful` is not set.
     """
-    reasons = [reason for reason in fit.reasons if reason.code not in _OF_MISSING_PARTS]
     modes = fit.model.n_modes
-    z2, limit = posterior.mean_square_z(modes), max(_IMPLAUSIBLE, float(chi2.isf(_RARE, modes)) / modes)
+    tested = _OF_MISSING_PARTS if calibration is not None else _OF_MISSING_PARTS - _BY_TRAINING_SHAPES
+    reasons = [reason for reason in fit.reasons if reason.code not in tested]
+    doubts = [] if fit.status != "doubtful" else reasons
     if apart_mm is not None:
-        reasons.append(Reason(ReasonCode.POSE_AMBIGUOUS, {"apart_mm": apart_mm}))
+        doubts.append(Reason(ReasonCode.POSE_AMBIGUOUS, {"apart_mm": apart_mm}))
+    z2, limit = posterior.mean_square_z(modes), max(_IMPLAUSIBLE, float(chi2.isf(_RARE, modes)) / modes)
     if z2 > limit:
-        reasons.append(Reason(ReasonCode.SHAPE_IMPLAUSIBLE, {"z_rms": float(np.sqrt(z2))}))
-    if fit.status != "doubtful" and z2 <= limit and apart_mm is None:
-        return "converged", fit.reasons
-    if not reasons:
+        doubts.append(Reason(ReasonCode.SHAPE_IMPLAUSIBLE, {"z_rms": float(np.sqrt(z2))}))
+    if calibration is not None:
+        doubts += _doubts_by_training_shapes(posterior, calibration, noise_mm)
+    if not doubts:
+        if fit.status != "doubtful":
+            return "converged", fit.reasons
         data = {"spread_mm": posterior.noise_mm, "model_matched_share": float(posterior.followed.mean())}
         return "converged", (Reason(ReasonCode.CONVERGED, data),)
     if not config.with_doubtful:
         raise FitError(
-            f"{fit.scan_name}: {sentence_of('doubtful', reasons)} Its completion would look more certain than it is; "
+            f"{fit.scan_name}: {sentence_of('doubtful', doubts)} Its completion would look more certain than it is; "
             "check scan, model and unit, give landmarks (--landmarks), or pass --with-doubtful."
         )
-    return "doubtful", tuple(reasons)
+    return "doubtful", tuple(doubts)
 
 
-def _notes(model: ShapeModel, fit: FitResult, observed: BoolArray) -> list[str]:
+def _doubts_by_training_shapes(
+    posterior: ShapePosterior, calibration: SurfaceCalibration, noise_mm: float
+) -> list[Reason]:
+    """Return in which respects the scan and its completion are unlike those of the left-out training shapes."""
+    doubts = list[Reason]()
+    usual_mm = float(posterior.left_out_mismatch_mm().max())
+    # Noise of the scan is no mismatch; it differs between neighbouring points.
+    mismatch_mm = float(np.sqrt(max(posterior.mismatch_mm**2 - noise_mm**2, 0.0)))
+    if mismatch_mm > _UNEXPLAINED * usual_mm:
+        doubts.append(Reason(ReasonCode.SCAN_UNEXPLAINED, {"mismatch_mm": mismatch_mm, "usual_mm": usual_mm}))
+    size_variance = float(posterior.prior_variance[SCALE])
+    if size_variance > 0 and abs(np.log(posterior.T_scan_model.scale)) > _OTHER_SIZE * np.sqrt(size_variance):
+        doubts.append(Reason(ReasonCode.SCALE_IMPLAUSIBLE, {"scale": posterior.T_scan_model.scale}))
+    if calibration.missing.mean() > 1 - _COMPLETE and not calibration.is_skilled:
+        ratios = calibration.log_ratios
+        data = {"training_shapes": float(len(ratios)), "nearer": float((ratios > 0).sum())}
+        doubts.append(Reason(ReasonCode.NO_SKILL, data))
+    return doubts
+
+
+def _notes(model: ShapeModel, fit: FitResult, observed: BoolArray, *, with_scale: bool) -> list[str]:
     """Return sentences on how much is missing.
 
     Raises:
@@ -435,6 +500,20 @@ def _notes(model: ShapeModel, fit: FitResult, observed: BoolArray) -> list[str]:
         notes.append(
             f"Nothing of the model is missing: the scan shows {100 * share:.0f} % of its vertices. Parts that the "
             "model does not have cannot be completed."
+        )
+    size_stddev = None if model.training is None else model.training.log_scale_stddev
+    if not with_scale:
+        notes.append("The size was fixed: sizes of shapes are part of the model, or the scale was held.")
+    elif size_stddev is None:
+        notes.append("The size was free: the model does not know the sizes of its training shapes.")
+    else:
+        notes.append(
+            f"The size was free, with the standard deviation of the training shapes' sizes ({100 * size_stddev:.2g} %)."
+        )
+    if model.training is None:
+        notes.append(
+            "The result is not calibrated: the model has no training shapes that could be left out in turn, so "
+            "intervals and standard deviations are those of the model, and are too small if it is wrong."
         )
     if not model.is_n_training_known:
         notes.append(

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from shapespace.fit.dense.residual_modes import ResidualModes
+from shapespace.fit.robust.normal_equations import SCALE
 from shapespace.geometry.similarity import POSE
 from shapespace.model.new_shapes import variances_of_new_shapes
 from shapespace.types import FloatArray
@@ -29,13 +30,13 @@ class LeftOutErrors:
     The P parameters are those of the completion: pose, coefficients and off-model variation.
 
     Args:
-        coefficients: (n, K) of the shapes, mm.
+        known: (n, 1 + K) log scale and coefficients of the shapes, mm.
         errors: (n, P) of the parameters, without noise of the scan.
         noise: (P, P) covariance of the errors by noise of the scan.
         shifts: (n, P) from the completion of the scan to the one by the model without the shape.
     """
 
-    coefficients: FloatArray
+    known: FloatArray
     errors: FloatArray
     noise: FloatArray
     shifts: FloatArray
@@ -47,23 +48,32 @@ class LeftOutErrors:
         return (self.errors.T @ self.errors) * ((n + 1) / (n * max(n - 3, 1))) + self.noise
 
 
+def root_of(covariance: FloatArray) -> FloatArray:
+    """Return a root R (P, P) of a covariance, R R^T; scaled, as angles and coefficients differ in size."""
+    unit = np.sqrt(np.maximum(covariance.diagonal(), 1e-300))
+    value, vector = np.linalg.eigh(covariance / np.outer(unit, unit))
+    return unit[:, None] * vector * np.sqrt(np.maximum(value, 0.0))
+
+
 def leave_one_out(
-    coefficients: FloatArray, H: FloatArray, pull: FloatArray, mean: FloatArray, variance: FloatArray,
+    known: FloatArray, H: FloatArray, pull: FloatArray, mean: FloatArray, variance: FloatArray,
     extra: ResidualModes,
 ) -> LeftOutErrors:  # fmt: skip
     """Return the errors of the completions of training shapes, each by the model of the others (E4).
 
     Args:
-        coefficients: (n, K) of the shapes in all modes of the model, mm.
+        known: (n, 1 + K) log scale of the shapes, and coefficients in all modes of the model, mm.
         H: (P, P) precision of the data.
         pull: (P,) of the data.
         mean: (P,) of the posterior of the scan.
         variance: (P,) of the prior; zero holds a parameter.
         extra: the residual modes.
     """
+    coefficients = known[:, 1:]
     n, K = coefficients.shape
-    size = K + min(_OFF_MODEL, len(variance) - POSE - K)
-    kept = np.arange(POSE, POSE + size)
+    end = POSE + K + min(_OFF_MODEL, len(variance) - POSE - K)
+    kept = np.arange(SCALE if variance[SCALE] > 0 else POSE, end)
+    c = slice(POSE - kept[0], POSE - kept[0] + K)
     # The prior of pose and faint modes is the same for all shapes, so they are eliminated once.
     other = np.setdiff1d(np.flatnonzero(variance > 0), kept)
     factor = cho_factor(H[np.ix_(other, other)] + np.diag(1.0 / variance[other]), lower=True)
@@ -72,25 +82,25 @@ def leave_one_out(
     pull_kept = pull[kept] - H[np.ix_(kept, other)] @ pull_other
     share = variance[POSE + K :].sum() / (extra.stddev**2).sum()
     z = coefficients / np.sqrt((coefficients**2).sum(axis=0) / (n - 1))
-    prior, mu, theta = np.diag(variance[kept]), np.zeros(size), np.zeros(size)
+    prior, mu, theta = np.diag(variance[kept]), np.zeros(len(kept)), np.zeros(len(kept))
     chosen = np.arange(n)
     if n > MOST_LEFT_OUT:
         chosen = np.sort(np.random.default_rng(0).choice(n, MOST_LEFT_OUT, replace=False))
     errors, shifts = np.zeros((2, len(chosen), len(variance)))
     for row, i in enumerate(chosen):
         others = np.delete(coefficients, i, axis=0)
-        mu[:K], theta[:K] = others.mean(axis=0), coefficients[i]
-        prior[:K, :K], outside = _prior_of(others - mu[:K])
+        mu[c], theta[c], theta[: c.start] = others.mean(axis=0), coefficients[i], known[i, : c.start]
+        prior[c, c], outside = _prior_of(others - mu[c])
         # What leaves the span of the others has the prior of the residual modes, with which it varies together.
-        off_model = share * extra.covariance_outside(outside, z[i], n)[:, :size]
-        prior[:K, :K] += off_model[:, :K] @ outside
-        prior[:K, K:], prior[K:, :K] = off_model[:, K:], off_model[:, K:].T
+        off_model = share * extra.covariance_outside(outside, z[i], n)[:, : end - POSE]
+        prior[c, c] += off_model[:, :K] @ outside
+        prior[c, c.stop :], prior[c.stop :, c] = off_model[:, K:], off_model[:, K:].T
         both = np.column_stack([mu - theta, prior @ pull_kept + mu])
-        solved = np.linalg.solve(np.eye(size) + prior @ H_kept, both)
+        solved = np.linalg.solve(np.eye(len(kept)) + prior @ H_kept, both)
         errors[row, kept], shifts[row, kept] = solved.T
     errors[:, other] = -errors[:, kept] @ slaved.T
     shifts[:, other] = pull_other - shifts[:, kept] @ slaved.T
-    return LeftOutErrors(coefficients[chosen], errors, _noise(H, variance), shifts - mean)
+    return LeftOutErrors(known[chosen], errors, _noise(H, variance), shifts - mean)
 
 
 def _noise(H: FloatArray, variance: FloatArray) -> FloatArray:

@@ -13,8 +13,8 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve
 
 from shapespace.errors import FitError
-from shapespace.fit.completion.leave_one_out import LeftOutErrors, leave_one_out
-from shapespace.fit.dense.residual_modes import residual_modes
+from shapespace.fit.completion.leave_one_out import LeftOutErrors, leave_one_out, root_of
+from shapespace.fit.dense.residual_modes import ResidualModes, residual_modes
 from shapespace.fit.landmark_terms import LandmarkConstraint
 from shapespace.fit.robust.kernels import Float32Array
 from shapespace.fit.robust.matching import Matcher, MatchHint, choose_bulging
@@ -36,17 +36,12 @@ _SETTLED = 2.5e-4  # share of the model's size; a step that moves no vertex furt
 _FAR = 0.05  # share of the model's size; farther points count as points of something else
 _LOOSE = 10.0
 """Standard deviation of rotation (radians) and of translation (in units of the model's size): hardly a prior."""
-_AMPLITUDES = np.array([1.0])
+_AMPLITUDES = np.geomspace(1e-4, 100.0, 19)
 """Variances of the off-model variation that are compared, in units of the one that the spectrum predicts."""
 _AMPLITUDE_STDDEV, _OF_UNKNOWN_MODEL = 1.0, 3.0
 """Standard deviation of the logarithm of the amplitude, chosen by benchmarks/completion.py on faces and femora; the
 second for models that do not state their number of shapes, whose spectrum does not predict the amplitude."""
-RANGE=[0.8]
-_RANGES = (1.6,)
-"""Shares of the model's size over which the residual modes are damped; a scan chooses among them."""
 AS_LIKELY = 3.0  # log density (a factor of 20) within which two explanations of a scan count as equally likely
-REPLICATES = 20  # simulated training sets; their mean varies by 3 % in the standard deviations
-_FLOOR = 1e-3  # variance outside the simulated modes along the model's own, in units of that of the residual modes
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +58,7 @@ class ShapePosterior:
         noise_mm: robust standard deviation of the residuals, mm of the model's frame.
         followed: (V,) True where a scan point is matched.
         mismatch_mm: RMS distance of the scan's points from the surface, each up to 5 % of the model's size.
+        left_out: errors of completions of the training shapes by models of the others; None without them.
     """
 
     T_scan_model: Similarity
@@ -76,21 +72,34 @@ class ShapePosterior:
     mismatch_mm: float
     left_out: LeftOutErrors | None
 
+    def left_out_mismatch_mm(self) -> FloatArray:
+        """Return (n,) the RMS distance along the normals of left-out shapes from their completions, mm.
+
+        It is over the vertices that the scan shows; empty without training shapes.
+        """
+        if self.left_out is None:
+            return np.zeros(0)
+        rows = np.einsum("vd,vdp->vp", self.surface.normals, self.rows())[self.followed]
+        off = rows @ self.left_out.errors.T.astype(np.float32)
+        return np.sqrt((off**2).mean(axis=0) + self.noise_mm**2).astype(np.float64)
+
     def log_density(self, modes: int) -> float:
         """Return the log density of scan and shape up to a constant, with as many observations as patches (E9)."""
         patches = PATCHES * float(self.followed.mean()) / NOISE_TEMPERATURE
-        return -patches * float(np.log(self.mismatch_mm)) - 0.5 * modes * self.mean_square_z(modes)
+        scale = self.prior_variance[SCALE]
+        size = float(np.log(self.T_scan_model.scale)) ** 2 / scale if scale > 0 else 0.0
+        return -patches * float(np.log(self.mismatch_mm)) - 0.5 * (modes * self.mean_square_z(modes) + size)
 
     def vertex_covariance(self) -> FloatArray:
         """Return (V, 3, 3) mm^2 of the positions of the vertices along the axes of the model's frame (E5)."""
-        rows = self._rows()
+        rows = self.rows()
         moved = (rows.reshape(-1, rows.shape[2]) @ self.covariance.astype(np.float32)).reshape(rows.shape)
         return np.asarray(np.einsum("vip,vjp->vij", moved, rows), dtype=np.float64)
 
     def prior_vertex_variance(self) -> FloatArray:
         """Return (V,) mm^2: the variance of the positions of the vertices in the population, in a known pose."""
         variance = self.prior_variance[POSE:].astype(np.float32)
-        return np.asarray(np.einsum("vip,p->v", self._rows()[:, :, POSE:] ** 2, variance), dtype=np.float64)
+        return np.asarray(np.einsum("vip,p->v", self.rows()[:, :, POSE:] ** 2, variance), dtype=np.float64)
 
     def mean_square_z(self, modes: int) -> float:
         """Return the mean square of the first coefficients in standard deviations of new shapes."""
@@ -98,25 +107,19 @@ class ShapePosterior:
 
     def draw_displacements(self, count: int, rng: np.random.Generator) -> Float32Array:
         """Return (count, V, 3) float32 displacements from the mean surface, mm of the model's frame (E6)."""
-        root = self._root()
+        root = root_of(self.covariance)
         draws = (root @ rng.standard_normal((root.shape[1], count))).astype(np.float32)
-        rows = self._rows()
+        rows = self.rows()
         return (rows.reshape(-1, len(root)) @ draws).T.reshape(count, *rows.shape[:2])
 
     def main_mode(self) -> FloatArray:
         """Return (V, 3) the displacement of one standard deviation along the first principal component, mm."""
-        rows, root = self._rows().reshape(-1, len(self.covariance)), self._root()
+        rows, root = self.rows().reshape(-1, len(self.covariance)), root_of(self.covariance)
         gram = root.T @ (rows.T @ rows).astype(np.float64) @ root
         vector = np.linalg.eigh(gram)[1][:, -1]
         return np.asarray(rows @ (root @ vector), dtype=np.float64).reshape(-1, 3)
 
-    def _root(self) -> FloatArray:
-        """Return a root R (P, P) of the covariance, R R^T; scaled, as angles and coefficients differ in size."""
-        unit = np.sqrt(np.maximum(self.covariance.diagonal(), 1e-300))
-        value, vector = np.linalg.eigh(self.covariance / np.outer(unit, unit))
-        return unit[:, None] * vector * np.sqrt(np.maximum(value, 0.0))
-
-    def _rows(self) -> Float32Array:
+    def rows(self) -> Float32Array:
         """Return (V, 3, 7 + K + R) float32 how each parameter moves each vertex."""
         pose = small_poses(self.surface.vertices).reshape(-1, 3, POSE).astype(np.float32)
         return np.concatenate([pose, self.surface.modes], axis=2)
@@ -124,8 +127,7 @@ class ShapePosterior:
 
 def shape_posterior(
     model: ShapeModel, target: ScanTarget, T_scan_model: Similarity, b: FloatArray, settings: RobustSettings,
-    *, with_scale: bool, seed: int = 0, marks: LandmarkConstraint | None = None,
-    replicates: int = REPLICATES,
+    *, with_scale: bool, marks: LandmarkConstraint | None = None, calibrated: bool = True,
 ) -> ShapePosterior:  # fmt: skip
     """Return the posterior near a fit with the pose `T_scan_model` and the coefficients `b` (K,) mm.
 
@@ -136,15 +138,18 @@ def shape_posterior(
         b: of the fit.
         settings: of the matches and their weights.
         with_scale: False holds the scale.
-        seed: of the simulated training sets.
         marks: landmarks of the scan, if any.
-        replicates: number of simulated training sets; 0 leaves their error out.
+        calibrated: whether to estimate the error from the training shapes (E4); a comparison of poses needs it not.
 
     Raises:
         FitError: hardly anything of the scan matches, or the scan does not determine the pose.
     """
-    size_mm = rms_size(model.mean_vertices)
-    problem = Problem.of(prepare(model), target, settings, T_scan_model.scale, with_scale=with_scale, marks=marks)
+    size_mm, training = rms_size(model.mean_vertices), model.training
+    size_stddev = None if training is None else training.log_scale_stddev
+    # If the sizes of the training shapes are known, the prior of the scale is about theirs, else about that of the fit.
+    start_scale = T_scan_model.scale if size_stddev is None else 1.0
+    settings = replace(settings, scale_stddev=size_stddev or settings.scale_stddev)
+    problem = Problem.of(prepare(model), target, settings, start_scale, with_scale=with_scale, marks=marks)
     iterate = problem.iterate(Estimate(T_scan_model, b))
     matcher = problem.matcher(_LEVEL)
     hint = matcher.first_hint(iterate.surface, iterate.T_scan_model, problem.prepared.tree)
@@ -152,7 +157,10 @@ def shape_posterior(
     own = problem.match(matcher, iterate, hint)
     beyond_mm2 = max(problem.unexplained_variance(own), 0.0)  # R17
     try:
-        problem, prior, iterate, line = _likeliest_range(problem, matcher, iterate, hint, beyond_mm2)
+        extra = residual_modes(model, settings.residual)
+        problem, prior = _with_residual_modes(problem, extra)
+        iterate = problem.iterate(Estimate(iterate.T_scan_model, np.pad(iterate.b, (0, len(extra.stddev)))))
+        line = _Linearised.of(problem, matcher, iterate, hint, prior, beyond_mm2)
         for _ in range(_LEVEL.iterations):
             before = iterate.T_scan_model.apply(iterate.surface.vertices)
             iterate = problem.iterate(iterate.estimate.moved_by(line.data.mean(line.variance) - line.theta))
@@ -160,7 +168,13 @@ def shape_posterior(
             if moved_mm < _SETTLED * size_mm * T_scan_model.scale:
                 break
             line = _Linearised.of(problem, matcher, iterate, line.weighted.matches.hint, prior, beyond_mm2)
-        covariance, left_out = _expected_error(model, line, problem, seed)
+        mean, left_out = line.data.mean(line.variance), None
+        covariance = line.data.covariance(line.variance)
+        if calibrated and training is not None:
+            log_scale = training.log_scale if with_scale else np.zeros(len(training))
+            known = np.column_stack([log_scale, training.coefficients])
+            left_out = leave_one_out(known, line.data.H, line.data.pull, mean, line.variance, extra)
+            covariance = left_out.covariance()
     except LinAlgError as error:
         raise FitError(
             f"{target.mesh.name}: what it shows does not determine the pose; give landmarks (--landmarks)."
@@ -173,30 +187,13 @@ def shape_posterior(
     )  # fmt: skip
 
 
-def _likeliest_range(
-    problem: Problem, matcher: Matcher, iterate: Iterate, hint: MatchHint, beyond_mm2: float
-) -> tuple[Problem, FloatArray, Iterate, _Linearised]:
-    """Return the problem with the residual modes that match the scan best, the prior variances (P,), and its start."""
-    starts: list[tuple[Problem, FloatArray, Iterate, _Linearised]] = []
-    for range_share in _RANGES:
-        free, prior = _with_residual_modes(problem, range_share)
-        start = free.iterate(Estimate(iterate.T_scan_model, np.pad(iterate.b, (0, len(prior) - POSE - len(iterate.b)))))
-        starts.append((free, prior, start, _Linearised.of(free, matcher, start, hint, prior, beyond_mm2)))
-    RANGE[0] = _RANGES[0]
-    best = max(start[3].log_evidence for start in starts)
-    return next(
-        start for start in starts if start[3].log_evidence > best - AS_LIKELY
-    )  # the shortest: it is the least certain
-
-
-def _with_residual_modes(problem: Problem, range_share: float) -> tuple[Problem, FloatArray]:
-    """Return the problem with the residual modes of a range, and the prior variances of its parameters (P,) (E1)."""
-    model, settings = problem.prepared.model, problem.settings
-    extra = residual_modes(model, replace(settings.residual, range_share=range_share))
+def _with_residual_modes(problem: Problem, extra: ResidualModes) -> tuple[Problem, FloatArray]:
+    """Return the problem with the residual modes, and the prior variances of its parameters (P,) (E1)."""
+    model = problem.prepared.model
     # The strongest residual modes have all of the variance that new shapes have outside the model.
     off_model = extra.stddev**2 * (lack_of_new_shapes(model) ** 2 * model.n_vertices / (extra.stddev**2).sum())
     size_mm = rms_size(model.mean_vertices)
-    scale = 0.0 if problem.prior.holds_scale else settings.scale_stddev**2
+    scale = problem.prior.scale_stddev**2
     prior = np.concatenate(
         [np.full(3, _LOOSE**2), np.full(3, (_LOOSE * size_mm) ** 2), [scale], variance_of_new_shapes(model), off_model]
     )
@@ -273,6 +270,11 @@ class _Data:
         factor, unit = self.factor(variance)
         return unit * cho_solve((factor, True), unit * self.pull)
 
+    def covariance(self, variance: FloatArray) -> FloatArray:
+        """Return the posterior covariance (P, P) with the prior variances `variance` (P,)."""
+        factor, unit = self.factor(variance)
+        return cho_solve((factor, True), np.eye(len(unit))) * np.outer(unit, unit)
+
     def log_evidence(self, variance: FloatArray) -> float:
         """Return the log evidence of the prior variances, up to a constant (E3)."""
         factor, unit = self.factor(variance)
@@ -290,18 +292,3 @@ def _likeliest_amplitude(data: _Data, prior: FloatArray, first: int, stddev: flo
     score = [data.log_evidence(_scaled(prior, first, a)) - 0.5 * (np.log(a) / stddev) ** 2 for a in _AMPLITUDES]
     best = int(np.argmax(score))
     return float(_AMPLITUDES[best]), score[best]
-
-
-def _expected_error(
-    model: ShapeModel, line: _Linearised, problem: Problem, seed: int
-) -> tuple[FloatArray, LeftOutErrors | None]:
-    """Return the covariance (P, P) of the error of the posterior mean, and the errors of left-out shapes (E4)."""
-    data, variance = line.data, line.variance
-    factor, unit = data.factor(variance)
-    posterior = cho_solve((factor, True), np.eye(len(variance))) * np.outer(unit, unit)
-    if model.training is None:
-        return posterior, None
-    C = model.training.coefficients
-    extra = residual_modes(model, replace(problem.settings.residual, range_share=RANGE[0]))
-    left = leave_one_out(C, data.H, data.pull, data.mean(variance), variance, extra)
-    return left.covariance(), left

@@ -60,6 +60,16 @@ _TEXTS: Mapping[ReasonCode, Callable[[Mapping[str, Any]], str]] = MappingProxyTy
             f"{100 * d['scattered_share']:.0f} % of the scan scatters widely around the fitted surface; remove its "
             "noise first"
         ),
+        ReasonCode.SCAN_UNEXPLAINED: lambda d: (
+            f"the model does not explain the scan: it lies {d['mismatch_mm']:.2f} mm (RMS) from the completed surface, "
+            f"where left-out training shapes lie at most {d['usual_mm']:.2f} mm from theirs; it is probably another "
+            "object, or contains parts of others"
+        ),
+        ReasonCode.NO_SKILL: lambda d: (
+            f"the missing part is not predicted better than by the mean shape: of {d['training_shapes']:.0f} training "
+            f"shapes left out in turn, the completion is nearer than the mean shape for {d['nearer']:.0f}; build a "
+            "model of more shapes, or give more of the object"
+        ),
         ReasonCode.FEW_TRAINING_SHAPES: lambda d: (
             f"the model is made of {d['training_shapes']:.0f} shapes, too few to predict how others differ, and this "
             f"shape leaves its span by {d['beyond_model_mm']:.1f} mm; build a model of at least {d['fewest_shapes']} "

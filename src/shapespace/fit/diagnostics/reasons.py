@@ -27,6 +27,9 @@ class ReasonCode(StrEnum):
     POSE_AMBIGUOUS = "pose_ambiguous"  # apart_mm
     PARTS_DISPLACED = "parts_displaced"  # displaced_share
     POINTS_SCATTERED = "points_scattered"  # scattered_share
+    # status doubtful: a completion, by the training shapes
+    SCAN_UNEXPLAINED = "scan_unexplained"  # mismatch_mm, usual_mm
+    NO_SKILL = "no_skill"  # training_shapes, nearer
     # status doubtful: the model
     FEW_TRAINING_SHAPES = "few_training_shapes"  # training_shapes, beyond_model_mm, fewest_shapes
     MODEL_TOO_NARROW = "model_too_narrow"  # spread_mm, z_rms

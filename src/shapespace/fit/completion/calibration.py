@@ -1,0 +1,135 @@
+"""Calibration of a completed surface on the training shapes: skill, and intervals of functions of the shape.
+
+Equation numbers are those of docs/completion.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import t as student
+
+from shapespace.fit.completion.leave_one_out import root_of
+from shapespace.fit.completion.shape_posterior import ShapePosterior
+from shapespace.fit.robust.kernels import Float32Array
+from shapespace.geometry.similarity import POSE, small_poses
+from shapespace.model.shape_model import ShapeModel
+from shapespace.types import BoolArray, FloatArray
+
+_SIGNIFICANT = 0.05  # probability to call a completion better than the mean shape that is not
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceCalibration:
+    """Completions of n training shapes, each by the model of the others, mm of the model's frame.
+
+    Args:
+        shapes: (n, V, 3) the training shapes.
+        errors: (n, V, 3) of their completions.
+        mean_errors: (n, V, 3) of the mean shape in the best pose on the observed vertices.
+        shifts: (n, V, 3) from the completion of the scan to the one by the model without the shape.
+        missing: (V,) True where the scan shows nothing.
+    """
+
+    shapes: Float32Array
+    errors: Float32Array
+    mean_errors: Float32Array
+    shifts: Float32Array
+    missing: BoolArray
+
+    def __len__(self) -> int:
+        """Return n, the number of shapes."""
+        return len(self.shapes)
+
+    @property
+    def skill(self) -> FloatArray:
+        """(V,) share of the mean shape's squared error that the completion removes; at most 1, negative if worse."""
+        own, mean = ((errors.astype(np.float64) ** 2).sum(axis=(0, 2)) for errors in (self.errors, self.mean_errors))
+        return 1.0 - own / np.maximum(mean, 1e-30)
+
+    @property
+    def mean_weight(self) -> FloatArray:
+        """(V,) weight of the mean shape that minimises the squared error of the left-out shapes, 0 to 1 (E10)."""
+        off = self.errors.astype(np.float64) - self.mean_errors
+        along = np.einsum("nvd,nvd->v", self.errors, off)
+        return np.clip(along / np.maximum(np.einsum("nvd,nvd->v", off, off), 1e-30), 0.0, 1.0)
+
+    @property
+    def log_ratios(self) -> FloatArray:
+        """(n,) logarithm of the RMS error of the mean shape over that of the completion, missing vertices."""
+        own, mean = (
+            (errors[:, self.missing].astype(np.float64) ** 2).sum(axis=(1, 2))
+            for errors in (self.errors, self.mean_errors)
+        )
+        return 0.5 * np.log(np.maximum(mean, 1e-30) / np.maximum(own, 1e-30))
+
+    @property
+    def is_skilled(self) -> bool:
+        """Whether missing vertices are predicted better than by the mean shape (t test over the shapes)."""
+        ratios = self.log_ratios
+        n = len(ratios)
+        limit = float(student.ppf(1.0 - _SIGNIFICANT, n - 1)) * float(ratios.std(ddof=1)) / np.sqrt(n)
+        return float(ratios.mean()) > limit
+
+    def interval(
+        self, function: Callable[[FloatArray], float], vertices: FloatArray, level: float
+    ) -> tuple[float, float, float, float]:
+        """Return mean, standard deviation and the ends of the interval of a function of the shape (E11, E12).
+
+        It is the cross-conformal interval of Barber et al. (Annals of Statistics 49(1), 2021, CV+), and that of the t
+        distribution if there are too few shapes for its quantiles.
+
+        Args:
+            function: of vertices (V, 3) in the frame of the model, mm.
+            vertices: (V, 3) of the completed surface in that frame.
+            level: probability of the interval.
+        """
+        n, value = len(self), function(vertices)
+        off = np.array([function(x + e) - function(x) for x, e in zip(self.shapes, self.errors, strict=True)])
+        others = np.array([function(vertices + shift) for shift in self.shifts])
+        spread = float(np.sqrt((off**2).mean() * (1.0 + 1.0 / n)))
+        k = int(np.floor((1.0 - level) * (n + 1)))
+        if k < 1:
+            reach = float(student.ppf(0.5 + level / 2, n - 1)) * spread  # E12
+            return value - float(off.mean()), spread, value - reach, value + reach
+        low, high = np.sort(others - np.abs(off)), np.sort(others + np.abs(off))
+        return value - float(off.mean()), spread, float(low[k - 1]), float(high[n - k])  # E11
+
+
+def calibrate(posterior: ShapePosterior, model: ShapeModel, missing: BoolArray) -> SurfaceCalibration | None:
+    """Return the calibration of the surface on the training shapes; None without them.
+
+    Args:
+        posterior: of the scan, with the errors of left-out shapes.
+        model: with all modes of its training shapes.
+        missing: (V,) True where the scan shows nothing.
+    """
+    left = posterior.left_out
+    if left is None:
+        return None
+    n, V = len(left.errors), model.n_vertices
+    rows = posterior.rows()
+    flat = rows.reshape(3 * V, -1)
+    rng = np.random.default_rng(0)
+    noise = root_of(left.noise) @ rng.standard_normal((len(left.noise), n))
+
+    def moved(parameters: FloatArray) -> Float32Array:
+        fields = (flat @ parameters.T.astype(np.float32)).T.reshape(n, V, 3)
+        # The completed surface follows the scan along its normals.
+        normals = posterior.surface.normals[~missing].astype(np.float32)
+        along = np.einsum("nvd,vd->nv", fields[:, ~missing], normals)
+        fields[:, ~missing] -= along[:, :, None] * normals
+        return fields
+
+    deviation = (left.known[:, 1:].astype(np.float32) @ model.vertex_basis.T.astype(np.float32)).reshape(n, V, 3)
+    mean = model.mean_vertices
+    pose = small_poses(mean).reshape(V, 3, POSE)
+    pose = pose if posterior.prior_variance[POSE - 1] > 0 else pose[:, :, : POSE - 1]
+    from_others = deviation * np.float32(len(model.training or ()) / max(len(model.training or ()) - 1, 1))
+    seen = pose[~missing].reshape(-1, pose.shape[2])
+    q = np.linalg.lstsq(seen, from_others[:, ~missing].reshape(n, -1).T, rcond=None)[0]
+    mean_errors = (pose.reshape(3 * V, -1) @ q).T.reshape(n, V, 3).astype(np.float32) - from_others
+    shapes = mean.astype(np.float32) + deviation
+    return SurfaceCalibration(shapes, moved(left.errors + noise.T), mean_errors, moved(left.shifts), missing)
