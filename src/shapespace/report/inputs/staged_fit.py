@@ -29,9 +29,9 @@ class Moment:
     Args:
         phase: 1 or 2.
         iteration: from 0, by phase.
-        rms_mm: what the loop saw, mm.
-        b: (K,) coefficients then, mm.
-        T_final_now: from the model's frame then to the frame of the final pose, in which all pictures are.
+        rms_mm: RMS closest distance, mm of the scan.
+        b: (K,) coefficients then, mm of the model's frame.
+        T_final_now: from the model's frame then to the picture frame, see `stage_arrays`.
     """
 
     phase: int
@@ -41,13 +41,13 @@ class Moment:
     T_final_now: Similarity
 
     def vertices(self, model: ShapeModel) -> FloatArray:
-        """Return the model's surface then, (V, 3), in the frame of the final pose."""
+        """Return the model's surface then, (V, 3), in the picture frame."""
         return self.T_final_now.apply(model.reconstruct(self.b))
 
 
 @dataclass(frozen=True, eq=False)
 class StagedFit:
-    """A fit in the frame of the pictures, with scan and model in the model's frame in mm.
+    """A fit in the picture frame: the axes of the model's frame, and the size of the scan in mm.
 
     Args:
         name: of the fit.
@@ -104,8 +104,8 @@ class StagedFit:
         1 % of the size of the model to the side; nowhere where the record says that the scan shows the whole model.
 
         Args:
-            surfaces: `final`, and `dense` where there is one, in the model's frame.
-            scan: as repaired, in the model's frame.
+            surfaces: `final`, and `dense` where there is one, in the picture frame.
+            scan: as repaired, in the picture frame.
             record: of the fit.
             name: of the fit.
             label: what pictures call it.
