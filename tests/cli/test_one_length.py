@@ -76,16 +76,18 @@ def test_distances_are_one_number_everywhere(run: Run, folder: Path, terminal: O
 
     record, row, view = record_in(folder), row_in(folder), ModelView.open(folder / "fits")
     (listed,) = view.fit_list()
-    drawn = facts_of(view.packed_fit("small"))["mean_mm"]["final"]
+    drawn = [facts_of(view.packed_fit("small"))["mean_mm"]["final"]]
     assert run("report", folder / "fits", "--no-open", "-o", folder / "report.html").code == 0
     report, notebook = (folder / "report.html").read_text(), result._repr_html_()
+    (folder / "fits" / "small.stages.npz").unlink()
+    drawn.append(facts_of(ModelView.open(folder / "fits").packed_fit("small"))["mean_mm"]["final"])
     for way, seen in zip(WAYS, ("model", "scan"), strict=True):
         mean = getattr(overlap, way).mean
         assert f"{mean:.2f} mm (" in terminal.out
         assert record["shown"][way]["mean"] == pytest.approx(mean)
         assert float(row[f"shown_{way}_mean_mm"]) == pytest.approx(mean)
         assert listed["shown"][way]["mean"] == pytest.approx(mean)
-        assert drawn[seen] == pytest.approx(mean, rel=1e-4)
+        assert [each[seen] for each in drawn] == pytest.approx([mean, mean], rel=1e-4), "with and without stages"
         assert mm(mean) in report and f"{mm(mean)} mean" in notebook
         whole = getattr(result.distances, way).mean
         assert record["distances_mm"]["final"][way]["mean"] == pytest.approx(whole)
