@@ -43,7 +43,6 @@ def record(name: str, k: int, *, status: str = "converged", **more: Any) -> dict
     shown = distances(0.3) | {"model_seen_share": 0.9, "scan_covered_share": 1.0}
     return found | {
         "shown": shown,
-        "shown_scan_mm": shown,
         "method": "robust",
         "start": "upright",
         "notes": [],

@@ -392,8 +392,8 @@ def _fit_all(
 
 
 def _vertex_error(vertices: FloatArray, scan: SimulatedScan) -> VertexErrors:
-    """Return how far `vertices`, in the scan's frame, lie from the true ones, in mm of the model's frame."""
-    error = np.linalg.norm(vertices - scan.truth_vertices, axis=1) / scan.T_scan_model.scale
+    """Return how far `vertices`, in the scan's frame, lie from the true ones, mm of the scan."""
+    error = np.linalg.norm(vertices - scan.truth_vertices, axis=1)
     return VertexErrors(mean=float(error.mean()), rms=float(np.sqrt((error**2).mean())), max=float(error.max()))
 
 

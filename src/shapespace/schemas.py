@@ -145,7 +145,7 @@ class Pose(Struct, frozen=True, kw_only=True):
 
 
 class Iteration(Struct, frozen=True, kw_only=True):
-    """One step of a fit; lengths in mm."""
+    """One step of a fit; lengths in mm of the scan."""
 
     phase: int
     iteration: int
@@ -181,6 +181,8 @@ class ReasonRecord(Struct, frozen=True, kw_only=True):
 class FitRecord(Struct, frozen=True, kw_only=True):
     """A NAME.fit.json; the fields are in the order of its keys.
 
+    Lengths are in mm of the scan, except coefficients, which are in mm of the model's frame.
+
     Args:
         id: SHA-256 of scan, model, landmarks, settings and version; the fitted surface's header has it too. Empty for a
             scan that could not be fitted, and in records of earlier versions.
@@ -194,23 +196,21 @@ class FitRecord(Struct, frozen=True, kw_only=True):
         model: the model.
         landmarks: the landmarks from which the fit started.
         T_scan_model: pose, in the scan's own frame and unit; None for a scan that could not be fitted, as are the rest.
-        b: (K,) coefficients in mm: norms over all vertices, so that b over the root of `n_vertices` is the RMS by
-            which a mode moves a vertex,
+        b: (K,) coefficients in mm of the model's frame: norms over all vertices, so that b over the root of
+            `n_vertices` is the RMS by which a mode moves a vertex,
         z: and in standard deviations.
-        b_stddev: (K,) mm.
+        b_stddev: (K,) mm of the model's frame.
         shrinkage: (K,) in [0, 1].
         found_landmarks: the model's landmarks, on the dense surface where there is one, by name.
         distances_mm: by stage, over the whole model and every scan point within its rim.
-        size_mm: root mean square distance of the fitted surface's vertices from their middle, mm of the scan.
+        size_mm: root mean square distance of the fitted surface's vertices from their middle.
         n_vertices: of that surface, V; None, as the next three are, in records of earlier versions.
         centroid_size_mm: root of the sum of those squares, which is size_mm times the root of V.
         extents_mm: of that surface along its principal axes, the longest first,
         area_mm2: and its area; None without triangles.
-        shown: distances of the final stage over what the scan shows, in mm of the model's frame; None, as the next
-            three are, in records of earlier versions.
-        shown_scan_mm: the same in mm of the scan.
-        shown_dense: of the dense surface, where there is one,
-        shown_dense_scan_mm: and in mm of the scan.
+        shown: distances of the final stage over what the scan shows; None, as the next is, in records of earlier
+            versions.
+        shown_dense: of the dense surface, where there is one.
     """
 
     CALLED: ClassVar = "the record of a fit"
@@ -228,9 +228,7 @@ class FitRecord(Struct, frozen=True, kw_only=True):
     reason: str = ""
     reasons: tuple[ReasonRecord, ...] = ()
     shown: OverlapDistances | None = None
-    shown_scan_mm: OverlapDistances | None = None
     shown_dense: OverlapDistances | None = None
-    shown_dense_scan_mm: OverlapDistances | None = None
     method: str = ""
     config: Mapping[str, Any] = {}
     start: str | None = None
@@ -285,7 +283,7 @@ class FitRecord(Struct, frozen=True, kw_only=True):
 
 _OF_FILES = frozenset(("name", "hash"))
 _OF_FAILED = frozenset(("reason", "config"))
-_NOT_ALWAYS = frozenset(("metadata", "shown_dense", "shown_dense_scan_mm", "area_mm2", "found_landmarks", "given_up"))
+_NOT_ALWAYS = frozenset(("metadata", "shown_dense", "area_mm2", "found_landmarks", "given_up"))
 """Keys of a fit that are left out where they are empty."""
 
 

@@ -25,6 +25,8 @@ from shapespace.batch.result_folder import names_for
 from shapespace.errors import FileError, FileFormatError
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.result import FitResult
+from shapespace.fit.vertex_regions import SHOWN
+from shapespace.geometry.closest import build_engine
 from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.schemas import File
 from shapespace.types import Mesh
@@ -109,12 +111,12 @@ def test_the_table_has_the_columns_of_the_contract_in_order(tmp_path: Path, resu
     assert rows[0]["checksum"] != rows[1]["checksum"]
 
 
-def test_what_scan_and_model_both_show_is_told_in_both_millimetres(tmp_path: Path) -> None:
+def test_distances_over_the_overlap_are_in_millimetres_of_the_scan(tmp_path: Path) -> None:
     half = raw_scan(np.array([0.5, -0.5, 1.0, 0.0, 0.3]), similarity(2, 10.0, 1.3), keep=0.0, noise_mm=0.1).scan
     fit = fit_scan(blob_model(), half, FitConfig())
     typed = fit_record(fit, SCAN, MODEL)
     record = typed.to_json()
-    shown, in_scan = record["shown"], record["shown_scan_mm"]
+    shown = record["shown"]
     assert 0.3 < shown["model_seen_share"] < 0.7 and shown["scan_covered_share"] > 0.8
     # Half of the model lies where the scan shows nothing, which is no fault of the fit.
     every = record["distances_mm"]["final"]["model_to_scan"]
@@ -123,14 +125,13 @@ def test_what_scan_and_model_both_show_is_told_in_both_millimetres(tmp_path: Pat
     assert not 0.95 < size < 1.05
     for direction in ("model_to_scan", "scan_to_model"):
         assert set(shown[direction]) == {*SUMMARY, "fraction"}
-        for length in SUMMARY - {"count"}:
-            assert in_scan[direction][length] == pytest.approx(size * shown[direction][length])
-        assert in_scan[direction]["count"] == shown[direction]["count"]
+    surface = fit.surface().vertices[np.isin(fit.regions, SHOWN)]
+    nearest_mm = build_engine(half).query(surface).distance * fit.mm_per_scan_unit
+    assert shown["model_to_scan"]["mean"] == pytest.approx(nearest_mm.mean())
     row = coefficient_row("one", typed)
     for direction in ("model_to_scan", "scan_to_model"):
         for measure in ("mean", "median"):
             assert row[f"shown_{direction}_{measure}_mm"] == shown[direction][measure]
-        assert row[f"shown_{direction}_mean_scan_mm"] == in_scan[direction]["mean"]
     assert row["model_seen_share"] == shown["model_seen_share"]
     write_coefficients(tmp_path / "c.csv", [row], 5)
     with (tmp_path / "c.csv").open(newline="") as stream:
@@ -154,7 +155,7 @@ def test_the_table_tells_pose_size_and_where_the_scan_was(result: FitResult, tmp
 
 
 def test_a_record_of_an_earlier_version_still_makes_a_row(result: FitResult) -> None:
-    record = structs.replace(fit_record(result, SCAN, MODEL), shown=None, shown_scan_mm=None, size_mm=None)
+    record = structs.replace(fit_record(result, SCAN, MODEL), shown=None, size_mm=None)
     row = coefficient_row("one", record)
     assert row["b1"] == result.b[0] and "model_seen_share" not in row
 
@@ -167,15 +168,16 @@ def test_names_that_look_like_formulas_are_made_harmless(tmp_path: Path) -> None
     assert (said["scan"], said["reason"]) == ("'=cmd()", "'@why")
 
 
-def test_stages_are_kept_for_figures_in_the_frame_of_the_model(tmp_path: Path, result: FitResult) -> None:
+def test_stages_are_kept_for_figures_in_the_size_of_the_scan(tmp_path: Path, result: FitResult) -> None:
     write_stages(tmp_path / "s.npz", result, blob_model())
     with np.load(tmp_path / "s.npz", allow_pickle=False) as stages:
-        assert np.allclose(stages["final"], blob_model().reconstruct(result.b), atol=1e-3)
+        size = result.T_scan_model.scale * result.mm_per_scan_unit
+        assert np.allclose(stages["final"], size * blob_model().reconstruct(result.b), atol=1e-3)
         assert np.allclose(np.abs(stages["model_to_scan_final"]), result.distances.model_to_scan_mm, rtol=1e-5)
         assert {"before", "initial", "scan_to_model_initial", "faces", "scan", "scan_faces", "regions"} <= set(
             stages.files
         )
-        assert np.allclose(stages["scan"], result.T_scan_model.inverse().apply(result.scan.vertices), atol=1e-3)
+        assert np.allclose(stages["scan"], size * result.T_scan_model.inverse().apply(result.scan.vertices), atol=1e-3)
 
 
 def test_the_iterations_kept_end_in_the_final_surface(tmp_path: Path, result: FitResult) -> None:

@@ -44,12 +44,13 @@ def test_sizes_are_those_of_the_fitted_surface_in_mm_of_the_scan(fitted: Fitted)
 
 def test_rms_columns_are_how_far_each_mode_moves_a_vertex(fitted: Fitted) -> None:
     result, _, row = fitted
+    scan_mm_per_model_mm = result.T_scan_model.scale * result.mm_per_scan_unit
     for k in range(MODEL.n_modes):
         b = np.zeros(MODEL.n_modes)
         b[k] = result.b[k]
         moved = np.sqrt(((MODEL.reconstruct(b) - MODEL.mean_vertices) ** 2).sum(axis=1).mean())
-        assert row[f"b{k + 1}_rms_mm"] == pytest.approx(moved)
+        assert row[f"b{k + 1}_rms_mm"] == pytest.approx(scan_mm_per_model_mm * moved)
     every = np.sqrt(((MODEL.reconstruct(result.b) - MODEL.mean_vertices) ** 2).sum(axis=1).mean())
-    assert row["shape_rms_mm"] == pytest.approx(every)
+    assert row["shape_rms_mm"] == pytest.approx(scan_mm_per_model_mm * every)
     columns = coefficient_columns(MODEL.n_modes)
     assert set(row) - {"reason"} <= set(columns) and columns[-1] == "model_hash"

@@ -105,11 +105,6 @@ def test_evidence_of_nothing_at_all_still_gives_figures() -> None:
     assert np.isfinite(astuple(estimate_error(best))).all()
 
 
-def test_a_diagnostic_by_its_name_in_brackets_still_works_and_warns() -> None:
-    with pytest.warns(DeprecationWarning, match=r"evidence\.spread_mm"):
-        assert GOOD["spread_mm"] == GOOD.spread_mm
-
-
 def cut_blob(*, missing: bool) -> Mesh:
     model = blob_model()
     shape = model.mesh(np.array([0.5, -0.5, 1.0, 0.0, 0.3]) * model.stddev)

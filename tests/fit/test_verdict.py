@@ -51,11 +51,7 @@ def test_what_is_returned_agrees_or_the_fit_is_not_converged(
     np.testing.assert_array_equal(surface.vertices, result.T_scan_model.apply(model.reconstruct(result.b)))
     np.testing.assert_allclose(result.z * model.stddev, result.b)
     measured = surface_distances(surface, result.scan).model_to_scan
-    assert result.distances.model_to_scan.mean * result.scan_mm_per_model_mm == pytest.approx(measured.mean, rel=1e-6)
-    in_scan_mm = result.overlap_distances.in_unit(result.scan_mm_per_model_mm)
-    assert in_scan_mm.scan_to_model.mean == pytest.approx(
-        result.overlap_distances.scan_to_model.mean * result.T_scan_model.scale
-    )
+    assert result.distances.model_to_scan.mean == pytest.approx(measured.mean, rel=1e-6)
     if result.status == "converged":
         assert (np.abs(result.b) <= 10 * np.sqrt(variance_of_new_shapes(model))).all()
         assert 0.8 < result.T_scan_model.scale < 1.25
@@ -117,9 +113,3 @@ def test_distances_over_what_the_scan_shows_leave_out_what_it_does_not() -> None
     assert half.distances.model_to_scan.mean > 5 * half.overlap_distances.model_to_scan.mean
     assert half.overlap_distances.model_to_scan.mean < 2 * whole.overlap_distances.model_to_scan.mean + 0.2
     assert 0.3 < half.overlap_distances.model_seen_share < 0.6 < 0.98 < whole.overlap_distances.model_seen_share
-
-
-def test_the_former_name_of_the_overlap_distances_still_works_and_warns() -> None:
-    result = fitted(8, "shape", "robust", False)
-    with pytest.warns(DeprecationWarning, match="overlap_distances"):
-        assert result.shown is result.overlap_distances

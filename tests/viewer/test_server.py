@@ -61,7 +61,6 @@ def test_a_dropped_scan_is_fitted_as_the_command_line_does(
     verdict = events[-2]
     assert verdict["status"] == "converged" and verdict["pictured"]
     assert 0 < verdict["shown"]["model_to_scan"]["mean"] < 1 and verdict["shown"]["model_seen_share"] > 0.9
-    assert verdict["shown_scan_mm"]["scan_to_model"]["mean"] > 0
 
     fit_file(Job("cli", scan_file), model, Path("blobs.h5"), tmp_path, FitConfig(), stages=True)
     expected = json.loads((tmp_path / "cli.fit.json").read_text())
@@ -385,17 +384,15 @@ def test_a_fit_without_stages_is_shown_from_its_surfaces_and_its_scan(start: Sta
 
 def test_the_list_of_fits_tells_what_scan_and_model_both_show(fits: Path) -> None:
     record = json.loads((fits / "a.fit.json").read_text())
-    older = {key: value for key, value in record.items() if key not in ("shown", "shown_scan_mm")}
+    older = {key: value for key, value in record.items() if key != "shown"}
     (fits / "older.fit.json").write_text(json.dumps(older))
     (fits / "odd.fit.json").write_text(json.dumps(record | {"shown": {"model_to_scan": 3}}))
     rows = {row["name"]: row for row in ModelView.open(fits).fit_list()}
-    for key in ("shown", "shown_scan_mm"):
-        for way in ("model_to_scan", "scan_to_model"):
-            told = rows["a"][key][way]
-            assert {name: told[name] for name in ("mean", "p95")} == {
-                name: record[key][way][name] for name in ("mean", "p95")
-            }
-        assert rows["a"][key]["model_seen_share"] == record["shown"]["model_seen_share"]
+    for way in ("model_to_scan", "scan_to_model"):
+        assert {name: rows["a"]["shown"][way][name] for name in ("mean", "p95")} == {
+            name: record["shown"][way][name] for name in ("mean", "p95")
+        }
+    assert rows["a"]["shown"]["model_seen_share"] == record["shown"]["model_seen_share"]
     assert rows["older"]["shown"] is None and rows["older"]["status"] == "converged"
     assert rows["odd"]["status"] == "unreadable" and rows["c"]["shown"] is None
 

@@ -138,9 +138,7 @@ def fit_record(
         reason=result.reason,
         reasons=tuple(ReasonRecord(code=reason.code.value, data=reason.data) for reason in result.reasons),
         shown=_overlap(result, "final"),
-        shown_scan_mm=_overlap(result, "final", result.scan_mm_per_model_mm),
         shown_dense=_overlap(result, "dense"),
-        shown_dense_scan_mm=_overlap(result, "dense", result.scan_mm_per_model_mm),
         method=result.method,
         config=dict(result.config),
         start=result.start,
@@ -221,11 +219,11 @@ def _both_ways(distances: SurfaceDistances) -> BothWays:
     )
 
 
-def _overlap(result: FitResult, stage: str, length: float = 1.0) -> OverlapDistances | None:
-    """Return the overlap distances at a stage, all lengths times `length`; None if the fit has no such stage."""
+def _overlap(result: FitResult, stage: str) -> OverlapDistances | None:
+    """Return the overlap distances at a stage; None if the fit has no such stage."""
     if stage not in result.stages:
         return None
-    overlap = result.overlap_distances_at(stage).in_unit(length)
+    overlap = result.overlap_distances_at(stage)
     return OverlapDistances(
         model_to_scan=_distances(overlap.model_to_scan),
         scan_to_model=_distances(overlap.scan_to_model),

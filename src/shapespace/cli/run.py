@@ -736,19 +736,19 @@ def _print_fit(name: str, record: FitRecord) -> None:
     file = record.scan.name
     # A scan that shares its file's name with others goes by the name of its results.
     called = file if stem_of(file) == name else f"{name} ({file})"
-    distances = _distances(record.shown, record.shown_scan_mm)
+    distances = _distances(record.shown)
     show(f"{called}: {record.status}" + (f": {distances}" if distances else ""))
-    if distances := _distances(record.shown_dense, record.shown_dense_scan_mm, measure="median"):
+    if distances := _distances(record.shown_dense, measure="median"):
         show(f"  dense surface: {distances}")
     for note in record.notes:
         show(f"  {note}")
 
 
-def _distances(overlap: OverlapDistances | None, in_scan: OverlapDistances | None, measure: str = "mean") -> str:
-    """Return the overlap distances in millimetres of the scan as text; empty if the record has none."""
-    if overlap is None or in_scan is None:
+def _distances(overlap: OverlapDistances | None, measure: str = "mean") -> str:
+    """Return the overlap distances as text; empty if the record has none."""
+    if overlap is None:
         return ""
-    distances = [getattr(way, measure) for way in (in_scan.model_to_scan, in_scan.scan_to_model)]
+    distances = [getattr(way, measure) for way in (overlap.model_to_scan, overlap.scan_to_model)]
     if any(value is None or not math.isfinite(value) for value in distances):
         return "scan and model do not overlap"
     shares = [

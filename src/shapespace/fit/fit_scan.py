@@ -213,7 +213,8 @@ def fit_scan(
         clock.append(time.perf_counter())
         stages = _measure(own, placed, driven, config)
         clock.append(time.perf_counter())
-        ended = Ended(own, placed.start, driven.fitted, stages, driven.ended, rms_size(own.mean_vertices))
+        size_mm = rms_size(own.mean_vertices) * driven.fitted.T_scan_fitted.scale
+        ended = Ended(own, placed.start, driven.fitted, stages, driven.ended, size_mm)
         status, reasons = judge(config.fitting, ended)
         if held is not None:
             driven = replace(
@@ -465,7 +466,7 @@ def _dense_stage(
         partial(_distances, model, target, T, fitted.b, dense.vertices_scan_mm),
         vertices=T_scan_mm.apply(dense.vertices_scan_mm),
         seen=dense.seen,
-        moved_mm=dense.moved_mm,
+        moved_mm=dense.moved_mm * fitted.T_scan_fitted.scale,
     )
 
 
@@ -479,8 +480,8 @@ def _distances(
 ) -> SurfaceDistances:  # fmt: skip
     """Measure the shape with coefficients `b` at `T`, or the surface `vertices_scan_mm` (V, 3) that was made of it.
 
-    Only the vertices of `region` (V,) count where there is one.
+    Distances are in mm of the scan. Only the vertices of `region` (V,) count where there is one.
     """
     vertices = T.apply(model.reconstruct(b)) if vertices_scan_mm is None else vertices_scan_mm
     placed = Mesh(vertices, model.faces, name="model")
-    return surface_distances(placed, target.mesh, scan_engine=target.engine, mm_per_length=1.0 / T.scale, region=region)
+    return surface_distances(placed, target.mesh, scan_engine=target.engine, region=region)

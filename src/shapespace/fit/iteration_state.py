@@ -24,8 +24,8 @@ class IcpState:
         T_scan_model: similarity from the model's frame to the scan's mm frame.
         b: (K,) coefficients, mm; zero throughout phase 1.
         rms_mm: RMS distance of the model's vertices that the method looks at, in both methods whether they count or
-            not, from their closest scan points, mm of the model's frame.
-        motion_mm: largest movement of a model vertex in this iteration, mm of the model's frame.
+            not, from their closest scan points, mm of the scan.
+        motion_mm: largest movement of a model vertex in this iteration, mm of the scan.
         stopped: None while running, else why: `rate`, or `cap`.
     """
 
@@ -51,7 +51,7 @@ class Fitted:
         shrinkage: (K,) in [0, 1]: 1 where the scan determines the coefficient, 0 where only the prior does.
         T_scan_fitted: pose of the surface that was fitted, before its projection onto the model's modes.
         vertices_scan_mm: (V, 3) that surface in the scan's mm frame; it may leave the span of the model,
-        outside_mm: by this (RMS), mm of the model's frame.
+        outside_mm: by this (RMS), mm of the scan.
         regions: finds the code of each vertex, (V,), in `fit.regions.REGIONS`.
         evidence: diagnostics from which the status is computed; None of a method without any.
         b_covariance: (K, K) of the coefficients, mm^2, where the method finds it.
@@ -99,8 +99,8 @@ class StopRule:
 
     Args:
         rate: stop when |e_k - e_(k-1)| is at most this share of e_(k-1).
-        motion_mm: and no vertex moves more than this; the RMS alone is blind to sliding (erratum to step 4).
-            Infinity gives the rule as printed.
+        motion_mm: and no vertex moves more than this, mm of the model's frame; the RMS alone is blind to sliding
+            (erratum to step 4). Infinity gives the rule as printed.
         max_iterations: cap of each phase.
 
     Raises:
@@ -116,7 +116,7 @@ class StopRule:
             raise InputError("A stopping rule needs a positive rate and motion and at least one iteration.")
 
     def why(self, rms_mm: Sequence[float], motion_mm: float) -> str | None:
-        """Return `rate` or `cap` when the history of `rms_mm` says stop, else None."""
+        """Return `rate` or `cap` when the history of `rms_mm` says stop, else None; both in mm of the model's frame."""
         if len(rms_mm) >= 2:
             change = abs(rms_mm[-1] - rms_mm[-2])
             if change <= self.rate * max(rms_mm[-2], 1e-12) and motion_mm <= self.motion_mm:

@@ -41,7 +41,7 @@ class Ended:
         fitted: where it ended, in that frame.
         stages: the surface at each stage, with its distances when they are asked for.
         phases: the last state of each phase, by its number.
-        size_mm: of the model: RMS distance of its mean from its centre, mm.
+        size_mm: RMS distance of the model's mean from its centre, mm of the scan.
     """
 
     model: ShapeModel

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class OverlapDistances:
-    """Distances over the parts that scan and model both contain, in mm: look at these first.
+    """Distances over the parts that scan and model both contain, mm of the scan: look at these first.
 
     Args:
         model_to_scan: over the model's vertices that the scan shows; the others are estimates.
@@ -46,12 +45,6 @@ class OverlapDistances:
     scan_to_model: DistanceSummary
     model_seen_share: float
     scan_covered_share: float
-
-    def in_unit(self, length: float) -> OverlapDistances:
-        """Return the distances with all lengths times `length`, as for millimetres of the scan."""
-        return replace(
-            self, model_to_scan=self.model_to_scan.times(length), scan_to_model=self.scan_to_model.times(length)
-        )
 
 
 Status: TypeAlias = Literal["converged", "max_iterations", "doubtful", "failed"]
@@ -69,7 +62,7 @@ class Stage:
         measure: measures the distances to the scan.
         vertices: (V, 3) in the scan's frame and unit where the surface is not the model's with b; else None.
         seen: (V,) False where the scan does not show such a surface; else None.
-        moved_mm: RMS displacement of such a surface along its normals over seen vertices, mm of the model's frame.
+        moved_mm: RMS displacement of such a surface along its normals over seen vertices, mm of the scan.
     """
 
     T_scan_model: Similarity
@@ -83,7 +76,7 @@ class Stage:
 
     @cached_property
     def distances(self) -> SurfaceDistances:
-        """Distances to the scan and back, mm of the model's frame, measured when first asked for."""
+        """Distances to the scan and back, mm of the scan, measured when first asked for."""
         return self.measure()
 
 
@@ -91,15 +84,17 @@ class Stage:
 class FitResult:
     """A fitted scan.
 
+    Lengths are in mm of the scan, its real size; only the coefficients `b` and `b_stddev` are in mm of the model.
+
     Args:
         scan_name: as the mesh was named.
         status: `converged`, `max_iterations`, or `doubtful` when the fit should not be trusted.
         reasons: why it has that status, as codes with data.
         T_scan_model: from the model's frame (mm) to the scan's frame and unit.
         mm_per_scan_unit: the scan's unit as found or given.
-        b: (K,) coefficients, mm.
-        b_stddev: (K,) their standard deviation, mm. Of the robust method it is calibrated (docs/uncertainty.md); of the
-            paper's it goes by the model's own noise and is mostly too small.
+        b: (K,) coefficients, mm of the model's frame.
+        b_stddev: (K,) their standard deviation, mm of the model's frame. Of the robust method it is calibrated
+            (docs/uncertainty.md); of the paper's it depends on the model's own noise and is mostly too small.
         shrinkage: (K,) in [0, 1]: near 1 where the scan determines the coefficient, near 0 where only the prior does.
         z: (K,) b in standard deviations of the model.
         z_covariance: (K, K) of z, calibrated; None of the paper's method. It is in no file.
@@ -219,27 +214,16 @@ class FitResult:
 
     @property
     def distances(self) -> SurfaceDistances:
-        """Distances of the final surface, mm of the model's frame, over all vertices."""
+        """Distances of the final surface, mm of the scan, over all vertices."""
         return self.stages["final"].distances
-
-    @property
-    def scan_mm_per_model_mm(self) -> float:
-        """Millimetres of the scan per millimetre of the model's frame: 1 where the pose has no free scale."""
-        return self.T_scan_model.scale * self.mm_per_scan_unit
 
     @cached_property
     def overlap_distances(self) -> OverlapDistances:
-        """Distances of the final surface where scan and model overlap, mm of the model's frame."""
+        """Distances of the final surface where scan and model overlap, mm of the scan."""
         return self.overlap_distances_at("final")
 
-    @property
-    def shown(self) -> OverlapDistances:
-        """Deprecated: use `overlap_distances`."""
-        warnings.warn("FitResult.shown is now FitResult.overlap_distances.", DeprecationWarning, stacklevel=2)
-        return self.overlap_distances
-
     def overlap_distances_at(self, stage: str) -> OverlapDistances:
-        """Return the distances at `stage` where scan and model overlap at the end of the fit."""
+        """Return the distances at `stage` where scan and model overlap at the end of the fit, mm of the scan."""
         distances, seen = self.stages[stage].distances, np.isin(self.regions, SHOWN)
         counted = slice(None) if distances.model_counted is None else distances.model_counted
         forward, backward = (

@@ -10,28 +10,30 @@ import numpy.typing as npt
 from shapespace.fit.result import FitResult
 from shapespace.fit.scan_target import mm_frame
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import FloatArray
+from shapespace.types import FloatArray, Similarity
 
-STAGES_VERSION = 2  # of the file with the stages of a fit; 2 is the format of the current release
+STAGES_VERSION = 3  # of the file with the stages of a fit
 
 
 def stage_arrays(result: FitResult, model: ShapeModel) -> dict[str, npt.NDArray[Any]]:
-    """Return what NAME.stages.npz holds: all that pictures of a fit need, in the model's frame in mm.
+    """Return the content of NAME.stages.npz: all data of pictures of a fit, in the picture frame.
+
+    The picture frame has the origin and the axes of the model's frame and the size of the scan, in mm.
 
     Of each stage the vertices (V, 3), the signed distances `model_to_scan_STAGE` (V,) and `scan_to_model_STAGE` (S,),
     positive where the scan lies outside of the model, not-a-number at scan points beyond the model's rim. `scan` and
     `scan_faces` are the scan as repaired; `regions` the codes of `fit.regions.REGIONS`; `history_*` each iteration,
-    with T (I, 3, 4) from the model's frame then to the frame of the final pose. Of a scan with colours, `scan_colours`
+    with T (I, 3, 4) from the model's frame then to the picture frame. Of a scan with colours, `scan_colours`
     (S, 3), `colours_final` and `colours_dense` (V, 3) are there too, uint8.
     """
-    T_model_scan = result.T_scan_model.inverse()
+    T_picture_scan = picture_frame(result.T_scan_model, result.mm_per_scan_unit)
     arrays: dict[str, npt.NDArray[Any]] = {
         "format_version": np.array(STAGES_VERSION),
-        "scan": T_model_scan.apply(result.scan.vertices).astype(np.float32),
+        "scan": T_picture_scan.apply(result.scan.vertices).astype(np.float32),
         "regions": result.regions.astype(np.uint8),
     }
     for name, stage in result.stages.items():
-        arrays[name] = T_model_scan.apply(result.surface(model, name).vertices).astype(np.float32)
+        arrays[name] = T_picture_scan.apply(result.surface(model, name).vertices).astype(np.float32)
         arrays[f"model_to_scan_{name}"] = stage.distances.model_to_scan_signed_mm.astype(np.float32)
         arrays[f"scan_to_model_{name}"] = stage.distances.scan_to_model_signed_mm.astype(np.float32)
         if stage.seen is not None:
@@ -44,8 +46,8 @@ def stage_arrays(result: FitResult, model: ShapeModel) -> dict[str, npt.NDArray[
         arrays["faces"] = model.faces
     if result.scan.faces is not None:
         arrays["scan_faces"] = result.scan.faces
-    T_model_mm = T_model_scan @ mm_frame(result.scan, result.mm_per_scan_unit).inverse()
-    T = [T_model_mm @ state.T_scan_model for state in result.history]
+    T_picture_mm = T_picture_scan @ mm_frame(result.scan, result.mm_per_scan_unit).inverse()
+    T = [T_picture_mm @ state.T_scan_model for state in result.history]
     arrays["history_phase"] = np.array([state.phase for state in result.history], dtype=np.int32)
     arrays["history_iteration"] = np.array([state.iteration for state in result.history], dtype=np.int32)
     arrays["history_rms_mm"] = np.array([state.rms_mm for state in result.history], dtype=np.float32)
@@ -54,6 +56,12 @@ def stage_arrays(result: FitResult, model: ShapeModel) -> dict[str, npt.NDArray[
         [np.column_stack([each.scale * each.rotation, each.translation]) for each in T], dtype=np.float64
     ).reshape(-1, 3, 4)
     return arrays
+
+
+def picture_frame(T_scan_model: Similarity, mm_per_scan_unit: float) -> Similarity:
+    """Return the similarity from the scan's own frame and unit to the picture frame of its fit."""
+    R = T_scan_model.rotation.T
+    return Similarity(mm_per_scan_unit, R, -mm_per_scan_unit * (R @ T_scan_model.translation))
 
 
 def _padded(b: FloatArray, modes: int) -> FloatArray:

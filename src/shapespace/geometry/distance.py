@@ -6,7 +6,7 @@ together (Sariyanidi et al., IJCB 2023).
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -43,17 +43,6 @@ class DistanceSummary:
             max=float(used.max()),
             count=len(used),
             fraction=len(used) / len(distance_mm),
-        )
-
-    def times(self, length: float) -> DistanceSummary:
-        """Return the same with all lengths times `length`."""
-        return replace(
-            self,
-            mean=self.mean * length,
-            median=self.median * length,
-            rms=self.rms * length,
-            p95=self.p95 * length,
-            max=self.max * length,
         )
 
 
@@ -122,7 +111,7 @@ def surface_distances(
         model: the model's surface, in the frame of the scan.
         scan: the scan; point clouds are measured to their points.
         scan_engine: the scan's search structure when it is there already.
-        mm_per_length: what one length in this frame is worth in mm of the model's frame.
+        mm_per_length: length of one unit of this frame, mm.
         region: (V,) the model's vertices that count; the scan is then measured to what lies between them. None for all.
     """
     require(model, Mesh, "surface_distances", "convert it with shapespace.as_mesh")

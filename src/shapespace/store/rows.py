@@ -19,7 +19,6 @@ _SIZES = ("centroid_size_mm", "length_mm", "width_mm", "depth_mm", "area_mm2")
 _LAST_COLUMNS = (
     *(f"shown_{direction}_{measure}_mm" for direction in _DIRECTIONS for measure in ("mean", "median")),
     *_SHARES,
-    *(f"shown_{direction}_mean_scan_mm" for direction in _DIRECTIONS),
     "path",
     *_EXPECTED,
     "size_mm",
@@ -93,10 +92,11 @@ def _size_cells(record: FitRecord) -> dict[str, Any]:
 
 
 def _moved_cells(record: FitRecord) -> dict[str, float]:
-    """Return the RMS by which each mode, and all together, move a vertex from the mean; b is a norm over all."""
-    if not record.n_vertices:
+    """Return the RMS, mm of the scan, by which each mode, and all together, move a vertex; b is a norm over all."""
+    if not record.n_vertices or record.T_scan_model is None or record.mm_per_scan_unit is None:
         return {}
-    moved = np.abs(np.asarray(record.b, dtype=np.float64)) / np.sqrt(float(record.n_vertices))
+    scan_mm_per_model_mm = record.T_scan_model.scale * record.mm_per_scan_unit
+    moved = np.abs(np.asarray(record.b, dtype=np.float64)) * scan_mm_per_model_mm / np.sqrt(float(record.n_vertices))
     cells = {f"b{k}_rms_mm": float(value) for k, value in enumerate(moved, 1)}
     return cells | {"shape_rms_mm": float(np.linalg.norm(moved))}
 
@@ -106,14 +106,13 @@ def _distance_column(direction: str, measure: str) -> str:
 
 
 def _overlap_cells(record: FitRecord) -> dict[str, Any]:
-    overlap, in_scan = record.shown, record.shown_scan_mm
-    if overlap is None or in_scan is None:  # of a fit by an earlier version
+    overlap = record.shown
+    if overlap is None:  # of a fit by an earlier version
         return {}
     cells: dict[str, Any] = {key: getattr(overlap, key) for key in _SHARES}
     for direction in _DIRECTIONS:
         summary: Distances = getattr(overlap, direction)
         cells |= {f"shown_{direction}_{measure}_mm": getattr(summary, measure) for measure in ("mean", "median")}
-        cells[f"shown_{direction}_mean_scan_mm"] = getattr(in_scan, direction).mean
     return cells
 
 

@@ -33,7 +33,7 @@ MAX_TRIANGLES = 300_000
 """Triangles of a scan that are sent to the page; the fit uses all."""
 _MAX_MESSAGE_BYTES = 2**24  # bytes of a message of the fitting process; a state has some hundred kB
 _VERDICT_KEYS = (
-    "status", "reason", "shown", "shown_scan_mm", "notes", "start", "seconds", "iterations", "b", "z", "b_stddev",
+    "status", "reason", "shown", "notes", "start", "seconds", "iterations", "b", "z", "b_stddev",
     "distances_mm",
 )  # fmt: skip
 """Keys of a record that are sent to the page."""

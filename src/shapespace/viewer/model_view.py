@@ -214,7 +214,6 @@ class ModelView:
         }
         row |= {
             "shown": to_json(fit.record.shown),
-            "shown_scan_mm": to_json(fit.record.shown_scan_mm),
             "model_to_scan_mm": _number(fit.summary_mm("final", "model_to_scan", "mean")),
             "scan_to_model_mm": _number(fit.summary_mm("final", "scan_to_model", "mean")),
             "expected_error_mm": _number(fit.expected_error_mm),

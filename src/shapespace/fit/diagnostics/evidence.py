@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import asdict, dataclass
 
 
 @dataclass(frozen=True, kw_only=True)
 class MatchEvidence:
-    """Diagnostics of the last iterate. Lengths are in mm of the model's frame, shares in [0, 1].
+    """Diagnostics of the last iterate. Lengths are in mm of the scan, shares in [0, 1].
 
     Args:
-        size_mm: RMS distance of the model's mean from its centroid.
+        size_mm: RMS distance of the model's mean, at the scale of the fit, from its centroid.
         seen_share: share of the model's vertices at which a point of the scan counts.
         model_matched_share: share of the model's vertices whose match has at least half the largest weight.
         model_allowed_share: share of the model's vertices whose matches may count.
@@ -26,8 +25,8 @@ class MatchEvidence:
         left_out_mm: RMS distance of the fitted surface from the span of the model.
         model_spread_mm: RMS distance of a training vertex from the mean.
         model_lack_mm: RMS distance of new shapes from the span of the model.
-        marks_stddev_mm: standard deviation of the given landmarks, mm of the scan; None without landmarks.
-        marks_rms_mm: RMS distance of the given landmarks from their places, mm of the scan; None without landmarks.
+        marks_stddev_mm: standard deviation of the given landmarks; None without landmarks.
+        marks_rms_mm: RMS distance of the given landmarks from their places; None without landmarks.
         posterior_error_mm: RMS vertex error by the posterior, with what is outside the model's modes.
     """
 
@@ -103,8 +102,3 @@ class FitEvidence(ScanEvidence):
     def to_dict(self) -> dict[str, float]:
         """Return the diagnostics by name, without those that were not measured."""
         return {name: value for name, value in asdict(self).items() if value is not None}
-
-    def __getitem__(self, name: str) -> float:
-        """Return a diagnostic by its name, as when evidence was a dictionary; deprecated."""
-        warnings.warn(f"evidence[{name!r}] is deprecated; use evidence.{name}.", DeprecationWarning, stacklevel=2)
-        return self.to_dict()[name]

@@ -200,7 +200,7 @@ FAILURE_OFFSET, FAILURE_SLOPE = 0.132, 3.429
 
 @dataclass(frozen=True)
 class ErrorEstimate:
-    """Expected error of a fit: the mean over the model's vertices, mm of the model's frame.
+    """Expected error of a fit: the mean over the model's vertices, mm of the scan.
 
     Args:
         expected_error_mm: half of such fits have a smaller error.

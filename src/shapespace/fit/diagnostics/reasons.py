@@ -60,7 +60,7 @@ class Reason:
 
     Args:
         code: the kind of reason.
-        data: its numbers by name, lengths in mm of the model's frame, see `ReasonCode`; the text of `OTHER`.
+        data: its numbers by name, lengths in mm of the scan, see `ReasonCode`; the text of `OTHER`.
     """
 
     code: ReasonCode

@@ -42,9 +42,7 @@ def find_contradictions(ended: Ended) -> list[Reason]:
     scale_ratio = float(fitted.T_scan_model.scale / fitted.T_scan_fitted.scale)
     if abs(np.log(scale_ratio)) > _OTHER_SCALE:
         reasons.append(Reason(ReasonCode.PROJECTED_SCALE, {"scale_ratio": scale_ratio}))
-    T_model_scan = fitted.T_scan_fitted.inverse()
-    projected = (T_model_scan @ fitted.T_scan_model).apply(model.reconstruct(fitted.b))
-    moved = T_model_scan.apply(fitted.vertices_scan_mm) - projected
+    moved = fitted.vertices_scan_mm - fitted.T_scan_model.apply(model.reconstruct(fitted.b))
     moved_mm = float(np.sqrt((moved**2).sum(axis=1).mean()))
     if moved_mm > _MOVED_AWAY * fitted.outside_mm + _LEAST_MOVED_SHARE * ended.size_mm:
         reasons.append(Reason(ReasonCode.PROJECTED_SURFACE, {"moved_mm": moved_mm}))

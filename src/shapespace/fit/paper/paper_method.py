@@ -78,7 +78,7 @@ class Paper:
         for state in shape_icp(model, engine, T_scan_model, stop, with_scale=limits.with_scale):
             T_scan_model, b, rms_mm = state.T_scan_model, state.b, state.rms_mm
             yield state
-        b_stddev = posterior_stddev(model, rms_mm**2 / 3.0)
+        b_stddev = posterior_stddev(model, (rms_mm / T_scan_model.scale) ** 2 / 3.0)
         return Fitted(
             T_scan_model=T_scan_model,
             b=b,
@@ -97,7 +97,7 @@ class Paper:
             {
                 "rms_mm": ended.phases[2].rms_mm,
                 "stop_rate": self.stop_rate,
-                "stop_motion_mm": self.stop_motion_mm,
+                "stop_motion_mm": self.stop_motion_mm * ended.fitted.T_scan_model.scale,
             },
         )
 

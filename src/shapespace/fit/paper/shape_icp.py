@@ -41,8 +41,8 @@ def shape_icp(
     Q = model.reconstruct(b)  # P6
     y = T_scan_model.apply(Q)
     matched = scan.query(y)
-    rms_mm = [matched.rms / T_scan_model.scale]
-    yield IcpState(2, 0, T_scan_model, b, rms_mm[0], np.inf)
+    rms_model_mm = [matched.rms / T_scan_model.scale]
+    yield IcpState(2, 0, T_scan_model, b, matched.rms, np.inf)
 
     for iteration in range(1, stop.max_iterations + 1):
         c = matched.points  # step 1: closest points of the current deformed model
@@ -52,15 +52,15 @@ def shape_icp(
         Q = model.reconstruct(b)  # P6: the deformed model
         moved, y = y, T_scan_model.apply(Q)
         matched = scan.query(y, near=matched)
-        rms_mm.append(matched.rms / T_scan_model.scale)
-        motion_mm = largest_motion(y - moved) / T_scan_model.scale
-        stopped = stop.why(rms_mm, motion_mm)  # step 4
+        rms_model_mm.append(matched.rms / T_scan_model.scale)
+        motion_mm = largest_motion(y - moved)
+        stopped = stop.why(rms_model_mm, motion_mm / T_scan_model.scale)  # step 4
         yield IcpState(
             phase=2,
             iteration=iteration,
             T_scan_model=T_scan_model,
             b=b,
-            rms_mm=rms_mm[-1],
+            rms_mm=matched.rms,
             motion_mm=motion_mm,
             stopped=stopped,
         )

@@ -31,23 +31,23 @@ def similarity_icp(
     Q_mean, b = model.mean_vertices, np.zeros(model.n_modes)
     p = T_scan_model.apply(Q_mean)
     matched = scan.query(p)
-    rms_mm = [matched.rms / T_scan_model.scale]
-    yield IcpState(1, 0, T_scan_model, b, rms_mm[0], np.inf)
+    rms_model_mm = [matched.rms / T_scan_model.scale]
+    yield IcpState(1, 0, T_scan_model, b, matched.rms, np.inf)
 
     for iteration in range(1, stop.max_iterations + 1):
         p_prime = matched.points  # P7: the closest scan point of each model vertex
         T_scan_model = fit_pose(Q_mean, p_prime, T_scan_model, with_scale)  # P8-P18
         moved, p = p, T_scan_model.apply(Q_mean)
         matched = scan.query(p, near=matched)
-        rms_mm.append(matched.rms / T_scan_model.scale)
-        motion_mm = largest_motion(p - moved) / T_scan_model.scale
-        stopped = stop.why(rms_mm, motion_mm)
+        rms_model_mm.append(matched.rms / T_scan_model.scale)
+        motion_mm = largest_motion(p - moved)
+        stopped = stop.why(rms_model_mm, motion_mm / T_scan_model.scale)
         yield IcpState(
             phase=1,
             iteration=iteration,
             T_scan_model=T_scan_model,
             b=b,
-            rms_mm=rms_mm[-1],
+            rms_mm=matched.rms,
             motion_mm=motion_mm,
             stopped=stopped,
         )

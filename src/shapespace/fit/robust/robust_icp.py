@@ -99,8 +99,8 @@ class WeightedMatches:
 
     @property
     def rms_mm(self) -> float:
-        """RMS closest distance of the sampled vertices of the model, mm of the model's frame."""
-        return float(np.sqrt((self.matches.vertices.distance**2).mean()))
+        """RMS closest distance of the sampled vertices of the model, mm of the scan."""
+        return float(np.sqrt((self.matches.vertices.near.distance**2).mean()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -432,7 +432,7 @@ def _summary(
         shrinkage=known.shrinkage(wanted),
         T_scan_fitted=T,
         vertices_scan_mm=T.apply(surface.vertices),
-        outside_mm=float(np.linalg.norm(iterate.b[wanted:]) / np.sqrt(len(surface.vertices))),
+        outside_mm=T.scale * float(np.linalg.norm(iterate.b[wanted:]) / np.sqrt(len(surface.vertices))),
         regions=FinalMatches(
             target=target,
             T_scan_model=T,
@@ -445,12 +445,12 @@ def _summary(
         ),
         match_evidence=MatchEvidence(
             **_matched(weighted, gathered, iterate, model, known.prior_variance[: model.n_modes]),
-            beyond_model_mm=beyond_mm,
-            left_out_mm=float(np.sqrt(left_out_mm2)),
-            model_spread_mm=float(np.sqrt((model.stddev**2).sum() / model.n_vertices)),
-            model_lack_mm=lack_of_new_shapes(model),
+            beyond_model_mm=T.scale * beyond_mm,
+            left_out_mm=T.scale * float(np.sqrt(left_out_mm2)),
+            model_spread_mm=T.scale * float(np.sqrt((model.stddev**2).sum() / model.n_vertices)),
+            model_lack_mm=T.scale * lack_of_new_shapes(model),
             **_of_marks(problem, iterate),
-            posterior_error_mm=float(np.hypot(known.surface_mm, np.sqrt(left_out_mm2))),
+            posterior_error_mm=T.scale * float(np.hypot(known.surface_mm, np.sqrt(left_out_mm2))),
         ),
         notes=() if problem.marks is None else problem.marks.notes(surface, T),
         landmark_covariance=_of_landmarks(model, known, surface, T),
@@ -487,8 +487,9 @@ def _matched(
     """
     points, vertices, v = weighted.matches.points, weighted.matches.vertices, weighted.weights.vertices
     size_mm, z2 = rms_size(model.mean_vertices), iterate.b[: model.n_modes] ** 2 / variance
+    scale = iterate.T_scan_model.scale
     return {
-        "size_mm": size_mm,
+        "size_mm": scale * size_mm,
         "seen_share": float(gathered.seen.mean()),
         "model_matched_share": float((v > _HALF * v.max()).mean()),
         "model_allowed_share": float(vertices.allowed.mean()),
@@ -497,8 +498,8 @@ def _matched(
         "model_near_share": float((vertices.distance < _NEAR * size_mm).mean()),
         "z2": float(z2.mean()),
         "z2_leading": float(z2[:_LEADING].mean()),
-        "log_scale": float(np.log(iterate.T_scan_model.scale)),
-        "spread_mm": weighted.sigma_mm,
+        "log_scale": float(np.log(scale)),
+        "spread_mm": scale * weighted.sigma_mm,
     }
 
 
@@ -520,7 +521,7 @@ def _states(
             T_scan_model=T,
             b=b,
             rms_mm=step.weighted.rms_mm,
-            motion_mm=step.motion_mm,
+            motion_mm=step.motion_mm * T.scale,
             stopped=stopped,
         )
         course = replace(course, iterate=step.iterate, hint=step.weighted.matches.hint)

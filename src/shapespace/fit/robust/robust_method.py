@@ -49,8 +49,8 @@ class Robust(RobustSettings):
         measured = ScanEvidence(
             **asdict(fitted.match_evidence),
             training_shapes=float(model.n_training),
-            start_score_mm=start.score_mm,
-            start_runner_up_score_mm=start.runner_up_score_mm,
+            start_score_mm=start.score_mm * start.T_scan_model.scale,
+            start_runner_up_score_mm=start.runner_up_score_mm * start.T_scan_model.scale,
             **asdict(find_layers(model, scan, fitted)),
             **asdict(find_displaced(model, scan, fitted)),
         )

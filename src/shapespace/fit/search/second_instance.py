@@ -19,7 +19,7 @@ from shapespace.fit.robust.robust_settings import RobustSettings
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.search.initialisation import Start
 from shapespace.geometry.closest import build_engine
-from shapespace.geometry.normals import boundary_vertices, part_of, rms_size, vertex_normals
+from shapespace.geometry.normals import boundary_vertices, part_of, vertex_normals
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh, Similarity
@@ -49,9 +49,9 @@ class SecondInstance:
     """A second instance of the object in the scan.
 
     Args:
-        away_mm: distance of its centroid from that of the first, mm of the model's frame.
-        gap_mm: gap between the two along the line through their centroids, mm of the model's frame; negative where
-            they overlap.
+        away_mm: distance of its centroid from that of the first, mm of the scan.
+        gap_mm: gap between the two along the line through their centroids, mm of the scan; negative where they
+            overlap.
     """
 
     away_mm: float
@@ -82,9 +82,9 @@ def find_second_instance(
     """
     if fitted.match_evidence.scan_near_share > _EXPLAINED:
         return None
-    size_mm, scale = rms_size(model.mean_vertices), fitted.T_scan_fitted.scale
+    size_mm = fitted.match_evidence.size_mm
     placed = build_engine(Mesh(fitted.vertices_scan_mm, model.faces))
-    is_far = placed.query(target.mesh.vertices).distance > _NEAR * size_mm * scale
+    is_far = placed.query(target.mesh.vertices).distance > _NEAR * size_mm
     if is_far.sum() < max(_FEWEST, _LEAST_REST * len(is_far)):
         return None
     remaining_target = ScanTarget(part_of(target.mesh, is_far))
@@ -98,14 +98,16 @@ def find_second_instance(
     except (FitError, InputError):
         return None
     own, second_evidence = fitted.match_evidence, second_fit.match_evidence
-    if failure_score(second_evidence) > 0.0 or second_evidence.spread_mm > _AS_GOOD * own.spread_mm:
+    if failure_score(second_evidence) > 0.0 or second_evidence.spread_mm / second_evidence.size_mm > (
+        _AS_GOOD * own.spread_mm / own.size_mm
+    ):
         return None
     first, second = fitted.vertices_scan_mm, second_fit.vertices_scan_mm
     offset = second.mean(axis=0) - first.mean(axis=0)
     away = float(np.linalg.norm(offset))
     towards = offset / max(away, 1e-12)
     gap = float((second @ towards).min() - (first @ towards).max())
-    return SecondInstance(away / scale, gap / scale)
+    return SecondInstance(away, gap)
 
 
 @dataclass(frozen=True)
@@ -142,8 +144,7 @@ def find_displaced(model: ShapeModel, target: ScanTarget, fitted: RobustFitted) 
     # Heights are compared with those of neighbours; fewer points than these have too few neighbours.
     if len(target.mesh.vertices) < _NEIGHBOURS or fitted.match_evidence.scan_near_share > _ALL_EXPLAINED:
         return Displaced()
-    scale = fitted.T_scan_fitted.scale
-    size, spread = rms_size(model.mean_vertices) * scale, fitted.match_evidence.spread_mm * scale
+    size, spread = fitted.match_evidence.size_mm, fitted.match_evidence.spread_mm
     points = target.mesh.vertices[target.draw(_POINTS, np.random.default_rng(0))]
     surface = Mesh(fitted.vertices_scan_mm, model.faces)
     nearest = build_engine(surface).query(points)
@@ -175,13 +176,13 @@ def find_layers(model: ShapeModel, target: ScanTarget, fitted: RobustFitted) -> 
         target: the scan in its mm frame.
         fitted: where the fit to it ended.
     """
-    size_mm, scale = rms_size(model.mean_vertices), fitted.T_scan_fitted.scale
+    size_mm = fitted.match_evidence.size_mm
     if fitted.match_evidence.spread_mm < _APART * size_mm:
         return Layers()
     points = target.mesh.vertices[target.draw(_POINTS, np.random.default_rng(0))]
     surface = Mesh(fitted.vertices_scan_mm, model.faces)
     nearest = build_engine(surface).query(points)
-    is_near = nearest.distance < 2 * _NEAR * size_mm * scale
+    is_near = nearest.distance < 2 * _NEAR * size_mm
     if is_near.sum() < _FEWEST:
         return Layers()
     normals = vertex_normals(surface)[nearest.vertex[is_near]]
@@ -196,7 +197,7 @@ def find_layers(model: ShapeModel, target: ScanTarget, fitted: RobustFitted) -> 
     layered = widest < _TIGHT * gap
     if not layered.any():
         return Layers()
-    return Layers(float(layered.mean()), float(np.median(gap[layered])) / scale)
+    return Layers(float(layered.mean()), float(np.median(gap[layered])))
 
 
 def _fit_pose_again(fitted: RobustFitted, remaining_points: FloatArray, size_mm: float) -> Similarity | None:
@@ -208,7 +209,7 @@ def _fit_pose_again(fitted: RobustFitted, remaining_points: FloatArray, size_mm:
     x = fitted.vertices_scan_mm[rng.choice(len(fitted.vertices_scan_mm), _GLANCED)]
 
     def score(points: FloatArray, cap: float) -> FloatArray:
-        return np.minimum(tree.query(points)[0], cap * size_mm * T.scale).mean(axis=-1)
+        return np.minimum(tree.query(points)[0], cap * size_mm).mean(axis=-1)
 
     places = remaining_points[rng.choice(len(remaining_points), _PLACES)] - x[rng.choice(_GLANCED, _PLACES)]
     places = np.vstack([np.median(remaining_points, axis=0) - np.median(x, axis=0), places])
@@ -217,4 +218,4 @@ def _fit_pose_again(fitted: RobustFitted, remaining_points: FloatArray, size_mm:
         distance, nearest = tree.query(move.apply(x))
         is_near = np.asarray(distance <= np.quantile(distance, _TRIMMED), dtype=np.bool_)
         move = fit_similarity(x[is_near], remaining_points[np.asarray(nearest)[is_near]], with_scale=False)
-    return move @ T if float(score(move.apply(x), _CAP)) < _SCORED * size_mm * T.scale else None
+    return move @ T if float(score(move.apply(x), _CAP)) < _SCORED * size_mm else None

@@ -41,7 +41,7 @@ EVIDENCE: Mapping[str, _Entry] = MappingProxyType(
         "z2": ("Mean squared coefficient, in variances of new shapes (about 1 is usual)", _plain),
         "z2_leading": ("... of the leading modes", _plain),
         "log_scale": ("Scale of the fit relative to the model", _size),
-        "size_mm": ("Size of the mean: RMS distance from its centroid", mm),
+        "size_mm": ("Size of the mean at the scale of the fit: RMS distance from its centroid", mm),
         "start_score_mm": ("Score of the start (lower is better)", mm),
         "start_runner_up_score_mm": ("... of the best other start", mm),
         "layered_share": ("Share of the scan with two layers", percent),

@@ -230,7 +230,7 @@ def surface_to_turn(page: Page, fit: SavedFit, surfaces: Mapping[str, Mesh], why
     Args:
         page: that it goes to.
         fit: of which it is.
-        surfaces: `final`, and `dense` where there is one, in the model's frame.
+        surfaces: `final`, and `dense` where there is one, in the picture frame.
         why: the scan is not shown, as the end of a sentence.
     """
     from shapespace.report.render import thumbnails

@@ -269,12 +269,12 @@ def staged_fit(folder: Folder, fit: SavedFit) -> StagedFit:
     if fit.entry.stages:
         return StagedFit.from_arrays(folder.arrays(fit.entry.stages), fit.record, name=fit.name, label=fit.label)
     surfaces = saved_surfaces(folder, fit)
-    scan = _in_model_frame(repair(raw_scan(folder, fit))[0], fit)
+    scan = _in_picture_frame(repair(raw_scan(folder, fit))[0], fit)
     return StagedFit.from_surfaces(surfaces, scan, fit.record, name=fit.name, label=fit.label)
 
 
 def saved_surfaces(folder: Folder, fit: SavedFit) -> dict[str, Mesh]:
-    """Return the fitted surface of `fit` as `final`, and its dense one as `dense`, in the model's frame.
+    """Return the fitted surface of `fit` as `final`, and its dense one as `dense`, in the picture frame.
 
     Raises:
         FileError: a file cannot be read.
@@ -284,16 +284,16 @@ def saved_surfaces(folder: Folder, fit: SavedFit) -> dict[str, Mesh]:
     surfaces = {stage: folder.mesh(file) for stage, file in files.items() if file or stage == "final"}
     if len({len(mesh.vertices) for mesh in surfaces.values()}) > 1:
         raise FileFormatError(f"{fit.name}: its fitted and its dense surface differ in their vertices; {_AGAIN}.")
-    return {stage: _in_model_frame(mesh, fit) for stage, mesh in surfaces.items()}
+    return {stage: _in_picture_frame(mesh, fit) for stage, mesh in surfaces.items()}
 
 
-def _in_model_frame(mesh: Mesh, fit: SavedFit) -> Mesh:
-    """Return `mesh`, which is in the frame and unit of the scan of `fit`, in the model's frame."""
-    T = fit.record.T_scan_model
-    if T is None or not T.scale > 0:
-        raise FileFormatError(f"The record of {fit.name} has no pose T_scan_model; {_AGAIN}.")
+def _in_picture_frame(mesh: Mesh, fit: SavedFit) -> Mesh:
+    """Return `mesh`, which is in the frame and unit of the scan of `fit`, in the picture frame."""
+    T, mm = fit.record.T_scan_model, fit.record.mm_per_scan_unit
+    if T is None or not T.scale > 0 or mm is None or not mm > 0:
+        raise FileFormatError(f"The record of {fit.name} has no pose T_scan_model or no mm_per_scan_unit; {_AGAIN}.")
     with np.errstate(all="ignore"):  # what overflows is refused
-        vertices = (mesh.vertices - np.array(T.translation)) @ np.array(T.rotation) / T.scale
+        vertices = mm * ((mesh.vertices - np.array(T.translation)) @ np.array(T.rotation))
     if not (len(vertices) and np.isfinite(vertices).all()):
         raise FileFormatError(f"{fit.name}: its surface, its scan or its pose has no finite coordinates; {_AGAIN}.")
     return mesh.with_vertices(vertices)

@@ -13,10 +13,10 @@ import numpy.typing as npt
 from shapespace.errors import FileFormatError, ShapespaceError
 from shapespace.fit.result import STAGES, FitResult
 from shapespace.fit.stages import STAGES_VERSION, stage_arrays
-from shapespace.fit.vertex_regions import REGIONS, UNSEEN
+from shapespace.fit.vertex_regions import REGIONS, SHOWN
 from shapespace.geometry.closest import build_engine, on_boundary
 from shapespace.geometry.distance import surface_distances
-from shapespace.geometry.normals import boundary_vertices, rms_size, vertex_normals
+from shapespace.geometry.normals import boundary_vertices
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import FitRecord
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity
@@ -29,9 +29,9 @@ class Moment:
     Args:
         phase: 1 or 2.
         iteration: from 0, by phase.
-        rms_mm: what the loop saw, mm.
-        b: (K,) coefficients then, mm.
-        T_final_now: from the model's frame then to the frame of the final pose, in which all pictures are.
+        rms_mm: RMS closest distance, mm of the scan.
+        b: (K,) coefficients then, mm of the model's frame.
+        T_final_now: from the model's frame then to the picture frame, see `stage_arrays`.
     """
 
     phase: int
@@ -41,13 +41,13 @@ class Moment:
     T_final_now: Similarity
 
     def vertices(self, model: ShapeModel) -> FloatArray:
-        """Return the model's surface then, (V, 3), in the frame of the final pose."""
+        """Return the model's surface then, (V, 3), in the picture frame."""
         return self.T_final_now.apply(model.reconstruct(self.b))
 
 
 @dataclass(frozen=True, eq=False)
 class StagedFit:
-    """A fit in the frame of the pictures, with scan and model in the model's frame in mm.
+    """A fit in the picture frame: the axes of the model's frame, and the size of the scan in mm.
 
     Args:
         name: of the fit.
@@ -58,7 +58,7 @@ class StagedFit:
         surfaces: the model at each stage: `final`; `before` and `initial` where the stages were saved; `dense` where
             there was one.
         model_to_scan_mm: by stage, (V,) signed closest distances: positive where the scan lies outside of the model;
-            not-a-number at vertices where the scan shows nothing, of which the nearest point says nothing.
+            not-a-number at vertices that the scan does not show, as in `OverlapDistances`.
         scan_to_model_mm: by stage, (S,) the same of scan points; not-a-number beyond the model's rim.
         regions: (V,) codes of `fit.regions.REGIONS`; None where the stages were not saved.
         b: (K,) mm.
@@ -100,12 +100,12 @@ class StagedFit:
     ) -> StagedFit:
         """Return a fit from its saved surfaces and its scan, and measure its distances.
 
-        A vertex counts as not shown by the scan where its closest point lies on the border of the scan, and more than
-        1 % of the size of the model to the side; nowhere where the record says that the scan shows the whole model.
+        A vertex counts as not shown by the scan where its closest point lies on the border of the scan; nowhere if the
+        record states that the scan shows the complete model.
 
         Args:
-            surfaces: `final`, and `dense` where there is one, in the model's frame.
-            scan: as repaired, in the model's frame.
+            surfaces: `final`, and `dense` where there is one, in the picture frame.
+            scan: as repaired, in the picture frame.
             record: of the fit.
             name: of the fit.
             label: what pictures call it.
@@ -126,11 +126,7 @@ class StagedFit:
             distances = surface_distances(surface, scan, scan_engine=engine)
             unseen = np.zeros(len(surface.vertices), dtype=bool)
             if scan.faces is not None and surface.faces is not None and not is_complete:
-                nearest = engine.query(surface.vertices)
-                along = np.einsum("ij,ij->i", nearest.points - surface.vertices, vertex_normals(surface))
-                sideways = np.sqrt(np.maximum(nearest.distance**2 - along**2, 0.0))
-                is_sideways = sideways > _SIDEWAYS_SHARE * rms_size(surface.vertices)
-                unseen = on_boundary(nearest, scan, boundary_vertices(scan)) & is_sideways
+                unseen = on_boundary(engine.query(surface.vertices), scan, boundary_vertices(scan))
             forward[stage] = np.where(unseen, np.nan, distances.model_to_scan_signed_mm)
             backward[stage] = distances.scan_to_model_signed_mm
         return StagedFit(
@@ -205,8 +201,7 @@ class StagedFit:
         is_finite &= all(moment.b.shape == b.shape and np.isfinite(moment.b).all() for moment in history)
         if not is_finite:
             raise FileFormatError(f"{name}: its saved stages do not fit together; {remedy}.")
-        unseen = regions == UNSEEN
-        overlap_mm = {stage: np.where(unseen, np.nan, d) for stage, d in forward.items()}
+        overlap_mm = {stage: np.where(np.isin(regions, SHOWN), d, np.nan) for stage, d in forward.items()}
         return StagedFit(
             name=name,
             label=label,
@@ -230,8 +225,6 @@ def measured_mm(distances_mm: FloatArray) -> FloatArray:
     return np.abs(distances_mm[np.isfinite(distances_mm)])
 
 
-_SIDEWAYS_SHARE = 0.01
-"""Of the model's size: the share within which the robust fit follows a scan to its border (`final_matches`)."""
 _MEDIANS = 5.0
 """Of the distances, at which a scale ends at the latest; beyond it lies what is no part of the object."""
 

@@ -144,7 +144,7 @@ class FolderPage:
             recognition_chapter = Chapter("Recognition", lambda: recognition.study_section(self.page, self.folder))
             chapters.insert(-2, recognition_chapter)
         chapters[-2:-2] = recognition.analysis_chapters(self.page, self.folder.root, self.analyses)
-        lead = "What a statistical shape model made of raw surfaces. Distances are in millimetres of the model's frame."
+        lead = "What a statistical shape model made of raw surfaces. Lengths are in millimetres of the scan."
         made = f"Made by shapespace {__version__} from the files in {name}."
         return self.page.html(f"{counted(len(self.fits), 'fit')} in {name}", [Text(lead)], made, chapters)
 

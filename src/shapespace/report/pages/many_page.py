@@ -105,7 +105,7 @@ class ManyPage(FolderPage):
             Chapter("The model", self.model_part, "Model"),
             Chapter("Settings and versions", self.settings, "Settings"),
         ]
-        lead = "What a statistical shape model made of raw surfaces. Distances are in millimetres of the model's frame."
+        lead = "What a statistical shape model made of raw surfaces. Lengths are in millimetres of the scan."
         made = f"Made by shapespace {__version__} from the files in {name}."
         return self.page.html(f"{counted(len(self.population), 'fit')} in {name}", [Text(lead)], made, chapters)
 

@@ -305,7 +305,7 @@ def pack_surfaces(
     """Return the data for the widget of a fit without its scan: as `pack_fit`, without scan and distances.
 
     Args:
-        surfaces: `final`, and `dense` where there is one, with the same triangles, in the model's frame.
+        surfaces: `final`, and `dense` where there is one, with the same triangles, in the picture frame.
         record: of the fit.
         name: of the fit.
         label: what pictures call it.

@@ -5,7 +5,6 @@
   const Viewer = window.ShapespaceViewer;
   const { $, h, page, guarded, json, binary } = Viewer;
   const FILTERED_FROM = 12;
-  const OTHER_SIZE = 0.02; // share by which the scan's millimetres differ where both are told
   const STATUS = {
     converged: "No problems detected", doubtful: "Do not trust this fit", max_iterations: "The fit was cut off",
     failed: "The scan could not be fitted", unreadable: "This result cannot be read", stopped: "The fit was stopped",
@@ -30,17 +29,16 @@
   const mm = (value) => (Number.isFinite(value) ? `${value.toFixed(2)} mm` : "unknown");
   const sharePercent = (share) => (Number.isFinite(share) ? `${Math.round(100 * share)} %` : "an unknown share");
 
-  /** Distances over what scan and model both show, in mm of the model and, where they differ, of the scan. */
+  /** Distances where scan and model overlap, mm of the scan. */
   function distanceFacts(facts) {
-    const { shown: told, shown_scan_mm: inScan } = facts;
-    if (!told) return null;
+    const overlap = facts.shown;
+    if (!overlap) return null;
     const rows = [
-      ["Model to scan", "model_to_scan", `the scan shows it, ${sharePercent(told.model_seen_share)} of the model`],
-      ["Scan to model", "scan_to_model", `the model covers it, ${sharePercent(told.scan_covered_share)} of the scan`],
+      ["Model to scan", "model_to_scan", `the scan shows it, ${sharePercent(overlap.model_seen_share)} of the model`],
+      ["Scan to model", "scan_to_model", `the model covers it, ${sharePercent(overlap.scan_covered_share)} of the scan`],
     ].map(([name, way, where]) => {
-      const { mean, p95 } = told[way], own = inScan ? inScan[way].mean : mean;
-      const other = Math.abs(own - mean) > OTHER_SIZE * mean ? ` (${mm(own)} of the scan)` : "";
-      return [name, `${mm(mean)}${other} mean where ${where}; 95 % within ${mm(p95)}`];
+      const { mean, p95 } = overlap[way];
+      return [name, `${mm(mean)} mean where ${where}; 95 % within ${mm(p95)}`];
     });
     return h("dl", { class: "facts", "data-testid": "shown" }, ...rows.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
   }
