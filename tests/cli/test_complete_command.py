@@ -38,7 +38,7 @@ def test_surfaces_samples_intervals_and_a_report(run: Run, world: World, broken:
     assert not (out / "needle.ply").exists()
     assert answer.facts["question"] == "complete" and "1 scan has no completion." in answer.facts["notes"]
     rows = (out / "estimates.csv").read_text().splitlines()
-    assert rows[0] == "scan,quantity,unit,value,mean,stddev,low_95,high_95"
+    assert rows[0] == "scan,quantity,unit,value,mean,stddev,low_95,high_95,calibrated_on"
     assert any(row.startswith("blob1,volume,mm3,") for row in rows)
     assert "Albrecht" in (out / "methods.txt").read_text()
     assert (out / "report.html").stat().st_size > 10_000

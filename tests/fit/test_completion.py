@@ -10,11 +10,14 @@ from scipy.spatial import ConvexHull
 from shapespace.datasets.simulated_scan import Cut, simulate_scan
 from shapespace.errors import FitError, InputError
 from shapespace.fit.completion.complete import Completion, CompletionConfig, complete, refine_surface
-from shapespace.fit.completion.shape_posterior import _Data, _estimated_covariance, _expected_error
+from shapespace.fit.completion.leave_one_out import leave_one_out
+from shapespace.fit.completion.shape_posterior import _Data
+from shapespace.fit.dense.residual_modes import ResidualModes
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.doctor import examine
 from shapespace.geometry.similarity import POSE
+from shapespace.model.new_shapes import variances_of_new_shapes
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh, Similarity
 from synthetic_shapes import blob, blob_model, raw_scan, similarity, sphere, training_meshes
@@ -111,27 +114,48 @@ def test_posterior_mean_and_evidence_are_those_of_gaussian_process_regression(ro
     assert np.isclose(data.log_evidence(variance) - data.log_evidence(other), difference)
 
 
-def test_the_error_of_an_estimated_covariance_is_that_of_brute_force() -> None:
-    """Training sets, new shapes and observations are drawn, and the errors of the estimates averaged."""
-    model = replace(MODEL, n_training=12)
-    P = POSE + MODEL.n_modes
+@pytest.mark.parametrize("has_scale", [False, True])
+def test_left_out_errors_are_those_of_gaussian_process_regression(has_scale: bool) -> None:
+    """Each shape is predicted by S A^T (A S A^T + I)^-1 y, S the prior of the model of the others."""
+    n, K, R, rows = 9, 8, 3, 6
     rng = np.random.default_rng(0)
-    A = np.zeros((4, P))
-    A[:, POSE:] = rng.standard_normal((4, MODEL.n_modes))
-    H = A.T @ A + np.diag(np.r_[np.full(POSE, 1e3), np.zeros(MODEL.n_modes)])
-    variance = np.r_[np.full(POSE, 1e-6), [4.0, 3.0, 2.0, 1.0, 0.5]]
-    expected = _expected_error(model, _Data(H, np.zeros(P)), variance, seed=1)[POSE:, POSE:]
-    errors = []
-    for _ in range(1500):
-        prior = _estimated_covariance(variance[POSE:], MODEL.n_modes, 12, rng)
-        mean = rng.standard_normal(5) * np.sqrt(variance[POSE:] / 12)
-        b = rng.standard_normal(5) * np.sqrt(variance[POSE:])
-        y = A[:, POSE:] @ (b - mean) + rng.standard_normal(4)
-        gain = prior @ A[:, POSE:].T @ np.linalg.inv(A[:, POSE:] @ prior @ A[:, POSE:].T + np.eye(4))
-        errors.append(mean + gain @ y - b)
-    assert np.allclose(np.diag(expected), np.var(errors, axis=0), rtol=0.35)
-    exact = _expected_error(replace(model, is_n_training_known=False), _Data(H, np.zeros(P)), variance, seed=1)
-    assert (np.diag(exact)[POSE:] < np.diag(expected)).all()
+    P = POSE + K + R
+    C = rng.standard_normal((n, K)) * np.linspace(4.0, 1.0, K)
+    C -= C.mean(axis=0)
+    known = np.column_stack([0.1 * rng.standard_normal(n) if has_scale else np.zeros(n), C])
+    A, noise = rng.standard_normal((rows, P)), rng.standard_normal(rows)
+    variance = np.r_[np.full(6, 100.0), 0.01 if has_scale else 0.0, np.ones(K), np.full(R, 0.2)]
+    products, mode = rng.standard_normal((K + R, 2 * K)).astype(np.float32), np.tile(np.arange(K), 2)
+    extra = ResidualModes(np.zeros((1, 3, 1)), np.sqrt(variance[-R:]), products, mode, np.repeat([0, 1], K))
+    left = leave_one_out(known, A.T @ A, A.T @ noise, np.zeros(P), variance, extra)
+    z = C / C.std(axis=0, ddof=1)
+    for i in range(n):
+        others = np.delete(C, i, axis=0)
+        mean = others.mean(axis=0)
+        value, axes = np.linalg.eigh(np.cov(others.T))
+        sample, V = value[::-1][: n - 2], axes[:, ::-1][:, : n - 2]
+        u = axes[:, 0]
+        spread = np.maximum(sample, variances_of_new_shapes(sample, sample.sum(), n - 1))
+        S = np.diag(variance)
+        b = slice(POSE, POSE + K)
+        S[b, b] = V * spread @ V.T
+        # The kernel of the residual modes without those that are made of the shape, along u.
+        kernel = sum(
+            X @ (np.eye(K) - np.outer(z[i], z[i]) / (n - 1)) @ X.T for X in (products[:, :K], products[:, K:])
+        )
+        S[b, b] += np.outer(u, u) * (u @ kernel[:K, :K] @ u)
+        S[b, POSE + K :] = np.outer(u, u @ kernel[:K, K:])
+        S[POSE + K :, b] = S[b, POSE + K :].T
+        truth, prior_mean = np.zeros(P), np.zeros(P)
+        truth[POSE - 1], truth[b], prior_mean[b] = known[i, 0], C[i], mean
+        gain = S @ A.T @ np.linalg.inv(A @ S @ A.T + np.eye(rows))
+        predicted = prior_mean + gain @ A @ (truth - prior_mean)
+        assert np.allclose(left.errors[i], predicted - truth, atol=1e-6)
+        assert np.allclose(left.shifts[i], prior_mean + gain @ (noise - A @ prior_mean), atol=1e-6)
+    S = np.diag(variance)
+    gain = S @ A.T @ np.linalg.inv(A @ S @ A.T + np.eye(rows))
+    assert np.allclose(left.noise, gain @ gain.T, atol=1e-8)
+    assert np.allclose(left.covariance() - left.noise, left.errors.T @ left.errors * 10 / (9 * 6))
 
 
 def test_regions_of_ninety_percent_contain_most_of_the_truth() -> None:

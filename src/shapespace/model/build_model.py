@@ -34,7 +34,7 @@ from shapespace.model.streamed import (
     too_large,
 )
 from shapespace.model.training_shapes import TrainingShapes
-from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks, common_faces, require
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, SurfaceLandmarks, common_faces, require
 
 
 def build_model(
@@ -98,10 +98,10 @@ def build_model(
         faces, alignment_vertices = meshes[0].faces, observed.indices(alignment_vertices)
     shapes, names = _training_shapes(meshes, faces, fill=kind.takes_holes), [mesh.name for mesh in meshes]
     rounding = rounding_mm(np.nan_to_num(meshes[0].vertices, posinf=0.0, neginf=0.0))
-    observed = np.isfinite(shapes).all(axis=2)
-    sizes = np.array([centroid_size(shape[own]) for shape, own in zip(shapes, observed, strict=True)])
+    observed = np.asarray(np.isfinite(shapes).all(axis=2), dtype=np.bool_)
+    sizes = _sizes(shapes, observed)
     shapes, completed = _aligned(shapes, names, config.gauge, align=align, alignment_vertices=alignment_vertices)
-    sizes /= [centroid_size(shape[own]) for shape, own in zip(shapes, observed, strict=True)]
+    sizes = sizes / _sizes(shapes, observed)
     # Coding overwrites the shapes of B-splines.
     aligned = shapes if kind is Vertices or config.without_training_shapes else shapes.copy()
     coder = kind.of(Mesh(shapes.mean(axis=0), faces, name="The mean of the meshes"), config.control_points)
@@ -207,6 +207,11 @@ def _of_streamed(
         if keep_shapes is not None:
             aligned.keep(keep_shapes, model.content_hash)
     return model
+
+
+def _sizes(shapes: FloatArray, observed: BoolArray) -> FloatArray:
+    """Return the centroid sizes (N,) of the observed vertices of shapes (N, V, 3)."""
+    return np.array([centroid_size(shapes[i, observed[i]]) for i in range(len(shapes))])
 
 
 def _with_training(

@@ -17,9 +17,9 @@ import numpy as np
 from scipy.stats import chi2
 
 from shapespace.errors import FitError, InputError
-from shapespace.fit.completion.calibration import SurfaceCalibration, calibrate
 from shapespace.fit.completion.mirror import add_mirror_image
 from shapespace.fit.completion.shape_posterior import AS_LIKELY, ShapePosterior, shape_posterior
+from shapespace.fit.completion.surface_calibration import SurfaceCalibration, calibrate
 from shapespace.fit.dense.dense_fit import dense_surface
 from shapespace.fit.diagnostics.reason_text import sentence_of
 from shapespace.fit.diagnostics.reasons import Reason, ReasonCode
@@ -58,7 +58,7 @@ _ON_SCAN = 5.0  # multiple of the noise within which a refined vertex is on the 
 _LEAST_GAIN = 0.1  # share of a vertex's variance that a scan removes, of models without training shapes
 _UNEXPLAINED = 2.0
 """Multiple of the largest distance of left-out training shapes from their completions beyond which the model does not
-explain a scan: 24 femora reach 1.3, other objects scaled to their size 4 and more (benchmarks/completion.py)."""
+explain a scan: 24 femora reach 1.0, other objects scaled to their size 2.9 and more (benchmarks/completion.py)."""
 _OTHER_SIZE = 4.0  # standard deviations of the training shapes' size
 _IMPLAUSIBLE, _RARE = 3.0, 1e-5
 """Mean square of the coefficients in standard deviations of new shapes (1.4 is the most measured, with 51 modes), and
@@ -251,9 +251,7 @@ class Completion:
     def _estimates(self, functions: Mapping[tuple[str, str], Function], level: float) -> tuple[QuantityEstimate, ...]:
         if not 0 < level < 1:
             raise InputError(f"The probability of an interval lies between 0 and 1, not {level:g}.")
-        return tuple(
-            self._quantity(function, name, unit, level) for (name, unit), function in functions.items()
-        )
+        return tuple(self._quantity(function, name, unit, level) for (name, unit), function in functions.items())
 
     def _quantity(self, function: Function, name: str, unit: str, level: float) -> QuantityEstimate:
         def of(vertices: FloatArray) -> float:
@@ -269,7 +267,9 @@ class Completion:
                 lambda vertices: of(T.apply(np.asarray(vertices, dtype=np.float64))),
                 T.inverse().apply(self.vertices), level,
             )  # fmt: skip
-            return QuantityEstimate(name, unit, value, mean, stddev, low, high, level, len(self.calibration))
+            return QuantityEstimate(
+                name, unit, value, mean, stddev, low, high, level, len(self.calibration) * self.calibration.of_training
+            )
         over = np.array([of(sample) for sample in self._samples])
         low, high = np.quantile(over, [(1 - level) / 2, (1 + level) / 2])
         mean, stddev = float(over.mean()), float(over.std(ddof=1))
@@ -336,9 +336,10 @@ def complete(
     with_scale = config.fit.limits(model).with_scale
 
     def posterior_at(fit: FitResult, *, calibrated: bool = True) -> ShapePosterior:
+        b = np.pad(fit.b, (0, model.n_modes - len(fit.b)))
         return shape_posterior(
-            model, target, T_mm_scan @ fit.T_scan_model, np.pad(fit.b, (0, model.n_modes - len(fit.b))), _SETTINGS, with_scale=with_scale,
-            marks=marks, calibrated=calibrated,
+            model, target, T_mm_scan @ fit.T_scan_model, b, _SETTINGS, with_scale=with_scale, marks=marks,
+            calibrated=calibrated,
         )  # fmt: skip
 
     apart_mm = None
@@ -347,7 +348,9 @@ def complete(
     stands_out = evidence.start_score_mm < _STANDS_OUT * evidence.start_runner_up_score_mm
     is_sure = fit.status != "doubtful" and evidence.seen_share > (_SURE / 2 if stands_out else _SURE)
     if not landmarks and T_scan_model is None and not is_sure:
-        fit, apart_mm = _likeliest_pose(fit, target, T_mm_scan.inverse(), config, lambda fit: posterior_at(fit, calibrated=False))
+        fit, apart_mm = _likeliest_pose(
+            fit, target, T_mm_scan.inverse(), config, lambda fit: posterior_at(fit, calibrated=False)
+        )
     posterior = posterior_at(fit)
     T = posterior.T_scan_model
     start = T.apply(posterior.surface.vertices)
@@ -414,7 +417,7 @@ def _likeliest_pose(
         with suppress(FitError):
             posterior = posterior_at(one)
             vertices = posterior.T_scan_model.apply(posterior.surface.vertices)
-            found.append((posterior.log_density(model.n_modes), one, vertices))
+            found.append((posterior.log_density(), one, vertices))
     if not found:
         return fit, None
     found.sort(key=lambda one: -one[0])
@@ -439,17 +442,17 @@ def _judged(
     Raises:
         FitError: there are reasons to doubt it, and `with_doubtful` is not set.
     """
-    modes = fit.model.n_modes
     tested = _OF_MISSING_PARTS if calibration is not None else _OF_MISSING_PARTS - _BY_TRAINING_SHAPES
     reasons = [reason for reason in fit.reasons if reason.code not in tested]
     doubts = [] if fit.status != "doubtful" else reasons
     if apart_mm is not None:
         doubts.append(Reason(ReasonCode.POSE_AMBIGUOUS, {"apart_mm": apart_mm}))
-    z2, limit = posterior.mean_square_z(modes), max(_IMPLAUSIBLE, float(chi2.isf(_RARE, modes)) / modes)
+    modes = posterior.n_modes
+    z2, limit = posterior.mean_square_z, max(_IMPLAUSIBLE, float(chi2.isf(_RARE, modes)) / modes)
     if z2 > limit:
         doubts.append(Reason(ReasonCode.SHAPE_IMPLAUSIBLE, {"z_rms": float(np.sqrt(z2))}))
     if calibration is not None:
-        doubts += _doubts_by_training_shapes(posterior, calibration, noise_mm)
+        doubts += _doubts_by_training_shapes(fit.model, posterior, calibration, noise_mm)
     if not doubts:
         if fit.status != "doubtful":
             return "converged", fit.reasons
@@ -464,11 +467,12 @@ def _judged(
 
 
 def _doubts_by_training_shapes(
-    posterior: ShapePosterior, calibration: SurfaceCalibration, noise_mm: float
+    model: ShapeModel, posterior: ShapePosterior, calibration: SurfaceCalibration, noise_mm: float
 ) -> list[Reason]:
     """Return in which respects the scan and its completion are unlike those of the left-out training shapes."""
     doubts = list[Reason]()
-    usual_mm = float(posterior.left_out_mismatch_mm().max())
+    # Triangles of the model are flat, those of training shapes and their completions alike.
+    usual_mm = float(np.hypot(posterior.left_out_mismatch_mm().max(), _sagitta_mm(model)))
     # Noise of the scan is no mismatch; it differs between neighbouring points.
     mismatch_mm = float(np.sqrt(max(posterior.mismatch_mm**2 - noise_mm**2, 0.0)))
     if mismatch_mm > _UNEXPLAINED * usual_mm:
@@ -481,6 +485,16 @@ def _doubts_by_training_shapes(
         data = {"training_shapes": float(len(ratios)), "nearer": float((ratios > 0).sum())}
         doubts.append(Reason(ReasonCode.NO_SKILL, data))
     return doubts
+
+
+def _sagitta_mm(model: ShapeModel) -> float:
+    """Return the RMS distance of the midpoints of the edges from the smooth surface through the vertices, mm."""
+    x, faces = model.mean_vertices, np.asarray(model.faces)
+    M, _ = loop_operator(len(x), faces)
+    smooth = np.asarray(M @ (2.0 * x - (M @ x)[: len(x)]))[len(x) :]
+    edges = np.unique(np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1), axis=0)
+    midpoints = x[edges].mean(axis=1)
+    return float(np.sqrt((build_engine(Mesh(smooth)).query(midpoints).distance ** 2).mean()))
 
 
 def _notes(model: ShapeModel, fit: FitResult, observed: BoolArray, *, with_scale: bool) -> list[str]:
@@ -512,8 +526,8 @@ def _notes(model: ShapeModel, fit: FitResult, observed: BoolArray, *, with_scale
         )
     if model.training is None:
         notes.append(
-            "The result is not calibrated: the model has no training shapes that could be left out in turn, so "
-            "intervals and standard deviations are those of the model, and are too small if it is wrong."
+            "The result is not calibrated: the model does not contain its training shapes, so intervals and standard "
+            "deviations are those of the model, and are too small if it is wrong."
         )
     if not model.is_n_training_known:
         notes.append(

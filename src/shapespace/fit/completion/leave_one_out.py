@@ -72,10 +72,12 @@ def leave_one_out(
     coefficients = known[:, 1:]
     n, K = coefficients.shape
     end = POSE + K + min(_OFF_MODEL, len(variance) - POSE - K)
-    kept = np.arange(SCALE if variance[SCALE] > 0 else POSE, end)
+    kept = np.arange(SCALE if variance[SCALE] > 0 else POSE, end, dtype=np.int32)
     c = slice(POSE - kept[0], POSE - kept[0] + K)
     # The prior of pose and faint modes is the same for all shapes, so they are eliminated once.
-    other = np.setdiff1d(np.flatnonzero(variance > 0), kept)
+    is_other = variance > 0
+    is_other[kept] = False
+    other = np.flatnonzero(is_other)
     factor = cho_factor(H[np.ix_(other, other)] + np.diag(1.0 / variance[other]), lower=True)
     slaved, pull_other = cho_solve(factor, H[np.ix_(other, kept)]), cho_solve(factor, pull[other])
     H_kept = H[np.ix_(kept, kept)] - H[np.ix_(kept, other)] @ slaved
@@ -83,7 +85,7 @@ def leave_one_out(
     share = variance[POSE + K :].sum() / (extra.stddev**2).sum()
     z = coefficients / np.sqrt((coefficients**2).sum(axis=0) / (n - 1))
     prior, mu, theta = np.diag(variance[kept]), np.zeros(len(kept)), np.zeros(len(kept))
-    chosen = np.arange(n)
+    chosen = np.arange(n, dtype=np.int32)
     if n > MOST_LEFT_OUT:
         chosen = np.sort(np.random.default_rng(0).choice(n, MOST_LEFT_OUT, replace=False))
     errors, shifts = np.zeros((2, len(chosen), len(variance)))

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from shapespace.errors import FitError
 from shapespace.fit.completion.leave_one_out import LeftOutErrors, leave_one_out, root_of
@@ -26,8 +26,8 @@ from shapespace.fit.robust.robust_settings import Level, RobustSettings
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.geometry.normals import rms_size
 from shapespace.geometry.similarity import POSE, small_poses
-from shapespace.model.new_shapes import variances_of_new_shapes
 from shapespace.model.shape_model import ShapeModel
+from shapespace.model.training_shapes import MOST_SHAPES
 from shapespace.types import BoolArray, FloatArray, Similarity
 
 _LEVEL = Level(modes=None, scan_points=20_000, vertices=500, triangles=True, iterations=15, stop_motion_mm=0.0)
@@ -58,6 +58,7 @@ class ShapePosterior:
         noise_mm: robust standard deviation of the residuals, mm of the model's frame.
         followed: (V,) True where a scan point is matched.
         mismatch_mm: RMS distance of the scan's points from the surface, each up to 5 % of the model's size.
+        n_modes: K.
         left_out: errors of completions of the training shapes by models of the others; None without them.
     """
 
@@ -70,6 +71,7 @@ class ShapePosterior:
     noise_mm: float
     followed: BoolArray
     mismatch_mm: float
+    n_modes: int
     left_out: LeftOutErrors | None
 
     def left_out_mismatch_mm(self) -> FloatArray:
@@ -81,14 +83,14 @@ class ShapePosterior:
             return np.zeros(0)
         rows = np.einsum("vd,vdp->vp", self.surface.normals, self.rows())[self.followed]
         off = rows @ self.left_out.errors.T.astype(np.float32)
-        return np.sqrt((off**2).mean(axis=0) + self.noise_mm**2).astype(np.float64)
+        return np.sqrt((off**2).mean(axis=0)).astype(np.float64)
 
-    def log_density(self, modes: int) -> float:
+    def log_density(self) -> float:
         """Return the log density of scan and shape up to a constant, with as many observations as patches (E9)."""
         patches = PATCHES * float(self.followed.mean()) / NOISE_TEMPERATURE
         scale = self.prior_variance[SCALE]
         size = float(np.log(self.T_scan_model.scale)) ** 2 / scale if scale > 0 else 0.0
-        return -patches * float(np.log(self.mismatch_mm)) - 0.5 * (modes * self.mean_square_z(modes) + size)
+        return -patches * float(np.log(self.mismatch_mm)) - 0.5 * (self.n_modes * self.mean_square_z + size)
 
     def vertex_covariance(self) -> FloatArray:
         """Return (V, 3, 3) mm^2 of the positions of the vertices along the axes of the model's frame (E5)."""
@@ -101,9 +103,10 @@ class ShapePosterior:
         variance = self.prior_variance[POSE:].astype(np.float32)
         return np.asarray(np.einsum("vip,p->v", self.rows()[:, :, POSE:] ** 2, variance), dtype=np.float64)
 
-    def mean_square_z(self, modes: int) -> float:
-        """Return the mean square of the first coefficients in standard deviations of new shapes."""
-        return float((self.b[:modes] ** 2 / self.prior_variance[POSE : POSE + modes]).mean())
+    @property
+    def mean_square_z(self) -> float:
+        """Mean square of the coefficients of the model's own modes in standard deviations of new shapes."""
+        return float((self.b[: self.n_modes] ** 2 / self.prior_variance[POSE : POSE + self.n_modes]).mean())
 
     def draw_displacements(self, count: int, rng: np.random.Generator) -> Float32Array:
         """Return (count, V, 3) float32 displacements from the mean surface, mm of the model's frame (E6)."""
@@ -170,9 +173,7 @@ def shape_posterior(
             line = _Linearised.of(problem, matcher, iterate, line.weighted.matches.hint, prior, beyond_mm2)
         mean, left_out = line.data.mean(line.variance), None
         covariance = line.data.covariance(line.variance)
-        if calibrated and training is not None:
-            log_scale = training.log_scale if with_scale else np.zeros(len(training))
-            known = np.column_stack([log_scale, training.coefficients])
+        if calibrated and (known := _known_shapes(model)) is not None:
             left_out = leave_one_out(known, line.data.H, line.data.pull, mean, line.variance, extra)
             covariance = left_out.covariance()
     except LinAlgError as error:
@@ -183,8 +184,21 @@ def shape_posterior(
         iterate.T_scan_model, iterate.surface, iterate.b, covariance, line.variance, line.amplitude,
         line.weighted.sigma_mm, line.followed,
         float(np.sqrt((np.minimum(line.weighted.matches.points.distance, _FAR * size_mm) ** 2).mean())),
-        left_out,
+        model.n_modes, left_out,
     )  # fmt: skip
+
+
+def _known_shapes(model: ShapeModel) -> FloatArray | None:
+    """Return log scale and coefficients (n, 1 + K) of the training shapes.
+
+    Samples of the model represent those of a model that states their number without containing them; None otherwise.
+    """
+    if model.training is not None:
+        return np.column_stack([model.training.log_scale, model.training.coefficients])
+    if not model.is_n_training_known or model.n_training <= model.n_modes:
+        return None
+    b = model.sample(min(model.n_training, MOST_SHAPES), np.random.default_rng(0))
+    return np.column_stack([np.zeros(len(b)), b - b.mean(axis=0)])
 
 
 def _with_residual_modes(problem: Problem, extra: ResidualModes) -> tuple[Problem, FloatArray]:
@@ -224,7 +238,9 @@ class _Linearised:
     log_evidence: float
 
     @staticmethod
-    def of(problem: Problem, matcher: Matcher, iterate: Iterate, hint: MatchHint, prior: FloatArray, beyond_mm2: float) -> _Linearised:
+    def of(
+        problem: Problem, matcher: Matcher, iterate: Iterate, hint: MatchHint, prior: FloatArray, beyond_mm2: float
+    ) -> _Linearised:
         """Return the likelihood near `iterate` (E2), and the amplitude given it (E3)."""
         weighted = problem.match(matcher, iterate, hint)
         gathered, equations = problem.equations(weighted, iterate, len(iterate.b))

@@ -20,6 +20,8 @@ _MORPH_STDDEV = 2.0  # ends of the morph, in standard deviations
 _FILE = "completion.npz"
 _CITATIONS = (
     "Albrecht T., Luthi M., Gerig T., Vetter T. (2013) Posterior shape models. Medical Image Analysis 17, 959-973.",
+    "Barber R.F., Candes E.J., Ramdas A., Tibshirani R.J. (2021) Predictive inference with the jackknife+. Annals of "
+    "Statistics 49, 486-507.",
     "Rubin D.B. (1987) Multiple imputation for nonresponse in surveys. Wiley, New York.",
 )
 
@@ -41,6 +43,7 @@ class CompletionReport:
     _parts: list[Part] = field(default_factory=list[Part], init=False)
     _arrays: dict[str, npt.NDArray[Any]] = field(default_factory=dict[str, npt.NDArray[Any]], init=False)
     _hashes: set[str] = field(default_factory=set[str], init=False)
+    _calibrated_on: int = field(default=0, init=False)
 
     def add(self, name: str, completion: Completion) -> None:
         """Add a completion with the name of its files."""
@@ -48,8 +51,12 @@ class CompletionReport:
         missing = ~completion.observed
         rms_mm = float(np.sqrt((completion.stddev_mm[missing] ** 2).mean())) if missing.any() else 0.0
         estimates = completion.estimates()
-        self._rows.append((name, completion.status, *shares, rms_mm, completion.posterior.noise_mm))
-        self._estimates += [(name, e.name, e.unit, e.value, e.mean, e.stddev, e.low, e.high) for e in estimates]
+        noise_mm = completion.posterior.noise_mm * completion.fit.mm_per_scan_unit * completion.T_scan_model.scale
+        self._rows.append((name, completion.status, *shares, rms_mm, noise_mm))
+        self._estimates += [
+            (name, e.name, e.unit, e.value, e.mean, e.stddev, e.low, e.high, e.calibrated_on) for e in estimates
+        ]
+        self._calibrated_on = first_count = estimates[0].calibrated_on
         mm = completion.fit.mm_per_scan_unit
         places = completion.surface().landmarks
         self._landmarks += [
@@ -63,7 +70,7 @@ class CompletionReport:
         self._summary.append(
             f"{name}: {completion.status}; the scan shows {100 * shares[0]:.0f} % of the vertices, the others have a "
             f"standard deviation of {rms_mm:.2f} mm; {first.name} {_number(first.value)} {first.unit} (95 % interval "
-            f"{_number(first.low)} to {_number(first.high)})."
+            f"{_number(first.low)} to {_number(first.high)}, {_source(first_count)})."
         )
         if completion.status == "doubtful":
             self._notes.setdefault(completion.reason, []).append(name)
@@ -82,14 +89,14 @@ class CompletionReport:
         count = len(self._rows)
         quantities = TablePart.of(
             "Quantities", ("scan", "quantity", "unit", "completed surface", "SD", "95 % from", "to"),
-            [(*row[:4], *row[5:]) for row in self._estimates[:_MOST_ROWS]],
-            note=f"Over {self.config.samples} samples of the whole shape. All of them are in estimates.csv.",
+            [(*row[:4], *row[5:8]) for row in self._estimates[:_MOST_ROWS]],
+            note=f"95 % intervals, {_source(self._calibrated_on)}. All quantities are in estimates.csv.",
         )  # fmt: skip
         columns = ("scan", "status", "observed", "estimated", "unknowable", "SD of missing vertices, mm", "noise, mm")
         scans = TablePart.of(
             "Scans", columns, self._rows[:_MOST_ROWS], percent=("observed", "estimated", "unknowable"),
-            note="Observed: the scan shows the vertex. Estimated: the scan reduces its variance by at least 10 %. "
-            "Unknowable: it does not.",
+            note="Observed: the scan shows the vertex. Estimated: it is predicted better than by the mean shape. "
+            "Unknowable: it is not.",
         )  # fmt: skip
         tables: dict[str, Rows] = {
             "completions.csv": (
@@ -97,7 +104,8 @@ class CompletionReport:
                  "noise_mm"), self._rows,
             ),
             "estimates.csv": (
-                ("scan", "quantity", "unit", "value", "mean", "stddev", "low_95", "high_95"), self._estimates,
+                ("scan", "quantity", "unit", "value", "mean", "stddev", "low_95", "high_95", "calibrated_on"),
+                self._estimates,
             ),
         }  # fmt: skip
         if self._landmarks:
@@ -133,13 +141,21 @@ class CompletionReport:
         return (
             "Partial scans were completed by the posterior of pose, coefficients and off-model variation of a shape "
             "model given the scan (Albrecht et al. 2013), linearised at its mean.",
-            "The prior variances were those of new shapes, the variance of the off-model variation was estimated from "
-            "each scan, and the error of a covariance matrix estimated from the training shapes was included by "
-            "simulated training sets.",
+            "The prior variances were those of new shapes, and the variance of the off-model variation was estimated "
+            "from each scan.",
+            f"Standard deviations and intervals are {_source(self._calibrated_on)}"
+            + (
+                ": each training shape was observed as the scan was and completed by the model of the others."
+                if self._calibrated_on
+                else ", since the model does not contain its training shapes."
+            ),
             "Where the scan shows the surface, the completed surface follows the scan.",
             *mirror,
-            f"Intervals are quantiles of {self.config.samples} samples of the whole shape (seed {self.config.seed}); "
-            "the samples are multiple imputations (Rubin 1987).",
+            "Intervals of quantities are cross-conformal (Barber et al. 2021)."
+            if self._calibrated_on
+            else "Intervals of quantities are those of the model.",
+            f"The {self.config.samples} samples of the whole shape (seed {self.config.seed}) are multiple imputations "
+            "(Rubin 1987).",
         )
 
     def _note(self, note: str, names: list[str], count: int) -> str:
@@ -173,6 +189,11 @@ class CompletionReport:
                 note="The first principal component of the samples.",
             ),
         ]  # fmt: skip
+
+
+def _source(calibrated_on: int) -> str:
+    """Return on what intervals are calibrated."""
+    return f"from {calibrated_on} training shapes left out in turn" if calibrated_on else "not calibrated"
 
 
 def _number(value: float) -> str:

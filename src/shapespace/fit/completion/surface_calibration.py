@@ -31,6 +31,7 @@ class SurfaceCalibration:
         mean_errors: (n, V, 3) of the mean shape in the best pose on the observed vertices.
         shifts: (n, V, 3) from the completion of the scan to the one by the model without the shape.
         missing: (V,) True where the scan shows nothing.
+        of_training: False if samples of the model represent its training shapes, which it does not contain.
     """
 
     shapes: Float32Array
@@ -38,6 +39,7 @@ class SurfaceCalibration:
     mean_errors: Float32Array
     shifts: Float32Array
     missing: BoolArray
+    of_training: bool
 
     def __len__(self) -> int:
         """Return n, the number of shapes."""
@@ -99,7 +101,7 @@ class SurfaceCalibration:
 
 
 def calibrate(posterior: ShapePosterior, model: ShapeModel, missing: BoolArray) -> SurfaceCalibration | None:
-    """Return the calibration of the surface on the training shapes; None without them.
+    """Return the calibration of the surface on the training shapes; None if the model neither contains nor counts them.
 
     Args:
         posterior: of the scan, with the errors of left-out shapes.
@@ -127,9 +129,12 @@ def calibrate(posterior: ShapePosterior, model: ShapeModel, missing: BoolArray) 
     mean = model.mean_vertices
     pose = small_poses(mean).reshape(V, 3, POSE)
     pose = pose if posterior.prior_variance[POSE - 1] > 0 else pose[:, :, : POSE - 1]
-    from_others = deviation * np.float32(len(model.training or ()) / max(len(model.training or ()) - 1, 1))
+    from_others = deviation * np.float32(n / (n - 1))
     seen = pose[~missing].reshape(-1, pose.shape[2])
     q = np.linalg.lstsq(seen, from_others[:, ~missing].reshape(n, -1).T, rcond=None)[0]
-    mean_errors = (pose.reshape(3 * V, -1) @ q).T.reshape(n, V, 3).astype(np.float32) - from_others
-    shapes = mean.astype(np.float32) + deviation
-    return SurfaceCalibration(shapes, moved(left.errors + noise.T), mean_errors, moved(left.shifts), missing)
+    mean_errors = (pose.reshape(3 * V, -1) @ q).T.reshape(n, V, 3) - from_others
+    shapes = (mean + deviation).astype(np.float32)
+    mean_errors = mean_errors.astype(np.float32)
+    return SurfaceCalibration(
+        shapes, moved(left.errors + noise.T), mean_errors, moved(left.shifts), missing, model.training is not None
+    )
