@@ -32,7 +32,9 @@ def cohort_of(
     from shapespace.cohort.read import CohortConfig, read_cohort
 
     _figures(arguments)  # files and options that do not fit are refused before the analysis
-    fixed = {} if gauge is None else {"gauge": gauge}
+    fixed: dict[str, object] = {} if gauge is None else {"gauge": gauge}
+    if not hasattr(arguments, "doubtful"):  # without the option, surfaces that need review are only counted
+        fixed["accept_review"] = True
     config = CohortConfig(**given(arguments, CohortConfig, least=least, **fixed))
     with steps(None, "reading", "shape", quiet=arguments.quiet) as step:
         cohort = read_cohort(arguments.data, config, onto=onto, on_shape=step)
