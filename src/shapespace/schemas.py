@@ -452,6 +452,15 @@ class SurfaceReview(Struct, frozen=True, kw_only=True):
         reasons = {code: count for code in get_args(ReviewCode) if (count := sum(code in own for own in every))}
         return SurfaceReview(surfaces=len(every), needs_review=sum(map(bool, every)), reasons=reasons)
 
+    def __add__(self, other: SurfaceReview) -> SurfaceReview:
+        codes: tuple[ReviewCode, ...] = get_args(ReviewCode)
+        counts = {code: self.reasons.get(code, 0) + other.reasons.get(code, 0) for code in codes}
+        return SurfaceReview(
+            surfaces=self.surfaces + other.surfaces,
+            needs_review=self.needs_review + other.needs_review,
+            reasons={code: count for code, count in counts.items() if count},
+        )
+
     @property
     def is_majority(self) -> bool:
         """Whether more than half of the surfaces need review."""
