@@ -100,10 +100,10 @@ class TemplateChoice:
 def choose_template(scans: Sequence[Mesh], seed: int) -> TemplateChoice:
     """Return which of `scans` is nearest to the others, judged by a few candidates and a few others.
 
-    Candidates are some with few pieces and short borders, as those lack least. If some scans have inner surfaces, all
-    are compared by their outer surfaces, and one without inner surfaces is chosen, unless it is another object: twice
-    as far from the others as they are. One that lacks a part shows less of the surface than the others do where it
-    lies on them, and is chosen only if all lack as much.
+    Candidates are some with few pieces and short borders, as those lack least. One that is more than twice as far from
+    the others as the median candidate is another object. If some scans have inner surfaces, all are compared by their
+    outer surfaces, and one without inner surfaces is preferred. One that lacks a part shows less of the surface than
+    the others do where it lies on them, and is chosen only if all lack as much.
 
     Raises:
         MeshError: none of them can be a template.
@@ -136,12 +136,12 @@ def choose_template(scans: Sequence[Mesh], seed: int) -> TemplateChoice:
             f"None of the scans can be a template, since none is a sheet of triangles with {_FEWEST} vertices or more; "
             "give --template MESH."
         )
-    fair = np.where(visible >= _AS_WHOLE * np.nanmax(visible), nearness, np.inf)
-    if is_mixed and np.isfinite(nearness[has_inside]).any():
-        is_of_kind = ~has_inside & (nearness <= SAME_KIND * np.nanmedian(nearness[has_inside]))
-        preferred = is_of_kind if np.isfinite(fair[is_of_kind]).any() else has_inside
-        fair = np.where(preferred, fair, np.nan)
-    return TemplateChoice(int(np.nanargmin(fair)), tuple(float(share) for share in nearness))
+    is_possible = nearness <= SAME_KIND * np.nanmedian(nearness)
+    if is_mixed and (is_possible & ~has_inside).any():
+        is_possible &= ~has_inside
+    is_possible &= visible >= _AS_WHOLE * visible[is_possible].max()
+    chosen = int(np.argmin(np.where(is_possible, nearness, np.inf)))
+    return TemplateChoice(chosen, tuple(float(share) for share in nearness))
 
 
 def _candidates(incompleteness: FloatArray, most: int, rng: np.random.Generator) -> npt.NDArray[np.intp]:
