@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Literal, Self, TypeVar, cast, get_args
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, ClassVar, Literal, Self, TypeAlias, TypeVar, cast, get_args
 
 import msgspec
 from msgspec import Struct
@@ -408,6 +408,62 @@ class Demo(Struct, frozen=True, kw_only=True):
 
 # NAME.correspond.json and correspondence.json
 
+ReviewCode: TypeAlias = Literal["doubtful", "folded", "not_settled", "missing", "unreached", "distance", "area_change"]
+"""Why a surface in correspondence needs review: its status is doubtful; it is far from its scan; triangles are folded;
+vertices are missing; parts of the scan are not reached; triangles change their area; the last round moved it."""
+
+
+class ReviewReason(Struct, frozen=True, kw_only=True):
+    """A measure of a surface in correspondence that is unusual among those of all scans, or beyond a limit.
+
+    Args:
+        code: the measure.
+        value: of the surface: a share from 0 to 1 (`distance` and `not_settled`: of the size of the object), or for
+            `area_change` the factor by which triangles grow or shrink.
+        usual: median of all surfaces.
+        excess: robust standard deviations by which the value is above the median; reasons are sorted by it.
+    """
+
+    code: ReviewCode
+    value: float
+    usual: float
+    excess: float
+
+
+class SurfaceReview(Struct, frozen=True, kw_only=True):
+    """Number of surfaces of a collection that need review.
+
+    Args:
+        surfaces: number of all surfaces.
+        needs_review: number of those with a reason to review them.
+        reasons: number of surfaces with each reason; a surface can have several.
+    """
+
+    surfaces: int = 0
+    needs_review: int = 0
+    reasons: Mapping[ReviewCode, int] = {}
+
+    @staticmethod
+    def of(codes: Iterable[Sequence[ReviewCode]]) -> SurfaceReview:
+        """Count surfaces by the `codes` of their reasons, which are empty for a surface that needs no review."""
+        every = [set(own) for own in codes]
+        reasons = {code: count for code in get_args(ReviewCode) if (count := sum(code in own for own in every))}
+        return SurfaceReview(surfaces=len(every), needs_review=sum(map(bool, every)), reasons=reasons)
+
+    def __add__(self, other: SurfaceReview) -> SurfaceReview:
+        codes: tuple[ReviewCode, ...] = get_args(ReviewCode)
+        counts = {code: self.reasons.get(code, 0) + other.reasons.get(code, 0) for code in codes}
+        return SurfaceReview(
+            surfaces=self.surfaces + other.surfaces,
+            needs_review=self.needs_review + other.needs_review,
+            reasons={code: count for code, count in counts.items() if count},
+        )
+
+    @property
+    def is_majority(self) -> bool:
+        """Whether more than half of the surfaces need review."""
+        return 2 * self.needs_review > self.surfaces
+
 
 class CorrespondRecord(Struct, frozen=True, kw_only=True):
     """A NAME.correspond.json: what came of one scan; lengths are in the scan's own unit, shares from 0 to 1.
@@ -420,12 +476,14 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
         reason: why it is excluded.
         probability: that its surface is right, as far as the other scans show.
         doubt: why it is doubtful.
+        review: further reasons to review the surface, the most unusual first; None in records of earlier versions.
         seen_share: share of the template's vertices that it shows; the others are estimates.
         covered_share: share of its points that the template reaches, leaving out those beyond the template's rim.
         area_share: area of its surface in correspondence beside that of the scan; well below 1 where the template lacks
             parts that the scan shows.
         distance_mean, distance_p95, distance_p99, distance_max: both ways, over what is seen and reached.
         scale: its size beside the usual one, units distinguished.
+        size: RMS distance of the surface from its centroid, by that of the mean shape.
         unit_ratio: how many times as large as in the unit of most scans its coordinates are, such as 0.001 for metres
             among millimetres.
         notes: sentences on what should be known.
@@ -454,6 +512,7 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
     reason: str = ""
     probability: float | None = None
     doubt: str = ""
+    review: list[ReviewReason] | None = None
     seen_share: float | None = None
     covered_share: float | None = None
     area_share: float | None = None
@@ -462,6 +521,7 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
     distance_p99: float | None = None
     distance_max: float | None = None
     scale: float | None = None
+    size: float | None = None
     unit_ratio: float = 1.0
     notes: list[str] = []
     folded_share: float | None = None
@@ -480,6 +540,12 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
         """Whether the scan has no surface."""
         return self.status in ("excluded", "set aside")
 
+    @property
+    def review_codes(self) -> list[ReviewCode]:
+        """Why the surface needs review; empty if it does not."""
+        codes: list[ReviewCode] = ["doubtful"] if self.doubt else []
+        return codes + [reason.code for reason in self.review or ()]
+
 
 class CorrespondenceRecord(Struct, frozen=True, kw_only=True):
     """A correspondence.json: the run as a whole.
@@ -491,6 +557,7 @@ class CorrespondenceRecord(Struct, frozen=True, kw_only=True):
         corresponding: NAMEs in correspondence.
         set_aside: NAME to reason of the others.
         doubtful: NAMEs in correspondence whose surfaces are probably wrong.
+        needs_review: NAME to the codes of the reasons (`CorrespondRecord.review_codes`), of those that need review.
         other_units: NAME to `unit_ratio` of those that are in another unit than most.
         mirrored: NAMEs of those that are mirror images of the majority.
         sides_decided: whether scans could be distinguished from their mirror images.
@@ -524,6 +591,7 @@ class CorrespondenceRecord(Struct, frozen=True, kw_only=True):
     results_hash: str = ""
     added: list[str] = []
     doubtful: list[str] = []
+    needs_review: dict[str, list[ReviewCode]] = {}
     format: str = FORMAT
     format_version: int = VERSION
 
@@ -956,6 +1024,7 @@ class Methods(Struct, frozen=True, kw_only=True):
         gauge: `shape` divides size out, `form` keeps it.
         tangent: whether the shapes lie in the tangent space at their mean.
         source: of the shapes: coefficients, fitted, dense, corresponding, other surfaces, or landmarks.
+        review: number of the surfaces in correspondence that need review.
         modes: of the model that the shapes are combinations of; None where they are not limited to modes.
         explained_variance_ratio: share of the model's training variance in these modes; None as for `modes`.
         dimensions: of the space that is analysed; None where maps of vertices are.
@@ -980,6 +1049,7 @@ class Methods(Struct, frozen=True, kw_only=True):
     gauge: str = "shape"
     tangent: bool = False
     source: str = "surfaces"
+    review: SurfaceReview = SurfaceReview()
     modes: int | None = None
     explained_variance_ratio: float | None = None
     dimensions: int | None = None

@@ -18,7 +18,7 @@ def test_info_says_what_is_in_a_folder_in_correspondence(run: Run, same: Path) -
     facts = run("info", same, "--json").facts
     assert (facts["kind"], facts["scans"], facts["in_correspondence"]) == ("correspondence", 7, len(NAMES))
     assert facts["vertices"] == VERTICES and facts["triangles"] == 2 * VERTICES - 4
-    assert list(facts["set_aside"]) == [ASIDE] and set(facts["to_be_looked_at"]) == {FAR, FOLDED, HIDDEN}
+    assert list(facts["set_aside"]) == [ASIDE] and set(facts["needs_review"]) == {FAR, FOLDED, HIDDEN}
     assert facts["moved_share_by_round"] == [0.05, 0.012] and facts["settled"] is False
     assert 0.001 < facts["distance_share_median"]["mean"] < facts["distance_share_median"]["p99"] < 0.02
     assert facts["scans_with_folds"] == 1 and 0.2 < facts["vertices_missing_somewhere"] / VERTICES < 0.3
@@ -31,7 +31,7 @@ def test_info_names_scans_and_their_reasons_line_by_line(run: Run, same: Path) -
     assert "in_correspondence: 6" in lines
     at = lines.index("set_aside: 1")
     assert lines[at + 1].startswith(f"  {ASIDE}: another object")
-    at = lines.index("to_be_looked_at: 3")
+    at = lines.index("needs_review: 3")
     assert any(line.startswith(f"  {HIDDEN}: It shows only 76 %") for line in lines[at + 1 : at + 4])
 
 

@@ -15,7 +15,7 @@ from shapespace.correspondence.correspondence_result import Correspondence
 from shapespace.correspondence.register import ElasticSettings
 from shapespace.correspondence.scan_set import copies, unit_ratios
 from shapespace.correspondence.settings import CorrespondConfig
-from shapespace.correspondence.template import clean_scan, resample
+from shapespace.correspondence.template import choose_template, clean_scan, resample
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.normals import faces_of
@@ -48,6 +48,14 @@ def test_points_without_triangles_are_put_where_their_meshes_are(plain: list[Flo
     for mesh, cloud in zip(plain, placed(made), strict=True):
         assert np.nanmean(np.linalg.norm(cloud - mesh, axis=1)) < 1.0
     assert dispersion_mm(BLOBS, placed(made)) < 1.1 * dispersion_mm(BLOBS, plain)
+
+
+def test_a_whole_object_of_another_kind_is_no_template_of_open_scans(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shapespace.correspondence.generic.MODES", 15)
+    scans = [without_ball(scan, scan.vertices[np.argmax(scan.vertices[:, 0])], 45.0) for scan in SCANS[:3]]
+    directions, faces = sphere(700)
+    choice = choose_template([Mesh(1e3 * directions, faces, name="ball"), *scans], 0)
+    assert choice.index != 0 and np.nanargmax(choice.nearness) == 0
 
 
 def turned(mesh: Mesh) -> Mesh:

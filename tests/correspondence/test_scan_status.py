@@ -18,6 +18,7 @@ from shapespace.correspondence.scan_status import Judgement, ScanEvidence, judge
 from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.geometry.mirror_plane import mirror_image
 from shapespace.io.meshes.mesh_io import write_mesh
+from shapespace.report.inputs.correspondence_folder import Corresponded
 
 QUICK = ElasticSettings(harmonics=60, points=500, iterations=10)
 CONFIG = CorrespondConfig(vertices=300, rounds=2, mirror="never", first=QUICK, next=QUICK)
@@ -89,6 +90,12 @@ def test_build_leaves_doubtful_surfaces_out_with_a_note_and_includes_them_on_req
     doubtful = summary["doubtful"]
     assert len(doubtful) == 1 and set(doubtful) <= set(summary["corresponding"])
     assert f"({len(doubtful)} doubtful)" in output.out
+    reviews = Corresponded(tmp_path / "same").reviews()
+    codes = {
+        name: [*(["doubtful"] if name in doubtful else []), *(r.code for r in own)] for name, own in reviews.items()
+    }
+    assert summary["needs_review"] == {name: own for name, own in codes.items() if own}
+    assert f"{len(summary['needs_review'])} of 8 surfaces need" in output.out
     for scan in (one.scan for one in BLOBS):
         record = json.loads((tmp_path / "same" / f"{scan.name}.correspond.json").read_text())
         assert (record["status"] == "doubtful") == (scan.name in doubtful) == (record["probability"] < DOUBTED)

@@ -114,6 +114,16 @@ def test_a_scan_with_inner_surfaces_is_no_template_where_others_have_none() -> N
     assert np.isfinite(everywhere.nearness).all()
 
 
+@pytest.mark.parametrize("at", [0, 3])
+def test_another_object_without_inner_surfaces_is_no_template(at: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shapespace.correspondence.generic.MODES", 15)
+    scans = [with_shell(raw_blob(k, points=700).scan) for k in range(3)]
+    directions, faces = sphere(700)
+    scans.insert(at, Mesh(0.1 * directions, faces, name="ball"))
+    choice = choose_template(scans, 0)
+    assert choice.index != at and np.nanargmax(choice.nearness) == at
+
+
 @pytest.mark.long
 def test_outer_registers_the_scans_without_their_shells() -> None:
     quick = ElasticSettings(harmonics=100, points=500, iterations=10)

@@ -476,6 +476,7 @@ COMMANDS: tuple[Command, ...] = (
             _OUTPUT,
             basic("--scans", "FOLDER", source=QUALITY_TARGETS),
             basic("--unseen", "FOLDER", source=QUALITY_TARGETS),
+            advanced("--with-doubtful", source=QUALITY_TARGETS),
             basic("--folds", "N|loo", source=QUALITY, parse=values.folds),
             basic("--modes", "K", source=QUALITY, parse=values.positive),
             basic("--samples", "N", source=QUALITY, parse=values.positive),

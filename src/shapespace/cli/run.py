@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from shapespace.batch.execution import ExecutionConfig
     from shapespace.schemas import CorrespondenceRecord, CorrespondRecord, FitRecord, OverlapDistances, Quality
 
-_BY_SCAN = ("set_aside", "unreadable", "to_be_looked_at")
+_BY_SCAN = ("set_aside", "unreadable", "needs_review")
 _LISTED = 10
 """Scans that the terminal lists."""
 _LONGEST = 400
@@ -711,6 +711,9 @@ def _print_fits(records: Mapping[str, FitRecord], counts: Mapping[str, int], fol
 
 
 def _print_correspondence(summary: CorrespondenceRecord, records: Sequence[CorrespondRecord], folder: Path) -> None:
+    from shapespace.schemas import SurfaceReview
+    from shapespace.store.review_text import describe_review, review_summary
+
     show(summary.template)
     for number, moved in enumerate(summary.rounds, 1):
         show(f"round {number}: vertices moved by {100 * moved:.2f} % of the size (RMS)")
@@ -721,12 +724,19 @@ def _print_correspondence(summary: CorrespondenceRecord, records: Sequence[Corre
             warn(f"{record.name} is doubtful: {record.doubt}")
     there = [record for record in records if not record.reason]
     seen = sum(record.seen_share or 0.0 for record in there) / len(there)
+    unusual = [record for record in there if record.review and not record.doubt]
+    for record in unusual[:_LISTED]:
+        warn(f"{record.name} needs review: {'; '.join(describe_review(record, record.review or ()))}")
+    if len(unusual) > _LISTED:
+        warn(f"and {len(unusual) - _LISTED} more surfaces need review")
     doubtful = sum(bool(record.doubt) for record in there)
     show(
         f"{len(there)} of {len(records)} scans in correspondence{f' ({doubtful} doubtful)' if doubtful else ''}, "
         f"{summary.vertices} vertices, of which a scan shows "
         f"{100 * seen:.1f} % on average; results in {folder}"
     )
+    if review := review_summary(SurfaceReview.of(record.review_codes for record in there)):
+        show(f"{review}; inspect them with shapespace report {folder}")
     show(f"next: shapespace build {folder} -o model.h5")
 
 

@@ -7,7 +7,7 @@ squares) needs the coefficients alone, whatever the number of vertices.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, TypeAlias
 
@@ -26,6 +26,7 @@ from shapespace.lazy import lazy_import
 from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import list_briefly, short_repr
+from shapespace.schemas import SurfaceReview
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, SurfaceLandmarks, read_only
 
 SUBJECT = "subject"
@@ -145,6 +146,7 @@ class Cohort:
             has none.
         samples: N samples of the distribution of each completed shape, in any pose; None for shapes without. Empty if
             no shape has any.
+        review: number of the surfaces read from a correspondence that need review.
     """
 
     names: tuple[str, ...]
@@ -164,6 +166,7 @@ class Cohort:
     analysed: BoolArray | None = None
     position_std: FloatArray | None = None
     samples: tuple[ShapeSamples | None, ...] = ()
+    review: SurfaceReview = field(default_factory=SurfaceReview)
 
     def __post_init__(self) -> None:
         n = len(self.names)

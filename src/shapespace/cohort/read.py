@@ -23,6 +23,7 @@ from shapespace.model.additive import AdditiveModel, load_model
 from shapespace.model.shape_model import ShapeModel
 from shapespace.store.corresponding import SURFACE, surface_files, surface_stem
 from shapespace.store.results import Results, modes_of
+from shapespace.store.review_text import review_summary
 from shapespace.store.rows import META
 from shapespace.types import FloatArray, Mesh, read_only
 
@@ -47,7 +48,9 @@ class CohortConfig:
         surfaces: shapes of fits: `coefficients` of the model, its `fitted` surface, or the `dense` surface on the scan;
             `auto` uses dense surfaces if all fits have one, otherwise coefficients.
         gauge: `form` keeps size, `shape` divides size out.
-        doubtful: include doubtful fits and corresponding surfaces (default: excluded, and counted).
+        doubtful: include doubtful fits and corresponding surfaces (default: excluded, and counted), and use a
+            correspondence in which more than half of the surfaces need review.
+        accept_review: use such a correspondence, without its doubtful surfaces (default: the value of `doubtful`).
         geometry: what is analysed of surfaces with landmarks: the `surface`, or the `landmarks` alone.
         least: shapes that there must be; one will do where it is compared with what is known already.
         imputations: number of samples of each completed shape (NAME.samples.npz next to NAME.ply) that compare,
@@ -59,6 +62,7 @@ class CohortConfig:
     surfaces: Surfaces = "auto"
     gauge: Gauge = "shape"
     doubtful: bool = False
+    accept_review: bool | None = None
     geometry: Geometry = "surface"
     least: int = 2
     imputations: int = 20
@@ -122,7 +126,7 @@ def read_cohort(
         listed = (source if source.is_dir() else source.parent) / _LANDMARKS
         if surfaces.landmarks is None and listed.is_file():
             surfaces = replace(surfaces, landmarks=read_surface_landmarks(listed))
-        return landmark_cohort(surfaces, onto)
+        return replace(landmark_cohort(surfaces, onto), review=surfaces.review)
     table, keys = (None, ()) if data.is_dir() else read_table(data)
     folder = Path(config.shapes) if config.shapes else (data if table is None else data.parent)
     if not folder.is_dir():
@@ -293,8 +297,13 @@ def _of_surfaces(
     on_shape: Callable[[int, int], None] | None,
 ) -> Cohort:
     listing = surface_files([folder])
+    in_table = set(keys)
+    review = listing.review(
+        [file for file in listing.files if surface_stem(file) in in_table], "--doubtful",
+        accept=config.doubtful if config.accept_review is None else config.accept_review,
+    )  # fmt: skip
     listing = listing if config.doubtful else listing.without_doubtful("--doubtful")
-    notes = list(listing.notes)
+    notes = [*([f"{summary}."] if (summary := review_summary(review)) else []), *listing.notes]
     if config.gauge == "form":
         listing.refuse_mixed_units()
     # A completion may be written in several formats; its samples are of the vertices of the PLY file.
@@ -335,7 +344,7 @@ def _of_surfaces(
         )
     corresponding = all(file.name.endswith(SURFACE) for file, _ in matched)
     source = ShapeSource("corresponding" if corresponding else "surfaces")
-    return replace(cohort, notes=(*notes, *cohort.notes), source=source)
+    return replace(cohort, notes=(*notes, *cohort.notes), source=source, review=review)
 
 
 def _by_key(rows: Sequence[_Row]) -> dict[str, _Row]:

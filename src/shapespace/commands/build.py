@@ -35,6 +35,7 @@ from shapespace.reprs import first_names
 from shapespace.schemas import FitRecord
 from shapespace.store.corresponding import SurfaceFiles, surface_files
 from shapespace.store.results import is_result
+from shapespace.store.review_text import provenance_with_review, review_summary
 from shapespace.types import MM_PER_UNIT, Mesh, SurfaceLandmarks, common_faces
 from shapespace.version import __version__
 
@@ -74,7 +75,7 @@ class BuildFilesConfig:
             those of that model.
         recursive: also search subfolders of the given folders.
         with_doubtful: include surfaces of doubtful fits and doubtful corresponding surfaces (default: excluded, and
-            counted).
+            counted), and use a correspondence in which more than half of the surfaces need review.
 
     Raises:
         InputError: options that do not go together.
@@ -151,8 +152,9 @@ def build(
     if output.suffix.lower() not in (".h5", ".hdf5"):
         raise InputError(f"{output}: a model file is HDF5, so give it a name that ends in .h5.")
     listed = surface_files(meshes, recursive=config.recursive)
+    review = listed.review(listed.files, "--with-doubtful", accept=config.with_doubtful)
     listed = listed if config.with_doubtful else listed.without_doubtful("--with-doubtful")
-    notes = list(listed.notes)
+    notes = [*([f"{summary}."] if (summary := review_summary(review)) else []), *listed.notes]
     parent = None if config.add is None else _parent(config.add, output)
     gauge = parent.gauge if parent is not None else config.gauge or "shape"
     if gauge == "form" or not config.model.align:
@@ -170,6 +172,7 @@ def build(
         name: region_vertices(read_region(file), len(first.vertices), name) for name, file in config.regions.items()
     }
     config = _with_origin(files, config, notes)
+    config = _with_words(config, provenance_with_review(config.model.provenance, review), config.model.licence)
     count = len(files) + (0 if parent is None else parent.n_training)
     if config.model.modes == "auto" and count < 4:
         config = replace(config, model=replace(config.model, modes=None))

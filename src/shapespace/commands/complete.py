@@ -18,6 +18,7 @@ from shapespace.io.containers.arrays import write_arrays
 from shapespace.io.files import make_folder, remove_file
 from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
+from shapespace.store.review_text import review_of_provenance
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,8 @@ def complete_scans(
     given = given_scans(scans, folder, recursive=files.recursive, say=say)
     one, many = landmark_files(files.landmarks, len(given))
     model = ShapeModel.load(model_path)
+    if review := review_of_provenance(model.provenance):
+        say(f"{model_path}: of its training surfaces, {review}.")
     make_folder(folder)
     jobs = scan_jobs(given, one, many, folder)
     failed: dict[str, str] = {}

@@ -28,9 +28,9 @@ from shapespace.correspondence.groupwise import ENOUGH_TO_JUDGE, correspond
 from shapespace.correspondence.landmark_guide import stray_landmarks, without_stray_landmarks
 from shapespace.correspondence.registration import RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.scan_set import copies, unit_ratios
+from shapespace.correspondence.scan_status import SurfaceMeasures, find_review_reasons
 from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.errors import InputError, ShapespaceError
-from shapespace.geometry.distortion import Distortion
 from shapespace.geometry.doctor import NON_FINITE, repair
 from shapespace.geometry.landmark_placement import far_landmarks, place_landmarks
 from shapespace.geometry.mirror_plane import mirror_image
@@ -180,7 +180,7 @@ def _corresponding(
     given = template.name if template is not None else "" if model is None else "The model's mean"
     if not given or made.moved[0] < _ANOTHER_SHAPE:
         _note_other_objects(made, notes)
-    records = records_of(made, read, jobs, folder)
+    records = records_of(made, read, jobs, folder, config.settled)
     say_notes(records, made, given, say)
     report_landmarks(records, read, say)
     # Until all is written the folder is none that build takes.
@@ -204,6 +204,7 @@ def _corresponding(
         groups=[list(group) for group in made.groups],
         inputs_hash=inputs_hash,
         doubtful=[record.name for record in records if record.doubt],
+        needs_review={record.name: codes for record in records if (codes := record.review_codes)},
     )
     summary = structs.replace(summary, results_hash=results_hash_of(summary, folder))
     write_text(folder / SUMMARY, json_text(summary))
@@ -498,13 +499,22 @@ def records_of(
     read: ScansRead,
     jobs: Sequence[Job],
     folder: Path,
+    settled: float,
     kept: Sequence[tuple[float, CorrespondRecord]] = (),
 ) -> list[CorrespondRecord]:
-    """Return the records of the scans `jobs`; `kept` are scales and records of the scans that they are added to."""
+    """Return the records of the scans `jobs`; `kept` are scales and records of the scans that they are added to.
+
+    `settled` is the setting of the correspondence.
+    """
     came = {scan.name: scan for scan in made.scans}
     surfaces = {mesh.name: mesh for mesh in made.meshes()}
     scaled = {scan.name: scan.T_scan_template.scale for scan in made.scans if scan.T_scan_template is not None}
     sizes = _sizes(scaled, kept)
+    mean_size = rms_size(made.template.vertices)
+    of_kept = [SurfaceMeasures.of_record(record, scale * mean_size) for scale, record in kept]
+    measures = {scan.name: scan.measures for scan in made.scans if scan.measures is not None}
+    reviews = find_review_reasons([*of_kept, *measures.values()], settled)[len(kept) :]
+    review = dict(zip(measures, reviews, strict=True))
     records: list[CorrespondRecord] = []
     for job in jobs:
         name, one = job.name, came.get(job.name)
@@ -512,7 +522,10 @@ def records_of(
         record = _record(name, source, one, read.unread.get(name, ""), read.notes.get(name, []))
         record = structs.replace(record, metadata=dict(job.metadata))
         if name in surfaces:
-            record = _judged(record, without_estimates(surfaces[name]), made.template, read.scans[name])
+            scan = read.scans[name]
+            area = float(np.nansum(face_areas(without_estimates(surfaces[name]))))
+            share = None if scan.faces is None else area / float(face_areas(scan).sum())
+            record = structs.replace(record, area_share=share, size=scaled[name] * mean_size, review=review[name])
         record = structs.replace(record, landmark_distances=read.landmark_distances.get(name, {}))
         if name in sizes:
             scale, ratio = map(float, sizes[name])
@@ -560,18 +573,11 @@ def _size_note(scale: float) -> str:
     return f"It is {scale:.2g} times as large as most; look whether it is the same kind of object."
 
 
-def _judged(record: CorrespondRecord, surface: Mesh, mean: Mesh, scan: Mesh) -> CorrespondRecord:
-    """Return a record with what the triangles of its surface tell."""
-    changed = Distortion.of(surface, mean)
-    area = None if scan.faces is None else float(np.nansum(face_areas(surface)) / face_areas(scan).sum())
-    return structs.replace(record, folded_share=changed.folded_share, area_factor=changed.area_factor, area_share=area)
-
-
 def _record(
     name: str, source: Source, one: Corresponding | None, unread: str, notes: Sequence[str]
 ) -> CorrespondRecord:
     path = source.path or source.name
-    if one is None or one.vertices is None:
+    if one is None or one.vertices is None or one.measures is None:
         reason = unread if one is None else one.reason
         return CorrespondRecord(
             name=name, path=path, hash=source.content_hash, status="excluded", reason=reason, notes=list(notes)
@@ -580,7 +586,8 @@ def _record(
     return CorrespondRecord(
         name=name, path=path, hash=source.content_hash, status=one.status, doubt=one.doubt,
         probability=one.probability if np.isfinite(one.probability) else None, seen_share=one.seen,
-        covered_share=one.covered, distance_mean=mean, distance_p95=p95, distance_p99=p99, distance_max=largest,
+        covered_share=one.covered, folded_share=one.measures.folded, area_factor=one.measures.area_change,
+        distance_mean=mean, distance_p95=p95, distance_p99=p99, distance_max=largest,
         notes=list(notes), moved_share=list(one.moved), cpu_s=list(one.seconds),
         landmark_rms=one.landmarks if np.isfinite(one.landmarks) else None, mirrored=one.mirrored,
     )  # fmt: skip

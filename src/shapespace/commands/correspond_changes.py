@@ -227,7 +227,7 @@ def _changed(
         made = _registered(finished, kept, read, marks, replace(config, outer=False), rounds, update=change.update)
     _note_copies(finished, kept, read)
     before = [] if change.update else [(_scale(finished, name), finished.records[name]) for name in kept]
-    records = records_of(made, read, jobs, folder, before)
+    records = records_of(made, read, jobs, folder, config.settled, before)
     say_notes(records, made, "", say)
     report_landmarks(records, read, say)
     every = {name: record for name, record in finished.records.items() if name not in change.remove}
@@ -367,6 +367,7 @@ def _summary(
         groups=[there, *groups] if groups else [],
         added=[] if change.update else [name for name in added if name in there],
         doubtful=[name for name, record in every.items() if record.doubt],
+        needs_review={name: codes for name, record in every.items() if (codes := record.review_codes)},
     )
 
 

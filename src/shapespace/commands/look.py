@@ -176,7 +176,7 @@ def correspondence_facts(folder: Path) -> dict[str, Any]:
         "in_correspondence": len(records),
         "set_aside": {record.name: record.reason for record in result.set_aside},
         "unreadable": {**result.unread, **population.unread},
-        "to_be_looked_at": {name: concern.text for name, concern in concerns.items() if concern.reasons},
+        "needs_review": {name: concern.text for name, concern in concerns.items() if concern.reasons},
         "vertices": len(result.mean.vertices),
         "triangles": len(faces_of(result.mean)),
         "template": result.run.template,

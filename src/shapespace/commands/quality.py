@@ -24,6 +24,7 @@ from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import BySize, Measured, Quality, json_text
 from shapespace.store.corresponding import SURFACE, surface_files, surface_stem
+from shapespace.store.review_text import review_summary
 from shapespace.types import Mesh
 
 _SURFACES = (".dense.ply", ".fitted.ply", SURFACE)
@@ -41,6 +42,8 @@ class QualityOptions:
         scans: folder of the scans that the surfaces were made from, with the same names, pose and unit: distances are
             measured to these.
         unseen: folder of corresponding shapes that no model was trained on: also measure the error on these.
+        with_doubtful: include doubtful corresponding surfaces (default: excluded, and counted), and use a
+            correspondence in which more than half of the surfaces need review.
 
     Raises:
         InputError: representations that there are not.
@@ -50,6 +53,7 @@ class QualityOptions:
     representations: Sequence[str] = ("vertices",)
     scans: Path | None = None
     unseen: Path | None = None
+    with_doubtful: bool = False
 
     def __post_init__(self) -> None:
         for name in self.representations:
@@ -129,7 +133,9 @@ def _targets(paths: Sequence[Path], options: QualityOptions, notes: list[str], *
         raise InputError("At most two targets or representations are compared; give one or two.")
     gauge = options.config.gauge if options.config.align else "form"
     loaded: list[tuple[ShapeModel | list[Mesh], dict[str, float]]] = [
-        (ShapeModel.load(p), {}) if not p.is_dir() and looks_like_model(p) else _meshes(p, notes, gauge, quiet=quiet)
+        (ShapeModel.load(p), {})
+        if not p.is_dir() and looks_like_model(p)
+        else _meshes(p, notes, gauge, options, quiet=quiet)
         for p in paths
     ]
     pairs = [(k, names[min(k, len(names) - 1)]) for k in range(len(paths))]
@@ -162,9 +168,14 @@ def _refuse_unlike(targets: Sequence[_Target]) -> None:
         )
 
 
-def _meshes(folder: Path, notes: list[str], gauge: Gauge, *, quiet: bool) -> tuple[list[Mesh], dict[str, float]]:
+def _meshes(
+    folder: Path, notes: list[str], gauge: Gauge, options: QualityOptions, *, quiet: bool
+) -> tuple[list[Mesh], dict[str, float]]:
     """Return the meshes of a folder in the unit of most of them, and the ratios of those that were in another."""
-    listed = surface_files([folder]).without_doubtful()
+    listed = surface_files([folder])
+    if review := review_summary(listed.review(listed.files, "--with-doubtful", accept=options.with_doubtful)):
+        notes.append(f"{folder}: {review}.")
+    listed = listed if options.with_doubtful else listed.without_doubtful("--with-doubtful")
     notes += listed.notes
     if gauge == "form":
         listed.refuse_mixed_units()
@@ -217,7 +228,7 @@ def _scans(target: _Target, folder: Path | None, *, quiet: bool) -> list[Mesh] |
 
 
 def _measure(target: _Target, options: QualityOptions, run: Runner, *, quiet: bool) -> ModelQuality:
-    unseen = [] if options.unseen is None else _meshes(options.unseen, [], "shape", quiet=quiet)[0]
+    unseen = [] if options.unseen is None else _meshes(options.unseen, [], "shape", options, quiet=quiet)[0]
     scans = _scans(target, options.scans, quiet=quiet)
     with steps(None, f"measuring {target.name}, in", "step", quiet=quiet) as step:
         return measure_quality(target.data, target.config, scans=scans, unseen=unseen, progress=step, run=run)

@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from shapespace.correspondence.scan_status import ScanEvidence, ScanStatus
+from shapespace.correspondence.scan_status import ScanEvidence, ScanStatus, SurfaceMeasures
 from shapespace.geometry.mirror_plane import FLIP
 from shapespace.lazy import lazy_import
 from shapespace.reprs import short_repr
+from shapespace.schemas import ReviewCode, ReviewReason
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity, SurfaceLandmarks
 
 
@@ -38,6 +39,9 @@ class Corresponding:
         observed: (V,) bool, False where `vertices` are estimates; None if excluded.
         position_std: (V,) standard deviation of each vertex's position in any direction along the surface, in the
             scan's unit: with 90 % probability the position is within 2.15 times it; None if excluded.
+        measures: of the quality of the surface; None if excluded.
+        review: reasons to review the surface, in addition to `doubt`, by its measures; the most unusual first. Empty
+            for scans that were added to a finished correspondence, since its records have the measures of the others.
     """
 
     name: str
@@ -57,8 +61,15 @@ class Corresponding:
     doubt: str = ""
     evidence: ScanEvidence | None = None
     position_std: FloatArray | None = None
+    measures: SurfaceMeasures | None = None
+    review: tuple[ReviewReason, ...] = ()
 
     __repr__ = short_repr
+
+    @property
+    def review_codes(self) -> list[ReviewCode]:
+        """Why the surface needs review; empty if it does not."""
+        return [*(["doubtful"] if self.doubt else []), *(reason.code for reason in self.review)]
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,10 +14,12 @@ from shapespace.correspondence.settings import FEWEST, SIZE, CorrespondConfig
 from shapespace.correspondence.template import check_template, choose_template, clean_scan, resample
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.doctor import repair
-from shapespace.geometry.normals import rms_size
+from shapespace.geometry.normals import faces_of, rms_size
 from shapespace.geometry.outer_surface import outer_surface
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh, Similarity
+
+_FEWEST_SHARE = 2 / 3  # of the requested vertices; with fewer, handles of the surface have hardly a vertex each
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +105,7 @@ def _chosen_scan(scans: Mapping[int, Mesh], config: CorrespondConfig) -> tuple[M
     choice = choose_template(list(scans.values()), config.seed)
     chosen = scans[list(scans)[choice.index]]
     mesh = resample(clean_scan(chosen), config.vertices)
+    _check_vertices(mesh, config.vertices)
     origin = (
         f"{chosen.name} is the first template: of {np.isfinite(choice.nearness).sum()} candidates it lies nearest "
         f"to the others, {100 * choice.nearness[choice.index]:.1f} % of its size off after a smooth change."
@@ -110,6 +113,27 @@ def _chosen_scan(scans: Mapping[int, Mesh], config: CorrespondConfig) -> tuple[M
     if chosen.colours is not None:
         mesh = replace(mesh, colours=chosen.colours[cKDTree(chosen.vertices).query(mesh.vertices)[1]])
     return mesh.with_vertices(mesh.vertices, chosen.landmarks), origin
+
+
+def _check_vertices(template: Mesh, wanted: int) -> None:
+    """Check that the first template has about as many vertices as requested.
+
+    Handles and holes take vertices: a closed surface of F triangles with g handles has F / 2 + 2 - 2 g.
+
+    Raises:
+        InputError: it has fewer than two thirds of them.
+    """
+    count = len(template.vertices)
+    if count < _FEWEST_SHARE * wanted:
+        edges = faces_of(template)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+        characteristic = count - len(np.unique(np.sort(edges, axis=1), axis=0)) + len(faces_of(template))
+        handles = (2 - characteristic) // 2
+        enough = int(np.ceil(-characteristic / (1 - _FEWEST_SHARE) / 100) * 100)
+        raise InputError(
+            f"{template.name} is the first template, and with --vertices {wanted} it has only {count} vertices, since "
+            f"its surface has about {handles} handles, as inner surfaces of CT scans have; give --vertices {enough} or "
+            "more, or remove inner surfaces (--outer)."
+        )
 
 
 def _transformed(model: ShapeModel, T: Similarity) -> ShapeModel:

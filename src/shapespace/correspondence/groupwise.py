@@ -41,14 +41,23 @@ from shapespace.correspondence.registration import (
 )
 from shapespace.correspondence.relief import Reliefs, agreement, relief
 from shapespace.correspondence.scan_set import unit_ratios
-from shapespace.correspondence.scan_status import Judgement, ScanEvidence, judge
+from shapespace.correspondence.scan_status import (
+    MOST_FOLDED,
+    Judgement,
+    ScanEvidence,
+    SurfaceMeasures,
+    find_review_reasons,
+    judge,
+)
 from shapespace.correspondence.settings import FEWEST, SIZE, CorrespondConfig
 from shapespace.correspondence.subject_tree import subject_levels
 from shapespace.correspondence.template import PoseModel, clean_scan
 from shapespace.correspondence.vertex_confidence import VertexConfidence
 from shapespace.errors import InputError, ShapespaceError
+from shapespace.geometry.distortion import Distortion
 from shapespace.geometry.landmark_placement import place_landmarks
 from shapespace.geometry.mirror_plane import FLIP, mirror_image
+from shapespace.geometry.normals import rms_size
 from shapespace.geometry.procrustes import align_to_weighted_mean
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.interop import as_meshes
@@ -109,7 +118,8 @@ def correspond(
         run: does the tasks of a round.
 
     Raises:
-        InputError: fewer than two scans, scans that are all equal, or too few that can be registered.
+        InputError: fewer than two scans, scans that are all equal, too few that can be registered, or settings with
+            which the first template has too few vertices, or the median surface more than 1 % of folded triangles.
         MeshError: no scan can be a template, or the template is none.
     """
     scans = list(as_meshes(scans, "correspond"))
@@ -129,7 +139,25 @@ def correspond(
             state = _registered_by_subject(problem, previous, state, run)
         if state.rounds[-1].moved < config.settled:  # C17
             break
-    return _result(problem, state, _evidence(state))
+    result = _result(problem, state, _evidence(state))
+    _check_folds(result, config)
+    return result
+
+
+def _check_folds(result: Correspondence, config: CorrespondConfig) -> None:
+    """Check that the vertices and rounds suffice for surfaces without folds.
+
+    Raises:
+        InputError: the median surface has more than 1 % of folded triangles.
+    """
+    folded = float(np.median([scan.measures.folded for scan in result.scans if scan.measures is not None]))
+    if folded > MOST_FOLDED:
+        raise InputError(
+            f"{100 * folded:.1f} % of the triangles of the median surface are folded over after {len(result.moved)} "
+            f"rounds with {len(result.template.vertices)} vertices, so these settings do not suffice for a "
+            f"correspondence; give more vertices (--vertices, {config.vertices} now) and rounds (--rounds, "
+            f"{config.rounds} now), or remove inner surfaces (--outer)."
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -906,6 +934,9 @@ def _result(problem: _Problem, state: RegistrationState, evidence: Mapping[int, 
     scans = [
         _scan_result(problem, state, i, complete.get(i), evidence.get(i), confidence) for i in range(len(problem.names))
     ]
+    measured = [scan.measures for scan in scans if scan.measures is not None]
+    reasons = iter(find_review_reasons(measured, problem.config.settled))
+    scans = [scan if scan.measures is None else replace(scan, review=tuple(next(reasons))) for scan in scans]
     points = state.landmarks.positions(state.template.vertices)
     template = state.template.with_vertices(state.template.vertices, points)
     landmarks = replace(state.landmarks, distance_mm=np.empty(0))  # places on a mean have no given point
@@ -970,4 +1001,19 @@ def _scan_result(
         doubt=judgement.doubt,
         evidence=evidence,
         position_std=T.scale * position_std,
+        measures=_measures(state.template, registration, moved),
+    )
+
+
+def _measures(template: Mesh, registration: ScanRegistration, moved: Sequence[float]) -> SurfaceMeasures:
+    """Return the measures of a surface in the frame of the template; `moved` are its movements in the rounds."""
+    seen = np.where(registration.observed[:, None], registration.vertices, np.nan)
+    changed = Distortion.of(template.with_vertices(seen), template)
+    return SurfaceMeasures(
+        distance=registration.distance[2] / rms_size(template.vertices),
+        folded=changed.folded_share,
+        missing=1.0 - float(registration.observed.mean()),
+        unreached=1.0 - registration.covered,
+        area_change=changed.area_factor,
+        not_settled=moved[-1] if moved else np.nan,
     )

@@ -1,17 +1,21 @@
 """Status of scans in correspondence: the probability that a surface is right, learned from simulated and real sets.
 
 After the last round each surface is compared with those of the other scans. A logistic model turns this evidence into
-the probability that the surface is wrong (C33).
+the probability that the surface is wrong (C33). A surface whose quality is unusual needs review, with typed reasons.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from math import exp, inf, nan
 from typing import Literal, TypeAlias
 
 import numpy as np
 
 from shapespace.correspondence.pose_consensus import SAME_POSE_DEG
+from shapespace.schemas import CorrespondRecord, ReviewCode, ReviewReason
+from shapespace.types import FloatArray
 
 ScanStatus: TypeAlias = Literal["converged", "doubtful", "excluded"]
 _INTERCEPT = -4.81
@@ -27,6 +31,13 @@ _DOUBTED = 0.14
 _CLEAR = 1.3
 """Agreement of reliefs (a correlation of 0.86) from which nothing is lacking: 33 wrong surfaces of 18 collections had
 at most 1.21. Without this limit 10 instead of 5 of 174 right ones were doubtful, as the usual one can be above 1.8."""
+_UNUSUAL = 4.0
+"""Robust standard deviations above the median from which a value needs review."""
+_LEAST_SPREAD = 0.25  # share of the median that counts as usual variation, where all scans are alike
+_TO_STDDEV = 1.4826  # MAD to standard deviation of a normal distribution: 1 / 0.6745
+MOST_FOLDED = 0.01
+"""Share of folded triangles above which a surface needs review whatever the others have. The median surface of
+eight femora and of eight molars has none, with 1000 and 3000 vertices."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,3 +100,87 @@ def judge(evidence: ScanEvidence) -> Judgement:
             f"of the others by {own:.2f} (usual: {usual:.2f})"
         )
     return Judgement("doubtful", right, doubt)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceMeasures:
+    """Measures of a surface in correspondence that decide whether it needs review; not-a-number if unknown.
+
+    Args:
+        distance: 99 % of the distances between scan and surface, both ways, are below it; share of the size.
+        folded: share of the triangles that are folded, and are not on the mean shape.
+        missing: share of the vertices that the scan does not show.
+        unreached: share of the scan that the surface does not cover.
+        area_change: factor by which 95 % of the triangles grow or shrink at most, the change of size divided out.
+        not_settled: RMS movement of the vertices in the last round, share of the size.
+    """
+
+    distance: float
+    folded: float
+    missing: float
+    unreached: float
+    area_change: float
+    not_settled: float
+
+    @staticmethod
+    def of_record(record: CorrespondRecord, size: float) -> SurfaceMeasures:
+        """Return the measures in a record; `size` is the RMS size of the surface in the unit of the scan."""
+
+        def known(value: float | None) -> float:
+            return nan if value is None else value
+
+        return SurfaceMeasures(
+            distance=known(record.distance_p99) / size,
+            folded=known(record.folded_share),
+            missing=1.0 - known(record.seen_share),
+            unreached=1.0 - known(record.covered_share),
+            area_change=record.area_factor or nan,
+            not_settled=record.moved_share[-1] if record.moved_share else nan,
+        )
+
+
+def find_review_reasons(surfaces: Sequence[SurfaceMeasures], settled: float) -> list[list[ReviewReason]]:
+    """Return for each of the `surfaces` of a collection the reasons to review it, the most unusual first.
+
+    A measure is unusual if it is more than four robust standard deviations above the median of all surfaces. Folded
+    triangles, distances and parts that are not reached also have limits of their own.
+
+    Args:
+        surfaces: all surfaces of the collection.
+        settled: movement below which a round is the last, share of the size.
+    """
+
+    def column(code: ReviewCode) -> FloatArray:
+        return np.array([getattr(surface, code) for surface in surfaces], dtype=np.float64)
+
+    def relative_spread(values: FloatArray) -> float:
+        return _LEAST_SPREAD * _median(values)
+
+    distance, growth, moved = column("distance"), np.log(column("area_change")), column("not_settled")
+    # Values, their least spread, the smallest unusual value, and the limit above which any value needs review.
+    measures: dict[ReviewCode, tuple[FloatArray, float, float, float]] = {
+        "distance": (distance, relative_spread(distance), 0.0, 0.1),
+        "folded": (column("folded"), 0.0005, 0.001, MOST_FOLDED),
+        "missing": (column("missing"), 0.03, 0.2, inf),
+        "unreached": (column("unreached"), 0.02, 0.1, 0.25),
+        "area_change": (growth, relative_spread(growth), 0.0, inf),
+        "not_settled": (moved, relative_spread(moved), settled, inf),
+    }
+    reasons: list[list[ReviewReason]] = [[] for _ in surfaces]
+    for code, (values, least_spread, least_value, limit) in measures.items():
+        usual = _median(values)
+        spread = max(_TO_STDDEV * _median(np.abs(values - usual)), least_spread, 1e-12)
+        for own, value in zip(reasons, values.tolist(), strict=True):
+            excess = (value - usual) / spread
+            if value > limit:
+                excess = max(excess, _UNUSUAL * value / limit)
+            if excess > _UNUSUAL and value > least_value:
+                shown = (exp(value), exp(usual)) if code == "area_change" else (value, usual)
+                own.append(ReviewReason(code=code, value=shown[0], usual=shown[1], excess=excess))
+    return [sorted(own, key=lambda reason: -reason.excess) for own in reasons]
+
+
+def _median(values: FloatArray) -> float:
+    """Return the median of the finite numbers, NaN if there are none."""
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) else nan

@@ -6,18 +6,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from shapespace.correspondence.generic import generic_model
 from shapespace.correspondence.harmonics import Harmonics
+from shapespace.correspondence.kinds import SAME_KIND
 from shapespace.correspondence.settings import LARGEST_ROTATION_DEG, PoseRange
 from shapespace.errors import MeshError, ShapespaceError
 from shapespace.fit.search.initialisation import Start, start_from_any_pose, start_near_frame
 from shapespace.geometry import remesh
 from shapespace.geometry.doctor import repair
 from shapespace.geometry.normals import boundary_edges, face_areas, faces_of, rms_size, without_vertices
-from shapespace.geometry.outer_surface import hidden_share
+from shapespace.geometry.outer_surface import hidden_share, outer_surface
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 
@@ -98,9 +100,10 @@ class TemplateChoice:
 def choose_template(scans: Sequence[Mesh], seed: int) -> TemplateChoice:
     """Return which of `scans` is nearest to the others, judged by a few candidates and a few others.
 
-    Candidates are some with few pieces and short borders, as those lack least, without inner surfaces where there are
-    such. One that lacks a part shows less of the
-    surface than the others do where it lies on them, and is chosen only if all lack as much.
+    Candidates are some with few pieces and short borders, as those lack least. One that is more than twice as far from
+    the others as the median candidate is another object. If some scans have inner surfaces, all are compared by their
+    outer surfaces, and one without inner surfaces is preferred. One that lacks a part shows less of the surface than
+    the others do where it lies on them, and is chosen only if all lack as much.
 
     Raises:
         MeshError: none of them can be a template.
@@ -108,12 +111,15 @@ def choose_template(scans: Sequence[Mesh], seed: int) -> TemplateChoice:
     rng = np.random.default_rng(seed)
     incompleteness = np.array([_incompleteness(scan) for scan in scans])
     has_inside = np.array([hidden_share(scan) > _INSIDE for scan in scans])
-    if np.isfinite(incompleteness[~has_inside]).any():
-        incompleteness[has_inside] = np.inf
-    candidates = np.argsort(incompleteness, kind="stable")[: max(_CANDIDATES, len(scans) // 2)]
-    candidates = candidates[np.isfinite(incompleteness[candidates])]
-    candidates = np.sort(rng.choice(candidates, min(_CANDIDATES, len(candidates)), replace=False))
+    usable = np.isfinite(incompleteness)
+    is_mixed = bool((usable & ~has_inside).any() and (usable & has_inside).any())
+    candidates = _candidates(np.where(has_inside & is_mixed, np.inf, incompleteness), _CANDIDATES, rng)
     others = np.sort(rng.choice(len(scans), min(_OTHERS, len(scans)), replace=False))
+    if is_mixed:
+        hollow = _candidates(np.where(has_inside, incompleteness, np.inf), _CANDIDATES - len(candidates), rng)
+        candidates = np.sort(np.concatenate([candidates, hollow]))
+        compared = {*candidates.tolist(), *others.tolist()}
+        scans = [outer_surface(s) if has_inside[k] and k in compared else s for k, s in enumerate(scans)]
     nearness, visible = np.full(len(scans), np.nan), np.full(len(scans), np.nan)
     for i in map(int, candidates):
         try:
@@ -130,8 +136,19 @@ def choose_template(scans: Sequence[Mesh], seed: int) -> TemplateChoice:
             f"None of the scans can be a template, since none is a sheet of triangles with {_FEWEST} vertices or more; "
             "give --template MESH."
         )
-    fair = np.where(visible >= _AS_WHOLE * np.nanmax(visible), nearness, np.inf)
-    return TemplateChoice(int(np.nanargmin(fair)), tuple(float(share) for share in nearness))
+    is_possible = nearness <= SAME_KIND * np.nanmedian(nearness)
+    if is_mixed and (is_possible & ~has_inside).any():
+        is_possible &= ~has_inside
+    is_possible &= visible >= _AS_WHOLE * visible[is_possible].max()
+    chosen = int(np.argmin(np.where(is_possible, nearness, np.inf)))
+    return TemplateChoice(chosen, tuple(float(share) for share in nearness))
+
+
+def _candidates(incompleteness: FloatArray, most: int, rng: np.random.Generator) -> npt.NDArray[np.intp]:
+    """Return the sorted indices of at most `most` scans, drawn from those of finite and small incompleteness."""
+    candidates = np.argsort(incompleteness, kind="stable")[: max(_CANDIDATES, len(incompleteness) // 2)]
+    candidates = candidates[np.isfinite(incompleteness[candidates])]
+    return np.sort(rng.choice(candidates, min(most, len(candidates)), replace=False))
 
 
 def check_template(template: Mesh) -> Mesh:

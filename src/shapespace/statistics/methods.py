@@ -42,6 +42,7 @@ def methods_of(cohort: Cohort, subjects: int, **known: Any) -> Methods:
         "gauge": cohort.gauge,
         "tangent": cohort.gauge == "shape" and bool(along <= _ALONG * (centred**2).sum(axis=1).max(initial=0.0)),
         "source": cohort.source.kind,
+        "review": cohort.review,
         "modes": cohort.source.modes,
         "explained_variance_ratio": cohort.source.explained_variance_ratio,
         "dimensions": int((singular > RANK * singular.max(initial=0.0)).sum()),

@@ -8,7 +8,7 @@ Random World, 2005; with refitting, Barber et al., Annals of Statistics 49(1), 2
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial.distance import cdist
@@ -21,7 +21,7 @@ from shapespace.fit.robust.posterior import variance_of_new_shapes
 from shapespace.geometry.normals import vertex_normals
 from shapespace.geometry.procrustes import centroid_size
 from shapespace.reprs import list_briefly
-from shapespace.schemas import Methods, SampleSize, TestScheme
+from shapespace.schemas import Methods, SampleSize, SurfaceReview, TestScheme
 from shapespace.statistics.analysis_result import AnalysisResult
 from shapespace.statistics.methods import methods_of
 from shapespace.statistics.multiple_imputation import Imputations, over_imputations
@@ -104,6 +104,7 @@ class ScoreResult(AnalysisResult):
         config: options of the scoring.
         notes: who was left out and why, and what should be known.
         imputations: those that scores combine; None without samples of completed shapes.
+        review: number of the surfaces of reference and subjects that need review.
     """
 
     names: tuple[str, ...]
@@ -131,6 +132,7 @@ class ScoreResult(AnalysisResult):
     config: ScoreConfig
     notes: tuple[str, ...]
     imputations: Imputations | None = None
+    review: SurfaceReview = field(default_factory=SurfaceReview)
 
     @property
     def percentile(self) -> FloatArray:
@@ -154,6 +156,7 @@ class ScoreResult(AnalysisResult):
         return methods_of(
             self.subjects, len(self.names), dimensions=self.modes, analysed_variance_ratio=self.variance_share,
             sizes=sizes,
+            review=self.review,
             tests=(
                 TestScheme(tested=("percentiles",), statistic="Mahalanobis distance",
                            resampling="leave-one-out"),
@@ -280,7 +283,7 @@ def _score_shapes(
         beyond_farther=read_only(beyond[1]), size_mm=subjects.sizes_mm, size_z=read_only(size_z), z=z, z_limit=limit,
         nearest=tuple(nearest), outside=(), reference_distance=read_only(np.sqrt(own_d2[0])),
         reference_rest_mm=read_only(own_rest[0]), subjects=subjects, config=config,
-        notes=(*notes, *_on_size(population.people)),
+        review=reference.review + subjects.review, notes=(*notes, *_on_size(population.people)),
     )  # fmt: skip
     return replace(scores, outside=tuple(tuple(_outside(scores, k)) for k in range(m)))
 

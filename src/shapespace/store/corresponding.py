@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from shapespace.errors import InputError
@@ -12,8 +12,9 @@ from shapespace.io.containers.json_files import read_json
 from shapespace.io.meshes.mesh_folders import mesh_files
 from shapespace.io.meshes.mesh_io import stem_of
 from shapespace.reprs import first_names
-from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord
+from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, ReviewCode, SurfaceReview
 from shapespace.store.results import ENDINGS, mesh_at, results_at, surfaces_of
+from shapespace.store.review_text import review_summary
 from shapespace.types import Mesh
 
 SURFACE, RECORD = CorrespondRecord.SURFACE, CorrespondRecord.ENDING
@@ -32,6 +33,7 @@ class SurfaceFiles:
         unit_ratios: of files in another unit than most of their folder, as of `CorrespondRecord`.
         mirrored: files of surfaces that are mirror images of the majority of their folder.
         doubtful: files of surfaces that are doubtful.
+        needs_review: reasons to review surfaces, doubtful ones among them, by the records of their correspondence.
         notes: what the user should know.
     """
 
@@ -40,6 +42,7 @@ class SurfaceFiles:
     mirrored: frozenset[Path]
     doubtful: frozenset[Path]
     notes: tuple[str, ...]
+    needs_review: Mapping[Path, Sequence[ReviewCode]] = field(default_factory=dict[Path, Sequence[ReviewCode]])
 
     def mesh(self, file: Path) -> Mesh:
         """Return the mesh in one of the files, in the unit and on the side of the majority.
@@ -53,6 +56,27 @@ class SurfaceFiles:
             return mesh
         std = None if mesh.position_std is None else mesh.position_std / ratio
         return replace(mesh, vertices=mesh.vertices / ratio, position_std=std)
+
+    def review(self, files: Iterable[Path], option: str = "", *, accept: bool) -> SurfaceReview:
+        """Return how many of the `files` need review by the records of their correspondence.
+
+        Args:
+            files: of the surfaces that are used, doubtful ones included.
+            option: of the command, which accepts surfaces that need review.
+            accept: whether more than half may need review.
+
+        Raises:
+            InputError: more than half need review, without `accept`.
+        """
+        used = list(files)
+        review = SurfaceReview.of(self.needs_review.get(file, ()) for file in used)
+        if review.is_majority and not accept:
+            named = first_names([file.name for file in used if file in self.needs_review], _NAMED)
+            raise InputError(
+                f"{review_summary(review)}, which is more than half ({named}); inspect them with shapespace report, "
+                f"run shapespace correspond with other settings{f', or use {option} to continue' if option else ''}."
+            )
+        return review
 
     def without_doubtful(self, option: str = "") -> SurfaceFiles:
         """Return the files without doubtful surfaces of a correspondence, with a note; `option`, if any, includes them.
@@ -131,6 +155,7 @@ def surface_files(paths: Sequence[Path], *, recursive: bool = False) -> SurfaceF
     ratios: dict[Path, float] = {}
     mirrored: set[Path] = set()
     doubtful: set[Path] = set()
+    needs_review: dict[Path, Sequence[ReviewCode]] = {}
     for folder in dict.fromkeys(file.parent for file in files if file.name.endswith(SURFACE)):
         if (summary := _summary_of(folder)) is not None:
             other_units = {folder / f"{name}{SURFACE}": ratio for name, ratio in summary.other_units.items()}
@@ -138,11 +163,13 @@ def surface_files(paths: Sequence[Path], *, recursive: bool = False) -> SurfaceF
             reflected = {folder / f"{name}{SURFACE}" for name in summary.mirrored}
             mirrored |= reflected.intersection(files)
             doubtful |= {folder / f"{name}{SURFACE}" for name in summary.doubtful}.intersection(files)
+            needs_review |= {folder / f"{name}{SURFACE}": ["doubtful"] for name in summary.doubtful}
+            needs_review |= {folder / f"{name}{SURFACE}": codes for name, codes in summary.needs_review.items()}
     if mirrored:
         of = "meshes is a mirror image" if len(mirrored) == 1 else "meshes are mirror images"
         names = first_names([file.name for file in files if file in mirrored], _NAMED)
         notes.append(f"{len(mirrored)} of {len(files)} {of} of the others ({names}) and reflected.")
-    return SurfaceFiles(tuple(files), ratios, frozenset(mirrored), frozenset(doubtful), tuple(notes))
+    return SurfaceFiles(tuple(files), ratios, frozenset(mirrored), frozenset(doubtful), tuple(notes), needs_review)
 
 
 def _summary_of(folder: Path) -> CorrespondenceRecord | None:

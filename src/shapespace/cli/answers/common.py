@@ -18,7 +18,12 @@ if TYPE_CHECKING:
 
 
 def cohort_of(
-    arguments: argparse.Namespace, gauge: Gauge | None = None, onto: Cohort | None = None, *, least: int = 2
+    arguments: argparse.Namespace,
+    gauge: Gauge | None = None,
+    onto: Cohort | None = None,
+    *,
+    least: int = 2,
+    accept_review: bool | None = None,
 ) -> Cohort:
     """Return the cohort that the arguments name.
 
@@ -27,13 +32,15 @@ def cohort_of(
         gauge: gauge of a command that has no option for it; None for the value of the option.
         onto: a cohort that this one is compared with.
         least: the smallest number of shapes, if `onto` is None.
+        accept_review: see `CohortConfig`; None for the value of --doubtful, or True for a command without the option.
     """
     from shapespace.batch.progress import steps
     from shapespace.cohort.read import CohortConfig, read_cohort
 
     _figures(arguments)  # files and options that do not fit are refused before the analysis
     fixed = {} if gauge is None else {"gauge": gauge}
-    config = CohortConfig(**given(arguments, CohortConfig, least=least, **fixed))
+    accept_review = getattr(arguments, "doubtful", True) if accept_review is None else accept_review
+    config = CohortConfig(**given(arguments, CohortConfig, least=least, accept_review=accept_review, **fixed))
     with steps(None, "reading", "shape", quiet=arguments.quiet) as step:
         cohort = read_cohort(arguments.data, config, onto=onto, on_shape=step)
     return replace(cohort, unit="") if getattr(arguments, "no_unit", False) else cohort

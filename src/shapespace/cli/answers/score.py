@@ -16,7 +16,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     config = ScoreConfig(**given(arguments, ScoreConfig))
     known = {"data": arguments.reference, "shapes": arguments.reference_shapes, "doubtful": False}
-    reference = cohort_of(argparse.Namespace(**{**vars(arguments), **known}))
+    reference = cohort_of(argparse.Namespace(**{**vars(arguments), **known}), accept_review=arguments.doubtful)
     subjects = cohort_of(arguments, onto=reference)
     with steps(len(subjects), "scoring", "subject", quiet=arguments.quiet) as step:
         result = score(reference, subjects, config, progress=step)

@@ -18,6 +18,7 @@ from shapespace.schemas import (
 )
 from shapespace.statistics.dispersion import FEWEST_OF_GROUP
 from shapespace.statistics.methods import REDUCED_OF_EACH_TERM, SCAN_OF_SUBJECT
+from shapespace.store.review_text import review_summary
 
 _SOURCES = {
     "coefficients": "coefficients of the model of the fits",
@@ -252,6 +253,8 @@ def _sentences(methods: Methods, *, in_paper: bool = False) -> Iterator[str]:
         f"{_alignment_sentence(methods)}{space} "
         + ("Lengths are in mm." if methods.unit == "mm" else "The coordinates have no unit, so lengths have none.")
     )
+    if review := review_summary(methods.review):
+        yield f"{review}."
     if any(test.resampling in ("permutation", "sign flips") for test in methods.tests):
         yield f"Exchangeability: {_exchangeability(methods)}"
     if in_paper and methods.dispersions:

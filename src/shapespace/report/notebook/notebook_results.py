@@ -14,7 +14,8 @@ from shapespace.report.inputs.saved_fits import Folder
 from shapespace.report.notebook.notebook_fits import Drawn, notebook_html
 from shapespace.report.pages.page import Page
 from shapespace.report.pages.study_parts import ANALYSIS, TITLES, StudyParts
-from shapespace.schemas import TablePart, read_part, to_json
+from shapespace.schemas import SurfaceReview, TablePart, read_part, to_json
+from shapespace.store.review_text import review_summary
 from shapespace.types import Mesh
 
 if TYPE_CHECKING:
@@ -91,6 +92,7 @@ def html_of_correspondence(correspondence: Correspondence) -> str:
     included = [scan for scan in correspondence.scans if not scan.reason]
     rows = [
         ("Scans", f"{len(included)} of {len(correspondence.scans)} in correspondence"),
+        ("Review", review_summary(SurfaceReview.of(scan.review_codes for scan in included)) or "no problems detected"),
         ("Surface", f"{len(correspondence.template.vertices):,} vertices"),
         ("Rounds", f"{len(correspondence.moved)}; movement in the last {percent(correspondence.moved[-1])} of the size")
         if correspondence.moved

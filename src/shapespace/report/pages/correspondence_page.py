@@ -60,7 +60,7 @@ _STATUS = {
     "unreadable": ("unreadable", "failed"),
     "excluded": ("excluded", "failed"),
     "doubtful": ("doubtful", "doubtful"),
-    "look": ("to be looked at", "doubtful"),
+    "look": ("needs review", "doubtful"),
     "converged": ("converged", "converged"),
 }
 _TRIANGLES_DRAWN = 400_000  # triangles; more are smaller than a pixel of the pictures
@@ -174,8 +174,8 @@ class CorrespondencePage:
         n, aside = len(self.records), len(self.out) + len(self.result.unread)
         text = f"{n} of {counted(self.total, 'scan')} {'is' if n == 1 else 'are'} in correspondence"
         some = self.looked_at
-        text += f"; {counted(len(some), 'of them stands', 'of them stand')} out and should be looked at" if some else (
-            " and none of them stands out"
+        text += f"; {counted(len(some), 'of them needs', 'of them need')} review" if some else (
+            " and none of them needs review"
         )  # fmt: skip
         text += f"; {aside} {'is' if aside == 1 else 'are'} excluded." if aside else "."
         folded = [record.folded_share for record in self.records if record.folded_share]
@@ -216,7 +216,7 @@ class CorrespondencePage:
         ]
         if len(some) > _MOST_NAMED:
             items.append(Item(f"{counted(len(some) - _MOST_NAMED, 'other')}, in the table of all."))
-        return Notice("In correspondence, and to be looked at", items)
+        return Notice("In correspondence; needs review", items)
 
     def _damaged(self) -> Mapping[str, str]:
         return {**self.result.unread, **self.all.unread}

@@ -4,7 +4,7 @@
 
   const Viewer = window.ShapespaceViewer;
   const { $, h, save, alertUser, ask, guarded, json, binary } = Viewer;
-  const WORDS = { unreadable: "unreadable", excluded: "excluded", doubtful: "doubtful", look: "to be looked at", converged: "converged" };
+  const WORDS = { unreadable: "unreadable", excluded: "excluded", doubtful: "doubtful", look: "needs review", converged: "converged" };
   const DOTS = { unreadable: "unreadable", excluded: "failed", doubtful: "doubtful", look: "doubtful", converged: "converged" };
 
   window.shapespaceReady = false;
