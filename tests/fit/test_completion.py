@@ -140,9 +140,7 @@ def test_left_out_errors_are_those_of_gaussian_process_regression(has_scale: boo
         b = slice(POSE, POSE + K)
         S[b, b] = V * spread @ V.T
         # The kernel of the residual modes without those that are made of the shape, along u.
-        kernel = sum(
-            X @ (np.eye(K) - np.outer(z[i], z[i]) / (n - 1)) @ X.T for X in (products[:, :K], products[:, K:])
-        )
+        kernel = sum(X @ (np.eye(K) - np.outer(z[i], z[i]) / (n - 1)) @ X.T for X in (products[:, :K], products[:, K:]))
         S[b, b] += np.outer(u, u) * (u @ kernel[:K, :K] @ u)
         S[b, POSE + K :] = np.outer(u, u @ kernel[:K, K:])
         S[POSE + K :, b] = S[b, POSE + K :].T

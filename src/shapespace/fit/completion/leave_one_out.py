@@ -19,6 +19,7 @@ from shapespace.model.new_shapes import variances_of_new_shapes
 from shapespace.types import FloatArray
 
 MOST_LEFT_OUT = 50  # shapes; standard deviations are then known to 10 %, and the time is seconds for 500 modes
+_FEWEST_LEFT_OUT, _MOST_WORK = 12, 10_000  # shapes, and shapes times modes: models of more modes leave out fewer shapes
 _OFF_MODEL = 60  # residual modes, the strongest, that vary together with what a shape has outside the others' span
 _ROUNDING = 1e-12  # share of the largest variance
 
@@ -86,8 +87,9 @@ def leave_one_out(
     z = coefficients / np.sqrt((coefficients**2).sum(axis=0) / (n - 1))
     prior, mu, theta = np.diag(variance[kept]), np.zeros(len(kept)), np.zeros(len(kept))
     chosen = np.arange(n, dtype=np.int32)
-    if n > MOST_LEFT_OUT:
-        chosen = np.sort(np.random.default_rng(0).choice(n, MOST_LEFT_OUT, replace=False))
+    most = min(MOST_LEFT_OUT, max(_FEWEST_LEFT_OUT, _MOST_WORK // K))
+    if n > most:
+        chosen = np.sort(np.random.default_rng(0).choice(n, most, replace=False))
     errors, shifts = np.zeros((2, len(chosen), len(variance)))
     for row, i in enumerate(chosen):
         others = np.delete(coefficients, i, axis=0)

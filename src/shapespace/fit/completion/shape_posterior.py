@@ -59,6 +59,7 @@ class ShapePosterior:
         followed: (V,) True where a scan point is matched.
         mismatch_mm: RMS distance of the scan's points from the surface, each up to 5 % of the model's size.
         n_modes: K.
+        step: (P,) from the parameters of the surface to the mean of its linearised posterior; about zero if settled.
         left_out: errors of completions of the training shapes by models of the others; None without them.
     """
 
@@ -72,6 +73,7 @@ class ShapePosterior:
     followed: BoolArray
     mismatch_mm: float
     n_modes: int
+    step: FloatArray
     left_out: LeftOutErrors | None
 
     def left_out_mismatch_mm(self) -> FloatArray:
@@ -131,6 +133,7 @@ class ShapePosterior:
 def shape_posterior(
     model: ShapeModel, target: ScanTarget, T_scan_model: Similarity, b: FloatArray, settings: RobustSettings,
     *, with_scale: bool, marks: LandmarkConstraint | None = None, calibrated: bool = True,
+    settled: bool = False,
 ) -> ShapePosterior:  # fmt: skip
     """Return the posterior near a fit with the pose `T_scan_model` and the coefficients `b` (K,) mm.
 
@@ -143,6 +146,7 @@ def shape_posterior(
         with_scale: False holds the scale.
         marks: landmarks of the scan, if any.
         calibrated: whether to estimate the error from the training shapes (E4); a comparison of poses needs it not.
+        settled: stay at the fit.
 
     Raises:
         FitError: hardly anything of the scan matches, or the scan does not determine the pose.
@@ -164,7 +168,7 @@ def shape_posterior(
         problem, prior = _with_residual_modes(problem, extra)
         iterate = problem.iterate(Estimate(iterate.T_scan_model, np.pad(iterate.b, (0, len(extra.stddev)))))
         line = _Linearised.of(problem, matcher, iterate, hint, prior, beyond_mm2)
-        for _ in range(_LEVEL.iterations):
+        for _ in range(0 if settled else _LEVEL.iterations):
             before = iterate.T_scan_model.apply(iterate.surface.vertices)
             iterate = problem.iterate(iterate.estimate.moved_by(line.data.mean(line.variance) - line.theta))
             moved_mm = float(np.abs(iterate.T_scan_model.apply(iterate.surface.vertices) - before).max())
@@ -184,7 +188,7 @@ def shape_posterior(
         iterate.T_scan_model, iterate.surface, iterate.b, covariance, line.variance, line.amplitude,
         line.weighted.sigma_mm, line.followed,
         float(np.sqrt((np.minimum(line.weighted.matches.points.distance, _FAR * size_mm) ** 2).mean())),
-        model.n_modes, left_out,
+        model.n_modes, mean - line.theta, left_out,
     )  # fmt: skip
 
 

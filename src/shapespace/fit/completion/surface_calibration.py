@@ -11,13 +11,17 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import t as student
 
+from shapespace.errors import FitError
 from shapespace.fit.completion.leave_one_out import root_of
-from shapespace.fit.completion.shape_posterior import ShapePosterior
+from shapespace.fit.completion.shape_posterior import ShapePosterior, shape_posterior
 from shapespace.fit.robust.kernels import Float32Array
+from shapespace.fit.robust.robust_settings import RobustSettings
+from shapespace.fit.scan_target import ScanTarget
 from shapespace.geometry.similarity import POSE, small_poses
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import BoolArray, FloatArray
+from shapespace.types import BoolArray, FloatArray, Similarity
 
+_SAMPLED = 1_000  # missing vertices that the expected error is the mean of
 _SIGNIFICANT = 0.05  # probability to call a completion better than the mean shape that is not
 
 
@@ -98,6 +102,45 @@ class SurfaceCalibration:
             return value - float(off.mean()), spread, value - reach, value + reach
         low, high = np.sort(others - np.abs(off)), np.sort(others + np.abs(off))
         return value - float(off.mean()), spread, float(low[k - 1]), float(high[n - k])  # E11
+
+
+def missing_error_mm(
+    model: ShapeModel, target: ScanTarget, T_scan_model: Similarity, b: FloatArray, observed: BoolArray,
+    *, with_scale: bool,
+) -> float | None:  # fmt: skip
+    """Return the expected distance of missing vertices of a fit from their true places, mm of the scan.
+
+    It is the mean over the training shapes, left out in turn; None without training shapes, or if the scan does not
+    determine the pose.
+
+    Args:
+        model: the shape space.
+        target: the scan in its mm frame.
+        T_scan_model: pose of the fit in that frame.
+        b: (K,) its coefficients, mm.
+        observed: (V,) True where the scan shows a vertex.
+        with_scale: whether the scale was free.
+    """
+    if model.training is None:
+        return None
+    model = model.with_all_modes
+    try:
+        posterior = shape_posterior(
+            model, target, T_scan_model, np.pad(b, (0, model.n_modes - len(b))), RobustSettings(vertex_share=0.0),
+            with_scale=with_scale, settled=True,
+        )  # fmt: skip
+    except FitError:
+        return None
+    left = posterior.left_out
+    assert left is not None
+    missing = np.flatnonzero(~observed)
+    some = np.random.default_rng(0).choice(missing, min(len(missing), _SAMPLED), replace=False)
+    rows = posterior.rows()[some]
+    errors = (rows.reshape(-1, rows.shape[2]) @ left.errors.T.astype(np.float32)).reshape(len(some), 3, -1)
+    noise = np.einsum("vip,pq,viq->v", rows, left.noise.astype(np.float32), rows, optimize=True)
+    # The fit is off the posterior mean, of which the errors are.
+    step = ((rows @ posterior.step.astype(np.float32)) ** 2).sum(axis=1)
+    return float(np.sqrt((errors**2).sum(axis=1) + (noise + step)[:, None]).mean()) * T_scan_model.scale
 
 
 def calibrate(posterior: ShapePosterior, model: ShapeModel, missing: BoolArray) -> SurfaceCalibration | None:

@@ -220,11 +220,17 @@ def estimate_log_error(evidence: ScanEvidence) -> float:
     return min(ERROR_OFFSET + sum(term.contribution(evidence) for term in ERROR_TERMS.values()), 0.0)
 
 
-def estimate_error(evidence: ScanEvidence) -> ErrorEstimate:
-    """Return the expected error of the fit with this evidence."""
-    log_error = estimate_log_error(evidence)
-    logit = FAILURE_OFFSET + FAILURE_SLOPE * (log_error - math.log(FAILED_SHARE))
-    expected_mm = math.exp(log_error) * evidence.size_mm
+def estimate_error(evidence: ScanEvidence, missing_share: float = 0.0, missing_error_mm: float = 0.0) -> ErrorEstimate:
+    """Return the expected error of the fit with this evidence.
+
+    Args:
+        evidence: of the fit.
+        missing_share: share of the model's vertices that the scan does not show.
+        missing_error_mm: their expected error by the training shapes, which the evidence does not contain.
+    """
+    shown_mm = math.exp(estimate_log_error(evidence)) * evidence.size_mm
+    expected_mm = (1.0 - missing_share) * shown_mm + missing_share * missing_error_mm
+    logit = FAILURE_OFFSET + FAILURE_SLOPE * math.log(expected_mm / (FAILED_SHARE * evidence.size_mm))
     low, high = INTERVAL
     return ErrorEstimate(expected_mm, low * expected_mm, high * expected_mm, 1.0 / (1.0 + math.exp(-logit)))
 

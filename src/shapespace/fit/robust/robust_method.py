@@ -6,16 +6,40 @@ from collections.abc import Generator
 from dataclasses import asdict, dataclass, replace
 from typing import ClassVar
 
+import numpy as np
+
 from shapespace.fit.diagnostics.evidence import FitEvidence, ScanEvidence
 from shapespace.fit.diagnostics.failure_model import estimate_error, find_failure_reasons
 from shapespace.fit.diagnostics.odd_scans import chirality_of, find_odd_scan_reasons
 from shapespace.fit.diagnostics.reasons import Reason, ReasonCode
-from shapespace.fit.iteration_state import Fitted, IcpState
+from shapespace.fit.iteration_state import Fitted, IcpState, RobustFitted
 from shapespace.fit.method import Ended, Limits
 from shapespace.fit.robust.robust_settings import RobustSettings
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.search.initialisation import Start
+from shapespace.fit.vertex_regions import SHOWN
 from shapespace.model.shape_model import ShapeModel
+
+_COMPLETE = 0.95  # share of the vertices; a complete scan still omits vertices at its border
+
+
+def _missing_part(
+    model: ShapeModel, scan: ScanTarget, fitted: RobustFitted, *, with_scale: bool
+) -> tuple[float, float]:
+    """Return the share of the vertices that a partial scan does not show, and their expected error, mm of the scan.
+
+    Zero for complete scans, and for models without training shapes, by which it is estimated.
+    """
+    from shapespace.fit.completion.surface_calibration import missing_error_mm  # compiled
+
+    if model.training is None or fitted.match_evidence.model_allowed_share > _COMPLETE:
+        return 0.0, 0.0
+    observed = np.isin(fitted.regions(), SHOWN)
+    if observed.mean() > _COMPLETE:
+        return 0.0, 0.0
+    T, b = fitted.T_scan_model, fitted.b
+    error_mm = missing_error_mm(model, scan, T, b, observed, with_scale=with_scale)
+    return (0.0, 0.0) if error_mm is None else (float(1.0 - observed.mean()), error_mm)
 
 
 @dataclass(frozen=True)
@@ -54,7 +78,8 @@ class Robust(RobustSettings):
             **asdict(find_layers(model, scan, fitted)),
             **asdict(find_displaced(model, scan, fitted)),
         )
-        evidence = FitEvidence(**asdict(measured), **asdict(estimate_error(measured)))
+        missing = (0.0, 0.0) if limits.part else _missing_part(model, scan, fitted, with_scale=limits.with_scale)
+        evidence = FitEvidence(**asdict(measured), **asdict(estimate_error(measured, *missing)))
         notes = list(fitted.notes)
         second = find_second_instance(model, scan, fitted, self, with_scale=limits.with_scale)
         if second is not None:
