@@ -456,6 +456,7 @@ COMMANDS: tuple[Command, ...] = (
                      "command"),
             advanced("--keep-shapes", source=BUILD_FILES),
             advanced("--add", "OLD.h5", source=BUILD_FILES),
+            advanced("--without-training-shapes", source=BUILD),
             advanced("--seed", "S", source=BUILD),
         ),
         (

@@ -104,6 +104,7 @@ def load_foreign(path: Path, mm: float | None = None, expressions: Path | None =
         "residuals": None,
         "regions": {},
         "is_n_training_known": linear.n_training is not None,
+        "training": None,
     }
     return Foreign(fields, rotation, n_identity, model_format.title, tuple(notes))
 
