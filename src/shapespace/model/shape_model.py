@@ -511,11 +511,11 @@ def _refuse_impossible(stddev: FloatArray, mean_vertices: FloatArray, first_mode
     for mode, value in ((int(stddev.argmin()), float(stddev.min())), (int(stddev.argmax()), float(stddev.max()))):
         if value < _ROUNDING * norm:
             raise InputError(
-                f"Mode {first_mode + mode + 1} of the model has a standard deviation of {value:.1e} mm, which is less than "
-                "the rounding of its vertices; leave such modes out."
+                f"Mode {first_mode + mode + 1} of the model has a standard deviation of {value:.1e} mm, which is less "
+                "than the rounding of its vertices; leave such modes out."
             )
         if value > _WIDEST * norm:
             raise InputError(
-                f"Mode {first_mode + mode + 1} of the model has a standard deviation of {value:.1e} mm, which no shape of "
-                "its size can have; check its unit."
+                f"Mode {first_mode + mode + 1} of the model has a standard deviation of {value:.1e} mm, which no shape "
+                "of its size can have; check its unit."
             )

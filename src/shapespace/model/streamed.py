@@ -216,7 +216,7 @@ class Aligned:
         return self.shapes.rows_from(index, index + 1).reshape(-1, 3) + self.training.template
 
     def relative_sizes(self) -> FloatArray:
-        """Return sizes (N,) before alignment relative to those after it; 1 for shapes not in `TrainingShapes.indices`."""
+        """Return sizes (N,) before alignment relative to those after it; 1 for shapes not in `TrainingShapes`."""
         sizes, chosen = np.ones(self.shapes.rows), self.training.alignment_vertices
         if self.training.align and self.training.gauge == "shape":
             for i in TrainingShapes.indices(len(sizes)):
