@@ -178,6 +178,7 @@ class ShapeModel:
         licence: str = "",
         seed: int = 0,
         out_of_core: bool | None = None,
+        without_training_shapes: bool = False,
         scratch: Scratch | None = None,
         keep_shapes: Path | None = None,
         tell: Tell | None = None,
@@ -199,6 +200,7 @@ class ShapeModel:
             licence=licence,
             seed=seed,
             out_of_core=out_of_core,
+            without_training_shapes=without_training_shapes,
         )
         return lazy_import("build_model")(meshes, config, scratch=scratch, keep_shapes=keep_shapes, log=tell)
 
