@@ -185,7 +185,7 @@ def test_check_of_several_files_exits_with_1_when_some_are_bad_and_2_when_all_ar
 def test_build_keeps_landmarks_that_lie_beside_and_says_so(run: Run, world: World, tmp_path: Path) -> None:
     outcome = run("build", world.meshes, "-o", tmp_path / "m.h5", "--modes", 2)
     assert outcome.code == 0
-    assert outcome.err == f"Landmarks are taken from {world.meshes / 'landmarks.csv'}.\n"
+    assert outcome.err == f"Landmarks are taken from {world.meshes / 'landmarks.csv'}.\n{RECONSTRUCTED}\n"
     assert "2 modes of 400 vertices from 12 meshes" in outcome.out
     model = ShapeModel.load(tmp_path / "m.h5")
     assert set(model.landmarks) == {"tip", "top", "left", "back"}

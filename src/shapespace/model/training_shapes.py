@@ -11,6 +11,7 @@ import numpy.typing as npt
 from scipy.linalg import eigh
 
 from shapespace.errors import InputError
+from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, read_only
 
 MOST_SHAPES = 500  # training shapes of a model file; of larger sets a fixed random subset, to bound size and time
@@ -35,6 +36,8 @@ class TrainingShapes:
     coefficients: FloatArray
     rest: FloatArray
     log_scale: FloatArray
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         coefficients, rest, log_scale = (read_only(x) for x in (self.coefficients, self.rest, self.log_scale))
