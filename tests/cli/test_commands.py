@@ -185,7 +185,7 @@ def test_check_of_several_files_exits_with_1_when_some_are_bad_and_2_when_all_ar
 def test_build_keeps_landmarks_that_lie_beside_and_says_so(run: Run, world: World, tmp_path: Path) -> None:
     outcome = run("build", world.meshes, "-o", tmp_path / "m.h5", "--modes", 2)
     assert outcome.code == 0
-    assert outcome.err == f"Landmarks are taken from {world.meshes / 'landmarks.csv'}.\n"
+    assert outcome.err == f"Landmarks are taken from {world.meshes / 'landmarks.csv'}.\n{RECONSTRUCTED}\n"
     assert "2 modes of 400 vertices from 12 meshes" in outcome.out
     model = ShapeModel.load(tmp_path / "m.h5")
     assert set(model.landmarks) == {"tip", "top", "left", "back"}
@@ -201,6 +201,53 @@ def test_build_prints_the_facts_that_info_prints(run: Run, world: World, tmp_pat
     assert told["licence"] == "CC0" and told["units"] == "mm" and told["training_shapes"] == 12
     text = run("info", tmp_path / "m.h5")
     assert text.code == 0 and "gauge: shape" in text.out
+
+
+RECONSTRUCTED = (
+    "The model contains 12 training shapes, from which their surfaces can be reconstructed; if they show people, share "
+    "it without them (build --without-training-shapes, or convert)."
+)
+NOT_CALIBRATED = "its results are not calibrated: statuses, intervals and expected errors come from the model alone."
+
+
+def test_build_and_info_state_that_training_shapes_can_be_reconstructed(run: Run, world: World, tmp_path: Path) -> None:
+    with_shapes = run("build", world.meshes, "-o", tmp_path / "m.h5", "--modes", "3")
+    assert RECONSTRUCTED in with_shapes.err and NOT_CALIBRATED not in with_shapes.err
+    facts = run("info", tmp_path / "m.h5", "--json").facts
+    assert facts["training_shapes_in_file"] == 12 and facts["training_shapes_note"] == RECONSTRUCTED
+    assert f"training_shapes_note: {RECONSTRUCTED}" in run("info", tmp_path / "m.h5").out
+
+
+@pytest.mark.parametrize("more", [[], ["--out-of-core"], ["--representation", "vertices"]])
+def test_build_omits_training_shapes_on_request_and_states_what_is_lost(
+    run: Run, world: World, tmp_path: Path, more: list[str]
+) -> None:
+    options = [world.meshes, "--modes", "3", *more]
+    without = run("build", *options, "-o", tmp_path / "n.h5", "--without-training-shapes")
+    assert without.code == 0
+    assert f"The model contains no training shapes, so {NOT_CALIBRATED}" in without.err
+    assert "reconstructed" not in without.err
+    facts = run("info", tmp_path / "n.h5", "--json").facts
+    assert facts["training_shapes_in_file"] == 0 and facts["training_shapes"] == 12
+    assert facts["training_shapes_note"].endswith(NOT_CALIBRATED)
+    model = ShapeModel.load(tmp_path / "n.h5")
+    run("build", *options, "-o", tmp_path / "m.h5")
+    whole = ShapeModel.load(tmp_path / "m.h5")
+    assert model.training is None and whole.training is not None and whole.content_hash == model.content_hash
+
+
+@pytest.mark.parametrize("output", ["shared.h5", "shared.bin"])
+def test_convert_never_writes_training_shapes(run: Run, world: World, tmp_path: Path, output: str) -> None:
+    run("build", world.meshes, "-o", tmp_path / "m.h5", "--modes", "3")
+    converted = run("convert", tmp_path / "m.h5", tmp_path / output)
+    assert f"Left out: 12 training shapes, so {NOT_CALIBRATED}" in converted.out
+    assert ShapeModel.load(tmp_path / output).training is None
+    assert ShapeModel.load(tmp_path / "m.h5").training is not None
+    again = run("convert", tmp_path / output, tmp_path / "again.h5")
+    assert "training shapes, so" not in again.out
+    coefficients = ShapeModel.load(tmp_path / "m.h5").training.coefficients  # type: ignore[union-attr]
+    for number_type in (np.float64, np.float32):
+        assert coefficients[0].astype(number_type).tobytes() not in (tmp_path / output).read_bytes()
 
 
 @pytest.mark.parametrize(

@@ -233,6 +233,69 @@ def test_arrays_of_any_value_and_shape_give_a_model_or_one_sentence(parts: Any, 
         assert np.isfinite(model.reconstruct(model.stddev)).all()
 
 
+@pytest.fixture(scope="module")
+def parts_with_rest(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Arrays and attributes of a good model whose training shapes have further modes."""
+    path = tmp_path_factory.mktemp("rest") / "m.h5"
+    blob_model(vertices=200, modes=2).save(path)
+    with h5py.File(path) as file:
+        arrays = {name: item[()] for name, item in file.items()}
+        return arrays, {k: v.item() if isinstance(v, np.generic) else v for k, v in file.attrs.items()}
+
+
+@pytest.mark.parametrize("name", ["training", "training_rest", "training_log_scale"])
+def test_training_shapes_of_any_value_and_shape_give_a_model_or_one_sentence(
+    parts_with_rest: Any, tmp_path: Path, name: str
+) -> None:
+    arrays, attributes = parts_with_rest
+    array = arrays[name]
+    others = [np.full_like(array, value) for value in values(name)]
+    for value in values(name):
+        others.append(array.copy())
+        others[-1].flat[1] = value
+    for other in others:
+        write_hdf5(tmp_path / "m.h5", arrays | {name: other}, attributes)
+        try:
+            model = ShapeModel.load(tmp_path / "m.h5").with_all_modes
+        except ModelFileError:
+            continue
+        assert np.isfinite(model.reconstruct(model.stddev)).all() and model.training is not None
+        assert np.isfinite(np.exp(model.training.log_scale)).all() and np.isfinite(model.training.stddev).all()
+    wrong = [array[:1], array[:-1], array[..., None], array.reshape(-1)[0], array.astype(np.int32)]
+    if array.ndim == 2:
+        wrong += [array[:, 1:], array.T, array.ravel(), np.concatenate([array, array], axis=1)]
+    for other in wrong:
+        write_hdf5(tmp_path / "m.h5", arrays | {name: np.asarray(other)}, attributes)
+        refused(tmp_path / "m.h5")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "why"),
+    [
+        ("training", np.nan, "must be finite"),
+        ("training", 1e308, "no shape of its size"),
+        ("training_rest", 0.5, "not of length 1"),
+        ("training_log_scale", 1000.0, "must be finite"),
+        ("training_log_scale", np.inf, "must be finite"),
+    ],
+)
+def test_training_shapes_that_cannot_be_are_refused(
+    parts_with_rest: Any, tmp_path: Path, name: str, value: float, why: str
+) -> None:
+    arrays, attributes = parts_with_rest
+    write_hdf5(tmp_path / "m.h5", arrays | {name: np.full_like(arrays[name], value)}, attributes)
+    refused(tmp_path / "m.h5", why)
+
+
+@pytest.mark.parametrize("name", ["training", "training_log_scale"])
+def test_training_shapes_without_their_coefficients_or_sizes_are_refused(
+    parts_with_rest: Any, tmp_path: Path, name: str
+) -> None:
+    arrays, attributes = parts_with_rest
+    write_hdf5(tmp_path / "m.h5", {key: array for key, array in arrays.items() if key != name}, attributes)
+    refused(tmp_path / "m.h5", f"missing or wrong: '{name}'")
+
+
 @pytest.mark.parametrize(
     "more",
     [

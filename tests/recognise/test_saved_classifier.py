@@ -15,6 +15,7 @@ from sklearn.pipeline import make_pipeline
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.recognise.classifier_file import FACTS, TRUSTED, SavedClassifier, load_classifier, software_versions
 from shapespace.recognise.classifiers import CLASSIFIERS
+from synthetic_shapes import blob_model
 
 HASH = "a" * 64
 
@@ -51,6 +52,16 @@ def test_a_classifier_read_back_answers_the_same(name, tmp_path):
     assert after.facts() == before.facts()
     new, _ = samples(seed=1)
     np.testing.assert_array_equal(after.probabilities(new), before.probabilities(new))
+
+
+def test_a_saved_classifier_that_refers_to_a_model_has_none_of_its_training_shapes(tmp_path):
+    model = blob_model(vertices=200)
+    assert model.training is not None
+    skops.io.dump({"model": model, "classifier": trained()}, tmp_path / "c.skops")
+    with zipfile.ZipFile(tmp_path / "c.skops") as archive:
+        content = [archive.read(name) for name in archive.namelist()]
+    assert any(model.stddev.tobytes() in one for one in content)  # so that the next line can fail
+    assert not any(model.training.coefficients[0].tobytes() in one for one in content)
 
 
 def test_the_file_says_what_it_is_to_anyone_who_opens_the_archive(good):

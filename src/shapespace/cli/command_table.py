@@ -456,6 +456,7 @@ COMMANDS: tuple[Command, ...] = (
                      "command"),
             advanced("--keep-shapes", source=BUILD_FILES),
             advanced("--add", "OLD.h5", source=BUILD_FILES),
+            advanced("--without-training-shapes", source=BUILD),
             advanced("--seed", "S", source=BUILD),
         ),
         (
@@ -504,7 +505,8 @@ COMMANDS: tuple[Command, ...] = (
         (
             "Of a folder that correspond wrote: the number of scans in correspondence, excluded and conspicuous scans "
             "with reasons, distances (medians, as shares of the size), missing vertices, folds, movement, CPU time. "
-            "Of a store: fits by status, shards, bytes, and damaged files.",
+            "Of a store: fits by status, shards, bytes, and damaged files. Of a model: also how many training shapes "
+            "the file contains, from which their surfaces can be reconstructed.",
         ),
     ),
     Command(
@@ -992,7 +994,7 @@ COMMANDS: tuple[Command, ...] = (
             basic("--unit", "UNIT", "unit of IN, if its format does not contain it (default: mm)", choices=_UNITS),
             advanced("--expressions", "FILE.bin", source=CONVERT),
         ),
-        ("Prints what was kept, changed and left out.",),
+        ("Prints what was kept, changed and left out. Training shapes are always left out.",),
     ),
     Command(
         "cache", "print the folder and size of the cache, or clear it", ("shapespace cache --clear",), run.cache,

@@ -15,6 +15,7 @@ from shapespace.batch.fit_work import naming
 from shapespace.batch.progress import progress, waiting
 from shapespace.batch.result_folder import RECORD
 from shapespace.commands.about import ABOUT, read_about
+from shapespace.commands.look import training_shapes_note
 from shapespace.errors import InputError, MeshError, ShapespaceError
 from shapespace.geometry.landmark_placement import far_landmarks, place_landmarks
 from shapespace.geometry.normals import without_estimates
@@ -204,7 +205,7 @@ def build(
                 f"It parts {additive.n_identity} modes of identity and {additive.n_expression} of expression, by "
                 f"{config.labels}."
             )
-            return additive.shape, notes
+            return additive.shape, [*notes, training_shapes_note(additive.shape)]
         chosen = replace(config.model, gauge=gauge, landmarks=marks, min_seen=_min_seen(config), out_of_core=False)
         model = build_model(loaded, chosen)
         if regions:
@@ -222,7 +223,7 @@ def _model_notes(model: ShapeModel, config: BuildFilesConfig) -> list[str]:
     if model.left_out:
         count_text = "1 mode is" if model.left_out == 1 else f"{model.left_out} modes are"
         notes.append(f"{count_text} left out, since alignment or rounding made them and no shape did.")
-    return notes
+    return [*notes, training_shapes_note(model)]
 
 
 def shapes_folder(model: Path) -> Path:

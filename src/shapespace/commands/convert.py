@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from shapespace.batch.progress import waiting
+from shapespace.commands.look import NOT_CALIBRATED
 from shapespace.errors import InputError
 from shapespace.formats.model_parts import ModelFormat
 from shapespace.formats.registry import MODEL_FORMATS, format_to_write
@@ -44,6 +46,8 @@ def convert(
     with waiting(f"reading {source.name}", quiet=quiet):
         model, of, notes = _load(source, mm, expressions)
         linear = model.as_linear()
+    model, left_out = _without_training_shapes(model)
+    notes += left_out
     if target is None:
         with waiting(f"writing {output.name}", quiet=quiet):
             model.save(output)
@@ -58,6 +62,18 @@ def convert(
     if "research" in linear.licence.lower() or "non-commercial" in linear.licence.lower():
         notes.append(f"The licence holds for the new file too: {linear.licence.rstrip('.')}.")
     return of, OWN[0] if target is None else target.title, notes
+
+
+def _without_training_shapes(
+    model: ShapeModel | AdditiveModel,
+) -> tuple[ShapeModel | AdditiveModel, list[str]]:
+    """Return the model without its training shapes, which are not shared, and a sentence on that if it had some."""
+    shape = model if isinstance(model, ShapeModel) else model.shape
+    if shape.training is None:
+        return model, []
+    note = f"Left out: {len(shape.training)} training shapes, so {NOT_CALIBRATED}."
+    shape = replace(shape, training=None)
+    return shape if isinstance(model, ShapeModel) else replace(model, shape=shape), [note]
 
 
 def _target(output: Path, to: str | None) -> ModelFormat | None:

@@ -27,6 +27,8 @@ from shapespace.store.corresponding import json_of
 from shapespace.store.results import Results, mesh_at, modes_of, results_at
 from shapespace.types import MM_PER_UNIT
 
+NOT_CALIBRATED = "its results are not calibrated: statuses, intervals and expected errors come from the model alone"
+
 
 def check(
     paths: Sequence[Path],
@@ -201,6 +203,8 @@ def model_facts(model: ShapeModel) -> dict[str, Any]:
         "triangles": 0 if model.faces is None else len(model.faces),
         "modes": model.n_modes,
         "training_shapes": model.n_training,
+        "training_shapes_in_file": 0 if model.training is None else len(model.training),
+        "training_shapes_note": training_shapes_note(model),
         "gauge": model.gauge,
         "units": "mm",
         "extent_mm": np.ptp(model.mean_vertices, axis=0).tolist(),
@@ -219,6 +223,17 @@ def model_facts(model: ShapeModel) -> dict[str, Any]:
         "licence": model.licence,
         "hash": model.content_hash,
     }
+
+
+def training_shapes_note(model: ShapeModel) -> str:
+    """Return what the training shapes in a model mean for privacy, or what a model without them lacks."""
+    if (training := model.training) is None:
+        return f"The model contains no training shapes, so {NOT_CALIBRATED}."
+    count = f"{len(training)} of its {model.n_training}" if len(training) < model.n_training else str(len(training))
+    return (
+        f"The model contains {count} training shapes, from which their surfaces can be reconstructed; if they show "
+        "people, share it without them (build --without-training-shapes, or convert)."
+    )
 
 
 def _landmark_distances(model: ShapeModel) -> dict[str, dict[str, float]]:

@@ -36,7 +36,7 @@ class BuildConfig:
             they are: the same model but for that rounding, with `ShapeModel.residuals`. None does so where a model of
             vertices would need more than four fifths of the free memory.
         without_training_shapes: omit the training shapes, from which their surfaces can be reconstructed, from the
-            model, such as before sharing it; then intervals and statuses cannot be calibrated on them.
+            model, for example before you share a model of people; its results are then not calibrated.
     """
 
     modes: int | float | Literal["auto"] | None = None

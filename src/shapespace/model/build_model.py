@@ -203,7 +203,8 @@ def _of_streamed(
             provenance=config.provenance,
             licence=config.licence,
         )
-        model = _with_training(model, aligned.shape, training.sizes if training.align else training.sizes**0, config)
+        sizes = np.ones(len(training.sizes)) if config.without_training_shapes else aligned.relative_sizes()
+        model = _with_training(model, aligned.shape, sizes, config)
         if keep_shapes is not None:
             aligned.keep(keep_shapes, model.content_hash)
     return model

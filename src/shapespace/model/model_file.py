@@ -20,7 +20,7 @@ from shapespace.errors import FileFormatError, InputError, ModelFileError
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.containers.hdf5 import Attribute, content_hash, read_hdf5, write_hdf5
 from shapespace.io.containers.json_files import plain_json
-from shapespace.model.training_shapes import TrainingShapes
+from shapespace.model.training_shapes import UNIT_TOLERANCE, TrainingShapes
 from shapespace.types import FloatArray, IntArray, SurfaceLandmarks
 from shapespace.version import __version__
 
@@ -38,7 +38,6 @@ _EVERY_MODEL = (
     _TRAINING_REST, _TRAINING_SIZE,
 )  # fmt: skip
 """What is not of one representation."""
-_UNIT_TOLERANCE = 1e-3  # length of a mode off 1; float32 rounding over millions of coordinates is smaller
 _LONGEST_DETAIL = 200  # characters of a library's error that a message repeats
 _WHOLE_NUMBERS = ("faces", "control_counts", "degree", _REGIONS, _CORNERS)
 
@@ -154,7 +153,7 @@ def _landmarks(vertices: Mapping[str, int], arrays: Mapping[str, npt.NDArray[Any
 
 
 def _training_shapes(arrays: Mapping[str, npt.NDArray[Any]]) -> TrainingShapes | None:
-    if _TRAINING not in arrays:
+    if not {_TRAINING, _TRAINING_REST, _TRAINING_SIZE} & arrays.keys():
         return None
     rest = arrays.get(_TRAINING_REST, np.zeros((arrays["mean"].size, 0)))
     return TrainingShapes(arrays[_TRAINING], rest, arrays[_TRAINING_SIZE])
@@ -188,7 +187,7 @@ def load(path: Path) -> ModelFields:
         if attributes_of_file.representation == "vertices" and arrays["basis"].ndim == 2:
             with np.errstate(over="ignore"):
                 length = np.einsum("dk,dk->k", arrays["basis"], arrays["basis"])
-            if not (np.abs(length - 1.0) < _UNIT_TOLERANCE).all():
+            if not (np.abs(length - 1.0) < UNIT_TOLERANCE).all():
                 raise ValueError("a column of basis is not of length 1")
         # What was read is a view of the whole file, which is let go here.
         owned = {name: array.copy() for name, array in arrays.items()}

@@ -140,6 +140,8 @@ class ShapeModel:
             rows, rest = self.training.rest.shape
             if (rest and rows != checked.vertices.size) or self.training.coefficients.shape[1] != k + rest:
                 raise InputError(f"The training shapes do not belong to a model of {k} modes.")
+            _refuse_impossible(self.training.stddev[k:], checked.vertices, first_mode=k)
+            _refuse_impossible(np.maximum(self.training.stddev[:k], stddev), checked.vertices)
         object.__setattr__(self, "faces", checked.faces)
         self.landmarks.check(len(checked.vertices))
         regions = {
@@ -176,6 +178,7 @@ class ShapeModel:
         licence: str = "",
         seed: int = 0,
         out_of_core: bool | None = None,
+        without_training_shapes: bool = False,
         scratch: Scratch | None = None,
         keep_shapes: Path | None = None,
         tell: Tell | None = None,
@@ -197,6 +200,7 @@ class ShapeModel:
             licence=licence,
             seed=seed,
             out_of_core=out_of_core,
+            without_training_shapes=without_training_shapes,
         )
         return lazy_import("build_model")(meshes, config, scratch=scratch, keep_shapes=keep_shapes, log=tell)
 
@@ -385,8 +389,7 @@ class ShapeModel:
         training = self.training
         if training is None or not training.rest.shape[1]:
             return self
-        rest = training.coefficients[:, self.n_modes :]
-        stddev = np.sqrt((rest**2).sum(axis=0) / (len(rest) - 1))
+        stddev = training.stddev[self.n_modes :]
         return dataclasses.replace(
             self, mean=self.mean_vertices.ravel(), basis=np.concatenate([self.vertex_basis, training.rest], axis=1),
             stddev=np.concatenate([self.stddev, stddev]), representation="vertices", coding={}, residuals=None,
@@ -502,19 +505,19 @@ def region_vertices(vertices: npt.ArrayLike, n_vertices: int, name: str) -> IntA
     return region
 
 
-def _refuse_impossible(stddev: FloatArray, mean_vertices: FloatArray) -> None:
+def _refuse_impossible(stddev: FloatArray, mean_vertices: FloatArray, first_mode: int = 0) -> None:
     """Refuse modes that vary by less than the vertices are rounded to, or by far more than the shape is large."""
     norm = float(np.linalg.norm(mean_vertices - mean_vertices.mean(axis=0)))
-    if norm == 0.0:
+    if norm == 0.0 or not len(stddev):
         return
     for mode, value in ((int(stddev.argmin()), float(stddev.min())), (int(stddev.argmax()), float(stddev.max()))):
         if value < _ROUNDING * norm:
             raise InputError(
-                f"Mode {mode + 1} of the model has a standard deviation of {value:.1e} mm, which is less than the "
-                "rounding of its vertices; leave such modes out."
+                f"Mode {first_mode + mode + 1} of the model has a standard deviation of {value:.1e} mm, which is less "
+                "than the rounding of its vertices; leave such modes out."
             )
         if value > _WIDEST * norm:
             raise InputError(
-                f"Mode {mode + 1} of the model has a standard deviation of {value:.1e} mm, which no shape of its size "
-                "can have; check its unit."
+                f"Mode {first_mode + mode + 1} of the model has a standard deviation of {value:.1e} mm, which no shape "
+                "of its size can have; check its unit."
             )

@@ -40,6 +40,7 @@ from shapespace.model.krylov import KeptPasses
 from shapespace.model.large_pca import checked_large_modes, large_components
 from shapespace.model.pca import ALL_EQUAL, PrincipalComponents
 from shapespace.model.spurious import rounding_mm
+from shapespace.model.training_shapes import TrainingShapes
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, common_faces
 
 Tell: TypeAlias = Callable[[str], None]
@@ -213,6 +214,15 @@ class Aligned:
     def shape(self, index: int) -> FloatArray:
         """Return the vertices (V, 3), mm, of one aligned shape."""
         return self.shapes.rows_from(index, index + 1).reshape(-1, 3) + self.training.template
+
+    def relative_sizes(self) -> FloatArray:
+        """Return sizes (N,) before alignment relative to those after it; 1 for shapes not in `TrainingShapes`."""
+        sizes, chosen = np.ones(self.shapes.rows), self.training.alignment_vertices
+        if self.training.align and self.training.gauge == "shape":
+            for i in TrainingShapes.indices(len(sizes)):
+                vertices = self.shape(int(i))
+                sizes[i] = self.training.sizes[i] / centroid_size(vertices if chosen is None else vertices[chosen])
+        return sizes
 
     def keep(self, folder: Path, model_hash: str) -> None:
         """Move the shapes to `folder`, for later shapes to be added to theirs.

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 from scipy.linalg import eigh
 
 from shapespace.errors import InputError
+from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, read_only
 
 MOST_SHAPES = 500  # training shapes of a model file; of larger sets a fixed random subset, to bound size and time
+UNIT_TOLERANCE = 1e-3  # length of a mode off 1; float32 rounding over millions of coordinates is smaller
 _SAME_SIZE = 1e-6  # spread of the logarithm of size; shapes that were scaled to one size have less
 _ROUNDING = 1e-6  # share of the total variance; modes with less are rounding
 
@@ -33,6 +37,8 @@ class TrainingShapes:
     rest: FloatArray
     log_scale: FloatArray
 
+    __repr__ = short_repr
+
     def __post_init__(self) -> None:
         coefficients, rest, log_scale = (read_only(x) for x in (self.coefficients, self.rest, self.log_scale))
         if coefficients.ndim != 2 or rest.ndim != 2 or coefficients.shape[1] < rest.shape[1] or len(coefficients) < 2:
@@ -44,6 +50,12 @@ class TrainingShapes:
             raise InputError(f"{len(coefficients)} training shapes need as many sizes, not {log_scale.shape}.")
         if not all(np.isfinite(x).all() for x in (coefficients, rest, log_scale)):
             raise InputError("The training shapes of a model must be finite.")
+        with np.errstate(over="ignore"):
+            if not np.isfinite(np.exp(np.abs(log_scale))).all():
+                raise InputError("The sizes of the training shapes of a model must be finite.")
+            length = np.einsum("dk,dk->k", rest, rest)
+        if not (np.abs(length - 1.0) < UNIT_TOLERANCE).all():
+            raise InputError("A further mode of the training shapes is not of length 1.")
         object.__setattr__(self, "coefficients", coefficients)
         object.__setattr__(self, "rest", rest)
         object.__setattr__(self, "log_scale", log_scale)
@@ -56,22 +68,34 @@ class TrainingShapes:
 
         Args:
             shape: returns the vertices (V, 3) of a shape by its index.
-            sizes: (n,) of the shapes before alignment, relative to those after it.
+            sizes: (N,) of the shapes before alignment, relative to those after it; only those of `indices` are used.
             mean: (V, 3) mm, of the model.
             basis: (3V, K) orthonormal modes of the model.
         """
-        index = np.arange(len(sizes))
-        if len(sizes) > MOST_SHAPES:
-            index = np.sort(np.random.default_rng(0).choice(index, MOST_SHAPES, replace=False))
-        off = np.stack([shape(int(i)).reshape(-1) for i in index]) - mean.reshape(-1)
-        total = float((off**2).sum())
+        index = TrainingShapes.indices(len(sizes))
+        off: FloatArray = np.empty((len(index), mean.size))
+        for row, i in enumerate(index):
+            off[row] = (shape(int(i)) - mean).reshape(-1)
+        total = float(np.vdot(off, off))
         b = off @ basis
-        off -= b @ basis.T
+        log_scale = np.log(sizes[index])
+        log_scale -= log_scale.mean()
+        if total - float(np.vdot(b, b)) <= _ROUNDING * total:
+            return TrainingShapes(b, np.zeros((mean.size, 0)), log_scale)
+        for row, own in zip(off, b, strict=True):  # one by one, to hold the shapes in memory once
+            row -= basis @ own
         value, vector = eigh(off @ off.T)
         significant = np.flatnonzero(value > _ROUNDING * total)[::-1]
         rest = (off.T @ vector[:, significant]) / np.sqrt(value[significant])
-        log_scale = np.log(sizes[index])
-        return TrainingShapes(np.concatenate([b, off @ rest], axis=1), rest, log_scale - log_scale.mean())
+        return TrainingShapes(np.concatenate([b, off @ rest], axis=1), rest, log_scale)
+
+    @staticmethod
+    def indices(count: int) -> npt.NDArray[np.int64]:
+        """Return the indices, in order, of the shapes that a model of `count` shapes contains."""
+        every = np.arange(count, dtype=np.int64)
+        if count <= MOST_SHAPES:
+            return every
+        return np.sort(np.random.default_rng(0).choice(every, MOST_SHAPES, replace=False))
 
     def __len__(self) -> int:
         """Return n, the number of shapes."""
@@ -81,6 +105,11 @@ class TrainingShapes:
         """Return the same shapes for a model that keeps the first `modes` of `basis` (3V, K)."""
         rest = [basis[:, modes:], *([self.rest] if self.rest.shape[1] else [])]
         return replace(self, rest=np.concatenate(rest, axis=1))
+
+    @cached_property
+    def stddev(self) -> FloatArray:
+        """Standard deviation (K + M,) of the coefficients about the mean of the model, mm."""
+        return np.sqrt((self.coefficients**2).sum(axis=0) / (len(self) - 1))
 
     @property
     def log_scale_stddev(self) -> float | None:

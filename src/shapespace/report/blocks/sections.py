@@ -22,7 +22,7 @@ from shapespace.report.blocks.blocks import (
     status,
 )
 from shapespace.report.blocks.evidence_text import evidence_facts
-from shapespace.report.blocks.wording import counted, isfinite, listed, mm, percent
+from shapespace.report.blocks.wording import counted, isfinite, listed, mm, percent, training_text
 from shapespace.report.inputs.saved_fits import SavedFit
 from shapespace.report.inputs.staged_fit import REGIONS, StagedFit, measured_mm, nice_ceiling
 from shapespace.report.pages.page import Page
@@ -95,7 +95,7 @@ def model_part(page: Page, model: ShapeModel, *, figure_of: str = "", to_move: i
         if (count := model.modes_for_variance(share)) is not None
     ]
     rows = [
-        ("Made of", counted(model.n_training, "shape")),
+        ("Made of", training_text(model)),
         ("Surface", f"{model.n_vertices:,} vertices, {0 if model.faces is None else len(model.faces):,} triangles"),
         ("Modes kept", f"{model.n_modes}, with {100 * float(model.cumulative_variance[-1]):.1f} % of the variance"),
         ("Variance", listed(needed) or "below 90 % in the modes kept"),

@@ -6,7 +6,10 @@ import re
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from math import isfinite
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
+
+if TYPE_CHECKING:
+    from shapespace.model.shape_model import ShapeModel
 
 STATUS_WORDS: Mapping[str, str] = {
     "converged": "converged",
@@ -39,6 +42,12 @@ def anchor(text: str) -> str:
 def counted(count: int, one: str, many: str | None = None) -> str:
     """Return a number with its noun, such as `1 scan` or `3 scans`."""
     return f"{count:,} {one if count == 1 else many or one + 's'}"
+
+
+def training_text(model: ShapeModel) -> str:
+    """Return the number of training shapes, and how many of them the model contains."""
+    text = counted(model.n_training, "shape")
+    return text if model.training is None else f"{text}, of which the model contains {len(model.training):,}"
 
 
 def listed(items: Sequence[str], most: int = 12) -> str:

@@ -12,7 +12,7 @@ from shapespace.fit.result import FitResult
 from shapespace.model.model_quality import Curve, ModelQuality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report.blocks.blocks import Block
-from shapespace.report.blocks.wording import counted, listed, mm, percent
+from shapespace.report.blocks.wording import listed, mm, percent, training_text
 from shapespace.report.inputs.staged_fit import StagedFit
 from shapespace.report.pages.write_html import require_report_extra
 
@@ -93,7 +93,7 @@ def html_of_model(model: ShapeModel) -> str:
         f"{percent(share)} in {n}" for share in _SHARES if (n := model.modes_for_variance(share)) is not None
     ]
     rows = [
-        ("Made of", counted(model.n_training, "shape")),
+        ("Made of", training_text(model)),
         ("Surface", f"{model.n_vertices:,} vertices, {0 if model.faces is None else len(model.faces):,} triangles"),
         ("Modes", f"{model.n_modes}, with {100 * float(model.cumulative_variance[-1]):.1f} % of the variance"),
         ("Variance", listed(modes_needed) or "below 90 % in the modes kept"),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from shapespace.errors import ShapespaceError
 from shapespace.report.analyses.result_tables import analysis_report
 from shapespace.report.blocks.blocks import Block, Cell, Column, Notes, Table, Text
-from shapespace.report.blocks.wording import counted, listed, mm, percent
+from shapespace.report.blocks.wording import listed, mm, percent, training_text
 from shapespace.report.inputs.saved_fits import Folder
 from shapespace.report.notebook.notebook_fits import Drawn, notebook_html
 from shapespace.report.pages.page import Page
@@ -126,7 +126,7 @@ def html_of_additive_model(model: AdditiveModel) -> str:
     shape = model.shape
     rows = [
         ("Coefficients", f"{model.n_identity} of identity, {shape.n_modes - model.n_identity} of expression"),
-        ("Made of", counted(shape.n_training, "shape")),
+        ("Made of", training_text(shape)),
         ("Surface", f"{shape.n_vertices:,} vertices, {0 if shape.faces is None else len(shape.faces):,} triangles"),
         ("Provenance", shape.provenance or "not stated"),
         ("Licence", shape.licence or "not stated"),
