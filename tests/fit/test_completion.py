@@ -16,6 +16,7 @@ from shapespace.fit.dense.residual_modes import ResidualModes
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.doctor import examine
+from shapespace.geometry.normals import part_of
 from shapespace.geometry.similarity import POSE
 from shapespace.model.new_shapes import variances_of_new_shapes
 from shapespace.model.shape_model import ShapeModel
@@ -241,3 +242,71 @@ def test_bad_input_has_one_sentence() -> None:
     assert any("Nothing of the model is missing" in note for note in whole.notes)
     with pytest.raises(FitError, match=r"10 % are needed|hardly|two poses"):
         complete(MODEL, cut_scan(np.zeros(5), 0.97)[0], FORM)
+
+
+@cache
+def blobs(gauge: str, count: int = 14) -> ShapeModel:
+    """Return a model of blobs of five modes, each scaled by its own size, that contains its training shapes."""
+    d, faces = sphere(400)
+    rng = np.random.default_rng(3)
+    shapes = [Mesh(blob(d, rng.standard_normal(5)) * np.exp(0.05 * rng.standard_normal()), faces) for _ in range(count)]
+    return ShapeModel.fit(shapes, gauge=gauge)
+
+
+@pytest.mark.parametrize("gauge", ["form", "shape"])
+def test_results_of_a_model_with_its_training_shapes_are_calibrated_on_them(gauge: str) -> None:
+    scan, truth, _ = cut_scan(np.array([0.8, -0.6, 1.0, 0.5, -0.4]), -0.2)
+    completion = complete(blobs(gauge), scan, replace(FORM, with_doubtful=True))
+    assert completion.status == "converged"
+    assert {estimate.calibrated_on for estimate in completion.estimates()} == {14}
+    assert not any("not calibrated" in note for note in completion.notes)
+    length = next(estimate for estimate in completion.estimates() if estimate.name == "area")
+    corners = truth[np.asarray(MODEL.faces)]
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
+    assert length.low < area < length.high
+    without = complete(replace(blobs(gauge), training=None), scan, replace(FORM, with_doubtful=True))
+    assert {estimate.calibrated_on for estimate in without.estimates()} == {0}
+    assert any("not calibrated" in note for note in without.notes)
+
+
+def test_the_prior_of_a_free_size_is_the_spread_of_the_training_shapes() -> None:
+    model = blobs("shape")
+    scan = cut_scan(np.zeros(5), 0.1)[0]
+    completion = complete(model, scan, replace(FORM, with_doubtful=True))
+    assert model.training is not None
+    spread = model.training.log_scale_stddev
+    assert spread is not None and 0.02 < spread < 0.1
+    assert np.isclose(completion.posterior.prior_variance[POSE - 1], spread**2)
+    assert any(f"{100 * spread:.2g} %" in note for note in completion.notes)
+    larger = complete(model, scan.with_vertices(1.5 * scan.vertices), replace(FORM, with_doubtful=True))
+    assert larger.status == "doubtful" and "times as large" in larger.reason
+
+
+def test_other_objects_are_not_converged() -> None:
+    d, faces = sphere(2000)
+    for stretch in ((1.0, 1.0, 3.0), (1.0, 2.5, 2.5)):
+        x = d * stretch
+        x = x * (np.linalg.norm(MODEL.mean_vertices) / 20.0 / np.sqrt((x**2).sum(axis=1).mean()))
+        for part in (x[:, 2] > -9e9, x[:, 2] > 0):
+            try:
+                completion = complete(blobs("form"), part_of(Mesh(x, faces), part), replace(FORM, with_doubtful=True))
+            except FitError:
+                continue
+            assert completion.status == "doubtful"
+
+
+def test_a_model_of_few_shapes_does_not_claim_to_predict_what_is_missing() -> None:
+    """Of a population of 30 equal modes, five shapes say nothing on a half that is missing."""
+    d, faces = sphere(400)
+    rng = np.random.default_rng(0)
+    centres = rng.standard_normal((30, 3))
+    bumps = np.exp(4 * (d @ (centres / np.linalg.norm(centres, axis=1, keepdims=True)).T - 1))
+
+    def shape() -> Mesh:
+        return Mesh(80 * d * (1 + 0.05 * bumps @ rng.standard_normal(30))[:, None], faces)
+
+    model = ShapeModel.fit([shape() for _ in range(5)], gauge="form")
+    truth = shape()
+    scan = part_of(truth, truth.vertices[:, 0] < 0)
+    with pytest.raises(FitError, match=r"not predicted better than by the mean shape|does not explain"):
+        complete(model, scan, FORM, T_scan_model=Similarity.identity())

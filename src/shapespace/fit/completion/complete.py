@@ -33,7 +33,14 @@ from shapespace.fit.scan_target import ScanTarget, mm_frame
 from shapespace.fit.search.initialisation import start_from_any_pose
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.loop import loop_operator
-from shapespace.geometry.normals import boundary_edges, enclosed_volume, face_areas, part_of, rms_size
+from shapespace.geometry.normals import (
+    boundary_edges,
+    enclosed_volume,
+    face_areas,
+    face_vectors,
+    part_of,
+    rms_size,
+)
 from shapespace.geometry.procrustes import centroid_size
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.interop import MeshLike
@@ -59,6 +66,7 @@ _LEAST_GAIN = 0.1  # share of a vertex's variance that a scan removes, of models
 _UNEXPLAINED = 2.0
 """Multiple of the largest distance of left-out training shapes from their completions beyond which the model does not
 explain a scan: 24 femora reach 1.0, other objects scaled to their size 2.9 and more (benchmarks/completion.py)."""
+_LEAST_AREA, _REVERTS = 0.1, 20  # share of its area that a triangle keeps on the scan, and rounds to enforce it
 _OTHER_SIZE = 4.0  # standard deviations of the training shapes' size
 _IMPLAUSIBLE, _RARE = 3.0, 1e-5
 """Mean square of the coefficients in standard deviations of new shapes (1.4 is the most measured, with 51 modes), and
@@ -570,7 +578,18 @@ def refine_surface(completion: Completion) -> Mesh:
     near = build_engine(scan).query(smooth)
     reach = _ON_SCAN * completion.posterior.noise_mm * completion.T_scan_model.scale
     is_observed = (np.asarray(M @ completion.observed.astype(np.float64)) > 1.0 - 1e-9) & (near.distance < reach)
-    mesh = Mesh(np.where(is_observed[:, None], near.points, smooth), faces, name=completion.scan_name)
+    vertices = np.where(is_observed[:, None], near.points, smooth)
+    # Closest points of a border coincide; triangles that would shrink or turn keep their smooth vertices.
+    usual = face_vectors(smooth, faces)
+    for _ in range(_REVERTS):
+        area = face_vectors(vertices, faces)
+        is_bad = np.einsum("fd,fd->f", area, usual) < _LEAST_AREA * np.einsum("fd,fd->f", usual, usual)
+        is_bad &= is_observed[faces].any(axis=1)
+        if not is_bad.any():
+            break
+        is_observed[faces[is_bad]] = False
+        vertices = np.where(is_observed[:, None], near.points, smooth)
+    mesh = Mesh(vertices, faces, name=completion.scan_name)
     if _is_closed(model) and enclosed_volume(mesh.vertices, faces) < 0:
         return replace(mesh, faces=np.ascontiguousarray(faces[:, ::-1]))
     return mesh
