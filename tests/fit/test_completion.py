@@ -154,7 +154,11 @@ def test_left_out_errors_are_those_of_gaussian_process_regression(has_scale: boo
     S = np.diag(variance)
     gain = S @ A.T @ np.linalg.inv(A @ S @ A.T + np.eye(rows))
     assert np.allclose(left.noise, gain @ gain.T, atol=1e-8)
-    assert np.allclose(left.covariance() - left.noise, left.errors.T @ left.errors * 10 / (9 * 6))
+    draws = np.random.default_rng(1).standard_normal((20_000, n + 1, 3))
+    S = np.einsum("sni,snj->sij", draws[:, 1:], draws[:, 1:])
+    factor = (left.covariance() - left.noise)[0, 0] / (left.errors.T @ left.errors)[0, 0]
+    T2 = np.einsum("si,sij,sj->s", draws[:, 0], np.linalg.inv(factor * S), draws[:, 0])
+    assert abs((T2 < 7.815).mean() - 0.95) < 0.01  # the quantile of 95 % of chi-squared with 3 degrees of freedom
 
 
 def test_regions_of_ninety_percent_contain_most_of_the_truth() -> None:

@@ -22,7 +22,7 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, Similarity
 
 _SAMPLED = 1_000  # missing vertices that the expected error is the mean of
-_SIGNIFICANT = 0.05  # probability to call a completion better than the mean shape that is not
+_SIGNIFICANT = 0.01  # probability to call a completion better than the mean shape that is not
 
 
 @dataclass(frozen=True, eq=False)
