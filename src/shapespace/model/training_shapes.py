@@ -86,7 +86,7 @@ class TrainingShapes:
             row -= basis @ own
         value, vector = eigh(off @ off.T)
         significant = np.flatnonzero(value > _ROUNDING * total)[::-1]
-        rest = (off.T @ vector[:, significant]) / np.sqrt(value[significant])
+        rest = off.T @ (vector[:, significant] / np.sqrt(value[significant]))
         return TrainingShapes(np.concatenate([b, off @ rest], axis=1), rest, log_scale)
 
     @staticmethod
