@@ -104,6 +104,10 @@ class ScoreTerm(Term[MatchEvidence]):
         return self.predictor(evidence) > self.limit
 
 
+def _scale_implausible(e: MatchEvidence) -> Reason:
+    return Reason(ReasonCode.SCALE_IMPLAUSIBLE, {"scale": math.exp(e.log_scale)})
+
+
 SCORE_OFFSET = -3.70  # logit; intercept of the logistic regression whose terms follow
 SCORE_TERMS = (
     ScoreTerm(
@@ -176,7 +180,7 @@ SCORE_TERMS = (
         lowest=0.0,
         usual=0.010,
         limit=0.7,
-        reason=lambda e: Reason(ReasonCode.SCALE_IMPLAUSIBLE, {"scale": math.exp(e.log_scale)}),
+        reason=_scale_implausible,
     ),
 )
 
@@ -242,6 +246,8 @@ def find_failure_reasons(evidence: FitEvidence) -> list[Reason]:
     if evidence.model_near_share > _NEAR_THROUGHOUT and not _is_doubtful(plausible):
         z_rms = math.sqrt(max(evidence.z2, evidence.z2_leading))
         return [Reason(ReasonCode.MODEL_TOO_NARROW, {"spread_mm": evidence.spread_mm, "z_rms": z_rms})]
+    if not _is_doubtful(replace(evidence, log_scale=0.0)):
+        return [_scale_implausible(evidence)]
     ranked = sorted(
         SCORE_TERMS, key=lambda term: (term.is_beyond_limit(evidence), term.contribution(evidence)), reverse=True
     )

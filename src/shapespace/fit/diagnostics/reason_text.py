@@ -103,7 +103,7 @@ _TEXTS: Mapping[ReasonCode, Callable[[Mapping[str, Any]], str]] = MappingProxyTy
             "where about 1 is usual"
         ),
         ReasonCode.SCALE_IMPLAUSIBLE: lambda d: (
-            f"the scan is {d['scale']:.2f} times as large as the model, where about 1 is usual"
+            f"the scan is {d['scale']:.2f} times as large as the model, where about 1 is usual; check its unit (--unit)"
         ),
         ReasonCode.PROBABLY_FAILED: lambda d: (
             f"its expected vertex error is {d['expected_error_mm']:.1f} mm (90 % interval {d['error_low_mm']:.1f} to "
