@@ -73,10 +73,16 @@ def test_a_symmetric_model_leaves_the_chirality_undecidable_and_doubts_nothing()
 
 
 @pytest.mark.parametrize(
-    ("log_odds", "decided"), [(4.9, "undecidable"), (-4.9, "undecidable"), (5.1, "mirrored"), (-5.1, "as scanned")]
-)
-def test_chirality_is_decided_by_odds_of_150_to_1(log_odds: float, decided: str) -> None:
-    assert chirality_of(log_odds) == decided
+    ("log_odds", "bound", "decided"),
+    [
+        (4.9, -20.0, "undecidable"), (-4.9, None, "undecidable"), (5.1, -20.0, "mirrored"), (-5.1, None, "as scanned"),
+        (5.1, 5.2, "undecidable"), (50.0, None, "undecidable"), (50.0, 49.0, "mirrored"),
+    ],
+)  # fmt: skip
+def test_chirality_is_decided_by_odds_of_150_to_1_and_more_than_those_of_training_shapes(
+    log_odds: float, bound: float | None, decided: str
+) -> None:
+    assert chirality_of(log_odds, bound) == decided
 
 
 def test_halves_of_different_scale_are_doubted() -> None:

@@ -233,6 +233,24 @@ def estimate_error(evidence: ScanEvidence) -> ErrorEstimate:
     return ErrorEstimate(expected_mm, low * expected_mm, high * expected_mm, 1.0 / (1.0 + math.exp(-logit)))
 
 
+def with_mirror_image(evidence: FitEvidence) -> FitEvidence:
+    """Return the evidence with an expected error that includes the exchange of the sides of an object.
+
+    Args:
+        evidence: of a fit whose chirality is undecidable, with the distance to the fit of the mirror image.
+    """
+    log_odds, apart_mm = evidence.mirrored_log_odds, evidence.mirrored_apart_mm
+    if log_odds is None or apart_mm is None:
+        return evidence
+    probability = 1.0 / (1.0 + math.exp(-log_odds))
+    high_mm, expected_mm = evidence.error_high_mm, evidence.expected_error_mm
+    if probability > 0.5 * (1.0 - COVERAGE):
+        high_mm = max(high_mm, apart_mm)
+    if probability > 0.5:
+        expected_mm = max(expected_mm, apart_mm)
+    return replace(evidence, error_high_mm=high_mm, expected_error_mm=expected_mm)
+
+
 def failure_score(evidence: MatchEvidence) -> float:
     """Return the logit of a failure; a fit with a score above zero is doubtful."""
     return SCORE_OFFSET + sum(term.contribution(evidence) for term in SCORE_TERMS)
