@@ -92,7 +92,7 @@ class FitEvidence(ScanEvidence):
         mirrored_bound: largest of these log odds of left-out training shapes; None where they were not fitted, as where
             the model does not explain the mirror image either.
         displaced_moved_mm: robust standard deviation of the displaced parts about the fitted surface after a similarity
-            moved them onto it; None where no part is displaced.
+            moved them onto it; None where no part is displaced, or the model does not explain the rest of the scan.
         displaced_bound: largest `displaced_share` of left-out training shapes; None where they were not fitted.
         second_instance_mm: distance of a second instance in the scan; None where none was found.
         second_instance_gap_mm: gap between the two instances, negative if they overlap; None where none was found.

@@ -18,7 +18,7 @@ from shapespace.geometry.normals import part_of
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh, Similarity
 
-_MOST = 20  # training shapes, a fixed random subset of larger sets, to bound the time
+_MOST = 10  # training shapes, a fixed random subset of larger sets, to bound the time: 2 to 10 s
 _ROUNDING = 1e-9  # share of the largest variance; modes with less are rounding
 _FEWEST = 3  # training shapes; two others have one mode
 

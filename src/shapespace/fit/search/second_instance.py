@@ -41,6 +41,7 @@ _TIGHT, _LEAST_SIDE = 0.5, 2  # two layers: largest width of one relative to the
 
 # displaced points, fewer cannot show whether a similarity explains them; iterations, a shift along the surface is slow
 _FEWEST_MOVED, _MOVES = 30, 100
+_LARGEST_SCALE = 2.0  # scale of a part about another; a part that the surface does not explain shrinks to a point of it
 
 # Chosen on the development seeds of `benchmarks/odd_cases.py`, and on 42 heads with hair.
 _ALL_EXPLAINED = 0.97
@@ -162,8 +163,9 @@ def compare_displaced(
 ) -> DisplacedTest:
     """Move the displaced part onto the fitted surface, and compare its share with those of left-out training shapes.
 
-    Where a part was assembled wrongly, a similarity moves it onto the surface. Training shapes are fitted by the model
-    of the others, where the scan shows them: a model of few shapes leaves parts of a new shape at a distance too.
+    Where a part was assembled wrongly, the model explains the rest, and a similarity moves the part onto the surface.
+    Training shapes are fitted by the model of the others, where the scan shows them: a model of few shapes leaves parts
+    of a new shape at a distance too.
 
     Args:
         model: the shape space.
@@ -173,7 +175,7 @@ def compare_displaced(
         with_scale: whether the pose has a free scale.
     """
     points = _displaced_points(model, target, fitted)[1]
-    if len(points) < _FEWEST_MOVED:
+    if len(points) < _FEWEST_MOVED or failure_score(fitted.match_evidence) > 0.0:
         return DisplacedTest()
     surface = Mesh(fitted.vertices_scan_mm, model.faces)
     engine, T = build_engine(surface), Similarity.identity()
@@ -181,6 +183,8 @@ def compare_displaced(
     for _ in range(_MOVES):
         T = fit_similarity(points, nearest.points)
         nearest = engine.query(T.apply(points), nearest)
+    if not 1.0 / _LARGEST_SCALE < T.scale < _LARGEST_SCALE:
+        return DisplacedTest()
     offset = T.apply(points) - nearest.points
     moved_mm = spread(np.einsum("ij,ij->i", offset, vertex_normals(surface)[nearest.vertex]))
     if moved_mm > _AS_GOOD * fitted.match_evidence.spread_mm:
