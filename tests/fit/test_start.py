@@ -48,6 +48,22 @@ def test_a_unit_that_is_given_is_used() -> None:
     assert result.T_scan_model.scale == pytest.approx(0.1, rel=0.1)
 
 
+@pytest.mark.parametrize("size", [0.3, 0.45, 2.4, 5.0])
+def test_a_scan_of_any_size_is_fitted_equally_and_an_implausible_size_is_the_only_doubt(size: float) -> None:
+    scan = raw_scan(Z, similarity(1, 5.0, 1.0)).scan
+    usual = fit_scan(blob_model(), scan, FitConfig(unit="mm"))
+    result = fit_scan(blob_model(), scan.with_vertices(size * scan.vertices), FitConfig(unit="mm"))
+    off = result.surface().vertices / size - usual.surface().vertices
+    assert np.sqrt((off**2).sum(axis=1).mean()) < 0.1
+    assert usual.status == "converged" and result.status == "doubtful"
+    assert [reason.code for reason in result.reasons] == ["scale_implausible"]
+    assert result.reason.endswith("where about 1 is usual; check its unit (--unit).")
+    # Without other sizes, which only a free scale allows, nothing fits.
+    assert (
+        start_from_any_pose(blob_model(), size * scan.vertices, seed=0).score_mm > 2.0 * usual.evidence.start_score_mm
+    )
+
+
 def turns(count: int, seed: int) -> list[FloatArray]:
     return [np.eye(3), *Rotation.random(count - 1, random_state=seed).as_matrix()]
 

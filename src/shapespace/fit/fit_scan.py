@@ -25,7 +25,13 @@ from shapespace.fit.region_fit import RegionFit
 from shapespace.fit.result import FitResult, Stage
 from shapespace.fit.robust.robust_settings import DenseSettings
 from shapespace.fit.scan_target import ScanTarget, mm_frame
-from shapespace.fit.search.initialisation import Start, find_unit, start_from_any_pose, start_from_landmarks
+from shapespace.fit.search.initialisation import (
+    Start,
+    find_unit,
+    start_from_any_pose,
+    start_from_landmarks,
+    start_of_any_size,
+)
 from shapespace.geometry.closest import ClosestPoints
 from shapespace.geometry.distance import SurfaceDistances, surface_distances
 from shapespace.geometry.doctor import repair
@@ -368,8 +374,10 @@ def _place(
         start = Start(T_mm_scan @ T_scan_model, "given", float("nan"))
     elif landmarks:
         start = start_from_landmarks(full_model, marks_mm, scan.name, with_scale=with_scale)
+    elif with_scale:
+        start = start_of_any_size(model, scan_mm.vertices, seed=config.seed)
     else:
-        start = start_from_any_pose(model, scan_mm.vertices, seed=config.seed, with_scale=with_scale)
+        start = start_from_any_pose(model, scan_mm.vertices, seed=config.seed, with_scale=False)
     if landmarks:
         stddev_mm = config.landmark_stddev_mm or SHARE * rms_size(full_model.mean_vertices) * start.T_scan_model.scale
         start = replace(start, marks=LandmarkConstraint.of(model, marks_mm, stddev_mm))

@@ -197,7 +197,8 @@ class FitResult:
         It is `undecidable` for a mirror-symmetric model, such as one of faces, for a region of a model, and for the
         paper's method, which does not test it.
         """
-        return chirality_of(None if self.evidence is None else self.evidence.mirrored_log_odds)
+        e = self.evidence
+        return "undecidable" if e is None else chirality_of(e.mirrored_log_odds, e.mirrored_bound)
 
     @property
     def iterations(self) -> dict[str, int]:

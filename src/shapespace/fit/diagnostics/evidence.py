@@ -87,6 +87,13 @@ class FitEvidence(ScanEvidence):
         error_high_mm: upper end of that interval.
         failure_probability: probability that the fit failed, see `failure_model`.
         mirrored_log_odds: log odds (nats) that the scan is mirrored; None where that was not tested.
+        mirrored_apart_mm: mean distance of the vertices from those of the fit to the mirror image, which is by how much
+            they are off if the scan is mirrored; None where the mirror image was not fitted.
+        mirrored_bound: largest of these log odds of left-out training shapes; None where they were not fitted, as where
+            the model does not explain the mirror image either.
+        displaced_moved_mm: robust standard deviation of the displaced parts about the fitted surface after a similarity
+            moved them onto it; None where no part is displaced, or the model does not explain the rest of the scan.
+        displaced_bound: largest `displaced_share` of left-out training shapes; None where they were not fitted.
         second_instance_mm: distance of a second instance in the scan; None where none was found.
         second_instance_gap_mm: gap between the two instances, negative if they overlap; None where none was found.
     """
@@ -96,6 +103,10 @@ class FitEvidence(ScanEvidence):
     error_high_mm: float
     failure_probability: float
     mirrored_log_odds: float | None = None
+    mirrored_apart_mm: float | None = None
+    mirrored_bound: float | None = None
+    displaced_moved_mm: float | None = None
+    displaced_bound: float | None = None
     second_instance_mm: float | None = None
     second_instance_gap_mm: float | None = None
 

@@ -104,6 +104,10 @@ class ScoreTerm(Term[MatchEvidence]):
         return self.predictor(evidence) > self.limit
 
 
+def _scale_implausible(e: MatchEvidence) -> Reason:
+    return Reason(ReasonCode.SCALE_IMPLAUSIBLE, {"scale": math.exp(e.log_scale)})
+
+
 SCORE_OFFSET = -3.70  # logit; intercept of the logistic regression whose terms follow
 SCORE_TERMS = (
     ScoreTerm(
@@ -176,7 +180,7 @@ SCORE_TERMS = (
         lowest=0.0,
         usual=0.010,
         limit=0.7,
-        reason=lambda e: Reason(ReasonCode.SCALE_IMPLAUSIBLE, {"scale": math.exp(e.log_scale)}),
+        reason=_scale_implausible,
     ),
 )
 
@@ -235,6 +239,24 @@ def estimate_error(evidence: ScanEvidence, missing_share: float = 0.0, missing_e
     return ErrorEstimate(expected_mm, low * expected_mm, high * expected_mm, 1.0 / (1.0 + math.exp(-logit)))
 
 
+def with_mirror_image(evidence: FitEvidence) -> FitEvidence:
+    """Return the evidence with an expected error that includes the exchange of the sides of an object.
+
+    Args:
+        evidence: of a fit whose chirality is undecidable, with the distance to the fit of the mirror image.
+    """
+    log_odds, apart_mm = evidence.mirrored_log_odds, evidence.mirrored_apart_mm
+    if log_odds is None or apart_mm is None:
+        return evidence
+    probability = 1.0 / (1.0 + math.exp(-log_odds))
+    high_mm, expected_mm = evidence.error_high_mm, evidence.expected_error_mm
+    if probability > 0.5 * (1.0 - COVERAGE):
+        high_mm = max(high_mm, apart_mm)
+    if probability > 0.5:
+        expected_mm = max(expected_mm, apart_mm)
+    return replace(evidence, error_high_mm=high_mm, expected_error_mm=expected_mm)
+
+
 def failure_score(evidence: MatchEvidence) -> float:
     """Return the logit of a failure; a fit with a score above zero is doubtful."""
     return SCORE_OFFSET + sum(term.contribution(evidence) for term in SCORE_TERMS)
@@ -248,6 +270,8 @@ def find_failure_reasons(evidence: FitEvidence) -> list[Reason]:
     if evidence.model_near_share > _NEAR_THROUGHOUT and not _is_doubtful(plausible):
         z_rms = math.sqrt(max(evidence.z2, evidence.z2_leading))
         return [Reason(ReasonCode.MODEL_TOO_NARROW, {"spread_mm": evidence.spread_mm, "z_rms": z_rms})]
+    if not _is_doubtful(replace(evidence, log_scale=0.0)):
+        return [_scale_implausible(evidence)]
     ranked = sorted(
         SCORE_TERMS, key=lambda term: (term.is_beyond_limit(evidence), term.contribution(evidence)), reverse=True
     )

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Literal, TypeAlias
 
-from shapespace.fit.diagnostics.evidence import FitEvidence
+from shapespace.fit.diagnostics.evidence import FitEvidence, ScanEvidence
+from shapespace.fit.diagnostics.failure_model import FAILED_SHARE
 from shapespace.fit.diagnostics.reasons import Reason, ReasonCode
 
 Chirality: TypeAlias = Literal["as scanned", "mirrored", "undecidable"]
@@ -38,16 +39,39 @@ def find_odd_scan_reasons(evidence: FitEvidence) -> list[Reason]:
     ]
 
 
-def chirality_of(mirrored_log_odds: float | None) -> Chirality:
-    """Return whether the scan is mirrored, from log odds (nats); None where that was not tested."""
+def chirality_of(mirrored_log_odds: float | None, mirrored_bound: float | None) -> Chirality:
+    """Return whether the scan is mirrored.
+
+    Args:
+        mirrored_log_odds: log odds (nats) that the scan is mirrored; None if that was not tested.
+        mirrored_bound: largest log odds of training shapes, each compared by the model of the others; None if unknown.
+    """
     if mirrored_log_odds is None or abs(mirrored_log_odds) < _DECIDED:
         return "undecidable"
-    return "mirrored" if mirrored_log_odds > 0.0 else "as scanned"
+    if mirrored_log_odds < 0.0:
+        return "as scanned"
+    return "mirrored" if mirrored_bound is not None and mirrored_log_odds > mirrored_bound else "undecidable"
+
+
+def is_side_undecidable(evidence: FitEvidence) -> bool:
+    """Return whether the mirror image of the scan was fitted, and neither side is clearly the right one."""
+    is_undecidable = chirality_of(evidence.mirrored_log_odds, evidence.mirrored_bound) == "undecidable"
+    return is_undecidable and evidence.mirrored_apart_mm is not None
+
+
+def has_displaced_parts(evidence: ScanEvidence) -> bool:
+    """Return whether more of the scan runs along the fitted surface at a distance than in correct fits."""
+    share, inward = evidence.displaced_share, evidence.displaced_inward_share
+    return share > _DISPLACED and evidence.displaced_purity > (_PURE_INWARD if inward > _DISPLACED else _PURE)
 
 
 def _find_mirrored(evidence: FitEvidence) -> list[Reason]:
-    is_mirrored = chirality_of(evidence.mirrored_log_odds) == "mirrored"
-    return [Reason(ReasonCode.SCAN_MIRRORED)] if is_mirrored else []
+    log_odds, apart_mm = evidence.mirrored_log_odds, evidence.mirrored_apart_mm
+    if chirality_of(log_odds, evidence.mirrored_bound) == "mirrored":
+        return [Reason(ReasonCode.SCAN_MIRRORED)]
+    if log_odds is None or apart_mm is None or log_odds <= 0.0 or apart_mm < FAILED_SHARE * evidence.size_mm:
+        return []
+    return [Reason(ReasonCode.SCAN_MAY_BE_MIRRORED, {"mirrored_apart_mm": apart_mm})]
 
 
 def _find_layers(evidence: FitEvidence) -> list[Reason]:
@@ -62,10 +86,12 @@ def _find_inconsistent_parts(evidence: FitEvidence) -> list[Reason]:
     gap_mm, distance_mm = evidence.second_instance_gap_mm, evidence.second_instance_mm
     if gap_mm is not None and distance_mm is not None and gap_mm < 0.0:
         reasons.append(Reason(ReasonCode.INSTANCES_OVERLAP, {"second_instance_mm": distance_mm}))
-    share, inward = evidence.displaced_share, evidence.displaced_inward_share
-    pure = _PURE_INWARD if inward > _DISPLACED else _PURE
-    if share > _DISPLACED and evidence.displaced_purity > pure:
-        reasons.append(Reason(ReasonCode.PARTS_DISPLACED, {"displaced_share": share}))
+    is_mirrored = chirality_of(evidence.mirrored_log_odds, evidence.mirrored_bound) == "mirrored"
+    if has_displaced_parts(evidence) and not is_mirrored:  # a mirrored scan has parts at a distance everywhere
+        share, bound = evidence.displaced_share, evidence.displaced_bound
+        is_tested = bound is not None and share > bound
+        code = ReasonCode.PARTS_DISPLACED if is_tested else ReasonCode.PARTS_UNEXPLAINED
+        reasons.append(Reason(code, {"displaced_share": share}))
     if evidence.scattered_share > _SCATTERED and evidence.spread_mm > _NOISY * evidence.size_mm:
         reasons.append(Reason(ReasonCode.POINTS_SCATTERED, {"scattered_share": evidence.scattered_share}))
     return reasons

@@ -11,11 +11,21 @@ from shapespace.fit.diagnostics.reasons import Reason, ReasonCode
 DOUBTFUL = "Do not trust this fit: "
 """Beginning of the sentence on a doubtful fit."""
 
+
+def _undecidable_side(d: Mapping[str, Any]) -> str:
+    if "mirrored_apart_mm" not in d:
+        return ""
+    return (
+        " Whether the scan is mirrored is undecidable: its mirror image fits the model about as well; if it is "
+        f"mirrored, the vertices are {d['mirrored_apart_mm']:.1f} mm off on average."
+    )
+
+
 _TEXTS: Mapping[ReasonCode, Callable[[Mapping[str, Any]], str]] = MappingProxyType(
     {
         ReasonCode.CONVERGED: lambda d: (
             f"Converged; robust residual SD {d['spread_mm']:.2f} mm over {100 * d['model_matched_share']:.0f} % of the "
-            "model's vertices."
+            f"model's vertices.{_undecidable_side(d)}"
         ),
         ReasonCode.CONVERGED_BY_RATE: lambda d: (
             f"Converged; RMS closest distance {d['rms_mm']:.2f} mm: its relative change is below {d['stop_rate']:g} "
@@ -41,6 +51,11 @@ _TEXTS: Mapping[ReasonCode, Callable[[Mapping[str, Any]], str]] = MappingProxyTy
             "the scan is mirrored: its mirror image fits the model better; mirror the scan (negate one coordinate of "
             "each vertex and reverse the triangles) and fit it again"
         ),
+        ReasonCode.SCAN_MAY_BE_MIRRORED: lambda d: (
+            "the scan may be mirrored: its mirror image fits the model better, which may be chance; compare its left "
+            "and right with those of the model; if it is mirrored, the vertices are "
+            f"{d['mirrored_apart_mm']:.1f} mm off on average"
+        ),
         ReasonCode.SCAN_LAYERED: lambda d: (
             f"the scan shows two surfaces on top of each other, about {d['layers_apart_mm']:.1f} mm apart"
         ),
@@ -55,6 +70,10 @@ _TEXTS: Mapping[ReasonCode, Callable[[Mapping[str, Any]], str]] = MappingProxyTy
         ReasonCode.PARTS_DISPLACED: lambda d: (
             f"{100 * d['displaced_share']:.0f} % of the scan runs along the fitted surface at a distance from it, as "
             "where its parts differ in scale or position; check how the scan was assembled, or crop it (--crop)"
+        ),
+        ReasonCode.PARTS_UNEXPLAINED: lambda d: (
+            f"{100 * d['displaced_share']:.0f} % of the scan runs along the fitted surface at a distance from it and "
+            "is not explained by the model: its parts may differ in scale or position, or the model may be too narrow"
         ),
         ReasonCode.POINTS_SCATTERED: lambda d: (
             f"{100 * d['scattered_share']:.0f} % of the scan scatters widely around the fitted surface; remove its "
@@ -103,7 +122,7 @@ _TEXTS: Mapping[ReasonCode, Callable[[Mapping[str, Any]], str]] = MappingProxyTy
             "where about 1 is usual"
         ),
         ReasonCode.SCALE_IMPLAUSIBLE: lambda d: (
-            f"the scan is {d['scale']:.2f} times as large as the model, where about 1 is usual"
+            f"the scan is {d['scale']:.2f} times as large as the model, where about 1 is usual; check its unit (--unit)"
         ),
         ReasonCode.PROBABLY_FAILED: lambda d: (
             f"its expected vertex error is {d['expected_error_mm']:.1f} mm (90 % interval {d['error_low_mm']:.1f} to "

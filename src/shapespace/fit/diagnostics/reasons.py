@@ -11,7 +11,7 @@ class ReasonCode(StrEnum):
     """Reasons for a status; the value is the code in NAME.fit.json, the comment lists the data."""
 
     # status converged
-    CONVERGED = "converged"  # spread_mm, model_matched_share
+    CONVERGED = "converged"  # spread_mm, model_matched_share; mirrored_apart_mm if the chirality is undecidable
     CONVERGED_BY_RATE = "converged_by_rate"  # rms_mm, stop_rate, stop_motion_mm
     # status max_iterations
     ITERATION_LIMIT = "iteration_limit"  # phase, iterations
@@ -22,10 +22,12 @@ class ReasonCode(StrEnum):
     DENSE_SURFACE_MOVED = "dense_surface_moved"  # moved_mm
     # status doubtful: the scan
     SCAN_MIRRORED = "scan_mirrored"
+    SCAN_MAY_BE_MIRRORED = "scan_may_be_mirrored"  # mirrored_apart_mm
     SCAN_LAYERED = "scan_layered"  # layers_apart_mm
     INSTANCES_OVERLAP = "instances_overlap"  # second_instance_mm
     POSE_AMBIGUOUS = "pose_ambiguous"  # apart_mm
     PARTS_DISPLACED = "parts_displaced"  # displaced_share
+    PARTS_UNEXPLAINED = "parts_unexplained"  # displaced_share
     POINTS_SCATTERED = "points_scattered"  # scattered_share
     # status doubtful: a completion, by the training shapes
     SCAN_UNEXPLAINED = "scan_unexplained"  # mismatch_mm, usual_mm

@@ -9,8 +9,12 @@ from typing import ClassVar
 import numpy as np
 
 from shapespace.fit.diagnostics.evidence import FitEvidence, ScanEvidence
-from shapespace.fit.diagnostics.failure_model import estimate_error, find_failure_reasons
-from shapespace.fit.diagnostics.odd_scans import chirality_of, find_odd_scan_reasons
+from shapespace.fit.diagnostics.failure_model import estimate_error, find_failure_reasons, with_mirror_image
+from shapespace.fit.diagnostics.odd_scans import (
+    find_odd_scan_reasons,
+    has_displaced_parts,
+    is_side_undecidable,
+)
 from shapespace.fit.diagnostics.reasons import Reason, ReasonCode
 from shapespace.fit.iteration_state import Fitted, IcpState, RobustFitted
 from shapespace.fit.method import Ended, Limits
@@ -58,8 +62,13 @@ class Robust(RobustSettings):
     ) -> Generator[IcpState, None, Fitted]:
         """Yield the states of phase 1 with the pose alone, then of phase 2 with pose and shape together."""
         from shapespace.fit.robust.robust_icp import robust_icp
-        from shapespace.fit.search.chirality import mirrored_log_odds
-        from shapespace.fit.search.second_instance import find_displaced, find_layers, find_second_instance  # compiled
+        from shapespace.fit.search.chirality import compare_with_mirror_image
+        from shapespace.fit.search.second_instance import (  # compiled
+            compare_displaced,
+            find_displaced,
+            find_layers,
+            find_second_instance,
+        )
 
         fitted = yield from robust_icp(
             model,
@@ -86,12 +95,13 @@ class Robust(RobustSettings):
             evidence = replace(evidence, second_instance_mm=second.away_mm, second_instance_gap_mm=second.gap_mm)
             notes.append(second.note)
         if not limits.part:
-            log_odds = mirrored_log_odds(model, scan, fitted, self, with_scale=limits.with_scale)
-            evidence = replace(evidence, mirrored_log_odds=log_odds)
-            if log_odds is not None and chirality_of(log_odds) == "undecidable":
-                notes.append(
-                    "Whether the scan is mirrored is undecidable: its mirror image fits the model about as well."
-                )
+            mirror = compare_with_mirror_image(model, scan, fitted, self, with_scale=limits.with_scale)
+            evidence = evidence if mirror is None else replace(evidence, **asdict(mirror))
+            evidence = with_mirror_image(evidence) if is_side_undecidable(evidence) else evidence
+        # A mirrored scan has parts at a distance everywhere.
+        if has_displaced_parts(evidence) and (evidence.mirrored_log_odds or 0.0) <= 0.0:
+            displaced = compare_displaced(model, scan, fitted, self, with_scale=limits.with_scale)
+            evidence = replace(evidence, **asdict(displaced))
         return replace(fitted, evidence=evidence, notes=notes)
 
     def doubts(self, ended: Ended) -> list[Reason]:
@@ -104,7 +114,7 @@ class Robust(RobustSettings):
         """Return that the fit converged, with its robust residual standard deviation."""
         evidence = ended.fitted.evidence
         assert evidence is not None
-        return Reason(
-            ReasonCode.CONVERGED,
-            {"spread_mm": evidence.spread_mm, "model_matched_share": evidence.model_matched_share},
-        )
+        data = {"spread_mm": evidence.spread_mm, "model_matched_share": evidence.model_matched_share}
+        if is_side_undecidable(evidence) and evidence.mirrored_apart_mm is not None:
+            data["mirrored_apart_mm"] = evidence.mirrored_apart_mm
+        return Reason(ReasonCode.CONVERGED, data)

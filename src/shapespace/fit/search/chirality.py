@@ -9,16 +9,19 @@ of `any_pose` comes first; only where the reflected scan fits about as well, or 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from shapespace.errors import FitError, InputError
-from shapespace.fit.iteration_state import Fitted, last_of
+from shapespace.fit.diagnostics.failure_model import failure_score
+from shapespace.fit.iteration_state import Fitted, RobustFitted, last_of
 from shapespace.fit.robust.posterior import variance_of_new_shapes
 from shapespace.fit.robust.robust_icp import robust_icp
 from shapespace.fit.robust.robust_settings import RobustSettings
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.search.initialisation import Start
+from shapespace.fit.search.left_out_fits import fit_left_out
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.mirror_plane import find_mirror
 from shapespace.geometry.normals import rms_size
@@ -35,6 +38,7 @@ _CLEARLY_WORSE = 1.1
 """Ratio of the scores of the search above which the reflected scan is not fitted completely."""
 _PATCHES = 100.0
 """Number of independent residuals of a surface; the smallest number in `posterior`."""
+_FLIP = np.diag([-1.0, 1.0, 1.0])
 _CAP, _POINTS, _VERTICES = 0.05, 2_000, 1_000
 """Cap of the distances as a share of the size, and number of points of the scan and vertices of the model."""
 
@@ -51,43 +55,81 @@ def is_asymmetric(model: ShapeModel) -> bool:
     return find_mirror(model.mesh()).off_share > max(_LEAST_ASYMMETRY, _LEAST_OF_SPREAD * spread)
 
 
-def mirrored_log_odds(
-    model: ShapeModel, target: ScanTarget, fitted: Fitted, settings: RobustSettings, *, with_scale: bool
-) -> float | None:
-    """Return the log odds (nats) that the scan is mirrored; None if the model is too symmetric to decide.
+@dataclass(frozen=True)
+class MirrorTest:
+    """Comparison of the scan with its mirror image; the fields are those of `FitEvidence`."""
+
+    mirrored_log_odds: float
+    mirrored_apart_mm: float | None = None
+    mirrored_bound: float | None = None
+
+
+def compare_with_mirror_image(
+    model: ShapeModel, target: ScanTarget, fitted: RobustFitted, settings: RobustSettings, *, with_scale: bool
+) -> MirrorTest | None:
+    """Return whether the mirror image fits better, and than those of training shapes do; None if undecidable.
+
+    If neither the scan nor its mirror image is explained by the model, which of them fits better is chance. Therefore
+    the bound is computed only if the mirror image fits better and its fit is not doubtful: training shapes are fitted
+    by the model of the others, where the scan shows them.
 
     Args:
-        model: the shape space.
+        model: the shape space; if its mean is too symmetric, nothing can be decided.
         target: the scan in its mm frame.
         fitted: result of the fit to it.
         settings: of the robust method.
         with_scale: whether the pose has a free scale.
     """
-    from shapespace.fit.search.pose_search import MIDDLE, refine  # compiled
-
     if not is_asymmetric(model):
         return None
-    scan, flip = target.mesh, np.diag([-1.0, 1.0, 1.0])
-    reflected = scan.vertices @ flip
+    compared = _compare(model, target, fitted, settings, with_scale=with_scale)
+    if compared is None:
+        return None
+    log_odds, mirror_fit = compared
+    if mirror_fit is None:
+        return MirrorTest(log_odds)
+    apart = np.linalg.norm(mirror_fit.vertices_scan_mm @ _FLIP - fitted.vertices_scan_mm, axis=1)
+    test = MirrorTest(log_odds, float(apart.mean()))
+    if log_odds <= 0.0 or failure_score(mirror_fit.match_evidence) > 0.0:
+        return test
+    left_out = fit_left_out(model, fitted, settings, with_scale=with_scale)
+    tests = [_compare(*each, settings, with_scale=with_scale) for each in left_out]
+    return replace(test, mirrored_bound=max((each[0] for each in tests if each is not None), default=None))
+
+
+def _compare(
+    model: ShapeModel, target: ScanTarget, fitted: Fitted, settings: RobustSettings, *, with_scale: bool
+) -> tuple[float, RobustFitted | None] | None:
+    """Return the log odds that a scan is mirrored, and the fit to its mirror image if its pose fits about as well.
+
+    It returns None if the pose search fails.
+    """
+    from shapespace.fit.search.pose_search import MIDDLE, refine  # compiled
+
+    scan = target.mesh
+    reflected = scan.vertices @ _FLIP
     T = fitted.T_scan_fitted
-    scan_pose = refine(model, scan.vertices, [T], with_scale=with_scale)[0]
-    starts = [_reflected_pose(T, flip, Q, model.mean_vertices.mean(axis=0)) for Q in _reflections(model)]
-    coarse = refine(model, reflected, starts, with_scale=with_scale, step=MIDDLE)
+    # The pose search is for scans of the model's size.
+    scale, unscaled = T.scale, Similarity(1.0 / T.scale, np.eye(3), np.zeros(3))
+    T = unscaled @ T
+    scan_pose = refine(model, scan.vertices / scale, [T], with_scale=with_scale)[0]
+    starts = [_reflected_pose(T, _FLIP, Q, model.mean_vertices.mean(axis=0)) for Q in _reflections(model)]
+    coarse = refine(model, reflected / scale, starts, with_scale=with_scale, step=MIDDLE)
     best = min(coarse, key=lambda pose: pose.score_mm)
-    mirrored_pose = refine(model, reflected, [best.T_scan_model], with_scale=with_scale)[0]
+    mirrored_pose = refine(model, reflected / scale, [best.T_scan_model], with_scale=with_scale)[0]
     if not math.isfinite(scan_pose.score_mm):
         return None
     ratio = mirrored_pose.score_mm / max(scan_pose.score_mm, 1e-12)
     if ratio > _CLEARLY_WORSE:
-        return -_PATCHES * math.log(min(ratio, 1e6))
+        return -_PATCHES * math.log(min(ratio, 1e6)), None
     faces = None if scan.faces is None else scan.faces[:, ::-1]
     mirror = ScanTarget(Mesh(reflected, faces, name=scan.name))
-    start = Start(mirrored_pose.T_scan_model, "given", float("nan"), mirrored_pose.b)
+    start = Start(unscaled.inverse() @ mirrored_pose.T_scan_model, "given", float("nan"), mirrored_pose.b)
     try:
-        fit_result = last_of(robust_icp(model, mirror, start, settings, with_scale=with_scale))
+        mirror_fit = last_of(robust_icp(model, mirror, start, settings, with_scale=with_scale))
     except (FitError, InputError):
-        return -_PATCHES * math.log(_CLEARLY_WORSE)
-    return _cost(model, target, fitted) - _cost(model, mirror, fit_result)
+        return -_PATCHES * math.log(_CLEARLY_WORSE), None
+    return _cost(model, target, fitted) - _cost(model, mirror, mirror_fit), mirror_fit
 
 
 def _reflections(model: ShapeModel) -> list[FloatArray]:

@@ -25,6 +25,7 @@ _PLAUSIBLE_COVER = (0.2, 2.6)  # scan size over model size that a unit may leave
 _LIKELIER_BY_FAR = 0.5  # difference in log size from which the second unit is ruled out
 _ONE_BASIN_DEG = 30.0  # rotation from which a refinement finds the pose of simulated scans
 _STANDS_OUT = 0.8  # score relative to that of the runner-up below which a start is unambiguous
+_COVERS = (_TYPICAL_COVER, 0.5)  # scan size over model size of other sizes; a search reaches 0.6 to 1.6 times each
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +50,11 @@ class Start:
     runner_up_score_mm: float = float("inf")
     alternatives: tuple[Start, ...] = ()
     marks: LandmarkConstraint | None = None
+
+    def scaled(self, factor: float) -> Start:
+        """Return the start, and its alternatives, for the scan scaled by `factor` about the origin."""
+        T = Similarity(factor, np.eye(3), np.zeros(3)) @ self.T_scan_model
+        return replace(self, T_scan_model=T, alternatives=tuple(start.scaled(factor) for start in self.alternatives))
 
 
 def find_unit(model: ShapeModel, scan: Mesh) -> str:
@@ -144,6 +150,28 @@ def start_from_any_pose(
     best, alternatives = starts[0], tuple(starts[1:])
     runner_up = min((other.score_mm for other in alternatives), default=float("inf"))
     return replace(best, runner_up_score_mm=runner_up, alternatives=alternatives)
+
+
+def start_of_any_size(model: ShapeModel, scan_vertices_mm: FloatArray, *, seed: int) -> Start:
+    """Return the best pose with a free scale, for a scan that can be many times larger or smaller than the model.
+
+    Other sizes are tried only if no pose stands out at the scan's own size, and win only if they fit clearly better.
+
+    Args:
+        model: the shape space.
+        scan_vertices_mm: (S, 3), at least one.
+        seed: seed of the subsample that is searched.
+    """
+    start = start_from_any_pose(model, scan_vertices_mm, seed=seed, with_scale=True)
+    if start.score_mm <= _STANDS_OUT * start.runner_up_score_mm:
+        return start
+    size, limit_mm = _size(scan_vertices_mm), _STANDS_OUT * start.score_mm
+    for cover in _COVERS if size > 0.0 else ():
+        ratio = size / (cover * _size(model.mean_vertices))
+        other = start_from_any_pose(model, scan_vertices_mm / ratio, seed=seed, with_scale=True)
+        if other.score_mm <= limit_mm:
+            start, limit_mm = other.scaled(ratio), other.score_mm
+    return start
 
 
 def start_near_frame(model: ShapeModel, scan_vertices_mm: FloatArray, *, largest_deg: float, seed: int) -> Start:

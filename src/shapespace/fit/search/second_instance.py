@@ -16,8 +16,10 @@ from shapespace.fit.diagnostics.failure_model import failure_score
 from shapespace.fit.iteration_state import RobustFitted, last_of
 from shapespace.fit.robust.robust_icp import robust_icp
 from shapespace.fit.robust.robust_settings import RobustSettings
+from shapespace.fit.robust.weights import spread
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.search.initialisation import Start
+from shapespace.fit.search.left_out_fits import fit_left_out
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.normals import boundary_vertices, part_of, vertex_normals
 from shapespace.geometry.similarity import fit_similarity
@@ -36,6 +38,10 @@ _GLANCED, _PLACES, _ROUNDS, _TRIMMED, _FARTHEST, _CAP = 150, 40, 25, 0.7, 0.5, 0
 # sampled scan points, nearest points of each (with itself), fewest points to judge by
 _POINTS, _NEIGHBOURS, _FEWEST = 2_000, 7, 100
 _TIGHT, _LEAST_SIDE = 0.5, 2  # two layers: largest width of one relative to the gap, and fewest points on each side
+
+# displaced points, fewer cannot show whether a similarity explains them; iterations, a shift along the surface is slow
+_FEWEST_MOVED, _MOVES = 30, 100
+_LARGEST_SCALE = 2.0  # scale of a part about another; a part that the surface does not explain shrinks to a point of it
 
 # Chosen on the development seeds of `benchmarks/odd_cases.py`, and on 42 heads with hair.
 _ALL_EXPLAINED = 0.97
@@ -121,6 +127,14 @@ class Displaced:
 
 
 @dataclass(frozen=True)
+class DisplacedTest:
+    """Comparison of displaced parts with the fitted surface; the fields are those of `FitEvidence`."""
+
+    displaced_moved_mm: float | None = None
+    displaced_bound: float | None = None
+
+
+@dataclass(frozen=True)
 class Layers:
     """Two surfaces of a scan on top of each other; the fields are those of `ScanEvidence`."""
 
@@ -141,10 +155,50 @@ def find_displaced(model: ShapeModel, target: ScanTarget, fitted: RobustFitted) 
         target: the scan in its mm frame.
         fitted: result of the fit to it.
     """
+    return _displaced_points(model, target, fitted)[0]
+
+
+def compare_displaced(
+    model: ShapeModel, target: ScanTarget, fitted: RobustFitted, settings: RobustSettings, *, with_scale: bool
+) -> DisplacedTest:
+    """Move the displaced part onto the fitted surface, and compare its share with those of left-out training shapes.
+
+    Where a part was assembled wrongly, the model explains the rest, and a similarity moves the part onto the surface.
+    Training shapes are fitted by the model of the others, where the scan shows them: a model of few shapes leaves parts
+    of a new shape at a distance too.
+
+    Args:
+        model: the shape space.
+        target: the scan in its mm frame.
+        fitted: result of the fit to it.
+        settings: of the robust method.
+        with_scale: whether the pose has a free scale.
+    """
+    points = _displaced_points(model, target, fitted)[1]
+    if len(points) < _FEWEST_MOVED or failure_score(fitted.match_evidence) > 0.0:
+        return DisplacedTest()
+    surface = Mesh(fitted.vertices_scan_mm, model.faces)
+    engine, T = build_engine(surface), Similarity.identity()
+    nearest = engine.query(points)
+    for _ in range(_MOVES):
+        T = fit_similarity(points, nearest.points)
+        nearest = engine.query(T.apply(points), nearest)
+    if not 1.0 / _LARGEST_SCALE < T.scale < _LARGEST_SCALE:
+        return DisplacedTest()
+    offset = T.apply(points) - nearest.points
+    moved_mm = spread(np.einsum("ij,ij->i", offset, vertex_normals(surface)[nearest.vertex]))
+    if moved_mm > _AS_GOOD * fitted.match_evidence.spread_mm:
+        return DisplacedTest(moved_mm)
+    left_out = fit_left_out(model, fitted, settings, with_scale=with_scale)
+    return DisplacedTest(moved_mm, max((find_displaced(*each).displaced_share for each in left_out), default=None))
+
+
+def _displaced_points(model: ShapeModel, target: ScanTarget, fitted: RobustFitted) -> tuple[Displaced, FloatArray]:
+    """Return the shares, and the displaced points (M, 3), mm of the scan."""
     # Heights are compared with those of neighbours; fewer points than these have too few neighbours.
     if len(target.mesh.vertices) < _NEIGHBOURS or fitted.match_evidence.scan_near_share > _ALL_EXPLAINED:
-        return Displaced()
-    size, spread = fitted.match_evidence.size_mm, fitted.match_evidence.spread_mm
+        return Displaced(), np.zeros((0, 3))
+    size, spread_mm = fitted.match_evidence.size_mm, fitted.match_evidence.spread_mm
     points = target.mesh.vertices[target.draw(_POINTS, np.random.default_rng(0))]
     surface = Mesh(fitted.vertices_scan_mm, model.faces)
     nearest = build_engine(surface).query(points)
@@ -152,16 +206,17 @@ def find_displaced(model: ShapeModel, target: ScanTarget, fitted: RobustFitted) 
     around = height[np.asarray(cKDTree(points).query(points, _NEIGHBOURS)[1], dtype=np.int32)[:, 1:]]
     alike = np.median(np.abs(around - height[:, None]), axis=1) < _ALIKE * np.abs(height)
     inside = ~boundary_vertices(surface)[nearest.vertex]
-    limit = max(_DISPLACED[0] * size, _SPREADS * spread)
+    limit = max(_DISPLACED[0] * size, _SPREADS * spread_mm)
     is_displaced = (np.abs(height) > limit) & (nearest.distance < _DISPLACED[1] * size) & alike & inside
     is_displaced &= np.abs(height) > _ALONG_NORMAL * nearest.distance
     far_share = max(float((nearest.distance > limit).mean()), 1.0 / len(points))
-    return Displaced(
+    shares = Displaced(
         displaced_share=float(is_displaced.mean()),
         displaced_inward_share=float((is_displaced & (height < 0.0)).mean()),
         displaced_purity=float(is_displaced.mean() / far_share),
         scattered_share=float(((nearest.distance > _DISPLACED[0] * size) & inside & ~alike).mean()),
     )
+    return shares, points[is_displaced]
 
 
 def find_layers(model: ShapeModel, target: ScanTarget, fitted: RobustFitted) -> Layers:
