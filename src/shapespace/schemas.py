@@ -447,7 +447,8 @@ class SurfaceReview(Struct, frozen=True, kw_only=True):
     def of(codes: Iterable[Sequence[ReviewCode]]) -> SurfaceReview:
         """Count surfaces by the `codes` of their reasons, which are empty for a surface that needs no review."""
         every = [set(own) for own in codes]
-        reasons = {code: count for code in get_args(ReviewCode) if (count := sum(code in own for own in every))}
+        known: tuple[ReviewCode, ...] = get_args(ReviewCode)
+        reasons = {code: count for code in known if (count := sum(code in own for own in every))}
         return SurfaceReview(surfaces=len(every), needs_review=sum(map(bool, every)), reasons=reasons)
 
     def __add__(self, other: SurfaceReview) -> SurfaceReview:

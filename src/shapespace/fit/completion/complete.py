@@ -21,6 +21,7 @@ from shapespace.fit.completion.mirror import add_mirror_image
 from shapespace.fit.completion.shape_posterior import AS_LIKELY, ShapePosterior, shape_posterior
 from shapespace.fit.completion.surface_calibration import SurfaceCalibration, calibrate
 from shapespace.fit.dense.dense_fit import dense_surface
+from shapespace.fit.diagnostics.odd_scans import converged_reason
 from shapespace.fit.diagnostics.reason_text import sentence_of
 from shapespace.fit.diagnostics.reasons import Reason, ReasonCode
 from shapespace.fit.fit_scan import FitConfig, fit_scan
@@ -432,7 +433,7 @@ def _likeliest_pose(
     best = found[0]
     for density, _, vertices in found[1:]:
         apart_mm = float(np.sqrt(((vertices - best[2]) ** 2).sum(axis=1).mean()))
-        if density > best[0] - AS_LIKELY and apart_mm > _OTHER_POSE * rms_size(model.mean_vertices):
+        if density > best[0] - AS_LIKELY and apart_mm > _OTHER_POSE * rms_size(best[2]):
             return best[1], apart_mm
     return best[1], None
 
@@ -464,8 +465,8 @@ def _judged(
     if not doubts:
         if fit.status != "doubtful":
             return "converged", fit.reasons
-        data = {"spread_mm": posterior.noise_mm, "model_matched_share": float(posterior.followed.mean())}
-        return "converged", (Reason(ReasonCode.CONVERGED, data),)
+        spread_mm = posterior.noise_mm * posterior.T_scan_model.scale
+        return "converged", (converged_reason(spread_mm, float(posterior.followed.mean()), fit.evidence),)
     if not config.with_doubtful:
         raise FitError(
             f"{fit.scan_name}: {sentence_of('doubtful', doubts)} Its completion would look more certain than it is; "
@@ -478,13 +479,15 @@ def _doubts_by_training_shapes(
     model: ShapeModel, posterior: ShapePosterior, calibration: SurfaceCalibration, noise_mm: float
 ) -> list[Reason]:
     """Return in which respects the scan and its completion are unlike those of the left-out training shapes."""
-    doubts = list[Reason]()
+    doubts, scale = list[Reason](), posterior.T_scan_model.scale
     # Triangles of the model are flat, those of training shapes and their completions alike.
     usual_mm = float(np.hypot(posterior.left_out_mismatch_mm().max(), _sagitta_mm(model)))
     # Noise of the scan is no mismatch; it differs between neighbouring points.
     mismatch_mm = float(np.sqrt(max(posterior.mismatch_mm**2 - noise_mm**2, 0.0)))
     if mismatch_mm > _UNEXPLAINED * usual_mm:
-        doubts.append(Reason(ReasonCode.SCAN_UNEXPLAINED, {"mismatch_mm": mismatch_mm, "usual_mm": usual_mm}))
+        doubts.append(
+            Reason(ReasonCode.SCAN_UNEXPLAINED, {"mismatch_mm": scale * mismatch_mm, "usual_mm": scale * usual_mm})
+        )
     size_variance = float(posterior.prior_variance[SCALE])
     if size_variance > 0 and abs(np.log(posterior.T_scan_model.scale)) > _OTHER_SIZE * np.sqrt(size_variance):
         doubts.append(Reason(ReasonCode.SCALE_IMPLAUSIBLE, {"scale": posterior.T_scan_model.scale}))

@@ -59,6 +59,20 @@ def is_side_undecidable(evidence: FitEvidence) -> bool:
     return is_undecidable and evidence.mirrored_apart_mm is not None
 
 
+def converged_reason(spread_mm: float, matched_share: float, evidence: FitEvidence | None) -> Reason:
+    """Return that a fit converged, with the distance of the vertices if the sides of the object may be exchanged.
+
+    Args:
+        spread_mm: robust standard deviation of the residuals.
+        matched_share: share of the model's vertices that are matched.
+        evidence: of the fit.
+    """
+    data: dict[str, float | str] = {"spread_mm": spread_mm, "model_matched_share": matched_share}
+    if evidence is not None and evidence.mirrored_apart_mm is not None and is_side_undecidable(evidence):
+        data["mirrored_apart_mm"] = evidence.mirrored_apart_mm
+    return Reason(ReasonCode.CONVERGED, data)
+
+
 def has_displaced_parts(evidence: ScanEvidence) -> bool:
     """Return whether more of the scan runs along the fitted surface at a distance than in correct fits."""
     share, inward = evidence.displaced_share, evidence.displaced_inward_share

@@ -11,11 +11,12 @@ import numpy as np
 from shapespace.fit.diagnostics.evidence import FitEvidence, ScanEvidence
 from shapespace.fit.diagnostics.failure_model import estimate_error, find_failure_reasons, with_mirror_image
 from shapespace.fit.diagnostics.odd_scans import (
+    converged_reason,
     find_odd_scan_reasons,
     has_displaced_parts,
     is_side_undecidable,
 )
-from shapespace.fit.diagnostics.reasons import Reason, ReasonCode
+from shapespace.fit.diagnostics.reasons import Reason
 from shapespace.fit.iteration_state import Fitted, IcpState, RobustFitted
 from shapespace.fit.method import Ended, Limits
 from shapespace.fit.robust.robust_settings import RobustSettings
@@ -114,7 +115,4 @@ class Robust(RobustSettings):
         """Return that the fit converged, with its robust residual standard deviation."""
         evidence = ended.fitted.evidence
         assert evidence is not None
-        data = {"spread_mm": evidence.spread_mm, "model_matched_share": evidence.model_matched_share}
-        if is_side_undecidable(evidence) and evidence.mirrored_apart_mm is not None:
-            data["mirrored_apart_mm"] = evidence.mirrored_apart_mm
-        return Reason(ReasonCode.CONVERGED, data)
+        return converged_reason(evidence.spread_mm, evidence.model_matched_share, evidence)
