@@ -264,13 +264,13 @@ def failure_score(evidence: MatchEvidence) -> float:
 
 def find_failure_reasons(evidence: FitEvidence) -> list[Reason]:
     """Return reasons to expect that a fit failed, the largest contribution first; empty where there are none."""
-    if not _is_doubtful(evidence):
+    if not is_doubtful(evidence):
         return _find_probable_failure(evidence)
     plausible = replace(evidence, z2=min(evidence.z2, 1.0), z2_leading=min(evidence.z2_leading, 1.0))
-    if evidence.model_near_share > _NEAR_THROUGHOUT and not _is_doubtful(plausible):
+    if evidence.model_near_share > _NEAR_THROUGHOUT and not is_doubtful(plausible):
         z_rms = math.sqrt(max(evidence.z2, evidence.z2_leading))
         return [Reason(ReasonCode.MODEL_TOO_NARROW, {"spread_mm": evidence.spread_mm, "z_rms": z_rms})]
-    if not _is_doubtful(replace(evidence, log_scale=0.0)):
+    if not is_doubtful(replace(evidence, log_scale=0.0)):
         return [_scale_implausible(evidence)]
     ranked = sorted(
         SCORE_TERMS, key=lambda term: (term.is_beyond_limit(evidence), term.contribution(evidence)), reverse=True
@@ -283,7 +283,8 @@ def find_failure_reasons(evidence: FitEvidence) -> list[Reason]:
     ]
 
 
-def _is_doubtful(evidence: MatchEvidence) -> bool:
+def is_doubtful(evidence: MatchEvidence) -> bool:
+    """Return whether the score, or one of its predictors alone, makes a fit doubtful."""
     return failure_score(evidence) > 0.0 or any(term.is_beyond_limit(evidence) for term in SCORE_TERMS)
 
 

@@ -70,8 +70,8 @@ def compare_with_mirror_image(
     """Return whether the mirror image fits better, and than those of training shapes do; None if undecidable.
 
     If neither the scan nor its mirror image is explained by the model, which of them fits better is chance. Therefore
-    the bound is computed only if the mirror image fits better and its fit is not doubtful: training shapes are fitted
-    by the model of the others, where the scan shows them.
+    the bound is computed only if the mirror image fits better, with a failure score up to zero: training shapes are
+    fitted by the model of the others, where the scan shows them.
 
     Args:
         model: the shape space; if its mean is too symmetric, nothing can be decided.

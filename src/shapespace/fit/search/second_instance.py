@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from shapespace.errors import FitError, InputError
-from shapespace.fit.diagnostics.failure_model import failure_score
+from shapespace.fit.diagnostics.failure_model import failure_score, is_doubtful
 from shapespace.fit.iteration_state import RobustFitted, last_of
 from shapespace.fit.robust.robust_icp import robust_icp
 from shapespace.fit.robust.robust_settings import RobustSettings
@@ -175,7 +175,7 @@ def compare_displaced(
         with_scale: whether the pose has a free scale.
     """
     points = _displaced_points(model, target, fitted)[1]
-    if len(points) < _FEWEST_MOVED or failure_score(fitted.match_evidence) > 0.0:
+    if len(points) < _FEWEST_MOVED or is_doubtful(fitted.match_evidence):
         return DisplacedTest()
     surface = Mesh(fitted.vertices_scan_mm, model.faces)
     engine, T = build_engine(surface), Similarity.identity()
