@@ -7,7 +7,8 @@
 one end, placed in a random pose, and completed and fitted by models of 12 or all 23 others, or of 5 and 8. Coverage is
 of the regions of 50, 90 and 95 % of missing vertices (chi-squared with three degrees of freedom) by distance from the
 cut, and of the 95 % intervals of length and volume; their width is compared with the narrowest constant one that
-contains 95 % of the errors. Other objects are balls, rods, molars, heads, and halves of them, scaled to the RMS size of the bones.
+contains 95 % of the errors. Other objects are balls, rods, molars, heads, and halves of them, scaled to the RMS size of
+the bones.
 """
 
 from __future__ import annotations

@@ -448,7 +448,8 @@ class SurfaceReview(Struct, frozen=True, kw_only=True):
         """Count surfaces by the `codes` of their reasons, which are empty for a surface that needs no review."""
         every = [set(own) for own in codes]
         known: tuple[ReviewCode, ...] = get_args(ReviewCode)
-        reasons = {code: count for code in known if (count := sum(code in own for own in every))}
+        counts = {code: sum(code in own for own in every) for code in known}
+        reasons = {code: counts[code] for code in known if counts[code]}
         return SurfaceReview(surfaces=len(every), needs_review=sum(map(bool, every)), reasons=reasons)
 
     def __add__(self, other: SurfaceReview) -> SurfaceReview:
