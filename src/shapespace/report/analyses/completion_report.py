@@ -9,13 +9,16 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.fit.completion.complete import ESTIMATED, OBSERVED, UNKNOWABLE, Completion, CompletionConfig
+from shapespace.geometry.closest import build_engine
 from shapespace.report.analyses.analysis_report import AnalysisReport, Rows
+from shapespace.report.render.decimate import decimate
 from shapespace.reprs import first_names
 from shapespace.schemas import MorphPart, Part, SurfaceMapPart, TablePart, TextPart
-from shapespace.types import FloatArray
+from shapespace.types import FloatArray, Mesh
 
 _MOST_SURFACES = 12  # scans whose surfaces are drawn; the files have all
 _MOST_SENTENCES, _MOST_ROWS = 12, 60
+_MOST_TRIANGLES = 20_000  # of a scan in the report
 _MORPH_STDDEV = 2.0  # ends of the morph, in standard deviations
 _FILE = "completion.npz"
 _CITATIONS = (
@@ -173,11 +176,27 @@ class CompletionReport:
             "vertices": vertices, "stddev": completion.stddev_mm, "missing": ~completion.observed,
             "low": vertices - mode, "high": vertices + mode,
         }  # fmt: skip
+        scan = decimate(completion.fit.scan, _MOST_TRIANGLES)[0]
+        if scan.faces is not None:
+            # The completed surface has no values, and is drawn grey below the scan.
+            distance_mm = build_engine(Mesh(completion.vertices, model.faces)).query(scan.vertices).distance * mm
+            arrays |= {
+                "both": np.concatenate([vertices, scan.vertices * mm]),
+                "both_faces": np.concatenate([np.asarray(model.faces), scan.faces + len(vertices)]),
+                "distance": np.concatenate([np.full(len(vertices), np.nan), distance_mm]),
+            }
         self._arrays.setdefault("faces", np.asarray(model.faces))
         self._arrays.update({f"{key}_{k}": value.astype(np.float32) if value.dtype == np.float64 else value
                              for key, value in arrays.items()})  # fmt: skip
         self._parts += [
             TextPart(title=name, level=2, text=(completion.reason,)),
+            *(
+                [] if scan.faces is None else [SurfaceMapPart(
+                    title="Scan on the completed surface", arrays=_FILE, vertices=f"both_{k}", faces=f"both_faces_{k}",
+                    values=f"distance_{k}", unit="mm", signed=False,
+                    note="Distance of the scan from the completed surface; the completed part is grey.",
+                )]
+            ),
             SurfaceMapPart(
                 title="Standard deviation of the vertices", arrays=_FILE, vertices=f"vertices_{k}",
                 values=f"stddev_{k}", mask=f"missing_{k}", unit="mm", signed=False,
