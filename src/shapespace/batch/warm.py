@@ -16,6 +16,7 @@ from shapespace.errors import ShapespaceError
 from shapespace.fit.dense.residual_modes import residual_modes
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.robust.robust_settings import ResidualSettings
+from shapespace.geometry.normals import part_of
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh
 
@@ -38,7 +39,9 @@ def _small_fits() -> None:
     model = ShapeModel.fit([_hill(20, seed) for seed in range(8)], gauge="shape", align=False)
     few = _hill(10, 9)
     upside_down = Mesh(few.vertices @ np.diag([1.0, -1.0, -1.0]), few.faces)
-    for raw in (upside_down, _hill(45, 9), Mesh(_hill(45, 9).vertices)):
+    hill = _hill(45, 9)
+    half = part_of(hill, hill.vertices[:, 0] < 0)
+    for raw in (upside_down, hill, Mesh(hill.vertices), half):
         # So small a scan may be refused, and says nothing of those to come.
         with contextlib.suppress(ShapespaceError):
             _ = fit_scan(model, raw, FitConfig(max_iterations=20)).distances

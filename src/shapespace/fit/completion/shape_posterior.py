@@ -154,7 +154,7 @@ def shape_posterior(
     size_mm, training = rms_size(model.mean_vertices), model.training
     size_stddev = None if training is None else training.log_scale_stddev
     # If the sizes of the training shapes are known, the prior of the scale is about theirs, else about that of the fit.
-    start_scale = T_scan_model.scale if size_stddev is None else 1.0
+    start_scale = T_scan_model.scale if size_stddev is None or settled else 1.0
     settings = replace(settings, scale_stddev=size_stddev or settings.scale_stddev)
     problem = Problem.of(prepare(model), target, settings, start_scale, with_scale=with_scale, marks=marks)
     iterate = problem.iterate(Estimate(T_scan_model, b))
