@@ -282,7 +282,7 @@ def test_the_prior_of_a_free_size_is_the_spread_of_the_training_shapes() -> None
     assert spread is not None and 0.02 < spread < 0.1
     assert np.isclose(completion.posterior.prior_variance[POSE - 1], spread**2)
     assert any(f"{100 * spread:.2g} %" in note for note in completion.notes)
-    larger = complete(model, scan.with_vertices(1.5 * scan.vertices), replace(FORM, with_doubtful=True))
+    larger = complete(model, scan.with_vertices(3.0 * scan.vertices), replace(FORM, with_doubtful=True))
     assert larger.status == "doubtful" and "times as large" in larger.reason
 
 

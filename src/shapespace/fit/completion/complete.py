@@ -28,7 +28,6 @@ from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.landmark_terms import SHARE, LandmarkConstraint
 from shapespace.fit.result import FitResult, Status
 from shapespace.fit.robust.kernels import Float32Array
-from shapespace.fit.robust.normal_equations import SCALE
 from shapespace.fit.robust.robust_settings import RobustSettings
 from shapespace.fit.scan_target import ScanTarget, mm_frame
 from shapespace.fit.search.initialisation import start_from_any_pose
@@ -68,7 +67,6 @@ _UNEXPLAINED = 2.0
 """Multiple of the largest distance of left-out training shapes from their completions beyond which the model does not
 explain a scan: 24 femora reach 1.0, other objects scaled to their size 2.9 and more (benchmarks/completion.py)."""
 _LEAST_AREA, _REVERTS = 0.1, 20  # share of its area that a triangle keeps on the scan, and rounds to enforce it
-_OTHER_SIZE = 4.0  # standard deviations of the training shapes' size
 _IMPLAUSIBLE, _RARE = 3.0, 1e-5
 """Mean square of the coefficients in standard deviations of new shapes (1.4 is the most measured, with 51 modes), and
 the probability of a normal shape to be implausible, which decides for few modes."""
@@ -77,7 +75,6 @@ _OF_MISSING_PARTS = frozenset(
         ReasonCode.EXPECTED_ERROR, ReasonCode.PROBABLY_FAILED, ReasonCode.MODEL_FAR_FROM_SCAN, ReasonCode.MODEL_UNSEEN,
         ReasonCode.MODEL_UNMATCHED, ReasonCode.FEW_TRAINING_SHAPES, ReasonCode.MODEL_TOO_NARROW,
         ReasonCode.MODE_IMPLAUSIBLE, ReasonCode.SHAPE_IMPLAUSIBLE, ReasonCode.LEADING_MODES_IMPLAUSIBLE,
-        ReasonCode.SCALE_IMPLAUSIBLE,
     }
 )  # fmt: skip
 """Reasons to doubt a fit that follow from missing parts, and that tests of the completion replace."""
@@ -488,9 +485,6 @@ def _doubts_by_training_shapes(
         doubts.append(
             Reason(ReasonCode.SCAN_UNEXPLAINED, {"mismatch_mm": scale * mismatch_mm, "usual_mm": scale * usual_mm})
         )
-    size_variance = float(posterior.prior_variance[SCALE])
-    if size_variance > 0 and abs(np.log(posterior.T_scan_model.scale)) > _OTHER_SIZE * np.sqrt(size_variance):
-        doubts.append(Reason(ReasonCode.SCALE_IMPLAUSIBLE, {"scale": posterior.T_scan_model.scale}))
     if calibration.missing.mean() > 1 - _COMPLETE and not calibration.is_skilled:
         ratios = calibration.log_ratios
         data = {"training_shapes": float(len(ratios)), "nearer": float((ratios > 0).sum())}
