@@ -18,7 +18,7 @@ from scipy.stats import chi2
 
 from shapespace.errors import FitError, InputError
 from shapespace.fit.completion.mirror import add_mirror_image
-from shapespace.fit.completion.shape_posterior import AS_LIKELY, ShapePosterior, shape_posterior
+from shapespace.fit.completion.shape_posterior import AS_LIKELY, OTHER_SIZE, ShapePosterior, shape_posterior
 from shapespace.fit.completion.surface_calibration import SurfaceCalibration, calibrate
 from shapespace.fit.dense.dense_fit import dense_surface
 from shapespace.fit.diagnostics.odd_scans import converged_reason
@@ -525,6 +525,8 @@ def _notes(model: ShapeModel, fit: FitResult, observed: BoolArray, *, with_scale
         notes.append("The size was fixed: sizes of shapes are part of the model, or the scale was held.")
     elif size_stddev is None:
         notes.append("The size was free: the model does not know the sizes of its training shapes.")
+    elif abs(np.log(fit.T_scan_model.scale * fit.mm_per_scan_unit)) > OTHER_SIZE * size_stddev:
+        notes.append("The size was free: it is that of no training shape, so the unit or scale of the scan is unknown.")
     else:
         notes.append(
             f"The size was free, with the standard deviation of the training shapes' sizes ({100 * size_stddev:.2g} %)."

@@ -41,7 +41,7 @@ _AMPLITUDES = np.geomspace(1e-4, 100.0, 19)
 _AMPLITUDE_STDDEV, _OF_UNKNOWN_MODEL = 1.0, 3.0
 """Standard deviation of the logarithm of the amplitude, chosen by benchmarks/completion.py on faces and femora; the
 second for models that do not state their number of shapes, whose spectrum does not predict the amplitude."""
-_OTHER_SIZE = 4.0  # standard deviations of the training shapes' size
+OTHER_SIZE = 4.0  # standard deviations of the training shapes' size
 AS_LIKELY = 3.0  # log density (a factor of 20) within which two explanations of a scan count as equally likely
 
 
@@ -154,7 +154,7 @@ def shape_posterior(
     """
     size_mm, training = rms_size(model.mean_vertices), model.training
     size_stddev = None if training is None else training.log_scale_stddev
-    if size_stddev is not None and abs(np.log(T_scan_model.scale)) > _OTHER_SIZE * size_stddev:
+    if size_stddev is not None and abs(np.log(T_scan_model.scale)) > OTHER_SIZE * size_stddev:
         size_stddev = None  # the scan has another size than any training shape, such as in an unknown unit
     # If the sizes of the training shapes are known, the prior of the scale is about theirs, else about that of the fit.
     start_scale = T_scan_model.scale if size_stddev is None or settled else 1.0
