@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from scipy.stats import chi2
@@ -65,7 +65,7 @@ _ON_SCAN = 5.0  # multiple of the noise within which a refined vertex is on the 
 _LEAST_GAIN = 0.1  # share of a vertex's variance that a scan removes, of models without training shapes
 _UNEXPLAINED = 2.0
 """Multiple of the largest distance of left-out training shapes from their completions beyond which the model does not
-explain a scan: 24 femora reach 1.0, other objects scaled to their size 2.9 and more (benchmarks/completion.py)."""
+explain a scan: 24 femora reach 1.0, other objects scaled to their size at least 2.9 (benchmarks/self_calibration.py)."""
 _LEAST_AREA, _REVERTS = 0.1, 20  # share of its area that a triangle keeps on the scan, and rounds to enforce it
 _IMPLAUSIBLE, _RARE = 3.0, 1e-5
 """Mean square of the coefficients in standard deviations of new shapes (1.4 is the most measured, with 51 modes), and
@@ -171,7 +171,7 @@ class Completion:
         posterior: joint distribution of pose, coefficients and off-model variation.
         T_scan_model: pose of the posterior, from the model's frame (mm) to the frame and unit of the scan.
         calibration: completions of the training shapes by models of the others, from which intervals, skill and status
-            are estimated; None if the model has no training shapes, whose results are not calibrated.
+            are estimated; None if the model neither contains nor counts its training shapes.
     """
 
     fit: FitResult
@@ -492,11 +492,18 @@ def _doubts_by_training_shapes(
     return doubts
 
 
+def _subdivided(x: FloatArray, M: Any) -> FloatArray:
+    """Return the vertices of one level of Loop subdivision by the operator `M`, of which the first stay at `x` (V, 3).
+
+    Subdivision smooths; what it removes is added beforehand.
+    """
+    return np.asarray(M @ (2.0 * x - (M @ x)[: len(x)]))
+
+
 def _sagitta_mm(model: ShapeModel) -> float:
     """Return the RMS distance of the midpoints of the edges from the smooth surface through the vertices, mm."""
     x, faces = model.mean_vertices, np.asarray(model.faces)
-    M, _ = loop_operator(len(x), faces)
-    smooth = np.asarray(M @ (2.0 * x - (M @ x)[: len(x)]))[len(x) :]
+    smooth = _subdivided(x, loop_operator(len(x), faces)[0])[len(x) :]
     edges = np.unique(np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1), axis=0)
     midpoints = x[edges].mean(axis=1)
     return float(np.sqrt((build_engine(Mesh(smooth)).query(midpoints).distance ** 2).mean()))
@@ -526,7 +533,9 @@ def _notes(model: ShapeModel, fit: FitResult, observed: BoolArray, *, with_scale
     elif size_stddev is None:
         notes.append("The size was free: the model does not know the sizes of its training shapes.")
     elif abs(np.log(fit.T_scan_model.scale * fit.mm_per_scan_unit)) > OTHER_SIZE * size_stddev:
-        notes.append("The size was free: it is that of no training shape, so the unit or scale of the scan is unknown.")
+        notes.append(
+            "The size was free: no training shape has the size of the fit, so the unit or scale of the scan is unknown."
+        )
     else:
         notes.append(
             f"The size was free, with the standard deviation of the training shapes' sizes ({100 * size_stddev:.2g} %)."
@@ -572,8 +581,7 @@ def refine_surface(completion: Completion) -> Mesh:
     model, scan = completion.model, completion.fit.scan
     M, faces = loop_operator(model.n_vertices, np.asarray(model.faces))
     x = completion.vertices
-    # Subdivision smooths; what it removes is given back beforehand, so that the vertices stay where they are.
-    smooth = np.asarray(M @ (2.0 * x - (M @ x)[: len(x)]))
+    smooth = _subdivided(x, M)
     near = build_engine(scan).query(smooth)
     reach = _ON_SCAN * completion.posterior.noise_mm * completion.T_scan_model.scale
     is_observed = (np.asarray(M @ completion.observed.astype(np.float64)) > 1.0 - 1e-9) & (near.distance < reach)

@@ -59,7 +59,7 @@ class CompletionReport:
         self._estimates += [
             (name, e.name, e.unit, e.value, e.mean, e.stddev, e.low, e.high, e.calibrated_on) for e in estimates
         ]
-        self._calibrated_on = first_count = estimates[0].calibrated_on
+        self._calibrated_on = estimates[0].calibrated_on
         mm = completion.fit.mm_per_scan_unit
         places = completion.surface().landmarks
         self._landmarks += [
@@ -73,7 +73,7 @@ class CompletionReport:
         self._summary.append(
             f"{name}: {completion.status}; the scan shows {100 * shares[0]:.0f} % of the vertices, the others have a "
             f"standard deviation of {rms_mm:.2f} mm; {first.name} {_number(first.value)} {first.unit} (95 % interval "
-            f"{_number(first.low)} to {_number(first.high)}, {_source(first_count)})."
+            f"{_number(first.low)} to {_number(first.high)}, {_source(first.calibrated_on)})."
         )
         if completion.status == "doubtful":
             self._notes.setdefault(completion.reason, []).append(name)
