@@ -65,7 +65,7 @@ _ON_SCAN = 5.0  # multiple of the noise within which a refined vertex is on the 
 _LEAST_GAIN = 0.1  # share of a vertex's variance that a scan removes, of models without training shapes
 _UNEXPLAINED = 2.0
 """Multiple of the largest distance of left-out training shapes from their completions beyond which the model does not
-explain a scan: 24 femora reach 1.0, other objects scaled to their size at least 2.9 (benchmarks/self_calibration.py)."""
+explain a scan: 24 femora reach 1.0, other objects scaled to that size 2.9 (benchmarks/self_calibration.py)."""
 _LEAST_AREA, _REVERTS = 0.1, 20  # share of its area that a triangle keeps on the scan, and rounds to enforce it
 _IMPLAUSIBLE, _RARE = 3.0, 1e-5
 """Mean square of the coefficients in standard deviations of new shapes (1.4 is the most measured, with 51 modes), and
