@@ -7,8 +7,8 @@
 one end, placed in a random pose, and completed and fitted by models of 12 or all 23 others, or of 5 and 8. Coverage is
 of the regions of 50, 90 and 95 % of missing vertices (chi-squared with three degrees of freedom) by distance from the
 cut, and of the 95 % intervals of length and volume; their width is compared with the narrowest constant one that
-contains 95 % of the errors. Other objects are balls, rods, molars, heads, and halves of them, scaled to the RMS size of
-the bones.
+contains 95 % of the errors. Other objects are balls, rods, molars, heads, spleens, and halves of them, scaled to the
+RMS size of the bones.
 """
 
 from __future__ import annotations
@@ -129,33 +129,39 @@ def print_row(size: int, share: float, row: Row) -> None:
     print(f"| {' | '.join(cells)} |", flush=True)
 
 
-def wrong_objects(size: float) -> Iterator[Mesh]:
-    """Yield other objects and halves of them, of the RMS size of the bones."""
-    ball = organs()(np.random.default_rng(0))
-    faces, rng = load_faces(), np.random.default_rng(1)
+def wrong_objects(size: float, seed: int) -> Iterator[Mesh]:
+    """Yield other objects and halves of them, of the RMS size of the bones, in random poses."""
+    rng = np.random.default_rng(seed)
+    ball, faces, teeth = organs()(rng), load_faces(), molars(seed)[0]
     stretched = [
         ball.with_vertices(ball.vertices * np.array(k)) for k in ((1, 1, 1), (1, 1.5, 4), (1, 1, 8), (1, 0.9, 12))
     ]
-    for mesh in (*stretched, *molars(0)[0][:8], *(faces.face(faces.draw_person(rng)) for _ in range(4))):
+    spleens = sorted((Path(os.environ["SHAPESPACE_DATA"]) / "spleens").glob("*.ply"))
+    heads = [faces.face(faces.draw_person(rng)) for _ in range(4)]
+    for mesh in (*stretched, *teeth[:8], *heads, *map(read_mesh, rng.permutation(spleens)[:6])):
         x = (mesh.vertices - mesh.vertices.mean(axis=0)) * (size / rms_size(mesh.vertices))
-        yield mesh.with_vertices(x)
-        for axis in np.linalg.svd(x, full_matrices=False)[2][:2]:
-            yield part_of(mesh.with_vertices(x), x @ axis < 0)
+        whole = mesh.with_vertices(x)
+        halves = [part_of(whole, x @ axis < 0) for axis in np.linalg.svd(x, full_matrices=False)[2][:2]]
+        for part in (whole, *halves):
+            yield part.with_vertices(random_similarity(rng, 180.0, (1.0, 1.0)).apply(part.vertices))
 
 
-def print_wrong(surfaces: list[Mesh]) -> None:
-    """Print how many other objects are converged."""
-    model = ShapeModel.fit(surfaces, gauge="form")
-    counts = {"completion": 0, "fit": 0}
-    objects = list(wrong_objects(rms_size(model.mean_vertices)))
+def print_wrong(surfaces: list[Mesh], seed: int) -> None:
+    """Print how many other objects are converged with a model of 18 of the bones."""
+    chosen = np.random.default_rng(seed).permutation(len(surfaces))[:18]
+    model = ShapeModel.fit([surfaces[k] for k in sorted(chosen)], gauge="form")
+    converged: dict[str, list[str]] = {"completions": [], "fits": []}
+    objects = list(wrong_objects(rms_size(model.mean_vertices), seed))
     for mesh in objects:
-        for name, function in (("completion", lambda m: complete(model, m, CONFIG)),
-                               ("fit", lambda m: fit_scan(model, m, CONFIG.fit))):  # fmt: skip
+        for name, function in (("completions", lambda m: complete(model, m, CONFIG)),
+                               ("fits", lambda m: fit_scan(model, m, CONFIG.fit))):  # fmt: skip
             try:
-                counts[name] += function(mesh).status == "converged"
+                if function(mesh).status == "converged":
+                    converged[name].append(mesh.name)
             except FitError:
                 continue
-    print(f"Other objects converged: {counts['completion']} completions and {counts['fit']} fits of {len(objects)}.")
+    counts = " and ".join(f"{len(names)} {name} {names or ''}" for name, names in converged.items())
+    print(f"Other objects converged, seed {seed}: {counts} of {len(objects)}.", flush=True)
 
 
 def main() -> None:
@@ -175,7 +181,8 @@ def main() -> None:
         for share in SHARES if size in SIZES else SHARES[1:]:
             print_row(size, share, run(surfaces, scans, size, share, arguments.seeds))
     if "wrong" in arguments.what:
-        print_wrong(surfaces)
+        for seed in range(arguments.seeds):
+            print_wrong(surfaces, seed)
 
 
 if __name__ == "__main__":

@@ -244,10 +244,19 @@ def test_what_was_dropped_edited_and_excluded_is_there_after_a_restart(open_tab,
             tab.page.get_by_test_id(f"select-{name}").click()
         tab.page.get_by_test_id("unit-selected").select_option("cm")
         tab.page.get_by_test_id("mirror-selected").click()
+        tab.until("document.querySelector('[data-testid=mirror-selected]').innerText !== 'Mirror'")
+        remove = tab.page.get_by_test_id("remove-selected").element_handle()
+        in_bar = "(button) => [button.offsetLeft, button.offsetTop - button.parentElement.offsetTop]"
+        place = remove.evaluate(in_bar)
         tab.page.get_by_test_id("group-selected").click()
+        assert remove.evaluate(in_bar) == place
         tab.page.get_by_test_id("group-column").fill("place")
         tab.page.get_by_test_id("group-value").fill("north")
         tab.page.get_by_test_id("group-save").click()
+        tab.page.get_by_test_id("group-form").wait_for(state="detached")
+        # A click that meets the closing of the form goes to the button that was seen.
+        assert remove.get_attribute("data-testid") == "remove-selected"
+        assert remove.evaluate(in_bar) == place
         tab.page.get_by_test_id("clear-selection").click()
         tab.page.get_by_test_id("layout-table").click()
         tab.page.get_by_test_id("cell-bone_001-group").click()

@@ -122,12 +122,13 @@
         <${Button} small testid="include-selected" onclick=${() => include(true)}>${S.include}<//>
         <${Button} small testid="exclude-selected" onclick=${() => include(false)}>${S.exclude}<//>
         <${Button} small testid="set-selected" onclick=${() => Studio.edit({ what: "set", ids, set: toNew ? "new" : "training" })}>${toNew ? S.toNew : S.toTraining}<//>
-        ${grouping ? html`<${Group} ids=${ids} onclose=${() => setGrouping(false)} />` : html`<${Button} small testid="group-selected" onclick=${() => setGrouping(true)}>${S.group}<//>`}
+        <${Button} small testid="group-selected" disabled=${grouping} onclick=${() => setGrouping(true)}>${S.group}<//>
         <${Button} small testid="mirror-selected" onclick=${() => Studio.edit({ what: "mirror", ids, mirrored })}>${mirrored ? S.mirror : S.unmirror}<//>
         <label>${S.columns.unit} <${Studio.Unit} aria-label=${S.setUnit} data-testid="unit-selected" value=${selected.every((one) => one.unit === selected[0].unit) ? selected[0].unit : ""}
           onunit=${(select) => Studio.edit({ what: "unit", ids, unit: select.value })} /></label>
         <${Button} small testid="remove-selected" onclick=${() => setRemoving(true)}>${S.remove}<//>
         <${Button} small testid="clear-selection" onclick=${onclear}>${S.clear}<//>
+        ${/* Last, on a line of its own: where it stood between the buttons, a click that met its closing went to another of them. */ grouping && html`<${Group} ids=${ids} onclose=${() => setGrouping(false)} />`}
         ${removing && html`<${Confirm} title=${S.removeTitle(ids.length)} text=${S.removeText} action=${S.remove} onclose=${() => setRemoving(false)}
           onyes=${async () => { if (await Studio.edit({ what: "remove", ids })) onclear(); }} />`}
       </div>`;
