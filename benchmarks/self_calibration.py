@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -129,16 +129,15 @@ def print_row(size: int, share: float, row: Row) -> None:
     print(f"| {' | '.join(cells)} |", flush=True)
 
 
-def wrong_objects(size: float, seed: int) -> Iterator[Mesh]:
-    """Yield other objects and halves of them, of the RMS size of the bones, in random poses."""
+def wrong_objects(size: float, seed: int, others: list[Mesh]) -> Iterator[Mesh]:
+    """Yield other objects, `others` among them, and halves of them, of the RMS size `size`, in random poses."""
     rng = np.random.default_rng(seed)
-    ball, faces, teeth = organs()(rng), load_faces(), molars(seed)[0]
+    ball, teeth = organs()(rng), molars(seed)[0]
     stretched = [
         ball.with_vertices(ball.vertices * np.array(k)) for k in ((1, 1, 1), (1, 1.5, 4), (1, 1, 8), (1, 0.9, 12))
     ]
     spleens = sorted((Path(os.environ["SHAPESPACE_DATA"]) / "spleens").glob("*.ply"))
-    heads = [faces.face(faces.draw_person(rng)) for _ in range(4)]
-    for mesh in (*stretched, *teeth[:8], *heads, *map(read_mesh, rng.permutation(spleens)[:6])):
+    for mesh in (*stretched, *teeth[:8], *others, *map(read_mesh, rng.permutation(spleens)[:6])):
         x = (mesh.vertices - mesh.vertices.mean(axis=0)) * (size / rms_size(mesh.vertices))
         whole = mesh.with_vertices(x)
         halves = [part_of(whole, x @ axis < 0) for axis in np.linalg.svd(x, full_matrices=False)[2][:2]]
@@ -146,22 +145,36 @@ def wrong_objects(size: float, seed: int) -> Iterator[Mesh]:
             yield part.with_vertices(random_similarity(rng, 180.0, (1.0, 1.0)).apply(part.vertices))
 
 
-def print_wrong(surfaces: list[Mesh], seed: int) -> None:
-    """Print how many other objects are converged with a model of 18 of the bones."""
-    chosen = np.random.default_rng(seed).permutation(len(surfaces))[:18]
-    model = ShapeModel.fit([surfaces[k] for k in sorted(chosen)], gauge="form")
+def print_wrong(surfaces: list[Mesh], scans: list[Mesh], seed: int) -> None:
+    """Print how many other objects are converged with a model of 18 of the bones, and with one of 18 faces."""
+    faces, rng = load_faces(), np.random.default_rng(seed)
+    chosen = rng.permutation(len(surfaces))
+    heads = [faces.face(faces.draw_person(rng)) for _ in range(22)]
+    bones_model = ShapeModel.fit([surfaces[k] for k in sorted(chosen[:18])], gauge="form")
+    faces_model = ShapeModel.fit([faces.cut_to_face(head) for head in heads[:18]], gauge="form")
+    count_converged(
+        bones_model, f"bones, seed {seed}", wrong_objects(rms_size(bones_model.mean_vertices), seed, heads[18:])
+    )
+    others = [scans[k] for k in chosen[18:22]]
+    count_converged(
+        faces_model, f"faces, seed {seed}", wrong_objects(rms_size(faces_model.mean_vertices), seed, others)
+    )
+
+
+def count_converged(model: ShapeModel, name: str, objects: Iterable[Mesh]) -> None:
+    """Print how many completions and fits of other objects are converged."""
     converged: dict[str, list[str]] = {"completions": [], "fits": []}
-    objects = list(wrong_objects(rms_size(model.mean_vertices), seed))
+    objects = list(objects)
     for mesh in objects:
-        for name, function in (("completions", lambda m: complete(model, m, CONFIG)),
+        for kind, function in (("completions", lambda m: complete(model, m, CONFIG)),
                                ("fits", lambda m: fit_scan(model, m, CONFIG.fit))):  # fmt: skip
             try:
                 if function(mesh).status == "converged":
-                    converged[name].append(mesh.name)
+                    converged[kind].append(mesh.name)
             except FitError:
                 continue
-    counts = " and ".join(f"{len(names)} {name} {names or ''}" for name, names in converged.items())
-    print(f"Other objects converged, seed {seed}: {counts} of {len(objects)}.", flush=True)
+    counts = " and ".join(f"{len(names)} {kind} {names or ''}" for kind, names in converged.items())
+    print(f"Other objects converged, {name}: {counts} of {len(objects)}.", flush=True)
 
 
 def main() -> None:
@@ -182,7 +195,7 @@ def main() -> None:
             print_row(size, share, run(surfaces, scans, size, share, arguments.seeds))
     if "wrong" in arguments.what:
         for seed in range(arguments.seeds):
-            print_wrong(surfaces, seed)
+            print_wrong(surfaces, scans, seed)
 
 
 if __name__ == "__main__":

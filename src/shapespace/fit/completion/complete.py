@@ -373,6 +373,12 @@ def complete(
         is_unknowable = variance > (1 - _LEAST_GAIN) * posterior.prior_vertex_variance()
     else:
         is_unknowable = calibration.skill <= 0
+        if status == "converged" and not observed.all():
+            left_out = "training shapes" if calibration.of_training else "samples of the model"
+            notes.append(
+                f"For {calibration.n_nearer} of {len(calibration)} {left_out} left out in turn the completion is "
+                "nearer to the missing part than the mean shape is."
+            )
         weight = np.where(observed, 0.0, calibration.mean_weight)[:, None]
         pose = fit_similarity(model.mean_vertices[observed], completed[observed], with_scale=with_scale)
         completed = completed + weight * (pose.apply(model.mean_vertices) - completed)  # E10
@@ -480,14 +486,13 @@ def _doubts_by_training_shapes(
     # Triangles of the model are flat, those of training shapes and their completions alike.
     usual_mm = float(np.hypot(posterior.left_out_mismatch_mm().max(), _sagitta_mm(model)))
     # Noise of the scan is no mismatch; it differs between neighbouring points.
-    mismatch_mm = float(np.sqrt(max(posterior.mismatch_mm**2 - noise_mm**2, 0.0)))
+    mismatch_mm = float(np.sqrt(max(posterior.covered_mismatch_mm**2 - noise_mm**2, 0.0)))
     if mismatch_mm > _UNEXPLAINED * usual_mm:
         doubts.append(
             Reason(ReasonCode.SCAN_UNEXPLAINED, {"mismatch_mm": scale * mismatch_mm, "usual_mm": scale * usual_mm})
         )
     if calibration.missing.mean() > 1 - _COMPLETE and not calibration.is_skilled:
-        ratios = calibration.log_ratios
-        data = {"training_shapes": float(len(ratios)), "nearer": float((ratios > 0).sum())}
+        data = {"training_shapes": float(len(calibration)), "nearer": float(calibration.n_nearer)}
         doubts.append(Reason(ReasonCode.NO_SKILL, data))
     return doubts
 

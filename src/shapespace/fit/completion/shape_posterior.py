@@ -24,11 +24,12 @@ from shapespace.fit.robust.prepared_model import ModelSurface, prepare
 from shapespace.fit.robust.robust_icp import Iterate, Problem, WeightedMatches
 from shapespace.fit.robust.robust_settings import Level, RobustSettings
 from shapespace.fit.scan_target import ScanTarget
-from shapespace.geometry.normals import rms_size
+from shapespace.geometry.closest import build_engine, on_boundary
+from shapespace.geometry.normals import boundary_vertices, rms_size
 from shapespace.geometry.similarity import POSE, small_poses
 from shapespace.model.shape_model import ShapeModel
 from shapespace.model.training_shapes import MOST_SHAPES
-from shapespace.types import BoolArray, FloatArray, Similarity
+from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
 
 _LEVEL = Level(modes=None, scan_points=20_000, vertices=500, triangles=True, iterations=15, stop_motion_mm=0.0)
 """At most so many scan points are matched, in at most so many steps; vertices only add to the spread of residuals."""
@@ -59,6 +60,7 @@ class ShapePosterior:
         noise_mm: robust standard deviation of the residuals, mm of the model's frame.
         followed: (V,) True where a scan point is matched.
         mismatch_mm: RMS distance of the scan's points from the surface, each up to 5 % of the model's size.
+        covered_mismatch_mm: that of the points that do not lie beyond the border of the model.
         n_modes: K.
         step: (P,) from the parameters of the surface to the mean of its linearised posterior; about zero if settled.
         left_out: errors of completions of the training shapes by models of the others; None without them.
@@ -73,6 +75,7 @@ class ShapePosterior:
     noise_mm: float
     followed: BoolArray
     mismatch_mm: float
+    covered_mismatch_mm: float
     n_modes: int
     step: FloatArray
     left_out: LeftOutErrors | None
@@ -187,11 +190,16 @@ def shape_posterior(
         raise FitError(
             f"{target.mesh.name}: what it shows does not determine the pose; give landmarks (--landmarks)."
         ) from error
+    # The walks of the fit may end in another fold of the surface.
+    surface = Mesh(iterate.surface.vertices, model.faces)
+    matches = build_engine(surface).query(iterate.T_scan_model.inverse().apply(matcher.points_mm))
+    squared = np.minimum(matches.distance, _FAR * size_mm) ** 2
+    covered = ~on_boundary(matches, surface, boundary_vertices(surface))
     return ShapePosterior(
         iterate.T_scan_model, iterate.surface, iterate.b, covariance, line.variance, line.amplitude,
-        line.weighted.sigma_mm, line.followed,
-        float(np.sqrt((np.minimum(line.weighted.matches.points.distance, _FAR * size_mm) ** 2).mean())),
-        model.n_modes, mean - line.theta, left_out,
+        line.weighted.sigma_mm, line.followed, float(np.sqrt(squared.mean())),
+        float(np.sqrt(squared[covered].mean())) if covered.any() else np.inf, model.n_modes, mean - line.theta,
+        left_out,
     )  # fmt: skip
 
 

@@ -72,6 +72,11 @@ class SurfaceCalibration:
         return 0.5 * np.log(np.maximum(mean, 1e-30) / np.maximum(own, 1e-30))
 
     @property
+    def n_nearer(self) -> int:
+        """Number of shapes whose missing vertices the completion predicts better than the mean shape."""
+        return int((self.log_ratios > 0).sum())
+
+    @property
     def is_skilled(self) -> bool:
         """Whether missing vertices are predicted better than by the mean shape (t test over the shapes)."""
         ratios = self.log_ratios
