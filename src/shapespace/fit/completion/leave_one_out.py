@@ -101,7 +101,7 @@ def leave_one_out(
         prior[c, c], outside = _prior_of(others - mu[c])
         # What leaves the span of the others has the prior of the residual modes, with which it varies together.
         off_model = share * extra.covariance_outside(outside, z[i], n)[:, : end - POSE]
-        prior[c, c] += off_model[:, :K] @ outside
+        prior[c, c] += off_model[:, :K] @ outside @ outside.T
         prior[c, c.stop :], prior[c.stop :, c] = off_model[:, K:], off_model[:, K:].T
         both = np.column_stack([mu - theta, prior @ pull_kept + mu])
         solved = np.linalg.solve(np.eye(len(kept)) + prior @ H_kept, both)
@@ -122,10 +122,10 @@ def _noise(H: FloatArray, variance: FloatArray) -> FloatArray:
 
 
 def _prior_of(others: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the prior covariance (K, K) of the model of centred shapes (m, K), and the projection outside of it."""
+    """Return the prior covariance (K, K) of the model of centred shapes (m, K), and a basis (K, r) of what it lacks."""
     m = len(others)
     value, vector = np.linalg.eigh(others.T @ others / (m - 1))
-    kept = np.flatnonzero(value > _ROUNDING * value[-1])[::-1][: m - 1]
-    sample, axes = value[kept], vector[:, kept]
+    rank = min(m - 1, int((value > _ROUNDING * value[-1]).sum()))
+    sample, axes = value[: -rank - 1 : -1], vector[:, : -rank - 1 : -1]
     new = np.maximum(sample, variances_of_new_shapes(sample, float(sample.sum()), m))
-    return (axes * new) @ axes.T, np.eye(len(vector)) - axes @ axes.T
+    return (axes * new) @ axes.T, vector[:, :-rank]

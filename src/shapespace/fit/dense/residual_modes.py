@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from shapespace.fit.robust.kernels import Float32Array
 from shapespace.fit.robust.prepared_model import prepare
@@ -60,14 +61,15 @@ class ResidualModes:
         """Return the covariance (K, K + R), mm^2, of what shapes have outside the span of all training shapes but one.
 
         Args:
-            outside: (K, K) projection outside that span.
+            outside: (K, r) orthonormal basis of what lies outside that span.
             z: (K,) coefficients of the one, in standard deviations; no local mode is made of it.
             count: number of shapes.
         """
-        own = np.zeros((int(self.field.max()) + 1, len(self.products)))
-        np.add.at(own, self.field, self.products.T * z[self.mode, None])
-        along = outside @ self.products[: len(outside)]
-        return along @ self.products.T - (outside @ own[:, : len(outside)].T) @ own / (count - 1)
+        C = self.products.shape[1]
+        own = csr_array((z[self.mode], (self.field, np.arange(C))), (int(self.field.max()) + 1, C)) @ self.products.T
+        K = len(outside)
+        along = (outside.T @ self.products[:K]) @ self.products.T
+        return outside @ (along - (own[:, :K] @ outside).T @ own / (count - 1))
 
 
 @cached_with_owner()
