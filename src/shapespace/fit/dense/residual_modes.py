@@ -65,9 +65,9 @@ class ResidualModes:
             z: (K,) coefficients of the one, in standard deviations; no local mode is made of it.
             count: number of shapes.
         """
-        C = self.products.shape[1]
-        own = csr_array((z[self.mode], (self.field, np.arange(C))), (int(self.field.max()) + 1, C)) @ self.products.T
         K = len(outside)
+        of_field = np.arange(int(self.field.max()) + 1)[:, None] == self.field
+        own = np.asarray(csr_array(of_field * z[self.mode]) @ self.products.T)
         along = (outside.T @ self.products[:K]) @ self.products.T
         return outside @ (along - (own[:, :K] @ outside).T @ own / (count - 1))
 
