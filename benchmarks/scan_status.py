@@ -239,7 +239,7 @@ def main() -> None:
     """Print a row for each collection."""
     sets = ["mirror", "trusted", "molars", *MODELLED, *ONE_SIDE]
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("sets", nargs="*", choices=[*sets, []], default=sets)
+    parser.add_argument("sets", nargs="*", choices=[*sets, []], default=[])
     parser.add_argument("--kinds", type=int, default=12)
     parser.add_argument("--first", type=int, default=0, help="number of the first kind")
     parser.add_argument("--vertices", type=int, default=400)
@@ -249,7 +249,7 @@ def main() -> None:
     numbers = range(arguments.first, arguments.first + arguments.kinds)
     collections = [
         (name, k, arguments.vertices)
-        for name in arguments.sets
+        for name in arguments.sets or sets
         for k in (numbers if name in ("mirror", "trusted") else [1, 2] if name in ONE_SIDE else [0])
     ]
     every: list[Row] = []

@@ -66,6 +66,9 @@ _LEAST_GAIN = 0.1  # share of a vertex's variance that a scan removes, of models
 _UNEXPLAINED = 2.0
 """Multiple of the largest distance of left-out training shapes from their completions beyond which the model does not
 explain a scan: 24 femora reach 1.0, other objects scaled to that size 2.9 (benchmarks/self_calibration.py)."""
+_MOST_OFF_MODEL = 4.0
+"""Off-model standard deviation of a scan, in units of the predicted one, of models without training shapes: 10 real
+femora reach 1.5, 132 other objects 4.6, except for two without any match (open femur model, the same benchmark)."""
 _LEAST_AREA, _REVERTS = 0.1, 20  # share of its area that a triangle keeps on the scan, and rounds to enforce it
 _IMPLAUSIBLE, _RARE = 3.0, 1e-5
 """Mean square of the coefficients in standard deviations of new shapes (1.4 is the most measured, with 51 modes), and
@@ -80,8 +83,8 @@ _OF_MISSING_PARTS = frozenset(
 """Reasons to doubt a fit that follow from missing parts, and that tests of the completion replace."""
 _BY_TRAINING_SHAPES = frozenset(
     {
-        ReasonCode.PROBABLY_FAILED, ReasonCode.MODEL_FAR_FROM_SCAN, ReasonCode.FEW_TRAINING_SHAPES,
-        ReasonCode.RESIDUAL_SPREAD, ReasonCode.NORMALS_DISAGREE,
+        ReasonCode.PROBABLY_FAILED, ReasonCode.FEW_TRAINING_SHAPES, ReasonCode.RESIDUAL_SPREAD,
+        ReasonCode.NORMALS_DISAGREE,
     }
 )  # fmt: skip
 """Those of them whose tests need the training shapes of the model."""
@@ -424,19 +427,21 @@ def _likeliest_pose(
     for other in start.alternatives:
         with suppress(FitError):
             fits.append(fit_scan(model, fit.scan, config.fit, T_scan_model=T_scan_mm @ other.T_scan_model))
-    found: list[tuple[float, FitResult, FloatArray]] = []
+    found: list[tuple[float, FitResult, FloatArray, float]] = []
     for one in fits:
         with suppress(FitError):
             posterior = posterior_at(one)
             vertices = posterior.T_scan_model.apply(posterior.surface.vertices)
-            found.append((posterior.log_density(), one, vertices))
+            found.append((posterior.log_density(), one, vertices, posterior.covered_mismatch_mm))
     if not found:
         return fit, None
     found.sort(key=lambda one: -one[0])
     best = found[0]
-    for density, _, vertices in found[1:]:
+    for density, _, vertices, mismatch_mm in found[1:]:
         apart_mm = float(np.sqrt(((vertices - best[2]) ** 2).sum(axis=1).mean()))
-        if density > best[0] - AS_LIKELY and apart_mm > _OTHER_POSE * rms_size(best[2]):
+        # Another pose that the scan is nearer to speaks against the likeliest one, whatever their densities are.
+        is_likely = density > best[0] - AS_LIKELY or mismatch_mm < best[3]
+        if is_likely and apart_mm > _OTHER_POSE * rms_size(best[2]):
             return best[1], apart_mm
     return best[1], None
 
@@ -465,6 +470,8 @@ def _judged(
         doubts.append(Reason(ReasonCode.SHAPE_IMPLAUSIBLE, {"z_rms": float(np.sqrt(z2))}))
     if calibration is not None:
         doubts += _doubts_by_training_shapes(fit.model, posterior, calibration, noise_mm)
+    elif (off_model := float(np.sqrt(posterior.amplitude))) > _MOST_OFF_MODEL:
+        doubts.append(Reason(ReasonCode.SCAN_OFF_MODEL, {"off_model": off_model}))
     if not doubts:
         if fit.status != "doubtful":
             return "converged", fit.reasons

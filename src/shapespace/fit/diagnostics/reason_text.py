@@ -84,6 +84,10 @@ _TEXTS: Mapping[ReasonCode, Callable[[Mapping[str, Any]], str]] = MappingProxyTy
             f"where left-out training shapes lie at most {d['usual_mm']:.2f} mm from theirs; it is probably another "
             "object, or contains parts of others"
         ),
+        ReasonCode.SCAN_OFF_MODEL: lambda d: (
+            f"the model does not explain the scan: outside of the model it varies {d['off_model']:.0f} times as much "
+            "as the model predicts; it is probably another object, or contains parts of others"
+        ),
         ReasonCode.NO_SKILL: lambda d: (
             f"the missing part is not predicted better than by the mean shape: of {d['training_shapes']:.0f} training "
             f"shapes left out in turn, the completion is nearer than the mean shape for {d['nearer']:.0f}; build a "

@@ -31,6 +31,7 @@ class ReasonCode(StrEnum):
     POINTS_SCATTERED = "points_scattered"  # scattered_share
     # status doubtful: a completion, by the training shapes
     SCAN_UNEXPLAINED = "scan_unexplained"  # mismatch_mm, usual_mm
+    SCAN_OFF_MODEL = "scan_off_model"  # off_model, in units of the predicted standard deviation
     NO_SKILL = "no_skill"  # training_shapes, nearer
     # status doubtful: the model
     FEW_TRAINING_SHAPES = "few_training_shapes"  # training_shapes, beyond_model_mm, fewest_shapes
