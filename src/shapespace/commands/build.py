@@ -17,7 +17,7 @@ from shapespace.batch.result_folder import RECORD
 from shapespace.commands.about import ABOUT, read_about
 from shapespace.commands.look import training_shapes_note
 from shapespace.errors import InputError, MeshError, ShapespaceError
-from shapespace.geometry.landmark_placement import far_landmarks, place_landmarks
+from shapespace.geometry.landmark_placement import far_landmarks, landmarks_in_frame_of, place_landmarks
 from shapespace.geometry.normals import without_estimates
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.files import make_folder, read_error
@@ -489,9 +489,9 @@ def _read_landmarks(path: Path, first: Mesh, mm: float, notes: list[str]) -> Sur
     """
     if path.suffix.lower() == ".csv" and is_of_vertices(path):
         return read_surface_landmarks(path)
-    points = read_landmarks(path)
-    placed = place_landmarks(first, {name: mm * point for name, point in points.items()})
-    notes += _placing_notes(placed, first)
+    points, turned = landmarks_in_frame_of(first, {name: mm * point for name, point in read_landmarks(path).items()})
+    placed = place_landmarks(first, points)
+    notes += [*(f"{path.name}: {sentence}" for sentence in turned), *_placing_notes(placed, first)]
     return placed
 
 
