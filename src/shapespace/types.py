@@ -490,7 +490,7 @@ class LabelVolume:
         labels: (X, Y, Z) whole numbers of any type, read-only, or (X, Y, Z, L) in L layers, for segments that overlap;
             0 is what has no label.
         affine: (4, 4) float64 from the indices of a voxel to its middle in mm: right, anterior, superior (RAS), as in
-            NIfTI and nibabel. Surfaces are in LPS.
+            NIfTI and nibabel. Surfaces made of it are in LPS.
         name: where it came from, used in messages.
         notes: sentences on what is worth knowing of the file.
         segments: with names, if the file has any.

@@ -21,7 +21,7 @@ _TURNED_RATIO, _TURNED_SHARE, _FEWEST = 3.0, 0.05, 3
 of the size, or, fewer than three, than `STRAY`: errors of placing do not vanish by a half turn."""
 _TURNED = (
     "Its landmarks are a half turn about z from its surface, as between RAS and LPS, so the signs of their x and y are "
-    "changed here; state the frame in the file of the surface (a comment SPACE=RAS), or export both in LPS."
+    "changed here; export both in LPS, or mark the file of a surface that is in RAS with SPACE=RAS."
 )
 
 
