@@ -194,7 +194,7 @@ def _print_check(report: Mapping[str, Any]) -> None:
         problem, action = finding["what"], finding["action"]
         show(
             f"  {finding['level']}: "
-            + (f"{problem[:-1]}; {action}" if finding["level"] == "refused" else f"{problem} {action}")
+            + (f"{problem[:-1]}; {action}" if finding["level"] == "refused" else f"{problem} {action}".rstrip())
         )
     print("  usable" if report["usable"] else "  not usable for fitting")
 

@@ -491,26 +491,14 @@ def _read_landmarks(path: Path, first: Mesh, mm: float, notes: list[str]) -> Sur
         return read_surface_landmarks(path)
     points, turned = landmarks_in_frame_of(first, {name: mm * point for name, point in read_landmarks(path).items()})
     placed = place_landmarks(first, points)
-    notes += [*(f"{path.name}: {sentence}" for sentence in turned), *_placing_notes(placed, first)]
+    distance, worst = placed.distance_mm, int(placed.distance_mm.argmax())
+    notes += [f"{path.name}: {sentence}" for sentence in turned]
+    notes.append(
+        f"Landmarks were placed on the surface of {first.name}; the given points are {distance.mean():.2g} mm from it "
+        f"on average, at most {distance[worst]:.2g} mm ({placed.names[worst]})."
+    )
+    notes += far_landmarks(first, placed)
     return placed
-
-
-def _placing_notes(landmarks: SurfaceLandmarks, surface: Mesh) -> list[str]:
-    """Return sentences on the distances of given points from the surface, and on points that are too far from it."""
-    distance, worst = landmarks.distance_mm, int(landmarks.distance_mm.argmax())
-    notes = [
-        f"Landmarks were placed on the surface of {surface.name}; the given points are {distance.mean():.2g} mm from "
-        f"it on average, at most {distance[worst]:.2g} mm ({landmarks.names[worst]})."
-    ]
-    if far := far_landmarks(surface, landmarks):
-        farthest = sorted(far, key=lambda name: -far[name])
-        named = first_names([f"{name} ({far[name]:.2g} mm)" for name in farthest], _NAMED)
-        some = "1 landmark is" if len(far) == 1 else f"{len(far)} landmarks are"
-        notes.append(
-            f"Warning: {some} farther from that surface than 1 % of its size and than its mean edge: {named}. Check "
-            "the names, the unit and the frame of the landmarks."
-        )
-    return notes
 
 
 def _with_origin(files: Sequence[Path], config: BuildFilesConfig, notes: list[str]) -> BuildFilesConfig:

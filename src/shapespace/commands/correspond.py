@@ -44,7 +44,7 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import describe_groups, first_names
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, json_text, read
 from shapespace.store.corresponding import LANDMARKS, MEAN, RECORD, SUMMARY, SURFACE
-from shapespace.types import Mesh, SurfaceLandmarks
+from shapespace.types import Mesh
 from shapespace.version import __version__
 
 ROUNDS_FOLDER, CHANGE_FOLDER = ".rounds", ".change"
@@ -372,7 +372,7 @@ def read_scans(
                 if scan.landmarks:
                     placed = place_landmarks(scan, scan.landmarks)
                     read.landmark_distances[job.name] = dict(zip(placed, placed.distance_mm.tolist(), strict=True))
-                    notes += _far_notes(scan, placed)
+                    notes += far_landmarks(scan, placed)
             except ShapespaceError as error:
                 read.unread[job.name] = f"{_BROKEN}{error}"
             bar.update()
@@ -394,19 +394,6 @@ def _looked_at(scan: Mesh, *, strict: bool) -> tuple[Mesh, list[str]]:
     notes = [f"{one.problem} {one.action}" for one in findings if one.level == "note" or NON_FINITE in one.problem]
     mesh, sentences = with_own_landmarks(mesh)
     return mesh, [*notes, *sentences]
-
-
-def _far_notes(scan: Mesh, placed: SurfaceLandmarks) -> list[str]:
-    """Return a sentence on landmarks of `scan` that are off its surface by more than their placing can explain."""
-    far = far_landmarks(scan, placed)
-    if not far:
-        return []
-    farthest = sorted(far, key=lambda name: -far[name])
-    named = first_names([f"{name} ({far[name]:.2g})" for name in farthest], _LISTED)
-    return [
-        "Landmarks are farther from its surface than 1 % of its size and than its mean edge (distances in its unit): "
-        f"{named}."
-    ]
 
 
 def report_landmarks(records: Sequence[CorrespondRecord], read: ScansRead, say: Say) -> None:

@@ -10,10 +10,12 @@ import numpy as np
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.normals import rms_size
+from shapespace.reprs import first_names
 from shapespace.types import RAS_TO_LPS, FloatArray, Mesh, SurfaceLandmarks
 
 _FAR_SHARE = 0.01
 """Share of the object's size (RMS): a landmark farther than this and than a mean edge is probably off the surface."""
+_NAMED = 10  # landmarks in a sentence
 STRAY = 0.25
 """A landmark that lies farther than this share of a scan's size off its surface does not belong to it."""
 _TURNED_RATIO, _TURNED_SHARE, _FEWEST = 3.0, 0.05, 3
@@ -98,8 +100,8 @@ def landmarks_in_frame_of(
     return dict(zip(points, both[len(places) :], strict=True)), (_TURNED,)
 
 
-def far_landmarks(mesh: Mesh, landmarks: SurfaceLandmarks) -> dict[str, float]:
-    """Return name -> distance, mm, of landmarks that were given too far from the surface to belong to it.
+def far_landmarks(mesh: Mesh, landmarks: SurfaceLandmarks) -> list[str]:
+    """Return a sentence on landmarks that were given too far from the surface to belong to it, if there are any.
 
     That is farther than the mean edge and than 1 % of the size of `mesh` (RMS distance from its centre).
     """
@@ -109,5 +111,11 @@ def far_landmarks(mesh: Mesh, landmarks: SurfaceLandmarks) -> dict[str, float]:
         edges = mesh.vertices[mesh.faces] - mesh.vertices[np.roll(mesh.faces, 1, axis=1)]
         lengths = np.asarray(np.linalg.norm(edges, axis=2), dtype=np.float64)
         limit = max(limit, float(np.nanmean(lengths)))
-    distances = zip(landmarks.names, landmarks.distance_mm, strict=True)
-    return {name: float(distance) for name, distance in distances if distance > limit}
+    distances = sorted(zip(landmarks.distance_mm.tolist(), landmarks.names, strict=True), reverse=True)
+    far = [f"{name} ({distance:.2g})" for distance, name in distances if distance > limit]
+    some = "1 landmark is" if len(far) == 1 else f"{len(far)} landmarks are"
+    sentence = (
+        f"Warning: {some} farther from that surface than 1 % of its size and than its mean edge (distances in its "
+        f"unit): {first_names(far, _NAMED)}. Check the names, the unit and the frame of the landmarks."
+    )
+    return [sentence] if far else []
