@@ -23,7 +23,7 @@ from skimage.measure import marching_cubes
 
 from shapespace.geometry.normals import face_vectors
 from shapespace.geometry.volume_surface import surface_of_volume
-from shapespace.types import BoolArray, FloatArray, IntArray, LabelVolume
+from shapespace.types import RAS_TO_LPS, BoolArray, FloatArray, IntArray, LabelVolume
 
 Surface = tuple[FloatArray, IntArray]
 NOISE_MM, POINTS = 0.4, 8000
@@ -182,7 +182,7 @@ def thin_plate(inside: BoolArray, voxel: FloatArray) -> Surface:
 
 
 def ours(inside: BoolArray, voxel: FloatArray) -> Surface:
-    mesh = surface_of_volume(LabelVolume(inside.astype(np.uint8), np.diag([*voxel, 1.0]))).mesh
+    mesh = surface_of_volume(LabelVolume(inside.astype(np.uint8), np.diag([*(voxel * RAS_TO_LPS), 1.0]))).mesh
     return mesh.vertices, mesh.faces
 
 

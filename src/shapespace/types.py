@@ -31,6 +31,9 @@ BoolArray: TypeAlias = npt.NDArray[np.bool_]
 MM_PER_UNIT: Mapping[str, float] = MappingProxyType({"um": 1e-3, "mm": 1.0, "cm": 10.0, "inch": 25.4, "m": 1000.0})
 """Millimetres in one of each unit a scan may come in."""
 
+RAS_TO_LPS = np.array([-1.0, -1.0, 1.0])
+"""Signs that take points (..., 3) from right, anterior, superior to left, posterior, superior, and back."""
+
 GREY = 128
 """Red, green and blue of vertices without a colour, where others of their surface have one."""
 
@@ -462,15 +465,35 @@ MAX_MEMORY_BYTES = 2**32
 """Memory that a label volume and its surface may take by default (4 GiB): a CT of the trunk with one organ takes 2."""
 
 
+@dataclass(frozen=True)
+class Segment:
+    """A segment of 3D Slicer: the voxels of one layer that have its label.
+
+    Args:
+        name: shown in 3D Slicer.
+        label: in its layer.
+        layer: index of the layer, 0 where there is one.
+        id: unique among the segments of a file.
+    """
+
+    name: str
+    label: int
+    layer: int = 0
+    id: str = ""
+
+
 @dataclass(frozen=True, eq=False)
 class LabelVolume:
     """Labels in voxels, with the position of the voxels in the patient.
 
     Args:
-        labels: (X, Y, Z) whole numbers of any type, read-only; 0 is what has no label.
-        affine: (4, 4) float64 from the indices of a voxel to its middle in mm: right, anterior, superior (RAS).
+        labels: (X, Y, Z) whole numbers of any type, read-only, or (X, Y, Z, L) in L layers, for segments that overlap;
+            0 is what has no label.
+        affine: (4, 4) float64 from the indices of a voxel to its middle in mm: right, anterior, superior (RAS), as in
+            NIfTI and nibabel. Surfaces made of it are in LPS.
         name: where it came from, used in messages.
         notes: sentences on what is worth knowing of the file.
+        segments: with names, if the file has any.
 
     Raises:
         InputError: arrays of the wrong shape or type, or an affine that is singular or not finite.
@@ -480,20 +503,28 @@ class LabelVolume:
     affine: FloatArray
     name: str = "volume"
     notes: tuple[str, ...] = ()
+    segments: tuple[Segment, ...] = ()
 
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
         labels, affine = np.asarray(self.labels).view(), read_only(self.affine)
-        if labels.ndim != 3 or not labels.size or labels.dtype.kind not in "iu":
+        if labels.ndim not in (3, 4) or not labels.size or labels.dtype.kind not in "iu":
             raise InputError(
-                f"{self.name}: labels must be whole numbers of the shape (X, Y, Z), not {labels.dtype} {labels.shape}."
+                f"{self.name}: labels must be whole numbers of the shape (X, Y, Z), or (X, Y, Z, L) in L layers, not "
+                f"{labels.dtype} {labels.shape}."
             )
         if affine.shape != (4, 4) or not np.isfinite(affine).all() or not np.linalg.det(affine[:3, :3]):
             raise InputError(f"{self.name}: the affine must be a (4, 4) array of finite numbers that can be inverted.")
         labels.setflags(write=False)
         object.__setattr__(self, "labels", labels)
         object.__setattr__(self, "affine", affine)
+
+    @property
+    def layers(self) -> tuple[npt.NDArray[np.integer[Any]], ...]:
+        """Views (X, Y, Z) of each layer of `labels`."""
+        layers = self.labels.reshape(*self.labels.shape[:3], -1)
+        return tuple(layers[..., layer] for layer in range(layers.shape[3]))
 
     @property
     def voxel_mm(self) -> FloatArray:

@@ -29,7 +29,7 @@ def nifti(path: Path, voxels: Any = None, affine: Any = AFFINE) -> Path:
     return path
 
 
-def test_nifti_and_nrrd_of_one_mask_give_one_surface_in_ras_mm(run: Run, tmp_path: Path) -> None:
+def test_nifti_and_nrrd_of_one_mask_give_one_surface_in_lps_mm(run: Run, tmp_path: Path) -> None:
     lps = np.diag([-1.0, -1, 1, 1]) @ AFFINE
     fields = {"space": "LPS", "space directions": lps[:3, :3].T, "space origin": lps[:3, 3]}
     nrrd.write(str(tmp_path / "two.seg.nrrd"), labels(), fields, index_order="F")
@@ -37,12 +37,12 @@ def test_nifti_and_nrrd_of_one_mask_give_one_surface_in_ras_mm(run: Run, tmp_pat
     assert outcome.code == 0 and outcome.err == ""
     one, two = read_mesh(tmp_path / "out" / "one.ply"), read_mesh(tmp_path / "out" / "two.ply")
     assert np.allclose(one.vertices, two.vertices, atol=1e-4)
-    middle = (AFFINE @ [*CENTRE, 1])[:3]
+    middle = (lps @ [*CENTRE, 1])[:3]
     off = np.abs(np.linalg.norm(one.vertices - middle, axis=1) - 6)
     assert off.mean() < 0.15
     report = examine(one)
     assert report.findings == () and report.boundary_edges == 0
-    assert outcome.out.splitlines()[-1] == f"2 of 2 volumes to surfaces in {tmp_path / 'out'}: RAS, mm"
+    assert outcome.out.splitlines()[-1] == f"2 of 2 volumes to surfaces in {tmp_path / 'out'}: LPS, mm"
     assert outcome.out.startswith(f"one.ply: {report.triangles:,} triangles around")
     assert "voxels of 1 x 1 x 1.5 mm" in outcome.out
 
@@ -51,7 +51,7 @@ def test_facts_are_json_with_frame_unit_and_voxels(run: Run, tmp_path: Path) -> 
     outcome = run("surface", nifti(tmp_path / "a.nii"), "-o", tmp_path / "out", "--json")
     assert outcome.facts["volumes"] == outcome.facts["surfaces"] == 1
     (record,) = outcome.facts["records"]
-    assert record["frame"] == "RAS" and record["unit"] == "mm" and np.allclose(record["voxel_mm"], (1, 1, 1.5))
+    assert record["frame"] == "LPS" and record["unit"] == "mm" and np.allclose(record["voxel_mm"], (1, 1, 1.5))
     assert record["labels"] == [1] and record["voxels"] == int(labels().sum()) and record["notes"] == []
     assert record["triangles"] == len(read_mesh(Path(record["surface"])).faces)
 

@@ -10,7 +10,7 @@ from scipy import ndimage
 from shapespace.errors import InputError
 from shapespace.geometry.doctor import examine
 from shapespace.geometry.volume_surface import VolumeSurface, _grown, _squared_distance, labels_in, surface_of_volume
-from shapespace.types import FloatArray, LabelVolume, Mesh
+from shapespace.types import RAS_TO_LPS, FloatArray, LabelVolume, Mesh
 
 pytest.importorskip("skimage", reason="the extra `volumes` is not installed")
 
@@ -18,7 +18,7 @@ pytest.importorskip("skimage", reason="the extra `volumes` is not installed")
 def ball(
     radius: float, voxel_mm: Any = (1, 1, 1), *, label: int = 1, shift: float = 0.3
 ) -> tuple[LabelVolume, FloatArray]:
-    """Return a voxelised ball with room around it, and its centre in mm; -x is the first axis, so that it is LAS."""
+    """Return a voxelised ball with room around it, and its centre in LPS mm; the first axis is -x, so it is LAS."""
     step = np.array(voxel_mm, dtype=np.float64)
     count = np.ceil(2 * radius / step).astype(int) + 6
     centre = step * ((count - 1) / 2 + shift)
@@ -27,7 +27,7 @@ def ball(
     affine = np.diag([*step, 1.0])
     affine[:3, 3] = 50, -20, 7
     affine[0] *= -1
-    return LabelVolume(labels.astype(np.int16), affine, "ball"), (centre + np.array((50, -20, 7))) * (-1, 1, 1)
+    return LabelVolume(labels.astype(np.int16), affine, "ball"), (centre + np.array((50, -20, 7))) * (1, -1, 1)
 
 
 def is_clean(mesh: Mesh) -> None:
@@ -38,7 +38,9 @@ def is_clean(mesh: Mesh) -> None:
 
 
 def volume_of(labels: Any, affine: Any = None) -> LabelVolume:
-    return LabelVolume(np.asarray(labels).astype(np.uint8), np.eye(4) if affine is None else affine, "made")
+    return LabelVolume(
+        np.asarray(labels).astype(np.uint8), np.diag([*RAS_TO_LPS, 1.0]) if affine is None else affine, "made"
+    )
 
 
 @pytest.mark.parametrize(
@@ -86,7 +88,8 @@ def test_a_sheared_affine_shears_the_surface_alone() -> None:
     shear[0, 2] = 0.01
     made = surface_of_volume(LabelVolume(volume.labels, shear @ volume.affine))
     plain = surface_of_volume(volume).mesh.vertices
-    assert np.allclose(made.mesh.vertices, plain @ shear[:3, :3].T, atol=0.01)
+    expected = (plain * RAS_TO_LPS) @ shear[:3, :3].T * RAS_TO_LPS
+    assert np.allclose(made.mesh.vertices, expected, atol=0.01)
 
 
 @pytest.mark.parametrize("step", [(1, 1, 1), (0.7, 0.7, 2.0), (3.0, 0.5, 1.0)])
@@ -159,8 +162,8 @@ def test_a_label_is_chosen_and_several_are_one_object() -> None:
     assert np.allclose(_around(surface_of_volume(volume, 1)), 10, atol=0.2)
     assert np.allclose(_around(surface_of_volume(volume, [2])), (30, 10, 10), atol=0.2)
     assert surface_of_volume(volume, np.uint8(2)).labels == (2,)
-    with pytest.raises(InputError, match="'all', not 'both'"):
-        surface_of_volume(volume, "both")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="there is no label both in it; it has 1, 2"):
+        surface_of_volume(volume, "both")
     assert surface_of_volume(volume, "all").labels == surface_of_volume(volume, (2, 1)).labels == (1, 2)
     with pytest.raises(InputError, match="there is no label 3 in it; it has 1, 2"):
         surface_of_volume(volume, 3)

@@ -342,13 +342,13 @@ COMMANDS: tuple[Command, ...] = (
         ),
     ),
     Command(
-        "surface", "extract surfaces of labels from label volumes (NIfTI, NRRD), as PLY in RAS mm",
+        "surface", "extract surfaces of labels from label volumes (NIfTI, NRRD), as PLY in LPS mm",
         ("shapespace surface masks -o surfaces --label 1", "shapespace fit model.h5 surfaces -o out --unit mm"),
         run.surface,
         (
             basic("volumes", "MASK", "label volumes, or folders of them", nargs="+", parse=Path),
             basic("-o --output", "DIR", "output folder; each surface is NAME.ply", parse=Path, required=True),
-            basic("--label", "N|N,N|all", source=SURFACE, field="labels", parse=values.labels),
+            basic("--label", "N|NAME|N,N|all", source=SURFACE, field="labels", parse=str),
             basic("--smooth", "S", source=SURFACE, parse=values.smoothing),
             advanced("--recursive", source=SURFACE),
             advanced("--keep-pieces", source=SURFACE),

@@ -157,7 +157,7 @@ def _print_surfaces(made: Sequence[Mapping[str, Any]], volumes: int, folder: Pat
     for record in made[_LISTED:]:
         for note in record["odd"]:
             show(f"{record['name']}.ply: {note}")
-    show(f"{len(made)} of {volumes} {'volume' if volumes == 1 else 'volumes'} to surfaces in {folder}: RAS, mm")
+    show(f"{len(made)} of {volumes} {'volume' if volumes == 1 else 'volumes'} to surfaces in {folder}: LPS, mm")
 
 
 def check(arguments: argparse.Namespace) -> int:
@@ -194,7 +194,7 @@ def _print_check(report: Mapping[str, Any]) -> None:
         problem, action = finding["what"], finding["action"]
         show(
             f"  {finding['level']}: "
-            + (f"{problem[:-1]}; {action}" if finding["level"] == "refused" else f"{problem} {action}")
+            + (f"{problem[:-1]}; {action}" if finding["level"] == "refused" else f"{problem} {action}".rstrip())
         )
     print("  usable" if report["usable"] else "  not usable for fitting")
 

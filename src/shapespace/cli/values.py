@@ -158,19 +158,6 @@ def axes(text: str) -> tuple[int, int]:
     return positive(across), positive(up)
 
 
-def labels(text: str) -> str | tuple[int, ...]:
-    """Return the labels of a volume, or `all`."""
-    if text == "all":
-        return text
-    try:
-        numbers = tuple(int(part) for part in text.split(","))
-    except ValueError:
-        numbers = (0,)
-    if 0 in numbers:
-        raise argparse.ArgumentTypeError(f"must be all, or whole numbers other than 0 such as 1 or 1,2, not {text!r}")
-    return numbers
-
-
 def named_file(text: str) -> tuple[str, Path]:
     """Return the name and the path of NAME=FILE."""
     name, equals, file = text.partition("=")

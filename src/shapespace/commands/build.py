@@ -17,7 +17,7 @@ from shapespace.batch.result_folder import RECORD
 from shapespace.commands.about import ABOUT, read_about
 from shapespace.commands.look import training_shapes_note
 from shapespace.errors import InputError, MeshError, ShapespaceError
-from shapespace.geometry.landmark_placement import far_landmarks, place_landmarks
+from shapespace.geometry.landmark_placement import far_landmarks, landmarks_in_frame_of, place_landmarks
 from shapespace.geometry.normals import without_estimates
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.files import make_folder, read_error
@@ -489,28 +489,16 @@ def _read_landmarks(path: Path, first: Mesh, mm: float, notes: list[str]) -> Sur
     """
     if path.suffix.lower() == ".csv" and is_of_vertices(path):
         return read_surface_landmarks(path)
-    points = read_landmarks(path)
-    placed = place_landmarks(first, {name: mm * point for name, point in points.items()})
-    notes += _placing_notes(placed, first)
+    points, turned = landmarks_in_frame_of(first, {name: mm * point for name, point in read_landmarks(path).items()})
+    placed = place_landmarks(first, points)
+    distance, worst = placed.distance_mm, int(placed.distance_mm.argmax())
+    notes += [f"{path.name}: {sentence}" for sentence in turned]
+    notes.append(
+        f"Landmarks were placed on the surface of {first.name}; the given points are {distance.mean():.2g} mm from it "
+        f"on average, at most {distance[worst]:.2g} mm ({placed.names[worst]})."
+    )
+    notes += far_landmarks(first, placed)
     return placed
-
-
-def _placing_notes(landmarks: SurfaceLandmarks, surface: Mesh) -> list[str]:
-    """Return sentences on the distances of given points from the surface, and on points that are too far from it."""
-    distance, worst = landmarks.distance_mm, int(landmarks.distance_mm.argmax())
-    notes = [
-        f"Landmarks were placed on the surface of {surface.name}; the given points are {distance.mean():.2g} mm from "
-        f"it on average, at most {distance[worst]:.2g} mm ({landmarks.names[worst]})."
-    ]
-    if far := far_landmarks(surface, landmarks):
-        farthest = sorted(far, key=lambda name: -far[name])
-        named = first_names([f"{name} ({far[name]:.2g} mm)" for name in farthest], _NAMED)
-        some = "1 landmark is" if len(far) == 1 else f"{len(far)} landmarks are"
-        notes.append(
-            f"Warning: {some} farther from that surface than 1 % of its size and than its mean edge: {named}. Check "
-            "the names, the unit and the frame of the landmarks."
-        )
-    return notes
 
 
 def _with_origin(files: Sequence[Path], config: BuildFilesConfig, notes: list[str]) -> BuildFilesConfig:

@@ -25,7 +25,7 @@ from shapespace.commands.landmark_files import LandmarkFiles
 from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
 from shapespace.correspondence.first_template import first_template
 from shapespace.correspondence.groupwise import ENOUGH_TO_JUDGE, correspond
-from shapespace.correspondence.landmark_guide import stray_landmarks, without_stray_landmarks
+from shapespace.correspondence.landmark_guide import with_own_landmarks
 from shapespace.correspondence.registration import RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.scan_set import copies, unit_ratios
 from shapespace.correspondence.scan_status import SurfaceMeasures, find_review_reasons
@@ -44,7 +44,7 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import describe_groups, first_names
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, json_text, read
 from shapespace.store.corresponding import LANDMARKS, MEAN, RECORD, SUMMARY, SURFACE
-from shapespace.types import Mesh, SurfaceLandmarks
+from shapespace.types import Mesh
 from shapespace.version import __version__
 
 ROUNDS_FOLDER, CHANGE_FOLDER = ".rounds", ".change"
@@ -166,7 +166,7 @@ def _corresponding(
     scans, notes = read.scans, read.notes
     marks.report_unused(say)
     if template is not None:
-        for sentence in _stray_landmarks_note(template):
+        for sentence in with_own_landmarks(template)[1]:
             say(f"{template.name}: {sentence}")
     settings, config = asdict(config), replace(config, outer=False)  # the scans are without inner surfaces now
     rounds = RoundsWithProgress(folder / ROUNDS_FOLDER, files.execution, quiet=quiet)
@@ -372,7 +372,7 @@ def read_scans(
                 if scan.landmarks:
                     placed = place_landmarks(scan, scan.landmarks)
                     read.landmark_distances[job.name] = dict(zip(placed, placed.distance_mm.tolist(), strict=True))
-                    notes += _far_notes(scan, placed)
+                    notes += far_landmarks(scan, placed)
             except ShapespaceError as error:
                 read.unread[job.name] = f"{_BROKEN}{error}"
             bar.update()
@@ -392,20 +392,8 @@ def _looked_at(scan: Mesh, *, strict: bool) -> tuple[Mesh, list[str]]:
     """
     mesh, findings = repair(scan, strict=strict)
     notes = [f"{one.problem} {one.action}" for one in findings if one.level == "note" or NON_FINITE in one.problem]
-    return without_stray_landmarks(mesh), [*notes, *_stray_landmarks_note(mesh)]
-
-
-def _far_notes(scan: Mesh, placed: SurfaceLandmarks) -> list[str]:
-    """Return a sentence on landmarks of `scan` that are off its surface by more than their placing can explain."""
-    far = far_landmarks(scan, placed)
-    if not far:
-        return []
-    farthest = sorted(far, key=lambda name: -far[name])
-    named = first_names([f"{name} ({far[name]:.2g})" for name in farthest], _LISTED)
-    return [
-        "Landmarks are farther from its surface than 1 % of its size and than its mean edge (distances in its unit): "
-        f"{named}."
-    ]
+    mesh, sentences = with_own_landmarks(mesh)
+    return mesh, [*notes, *sentences]
 
 
 def report_landmarks(records: Sequence[CorrespondRecord], read: ScansRead, say: Say) -> None:
@@ -428,20 +416,6 @@ def report_landmarks(records: Sequence[CorrespondRecord], read: ScansRead, say: 
     ]
     after = f"; from their places on the corresponding surfaces {100 * np.mean(off):.2g} % (RMS)" if off else ""
     say(f"{sentence}{after}.")
-
-
-def _stray_landmarks_note(scan: Mesh) -> list[str]:
-    """Return a sentence on landmarks that do not belong to `scan`, if there are any."""
-    off = stray_landmarks(scan)
-    if not off:
-        return []
-    if len(off) == len(scan.landmarks):
-        return [
-            f"Its landmarks are left out: they lie {min(off.values()):.2g} times its size off its surface, or more; "
-            "look at their unit and frame."
-        ]
-    named = ", ".join(f"{name} ({share:.2g} times its size)" for name, share in list(off.items())[:_LISTED])
-    return [f"Landmarks that lie far off its surface are left out: {named}."]
 
 
 def note_copies(scans: dict[str, Mesh], notes: dict[str, list[str]]) -> None:

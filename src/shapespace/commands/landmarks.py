@@ -18,7 +18,7 @@ from shapespace.commands.landmark_files import LandmarkFiles
 from shapespace.correspondence.landmark_transfer import LandmarkCheck, MarkedSpecimens, TransferredLandmarks
 from shapespace.correspondence.semilandmarks import Semilandmarks, SemilandmarkSet
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
-from shapespace.geometry.landmark_placement import place_landmarks
+from shapespace.geometry.landmark_placement import landmarks_in_frame_of, place_landmarks
 from shapespace.geometry.normals import rms_size
 from shapespace.io.files import make_folder, write_text
 from shapespace.io.landmarks.configuration_io import CURVE_SLIDERS, SURFACE_SLIDERS
@@ -177,6 +177,12 @@ def _open(scans: Path, marked: Path | None, say: Say) -> _Correspondence:
     surfaces = {surface_stem(file): mesh_at(file) for file in files.files}
     meshes = [Mesh(mesh.vertices, mesh.faces, name=name, observed=mesh.observed) for name, mesh in surfaces.items()]
     given = {} if marked is None else _read_marks(marked, summary, {m.name: rms_size(m.vertices) for m in meshes}, say)
+    for mesh in meshes:
+        if mesh.name in given:
+            points, notes = landmarks_in_frame_of(mesh, given[mesh.name])
+            given[mesh.name] = dict(points)
+            for note in notes:
+                say(f"{mesh.name}: {note}")
     specimens = MarkedSpecimens.of(meshes, given, summary.mirrored)
     return _Correspondence(scans, summary, specimens, given)
 

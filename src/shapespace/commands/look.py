@@ -75,7 +75,8 @@ def check(
         if path in targets:
             remove_file(targets[path])  # one of an earlier run may contradict the report
         try:
-            report, repaired = examine_and_repair(read_mesh(path), strict=strict)
+            mesh = read_mesh(path)
+            report, repaired = examine_and_repair(mesh, strict=strict)
         except ShapespaceError as error:
             reports.append({"file": str(path), "usable": False, "error": naming(path, str(error))})
             continue
@@ -84,6 +85,7 @@ def check(
             reports.append({"file": str(path), "usable": False, "error": short})
             continue
         findings = [{"level": one.level, "what": one.problem, "action": one.action} for one in report.findings]
+        findings += [{"level": "note", "what": note, "action": ""} for note in mesh.notes]
         reports.append({"file": str(path), "usable": repaired is not None, **asdict(report), "findings": findings})
         if repaired is not None and path in targets:
             written = replace(repaired, vertices=MM_PER_UNIT[unit or "mm"] * repaired.vertices, landmarks={})

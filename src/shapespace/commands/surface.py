@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +31,7 @@ def write_surfaces(
     paths: Sequence[Path],
     folder: Path,
     *,
-    labels: int | Sequence[int] | Literal["all"] | None = None,
+    labels: int | str | Sequence[int | str] | None = None,
     smooth: float = SMOOTH,
     keep_pieces: bool = False,
     recursive: bool = False,
@@ -39,7 +39,7 @@ def write_surfaces(
     quiet: bool = False,
     say: Callable[[str], None],
 ) -> list[dict[str, Any]]:
-    """Write the surface of each volume as NAME.ply into `folder`, in RAS coordinates and mm.
+    """Write the surface of each volume as NAME.ply into `folder`, in LPS coordinates and mm.
 
     Returns:
         A record of each volume, in order; that of an unusable volume has an `error`.
@@ -47,7 +47,7 @@ def write_surfaces(
     Args:
         paths: label volumes, and folders of them.
         folder: output folder.
-        labels: labels that form one object, or `all` (default: the only label of the volume).
+        labels: labels or names of segments that form one object, or `all` (default: the only label of the volume).
         smooth: standard deviation of the smoothing in voxels, 0 to 10; 0 for none (default 1.3).
         keep_pieces: keep all pieces and cavities (default: the largest piece, cavities filled, with a message).
         recursive: also search subfolders of the given folders.
@@ -114,7 +114,7 @@ def _names(files: Sequence[Path]) -> list[str]:
 def _facts(made: VolumeSurface) -> dict[str, Any]:
     faces = made.mesh.faces
     return {
-        "frame": "RAS",
+        "frame": "LPS",
         "unit": "mm",
         "labels": list(made.labels),
         "voxel_mm": made.voxel_mm.tolist(),

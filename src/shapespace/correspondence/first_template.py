@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from shapespace.correspondence.landmark_guide import contradicts_most, without_stray_landmarks
+from shapespace.correspondence.landmark_guide import contradicts_most, with_own_landmarks
 from shapespace.correspondence.scan_set import copies
 from shapespace.correspondence.settings import FEWEST, SIZE, CorrespondConfig
 from shapespace.correspondence.template import check_template, choose_template, clean_scan, resample
@@ -67,7 +67,7 @@ def first_template(
     if model is not None:
         mesh, origin = _mean_of(model), "The template is the mean of the model given."
     elif template is not None:
-        mesh = without_stray_landmarks(check_template(template))
+        mesh, _ = with_own_landmarks(check_template(template))
         origin = f"{template.name} was given as the template."
     else:
         mesh, origin = _chosen_scan(repaired, config)
@@ -86,7 +86,7 @@ def repaired_scans(scans: Sequence[Mesh], config: CorrespondConfig) -> tuple[dic
     broken: dict[int, str] = {}
     for i, scan in enumerate(scans):
         try:
-            repaired[i] = without_stray_landmarks(repair(outer_surface(scan) if config.outer else scan)[0])
+            repaired[i], _ = with_own_landmarks(repair(outer_surface(scan) if config.outer else scan)[0])
         except MeshError as error:
             broken[i] = f"broken: {error}"
     if config.ignore_colours:

@@ -14,7 +14,7 @@ import numpy as np
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.errors import InputError
 from shapespace.geometry.closest import build_engine
-from shapespace.geometry.landmark_placement import place_landmarks
+from shapespace.geometry.landmark_placement import STRAY, landmarks_in_frame_of, place_landmarks
 from shapespace.geometry.mirror_plane import FLIP
 from shapespace.geometry.normals import rms_size
 from shapespace.geometry.similarity import fit_similarity
@@ -31,8 +31,7 @@ _FIRMEST = 1e-3
 """Two landmarks in one place leave (C8) without a solution where s / a is 0."""
 _SURE = 3.0
 """Landmarks on a line, but for less than this many times their uncertainty, do not determine its rotation."""
-_STRAY = 0.25
-"""A landmark that lies farther than this share of a scan's size off its surface does not belong to it."""
+_LISTED = 3  # landmarks in a sentence
 
 
 class MirroredLandmarksError(InputError):
@@ -122,13 +121,25 @@ def stray_landmarks(scan: Mesh) -> dict[str, float]:
     if not scan.landmarks:
         return {}
     distance = build_engine(scan).query(np.stack(list(scan.landmarks.values()))).distance / rms_size(scan.vertices)
-    return {name: float(share) for name, share in zip(scan.landmarks, distance, strict=True) if share > _STRAY}
+    return {name: float(share) for name, share in zip(scan.landmarks, distance, strict=True) if share > STRAY}
 
 
-def without_stray_landmarks(scan: Mesh) -> Mesh:
-    """Return `scan` without its stray landmarks."""
-    stray = stray_landmarks(scan)
-    return replace(scan, landmarks={name: point for name, point in scan.landmarks.items() if name not in stray})
+def with_own_landmarks(scan: Mesh) -> tuple[Mesh, list[str]]:
+    """Return `scan` with the landmarks of its surface, in its frame, and sentences on those changed or left out."""
+    points, notes = landmarks_in_frame_of(scan, scan.landmarks)
+    scan = replace(scan, landmarks=points)
+    off = stray_landmarks(scan)
+    if not off:
+        return scan, [*notes]
+    named = ", ".join(f"{name} ({share:.2g} times its size)" for name, share in list(off.items())[:_LISTED])
+    sentence = f"Landmarks that lie far off its surface are left out: {named}."
+    if len(off) == len(points):
+        sentence = (
+            f"Its landmarks are left out: they lie {min(off.values()):.2g} times its size off its surface, or more; "
+            "look at their unit and frame."
+        )
+    own = {name: point for name, point in points.items() if name not in off}
+    return replace(scan, landmarks=own), [*notes, sentence]
 
 
 def contradicts_most(template: Mesh, scans: Iterable[Mesh], uncertainty: float) -> bool:

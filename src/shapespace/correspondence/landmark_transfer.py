@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from shapespace.errors import InputError
-from shapespace.geometry.landmark_placement import place_landmarks
+from shapespace.geometry.landmark_placement import STRAY, place_landmarks
 from shapespace.geometry.mirror_plane import FLIP
 from shapespace.geometry.normals import rms_size
 from shapespace.geometry.procrustes import align_to_weighted_mean
@@ -30,8 +30,6 @@ the values with the best coverage on half of the landmarks of molars, femora and
 (benchmarks/landmark_transfer.py; the other half is the test)."""
 _OFF_SCAN, _WIDE = 0.05, 0.25
 """Shares of the size: distance of a landmark from the scan, and radius of its region, beyond which it is doubtful."""
-_STRAY = 0.25
-"""Share of the size: a given landmark farther than this from its surface belongs to another specimen or frame."""
 _OUTLIER, _OUTLIER_REGIONS, _LEAST_ERROR, _ENOUGH = 4.0, 2.5, 0.02, 4
 """A landmark is an outlier beyond this multiple of the error usual for landmark and specimen, where at least `_ENOUGH`
 specimens are marked, or this multiple of its 90 % region; but not below this share of the size."""
@@ -152,10 +150,10 @@ class MarkedSpecimens:
         for name, points in marked.items():
             mesh = surfaces[index[name]]
             on = placed[index[name]] = place_landmarks(Mesh(mesh.vertices, mesh.faces, name=name), points)
-            limit = _STRAY * rms_size(mesh.vertices)
+            limit = STRAY * rms_size(mesh.vertices)
             if far := [n for n, off in zip(on.names, on.distance_mm, strict=True) if off > limit]:
                 raise InputError(
-                    f"{name}: landmark {far[0]!r} lies {max(on.distance_mm) / limit * _STRAY:.2g} sizes off the surface"
+                    f"{name}: landmark {far[0]!r} lies {max(on.distance_mm) / limit * STRAY:.2g} sizes off the surface"
                     f" ({len(far)} of {len(on)} do); the landmarks are of another specimen or in another frame."
                 )
         return MarkedSpecimens(tuple(surfaces), placed, distance, mean / size)

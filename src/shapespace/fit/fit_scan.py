@@ -35,6 +35,7 @@ from shapespace.fit.search.initialisation import (
 from shapespace.geometry.closest import ClosestPoints
 from shapespace.geometry.distance import SurfaceDistances, surface_distances
 from shapespace.geometry.doctor import repair
+from shapespace.geometry.landmark_placement import landmarks_in_frame_of
 from shapespace.geometry.normals import rms_size
 from shapespace.io.interop import MeshLike, as_mesh
 from shapespace.io.landmarks.landmark_io import read_landmarks
@@ -360,7 +361,8 @@ def _place(
     T_scan_model: Similarity | None,
 ) -> _Placed:
     """Crop and repair the scan, find its unit, and find where to begin; landmarks are those of the `whole` model."""
-    notes: list[str] = []
+    landmarks, notes = landmarks_in_frame_of(scan, landmarks or {})
+    notes = [*notes]
     if config.crop:
         scan, cropped = Crop.of(config.crop).cut(scan, full_model, landmarks, config.unit)
         notes.append(cropped)
@@ -369,7 +371,7 @@ def _place(
     T_mm_scan = mm_frame(scan, mm)
     scan_mm = scan.with_vertices(T_mm_scan.apply(scan.vertices))
     with_scale = config.limits(model).with_scale
-    marks_mm = {name: T_mm_scan.apply(point) for name, point in (landmarks or {}).items()}
+    marks_mm = {name: T_mm_scan.apply(point) for name, point in landmarks.items()}
     if T_scan_model is not None:
         start = Start(T_mm_scan @ T_scan_model, "given", float("nan"))
     elif landmarks:

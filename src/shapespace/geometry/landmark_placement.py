@@ -10,10 +10,21 @@ import numpy as np
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.normals import rms_size
-from shapespace.types import FloatArray, Mesh, SurfaceLandmarks
+from shapespace.reprs import first_names
+from shapespace.types import RAS_TO_LPS, FloatArray, Mesh, SurfaceLandmarks
 
 _FAR_SHARE = 0.01
 """Share of the object's size (RMS): a landmark farther than this and than a mean edge is probably off the surface."""
+_NAMED = 10  # landmarks in a sentence
+STRAY = 0.25
+"""A landmark that lies farther than this share of a scan's size off its surface does not belong to it."""
+_TURNED_RATIO, _TURNED_SHARE, _FEWEST = 3.0, 0.05, 3
+"""Landmarks are turned if they are this many times nearer (RMS) after a half turn, and were farther off than this share
+of the size, or, fewer than three, than `STRAY`: errors of placing do not vanish by a half turn."""
+_TURNED = (
+    "Its landmarks are a half turn about z from its surface, as between RAS and LPS, so the signs of their x and y are "
+    "changed here; export both in LPS, or mark the file of a surface that is in RAS with SPACE=RAS."
+)
 
 
 def place_landmarks(mesh: Mesh, points: Mapping[str, FloatArray], *, precision: float = 1e-12) -> SurfaceLandmarks:
@@ -62,8 +73,35 @@ def place_landmarks(mesh: Mesh, points: Mapping[str, FloatArray], *, precision: 
     return SurfaceLandmarks(tuple(points), corners, weights, distance)
 
 
-def far_landmarks(mesh: Mesh, landmarks: SurfaceLandmarks) -> dict[str, float]:
-    """Return name -> distance, mm, of landmarks that were given too far from the surface to belong to it.
+def landmarks_in_frame_of(
+    mesh: Mesh, points: Mapping[str, FloatArray]
+) -> tuple[Mapping[str, FloatArray], tuple[str, ...]]:
+    """Return landmarks in the frame of a surface: turned by a half turn about z if only that takes them to it.
+
+    Args:
+        mesh: the surface, in any unit.
+        points: name -> (3,) in the same unit.
+
+    Returns:
+        The landmarks, turned or as given, and a sentence if they were turned.
+    """
+    places = np.array(list(points.values()), dtype=np.float64)
+    if not points or not np.isfinite(places).all() or not np.isfinite(mesh.vertices).any():
+        return points, ()
+    both = np.concatenate([places, places * RAS_TO_LPS])
+    placed = place_landmarks(mesh, {str(i): point for i, point in enumerate(both)})
+    off = placed.distance_mm.reshape(2, -1) / rms_size(mesh.vertices[np.isfinite(mesh.vertices).all(axis=1)])
+    off = off[:, off.min(axis=0) <= STRAY]  # the others are not explained by a half turn
+    if 2 * off.shape[1] < len(places):
+        return points, ()
+    as_given, turned = np.sqrt((off**2).mean(axis=1))
+    if as_given < _TURNED_RATIO * turned or as_given < (_TURNED_SHARE if off.shape[1] >= _FEWEST else STRAY):
+        return points, ()
+    return dict(zip(points, both[len(places) :], strict=True)), (_TURNED,)
+
+
+def far_landmarks(mesh: Mesh, landmarks: SurfaceLandmarks) -> list[str]:
+    """Return a sentence on landmarks that were given too far from the surface to belong to it, if there are any.
 
     That is farther than the mean edge and than 1 % of the size of `mesh` (RMS distance from its centre).
     """
@@ -73,5 +111,11 @@ def far_landmarks(mesh: Mesh, landmarks: SurfaceLandmarks) -> dict[str, float]:
         edges = mesh.vertices[mesh.faces] - mesh.vertices[np.roll(mesh.faces, 1, axis=1)]
         lengths = np.asarray(np.linalg.norm(edges, axis=2), dtype=np.float64)
         limit = max(limit, float(np.nanmean(lengths)))
-    distances = zip(landmarks.names, landmarks.distance_mm, strict=True)
-    return {name: float(distance) for name, distance in distances if distance > limit}
+    distances = sorted(zip(landmarks.distance_mm.tolist(), landmarks.names, strict=True), reverse=True)
+    far = [f"{name} ({distance:.2g})" for distance, name in distances if distance > limit]
+    some = "1 landmark is" if len(far) == 1 else f"{len(far)} landmarks are"
+    sentence = (
+        f"Warning: {some} farther from that surface than 1 % of its size and than its mean edge (distances in its "
+        f"unit): {first_names(far, _NAMED)}. Check the names, the unit and the frame of the landmarks."
+    )
+    return [sentence] if far else []

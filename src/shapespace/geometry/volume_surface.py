@@ -11,8 +11,9 @@ from __future__ import annotations
 import math
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from itertools import pairwise
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +24,7 @@ from shapespace.geometry.normals import boundary_edges, enclosed_volume
 from shapespace.geometry.remesh import is_sheet
 from shapespace.lazy import lazy_import
 from shapespace.reprs import short_repr
-from shapespace.types import MAX_MEMORY_BYTES, BoolArray, FloatArray, IntArray, LabelVolume, Mesh, require
+from shapespace.types import MAX_MEMORY_BYTES, RAS_TO_LPS, BoolArray, FloatArray, IntArray, LabelVolume, Mesh, require
 
 SMOOTH = 1.3
 """Standard deviation of the smoothing by default, in voxels."""
@@ -61,8 +62,8 @@ class VolumeSurface:
     """The surface of labels in a volume.
 
     Args:
-        mesh: closed, its triangles counter-clockwise seen from outside; RAS, mm.
-        labels: what it encloses.
+        mesh: closed, its triangles counter-clockwise seen from outside; LPS, mm.
+        labels: what it encloses: labels, or names of segments if they were chosen by name.
         voxel_mm: (3,) size of a voxel.
         voxels: how many it was made of.
         pieces: how many pieces hang together, by faces or edges of voxels, among those of the labels.
@@ -74,7 +75,7 @@ class VolumeSurface:
     """
 
     mesh: Mesh
-    labels: tuple[int, ...]
+    labels: tuple[int | str, ...]
     voxel_mm: FloatArray
     voxels: int
     pieces: int
@@ -92,17 +93,18 @@ class VolumeSurface:
 
 def surface_of_volume(
     volume: LabelVolume,
-    labels: int | Sequence[int] | Literal["all"] | None = None,
+    labels: int | str | Sequence[int | str] | None = None,
     *,
     smooth: float = SMOOTH,
     keep_pieces: bool = False,
     max_memory_bytes: int = MAX_MEMORY_BYTES,
 ) -> VolumeSurface:
-    """Return the surface around labels, at sub-voxel accuracy.
+    """Return the surface around labels, at sub-voxel accuracy, in LPS mm.
 
     Args:
         volume: labels and where they lie, as `read_volume` gives them.
-        labels: one, or several that are taken as one object; "all" but 0; None for the only one there is.
+        labels: one, or several that are taken as one object, in a sequence or separated by commas: labels, or names of
+            segments; "all" but 0; None for the only one there is.
         smooth: standard deviation of the smoothing in voxels, of their mean size where they are not cubes; 0 for none.
         keep_pieces: keep all pieces and cavities, instead of the largest piece without them.
         max_memory_bytes: memory limit for the volume and its surface; the need is estimated from the size of
@@ -116,10 +118,10 @@ def surface_of_volume(
     require(volume, LabelVolume, "surface_of_volume", "read one with shapespace.io.read_volume")
     if not 0 <= smooth <= MOST_SMOOTH:
         raise InputError(f"The smoothing must be from 0 to {MOST_SMOOTH:g} voxels, not {smooth}.")
-    chosen = _chosen(volume, labels)
+    chosen, wanted = _chosen(volume, labels)
     sigma = smooth * np.cbrt(np.prod(volume.voxel_mm)) / volume.voxel_mm
     memory = _Memory(volume.labels.nbytes, max_memory_bytes, volume.name)
-    mask, corner = _cut_out(volume.labels, chosen, np.ceil(3 * sigma).astype(int) + 3, memory)
+    mask, corner = _cut_out(volume, wanted, np.ceil(3 * sigma).astype(int) + 3, memory)
     part = _Solid.of(mask, keep_pieces=keep_pieces)
     memory.check(mask.shape, count_crossings(part.mask))
     if part.voxels < _FEWEST:
@@ -127,10 +129,10 @@ def surface_of_volume(
             f"{volume.name}: {_named(chosen)} has only {part.voxels} "
             f"{'voxel' if part.voxels == 1 else 'voxels that hang together'}; a surface needs {_FEWEST}."
         )
-    at_border = _at_border(part.mask, corner, volume.labels.shape)
+    at_border = _at_border(part.mask, corner, volume.labels.shape[:3])
     field, share = _smoothed(part, volume.voxel_mm, sigma)
     vertices, faces = _triangles(field, volume.name)
-    points = (vertices + corner) @ volume.affine[:3, :3].T + volume.affine[:3, 3]
+    points = ((vertices + corner) @ volume.affine[:3, :3].T + volume.affine[:3, 3]) * RAS_TO_LPS
     if np.linalg.det(volume.affine[:3, :3]) < 0:
         faces = faces[:, ::-1]
     return VolumeSurface(
@@ -226,51 +228,81 @@ def labels_in(labels: _Labels) -> tuple[int, ...]:
     return tuple(sorted(numbers - {0}))
 
 
-def _chosen(volume: LabelVolume, labels: int | Sequence[int] | Literal["all"] | None) -> tuple[int, ...]:
+_Places = dict[int, list[int]]
+"""Layer -> labels in it that form an object."""
+
+
+def _chosen(
+    volume: LabelVolume, labels: int | str | Sequence[int | str] | None
+) -> tuple[tuple[int | str, ...], _Places]:
+    """Return the labels or names of segments that form the object, and where they are."""
     try:
-        present = labels_in(volume.labels)
+        present = [(layer, label) for layer, values in enumerate(volume.layers) for label in labels_in(values)]
     except InputError as error:
         raise InputError(f"{volume.name}: {error}") from error
     if not present:
         raise InputError(f"{volume.name}: all its voxels are 0; give a volume with a label.")
-    listed = ", ".join(map(str, present[:_LISTED])) + (f", ... ({len(present)})" if len(present) > _LISTED else "")
-    if labels is None:
-        if len(present) > 1:
-            raise InputError(
-                f"{volume.name}: it has the labels {listed}; say which (--label), or take all as one (--label all)."
-            )
-        return present
+    segments = {(one.layer, one.label): one for one in volume.segments if (one.layer, one.label) in set(present)}
+    places: dict[int | str, list[tuple[int, int]]] = {}
+    for place in present:
+        places.setdefault(place[1], []).append(place)
+    for place, segment in segments.items():
+        places.setdefault(segment.name, []).append(place)
+    for place, segment in segments.items():
+        places.setdefault(segment.id, [place])
+    names = [segments[place].name if place in segments else place[1] for place in present]
+    listed = ", ".join(map(str, names[:_LISTED])) + (f", ... ({len(names)})" if len(names) > _LISTED else "")
+    if labels is None and len(present) > 1:
+        kind = "segments" if segments else "labels"
+        raise InputError(
+            f"{volume.name}: it has the {kind} {listed}; say which (--label), or take all as one (--label all)."
+        )
+    if labels is None or (isinstance(labels, str) and labels == "all" and labels not in places):
+        return tuple(dict.fromkeys(names)), _by_layer(present)
     if isinstance(labels, str):
-        if labels != "all":
-            raise InputError(f"Labels must be whole numbers or 'all', not {labels!r}.")
-        return present
-    asked = {int(label) for label in np.atleast_1d(np.asarray(labels, dtype=np.int64))}
-    absent = tuple(sorted(asked - set(present)))
+        parts = [labels] if labels in places else [part.strip() for part in labels.split(",")]
+        asked = {int(part) if part not in places and part.lstrip("-").isdecimal() else part for part in parts}
+    else:
+        asked = {label if isinstance(label, str) else int(label) for label in np.atleast_1d(np.array(labels, object))}
+    absent = tuple(sorted(asked - places.keys(), key=str))
     if absent or not asked:
         raise InputError(f"{volume.name}: there is no {_named(absent) if absent else 'label'} in it; it has {listed}.")
-    return tuple(sorted(asked))
+    for label in asked:
+        if len(places[label]) > 1:
+            choices = ", ".join(segments[p].name if isinstance(label, int) else segments[p].id for p in places[label])
+            raise InputError(f"{volume.name}: {_named((label,))} is in several layers; choose one of {choices}.")
+    return tuple(sorted(asked, key=places.__getitem__)), _by_layer([places[label][0] for label in asked])
 
 
-def _named(labels: tuple[int, ...]) -> str:
+def _by_layer(places: Sequence[tuple[int, int]]) -> _Places:
+    return {layer: [label for other, label in places if other == layer] for layer, _ in places}
+
+
+def _named(labels: tuple[int | str, ...]) -> str:
     return f"label{'s' if len(labels) > 1 else ''} {', '.join(map(str, labels))}"
 
 
 def _cut_out(
-    labels: _Labels, chosen: tuple[int, ...], margin: npt.NDArray[np.int_], memory: _Memory
+    volume: LabelVolume, wanted: _Places, margin: npt.NDArray[np.int_], memory: _Memory
 ) -> tuple[BoolArray, FloatArray]:
-    """Return the box around the `chosen` labels with a margin on each axis, and (3,) where in the volume it begins."""
-    low, high = np.array(labels.shape, dtype=np.int64), np.zeros(3, dtype=np.int64)
-    wanted = np.array(chosen, dtype=labels.dtype)
-    for block in _blocks(labels.shape):
-        if labels[block].any() and (inside := _is_one_of(labels[block], wanted)).any():
+    """Return the box around the labels in `wanted` with a margin on each axis, and (3,) where it begins."""
+    shape, layers = volume.labels.shape[:3], volume.layers
+
+    def inside(block: tuple[slice, ...]) -> BoolArray:
+        masks = (_is_one_of(layers[layer][block], labels) for layer, labels in wanted.items())
+        return reduce(np.logical_or, masks)
+
+    low, high = np.array(shape, dtype=np.int64), np.zeros(3, dtype=np.int64)
+    for block in _blocks(shape):
+        if (found := inside(block)).any():
             for axis in range(3):
-                along = np.flatnonzero(inside.any(axis=tuple(other for other in range(3) if other != axis)))
+                along = np.flatnonzero(found.any(axis=tuple(other for other in range(3) if other != axis)))
                 low[axis] = min(low[axis], block[axis].start + along[0])
                 high[axis] = max(high[axis], block[axis].start + along[-1] + 1)
     memory.check((high - low + 2 * margin).tolist())
     mask = np.zeros(high - low + 2 * margin, dtype=np.bool_)
     corner = low - margin
-    for block in _blocks(labels.shape):
+    for block in _blocks(shape):
         begin = [max(one.start, int(offset)) for one, offset in zip(block, low, strict=True)]
         end = [min(one.stop, int(offset)) for one, offset in zip(block, high, strict=True)]
         if all(a < b for a, b in zip(begin, end, strict=True)):
@@ -278,11 +310,11 @@ def _cut_out(
             here = tuple(
                 slice(a - int(offset), b - int(offset)) for a, b, offset in zip(begin, end, corner, strict=True)
             )
-            mask[here] = _is_one_of(labels[there], wanted)
+            mask[here] = inside(there)
     return mask, corner.astype(np.float64)
 
 
-def _is_one_of(values: _Labels, wanted: _Labels) -> BoolArray:
+def _is_one_of(values: _Labels, wanted: list[int]) -> BoolArray:
     # Several times as fast for one label, which is the usual case.
     return values == wanted[0] if len(wanted) == 1 else np.isin(values, wanted)
 

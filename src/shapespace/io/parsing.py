@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from shapespace.errors import FileFormatError
 from shapespace.io.read_limits import MOST_PARTS
-from shapespace.types import BoolArray, ByteArray, FloatArray, Mesh
+from shapespace.types import RAS_TO_LPS, BoolArray, ByteArray, FloatArray, Mesh
 
 IndexArray = npt.NDArray[np.int64]
 
@@ -25,6 +25,11 @@ _BLOCK_BYTES = 1 << 18
 _LINE_END = re.compile(rb"\r?\n|\r")
 _SPACE = re.compile(rb"\s")
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
+SPACE = "SPACE=LPS"
+"""Mark of the frame in headers of meshes, as 3D Slicer writes it."""
+# As a comment, or as a field of legacy VTK, whose text has its length before it in binary files.
+_RAS = re.compile(rb"\bSPACE(?:\s*[=:]\s*|\s+1\s+1\s+\w*string\s+)\W?RAS\b", re.IGNORECASE)
+_RAS_NOTE = "Its header states the frame RAS; it was converted to LPS."
 
 
 def damage_error(path: Path, problem: str) -> FileFormatError:
@@ -186,12 +191,17 @@ def mesh_of(
     notes: tuple[str, ...] = (),
     observed: BoolArray | None = None,
     position_std: FloatArray | None = None,
+    header: bytes = b"",
 ) -> Mesh:
     """Return the mesh read from `path`: (V, 3) float64 and (F, 3) int64, which `Mesh` checks and narrows.
+
+    Vertices of a file whose `header` has the mark SPACE=RAS are converted to LPS, with a note.
 
     Raises:
         MeshError: faces that point past the end of the vertices.
     """
+    if _RAS.search(header):
+        vertices, notes = vertices * RAS_TO_LPS + 0.0, (*notes, _RAS_NOTE)  # no -0.0
     return Mesh(
         vertices=vertices,
         faces=faces,  # pyright: ignore[reportArgumentType]  # Mesh narrows it to int32

@@ -32,6 +32,7 @@ from shapespace.fit.robust.robust_settings import RobustSettings
 from shapespace.fit.scan_target import ScanTarget, mm_frame
 from shapespace.fit.search.initialisation import start_from_any_pose
 from shapespace.geometry.closest import build_engine
+from shapespace.geometry.landmark_placement import landmarks_in_frame_of
 from shapespace.geometry.loop import loop_operator
 from shapespace.geometry.normals import (
     boundary_edges,
@@ -338,6 +339,7 @@ def complete(
     target = ScanTarget(fit.scan.with_vertices(T_mm_scan.apply(fit.scan.vertices)))
     marks = None
     if landmarks:
+        landmarks, _ = landmarks_in_frame_of(fit.scan, landmarks)  # as in the fit, whose notes state it
         scale = (T_mm_scan @ fit.T_scan_model).scale
         stddev_mm = config.fit.landmark_stddev_mm or SHARE * rms_size(model.mean_vertices) * scale
         marks_mm = {name: T_mm_scan.apply(point) for name, point in landmarks.items()}

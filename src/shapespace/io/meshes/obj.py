@@ -11,6 +11,7 @@ from shapespace.errors import FileFormatError
 from shapespace.io.meshes.obj_textures import texture_colours
 from shapespace.io.parsing import (
     CUT_SHORT,
+    SPACE,
     IndexArray,
     bytes_of_colours,
     damage_error,
@@ -77,7 +78,8 @@ def read_obj(data: bytes, path: Path) -> Mesh:
     notes: tuple[str, ...] = ()
     if vertex_colours is None:
         vertex_colours, notes = texture_colours(data, count, path)
-    return mesh_of(np.concatenate(vertices), join_parts(faces, np.int64, 3), path, vertex_colours, notes)
+    header = data[: data.find(b"\nv")]
+    return mesh_of(np.concatenate(vertices), join_parts(faces, np.int64, 3), path, vertex_colours, notes, header=header)
 
 
 def _points(points: list[list[bytes]], lines_before: int, path: Path) -> FloatArray:
@@ -129,4 +131,4 @@ def write_obj(mesh: Mesh) -> bytes:
         text = number_lines(np.hstack([mesh.vertices, mesh.colours / 255.0]), f"{pattern} %.6g %.6g %.6g")
     if mesh.faces is not None:
         text += number_lines(mesh.faces.astype(np.int64) + 1, "f %d %d %d")
-    return text.encode("ascii")
+    return f"# {SPACE}\n{text}".encode("ascii")

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from shapespace.errors import FileFormatError
 from shapespace.io.parsing import (
     CUT_SHORT,
+    SPACE,
     IndexArray,
     bytes_of_colours,
     check_count,
@@ -140,6 +141,7 @@ def read_ply(data: bytes, path: Path) -> Mesh:
     """
     data = plain_text(data)
     order, elements, offset = _header(data, path)
+    header = data[:offset]
     vertices: FloatArray | None = None
     colours: ByteArray | None = None
     observed: BoolArray | None = None
@@ -183,7 +185,7 @@ def read_ply(data: bytes, path: Path) -> Mesh:
             faces = fan_triangles(counts, corners)
     if vertices is None:
         raise damage_error(path, "its header declares no vertices")
-    return mesh_of(vertices, faces, path, colours, observed=observed, position_std=std)
+    return mesh_of(vertices, faces, path, colours, observed=observed, position_std=std, header=header)
 
 
 def probe_ply(head: bytes, size: int, path: Path) -> None:
@@ -463,11 +465,11 @@ def write_ply(mesh: Mesh, comment: str = "") -> bytes:
 
     Args:
         mesh: vertices in whatever unit they are in.
-        comment: one line for the header, ASCII.
+        comment: one line for the header, ASCII; the mark of the frame follows it.
     """
     faces = mesh.faces
     lines = ["ply", "format binary_little_endian 1.0", *([f"comment {comment}"] if comment else [])]
-    lines += [f"element vertex {len(mesh.vertices)}"]
+    lines += [f"comment {SPACE}", f"element vertex {len(mesh.vertices)}"]
     lines += [f"property double {axis}" for axis in "xyz"]
     columns: list[tuple[str, str, tuple[int, ...], npt.NDArray[Any]]] = [("at", "<f8", (3,), mesh.vertices)]
     if mesh.colours is not None:

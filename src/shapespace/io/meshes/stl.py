@@ -11,6 +11,7 @@ import numpy.typing as npt
 from shapespace.errors import InputError
 from shapespace.io.parsing import (
     CUT_SHORT,
+    SPACE,
     IndexArray,
     check_count,
     damage_error,
@@ -25,6 +26,7 @@ from shapespace.types import FloatArray, Mesh
 _ROW = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 # A few corners closer than float32 can tell are noise; with more, the surface that is read is another one.
 _MOST_MERGED = 0.01
+_HEADER, _FIRST_LINE = 80, 512  # bytes; of binary STL, and those that hold the first line of text
 
 
 def read_stl(data: bytes, path: Path) -> Mesh:
@@ -56,7 +58,8 @@ def read_stl(data: bytes, path: Path) -> Mesh:
     if not len(corners):
         raise damage_error(path, "it holds no triangles")
     vertices, index = merge_equal(corners)
-    return mesh_of(vertices, index.reshape(-1, 3), path)
+    header = data[: _HEADER if binary else _FIRST_LINE]
+    return mesh_of(vertices, index.reshape(-1, 3), path, header=header)
 
 
 def probe_stl(head: bytes, size: int, path: Path) -> None:
@@ -131,4 +134,4 @@ def write_stl(mesh: Mesh) -> bytes:
     table = np.zeros(len(corners), dtype=_ROW)
     table["normal"] = np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
     table["corners"] = corners
-    return b"binary STL".ljust(80) + len(corners).to_bytes(4, "little") + table.tobytes()
+    return f"binary STL {SPACE}".encode("ascii").ljust(_HEADER) + len(corners).to_bytes(4, "little") + table.tobytes()

@@ -20,6 +20,7 @@ import numpy.typing as npt
 from shapespace.errors import FileFormatError
 from shapespace.io.parsing import (
     CUT_SHORT,
+    SPACE,
     IndexArray,
     check_count,
     damage_error,
@@ -46,7 +47,7 @@ _LEGACY = {
 }  # fmt: skip
 _XML = {
     "Int8": "i1", "UInt8": "u1", "Int16": "i2", "UInt16": "u2", "Int32": "i4", "UInt32": "u4",
-    "Int64": "i8", "UInt64": "u8", "Float32": "f4", "Float64": "f8",
+    "Int64": "i8", "UInt64": "u8", "Float32": "f4", "Float64": "f8", "String": "u1",
 }  # fmt: skip
 # Fields may hold these too, which no surface needs, so they are passed over.
 _TEXTS = ("string", "utf8_string")
@@ -175,6 +176,7 @@ def read_vtk(data: bytes, path: Path) -> Mesh:
     """
     data = plain_text(data)
     head = data[:1024].split(b"\n", 3)
+    header = head[1:2]
     if len(head) < 4 or not head[0].startswith(b"# vtk DataFile"):
         raise damage_error(path, "it does not start with '# vtk DataFile', so it is not a VTK file")
     encoding = head[2].strip().upper()
@@ -205,11 +207,13 @@ def read_vtk(data: bytes, path: Path) -> Mesh:
             elif word == b"TRIANGLE_STRIPS":
                 faces.append(strip_triangles(counts, corners))
         elif word == b"FIELD":
+            begin = cursor.position
             cursor.word()
             count = _count(cursor, path)
             allowance.part(max(count, 0))
             for _ in range(count):
                 _skip_field(cursor, path)
+            header.append(body[begin : cursor.position])
         elif word == b"METADATA":
             cursor.skip_metadata()
         else:
@@ -218,7 +222,7 @@ def read_vtk(data: bytes, path: Path) -> Mesh:
     if vertices is None:
         raise damage_error(path, f"it has no POINTS; {CUT_SHORT}")
     colours = _legacy_colours(cursor, len(vertices)) if word == b"POINT_DATA" else None
-    return mesh_of(vertices, join_parts(faces, np.int64, 3), path, colours)
+    return mesh_of(vertices, join_parts(faces, np.int64, 3), path, colours, header=b"\n".join(header))
 
 
 def _legacy_colours(cursor: _Cursor, vertices: int) -> ByteArray | None:
@@ -343,7 +347,7 @@ def _from_offsets(offsets: IndexArray, corners: IndexArray, path: Path) -> tuple
 def write_vtk(mesh: Mesh) -> bytes:
     """Return `mesh` as binary legacy VTK poly data (version 3.0, known to all readers), with doubles."""
     n = len(mesh.vertices)
-    head = f"# vtk DataFile Version 3.0\nshapespace\nBINARY\nDATASET POLYDATA\nPOINTS {n} double\n"
+    head = f"# vtk DataFile Version 3.0\nshapespace {SPACE}\nBINARY\nDATASET POLYDATA\nPOINTS {n} double\n"
     cells = np.arange(n, dtype=np.int32).reshape(-1, 1) if mesh.faces is None else mesh.faces
     packed = np.empty((len(cells), cells.shape[1] + 1), dtype=">i4")
     packed[:, 0], packed[:, 1:] = cells.shape[1], cells
@@ -432,7 +436,11 @@ def read_vtp(data: bytes, path: Path) -> Mesh:
         raise damage_error(path, f"it holds no points; {CUT_SHORT}")
     known_colours = [part for part in colours if part is not None]
     vertex_colours = np.concatenate(known_colours) if len(known_colours) == len(colours) else None
-    return mesh_of(np.concatenate(points), join_parts(faces, np.int64, 3), path, vertex_colours)
+    spaces = [_data_array(a, xml).astype(np.uint8) for a in root.iterfind("PolyData/FieldData/*[@Name='SPACE']")]
+    return mesh_of(
+        np.concatenate(points), join_parts(faces, np.int64, 3), path, vertex_colours,
+        header=b"".join(b" SPACE=" + codes.tobytes() for codes in spaces),
+    )  # fmt: skip
 
 
 def _faces_of(mesh: Mesh) -> IndexArray:
@@ -571,6 +579,8 @@ def write_vtp(mesh: Mesh) -> bytes:
         '<?xml version="1.0"?>',
         '<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt64">',
         "<PolyData>",
+        '<FieldData><Array type="String" Name="SPACE" NumberOfTuples="1" format="ascii">'
+        f"{' '.join(map(str, SPACE.encode('ascii')[-3:]))} 0</Array></FieldData>",
         f'<Piece NumberOfPoints="{n}" NumberOfVerts="{verts}" NumberOfLines="0" NumberOfStrips="0"'
         f' NumberOfPolys="{polys}">',
         "<Points>",

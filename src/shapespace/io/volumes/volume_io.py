@@ -28,7 +28,7 @@ import numpy.typing as npt
 from shapespace.errors import FileError, InputError, ShapespaceError
 from shapespace.io.files import open_file, read_error
 from shapespace.io.parsing import CUT_SHORT, damage_error
-from shapespace.types import MAX_MEMORY_BYTES, FloatArray, LabelVolume
+from shapespace.types import MAX_MEMORY_BYTES, FloatArray, LabelVolume, Segment
 
 VOLUME_ENDINGS = (".nii", ".nii.gz", ".nrrd")
 """The endings that `read_volume` takes."""
@@ -87,6 +87,7 @@ class _VolumeHeader:
         shift: what is then added.
         notes: what is worth saying.
         axes: which of the axes are those of space.
+        segments: of 3D Slicer; with them, another axis may be that of layers.
     """
 
     shape: tuple[int, ...]
@@ -97,6 +98,7 @@ class _VolumeHeader:
     shift: float = 0.0
     notes: tuple[str, ...] = ()
     axes: tuple[int, ...] = (0, 1, 2)
+    segments: tuple[Segment, ...] = ()
 
     @property
     def bytes(self) -> int:
@@ -134,7 +136,8 @@ def read_volume(path: Path | str, *, max_memory_bytes: int = MAX_MEMORY_BYTES) -
 
     Returns:
         Its labels, and the affine from voxels to RAS millimetres: of NIfTI the sform, else the qform; of NRRD space
-        directions and origin, with LPS and LAS turned to RAS, and units to millimetres.
+        directions and origin, with LPS and LAS turned to RAS, and units to millimetres. Segments of 3D Slicer have
+        their names; those that overlap are in layers.
 
     Raises:
         ShapespaceError: the extra `volumes` is not installed.
@@ -157,10 +160,11 @@ def read_volume(path: Path | str, *, max_memory_bytes: int = MAX_MEMORY_BYTES) -
             head, stream = (_open_nrrd if is_nrrd else _open_nifti)(file, size, stack, path)
         except OSError as error:
             raise read_error(path, error) from error
-        shape = _spatial_shape(head, path)
+        order, shape = _spatial_order(head, path)
         affine = _check_affine(head.affine, path)
         labels = _labels(stream, head, max_memory_bytes, path)
-    return LabelVolume(labels.reshape(shape, order="F"), affine, path.name, head.notes)
+    labels = labels.reshape(head.shape, order="F").transpose(order).reshape(shape)
+    return LabelVolume(labels, affine, path.name, head.notes, head.segments)
 
 
 def _check_size(size: int, path: Path) -> None:
@@ -383,12 +387,20 @@ def _nrrd_head(fields: dict[str, Any], path: Path) -> _VolumeHeader:
         if len(shape) != int(fields["dimension"]):
             raise ValueError("sizes and dimension disagree")
         affine, notes, axes = _nrrd_affine(fields, path)
+        segments = tuple(_segment(fields, n) for n in range(len(fields)) if f"Segment{n}_ID" in fields)
     except InputError:
         raise
     except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
         raise damage_error(path, f"its header is damaged ({_first_words(error)}), so export it again") from error
     kind = np.dtype(code).newbyteorder("<" if order == "little" else ">")
-    return _VolumeHeader(shape, kind, 0, affine, notes=notes, axes=axes)
+    return _VolumeHeader(shape, kind, 0, affine, notes=notes, axes=axes, segments=segments)
+
+
+def _segment(fields: dict[str, Any], n: int) -> Segment:
+    name, own = str(fields.get(f"Segment{n}_Name") or fields[f"Segment{n}_ID"]), str(fields[f"Segment{n}_ID"])
+    # Before 3D Slicer 4.11, a file had one layer per segment and did not state labels.
+    layer = int(fields.get(f"Segment{n}_Layer", n if len(fields["sizes"]) > 3 else 0))
+    return Segment(name, int(fields.get(f"Segment{n}_LabelValue", 1)), layer, own)
 
 
 def _nrrd_affine(fields: dict[str, Any], path: Path) -> tuple[FloatArray, tuple[str, ...], tuple[int, ...]]:
@@ -443,14 +455,16 @@ def _check_declared(head: _VolumeHeader, most_bytes: int, path: Path) -> None:
         raise damage_error(path, f"its header declares {size} voxels, more than the file can hold; {CUT_SHORT}")
 
 
-def _spatial_shape(head: _VolumeHeader, path: Path) -> tuple[int, ...]:
-    """Return the lengths of the three spatial axes; all other axes must have length 1."""
+def _spatial_order(head: _VolumeHeader, path: Path) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Return the axes in the order space, layers, and the shape (X, Y, Z) or (X, Y, Z, L) of the labels."""
     size = " x ".join(map(str, head.shape))
     if len(head.shape) < 3 or len(head.axes) != 3:
         raise InputError(f"{path} has {len(head.shape)} dimensions ({size}), which is no volume; give one of labels.")
-    if math.prod(head.shape) != math.prod(head.shape[axis] for axis in head.axes):
+    others = tuple(axis for axis in range(len(head.shape)) if axis not in head.axes)
+    layers = tuple(head.shape[axis] for axis in others if head.shape[axis] > 1)
+    if len(layers) > (1 if head.segments else 0):
         raise InputError(f"{path} has {len(head.shape)} dimensions ({size}), more than one volume; give one of labels.")
-    return tuple(head.shape[axis] for axis in head.axes)
+    return (*head.axes, *others), (*(head.shape[axis] for axis in head.axes), *layers)
 
 
 def _check_affine(affine: FloatArray, path: Path) -> FloatArray:
