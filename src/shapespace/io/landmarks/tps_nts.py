@@ -13,7 +13,7 @@ import numpy as np
 
 from shapespace.errors import InputError
 from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations, mark_missing
-from shapespace.io.parsing import CUT_SHORT, damage_error
+from shapespace.io.parsing import CUT_SHORT, damage_error, numeric_text
 from shapespace.io.tables.table_io import MISSING
 from shapespace.reprs import first_names
 from shapespace.types import FloatArray
@@ -37,6 +37,7 @@ def coordinates(
         except ValueError as error:
             if cell.lower() not in MISSING and cell != "?":
                 problem = f"{describe(at)} has a {noun} that is not a number ({cell[:20]!r})"
+                problem += ", perhaps with a decimal comma; write decimal points" * ("," in cell)
                 raise damage_error(path, problem) from error
             number = math.nan
         if math.isinf(number):
@@ -97,6 +98,7 @@ def parse_tps(text: str, path: Path) -> LandmarkConfigurations:
 
 def tps_specimens(text: str, path: Path) -> Iterator[tuple[list[list[list[float]]], dict[str, str]]]:
     """Yield the rows of coordinates of the landmarks and of each curve of a specimen, and the values of other keys."""
+    text = numeric_text(text.encode("utf-8", "replace"), path, commas_separate=True).decode()
     lines = "\n".join(line.strip() for line in text.splitlines() if line.strip())
     start, *blocks = re.split(r"^(?=LM3?\s*=)", lines, flags=re.IGNORECASE | re.MULTILINE)
     if start or not blocks:
@@ -123,9 +125,7 @@ def _specimen(block: str, number: int, path: Path) -> tuple[list[list[list[float
                 raise damage_error(path, f"{declared}, and {len(rows)} rows of coordinates follow; {CUT_SHORT}")
             at += count
             if not is_outline:
-                # tpsDig writes the decimal comma of the system.
-                words = (row.replace(",", ".").split() for row in rows)
-                parts.append([coordinates(row, path, lambda _: f"specimen {number}") for row in words])
+                parts.append([coordinates(row.split(), path, lambda _: f"specimen {number}") for row in rows])
         elif key != "curves":
             values[key] = value
     return parts, values
@@ -162,6 +162,7 @@ def tps_text(specimens: Mapping[str, FloatArray], values: Mapping[str, Sequence[
 
 def parse_nts(text: str, path: Path) -> LandmarkConfigurations:
     """Return the landmarks of an NTS file: a row for each specimen, or one specimen with a row for each landmark."""
+    text = numeric_text(text.encode("utf-8", "replace"), path).decode()
     lines = [line.strip() for line in text.splitlines() if line.strip() and line.lstrip()[0] not in "\"'"]
     header = _NTS_HEADER.fullmatch(lines[0]) if lines else None
     if header is None or header[7] is None:

@@ -30,6 +30,7 @@ from shapespace.io.parsing import (
     ints_of,
     join_parts,
     mesh_of,
+    numeric_text,
     plain_text,
     strip_triangles,
     word_block,
@@ -182,7 +183,7 @@ def read_vtk(data: bytes, path: Path) -> Mesh:
     allowance = Allowance(len(data), path)
     cursor: _Cursor
     if encoding == b"ASCII":
-        cursor = _TextCursor(body, path)
+        cursor = _TextCursor(numeric_text(data, path, len(data) - len(body))[len(data) - len(body) :], path)
     elif encoding == b"BINARY":
         cursor = _BinaryCursor(body, path)
     else:
@@ -387,7 +388,7 @@ def read_vtp(data: bytes, path: Path) -> Mesh:
         tag, _, body = tail.partition(b">")
         head += mark + tag + b"/></VTKFile>"
         appended = body.partition(b"_")[2]
-    root = xml_root(head, path)
+    root = xml_root(numeric_text(head, path), path)
     if root.tag != "VTKFile" or root.get("type") != "PolyData":
         raise damage_error(path, "it is not a VTK file of type PolyData; extract its surface first")
     compressor = root.get("compressor", "")
