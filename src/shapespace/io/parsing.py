@@ -79,7 +79,11 @@ def numeric_text(data: bytes, path: Path, start: int = 0, *, commas_separate: bo
         is_mixed = first.setdefault(role, number) == number and "decimal" in first and bool(first.keys() & _OTHER_ROLES)
         if role == "unclear" or is_mixed:
             here = " ".join(line.decode("utf-8", "replace").split())[:60]
-            other = f", unlike line {min(first.values())}" if is_mixed and role != "unclear" else ""
+            other = (
+                f", unlike line {min(n for other, n in first.items() if other in {'decimal'} | _OTHER_ROLES)}"
+                if is_mixed and role != "unclear"
+                else ""
+            )
             raise damage_error(
                 path, f"it may have decimal commas, or commas between numbers, in line {number} ({here!r}){other}; "
                 "export it again with decimal points"

@@ -17,7 +17,7 @@ import numpy as np
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.files import read_bytes, write_text
 from shapespace.io.landmarks.tps_nts import tps_specimens
-from shapespace.io.parsing import damage_error, is_number, json_value, numeric_text, xml_root
+from shapespace.io.parsing import CUT_SHORT, damage_error, is_number, json_value, numeric_text, xml_root
 from shapespace.io.read_limits import LARGEST_LANDMARK_FILE_BYTES
 from shapespace.io.tables.table_io import MISSING, csv_lines, rows_text, unescape_formula
 from shapespace.types import FloatArray, SurfaceLandmarks
@@ -367,6 +367,18 @@ def _slicer(value: Any, path: Path) -> Pairs:
     return out
 
 
+def slicer_curves(data: bytes, path: Path) -> list[tuple[list[str], bool]]:
+    """Return the labels along each curve of a file of 3D Slicer, and whether it is closed."""
+    return [
+        (
+            [str(entry.get("label") or entry.get("id") or "").strip() for entry in markup["controlPoints"]],
+            "Closed" in kind,
+        )
+        for markup in json_value(data, path)["markups"]
+        if (kind := str(markup.get("type"))) in ("Curve", "ClosedCurve")
+    ]
+
+
 def _write_slicer(landmarks: Mapping[str, FloatArray]) -> str:
     points = [
         {"id": str(i), "label": name, "position": _numbers(np.nan_to_num(point)),
@@ -560,6 +572,21 @@ def _read_tps(data: bytes, path: Path) -> Pairs:
     return [(f"point_{i}", None if np.isnan(p).any() else _point(p, f"point_{i}", path)) for i, p in enumerate(rows)]
 
 
+def _read_amira(data: bytes, path: Path) -> Pairs:
+    text = "\n".join(_text_lines(numeric_text(data, path)))
+    count = re.search(r"^define\s+Markers\s+(\d{1,9})\s*$", text, re.MULTILINE)
+    block = re.search(r"^Markers\s*\{\s*(?:float|double)\[3\]\s+Coordinates\s*\}\s*=?\s*@(\d+)", text, re.MULTILINE)
+    if not text.startswith("#") or " ASCII " not in text.partition("\n")[0] or not (count and block):
+        raise damage_error(path, "it is no ASCII landmark file of Amira with Markers, so save it as landmarkAscii")
+    if sets := re.search(r"NumSets\s+(?!1\b)(\d+)", text):
+        raise damage_error(path, f"it has {sets[1][:9]} sets of landmarks, so save each in a file of its own")
+    body = re.search(rf"^@{block[1]}\s*\n([^@]*)", text, re.MULTILINE)
+    rows = [row for row in (body[1] if body else "").splitlines() if row and not row.startswith("#")]
+    if len(rows) != int(count[1]):
+        raise damage_error(path, f"it declares {count[1]} landmarks, and {len(rows)} rows follow; {CUT_SHORT}")
+    return [(f"point_{k}", _point(row.split(), f"point_{k}", path)) for k, row in enumerate(rows)]
+
+
 def _read_tlms(data: bytes, path: Path) -> Pairs:
     out: Pairs = []
     for line in filter(None, _text_lines(numeric_text(data, path))):
@@ -615,6 +642,7 @@ READ_ONLY_LANDMARKS: Mapping[str, Callable[[bytes, Path], Pairs]] = MappingProxy
         ".lm3": _read_lm3,
         ".tps": _read_tps,
         ".tlms": _read_tlms,
+        ".landmarkascii": _read_amira,
         ".txt": _read_points,
         ".pts": _read_points,
     }

@@ -61,6 +61,8 @@ _MAX_INFLATION = 1040
 _COLOUR_WIDTHS = (3, 4)  # RGB and RGBA
 _MOST_ATTRIBUTES = 100  # arrays searched for colours; limit on damaged files
 
+_LINE_NOTES = ("Its lines are not read, only their points; give curves as landmarks, such as curves of 3D Slicer.",)
+
 Values = npt.NDArray[Any]
 
 
@@ -194,6 +196,7 @@ def read_vtk(data: bytes, path: Path) -> Mesh:
         raise damage_error(path, f"it has '{kind}', not DATASET POLYDATA; extract its surface first")
     vertices: FloatArray | None = None
     faces: list[IndexArray] = []
+    notes: tuple[str, ...] = ()
     while (word := cursor.word()) not in (b"", b"POINT_DATA", b"CELL_DATA"):
         allowance.part()
         if word == b"POINTS":
@@ -205,6 +208,8 @@ def read_vtk(data: bytes, path: Path) -> Mesh:
                 faces.append(fan_triangles(counts, corners))
             elif word == b"TRIANGLE_STRIPS":
                 faces.append(strip_triangles(counts, corners))
+            elif word == b"LINES" and len(counts):
+                notes = _LINE_NOTES
         elif word == b"FIELD":
             cursor.word()
             count = _count(cursor, path)
@@ -219,7 +224,7 @@ def read_vtk(data: bytes, path: Path) -> Mesh:
     if vertices is None:
         raise damage_error(path, f"it has no POINTS; {CUT_SHORT}")
     colours = _legacy_colours(cursor, len(vertices)) if word == b"POINT_DATA" else None
-    return mesh_of(vertices, join_parts(faces, np.int64, 3), path, colours)
+    return mesh_of(vertices, join_parts(faces, np.int64, 3), path, colours, notes)
 
 
 def _legacy_colours(cursor: _Cursor, vertices: int) -> ByteArray | None:
@@ -433,7 +438,9 @@ def read_vtp(data: bytes, path: Path) -> Mesh:
         raise damage_error(path, f"it holds no points; {CUT_SHORT}")
     known_colours = [part for part in colours if part is not None]
     vertex_colours = np.concatenate(known_colours) if len(known_colours) == len(colours) else None
-    return mesh_of(np.concatenate(points), join_parts(faces, np.int64, 3), path, vertex_colours)
+    has_lines = any(piece.get("NumberOfLines", "0") != "0" for piece in root.iterfind("PolyData/Piece"))
+    notes = _LINE_NOTES if has_lines else ()
+    return mesh_of(np.concatenate(points), join_parts(faces, np.int64, 3), path, vertex_colours, notes)
 
 
 def _faces_of(mesh: Mesh) -> IndexArray:
