@@ -210,7 +210,7 @@ def _read_folder(folder: Path) -> LandmarkConfigurations:
         points.append(part.points[:, [place[name] for name in first.landmarks]])
     if renamed:
         notes.append(
-            f"Labels of {first_names(renamed, _NAMED)} differ from those of {Path(first.where).name} before the number, "
+            f"Labels of {first_names(renamed, _NAMED)} differ from {Path(first.where).name} before the number, "
             "and are matched by number."
         )  # fmt: skip
     keys = dict.fromkeys(key for part in parts for key in part.columns)
