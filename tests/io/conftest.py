@@ -1,5 +1,3 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -11,15 +9,3 @@ def tetrahedron() -> Mesh:
     """A closed surface whose coordinates need all digits of float64."""
     vertices = np.array([[0.1, 0.2, 0.3], [1 / 3, 0, 0], [0, 1e3 / 7, 0], [0, 0, -2 / 7]])
     return Mesh(vertices, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], dtype=np.int32), name="t")
-
-
-@pytest.fixture
-def write(tmp_path: Path):
-    """Write text or bytes to a file of the given name and return its path."""
-
-    def put(name: str, content: str | bytes) -> Path:
-        path = tmp_path / name
-        path.write_bytes(content if isinstance(content, bytes) else content.encode())
-        return path
-
-    return put

@@ -144,7 +144,7 @@ def test_csv_with_and_without_header(write, text: str):
         ("a.csv", "a,1,2\n", "3 columns"),
         ("a.csv", "a,1,2,3\nb,1,2\n", "fewer"),
         ("a.csv", "a,1,2,3\nb,1,2,x\n", "not a number"),
-        ("a.csv", "a;1;2;3\n", "columns"),
+        ("a.csv", "a|1|2|3\n", "columns"),
         ("a.csv", "name,vertex\na,1\n", "vertex numbers"),
         ("a.csv", ",1,2,3\n", "without a name"),
         ("a.csv", "name,x,y,z\n", "no landmarks"),

@@ -30,6 +30,16 @@ SPACE = "SPACE=LPS"
 # As a comment, or as a field of legacy VTK, whose text has its length before it in binary files.
 _RAS = re.compile(rb"\bSPACE(?:\s*[=:]\s*|\s+1\s+1\s+\w*string\s+)\W?RAS\b", re.IGNORECASE)
 _RAS_NOTE = "Its header states the frame RAS; it was converted to LPS."
+_COMMENT = re.compile(rb"\s*(#|//|%|comment\b|.*=)")
+"""Lines with no coordinates: comments, and those of TPS with a key; the attributes of XML have none either."""
+_WORD_END = re.compile(rb"[\s;<>]+")
+_WITH_COMMA = re.compile(rb"[+-]?\d*,\d+([eE][+-]?\d+)?")
+_COMMA_OF_NUMBER = re.compile(rb"(?<![^\s;<>])([+-]?\d*),(\d+(?:[eE][+-]?\d+)?)(?![^\s;<>])")
+_NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_OTHER_ROLES = frozenset({"separator", "point"})
+"""Of commas and points in numbers, none of which is together with decimal commas in one file."""
+_LEADING_ZERO = re.compile(rb"0\d+")
+_THOUSANDS = re.compile(rb"[+-]?\d{1,3}(,\d{3})+\.|[+-]?\d{1,3}(\.\d{3})+,")
 
 
 def damage_error(path: Path, problem: str) -> FileFormatError:
@@ -49,6 +59,67 @@ def is_number(text: str) -> bool:
 def plain_text(data: bytes) -> bytes:
     """Return `data` without the mark with which some programs begin text in UTF-8."""
     return data.removeprefix(_BYTE_ORDER_MARK)
+
+
+def numeric_text(data: bytes, path: Path, start: int = 0, *, commas_separate: bool = False) -> bytes:
+    """Return text without its mark of UTF-8, and with points for the decimal commas of some locales.
+
+    A comma is a decimal mark where the numbers of a line are separated otherwise: `1,5 2,0 3` or `1,5; 2,0; 3`.
+
+    Args:
+        data: the file.
+        path: for messages.
+        start: where the numbers begin, after a header.
+        commas_separate: whether the format allows commas between numbers, which become spaces: `1.5,2,3`, `1.5, 2, 3`.
+
+    Raises:
+        FileFormatError: commas that can be read in two ways, or numbers with decimal commas and with points.
+    """
+    data = plain_text(data)
+    if data.find(b",", start) < 0:
+        return data
+    out, first = list[bytes](), dict[str, int]()
+    for number, line in enumerate(data[start:].splitlines(), data.count(b"\n", 0, start) + 1):
+        role = _role_of_commas(line, commas_separate)
+        is_mixed = first.setdefault(role, number) == number and "decimal" in first and bool(first.keys() & _OTHER_ROLES)
+        if role == "unclear" or is_mixed:
+            here = " ".join(line.decode("utf-8", "replace").split())[:60]
+            other = (
+                f", unlike line {min(n for other, n in first.items() if other in {'decimal'} | _OTHER_ROLES)}"
+                if is_mixed and role != "unclear"
+                else ""
+            )
+            raise damage_error(
+                path, f"it may have decimal commas, or commas between numbers, in line {number} ({here!r}){other}; "
+                "export it again with decimal points"
+            )  # fmt: skip
+        mark = rb"\1.\2" if role == "decimal" else b" " if commas_separate and not _COMMENT.match(line) else b""
+        out.append(_COMMA_OF_NUMBER.sub(mark, line) if role == "decimal" else line.replace(b",", mark or b","))
+    return data[:start] + b"\n".join(out) + b"\n" if commas_separate or "decimal" in first else data
+
+
+def _role_of_commas(line: bytes, commas_separate: bool) -> str:
+    """Return `decimal`, `separator`, `unclear`, `point` (numbers with decimal points), or `none`."""
+    has_comma = b"," in line
+    if not (has_comma or b"." in line) or _COMMENT.match(line):
+        return "none"
+    words = [word for word in (one.strip(b",") for one in _WORD_END.split(line)) if word]
+    plain = [word for word in words if _NUMBER.fullmatch(word)]
+    decimal = [word for word in words if _WITH_COMMA.fullmatch(word)]
+    lists = [word for word in words if b"," in word and word not in decimal]
+    # A name of a part or material may have a number; coordinates are two or more, or alone in a line.
+    is_numeric = len(plain) + len(decimal) > 1 or len(plain) + len(decimal) == len(words)
+    has_points = is_numeric and any(b"." in word for word in plain)
+    if decimal and len(words) > commas_separate and (is_numeric or (commas_separate and lists)):
+        between = commas_separate and re.search(rb",[\s;]|[\s;],", line.strip())
+        return "unclear" if has_points or lists or between else "decimal"
+    if commas_separate and has_comma:
+        cells = b",".join([*lists, *plain]).split(b",")
+        # Thousands, or the digits after a decimal comma, which begin with a zero as no whole number does.
+        is_cut = any(map(_LEADING_ZERO.fullmatch, cells)) or (len(words) > 1 and any(map(_THOUSANDS.match, words)))
+        return "unclear" if is_cut else "separator" if any(map(_NUMBER.fullmatch, cells)) else "none"
+    is_list = any(len(cells := word.split(b",")) > 2 and all(map(_NUMBER.fullmatch, cells)) for word in lists)
+    return "unclear" if is_list else "point" if has_points else "none"
 
 
 def _block(text: bytes, start: int, end: re.Pattern[bytes], size: int = _BLOCK_BYTES) -> tuple[bytes, int]:
@@ -110,7 +181,8 @@ def floats(tokens: Iterable[bytes], path: Path) -> FloatArray:
     try:
         return np.fromiter(map(float, tokens), dtype=np.float64)
     except ValueError as error:
-        raise damage_error(path, f"it has text where a number should be ({_short(error)})") from error
+        comma = ", perhaps a decimal comma, so export it with decimal points" * ("," in str(error))
+        raise damage_error(path, f"it has text where a number should be ({_short(error)}){comma}") from error
 
 
 def ints(tokens: Iterable[bytes], path: Path) -> IndexArray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,16 +14,28 @@ import numpy as np
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.io.files import make_folder, read_bytes, write_text
 from shapespace.io.landmarks.configuration_tables import header_kind, long_text, morphoj_texts, parse_table, wide_text
-from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations, read_landmark_numbers
-from shapespace.io.landmarks.landmark_io import LANDMARK_FORMATS, READ_ONLY_LANDMARKS, csv_rows, read_landmarks
+from shapespace.io.landmarks.landmark_configurations import (
+    LandmarkConfigurations,
+    read_landmark_numbers,
+    sliders_of_curves,
+)
+from shapespace.io.landmarks.landmark_io import (
+    LANDMARK_FORMATS,
+    READ_ONLY_LANDMARKS,
+    csv_rows,
+    read_landmarks,
+    slicer_curves,
+)
 from shapespace.io.landmarks.r_arrays import R_ENDINGS, parse_r
-from shapespace.io.landmarks.tps_nts import nts_text, parse_nts, parse_tps, tps_text
+from shapespace.io.landmarks.tps_nts import nts_text, parse_dta, parse_morphologika, parse_nts, parse_tps, tps_text
 from shapespace.io.parsing import damage_error, is_number
 from shapespace.io.read_limits import LARGEST_CONFIGURATIONS_FILE_BYTES
 from shapespace.io.tables.table_io import decoded_text, table_rows, table_text
 from shapespace.reprs import first_names
 
-_TEXTS = {".tps": parse_tps, ".nts": parse_nts}
+_TEXTS = {".tps": parse_tps, ".nts": parse_nts, ".dta": parse_dta}
+_MORPHOLOGIKA = re.compile(rb"^(?:\xef\xbb\xbf)?\s*\[\s*individuals\s*\]", re.IGNORECASE | re.MULTILINE)
+_HEAD_BYTES = 2**16  # 64 KiB hold the sections before the coordinates
 _TABLES = (".csv", ".txt", ".tsv", ".xlsx")
 _SINGLE = tuple(sorted({*LANDMARK_FORMATS, *READ_ONLY_LANDMARKS} - {".tps"}, key=lambda one: (-len(one), one)))
 _MILLIMETRES = (".mrk.json", ".fcsv")
@@ -47,7 +60,8 @@ def read_configurations(
 ) -> LandmarkConfigurations:
     """Read the landmarks of many specimens, missing ones as not-a-number.
 
-    Formats: TPS with curves and scale, NTS, wide and long tables (CSV, Excel), MorphoJ tables (.txt), arrays of R
+    Formats: TPS with curves and scale, NTS, IDAV Landmark (.dta), Morphologika (.txt), wide and long tables (CSV,
+    Excel), MorphoJ tables (.txt), arrays of R
     (.rda, .RData, .rds), and folders with a file for each specimen in any format of `read_landmarks`, TPS or NTS.
     Values that are scaled, left out or taken as missing are in the notes.
 
@@ -85,12 +99,13 @@ def _read_file(path: Path, name: str | None) -> LandmarkConfigurations:
         return parse_r(data, path, name)
     if name is not None:
         raise InputError(f"{path} is no file of R, whose arrays have names; leave --object out.")
-    if suffix in _TEXTS or re.match(rb"\s*LM3?\s*=", data, re.IGNORECASE):
+    is_morphologika = _is_morphologika(data)
+    if suffix in _TEXTS or is_morphologika or re.match(rb"\s*LM3?\s*=", data, re.IGNORECASE):
         try:
             text = decoded_text(data)
         except ValueError as error:
             raise FileFormatError(f"{path} {error}; export it again.") from error
-        return _TEXTS.get(suffix, parse_tps)(text, path)
+        return (parse_morphologika if is_morphologika else _TEXTS.get(suffix, parse_tps))(text, path)
     kind = _header_kind(data) if suffix in _TABLES else "single"
     if single is None or kind in ("wide", "long") or (suffix == ".csv" and kind != "single"):
         return parse_table(data, path)
@@ -106,9 +121,14 @@ def is_configurations(path: Path | str) -> bool:
     if path.suffix.lower() not in _TABLES:
         return path.is_file() and path.suffix.lower() in (*_TEXTS, *R_ENDINGS)
     try:
-        return _header_kind(read_bytes(path, LARGEST_CONFIGURATIONS_FILE_BYTES)) in ("wide", "long")
+        data = read_bytes(path, LARGEST_CONFIGURATIONS_FILE_BYTES)
+        return _is_morphologika(data) or _header_kind(data) in ("wide", "long")
     except ShapespaceError:
         return False
+
+
+def _is_morphologika(data: bytes) -> bool:
+    return _MORPHOLOGIKA.search(data[:_HEAD_BYTES]) is not None
 
 
 def _header_kind(data: bytes) -> str:
@@ -121,12 +141,20 @@ def _header_kind(data: bytes) -> str:
 def _read_specimen(path: Path, ending: str) -> LandmarkConfigurations:
     points = read_landmarks(path, keep_absent=True)
     is_numbered = all(re.fullmatch(r"point_\d+", label) for label in points)
+    number, curves = {label: k for k, label in enumerate(points)}, list[tuple[list[int], bool]]()
+    if ending == ".mrk.json":
+        found = slicer_curves(read_bytes(path, LARGEST_CONFIGURATIONS_FILE_BYTES), path)
+        curves = [([number[label] for label in labels], closed) for labels, closed in found]
+    sliders = sliders_of_curves(curves)
+    note = f"{len(sliders)} points of curves (Curve, ClosedCurve) are semilandmarks."
     return LandmarkConfigurations(
         names=(path.name[: -len(ending)].removesuffix(".landmarks"),),
         points=np.array([list(points.values())]),
         landmarks=() if is_numbered else tuple(points),
         unit="mm" if ending in _MILLIMETRES else "",
+        curve_sliders=sliders,
         where=str(path),
+        notes=(note,) if len(sliders) else (),
     )
 
 
@@ -155,21 +183,36 @@ def _read_folder(folder: Path) -> LandmarkConfigurations:
     ending = max(files, key=lambda one: (len(files[one]), one == ".mrk.json"))
     others = [file.name for other, listed in files.items() if other != ending for file in listed]
     notes = [f"{len(others)} files without {ending} are left out ({first_names(others, _NAMED)})."] if others else []
-    first, *rest = parts = [
-        _read_file(file, None) if ending in _TEXTS else _read_specimen(file, ending) for file in files[ending]
-    ]
-    points = [first.points]
-    for file, part in zip(files[ending][1:], rest, strict=True):
-        place = {name: k for k, name in enumerate(part.landmarks)}
+    first, *rest = parts = _join_files(
+        [_read_file(file, None) if ending in _TEXTS else _read_specimen(file, ending) for file in files[ending]]
+    )
+    if len(parts) < len(files[ending]):
+        notes.append(
+            f"{len(files[ending])} files are joined to {len(parts)} specimens by the first part of their names."
+        )
+    points, renamed = [first.points], list[str]()
+    for part in rest:
+        file, place = Path(part.where), {name: k for k, name in enumerate(part.landmarks)}
+        if (
+            place.keys() != set(first.landmarks)
+            and set(own := _numbering(part)) == set(keys := _numbering(first)) != set()
+        ):
+            place = {label: own.index(key) for label, key in zip(first.landmarks, keys, strict=True)}
+            renamed.append(file.name)
         if part.dimensions != first.dimensions or place.keys() != set(first.landmarks):
             has, expected = (f"{len(one.landmarks)} landmarks in {one.dimensions}-D" for one in (part, first))
             other = first_names(sorted(place.keys() ^ set(first.landmarks)), _NAMED)
             raise damage_error(
-                file, f"it has {has} and {files[ending][0].name} has {expected}"
+                file, f"it has {has} and {Path(first.where).name} has {expected}"
                 f"{f' ({other} in one of them alone)' if other else ''}; give the same landmarks to all files, with NA "
                 "or as undefined where one is missing"
             )  # fmt: skip
         points.append(part.points[:, [place[name] for name in first.landmarks]])
+    if renamed:
+        notes.append(
+            f"Labels of {first_names(renamed, _NAMED)} differ from {Path(first.where).name} before the number, "
+            "and are matched by number."
+        )  # fmt: skip
     keys = dict.fromkeys(key for part in parts for key in part.columns)
     return replace(
         first,
@@ -178,6 +221,49 @@ def _read_folder(folder: Path) -> LandmarkConfigurations:
         columns={key: tuple(c for p in parts for c in p.columns.get(key, [""] * len(p))) for key in keys},
         where=str(folder),
         notes=(*notes, *dict.fromkeys(note for part in parts for note in part.notes)),
+    )
+
+
+def _numbering(part: LandmarkConfigurations) -> list[tuple[bool, str]]:
+    """Return whether a landmark is on a curve, and the number in its label, such as `F-1`; empty if labels have others.
+
+    3D Slicer calls points as their node and a number by default, and nodes of one name get `_1`, `_2` and so on.
+    """
+    on_curve = np.isin(np.arange(len(part.landmarks)), part.curve_sliders).tolist()
+    found = [re.fullmatch(r"(.*[-_])(\d+)", label) for label in part.landmarks]
+    keys = [(is_on, match[2]) for is_on, match in zip(on_curve, found, strict=True) if match]
+    prefixes = {(is_on, match[1]) for is_on, match in zip(on_curve, found, strict=True) if match}
+    return keys if len(keys) == len(found) and len(prefixes) == len(set(on_curve)) else []
+
+
+def _join_files(parts: Sequence[LandmarkConfigurations]) -> Sequence[LandmarkConfigurations]:
+    """Return one part of each specimen where the files NAME_a and NAME_b have its landmarks and its curves."""
+    split = [re.split(r"[ ._-](?=[^ ._-]+$)", part.names[0], maxsplit=1) for part in parts if len(part) == 1]
+    groups: dict[str, list[LandmarkConfigurations]] = {}
+    for words, part in zip(split, parts, strict=False):
+        groups.setdefault(words[0], []).append(part)
+    kinds = {tuple(sorted(tuple(words[1:]) for words in split if words[0] == stem)) for stem in groups}
+    has_curves = [bool(len(part.curve_sliders)) for part in parts]
+    if len(split) < len(parts) or len(kinds) != 1 or len(groups) == len(parts) or len(set(has_curves)) == 1:
+        return parts
+    return [_joined(stem, sorted(own, key=lambda one: len(one.curve_sliders) > 0)) for stem, own in groups.items()]
+
+
+def _joined(name: str, parts: Sequence[LandmarkConfigurations]) -> LandmarkConfigurations:
+    """Return the landmarks of one specimen from several files; labels of several files get the name of their file."""
+    counts = Counter(label for part in parts for label in part.landmarks)
+    starts = np.cumsum([0, *(len(part.landmarks) for part in parts)]).tolist()
+    return replace(
+        parts[0],
+        names=(name,),
+        points=np.concatenate([part.points for part in parts], axis=1),
+        landmarks=tuple(
+            label if counts[label] == 1 else f"{part.names[0].removeprefix(name)[1:]}_{label}"
+            for part in parts
+            for label in part.landmarks
+        ),
+        curve_sliders=np.concatenate([p.curve_sliders + at for p, at in zip(parts, starts, strict=False)]),
+        notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
     )
 
 

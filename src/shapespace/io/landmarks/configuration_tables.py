@@ -20,8 +20,10 @@ from shapespace.types import FloatArray
 
 _AXIS_FIRST = re.compile(r"([xyz])[ ._-]?(\d+)", re.IGNORECASE)
 _AXIS_LAST = re.compile(r"(.*\d|.+?)(?:(?<=\d)|[ ._-])([xyz])", re.IGNORECASE)
+_NUMBERED = re.compile(r"(?:raw|proc)?coord[ ._-]?\d+", re.IGNORECASE)
+"""Columns of coordinates of MorphoJ, whose names have no axis."""
 _LANDMARK = ("landmark", "landmarks", "lm", "point", "semilandmark")
-_KEYS = (*KEYS, "individual", "label")
+_KEYS = (*KEYS, "individual", "label", "identifier")
 _NAMED = 3  # names in a sentence
 
 
@@ -39,6 +41,10 @@ def header_kind(header: Sequence[str]) -> str:
 def _landmark_columns(header: Sequence[str]) -> dict[str, dict[str, int]]:
     """Return landmark -> axis -> column for the styles x1, X.1, 1.X, 1X, lm1_x and nose_x."""
     columns: dict[str, dict[str, int]] = {}
+    if numbered := [column for column, name in enumerate(header) if _NUMBERED.fullmatch(name.strip())]:
+        width = 2 if len(numbered) % 3 else 3
+        starts = range(0, len(numbered), width)
+        return {str(k): dict(zip("xyz", numbered[at : at + width], strict=False)) for k, at in enumerate(starts, 1)}
     for column, name in enumerate(header):
         first, last = _AXIS_FIRST.fullmatch(name.strip()), _AXIS_LAST.fullmatch(name.strip())
         if match := first or last:
@@ -59,6 +65,11 @@ def parse_table(content: bytes, path: Path) -> LandmarkConfigurations:
     if kind not in ("wide", "long"):
         known = "such as x1, y1, x2, y2 or specimen, landmark, x, y"
         raise damage_error(path, f"its header has no landmark columns, {known} ({', '.join(header)[:60]})")
+    numbered = [name for name in header if _NUMBERED.fullmatch(name.strip())]
+    if numbered and len(numbered) % 6 in (0, 1, 5):
+        problem = f"its {len(numbered)} columns of coordinates of MorphoJ ({numbered[0]}, ...) can be 2-D or 3-D"
+        advice = "name the columns x1, y1, x2, y2 or x1, y1, z1, x2, y2, z2, and so on"
+        raise damage_error(path, f"{problem}; {advice}")
     if not rows:
         raise damage_error(path, "it has no specimens below its header")
     return mark_missing((_wide if kind == "wide" else _long)(header, rows, path))

@@ -80,6 +80,17 @@ class LandmarkConfigurations:
         return np.logical_not(np.logical_or.reduce(np.isnan(self.points), axis=2))
 
 
+def sliders_of_curves(curves: Sequence[tuple[Sequence[int], bool]]) -> IntArray:
+    """Return (M, 3) the points before, sliding and after: all but the ends of open curves and the start of closed ones.
+
+    Args:
+        curves: numbers of the points, from 0, along each curve, and whether it is closed.
+    """
+    rings = [[*points, points[0]] if closed and points else [*points] for points, closed in curves]
+    triples = [triple for ring in rings for triple in zip(ring, ring[1:], ring[2:], strict=False)]
+    return np.reshape(triples, (-1, 3)).astype(np.int32)
+
+
 def mark_missing(raw: LandmarkConfigurations) -> LandmarkConfigurations:
     """Return landmarks with not-a-number for all coordinates of missing ones, and notes on them.
 

@@ -17,9 +17,9 @@ import numpy as np
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.files import read_bytes, write_text
 from shapespace.io.landmarks.tps_nts import tps_specimens
-from shapespace.io.parsing import damage_error, is_number, json_value, xml_root
+from shapespace.io.parsing import CUT_SHORT, damage_error, is_number, json_value, numeric_text, xml_root
 from shapespace.io.read_limits import LARGEST_LANDMARK_FILE_BYTES
-from shapespace.io.tables.table_io import MISSING, rows_text, unescape_formula
+from shapespace.io.tables.table_io import MISSING, csv_lines, rows_text, unescape_formula
 from shapespace.types import FloatArray, SurfaceLandmarks
 
 Pairs = list[tuple[str, FloatArray | None]]
@@ -265,7 +265,8 @@ def _point(values: Iterable[Any], landmark_name: str, path: Path) -> FloatArray:
     try:
         numbers = [float(value) for value in values]
     except (TypeError, ValueError, OverflowError) as error:
-        raise damage_error(path, f"{landmark_name} has a coordinate that is not a number") from error
+        comma = " but may have a decimal comma, so export it with decimal points" * ("," in str(error))
+        raise damage_error(path, f"{landmark_name} has a coordinate that is not a number{comma}") from error
     if len(numbers) != 3:
         raise damage_error(path, f"{landmark_name} has {len(numbers)} coordinates, not 3")
     return np.array(numbers, dtype=np.float64)
@@ -366,6 +367,18 @@ def _slicer(value: Any, path: Path) -> Pairs:
     return out
 
 
+def slicer_curves(data: bytes, path: Path) -> list[tuple[list[str], bool]]:
+    """Return the labels along each curve of a file of 3D Slicer, and whether it is closed."""
+    return [
+        (
+            [str(entry.get("label") or entry.get("id") or "").strip() for entry in markup["controlPoints"]],
+            "Closed" in kind,
+        )
+        for markup in json_value(data, path)["markups"]
+        if (kind := str(markup.get("type"))) in ("Curve", "ClosedCurve")
+    ]
+
+
 def _write_slicer(landmarks: Mapping[str, FloatArray]) -> str:
     points = [
         {"id": str(i), "label": name, "position": _numbers(np.nan_to_num(point)),
@@ -426,22 +439,26 @@ def _write_pp(landmarks: Mapping[str, FloatArray]) -> str:
 
 
 def csv_rows(data: bytes, path: Path) -> list[list[str]]:
-    """Return the rows of comma-separated UTF-8 text, without white space around cells, empty lines and comments (`#`).
+    """Return the rows of UTF-8 text separated by commas, semicolons or tabs, without white space around cells.
+
+    Empty lines and comments (`#`) are left out.
 
     Raises:
         FileFormatError: it is something else.
     """
     try:
         text = data.decode("utf-8-sig")
-        lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-        return [[unescape_formula(cell.strip()) for cell in row] for row in csv.reader(lines, strict=True)]
+        lines = [f"{line}\n" for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+        return [[unescape_formula(cell.strip()) for cell in row] for row in csv_lines("".join(lines))]
     except (UnicodeDecodeError, csv.Error) as error:
         raise damage_error(path, "it is not comma-separated text") from error
+    except ValueError as error:
+        raise FileFormatError(f"{path} {error}; correct the table.") from error
 
 
 def _read_csv(data: bytes, path: Path) -> Pairs:
     rows = csv_rows(data, path)
-    columns = [1, 2, 3]
+    columns, width = [1, 2, 3], len(rows[0]) if rows else 0
     if rows and not all(is_number(cell) for cell in rows[0][1:4]):
         header = [cell.lower() for cell in rows[0]]
         if header[:2] == ["name", "vertex"]:
@@ -456,6 +473,9 @@ def _read_csv(data: bytes, path: Path) -> Pairs:
     for row in rows:
         if len(row) <= max(columns):
             raise damage_error(path, f"landmark '{row[0][:60]}' has fewer than 3 coordinates")
+        if len(row) > width and any(row[width:]):
+            problem = f"landmark '{row[0][:60]}' has {len(row)} columns, and the first line {width}"
+            raise damage_error(path, f"{problem}; if it has decimal commas, separate the columns by semicolons")
         is_absent = all(row[c].lower() in MISSING for c in columns)
         xyz = (row[c] for c in columns)
         out.append((row[0], None if is_absent else _point(xyz, f"landmark '{row[0][:60]}'", path)))
@@ -471,10 +491,15 @@ def _text_lines(data: bytes) -> list[str]:
     return [line.strip() for line in data.decode("utf-8-sig", "replace").splitlines()]
 
 
+def _number_lines(data: bytes, path: Path) -> list[str]:
+    """Return the lines of text with numbers that commas may separate, without white space around them."""
+    return _text_lines(numeric_text(data, path, commas_separate=True))
+
+
 def _read_bnd(data: bytes, path: Path) -> Pairs:
     out: Pairs = []
-    for line in filter(None, _text_lines(data)):
-        words = line.replace(",", " ").split()
+    for line in filter(None, _number_lines(data, path)):
+        words = line.split()
         name = f"point_{len(out)}"
         if len(words) != 4 or not words[0].isascii() or not words[0].isdecimal():
             raise damage_error(path, f"{name} is not a row of a vertex number and x y z; it is damaged or cut short")
@@ -483,7 +508,7 @@ def _read_bnd(data: bytes, path: Path) -> Pairs:
 
 
 def _read_lm3(data: bytes, path: Path) -> Pairs:
-    lines = [line for line in _text_lines(data) if line]
+    lines = [line for line in _text_lines(numeric_text(data, path)) if line]
     header_matches = (re.fullmatch(r"(\d{1,6})(?:\s+landmarks?\s*:?)?", line, re.IGNORECASE) for line in lines)
     header_row, count = next(((i, int(m[1])) for i, m in enumerate(header_matches) if m), (0, -1))
     if count < 0:
@@ -497,6 +522,7 @@ def _read_lm3(data: bytes, path: Path) -> Pairs:
 
 
 _FCSV_COLUMNS = "id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID"
+_FCSV_EXTRA = 2  # cells after the columns, which Slicer 5 writes
 
 
 def _read_fcsv(data: bytes, path: Path) -> Pairs:
@@ -517,6 +543,9 @@ def _read_fcsv(data: bytes, path: Path) -> Pairs:
     for row in csv_rows(data, path):
         entry = dict(zip(columns, row, strict=False))
         name = entry.get("label") or entry.get("id") or ""
+        if len(row) > len(columns) + _FCSV_EXTRA and not any("." in row[columns.index(axis)] for axis in "xyz"):
+            raise damage_error(path, f"landmark '{name[:60]}' has {len(row)} cells, perhaps for decimal commas; "
+                               "export it again with decimal points")  # fmt: skip
         point = _point((entry.get(axis) for axis in "xyz"), f"landmark '{name[:60]}'", path)
         out.append((name, sign * point + 0.0))
     return out
@@ -543,9 +572,24 @@ def _read_tps(data: bytes, path: Path) -> Pairs:
     return [(f"point_{i}", None if np.isnan(p).any() else _point(p, f"point_{i}", path)) for i, p in enumerate(rows)]
 
 
+def _read_amira(data: bytes, path: Path) -> Pairs:
+    text = "\n".join(_text_lines(numeric_text(data, path)))
+    count = re.search(r"^define\s+Markers\s+(\d{1,9})\s*$", text, re.MULTILINE)
+    block = re.search(r"^Markers\s*\{\s*(?:float|double)\[3\]\s+Coordinates\s*\}\s*=?\s*@(\d+)", text, re.MULTILINE)
+    if not text.startswith("#") or " ASCII " not in text.partition("\n")[0] or not (count and block):
+        raise damage_error(path, "it is no ASCII landmark file of Amira with Markers, so save it as landmarkAscii")
+    if sets := re.search(r"NumSets\s+(?!1\b)(\d+)", text):
+        raise damage_error(path, f"it has {sets[1][:9]} sets of landmarks, so save each in a file of its own")
+    body = re.search(rf"^@{block[1]}\s*\n([^@]*)", text, re.MULTILINE)
+    rows = [row for row in (body[1] if body else "").splitlines() if row and not row.startswith("#")]
+    if len(rows) != int(count[1]):
+        raise damage_error(path, f"it declares {count[1]} landmarks, and {len(rows)} rows follow; {CUT_SHORT}")
+    return [(f"point_{k}", _point(row.split(), f"point_{k}", path)) for k, row in enumerate(rows)]
+
+
 def _read_tlms(data: bytes, path: Path) -> Pairs:
     out: Pairs = []
-    for line in filter(None, _text_lines(data)):
+    for line in filter(None, _text_lines(numeric_text(data, path))):
         words = line.split()
         if len(words) != 5 or words[1] not in ("0", "1"):
             raise damage_error(path, "it has a line other than 'name visible x y z', so it is not scalismo's .tlms")
@@ -560,13 +604,13 @@ def _read_points(data: bytes, path: Path) -> Pairs:
     """Read rows `x y z` or `name x y z`, after a count or a header perhaps, as landmark editors save them."""
     out: Pairs = []
     declared = None
-    for line in _text_lines(data):
+    for line in _number_lines(data, path):
         row = line.partition("#")[0].strip()
         head = _POINTS_HEAD.fullmatch(row)
         if not row or head:
             declared = int(next(filter(None, head.groups()), 0)) or declared if head else declared
             continue
-        words = re.split(r"[\s,;]+", row.rstrip(",;"))
+        words = row.replace(";", " ").split()
         name = words[0] if len(words) == 4 else f"point_{len(out)}"
         if not out and not any(map(is_number, words)):
             continue  # names of columns
@@ -598,6 +642,7 @@ READ_ONLY_LANDMARKS: Mapping[str, Callable[[bytes, Path], Pairs]] = MappingProxy
         ".lm3": _read_lm3,
         ".tps": _read_tps,
         ".tlms": _read_tlms,
+        ".landmarkascii": _read_amira,
         ".txt": _read_points,
         ".pts": _read_points,
     }

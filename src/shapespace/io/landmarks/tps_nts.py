@@ -12,13 +12,15 @@ from pathlib import Path
 import numpy as np
 
 from shapespace.errors import InputError
-from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations, mark_missing
-from shapespace.io.parsing import CUT_SHORT, damage_error
+from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations, mark_missing, sliders_of_curves
+from shapespace.io.parsing import CUT_SHORT, damage_error, numeric_text
 from shapespace.io.tables.table_io import MISSING
 from shapespace.reprs import first_names
 from shapespace.types import FloatArray
 
 _NAMED = 3  # specimens in a sentence
+_CLOSED = "="
+"""Key of values, which no file has, of specimens whose curves are outlines."""
 _NTS_HEADER = re.compile(
     r"1\s+(\d{1,9})\s*([LBE]?)\s+(\d{1,9})\s*(L?)\s+([01])(?:\s+([^\sD]\S*))?(?:\s+DIM\s*=\s*([23]))?\s*", re.IGNORECASE
 )
@@ -37,6 +39,7 @@ def coordinates(
         except ValueError as error:
             if cell.lower() not in MISSING and cell != "?":
                 problem = f"{describe(at)} has a {noun} that is not a number ({cell[:20]!r})"
+                problem += ", perhaps with a decimal comma; write decimal points" * ("," in cell)
                 raise damage_error(path, problem) from error
             number = math.nan
         if math.isinf(number):
@@ -49,13 +52,24 @@ def parse_tps(text: str, path: Path) -> LandmarkConfigurations:
     """Return the landmarks of a TPS file; the points of curves are semilandmarks after the landmarks.
 
     The inner points of a curve slide between their neighbours. SCALE= is applied if all specimens have it, as in
-    geomorph. IMAGE=, COMMENT= and other keys become columns. Outlines are left out.
+    geomorph. IMAGE=, COMMENT= and other keys become columns. Outlines are closed curves in files without landmarks, and
+    are left out of others.
     """
     parts, values = zip(*tps_specimens(text, path), strict=True)
+    images = [re.sub(r"\.\w{1,5}$", "", one.get("image", "")) for one in values]
     names = tuple(
-        one.get("id") or re.sub(r"\.\w{1,5}$", "", one.get("image", "")) or f"specimen {k}"
-        for k, one in enumerate(values, 1)
+        one.get("id") or image or f"specimen {k}" for k, (one, image) in enumerate(zip(values, images, strict=True), 1)
     )
+    notes = list[str]()
+    if len(set(names)) < len(names) == len(set(images)) and all(images):
+        names = tuple(images)
+        notes.append("Specimens are called as their IMAGE=, since values of ID= are repeated.")
+    closed = all(_CLOSED in one for one in values)
+    if closed and len({len(own) for own in parts}) == 1 and len(set(map(str, [list(map(len, p)) for p in parts]))) > 1:
+        parts, least = _resampled(parts, path)
+        notes.append(
+            f"Outlines are resampled to {least} points at equal distances, since their numbers of points differ."
+        )
     counts = [list(map(len, own)) for own in parts]
     for name, count in zip(names, counts, strict=True):
         if count != counts[0]:
@@ -65,7 +79,7 @@ def parse_tps(text: str, path: Path) -> LandmarkConfigurations:
             problem = f"specimen {name[:60]!r} has {has} and {names[0][:60]!r} has {expected}"
             raise damage_error(path, f"{problem}; digitise the same for all, with NA for missing landmarks")
     points = _array([[row for part in own for row in part] for own in parts], names, path)
-    notes, unscaled = list[str](), [name for name, one in zip(names, values, strict=True) if "scale" not in one]
+    unscaled = [name for name, one in zip(names, values, strict=True) if "scale" not in one]
     scales = np.ones(len(names))
     if not unscaled:
         cells = [one["scale"].replace(",", ".") for one in values]  # a decimal comma, as in coordinates
@@ -80,16 +94,17 @@ def parse_tps(text: str, path: Path) -> LandmarkConfigurations:
         )
     elif points.shape[2] == 2:
         notes.append("No specimen has SCALE=, so sizes are in the unit of the file, such as pixels.")
-    if any("outlines" in one for one in values):
+    if any("outlines" in one for one in values) and not closed:
         notes.append("Outlines (OUTLINES=) are left out.")
-    ends = np.cumsum(counts[0])
-    inner = [k for a, b in pairwise(ends) for k in range(int(a) + 1, int(b) - 1)]
-    if inner:
-        notes.append(f"{len(inner)} inner points of {len(ends) - 1} curves are semilandmarks.")
-    keys = dict.fromkeys(key for one in values for key in one if key not in ("id", "scale", "outlines"))
+    ends = np.cumsum(counts[0]).tolist()
+    sliders = sliders_of_curves([(range(a, b), closed) for a, b in pairwise(ends)])
+    if len(sliders):
+        kind = "points after the first of {} outlines" if closed else "inner points of {} curves"
+        notes.append(f"{len(sliders)} {kind.format(len(ends) - 1)} are semilandmarks.")
+    keys = dict.fromkeys(key for one in values for key in one if key not in ("id", "scale", "outlines", _CLOSED))
     raw = mark_missing(LandmarkConfigurations(
         names=names, points=points, columns={key: tuple(one.get(key, "") for one in values) for key in keys},
-        curve_sliders=np.reshape(inner, (-1, 1)).astype(np.int32) + np.arange(-1, 2, dtype=np.int32),
+        curve_sliders=sliders,
         where=str(path), notes=tuple(notes),
     ))  # fmt: skip
     return replace(raw, points=raw.points * scales[:, None, None])
@@ -97,6 +112,7 @@ def parse_tps(text: str, path: Path) -> LandmarkConfigurations:
 
 def tps_specimens(text: str, path: Path) -> Iterator[tuple[list[list[list[float]]], dict[str, str]]]:
     """Yield the rows of coordinates of the landmarks and of each curve of a specimen, and the values of other keys."""
+    text = numeric_text(text.encode("utf-8", "replace"), path, commas_separate=True).decode()
     lines = "\n".join(line.strip() for line in text.splitlines() if line.strip())
     start, *blocks = re.split(r"^(?=LM3?\s*=)", lines, flags=re.IGNORECASE | re.MULTILINE)
     if start or not blocks:
@@ -107,6 +123,7 @@ def tps_specimens(text: str, path: Path) -> Iterator[tuple[list[list[list[float]
 
 def _specimen(block: str, number: int, path: Path) -> tuple[list[list[list[float]]], dict[str, str]]:
     lines, parts, values = block.splitlines(), list[list[list[float]]](), dict[str, str]()
+    outlines = list[list[list[float]]]()
     at, is_outline = 0, False
     while at < len(lines):
         key, equals, value = (part.strip() for part in lines[at].partition("="))
@@ -122,13 +139,25 @@ def _specimen(block: str, number: int, path: Path) -> tuple[list[list[list[float
                 declared = f"specimen {number} declares {value[:20]!r} points"
                 raise damage_error(path, f"{declared}, and {len(rows)} rows of coordinates follow; {CUT_SHORT}")
             at += count
-            if not is_outline:
-                # tpsDig writes the decimal comma of the system.
-                words = (row.replace(",", ".").split() for row in rows)
-                parts.append([coordinates(row, path, lambda _: f"specimen {number}") for row in words])
+            points = [coordinates(row.split(), path, lambda _: f"specimen {number}") for row in rows]
+            (outlines if is_outline else parts).append(points)
         elif key != "curves":
             values[key] = value
-    return parts, values
+    return (parts, values) if any(parts) or not outlines else ([[], *outlines], {**values, _CLOSED: ""})
+
+
+def _resampled(parts: Sequence[list[list[list[float]]]], path: Path) -> tuple[list[list[list[list[float]]]], str]:
+    """Return outlines with the least number of points that a specimen has, by arc length from their first points."""
+    least, out = [min(map(len, own)) for own in zip(*parts, strict=True)], list[list[list[list[float]]]]()
+    for number, own in enumerate(parts, 1):
+        _array([[row for curve in own for row in curve]], [f"specimen {number}"], path)
+        out.append([[]])
+        for curve, count in zip(own[1:], least[1:], strict=True):
+            ring = np.array([*curve, *curve[:1]])
+            along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(ring, axis=0), axis=1)))
+            places = np.linspace(0.0, along[-1], count, endpoint=False)
+            out[-1].append(np.stack([np.interp(places, along, axis) for axis in ring.T], axis=1).tolist())
+    return out, " and ".join(map(str, least[1:]))
 
 
 def _array(specimens: Sequence[list[list[float]]], names: Sequence[str], path: Path) -> FloatArray:
@@ -162,6 +191,7 @@ def tps_text(specimens: Mapping[str, FloatArray], values: Mapping[str, Sequence[
 
 def parse_nts(text: str, path: Path) -> LandmarkConfigurations:
     """Return the landmarks of an NTS file: a row for each specimen, or one specimen with a row for each landmark."""
+    text = numeric_text(text.encode("utf-8", "replace"), path).decode()
     lines = [line.strip() for line in text.splitlines() if line.strip() and line.lstrip()[0] not in "\"'"]
     header = _NTS_HEADER.fullmatch(lines[0]) if lines else None
     if header is None or header[7] is None:
@@ -189,6 +219,48 @@ def parse_nts(text: str, path: Path) -> LandmarkConfigurations:
         names = [path.name.removesuffix(path.suffix)]
     points = points.reshape(len(names), -1, width)
     return mark_missing(LandmarkConfigurations(names=tuple(names), points=points, where=str(path), notes=tuple(notes)))
+
+
+def parse_dta(text: str, path: Path) -> LandmarkConfigurations:
+    """Return the landmarks of a file of IDAV Landmark, which is NTS with the names of meshes."""
+    raw = parse_nts(text, path)
+    return replace(raw, names=tuple(re.sub(r"\.(ply|obj|stl)$", "", name, flags=re.IGNORECASE) for name in raw.names))
+
+
+def parse_morphologika(text: str, path: Path) -> LandmarkConfigurations:
+    """Return the landmarks of a Morphologika file; its labels and groups become columns."""
+    data = text.encode("utf-8", "replace")
+    data = numeric_text(data, path, max(data.lower().find(b"[rawpoints]"), 0), commas_separate=True)
+    sections, own = dict[str, list[str]](), list[str]()
+    for line in filter(None, map(str.strip, data.decode().splitlines())):
+        if section := re.fullmatch(r"\[\s*(\w+)\s*\].*", line):
+            own = sections.setdefault(section[1].lower(), [])
+        elif not line.startswith("'"):
+            own.append(line)
+    try:
+        n, p, width = (int(sections[key][0]) for key in ("individuals", "landmarks", "dimensions"))
+        words = " ".join(sections["rawpoints"]).split()
+    except (KeyError, IndexError, ValueError) as error:
+        problem = "a Morphologika file needs [individuals], [landmarks], [dimensions] and [rawpoints]"
+        raise damage_error(path, f"{problem}, each with its numbers") from error
+    names = sections.get("names") or [f"specimen {k}" for k in range(1, n + 1)]
+    if width not in (2, 3) or min(n, p) < 1 or len(words) != n * p * width or len(names) != n:
+        declared = f"it declares {n} individuals with {p} landmarks in {width} dimensions"
+        raise damage_error(path, f"{declared}, and has {len(names)} names and {len(words)} coordinates; {CUT_SHORT}")
+    points = np.array(coordinates(words, path, lambda k: f"specimen {names[k // (p * width)]!r}"))
+    labels, rows = " ".join(sections.get("labels", [])).split(), sections.get("labelvalues", [])
+    cells = [[row] if len(labels) == 1 else row.split() for row in rows]
+    if labels and (len(cells) != n or any(len(row) != len(labels) for row in cells)):
+        raise damage_error(
+            path, f"its [labelvalues] are not {n} rows with a value for each of {', '.join(labels)[:60]}"
+        )
+    columns = {label: tuple(row[k] for row in cells) for k, label in enumerate(labels)}
+    groups = re.findall(r"(\S+)\s+(\d{1,9})(?=\s|$)", " ".join(sections.get("groups", [])))
+    if groups and sum(int(count) for _, count in groups) == n:
+        columns["group"] = tuple(name for name, count in groups for _ in range(int(count)))
+    return mark_missing(LandmarkConfigurations(
+        names=tuple(names), points=points.reshape(n, p, width), columns=columns, where=str(path)
+    ))  # fmt: skip
 
 
 def nts_text(raw: LandmarkConfigurations) -> str:

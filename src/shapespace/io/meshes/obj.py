@@ -22,7 +22,7 @@ from shapespace.io.parsing import (
     line_blocks,
     mesh_of,
     number_lines,
-    plain_text,
+    numeric_text,
 )
 from shapespace.types import FloatArray, Mesh
 
@@ -44,7 +44,7 @@ def read_obj(data: bytes, path: Path) -> Mesh:
         FileFormatError: it has no `v` line, a line with too few numbers, or an index of zero.
         MeshError: faces that point past the end of the vertices.
     """
-    data = plain_text(data)
+    data = numeric_text(data, path)
     if b"\\" in data:
         data = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
     vertices: list[FloatArray] = []

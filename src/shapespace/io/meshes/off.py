@@ -23,7 +23,7 @@ from shapespace.io.parsing import (
     line_blocks,
     mesh_of,
     number_lines,
-    plain_text,
+    numeric_text,
 )
 from shapespace.types import FloatArray, Mesh
 
@@ -43,7 +43,7 @@ def read_off(data: bytes, path: Path) -> Mesh:
         FileFormatError: it is not text OFF in three dimensions, or it is cut short.
         MeshError: faces that point past the end of the vertices.
     """
-    rows = _rows(plain_text(data))
+    rows = _rows(numeric_text(data, path))
     first = next(rows, [b""])
     keyword = _KEYWORD.match(first[0])
     if keyword is None:

@@ -18,6 +18,7 @@ from shapespace.io.parsing import (
     join_parts,
     line_blocks,
     mesh_of,
+    numeric_text,
     plain_text,
 )
 from shapespace.io.read_limits import Allowance
@@ -46,7 +47,7 @@ def read_pcd(data: bytes, path: Path) -> Mesh:
     row, n = _row(head, path)
     kind = head["DATA"][0].lower()
     if kind == "ascii":
-        points = _text(data[data_start:], head, n, path)
+        points = _text(numeric_text(data, path, data_start)[data_start:], head, n, path)
     elif kind == "binary":
         check_count(n, row.itemsize, len(data) - data_start, "points", path)
         table = np.frombuffer(data, row, n, data_start)

@@ -25,6 +25,7 @@ from shapespace.io.parsing import (
     ints,
     join_parts,
     mesh_of,
+    numeric_text,
     plain_text,
     word_block,
 )
@@ -142,6 +143,8 @@ def read_ply(data: bytes, path: Path) -> Mesh:
     data = plain_text(data)
     order, elements, offset = _header(data, path)
     header = data[:offset]
+    if order == "":
+        data = numeric_text(data, path, offset)
     vertices: FloatArray | None = None
     colours: ByteArray | None = None
     observed: BoolArray | None = None

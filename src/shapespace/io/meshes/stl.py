@@ -19,6 +19,7 @@ from shapespace.io.parsing import (
     join_parts,
     line_blocks,
     mesh_of,
+    numeric_text,
     plain_text,
 )
 from shapespace.types import FloatArray, Mesh
@@ -73,7 +74,7 @@ def _ascii_corners(data: bytes, path: Path) -> FloatArray:
     corners: list[FloatArray] = []
     count = facets = 0
     last = b""
-    for lines in line_blocks(plain_text(data)):
+    for lines in line_blocks(numeric_text(data, path)):
         words = [split for split in map(bytes.split, map(bytes.lower, lines)) if split]
         rows = [split for split in words if split[0] == b"vertex"]
         facets += sum(split[0] == b"facet" for split in words)

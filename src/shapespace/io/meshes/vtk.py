@@ -31,6 +31,7 @@ from shapespace.io.parsing import (
     ints_of,
     join_parts,
     mesh_of,
+    numeric_text,
     plain_text,
     strip_triangles,
     word_block,
@@ -60,6 +61,8 @@ _BLANK_LINE = re.compile(rb"\n[ \t\r]*\n")
 _MAX_INFLATION = 1040
 _COLOUR_WIDTHS = (3, 4)  # RGB and RGBA
 _MOST_ATTRIBUTES = 100  # arrays searched for colours; limit on damaged files
+
+_LINE_NOTES = ("Its lines are not read, only their points; give curves as landmarks, such as curves of 3D Slicer.",)
 
 Values = npt.NDArray[Any]
 
@@ -184,7 +187,7 @@ def read_vtk(data: bytes, path: Path) -> Mesh:
     allowance = Allowance(len(data), path)
     cursor: _Cursor
     if encoding == b"ASCII":
-        cursor = _TextCursor(body, path)
+        cursor = _TextCursor(numeric_text(data, path, len(data) - len(body))[len(data) - len(body) :], path)
     elif encoding == b"BINARY":
         cursor = _BinaryCursor(body, path)
     else:
@@ -195,6 +198,7 @@ def read_vtk(data: bytes, path: Path) -> Mesh:
         raise damage_error(path, f"it has '{kind}', not DATASET POLYDATA; extract its surface first")
     vertices: FloatArray | None = None
     faces: list[IndexArray] = []
+    notes: tuple[str, ...] = ()
     while (word := cursor.word()) not in (b"", b"POINT_DATA", b"CELL_DATA"):
         allowance.part()
         if word == b"POINTS":
@@ -206,6 +210,8 @@ def read_vtk(data: bytes, path: Path) -> Mesh:
                 faces.append(fan_triangles(counts, corners))
             elif word == b"TRIANGLE_STRIPS":
                 faces.append(strip_triangles(counts, corners))
+            elif word == b"LINES" and len(counts):
+                notes = _LINE_NOTES
         elif word == b"FIELD":
             begin = cursor.position
             cursor.word()
@@ -222,7 +228,7 @@ def read_vtk(data: bytes, path: Path) -> Mesh:
     if vertices is None:
         raise damage_error(path, f"it has no POINTS; {CUT_SHORT}")
     colours = _legacy_colours(cursor, len(vertices)) if word == b"POINT_DATA" else None
-    return mesh_of(vertices, join_parts(faces, np.int64, 3), path, colours, header=b"\n".join(header))
+    return mesh_of(vertices, join_parts(faces, np.int64, 3), path, colours, notes, header=b"\n".join(header))
 
 
 def _legacy_colours(cursor: _Cursor, vertices: int) -> ByteArray | None:
@@ -391,7 +397,7 @@ def read_vtp(data: bytes, path: Path) -> Mesh:
         tag, _, body = tail.partition(b">")
         head += mark + tag + b"/></VTKFile>"
         appended = body.partition(b"_")[2]
-    root = xml_root(head, path)
+    root = xml_root(numeric_text(head, path), path)
     if root.tag != "VTKFile" or root.get("type") != "PolyData":
         raise damage_error(path, "it is not a VTK file of type PolyData; extract its surface first")
     compressor = root.get("compressor", "")
@@ -436,9 +442,11 @@ def read_vtp(data: bytes, path: Path) -> Mesh:
         raise damage_error(path, f"it holds no points; {CUT_SHORT}")
     known_colours = [part for part in colours if part is not None]
     vertex_colours = np.concatenate(known_colours) if len(known_colours) == len(colours) else None
+    has_lines = any(piece.get("NumberOfLines", "0") != "0" for piece in root.iterfind("PolyData/Piece"))
+    notes = _LINE_NOTES if has_lines else ()
     spaces = [_data_array(a, xml).astype(np.uint8) for a in root.iterfind("PolyData/FieldData/*[@Name='SPACE']")]
     return mesh_of(
-        np.concatenate(points), join_parts(faces, np.int64, 3), path, vertex_colours,
+        np.concatenate(points), join_parts(faces, np.int64, 3), path, vertex_colours, notes,
         header=b"".join(b" SPACE=" + codes.tobytes() for codes in spaces),
     )  # fmt: skip
 

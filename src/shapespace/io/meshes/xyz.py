@@ -7,18 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
-from shapespace.io.parsing import CUT_SHORT, damage_error, floats, ints, join_parts, line_blocks, mesh_of, plain_text
+from shapespace.io.parsing import CUT_SHORT, damage_error, floats, ints, join_parts, line_blocks, mesh_of, numeric_text
 from shapespace.types import FloatArray, Mesh
 
 _COMMENTS = (b"#", b"//", b"%")
-_SEPARATORS = bytes.maketrans(b",;\t", b"   ")
 
 
 def read_xyz(data: bytes, path: Path) -> Mesh:
     """Read rows whose first three numbers are a point; intensity, colour and normals are ignored.
 
     A row of one number says how many points follow it. A first line of words is the names of columns, and `#`, `//` and
-    `%` begin comments; commas and semicolons are spaces.
+    `%` begin comments; commas, semicolons and white space separate numbers, which may have decimal commas.
 
     Args:
         data: the whole file.
@@ -31,8 +30,8 @@ def read_xyz(data: bytes, path: Path) -> Mesh:
         raise damage_error(path, "it is binary; of this ending only text with rows of x y z is read")
     parts: list[FloatArray] = []
     width = lines_before = declared = 0
-    for lines in line_blocks(plain_text(data)):
-        rows = [line.translate(_SEPARATORS).split() for line in lines if not line.lstrip().startswith(_COMMENTS)]
+    for lines in line_blocks(numeric_text(data, path, commas_separate=True)):
+        rows = [line.replace(b";", b" ").split() for line in lines if not line.lstrip().startswith(_COMMENTS)]
         rows = [row for row in rows if row]
         if rows and not lines_before and not width and not _is_number(rows[0][0]) and len(rows[0]) >= 3:
             rows = rows[1:]

@@ -133,7 +133,7 @@ def table_rows(content: bytes) -> Iterator[list[str]]:
     if content.startswith(_OLD_EXCEL):
         raise ValueError("is an Excel file of the old format (.xls); save it as .xlsx or CSV")
     try:
-        lines = _sheet(content) if content.startswith(WORKBOOK_START) else _csv_lines(decoded_text(content))
+        lines = _sheet(content) if content.startswith(WORKBOOK_START) else csv_lines(decoded_text(content))
         raw = next(lines, list[str]())
         while raw and not raw[-1].strip():
             raw.pop()
@@ -150,7 +150,8 @@ def table_rows(content: bytes) -> Iterator[list[str]]:
             if len(row) > len(raw) and not any(cell.strip() for cell in row[len(raw) :]):
                 del row[len(raw) :]
             if len(row) > len(raw) or (checksum_column is not None and len(row) != len(raw)):
-                raise ValueError(f"has {len(row)} cells in row {number}, and {len(raw)} columns")
+                comma = " (with decimal commas, separate the columns by semicolons)" * (checksum_column is None)
+                raise ValueError(f"has {len(row)} cells in row {number}, and {len(raw)} columns{comma}")
             if checksum_column is not None and row_checksum(raw, row) != row[checksum_column]:
                 raise ValueError(f"was changed in row {number} since it was written, as its column {CHECKSUM} tells")
             n_unchecked += len(raw) - len(row)
@@ -195,7 +196,8 @@ def decoded_text(content: bytes) -> str:
         return content.decode("latin-1" if is_undefined else "cp1252")
 
 
-def _csv_lines(text: str) -> Iterator[list[str]]:
+def csv_lines(text: str) -> Iterator[list[str]]:
+    """Yield the lines of text separated by commas, semicolons or tabs that have a cell, as `table_rows` describes."""
     first = text[: text.find("\n") + 1].strip() if "\n" in text else ""
     stated = _SEPARATOR.fullmatch(first)
     if stated and stated[1] in _DELIMITERS:
@@ -212,6 +214,8 @@ def _delimiter(text: str) -> str:
     start = text.lstrip("\r\n \ufeff")
     end = re.search(r"[\r\n]", start)
     header = re.sub(r'"[^"]*"', "", start[: end.start()] if end else start)
+    # A table without a header may begin with decimal commas.
+    header = re.sub(r"(?<=\d),(?=\d)", "", header) if ";" in header else header
     return max(_DELIMITERS, key=header.count)
 
 
@@ -222,7 +226,9 @@ def _with_decimal_points(lines: list[list[str]]) -> list[list[str]]:
         ValueError: a column has both, or points for thousands.
     """
     for column, name in enumerate(lines[0] if lines else []):
-        cells = {number: line[column].strip() for number, line in enumerate(lines) if number and column < len(line)}
+        cells = {number: line[column].strip() for number, line in enumerate(lines) if column < len(line)}
+        if not _DECIMAL_COMMA.fullmatch(cells[0]):
+            del cells[0]
         cells = {number: cell for number, cell in cells.items() if cell.lower() not in MISSING}
         with_comma = [n for n, cell in cells.items() if _DECIMAL_COMMA.fullmatch(cell) or _THOUSANDS.fullmatch(cell)]
         other_cells = [cell for number, cell in cells.items() if number not in set(with_comma)]
