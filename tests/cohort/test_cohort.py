@@ -386,9 +386,21 @@ def test_meshes_in_correspondence_are_a_cohort(meshes: Callable[..., Path], tmp_
 
 
 def test_meshes_that_are_not_in_correspondence_are_refused(meshes: Callable[..., Path], tmp_path: Path) -> None:
-    table = meshes(change=lambda k, mesh: Mesh(mesh.vertices, mesh.faces[::-1]) if k == 3 else mesh)  # type: ignore[index]
-    with pytest.raises(CorrespondenceError, match="m3 has other vertices or triangles than m0"):
+    table = meshes(change=lambda k, mesh: Mesh(mesh.vertices, (mesh.faces + 1) % 80) if k == 3 else mesh)
+    with pytest.raises(CorrespondenceError, match="m3 and m0 have different triangles on the same number of vertices"):
         read_cohort(table, CohortConfig(shapes=tmp_path / "meshes"))
+
+
+def test_meshes_with_the_triangles_of_the_first_in_another_order_are_the_same_cohort() -> None:
+    plain = training_meshes(5, vertices=80)
+    turned = [Mesh(mesh.vertices, mesh.faces[::-1, ::-1]) if k else mesh for k, mesh in enumerate(plain)]
+    known, cohort = (Cohort.of_meshes(own, blank(5)[1]) for own in (plain, turned))
+    assert np.array_equal(cohort.coefficients, known.coefficients) and np.array_equal(cohort.faces, plain[0].faces)
+    new = Cohort.of_meshes(turned[3:], blank(2)[1], onto=known)
+    assert np.array_equal(new.faces, plain[0].faces)
+    other = Mesh(plain[4].vertices, (plain[4].faces + 1) % 80, name="other.ply")
+    with pytest.raises(CorrespondenceError, match=r"other\.ply and blob_0\.ply have different triangles"):
+        Cohort.of_meshes([other], blank(1)[1], onto=known)
 
 
 def cut(meshes: Sequence[Mesh], seed: int = 0, share: float = 0.15) -> list[Mesh]:
