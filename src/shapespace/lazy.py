@@ -41,6 +41,7 @@ LAZY_FUNCTIONS: Mapping[str, str] = MappingProxyType(
         "to_open3d": "io.interop",
         "to_pyvista": "io.interop",
         "to_trimesh": "io.interop",
+        "trusted_surfaces": "store.corresponding",
         "view_fit": "viewer.notebook_viewer",
         "view_model": "viewer.notebook_viewer",
     }

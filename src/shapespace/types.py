@@ -14,7 +14,7 @@ from math import isfinite
 from numbers import Integral
 from os import PathLike
 from types import MappingProxyType
-from typing import Any, TypeAlias
+from typing import Any, NoReturn, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -532,8 +532,18 @@ class LabelVolume:
         return read_only(np.linalg.norm(self.affine[:3, :3], axis=0))
 
 
+def are_same_triangles(first: IntArray | None, second: IntArray | None) -> bool:
+    """Whether two arrays (F, 3) are the same triangles, in any order, orientation and from any of their corners."""
+    if first is None or second is None:
+        return first is second
+    if first.shape != second.shape or np.array_equal(first, second):
+        return first.shape == second.shape
+    corners = (np.sort(first, axis=1), np.sort(second, axis=1))
+    return np.array_equal(*(rows[np.lexsort(rows.T)] for rows in corners))
+
+
 def common_faces(meshes: Iterable[Mesh]) -> IntArray | None:
-    """Return the triangles that all `meshes` share, or None for point clouds.
+    """Return the triangles that all `meshes` share, as the first has them, or None for point clouds.
 
     Raises:
         CorrespondenceError: two of them differ; the message names the second.
@@ -542,18 +552,15 @@ def common_faces(meshes: Iterable[Mesh]) -> IntArray | None:
     for mesh in meshes:
         if first is None:
             first = mesh
-            continue
-        if len(mesh.vertices) != len(first.vertices):
-            raise CorrespondenceError(
-                f"{mesh.name} has {len(mesh.vertices)} vertices but {first.name} has {len(first.vertices)}; "
-                "a shape model needs meshes in vertex correspondence, so run shapespace correspond on them first."
-            )
-        same = (mesh.faces is None) == (first.faces is None) and (
-            mesh.faces is None or first.faces is None or np.array_equal(mesh.faces, first.faces)
-        )
-        if not same:
-            raise CorrespondenceError(
-                f"{mesh.name} and {first.name} have different triangles on the same number of vertices; "
-                "a shape model needs meshes in vertex correspondence, so run shapespace correspond on them first."
-            )
+        elif len(mesh.vertices) != len(first.vertices):
+            _refuse_pair(f"{mesh.name} has {len(mesh.vertices)} vertices but {first.name} has {len(first.vertices)}")
+        elif not are_same_triangles(mesh.faces, first.faces):
+            _refuse_pair(f"{mesh.name} and {first.name} have different triangles on the same number of vertices")
     return None if first is None else first.faces
+
+
+def _refuse_pair(difference: str) -> NoReturn:
+    raise CorrespondenceError(
+        f"{difference}; only meshes in vertex correspondence can be modelled or compared, so run shapespace correspond "
+        "on them first."
+    )

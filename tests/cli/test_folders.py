@@ -243,3 +243,21 @@ def test_a_log_says_how_far_a_long_step_is_ever_more_rarely(
         step(1, 2)
         time.sleep(0.2)
     assert not capsys.readouterr().err
+
+
+def test_meshes_that_check_has_mirrored_and_the_others_are_one_collection(
+    run: Run, world: World, tmp_path: Path
+) -> None:
+    """Left bones as they are and right ones mirrored have the same vertices, and triangles the other way round."""
+    files, left, right = sorted(world.meshes.glob("*.ply")), tmp_path / "left", tmp_path / "right"
+    for number, file in enumerate(files):
+        mesh = read_mesh(file)
+        (right if number % 2 else left).mkdir(exist_ok=True)
+        if number % 2:
+            mesh = mesh.with_vertices(mesh.vertices * [-1.0, 1.0, 1.0])
+        write_mesh((right if number % 2 else left) / file.name, mesh)
+    assert run("check", right, "-o", tmp_path / "mirrored", "--mirror").code == 0
+    known = run("build", world.meshes, "-o", tmp_path / "known.h5", "--json").facts
+    built = run("build", left, tmp_path / "mirrored", "-o", tmp_path / "model.h5", "--json").facts
+    assert built["training_shapes"] == known["training_shapes"] == len(files)
+    assert built["stddev_mm"] == pytest.approx(known["stddev_mm"], rel=1e-4)

@@ -59,7 +59,7 @@ def test_landmarks_are_converted_with_their_sliders_and_what_is_left_out_is_prin
 ) -> None:
     sliders = tmp_path / "curves.csv"
     sliders.write_text("before,slide,after\n1,2,3\n")
-    outcome = run("landmarks", "convert", table, tmp_path / "newts.tps", "--sliders", sliders)
+    outcome = run("landmarks", "convert", table, "-o", tmp_path / "newts.tps", "--sliders", sliders)
     assert outcome.code == 0 and "24 specimens with 9 landmarks" in outcome.out
     assert outcome.err.splitlines() == [
         "Columns of the table (sex, site) are left out, since the format tps has none.",

@@ -103,3 +103,21 @@ def test_help_of_all_commands_takes_less_than_a_second_each() -> None:
         start = time.process_time()
         printed(*command.name.split(), "--help-all")
         assert time.process_time() - start < 1.0, command.name
+
+
+@pytest.mark.parametrize(
+    ("arguments", "usage", "sentence"),
+    [
+        (("buidl", "faces"), "usage: shapespace [-h]", "there is no command 'buidl'; did you mean build?"),
+        (("landmarks", "convrt", "a"), "usage: shapespace landmarks", "'convrt'; did you mean convert?"),
+        (("build", "faces", "--outpt", "m.h5"), "usage: shapespace build", "no option --outpt; did you mean --output?"),
+        (("test", "pls", "x", "--permutatoins=9"), "usage: shapespace test pls", "did you mean --permutations?"),
+        (("build", "faces", "-o", "m.h5", "--qqq"), "usage: shapespace build", "there is no option --qqq\n"),
+        (("info", "m.h5", "-z"), "usage: shapespace info", "unrecognized arguments: -z"),
+    ],
+)
+def test_a_misspelt_command_or_option_names_the_nearest_below_the_usage_of_its_command(
+    run: Run, arguments: tuple[str, ...], usage: str, sentence: str
+) -> None:
+    outcome = run(*arguments)
+    assert outcome.code == 2 and outcome.err.startswith(usage) and sentence in outcome.err

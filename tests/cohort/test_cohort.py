@@ -281,7 +281,7 @@ def test_a_table_names_fits_by_their_scans_and_tells_whom_it_lacks(fits: Path, t
     rows = "".join(f"../scans/scan{k}.ply,{k}\n" for k in (9, 0, 3)) + "stranger.ply,7\n"
     write_text(tmp_path / "data.csv", f"{column},age\n{rows}")
     cohort = read_cohort(tmp_path / "data.csv", CohortConfig(shapes=fits))
-    assert cohort.names == ("scan9", "scan0") and list(cohort.table.numbers("age")) == [9, 0]
+    assert cohort.names == ("scan0", "scan9") and list(cohort.table.numbers("age")) == [0, 9]
     told = " ".join(cohort.notes)
     assert "1 of 4 rows" in told and "(stranger)" in told
     assert "1 of 3 fits are left out, which are doubtful (scan3)" in told
@@ -386,9 +386,21 @@ def test_meshes_in_correspondence_are_a_cohort(meshes: Callable[..., Path], tmp_
 
 
 def test_meshes_that_are_not_in_correspondence_are_refused(meshes: Callable[..., Path], tmp_path: Path) -> None:
-    table = meshes(change=lambda k, mesh: Mesh(mesh.vertices, mesh.faces[::-1]) if k == 3 else mesh)  # type: ignore[index]
-    with pytest.raises(CorrespondenceError, match="m3 has other vertices or triangles than m0"):
+    table = meshes(change=lambda k, mesh: Mesh(mesh.vertices, (mesh.faces + 1) % 80) if k == 3 else mesh)
+    with pytest.raises(CorrespondenceError, match="m3 and m0 have different triangles on the same number of vertices"):
         read_cohort(table, CohortConfig(shapes=tmp_path / "meshes"))
+
+
+def test_meshes_with_the_triangles_of_the_first_in_another_order_are_the_same_cohort() -> None:
+    plain = training_meshes(5, vertices=80)
+    turned = [Mesh(mesh.vertices, mesh.faces[::-1, ::-1]) if k else mesh for k, mesh in enumerate(plain)]
+    known, cohort = (Cohort.of_meshes(own, blank(5)[1]) for own in (plain, turned))
+    assert np.array_equal(cohort.coefficients, known.coefficients) and np.array_equal(cohort.faces, plain[0].faces)
+    new = Cohort.of_meshes(turned[3:], blank(2)[1], onto=known)
+    assert np.array_equal(new.faces, plain[0].faces)
+    other = Mesh(plain[4].vertices, (plain[4].faces + 1) % 80, name="other.ply")
+    with pytest.raises(CorrespondenceError, match=r"other\.ply and blob_0\.ply have different triangles"):
+        Cohort.of_meshes([other], blank(1)[1], onto=known)
 
 
 def cut(meshes: Sequence[Mesh], seed: int = 0, share: float = 0.15) -> list[Mesh]:
@@ -506,3 +518,16 @@ def test_coefficients_state_their_modes_and_share_of_the_variance(modes: int) ->
     assert cohort.source == ShapeSource("coefficients", modes, share)
     assert str(cohort.source) == f"coefficients, {modes} modes, {100 * share:.0f} % of the variance"
     assert cohort.take([0, 1]).source == cohort.source
+
+
+def test_the_order_of_the_rows_of_a_table_does_not_change_a_cohort(meshes: Callable[..., Path], tmp_path: Path) -> None:
+    table = meshes(12)
+    heads, *rows = table.read_text().splitlines()
+    cohorts: list[Cohort] = []
+    for order in (rows, rows[::-1], [*rows[5:], *rows[:5]]):
+        write_text(table, "\n".join([heads, *order, ""]))
+        cohorts.append(read_cohort(table, CohortConfig(shapes=tmp_path / "meshes")))
+    assert cohorts[0].names == tuple(f"m{k}" for k in range(12))
+    for cohort in cohorts[1:]:
+        assert cohort.names == cohorts[0].names and list(cohort.table.numbers("age")) == list(range(12))
+        assert np.array_equal(cohort.coefficients, cohorts[0].coefficients)

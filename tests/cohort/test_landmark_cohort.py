@@ -85,6 +85,7 @@ def test_a_file_a_folder_of_align_and_a_table_beside_either_are_the_same_cohort(
     assert any("default options" in note for note in cohorts[0].notes) and len(cohorts[1].notes) == 1
     assert "aligned: 1 specimen to check (see align.json)." in cohorts[1].notes[0]
     for cohort in cohorts:
+        assert cohort.names == cohorts[0].names
         order = [cohort.names.index(name) for name in NAMES]
         assert np.allclose(cohort.sizes_mm[order], cohorts[0].sizes_mm, rtol=1e-12)
         distances = np.linalg.norm(cohort.coefficients[order][:, None] - cohort.coefficients[order], axis=2)
@@ -92,7 +93,7 @@ def test_a_file_a_folder_of_align_and_a_table_beside_either_are_the_same_cohort(
         # The second ends its iterations from another first specimen.
         assert np.allclose(distances, own, atol=1e-4)
         assert cohort.table.texts("sex") == tuple(SEX[NAMES.index(name)] for name in cohort.names)
-    assert cohorts[2].table.numbers("age").tolist() == list(range(10, 10 + N))
+    assert cohorts[2].table.numbers("age").tolist() == list(range(10, 10 + N))[::-1]
 
 
 def test_rows_without_landmarks_and_landmarks_without_rows_are_left_out_with_notes(file: Path, tmp_path: Path) -> None:

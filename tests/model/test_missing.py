@@ -157,7 +157,25 @@ def test_seldom_shown_vertices_go_with_their_triangles_and_landmarks() -> None:
     assert dict(model.landmarks) == {"there": 29}
     assert model.faces is not None and model.faces.max() == 188
     assert ShapeModel.fit(holed(meshes, shown), min_seen=0.4).n_vertices == 199
-    assert ShapeModel.fit(holed(meshes, shown), alignment_vertices=np.arange(15, 60, dtype=np.int32)).n_vertices == 189
+    assert list(model.dropped_vertices) == [5, *range(20, 30)]
+
+
+def test_a_model_takes_shapes_of_its_source_also_from_its_file(tmp_path: Path) -> None:
+    meshes = training_meshes(count=8, vertices=100)
+    shown = np.ones((8, 100), dtype=bool)
+    shown[:, 20:30] = False
+    given = holed(meshes, shown)
+    model = ShapeModel.fit(given, modes=3)
+    model.save(tmp_path / "m.h5")
+    kept = np.delete(meshes[2].vertices, np.arange(20, 30), axis=0)
+    loaded = ShapeModel.load(tmp_path / "m.h5")
+    for shape in (given[2], meshes[2].vertices):
+        np.testing.assert_array_equal(loaded.project(shape), model.project(kept))
+    assert loaded.content_hash == model.content_hash == replace(model, dropped_vertices=[]).content_hash
+    b = model.stddev * [1.0, -1.0, 0.5]
+    partial = np.insert(model.reconstruct(b), [20] * 10, np.nan, axis=0)
+    partial[40:60] = np.nan
+    np.testing.assert_allclose(model.project(partial, align=False), b, atol=0.02 * model.stddev[0])
 
 
 @pytest.mark.parametrize("modes", [3, 0.9, "auto"])

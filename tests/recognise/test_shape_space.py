@@ -1,12 +1,16 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 from sklearn.base import clone
+from sklearn.model_selection import GridSearchCV, cross_val_score
 from sklearn.pipeline import make_pipeline
 
 import shapespace as ss
 from shapespace.batch.fit_records import Source, failed_record, fit_record
 from shapespace.errors import CorrespondenceError, FileFormatError, InputError
 from shapespace.fit.fit_scan import FitConfig, fit_scan
+from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.recognise.classifiers import CLASSIFIERS
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model, raw_scan, similarity, training_meshes
@@ -76,8 +80,8 @@ def test_what_does_not_belong_to_the_model_is_refused():
         space.transform([other])
     with pytest.raises(FileFormatError, match="number 1 is damaged"):
         space.transform([{"status": "converged"}])
-    with pytest.raises(InputError, match="neither a mesh nor a fit"):
-        space.transform([np.zeros((300, 3))])
+    with pytest.raises(InputError, match="int is no mesh"):
+        space.transform([3])
     with pytest.raises(InputError, match="meshes in correspondence"):
         ss.ShapeSpace().fit([other])
     with pytest.raises(InputError, match="no kind of meshes"):
@@ -101,3 +105,42 @@ def test_it_is_the_first_step_of_a_pipeline_that_can_be_cloned():
     fitted = clone(pipeline).fit(MESHES, labels)
     assert fitted.predict_proba(MESHES[:5]).shape == (5, 2)
     assert fitted[0].model_hash_ == ss.ShapeModel.fit(MESHES, modes=4).content_hash
+
+
+def partly_observed(meshes: tuple[Mesh, ...]) -> list[Mesh]:
+    """Return meshes as correspond writes them: estimates where they are not observed, at vertices 0 to 8 most often."""
+    out: list[Mesh] = []
+    for k, mesh in enumerate(meshes):
+        observed = np.ones(len(mesh.vertices), dtype=np.bool_)
+        observed[: 9 if k % 5 else 3], observed[20 + 3 * k : 30 + 3 * k] = False, False
+        out.append(Mesh(mesh.vertices, mesh.faces, name=mesh.name, observed=observed))
+    return out
+
+
+def test_meshes_with_rarely_observed_vertices_go_through_all_steps_of_scikit_learn():
+    plain = training_meshes(12, 100)
+    meshes = partly_observed(plain)
+    space = ss.ShapeSpace(modes=3).fit(meshes)
+    model, z = space.model_, space.transform(meshes)
+    assert model.n_vertices == 91 and list(model.dropped_vertices) == list(range(9))
+    np.testing.assert_allclose(z, [model.to_z(model.project(mesh)) for mesh in meshes])
+    complete = ss.ShapeSpace(modes=3).fit_transform(plain)
+    assert np.abs(np.corrcoef(z[:, 0], complete[:, 0])[0, 1]) > 0.95  # a fifth of the vertices is missing
+    labels = ["long", "short"] * 6
+    pipeline = make_pipeline(ss.ShapeSpace(modes=2), CLASSIFIERS["lda"](0))
+    search = GridSearchCV(pipeline, {"shapespace__modes": [2]}, cv=2, error_score="raise", refit=False)
+    score = search.fit(meshes, labels).cv_results_["mean_test_score"][0]
+    assert score == cross_val_score(pipeline, meshes, labels, cv=2, error_score="raise").mean()
+
+
+@pytest.mark.parametrize("kind", ["paths", "folder", "array"])
+def test_paths_folders_and_arrays_are_taken_as_build_model_takes_them(kind: str, tmp_path: Path):
+    meshes = [Mesh(mesh.vertices.astype(np.float32), mesh.faces) for mesh in MESHES[:6]]
+    paths = [tmp_path / f"m{k}.ply" for k in range(6)]
+    for path, mesh in zip(paths, meshes, strict=True):
+        write_mesh(path, mesh)
+    given = {"paths": paths, "folder": tmp_path, "array": np.stack([mesh.vertices for mesh in meshes])}[kind]
+    space = ss.ShapeSpace(modes=3).fit(given)
+    np.testing.assert_allclose(space.transform(given), ss.ShapeSpace(modes=3).fit_transform(meshes), atol=1e-9)
+    model = ss.build_model(given, ss.BuildConfig(modes=3))
+    assert model.content_hash == space.model_hash_ and model.n_training == 6

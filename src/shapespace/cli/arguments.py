@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import difflib
+import itertools
 import textwrap
 from collections.abc import Sequence
 from typing import Any
@@ -48,7 +50,25 @@ class CommandParser(argparse.ArgumentParser):
     ) -> Any:
         """Parse arguments after adding the options."""
         self._add_options(help_level="basic")
-        return super().parse_known_args(args, namespace)
+        if self._command:  # before what is missing, and not in the parser of all commands, whose usage is another
+            known = [name for name in self._option_string_actions if name.startswith("--")]
+            for text in itertools.takewhile(lambda text: text != "--", args):
+                option = text.partition("=")[0]
+                if option.startswith("--") and not any(name.startswith(option) for name in known):
+                    self.error(f"there is no option {option}{_suggestion(option, known)}")
+        parsed, unknown = super().parse_known_args(args, namespace)
+        if unknown and self._command:
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return parsed, unknown
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        """Name the command that is nearest to an unknown one."""
+        names: list[str] = list(action.choices or ()) if action.metavar and not action.option_strings else []
+        if self._command is None and names and value not in names:
+            raise argparse.ArgumentError(
+                None, f"there is no command {value!r}{_suggestion(value, names)} (commands: {', '.join(names)})"
+            )
+        super()._check_value(action, value)
 
     def format_help(self, *, everything: bool = False) -> str:
         """Return the help: basic options, or all."""
@@ -96,6 +116,11 @@ class _HelpAll(argparse.Action):
         """Print it, and end."""
         print(parser.format_help(everything=True), end="")
         parser.exit()
+
+
+def _suggestion(text: str, known: Sequence[str]) -> str:
+    nearest = difflib.get_close_matches(text, known, 1)
+    return f"; did you mean {nearest[0]}?" if nearest else ""
 
 
 def _sentence(summary: str) -> str:

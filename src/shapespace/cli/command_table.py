@@ -117,12 +117,12 @@ class Command:
         endings = {"+": "...", "*": "...]", "?": "]"}
         words = ["shapespace", self.name]
         for option in self.options:
-            if option.is_positional:
+            if option.is_positional and not option.hidden:
                 start = "[" if option.nargs in ("*", "?") else ""
                 words.append(f"{start}{option.metavar}{endings.get(option.nargs or '', '')}")
         needed: dict[str, list[str]] = {}
         for option in self.options:
-            if option.required:
+            if option.required and not option.hidden:
                 needed.setdefault(option.either or option.names, []).append(f"{option.spellings[0]} {option.metavar}")
         words += [f"({' | '.join(either)})" if len(either) > 1 else either[0] for either in needed.values()]
         return " ".join([*words, "[options]"])
@@ -149,7 +149,7 @@ _IDENTITY_RULES = (
     "asymmetry, regress and score."
 )
 _TARGET = "target"
-_MODES = "modes"
+_MODES, _TARGET = "modes", "target"
 _CHANGE = "change"
 
 
@@ -660,11 +660,14 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command(
         "landmarks convert", "convert landmarks of many specimens between TPS, NTS, MorphoJ, CSV, R and Slicer files",
-        ("shapespace landmarks convert skulls.tps skulls.csv",
-         "shapespace landmarks convert plethodon.rda morphoj.txt"), run.landmarks_convert,
+        ("shapespace landmarks convert skulls.tps -o skulls.csv",
+         "shapespace landmarks convert plethodon.rda -o morphoj.txt"), run.landmarks_convert,
         (
             _LANDMARK_DATA,
-            basic("output", "OUT", "file; a folder for formats with a file for each specimen", parse=Path),
+            basic("out", "OUT", "the same as --output", parse=Path, nargs="?", required=True, either=_TARGET,
+                  hidden=True),
+            basic("-o --output", "OUT", "file; a folder for formats with a file for each specimen", parse=Path,
+                  required=True, either=_TARGET),
             basic("--to", "FORMAT", source=LANDMARKS_CONVERT),
             _SLIDERS,
             basic("--object", "NAME", source=LANDMARKS_CONVERT, field="object_name"),

@@ -459,15 +459,16 @@ def landmarks_convert(arguments: argparse.Namespace) -> int:
     from shapespace.commands.landmark_data import convert_landmarks
     from shapespace.report.blocks.wording import counted
 
-    found, notes = convert_landmarks(arguments.data, arguments.output, **given(arguments, convert_landmarks))
+    output = arguments.output or arguments.out
+    found, notes = convert_landmarks(arguments.data, output, **given(arguments, convert_landmarks))
     for note in notes:
         say(note)
     if arguments.json:
-        show_json({"output": str(arguments.output), "specimens": len(found), "landmarks": len(found.landmarks),
+        show_json({"output": str(output), "specimens": len(found), "landmarks": len(found.landmarks),
                    "dimensions": found.dimensions, "notes": notes})  # fmt: skip
     else:
         specimens, landmarks = counted(len(found), "specimen"), counted(len(found.landmarks), "landmark")
-        show(f"{specimens} with {landmarks} in {arguments.output}")
+        show(f"{specimens} with {landmarks} in {output}")
     return 0
 
 

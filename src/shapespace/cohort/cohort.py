@@ -18,7 +18,7 @@ from shapespace.cohort.classes import class_notes
 from shapespace.cohort.incomplete import complete_by_population, completed_shapes
 from shapespace.cohort.shape_samples import ShapeSamples
 from shapespace.cohort.table import Table, list_names, numbers_as_text
-from shapespace.errors import CorrespondenceError, InputError
+from shapespace.errors import InputError
 from shapespace.geometry.landmark_alignment import AlignedLandmarks, project_to_tangent
 from shapespace.geometry.procrustes import Gauge, align_in_place, centroid_size, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
@@ -27,7 +27,7 @@ from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import list_briefly, short_repr
 from shapespace.schemas import SurfaceReview
-from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, SurfaceLandmarks, read_only
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, SurfaceLandmarks, common_faces, read_only
 
 SUBJECT = "subject"
 """The column that says whose a shape is, unless another is named."""
@@ -492,19 +492,15 @@ class Cohort:
             CorrespondenceError: meshes that differ in vertices or triangles.
             InputError: as `of_shapes`.
         """
-        first = meshes[0]
-        for mesh in meshes[1:]:
-            if mesh.vertices.shape != first.vertices.shape or not _same_faces(mesh.faces, first.faces):
-                raise CorrespondenceError(
-                    f"{mesh.name} has other vertices or triangles than {first.name}; only meshes in correspondence "
-                    "can be compared, so bring the scans to it with shapespace correspond."
-                )
+        has_triangles = onto is not None and onto.faces is not None and meshes[0].faces is not None
+        known = [Mesh(onto.reference, onto.faces, name=onto.names[0])] if onto is not None and has_triangles else []
+        faces = common_faces([*known, *meshes])
         shapes = np.stack([mesh.vertices for mesh in meshes])
         names = [mesh.name for mesh in meshes]
-        all_observed = np.ones(len(first.vertices), dtype=np.bool_)
+        all_observed = np.ones(shapes.shape[1], dtype=np.bool_)
         observed = np.stack([all_observed if mesh.observed is None else mesh.observed for mesh in meshes])
         cohort = Cohort.of_shapes(
-            shapes, {}, names=names, faces=first.faces, gauge=gauge, onto=onto, least=least, observed=observed,
+            shapes, {}, names=names, faces=faces, gauge=gauge, onto=onto, least=least, observed=observed,
             samples=samples,
         )  # fmt: skip
         stds = [mesh.position_std for mesh in meshes if mesh.position_std is not None]
@@ -685,12 +681,6 @@ def _in_basis(rows: FloatArray, coefficients: FloatArray) -> tuple[FloatArray, F
         return read_only(rows), read_only(coefficients)
     q, r = np.linalg.qr(rows.T)
     return read_only(q.T), read_only(coefficients @ r.T)
-
-
-def _same_faces(first: npt.NDArray[np.int32] | None, second: npt.NDArray[np.int32] | None) -> bool:
-    return (first is None and second is None) or (
-        first is not None and second is not None and np.array_equal(first, second)
-    )
 
 
 def _cell(value: object) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from shapespace.cohort.cohort import Cohort, padded
-from shapespace.cohort.table import Table, list_names, note_unmatched, numbers_as_text, read_table
+from shapespace.cohort.table import Table, list_names, name_key, note_unmatched, numbers_as_text, read_table
 from shapespace.errors import FileFormatError, InputError
 from shapespace.geometry.landmark_alignment import AlignConfig, AlignedLandmarks, align_landmarks
 from shapespace.geometry.procrustes import Gauge, centroid_size
@@ -224,18 +224,19 @@ def join_table(
         table: of further covariates, whose key column names the specimens; None for none.
         where: what the specimens are called in messages.
         keep_unmatched: keep specimens without a row, with empty cells, in the order of `names`; otherwise specimens
-            are in the order of the table.
+            are sorted by name.
 
     Raises:
         InputError: no row is of a specimen.
     """
     own = Table(columns, tuple(names), where)
+    every = range(len(names)) if keep_unmatched else sorted(range(len(names)), key=lambda k: name_key(names[k]))
     if table is None:
-        return list(range(len(names))), own, []
+        return list(every), own.take(every), []
     number = {stem_of(name): k for k, name in enumerate(names)} | {name: k for k, name in enumerate(names)}
     given, keys = read_table(table, number)
     row = {number[key]: k for k, key in enumerate(keys) if key in number}
-    rows, notes = list(range(len(names))) if keep_unmatched else list(row), list[str]()
+    rows, notes = [k for k in every if keep_unmatched or k in row], list[str]()
     note_unmatched(notes, given, keys, number, [names[k] for k in row], names, where, remedy="name the specimens alike")
     joined = {name: tuple(cells[row[k]] if k in row else "" for k in rows) for name, cells in given.columns.items()}
     return rows, Table({**own.take(rows).columns, **joined}, tuple(names[k] for k in rows), given.where), notes

@@ -14,7 +14,7 @@ import numpy as np
 from shapespace.cohort.cohort import Cohort, Fitted, ShapeSource
 from shapespace.cohort.landmark_cohort import has_landmarks, landmark_cohort, read_landmark_cohort
 from shapespace.cohort.shape_samples import ENDING, SampleFile, find_samples
-from shapespace.cohort.table import Table, list_names, note_unmatched, read_table
+from shapespace.cohort.table import Table, list_names, name_key, note_unmatched, read_table
 from shapespace.errors import InputError
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.landmarks.landmark_io import read_surface_landmarks
@@ -128,6 +128,9 @@ def read_cohort(
             surfaces = replace(surfaces, landmarks=read_surface_landmarks(listed))
         return replace(landmark_cohort(surfaces, onto), review=surfaces.review)
     table, keys = (None, ()) if data.is_dir() else read_table(data)
+    if table is not None:
+        order = sorted(range(len(keys)), key=lambda row: name_key(keys[row]))
+        table, keys = table.take(order), tuple(keys[row] for row in order)
     folder = Path(config.shapes) if config.shapes else (data if table is None else data.parent)
     if not folder.is_dir():
         raise InputError(
@@ -186,7 +189,7 @@ def _rows(results: Results) -> list[_Row]:
                     known={column.removeprefix(META): str(part[column][index] or "").strip() for column in known},
                 )
             )
-    return sorted(rows, key=lambda row: row.name)
+    return sorted(rows, key=lambda row: name_key(row.name))
 
 
 def _of_results(

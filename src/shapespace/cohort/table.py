@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -163,6 +164,12 @@ def read_table(path: Path, specimens: Collection[str] = ()) -> tuple[Table, tupl
             column = head.removeprefix(_META)
             columns[head if column in heads or not column else column] = tuple(row[index] for row in rows)
     return Table(columns, keys, str(path)), keys
+
+
+def name_key(name: str) -> tuple[list[str], list[int]]:
+    """Return the key by which rows are sorted, with numbers in names by their value: permutations of rows and so p
+    then do not depend on their order in a file."""
+    return re.split(r"[0-9]+", name), [int(digits) for digits in re.findall(r"[0-9]+", name)]
 
 
 def _with_folders(path: PurePath) -> str:

@@ -18,7 +18,7 @@ from shapespace.io.containers.json_files import read_json
 from shapespace.io.files import read_bytes
 from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.io.meshes.obj import write_obj
-from shapespace.types import FloatArray, IntArray, Mesh
+from shapespace.types import FloatArray, Mesh, are_same_triangles
 
 _ICT: Final = "generic_neutral_mesh"
 _ICT_MM = 10.0
@@ -62,10 +62,9 @@ class ObjFolder:
         steps: list[FloatArray] = []
         for file in mode_files:
             shape = read_mesh(file)
-            same = len(shape.vertices) == len(neutral_mesh.vertices) and _have_same_faces(
+            if len(shape.vertices) != len(neutral_mesh.vertices) or not are_same_triangles(
                 shape.faces, neutral_mesh.faces
-            )
-            if not same:
+            ):
                 raise ModelFileError(
                     f"{file} has other vertices or triangles than {neutral.name}, so that they are no blendshapes; "
                     f"{_AGAIN}."
@@ -125,10 +124,6 @@ def _counts(path: Path) -> tuple[int, int]:
     """Return approximate numbers of vertices and faces of an OBJ file, without parsing it."""
     content = b"\n" + read_bytes(path, _LOOKED_AT_BYTES)
     return content.count(b"\nv "), content.count(b"\nf ")
-
-
-def _have_same_faces(first: IntArray | None, second: IntArray | None) -> bool:
-    return first is second if first is None or second is None else np.array_equal(first, second)
 
 
 def _split_modes(steps: FloatArray, names: list[str]) -> tuple[Modes, Modes | None]:

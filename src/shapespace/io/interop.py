@@ -11,7 +11,7 @@ import numpy as np
 
 from shapespace.errors import InputError, MeshError
 from shapespace.io.meshes.mesh_io import read_mesh
-from shapespace.lazy import require_package
+from shapespace.lazy import lazy_import, require_package
 from shapespace.types import ByteArray, IntArray, Mesh
 
 MeshLike: TypeAlias = Mesh | str | os.PathLike[str] | Any
@@ -74,16 +74,19 @@ def as_meshes(items: Any, function: str) -> Sequence[Mesh]:
     """Return a sequence of meshes from anything that `as_mesh` takes; each is converted when it is accessed.
 
     Args:
-        items: a list, or anything with a length and items; an array (N, V, 3) too.
+        items: a list, or anything with a length and items; an array (N, V, 3) too; the folder of meshes, of which those
+            that `build` takes are read.
         function: that was given it, for the message.
 
     Raises:
         InputError: it is no such sequence. An item that is no mesh raises when it is accessed.
     """
+    if isinstance(items, str | os.PathLike) and Path(cast("str | os.PathLike[str]", items)).is_dir():
+        return _MeshSequence(lazy_import("trusted_surfaces")(Path(cast("str | os.PathLike[str]", items))))
     if isinstance(items, str | os.PathLike | Mesh) or not (hasattr(items, "__len__") and hasattr(items, "__getitem__")):
         raise InputError(
             f"{function} takes a list of meshes, not {type(cast(object, items)).__name__}; give meshes, their paths, "
-            "or arrays (V, 3)."
+            "arrays (V, 3), or a folder of meshes."
         )
     return _MeshSequence(items)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from os import PathLike
 from pathlib import Path
 from typing import Any, Literal
 
@@ -38,7 +39,7 @@ from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, SurfaceLandm
 
 
 def build_model(
-    meshes: Meshes | Sequence[MeshLike],
+    meshes: Meshes | Sequence[MeshLike] | str | PathLike[str],
     config: BuildConfig | None = None,
     *,
     scratch: Scratch | None = None,
@@ -50,8 +51,9 @@ def build_model(
     Args:
         meshes: at least two, same vertices in the same order, same triangles: a list, or anything with a length
             and items that loads a mesh when it is accessed. Items are anything that `as_mesh` takes: meshes, paths,
-            arrays (V, 3) of points, or objects of other tools. Vertices that are not-a-number or not observed are
-            missing: a model of vertices learns from the others, one of B-splines from filled ones.
+            arrays (V, 3) of points, or objects of other tools. A folder of meshes does too. Vertices that are
+            not-a-number or not observed are missing: a model of vertices learns from the others, one of B-splines from
+            filled ones.
         config: options; None for the defaults.
         scratch: for the file of streamed meshes, and for what a build that is killed goes on with; None takes the
             system's folder for temporary files and does not go on.
@@ -91,11 +93,12 @@ def build_model(
             SurfaceLandmarks.of(landmarks).check(len(meshes[0].vertices))
         return _of_streamed(stream, config, landmarks, keep_shapes, log)
     meshes = [without_estimates(meshes[index]) for index in range(len(meshes))]
-    faces = common_faces(meshes)
+    faces, dropped = common_faces(meshes), np.zeros(0, dtype=np.int32)
     if not kind.takes_holes and len(meshes) > 1:
         observed = ObservedMeshes.of(meshes, config.min_seen)
         meshes, landmarks = observed.meshes, observed.landmarks(landmarks)
         faces, alignment_vertices = meshes[0].faces, observed.indices(alignment_vertices)
+        dropped = np.flatnonzero(~observed.vertices).astype(np.int32)
     shapes, names = _training_shapes(meshes, faces, fill=kind.takes_holes), [mesh.name for mesh in meshes]
     rounding = rounding_mm(np.nan_to_num(meshes[0].vertices, posinf=0.0, neginf=0.0))
     observed = np.asarray(np.isfinite(shapes).all(axis=2), dtype=np.bool_)
@@ -123,6 +126,7 @@ def build_model(
         representation=config.representation,
         provenance=config.provenance,
         licence=config.licence,
+        dropped_vertices=dropped,
     )
     return _with_training(model, aligned.__getitem__, sizes, config)
 

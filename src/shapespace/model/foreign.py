@@ -105,6 +105,7 @@ def load_foreign(path: Path, mm: float | None = None, expressions: Path | None =
         "regions": {},
         "is_n_training_known": linear.n_training is not None,
         "training": None,
+        "dropped_vertices": np.zeros(0, dtype=np.int32),
     }
     return Foreign(fields, rotation, n_identity, model_format.title, tuple(notes))
 

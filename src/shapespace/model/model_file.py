@@ -33,9 +33,10 @@ _RESIDUALS = "residuals"
 _REGIONS = "regions"
 _CORNERS, _BARYCENTRIC, _DISTANCE = "landmark_corners", "landmark_barycentric", "landmark_distance_mm"
 _TRAINING, _TRAINING_REST, _TRAINING_SIZE = "training", "training_rest", "training_log_scale"
+_DROPPED = "dropped_vertices"
 _EVERY_MODEL = (
     "mean", "basis", "stddev", "faces", _RESIDUALS, _REGIONS, _CORNERS, _BARYCENTRIC, _DISTANCE, _TRAINING,
-    _TRAINING_REST, _TRAINING_SIZE,
+    _TRAINING_REST, _TRAINING_SIZE, _DROPPED,
 )  # fmt: skip
 """What is not of one representation."""
 _LONGEST_DETAIL = 200  # characters of a library's error that a message repeats
@@ -77,6 +78,7 @@ class ModelFields(TypedDict):
     regions: Mapping[str, IntArray]
     is_n_training_known: bool
     training: TrainingShapes | None
+    dropped_vertices: IntArray
 
 
 def hash_of(model: ModelFields) -> str:
@@ -98,6 +100,8 @@ def save(
     if (training := model["training"]) is not None:  # no part of the hash: a shared model without them is the same
         arrays |= {_TRAINING: training.coefficients, _TRAINING_SIZE: training.log_scale}
         arrays |= {_TRAINING_REST: training.rest} if training.rest.size else {}
+    if (dropped := model["dropped_vertices"]).size:  # no part of the hash; float64, which earlier versions skip
+        arrays[_DROPPED] = dropped.astype(np.float64)
     write_hdf5(path, {**arrays, **(more_arrays or {})}, {**attributes, **(more_attributes or {}), **made_by})
 
 
@@ -159,6 +163,12 @@ def _training_shapes(arrays: Mapping[str, npt.NDArray[Any]]) -> TrainingShapes |
     return TrainingShapes(arrays[_TRAINING], rest, arrays[_TRAINING_SIZE])
 
 
+def _dropped_vertices(numbers: FloatArray) -> IntArray:
+    if numbers.ndim != 1 or not ((numbers >= 0) & (numbers < 2**31) & (numbers % 1 == 0)).all():
+        raise ValueError("dropped vertices must be whole numbers")
+    return numbers.astype(np.int32)
+
+
 def load(path: Path) -> ModelFields:
     """Return the fields of the `ShapeModel` in `path`.
 
@@ -209,6 +219,7 @@ def load(path: Path) -> ModelFields:
             "regions": _regions(attributes_of_file.regions, owned.get(_REGIONS)),
             "is_n_training_known": attributes_of_file.n_training_known != "no",
             "training": _training_shapes(owned),
+            "dropped_vertices": _dropped_vertices(owned.get(_DROPPED, np.zeros(0))),
         }
     except (KeyError, ValueError, InputError) as error:
         reason = str(error)[:_LONGEST_DETAIL].replace("`", "").replace("Object missing", "missing")

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, cast
@@ -15,6 +16,7 @@ import numpy.typing as npt
 
 from shapespace.errors import CorrespondenceError, InputError, ModelFileError
 from shapespace.formats.model_parts import LinearModel
+from shapespace.geometry.normals import without_estimates
 from shapespace.geometry.procrustes import Gauge
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.interop import MeshLike
@@ -26,7 +28,7 @@ from shapespace.model.missing import MIN_SEEN
 from shapespace.model.representation import REPRESENTATIONS, Representation
 from shapespace.model.training_shapes import TrainingShapes
 from shapespace.reprs import short_repr
-from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks, read_only, require_path
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, SurfaceLandmarks, read_only, require_path
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -35,6 +37,8 @@ if TYPE_CHECKING:
 
 _PROJECTION_ITERATIONS = 200  # limit of the alternation of pose and coefficients
 _PROJECTION_TOLERANCE = 1e-10  # change of coefficients, in SD of the first mode, that ends it: float64 rounding
+_FEWEST_OBSERVED = 3  # vertices that determine a pose
+_LEAST_NOISE = 1e-12  # share of the first mode's variance, so that models without noise determine all modes
 _SHARE_TOLERANCE = 1e-12  # share of variance; cumulative sums in float64 are off by less
 _TOLD = 300  # characters of a library's error that a message repeats
 _FILE = "_file"
@@ -76,6 +80,8 @@ class ShapeModel:
         training: the training shapes, by which results are calibrated (docs/uncertainty.md); None of models of other
             tools, and without `training` when the model is shared. The content hash does not depend on them, and
             copies and other processes do not have them.
+        dropped_vertices: (U,) int32 vertices of the training meshes that are not in the model, since too few meshes
+            observe them; its own are the V others in order. `project` takes shapes with and without them.
 
     Raises:
         InputError: arrays whose shapes do not belong together, or standard deviations that cannot be.
@@ -99,6 +105,7 @@ class ShapeModel:
     is_n_training_known: bool = True
     regions: Mapping[str, IntArray] = field(default_factory=lambda: dict[str, IntArray]())
     training: TrainingShapes | None = field(default=None, repr=False)
+    dropped_vertices: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int32), repr=False)
 
     __repr__ = short_repr
 
@@ -143,6 +150,12 @@ class ShapeModel:
             _refuse_impossible(self.training.stddev[k:], checked.vertices, first_mode=k)
             _refuse_impossible(np.maximum(self.training.stddev[:k], stddev), checked.vertices)
         object.__setattr__(self, "faces", checked.faces)
+        source = len(checked.vertices) + len(self.dropped_vertices)
+        none = np.zeros(0, dtype=np.int32)
+        dropped = region_vertices(self.dropped_vertices, source, "dropped") if len(self.dropped_vertices) else none
+        if len(dropped) != len(self.dropped_vertices):
+            raise InputError("A dropped vertex of a shape model is named twice.")
+        object.__setattr__(self, "dropped_vertices", dropped)
         self.landmarks.check(len(checked.vertices))
         regions = {
             str(name): region_vertices(vertices, len(checked.vertices), name) for name, vertices in self.regions.items()
@@ -164,7 +177,7 @@ class ShapeModel:
     @classmethod
     def fit(
         cls,
-        meshes: Meshes | Sequence[MeshLike],
+        meshes: Meshes | Sequence[MeshLike] | str | PathLike[str],
         *,
         modes: int | float | Literal["auto"] | None = None,
         gauge: Gauge = "shape",
@@ -313,39 +326,52 @@ class ShapeModel:
         """Return the coefficients b (K,), mm, of a shape in vertex correspondence: b = P^T (Q - mean) (P19).
 
         Args:
-            shape: a mesh or (V, 3) vertices, mm, in the model's vertex order.
+            shape: a mesh or (V, 3) vertices, mm, in the order of the model's vertices or of those of its training
+                meshes, of which `dropped_vertices` are not used. Vertices that are not-a-number or not observed are
+                missing: b is then the likeliest by the others.
             align: find its pose along with b, by the model's gauge; False if it is in the model's frame already.
 
         Raises:
             CorrespondenceError: another number of vertices than the model's.
-            InputError: values that are not finite.
+            InputError: values that are infinite, or hardly a vertex observed.
         """
+        shape = without_estimates(shape) if isinstance(shape, Mesh) else shape
         vertices = shape.vertices if isinstance(shape, Mesh) else np.asarray(shape, dtype=np.float64)
+        if vertices.shape == (self.n_vertices + len(self.dropped_vertices), 3):
+            vertices = np.delete(vertices, self.dropped_vertices, axis=0)
         if vertices.shape != (self.n_vertices, 3):
             name = shape.name if isinstance(shape, Mesh) else "The shape"
             raise CorrespondenceError(
                 f"{name} has {len(vertices)} vertices but the model has {self.n_vertices}; only shapes in the "
                 "model's vertex order can be projected, so fit this one instead (shapespace fit, or fit_scan)."
             )
-        if not np.isfinite(vertices).all():
-            raise InputError("A shape to be projected must be finite.")
+        is_observed: BoolArray = ~np.logical_or.reduce(np.isnan(vertices), axis=1)
+        if np.isinf(vertices).any() or is_observed.sum() < _FEWEST_OBSERVED:
+            raise InputError("A shape to be projected must be finite, but for missing vertices (nan).")
         b = np.zeros(self.n_modes)
         if not align:
-            return self._nearest(vertices)
+            return self._nearest(vertices, is_observed)
         Q = self.mean_vertices
         for _ in range(_PROJECTION_ITERATIONS):
             # Phase 2 with known matches: pose and coefficients in turn, since modes may hold a little pose.
-            T_shape_model = fit_similarity(Q, vertices, with_scale=self.gauge == "shape")
+            T_shape_model = fit_similarity(Q[is_observed], vertices[is_observed], with_scale=self.gauge == "shape")
             Q_matched = T_shape_model.inverse().apply(vertices)
-            before, b = b, self._nearest(Q_matched)
+            before, b = b, self._nearest(Q_matched, is_observed)
             if np.abs(b - before).max() <= _PROJECTION_TOLERANCE * self.stddev[0]:
                 break
             Q = self.reconstruct(b)
         return b
 
-    def _nearest(self, vertices: FloatArray) -> FloatArray:
-        """Return the coefficients (K,) of the shape nearest to `vertices` (V, 3) in the model's frame."""
-        return self._vertex_modes @ (vertices - self.mean_vertices).reshape(-1)
+    def _nearest(self, vertices: FloatArray, is_observed: BoolArray) -> FloatArray:
+        """Return the coefficients (K,) of the shape nearest to `vertices` (V, 3) in the model's frame; the likeliest
+        where only some are observed (V,), whose nearest shape could have anything elsewhere."""
+        off = vertices - self.mean_vertices
+        if is_observed.all():
+            return self._vertex_modes @ off.reshape(-1)
+        modes = self._vertex_modes.reshape(self.n_modes, -1, 3)[:, is_observed].reshape(self.n_modes, -1)
+        noise = max(self.noise_variance, _LEAST_NOISE * self.stddev[0] ** 2)
+        precision = modes @ modes.T + np.diag(noise / self.stddev**2)
+        return np.asarray(np.linalg.solve(precision, modes @ off[is_observed].reshape(-1)), dtype=np.float64)
 
     def to_z(self, b: npt.ArrayLike) -> FloatArray:
         """Return coefficients z (..., k), in standard deviations, of `b` (..., k) in mm; k is at most K."""

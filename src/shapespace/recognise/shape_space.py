@@ -14,14 +14,17 @@ from shapespace.errors import InputError, ShapespaceError
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.result import FitResult
 from shapespace.geometry.procrustes import Gauge
+from shapespace.io.interop import MeshLike, as_mesh, as_meshes
 from shapespace.model.shape_model import ShapeModel
 from shapespace.recognise.labelled_scans import from_record
 from shapespace.recognise.learn import BaseEstimator, TransformerMixin, check_is_fitted
 from shapespace.schemas import FIT_AGAIN, FitRecord, read
 from shapespace.types import FloatArray, IntArray, Mesh
 
-Surface: TypeAlias = Mesh | FitResult | FitRecord | Mapping[str, Any]
-"""A mesh, the result of a fit, or its record, typed or as the content of NAME.fit.json."""
+Surface: TypeAlias = MeshLike | FitResult | FitRecord | Mapping[str, Any]
+"""A mesh or what `as_mesh` takes, the result of a fit, or its record, typed or as the content of NAME.fit.json."""
+Surfaces: TypeAlias = Sequence[Surface] | FloatArray | str | PathLike[str]
+"""Several of them; (n, V, 3) vertices; or the folder of meshes in correspondence."""
 
 
 class ShapeSpace(TransformerMixin, BaseEstimator):
@@ -77,7 +80,7 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
         # A model is never changed, and its read-only parts cannot be copied deeply.
         return ShapeSpace(**cast(dict[str, Any], self.get_params(deep=False)))
 
-    def fit(self, X: Sequence[Surface], y: Any = None) -> ShapeSpace:
+    def fit(self, X: Surfaces, y: Any = None) -> ShapeSpace:
         """Build the shape space of meshes in correspondence, mm, or take the ready `model`, whatever `X` is.
 
         Raises:
@@ -94,12 +97,12 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
         self.n_features_out_ = self.model_.n_modes
         return self
 
-    def _build(self, X: Sequence[Surface]) -> ShapeModel:
-        meshes = [mesh for mesh in X if isinstance(mesh, Mesh)]
-        if len(meshes) != len(X):
+    def _build(self, X: Surfaces) -> ShapeModel:
+        surfaces = _items(X)
+        if any(isinstance(item, FitResult | FitRecord | Mapping) for item in surfaces):
             raise InputError("A shape space is built from meshes in correspondence; give those, or a ready model.")
         return ShapeModel.fit(
-            meshes,
+            surfaces,
             modes=self.modes,
             gauge=self.gauge,
             align=self.align,
@@ -107,7 +110,7 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
             seed=self.seed,
         )
 
-    def transform(self, X: Sequence[Surface]) -> FloatArray:
+    def transform(self, X: Surfaces) -> FloatArray:
         """Return coefficients z (n, K) in standard deviations of the model; rows of failed fits are NaN.
 
         Raises:
@@ -116,23 +119,23 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
             FileFormatError: a record that is damaged.
         """
         check_is_fitted(self)
-        rows = [self._coefficients(surface, number) for number, surface in enumerate(X, 1)]
+        rows = [self._coefficients(surface, number) for number, surface in enumerate(_items(X), 1)]
         return np.stack(rows) if rows else np.zeros((0, self.n_features_out_))
 
     def _coefficients(self, surface: Surface, number: int) -> FloatArray:
         model = self.model_
-        if isinstance(surface, Mesh):
-            if self.meshes == "scans":
-                return self._of_scan(surface, number)
-            return model.to_z(model.project(surface, align=self.align))
         if isinstance(surface, FitResult):
             self._refuse_other_model(surface.model_hash, surface.scan_name)
             return self._of_fit(surface)
-        if not isinstance(surface, FitRecord | Mapping):  # pyright: ignore[reportUnnecessaryIsInstance]
-            raise InputError(f"Number {number} is neither a mesh nor a fit, but {type(surface).__name__}.")
         name = f"number {number}"
+        if not isinstance(surface, FitRecord | Mapping):
+            if self.meshes == "scans":
+                return self._of_scan(surface, number)
+            return model.to_z(model.project(as_mesh(surface, name), align=self.align))
         record = (
-            surface if isinstance(surface, FitRecord) else read(FitRecord, surface, f"The record of {name}", FIT_AGAIN)
+            surface
+            if isinstance(surface, FitRecord)
+            else read(FitRecord, cast(Mapping[str, Any], surface), f"The record of {name}", FIT_AGAIN)
         )
         scan = from_record(name, record)
         self._refuse_other_model(scan.model_hash, scan.file)
@@ -142,9 +145,9 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
             raise InputError(f"The record of {scan.file} has {len(scan.z)} coefficients, not {model.n_modes}.")
         return scan.z
 
-    def _of_scan(self, scan: Mesh, number: int) -> FloatArray:
+    def _of_scan(self, scan: MeshLike, number: int) -> FloatArray:
         try:
-            return self._of_fit(fit_scan(self.model_, scan, self.config or FitConfig()))
+            return self._of_fit(fit_scan(self.model_, as_mesh(scan, f"number {number}"), self.config or FitConfig()))
         except ShapespaceError as error:
             warnings.warn(f"Number {number} has no coefficients: {error}", stacklevel=4)
             return np.full(self.model_.n_modes, np.nan)
@@ -175,3 +178,7 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
         """Return the names z1 to zK, (K,)."""
         check_is_fitted(self)
         return np.asarray([f"z{k}" for k in range(1, self.n_features_out_ + 1)], dtype=object)
+
+
+def _items(X: Surfaces) -> Sequence[Any]:
+    return as_meshes(X, "ShapeSpace") if isinstance(X, str | PathLike) else cast(Sequence[Any], X)

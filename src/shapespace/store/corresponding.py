@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -43,6 +44,12 @@ class SurfaceFiles:
     doubtful: frozenset[Path]
     notes: tuple[str, ...]
     needs_review: Mapping[Path, Sequence[ReviewCode]] = field(default_factory=dict[Path, Sequence[ReviewCode]])
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def __getitem__(self, index: int, /) -> Mesh:
+        return self.mesh(self.files[index])
 
     def mesh(self, file: Path) -> Mesh:
         """Return the mesh in one of the files, in the unit and on the side of the majority.
@@ -170,6 +177,20 @@ def surface_files(paths: Sequence[Path], *, recursive: bool = False) -> SurfaceF
         names = first_names([file.name for file in files if file in mirrored], _NAMED)
         notes.append(f"{len(mirrored)} of {len(files)} {of} of the others ({names}) and reflected.")
     return SurfaceFiles(tuple(files), ratios, frozenset(mirrored), frozenset(doubtful), tuple(notes), needs_review)
+
+
+def trusted_surfaces(folder: Path) -> SurfaceFiles:
+    """Return the surfaces of a folder that `build` takes, with its notes as warnings.
+
+    Raises:
+        InputError: as `surface_files`; all are doubtful, or more than half need review.
+    """
+    listing = surface_files([folder])
+    listing.review(listing.files, accept=False)
+    listing = listing.without_doubtful()
+    for note in listing.notes:
+        warnings.warn(note, stacklevel=4)
+    return listing
 
 
 def _summary_of(folder: Path) -> CorrespondenceRecord | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +30,7 @@ from shapespace.report.blocks.wording import printable, without_folders
 from shapespace.report.inputs.saved_fits import Folder
 from shapespace.report.inputs.staged_fit import nice_ceiling
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, ReviewReason, read
-from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
+from shapespace.types import BoolArray, FloatArray, Mesh, Similarity, are_same_triangles
 
 _FEWEST_VERTICES = 3  # a triangle
 _ONE_UNIT = 5.0  # ratio of scales; mm, cm and m differ by 10 or more
@@ -151,7 +151,7 @@ class Corresponded:
         """
         mesh = without_estimates(self.folder.mesh(f"{name}{CorrespondRecord.SURFACE}"))
         mesh = mirror_image(mesh) if self.records[name].mirrored else mesh
-        if mesh.faces is None or not np.array_equal(mesh.faces, faces_of(self._mean)):
+        if not are_same_triangles(mesh.faces, faces_of(self._mean)):
             raise FileFormatError(
                 f"{name}{CorrespondRecord.SURFACE} is not on the template of this folder; {CORRESPOND_AGAIN}."
             )
@@ -159,7 +159,7 @@ class Corresponded:
             raise FileFormatError(
                 f"{name}{CorrespondRecord.SURFACE} has hardly a vertex that is not missing; {CORRESPOND_AGAIN}."
             )
-        return mesh
+        return replace(mesh, faces=self._mean.faces)
 
     def placed(self, name: str) -> PlacedSurface:
         """Return the surface of the scan `name` moved onto the mean shape.
