@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from shapespace.cohort.cohort import Cohort, padded
-from shapespace.cohort.table import Table, list_names, note_unmatched, numbers_as_text, read_table
+from shapespace.cohort.table import Table, list_names, match_rows, numbers_as_text, read_table
 from shapespace.errors import FileFormatError, InputError
 from shapespace.geometry.landmark_alignment import AlignConfig, AlignedLandmarks, align_landmarks
 from shapespace.geometry.procrustes import Gauge, centroid_size
@@ -232,10 +232,11 @@ def join_table(
     own = Table(columns, tuple(names), where)
     if table is None:
         return list(range(len(names))), own, []
-    number = {stem_of(name): k for k, name in enumerate(names)} | {name: k for k, name in enumerate(names)}
-    given, keys = read_table(table, number)
-    row = {number[key]: k for k, key in enumerate(keys) if key in number}
-    rows, notes = list(range(len(names))) if keep_unmatched else list(row), list[str]()
-    note_unmatched(notes, given, keys, number, [names[k] for k in row], names, where, remedy="name the specimens alike")
+    given = read_table(table)
+    matched, notes = match_rows(
+        given, [(name, stem_of(name)) for name in names], where, remedy="name the specimens alike"
+    )
+    row = {number: k for k, number in matched.items()}
+    rows = list(range(len(names))) if keep_unmatched else list(row)
     joined = {name: tuple(cells[row[k]] if k in row else "" for k in rows) for name, cells in given.columns.items()}
     return rows, Table({**own.take(rows).columns, **joined}, tuple(names[k] for k in rows), given.where), notes

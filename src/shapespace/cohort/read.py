@@ -14,14 +14,13 @@ import numpy as np
 from shapespace.cohort.cohort import Cohort, Fitted, ShapeSource
 from shapespace.cohort.landmark_cohort import has_landmarks, landmark_cohort, read_landmark_cohort
 from shapespace.cohort.shape_samples import ENDING, SampleFile, find_samples
-from shapespace.cohort.table import Table, list_names, note_unmatched, read_table
+from shapespace.cohort.table import Table, list_names, match_rows, names_of_file, read_table
 from shapespace.errors import InputError
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.landmarks.landmark_io import read_surface_landmarks
-from shapespace.io.meshes.mesh_io import stem_of
 from shapespace.model.additive import AdditiveModel, load_model
 from shapespace.model.shape_model import ShapeModel
-from shapespace.store.corresponding import SURFACE, surface_files, surface_stem
+from shapespace.store.corresponding import SURFACE, SurfaceFiles, surface_files, surface_stem
 from shapespace.store.results import Results, modes_of
 from shapespace.store.review_text import review_summary
 from shapespace.store.rows import META
@@ -127,7 +126,7 @@ def read_cohort(
         if surfaces.landmarks is None and listed.is_file():
             surfaces = replace(surfaces, landmarks=read_surface_landmarks(listed))
         return replace(landmark_cohort(surfaces, onto), review=surfaces.review)
-    table, keys = (None, ()) if data.is_dir() else read_table(data)
+    table = None if data.is_dir() else read_table(data)
     folder = Path(config.shapes) if config.shapes else (data if table is None else data.parent)
     if not folder.is_dir():
         raise InputError(
@@ -136,13 +135,13 @@ def read_cohort(
         )
     results = Results(folder) if folder != source or results is None else results
     if len(results):
-        return _of_results(results, table, keys, config, onto, on_shape)
+        return _of_results(results, table, config, onto, on_shape)
     if table is None:
         raise InputError(
             f"{folder} holds neither results of fits nor landmark files; give a CSV table of its meshes, and the "
             "folder as --shapes."
         )
-    return _of_surfaces(folder, table, keys, config, onto, on_shape)
+    return _of_surfaces(folder, table, config, onto, on_shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,7 +191,6 @@ def _rows(results: Results) -> list[_Row]:
 def _of_results(
     results: Results,
     table: Table | None,
-    keys: Sequence[str],
     config: CohortConfig,
     onto: Cohort | None,
     on_shape: Callable[[int, int], None] | None,
@@ -206,17 +204,11 @@ def _of_results(
         table = Table(cells, tuple(row.name for row in rows), str(results.folder))
         pairs = [(row, index) for index, row in enumerate(rows)]
     else:
-        by_key = _by_key(rows)
-        pairs = [(by_key[key], index) for index, key in enumerate(keys) if key in by_key]
-        note_unmatched(
-            notes=notes,
-            table=table,
-            keys=keys,
-            available=by_key,
-            used=[row.name for row, _ in pairs],
-            names=[row.name for row in rows],
-            where=results.folder,
+        matched, unmatched = match_rows(
+            table, [(row.name, *names_of_file(row.scan_name)) for row in rows], results.folder
         )
+        pairs = [(rows[k], index) for index, k in matched.items()]
+        notes += unmatched
     accepted = [(row, index) for row, index in pairs if row.status in used]
     for status, count in Counter(row.status for row, _ in pairs if row.status not in used).items():
         excluded_names = list_names([row.name for row, _ in pairs if row.status == status])
@@ -291,37 +283,22 @@ def _kind(
 def _of_surfaces(
     folder: Path,
     table: Table,
-    keys: Sequence[str],
     config: CohortConfig,
     onto: Cohort | None,
     on_shape: Callable[[int, int], None] | None,
 ) -> Cohort:
     listing = surface_files([folder])
-    in_table = set(keys)
+    matched, _ = _match_files(table, listing, folder)
     review = listing.review(
-        [file for file in listing.files if surface_stem(file) in in_table], "--doubtful",
+        [file for file, _ in matched], "--doubtful",
         accept=config.doubtful if config.accept_review is None else config.accept_review,
     )  # fmt: skip
     listing = listing if config.doubtful else listing.without_doubtful("--doubtful")
     notes = [*([f"{summary}."] if (summary := review_summary(review)) else []), *listing.notes]
     if config.gauge == "form":
         listing.refuse_mixed_units()
-    # A completion may be written in several formats; its samples are of the vertices of the PLY file.
-    files = {
-        surface_stem(file): file
-        for file in listing.files
-        if file.suffix.lower() == ".ply" or not (file.suffix.lower() == ".csv" or file.with_suffix(ENDING).is_file())
-    }
-    matched = [(files[key], row_index) for row_index, key in enumerate(keys) if key in files]
-    note_unmatched(
-        notes=notes,
-        table=table,
-        keys=keys,
-        available=files,
-        used=[surface_stem(file) for file, _ in matched],
-        names=list(files),
-        where=folder,
-    )
+    matched, unmatched = _match_files(table, listing, folder)
+    notes += unmatched
     least = config.least if onto is None else 1
     if len(matched) < least:
         raise InputError(
@@ -347,11 +324,16 @@ def _of_surfaces(
     return replace(cohort, notes=(*notes, *cohort.notes), source=source, review=review)
 
 
-def _by_key(rows: Sequence[_Row]) -> dict[str, _Row]:
-    """Return fits by scan name and by fit name; the fit name takes precedence."""
-    scans = Counter(stem_of(row.scan_name) for row in rows)
-    by_scan = {stem_of(row.scan_name): row for row in rows if scans[stem_of(row.scan_name)] == 1}
-    return by_scan | {row.name: row for row in rows}
+def _match_files(table: Table, listing: SurfaceFiles, folder: Path) -> tuple[list[tuple[Path, int]], list[str]]:
+    """Return the surface and the number of each row that has one, and notes as of `match_rows`."""
+    # A completion may be written in several formats; its samples are of the vertices of the PLY file.
+    files = {
+        surface_stem(file): file
+        for file in listing.files
+        if file.suffix.lower() == ".ply" or not (file.suffix.lower() == ".csv" or file.with_suffix(ENDING).is_file())
+    }
+    rows, notes = match_rows(table, [(name, file.name) for name, file in files.items()], folder)
+    return [(list(files.values())[k], row) for row, k in rows.items()], notes
 
 
 def _refuse_mixed(fits: Sequence[_Row], folder: Path) -> None:

@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from shapespace.cohort.landmark_cohort import join_table, write_aligned
-from shapespace.cohort.table import Table
+from shapespace.cohort.table import Table, refuse_repeated
 from shapespace.commands.landmark_data import find_other_scales
 from shapespace.errors import FileFormatError, InputError
 from shapespace.geometry.landmark_alignment import AlignConfig, AlignedLandmarks, align_landmarks, find_outliers
@@ -101,7 +101,6 @@ def _structures(path: Path) -> dict[str, str]:
     landmark, structure = (key_column(header, (name,)) for name in ("landmark", "structure"))
     if landmark is None or structure is None:
         raise FileFormatError(f"{path} has no columns landmark and structure; write one row for each landmark.")
-    structures = {row[landmark]: row[structure] for row in rows}
-    if len(structures) < len(rows):
-        raise FileFormatError(f"{path} has two rows of one landmark; keep one for each.")
-    return structures
+    names = [row[landmark] for row in rows]
+    refuse_repeated(path, names, names, "landmark")
+    return {row[landmark]: row[structure] for row in rows}
