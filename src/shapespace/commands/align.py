@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from shapespace.cohort.landmark_cohort import join_table, write_aligned
-from shapespace.cohort.table import Table, refuse_repeated
+from shapespace.cohort.table import Table, list_names, refuse_repeated
 from shapespace.commands.landmark_data import find_other_scales
 from shapespace.errors import FileFormatError, InputError
 from shapespace.geometry.landmark_alignment import AlignConfig, AlignedLandmarks, align_landmarks, find_outliers
@@ -87,7 +87,11 @@ def align(
 
 
 def _reflected(raw: LandmarkConfigurations, column: str, value: str) -> LandmarkConfigurations:
-    rows = [k for k, cell in enumerate(Table(raw.columns, raw.names, raw.where).texts(column)) if cell == value]
+    cells = Table(raw.columns, raw.names, raw.where).texts(column)
+    rows = [k for k, cell in enumerate(cells) if cell == value]
+    if not all(cells):
+        missing = list_names([name for name, cell in zip(raw.names, cells, strict=True) if not cell])
+        raise InputError(f"{raw.where}: {column} of {missing} is missing; fill it in, as --reflect needs it of all.")
     if not rows:
         raise InputError(f"{raw.where}: no specimen has {column} {value}; correct --reflect.")
     points = raw.points.copy()
