@@ -43,6 +43,7 @@ LAZY_FUNCTIONS: Mapping[str, str] = MappingProxyType(
         "to_trimesh": "io.interop",
         "view_fit": "viewer.notebook_viewer",
         "view_model": "viewer.notebook_viewer",
+        "write_mesh": "io.meshes.mesh_io",
     }
 )
 """Function -> its module, which is imported when the function is first asked for."""

@@ -119,7 +119,7 @@ def test_a_basis_that_is_not_orthonormal_is_made_so_and_keeps_every_shape() -> N
 def test_in_the_form_gauge_each_shape_has_its_own_size_and_its_own_shape(gauge: str) -> None:
     given = blob_model(VERTICES, MODES, gauge)
     # A frame far from the middle of the object must not turn sizes into places.
-    given = replace(given, mean=given.mean + np.tile([500.0, -200.0, 50.0], VERTICES))
+    given = replace(given, mean=given.mean + np.array([500.0, -200.0, 50.0]))
     fitted, sizes = fitted_of(given), np.linspace(400.0, 900.0, COUNT)
     cohort = Cohort.of_fits(fitted, *blank(COUNT), sizes, "form")
     shapes = np.stack([given.reconstruct(b) for b in fitted.b])

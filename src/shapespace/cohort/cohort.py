@@ -17,7 +17,7 @@ import numpy.typing as npt
 from shapespace.cohort.classes import class_notes
 from shapespace.cohort.incomplete import complete_by_population, completed_shapes
 from shapespace.cohort.shape_samples import ShapeSamples
-from shapespace.cohort.table import Table, list_names, numbers_as_text
+from shapespace.cohort.table import Table, cell_text, list_names, numbers_as_text
 from shapespace.errors import CorrespondenceError, InputError
 from shapespace.geometry.landmark_alignment import AlignedLandmarks, project_to_tangent
 from shapespace.geometry.procrustes import Gauge, align_in_place, centroid_size, scale_to_tangent
@@ -393,7 +393,7 @@ class Cohort:
             count_word = {1: "one", 2: "two"}.get(fewest, str(fewest))
             raise InputError(f"A cohort needs {count_word} or more finite shapes (N, V, 3), not {shapes.shape}.")
         shape_names = tuple(names) if names is not None else tuple(f"shape {k + 1}" for k in range(len(shapes)))
-        cells = {name: tuple(_cell(value) for value in values) for name, values in columns.items()}
+        cells = {name: tuple(map(cell_text, values)) for name, values in columns.items()}
         is_observed: BoolArray = ~np.logical_or.reduce(np.isnan(shapes), axis=2)
         is_known = is_observed if observed is None else np.logical_and(is_observed, observed)
         completed_rows = [row for row, own in enumerate(samples) if own is not None]
@@ -694,7 +694,3 @@ def _same_faces(first: npt.NDArray[np.int32] | None, second: npt.NDArray[np.int3
     return (first is None and second is None) or (
         first is not None and second is not None and np.array_equal(first, second)
     )
-
-
-def _cell(value: object) -> str:
-    return "" if value is None or value != value else str(value)

@@ -108,7 +108,7 @@ def _notes(folder: Path, record: AlignRecord) -> tuple[str, ...]:
 
 
 def read_landmark_cohort(
-    path: Path, table: Path | None, gauge: Gauge, onto: Cohort | None = None, least: int = 2
+    path: Path, table: Path | Table | None, gauge: Gauge, onto: Cohort | None = None, least: int = 2
 ) -> Cohort:
     """Return the cohort of a landmark file, aligned by default options, or of a folder that `align` wrote.
 
@@ -211,7 +211,7 @@ def landmark_cohort(cohort: Cohort, onto: Cohort | None = None) -> Cohort:
 def join_table(
     names: Sequence[str],
     columns: Mapping[str, tuple[str, ...]],
-    table: Path | None,
+    table: Path | Table | None,
     where: str,
     *,
     keep_unmatched: bool = False,
@@ -232,7 +232,7 @@ def join_table(
     own = Table(columns, tuple(names), where)
     if table is None:
         return list(range(len(names))), own, []
-    given = read_table(table)
+    given = table if isinstance(table, Table) else read_table(table)
     matched, notes = match_rows(
         given, [(name, stem_of(name)) for name in names], where, remedy="name the specimens alike"
     )

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias, cast, get_args
 
 import numpy as np
 
@@ -82,7 +82,7 @@ class CohortConfig:
 
 
 def read_cohort(
-    data: Path | str,
+    data: Path | str | Any,
     config: CohortConfig | None = None,
     *,
     onto: Cohort | None = None,
@@ -97,7 +97,8 @@ def read_cohort(
 
     Args:
         data: a table whose column `file`, `scan`, `specimen`, `name` or `id` names a shape in each row
-            (coefficients.csv is one); a folder of results of fits, whose metadata are the table; or landmarks.
+            (coefficients.csv is one), as a file or a DataFrame; a folder of results of fits, whose metadata are the
+            table; or landmarks.
         config: which shapes; None for the defaults.
         onto: a cohort that these shapes, of which there may be one alone, are to be compared with.
         on_shape: called with (done, total) as surfaces are read.
@@ -108,15 +109,22 @@ def read_cohort(
         InputError: no row has a shape, fits of different models, the same scan twice, or fewer than two shapes.
         CorrespondenceError: meshes that are not in correspondence.
     """
-    data, config = Path(data), config or CohortConfig()
+    config = config or CohortConfig()
+    given: Table | None = None
+    if not isinstance(data, str | PathLike):
+        given = data if isinstance(data, Table) else Table.of(data)
+        if not config.shapes:
+            raise InputError("A table in memory needs the place of its shapes; give it as CohortConfig(shapes=...).")
+        data = config.shapes
+    data = Path(cast("str | PathLike[str]", data))
     source = Path(config.shapes) if config.shapes else data
     results = Results(source) if source.is_dir() else None
     if source.exists() and not (results is not None and len(results)) and has_landmarks(source):
-        table = data if config.shapes and source != data else None
+        table = given or (data if config.shapes and source != data else None)
         return read_landmark_cohort(source, table, config.gauge, onto, config.least)
     if config.geometry == "landmarks":
         least = 1 if onto is not None else config.least
-        surfaces = read_cohort(data, replace(config, geometry="surface", least=least), on_shape=on_shape)
+        surfaces = read_cohort(given or data, replace(config, geometry="surface", least=least), on_shape=on_shape)
         if surfaces.samples:
             note = (
                 "The samples of completed shapes are not used for landmarks, so p does not contain their uncertainty."
@@ -126,7 +134,7 @@ def read_cohort(
         if surfaces.landmarks is None and listed.is_file():
             surfaces = replace(surfaces, landmarks=read_surface_landmarks(listed))
         return replace(landmark_cohort(surfaces, onto), review=surfaces.review)
-    table = None if data.is_dir() else read_table(data)
+    table = given or (None if data.is_dir() else read_table(data))
     folder = Path(config.shapes) if config.shapes else (data if table is None else data.parent)
     if not folder.is_dir():
         raise InputError(
@@ -222,8 +230,8 @@ def _of_results(
     fits = [row for row, _ in accepted]
     _refuse_mixed(fits, results.folder)
     model, additive = _model_of(results, fits[0], None if config.model is None else Path(config.model))
-    stated = table.take([index for _, index in accepted])
     names = tuple(row.name for row in fits)
+    stated = replace(table.take([index for _, index in accepted]), rows=names)
     sizes = read_only([row.size_mm for row in fits])
     width = max(len(row.b) for row in fits)
     fitted = Fitted(
@@ -312,8 +320,9 @@ def _of_surfaces(
         if on_shape is not None:
             on_shape(n_read, len(matched))
     cohort = Cohort.of_meshes(
-        meshes, table.take([row_index for _, row_index in matched]), config.gauge, onto, config.least, samples
-    )
+        meshes, replace(table.take([row for _, row in matched]), rows=tuple(mesh.name for mesh in meshes)),
+        config.gauge, onto, config.least, samples,
+    )  # fmt: skip
     if 1 < cohort.imputations < config.imputations:
         notes.append(
             f"A completed shape has {cohort.imputations} samples, so there are as many imputations, not "

@@ -7,7 +7,7 @@ import unicodedata
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -56,6 +56,41 @@ class Table:
                 f"{self.where} has two columns whose names differ only in white space; rename one of them."
             )
         object.__setattr__(self, "columns", plain)
+
+    @staticmethod
+    def of(data: Any, where: str = "The table") -> Table:
+        """Return the table in a DataFrame of pandas or polars, or in a mapping of name to cells.
+
+        The first of the columns `file`, `scan`, `specimen`, `name` and `id` names the specimens, as in files; without
+        one, the index of a pandas DataFrame does, where it holds names.
+
+        Args:
+            data: the table.
+            where: what the table is called in messages.
+
+        Raises:
+            InputError: it is no table, has no rows or two columns of one name, or names no specimens.
+        """
+        own: list[Any] = list(
+            data.columns if hasattr(data, "columns") else data.keys() if hasattr(data, "keys") else ()
+        )
+        heads = [str(head).strip() for head in own]
+        if not heads:
+            raise InputError(f"{where} is no DataFrame or mapping with columns, but {type(data).__name__}; give one.")
+        if len(set(heads)) < len(heads):
+            raise InputError(f"{where} has two columns of one name; rename one of them.")
+        columns = {head: tuple(cell_text(value) for value in data[name]) for head, name in zip(heads, own, strict=True)}
+        key = key_column(heads)
+        index: Any = getattr(data, "index", None)
+        if key is not None:
+            rows = columns.pop(heads[key])
+        else:
+            named = key_column([str(getattr(index, "name", ""))]) is not None
+            rows = tuple(map(cell_text, index)) if hasattr(index, "__iter__") else ()
+            rows = rows if named or not all(map(is_number, rows)) else ()
+        if not rows or not all(rows):
+            raise InputError(f"{where} names no specimen in some row; it needs rows, and a column {' or '.join(KEYS)}.")
+        return Table(columns, rows, where)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -260,6 +295,14 @@ def _specimen_index(specimens: Sequence[Sequence[str]], form: Callable[[str], st
                 owners.setdefault(form(own[depth]), set()).add(k)
         index = {name: min(own) for name, own in owners.items() if len(own) == 1} | index
     return index
+
+
+def cell_text(value: object) -> str:
+    """Return the text of a value of a column in memory; empty for a missing one."""
+    if isinstance(value, float) and value.is_integer():  # also NumPy's float64
+        return str(int(value))  # as of whole numbers in a column with missing values
+    text = "" if value is None else str(value)
+    return "" if text in ("<NA>", "NaT") else plain_cell(text)
 
 
 def plain_cell(cell: str) -> str:
