@@ -34,7 +34,7 @@ def signature(name: str, of: Any) -> str:
 def sentence(of: Any, written: str) -> str:
     """Return the first sentence of a docstring; for values, which have none, `written` on the page."""
     if not callable(of):
-        return written.partition(" [source]")[0]
+        return written.partition(" [")[0].rstrip(".")
     paragraph = " ".join((inspect.getdoc(of) or "").partition("\n\n")[0].split())
     return re.split(r"(?<=[.:;])\s", paragraph)[0].rstrip(".:;")
 
