@@ -17,7 +17,7 @@ class CorrespondenceError(InputError):
     """Meshes, or a mesh and a model, do not share their vertices or their triangles."""
 
 
-class FileError(ShapespaceError):
+class FileError(ShapespaceError, OSError):
     """A file cannot be read or written; the sentence names it."""
 
 

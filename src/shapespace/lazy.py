@@ -44,6 +44,7 @@ LAZY_FUNCTIONS: Mapping[str, str] = MappingProxyType(
         "trusted_surfaces": "store.corresponding",
         "view_fit": "viewer.notebook_viewer",
         "view_model": "viewer.notebook_viewer",
+        "write_mesh": "io.meshes.mesh_io",
     }
 )
 """Function -> its module, which is imported when the function is first asked for."""

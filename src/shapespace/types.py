@@ -79,6 +79,23 @@ def require_whole(value: object, name: str) -> None:
         raise InputError(f"{name} is a whole number or None, not {type(value).__name__}; give a number such as 10.")
 
 
+def generator_of(rng: object, function: str) -> np.random.Generator:
+    """Return a generator from itself or a seed.
+
+    Args:
+        rng: `np.random.Generator`, or a whole number from 0.
+        function: that takes it, for the message.
+
+    Raises:
+        InputError: it is neither.
+    """
+    if isinstance(rng, np.random.Generator):
+        return rng
+    if isinstance(rng, bool) or not isinstance(rng, Integral) or int(rng) < 0:
+        raise InputError(f"{function} takes a seed from 0 or a np.random.Generator, not {rng!r:.40}.")
+    return np.random.default_rng(int(rng))
+
+
 def read_only(array: npt.ArrayLike) -> FloatArray:
     """Return `array` as a C-ordered float64 array that refuses writing; a view where no copy is needed.
 
@@ -135,8 +152,8 @@ class Mesh:
             if raw.size and (raw.min() < 0 or raw.max() >= len(vertices)):
                 bad = int(raw.max()) if raw.max() >= len(vertices) else int(raw.min())
                 raise MeshError(
-                    f"{self.name}: a face points at vertex {bad}, but there are only {len(vertices)} vertices; "
-                    "the file is damaged or cut short."
+                    f"{self.name}: a face points at vertex {bad}, but there are only {len(vertices)} vertices, "
+                    f"counted from 0; correct the faces, or export the file again."
                 )
             faces = np.ascontiguousarray(raw, dtype=np.int32).view()
             faces.setflags(write=False)
@@ -186,6 +203,29 @@ class Mesh:
             notes=self.notes,
             observed=self.observed,
         )
+
+    @property
+    def bounds(self) -> FloatArray:
+        """(2, 3) least and largest coordinates of the vertices, in their unit."""
+        return read_only([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+    @property
+    def area(self) -> float:
+        """Area of the triangles, in the square of the unit of `vertices`; 0 for a point cloud."""
+        if self.faces is None:
+            return 0.0
+        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
+        return 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+
+    def export(self, path: PathLike[str] | str) -> None:
+        """Write the mesh to a file, in the format of its ending; see `write_mesh`.
+
+        Raises:
+            FileFormatError: the ending is no format that is written.
+            FileError: the file cannot be written.
+        """
+        require_path(path, "Mesh.export")
+        lazy_import("write_mesh")(path, self)
 
     def to_trimesh(self) -> Any:
         """Return a `trimesh.Trimesh` with the same vertices, or a `trimesh.PointCloud` where there are no triangles.

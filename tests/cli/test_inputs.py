@@ -60,6 +60,8 @@ def test_lists_of_lines_and_patterns_name_scans(run: Run, world: World, tmp_path
         ("", "needs a column"),
         ("id,scan\n../x,a.ply\n", "row 2 has an id that no file can have"),
         ("id,scan\nx,a.ply\nX,b.ply\n", "Two scans have the id"),
+        ("scan,age\na.ply,1\nb.ply,2\na.ply,3\n", "rows 1 ('a.ply') and 3 ('a.ply') are of one specimen"),
+        ("id,scan\nx,a.ply\nX,a.ply\n", "rows 1 ('x') and 2 ('X') are of one specimen"),
         ("scan,age\na.ply,3,4\n", "has 3 cells in row 1"),
         ("scan,age\n,3\n", "row 2 names no scan"),
         ("scan\n\0\n", "binary"),

@@ -160,7 +160,7 @@ def test_bad_input_gives_one_sentence(run: Run, classifier: Path, train: Path, n
         (("train", train, *labels, *out, "--classifier", "forest"), "no classifier 'forest'"),
         (("train", train, *labels, *out, "--modes", 9), "There are 4 coefficients"),
         (("train", train, "--labels", tmp_path / "few.csv", *out), "at least two classes"),
-        (("train", train, "--labels", train / "p0_smile.fit.json", *out), "table of labels|CSV"),
+        (("train", train, "--labels", train / "p0_smile.fit.json", *out), "no table of specimens"),
         (("train", train, "--labels", tmp_path / "people.csv", *out), "a column label or expression"),
         (("predict", classifier, new, "-o", tmp_path / "a.csv"), "give --labels"),
         (("predict", tmp_path / "damaged.skops", new, "-o", tmp_path / "a.csv"), "cut short"),

@@ -119,7 +119,7 @@ def test_a_basis_that_is_not_orthonormal_is_made_so_and_keeps_every_shape() -> N
 def test_in_the_form_gauge_each_shape_has_its_own_size_and_its_own_shape(gauge: str) -> None:
     given = blob_model(VERTICES, MODES, gauge)
     # A frame far from the middle of the object must not turn sizes into places.
-    given = replace(given, mean=given.mean + np.tile([500.0, -200.0, 50.0], VERTICES))
+    given = replace(given, mean=given.mean + np.array([500.0, -200.0, 50.0]))
     fitted, sizes = fitted_of(given), np.linspace(400.0, 900.0, COUNT)
     cohort = Cohort.of_fits(fitted, *blank(COUNT), sizes, "form")
     shapes = np.stack([given.reconstruct(b) for b in fitted.b])
@@ -283,9 +283,9 @@ def test_a_table_names_fits_by_their_scans_and_tells_whom_it_lacks(fits: Path, t
     cohort = read_cohort(tmp_path / "data.csv", CohortConfig(shapes=fits))
     assert cohort.names == ("scan0", "scan9") and list(cohort.table.numbers("age")) == [0, 9]
     told = " ".join(cohort.notes)
-    assert "1 of 4 rows" in told and "(stranger)" in told
+    assert "1 of 4 rows" in told and "stranger" in told
     assert "1 of 3 fits are left out, which are doubtful (scan3)" in told
-    assert "7 of 10 shapes" in told and "have no row" in told
+    assert "7 of 10 specimens" in told and "have no row" in told
 
 
 def test_coefficients_csv_is_a_table_of_its_own_folder(fits: Path) -> None:
@@ -340,7 +340,7 @@ def test_too_few_fits_say_why(fits: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"1 of its fits can be used.*doubtful \(scan3, scan4\)"):
         read_cohort(tmp_path / "data.csv", CohortConfig(shapes=fits))
     write_text(tmp_path / "data.csv", "file\nx\ny\n")
-    with pytest.raises(InputError, match=r"holds no shape of .*such as x, y; there is scan0, scan1"):
+    with pytest.raises(InputError, match=r"holds no specimen of .*such as x, y; specimens scan0, scan1"):
         read_cohort(tmp_path / "data.csv", CohortConfig(shapes=fits))
 
 

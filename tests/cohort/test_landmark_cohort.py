@@ -11,7 +11,7 @@ import pytest
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.landmark_cohort import landmark_cohort
 from shapespace.cohort.read import CohortConfig, read_cohort
-from shapespace.cohort.table import read_table
+from shapespace.cohort.table import match_rows, read_table
 from shapespace.commands.align import align
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.geometry.landmark_alignment import AlignConfig, align_landmarks
@@ -100,8 +100,8 @@ def test_rows_without_landmarks_and_landmarks_without_rows_are_left_out_with_not
     table = write_table(tmp_path / "some.csv", (*NAMES[:5], "unknown"))
     cohort = read_cohort(table, CohortConfig(shapes=file))
     assert cohort.names == NAMES[:5]
-    assert "1 of 6 rows" in cohort.notes[0] and "7 of 12 shapes" in cohort.notes[1]
-    with pytest.raises(InputError, match="holds no shape of"):
+    assert "1 of 6 rows" in cohort.notes[0] and "7 of 12 specimens" in cohort.notes[1]
+    with pytest.raises(InputError, match="holds no specimen of"):
         read_cohort(write_table(tmp_path / "none.csv", ("a", "b")), CohortConfig(shapes=file))
     with pytest.raises(InputError, match="1 specimen can be used, and 2 are needed"):
         read_cohort(write_table(tmp_path / "one.csv", NAMES[:1]), CohortConfig(shapes=file))
@@ -196,4 +196,4 @@ def test_damaged_folders_are_refused_in_one_sentence(
 def test_a_table_of_scans_and_one_of_specimens_both_name_the_landmarks(tmp_path: Path) -> None:
     table = tmp_path / "table.csv"
     table.write_text("file,sex\na.1,f\nscans/b.ply,m\nc.2,f\nc.3,m\n")
-    assert read_table(table, {"a.1", "b"})[1] == ("a.1", "b", "c.2", "c.3")
+    assert match_rows(read_table(table), [["a.1"], ["b"]], "x")[0] == {0: 0, 1: 1}

@@ -1,12 +1,13 @@
 """Tables of what is known of shapes: numbers, classes, missing cells, and what is refused by name."""
 
-from pathlib import Path
+from collections.abc import Sequence
+from pathlib import Path, PurePath
 
 import numpy as np
 import pytest
 
 from shapespace.cohort.classes import notes_on_classes
-from shapespace.cohort.table import Table, list_names, numbers_as_text, read_table
+from shapespace.cohort.table import Table, list_names, match_rows, names_of_file, numbers_as_text, read_table
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.files import write_text
 
@@ -19,8 +20,8 @@ def written(folder: Path, text: str = LINES) -> Path:
 
 
 def test_rows_are_called_by_their_files_and_cells_that_say_nothing_are_empty(tmp_path: Path) -> None:
-    table, keys = read_table(written(tmp_path))
-    assert keys == table.rows == ("a", "b", "c") and list(table.columns) == ["sex", "age"]
+    table = read_table(written(tmp_path))
+    assert table.rows == ("scans/a.ply", "b.ply", "c.stl") and list(table.columns) == ["sex", "age"]
     assert table.texts("sex") == ("f", "m", "") and table.texts("age") == ("20", "", "41.5")
     assert np.array_equal(table.numbers("age"), [20, np.nan, 41.5], equal_nan=True)
     assert table.kind("sex") == "text" and table.kind("age") == "number"
@@ -29,7 +30,7 @@ def test_rows_are_called_by_their_files_and_cells_that_say_nothing_are_empty(tmp
 
 @pytest.mark.parametrize("word", ["", " ", "NA", "nan", "N/A", "null", "None"])
 def test_missing_is_written_in_many_ways(tmp_path: Path, word: str) -> None:
-    table, _ = read_table(written(tmp_path, f"id,age\na,{word}\nb,3\n"))
+    table = read_table(written(tmp_path, f"id,age\na,{word}\nb,3\n"))
     assert table.missing(["age"]) == [0]
 
 
@@ -37,13 +38,79 @@ def test_missing_is_written_in_many_ways(tmp_path: Path, word: str) -> None:
     ("heads", "own"), [("file,scan,name,id", 0), ("scan,name,id,other", 0), ("name,id,a,b", 0), ("x,y,z,id", 3)]
 )
 def test_the_first_of_the_columns_that_may_name_a_shape_does(tmp_path: Path, heads: str, own: int) -> None:
-    table, keys = read_table(written(tmp_path, f"{heads}\np,q,r,s\n"))
-    assert keys == ("pqrs"[own],) and heads.split(",")[own] not in table.columns and len(table.columns) == 3
+    table = read_table(written(tmp_path, f"{heads}\np,q,r,s\n"))
+    assert table.rows == ("pqrs"[own],) and heads.split(",")[own] not in table.columns and len(table.columns) == 3
 
 
-def test_scans_of_one_name_in_different_folders_are_told_apart_by_them(tmp_path: Path) -> None:
-    _, keys = read_table(written(tmp_path, "file\nanna/smile.ply\nbert/smile.ply\nbert\\calm.ply\n"))
-    assert keys == ("anna_smile", "bert_smile", "calm")
+def matched(rows: str, *specimens: Sequence[str]) -> dict[str, str]:
+    """Return row -> specimen of a table with these rows, separated by spaces."""
+    names = tuple(rows.split())
+    found, _ = match_rows(Table({}, names, "data.csv"), specimens, "scans")
+    return {names[row]: specimens[k][0] for row, k in found.items()}
+
+
+def test_scans_of_one_name_in_different_folders_are_told_apart_by_them() -> None:
+    rows = "anna/smile.ply bert/smile.ply bert\\calm.ply"
+    assert matched(rows, ["bert_smile"], ["calm"], ["smile"]) == {
+        "bert/smile.ply": "bert_smile", "bert\\calm.ply": "calm",
+    }  # fmt: skip
+    paths = [names_of_file(PurePath(f"/data/{name}.ply")) for name in ("bert/smile", "anna/smile")]
+    assert match_rows(Table({}, tuple(rows.split())), paths, "scans")[0] == {0: 1, 1: 0}
+
+
+@pytest.mark.parametrize(
+    ("row", "specimen"),
+    [
+        ("anna", "anna"), ("ANNA", "anna"), ("Anna.ply", "anna"), ("scans/anna.nii.gz", "anna"), ("anna", "Anna"),
+        ("c:\\in\\anna.PLY", "anna"), ("a.1", "a.1"), ("a.1.ply", "a.1"), ("A.1", "a.1"), ("anna.v2", "anna"),
+        ("in/anna.ply", "in_anna"), ("x/in/anna.ply", "in_anna"), (" anna ", "anna"), ("Mu\u0308ller", "M\u00fcller"),
+        ("STRASSE", "straße"),
+    ],
+)  # fmt: skip
+def test_a_row_names_a_specimen_or_its_file_in_any_case(row: str, specimen: str) -> None:
+    others = [["b"], ["ann"], ["annab"]]
+    assert match_rows(Table({}, (row,)), [*others, [specimen]], "scans")[0] == {0: 3}
+
+
+def test_a_row_that_fits_several_specimens_is_of_the_one_that_it_names_exactly_or_of_none() -> None:
+    assert matched("a A", ["A"], ["a"]) == {"a": "a", "A": "A"}
+    assert matched("B.1 B", ["b"], ["B.1"]) == {"B.1": "B.1", "B": "b"}
+    assert matched("Ab x", ["ab"], ["AB"], ["x"]) == {"x": "x"}
+    assert matched("a fit1", ["fit1", "a"], ["a", "b"]) == {"a": "a", "fit1": "fit1"}, (
+        "the name of a fit goes before those of scans"
+    )
+
+
+@pytest.mark.parametrize(
+    ("rows", "told"),
+    [
+        ("anna bert anna", r"rows 1 \('anna'\) and 3 \('anna'\) are of one specimen;"),
+        ("anna Anna", r"rows 1 \('anna'\) and 2 \('Anna'\) are of one specimen;"),
+        ("anna.ply anna.stl", r"\('anna.ply'\) and 2 \('anna.stl'\) are of one specimen;"),
+        ("in/anna.ply ANNA", "are of one specimen;"),
+        ("bert Nobody nobody", r"\('Nobody'\) and 3 \('nobody'\) are of one specimen;"),
+        ("anna Anna BERT bert", "are of one specimen; so are those of 1 more;"),
+    ],
+)
+def test_two_rows_of_one_specimen_are_refused_and_both_named(rows: str, told: str) -> None:
+    with pytest.raises(FileFormatError, match=told) as error:
+        matched(rows, ["anna"], ["bert"])
+    assert str(error.value).startswith("data.csv: ") and str(error.value).endswith("keep one row for each specimen.")
+
+
+def test_rows_without_a_specimen_and_specimens_without_a_row_are_counted() -> None:
+    table = Table({}, tuple("abcxyzw"), "data.csv")
+    assert match_rows(table, [[name] for name in "dcbaq"], "scans")[1] == [
+        "4 of 7 rows of data.csv have no specimen in scans and are left out (x, y, z and 1 more).",
+        "2 of 5 specimens in scans have no row in data.csv (d, q).",
+    ]
+    assert match_rows(table.take([0, 3]), [["a"], ["b"]], "scans")[1] == [
+        "1 of 2 rows of data.csv has no specimen in scans and is left out (x).",
+        "1 of 2 specimens in scans has no row in data.csv (b).",
+    ]
+    assert match_rows(table.take([0]), [["a"]], "scans")[1] == []
+    with pytest.raises(InputError, match=r"scans holds no specimen of data.csv \(rows such as x; specimens a\); give"):
+        match_rows(table.take([3]), [["a"]], "scans")
 
 
 def test_a_string_among_numbers_is_refused_by_its_row_and_many_make_classes() -> None:
@@ -81,12 +148,10 @@ def test_rows_can_be_taken_in_any_order() -> None:
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("age,sex\n1,2\n", "no table of shapes"),
-        ("file,age\n", "no table of shapes"),
-        ("", "no table of shapes"),
-        ("file,age\na,1\na,2\n", "two or more rows of 'a'"),
+        ("age,sex\n1,2\n", "no table of specimens"),
+        ("file,age\n", "no table of specimens"),
+        ("", "no table of specimens"),
         ("file,age\na,1\n,2\n", "has no file in row 2"),
-        ("file,age\na.ply,1\na.stl,2\n", "two or more rows of 'a'"),
         ("file,age,age\na,1,2\n", r"two columns of one name \('age'\)"),
         ("file,age\na,1,2\n", "3 cells in row 1"),
         ('file,age\n"a,1\n', "not a CSV table"),
@@ -105,8 +170,10 @@ def test_tables_are_read_in_the_encodings_and_with_the_delimiters_that_programs_
 ) -> None:
     text = "File,sex,age\nMüller.ply,f,20\nb.ply,m,\n".replace(",", delimiter)
     (tmp_path / "data.csv").write_bytes(text.encode(encoding))
-    table, keys = read_table(tmp_path / "data.csv")
-    assert keys == ("Müller", "b") and table.texts("sex") == ("f", "m") and table.texts("age") == ("20", "")
+    table = read_table(tmp_path / "data.csv")
+    assert (
+        table.rows == ("Müller.ply", "b.ply") and table.texts("sex") == ("f", "m") and table.texts("age") == ("20", "")
+    )
 
 
 def test_what_is_no_text_or_not_there_is_refused(tmp_path: Path) -> None:
@@ -120,12 +187,12 @@ def test_what_is_no_text_or_not_there_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("key", ["ID", "Specimen", "SCAN", "Name", "file", " id "])
 def test_the_key_may_be_any_of_five_columns_in_any_case(tmp_path: Path, key: str) -> None:
-    table, keys = read_table(written(tmp_path, f"sex,{key}\nf,a\nm,b\n"))
-    assert keys == ("a", "b") and list(table.columns) == ["sex"]
+    table = read_table(written(tmp_path, f"sex,{key}\nf,a\nm,b\n"))
+    assert table.rows == ("a", "b") and list(table.columns) == ["sex"]
 
 
 def test_decimal_commas_are_read_where_commas_do_not_part_cells(tmp_path: Path) -> None:
-    table, _ = read_table(written(tmp_path, "id;age;site;n\na;20,5;1,2a;1\nb;-3;x;2\nc;NA;y;3\n"))
+    table = read_table(written(tmp_path, "id;age;site;n\na;20,5;1,2a;1\nb;-3;x;2\nc;NA;y;3\n"))
     assert np.array_equal(table.numbers("age"), [20.5, -3, np.nan], equal_nan=True)
     assert table.texts("site") == ("1,2a", "x", "y") and table.texts("n") == ("1", "2", "3")
     for cells in ("20,5 1.5", "1.234,5 2", "1.234,5 1,5"):
@@ -135,12 +202,12 @@ def test_decimal_commas_are_read_where_commas_do_not_part_cells(tmp_path: Path) 
 
 
 def test_rows_may_be_shorter_than_the_header_and_have_empty_cells_beside_it(tmp_path: Path) -> None:
-    table, keys = read_table(written(tmp_path, "sep=;\nid;sex;age;;\na;f;20;;\nb;m\n;;;;\n"))
-    assert keys == ("a", "b") and table.texts("age") == ("20", "")
+    table = read_table(written(tmp_path, "sep=;\nid;sex;age;;\na;f;20;;\nb;m\n;;;;\n"))
+    assert table.rows == ("a", "b") and table.texts("age") == ("20", "")
 
 
 def test_white_space_of_cells_and_names_of_columns_makes_no_class(tmp_path: Path) -> None:
-    table, _ = read_table(written(tmp_path, "id, Group \na,Wild \nb,\xa0Wild\nc,Wild\n"))
+    table = read_table(written(tmp_path, "id, Group \na,Wild \nb,\xa0Wild\nc,Wild\n"))
     own = Table({" Group ": ("Wild ", " Wild", "Wild\t")}, ("a", "b", "c"))
     assert table.texts("Group") == own.texts("Group") == ("Wild",) * 3
     with pytest.raises(InputError, match="two columns whose names differ only in white space"):
@@ -148,7 +215,7 @@ def test_white_space_of_cells_and_names_of_columns_makes_no_class(tmp_path: Path
 
 
 def test_what_a_spreadsheet_would_run_loses_its_apostrophe_and_columns_of_lists_their_mark(tmp_path: Path) -> None:
-    table, _ = read_table(written(tmp_path, "scan,meta_sex,meta_age,age\na,'=f(),1,2\n"))
+    table = read_table(written(tmp_path, "scan,meta_sex,meta_age,age\na,'=f(),1,2\n"))
     assert table.texts("sex") == ("=f()",) and table.texts("meta_age") == ("1",) and table.texts("age") == ("2",)
 
 

@@ -610,6 +610,13 @@ def test_public_names_are_in_the_reference() -> None:
     assert set(re.findall(r"^- `(\w+)`:", text, re.MULTILINE)) == set(PUBLIC_NAMES()) - {"__version__"}
 
 
+def test_the_python_reference_is_up_to_date() -> None:
+    wanted = runpy.run_path(str(ROOT / "tools" / "make_api_reference.py"))["page"]()
+    assert (ROOT / "docs" / "api.md").read_text("utf-8") == wanted, "run: python tools/make_api_reference.py"
+    for name, signature in re.findall(r"^- `(\w+)`: .*\n  `(\w+)", wanted, re.MULTILINE):
+        assert name == signature
+
+
 def test_public_names_have_docstrings() -> None:
     for name, value in PUBLIC_NAMES().items():
         assert inspect.getdoc(value), name

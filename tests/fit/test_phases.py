@@ -134,7 +134,7 @@ def test_correspondences_follow_the_deformed_model(model: ShapeModel) -> None:
     search = build_engine(raw.scan)
     T = states[0].T_scan_model
     mean_matches = search.query(T.apply(model.mean_vertices)).points
-    printed = model.basis.T @ (T.inverse().apply(mean_matches).ravel() - model.mean)
+    printed = model.basis.T @ (T.inverse().apply(mean_matches).ravel() - model.mean.ravel())
     assert np.abs(states[1].b - printed).max() > 0
     assert np.abs(states[-1].b - states[1].b).max() > 3.0
     truth = model.project(raw.truth)
@@ -144,7 +144,7 @@ def test_correspondences_follow_the_deformed_model(model: ShapeModel) -> None:
 def test_matches_are_projected_in_the_frame_of_the_model(model: ShapeModel) -> None:
     T = similarity(5, 60.0, 2.0, 100.0)
     b, scan = instance(model, T)
-    raw_coordinates = model.basis.T @ (scan.vertices.ravel() - model.mean)  # P19 as printed
+    raw_coordinates = model.basis.T @ (scan.vertices.ravel() - model.mean.ravel())  # P19 as printed
     assert np.abs(raw_coordinates - b).max() > 100
     state = list(shape_icp(model, build_engine(scan), T, StopRule(1e-6, 1e-6, 1), b=b))[-1]
     assert np.abs(state.b - b).max() < 1e-9

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from shapespace.cohort.labels import Label, read_labels
 from shapespace.cohort.table import read_table
 from shapespace.errors import FileFormatError
-from shapespace.io.tables.label_table import Label, read_labels
 from shapespace.io.tables.table_io import CHECKSUM, checked_table_text, table_rows, table_text
 from shapespace.io.tables.workbook import sheet_rows
 
@@ -82,8 +82,8 @@ STYLES = (
 def test_a_workbook_is_read_as_the_table_that_it_shows(tmp_path: Path) -> None:
     path = tmp_path / "people.xlsx"
     path.write_bytes(workbook(SHEET, STRINGS, styles=STYLES))
-    table, keys = read_table(path)
-    assert keys == ("Müller", "b")
+    table = read_table(path)
+    assert table.rows == ("Müller", "b")
     assert dict(table.columns) == {
         "sex": ("f", ""), "age": ("20.5", ""), "visit": ("2021-01-01", "2021-01-01 12:00:00"), "smokes": ("TRUE", ""),
     }  # fmt: skip
@@ -91,10 +91,10 @@ def test_a_workbook_is_read_as_the_table_that_it_shows(tmp_path: Path) -> None:
 
 def test_labels_are_what_compare_takes(tmp_path: Path) -> None:
     (tmp_path / "t.csv").write_bytes("ID;age;group \r\na;1,5;wild\r\nb;2;wild \r\nc;3;lab\r\n".encode("utf-16"))
-    expected = {"a": Label("wild"), "b": Label("wild"), "c": Label("lab")}
-    assert read_labels(tmp_path / "t.csv") == expected
+    expected = (Label("wild"), Label("wild"), Label("lab"))
+    assert read_labels(tmp_path / "t.csv").labels == expected
     (tmp_path / "t.csv").write_text("specimen,age,habitat\na,1,wild\nb,2,wild\nc,3,lab\n")
-    assert read_labels(tmp_path / "t.csv", of_any=True) == expected
+    assert read_labels(tmp_path / "t.csv", of_any=True).labels == expected
     with pytest.raises(FileFormatError, match="no table of labels"):
         read_labels(tmp_path / "t.csv")
 

@@ -134,7 +134,7 @@ def test_truncation_adds_what_it_drops_to_the_noise_variance(k: int) -> None:
     short = full.truncate(k)
     data = np.stack([m.vertices.ravel() for m in meshes])
     b = (data - data.mean(axis=0)) @ short.basis
-    left_over = ((data - short.mean - b @ short.basis.T) ** 2).sum() / (len(meshes) - 1)
+    left_over = ((data - short.mean.ravel() - b @ short.basis.T) ** 2).sum() / (len(meshes) - 1)
     assert short.noise_variance == pytest.approx(left_over / (600 - k), rel=1e-6, abs=1e-12)
     direct = ShapeModel.fit(meshes, modes=k, align=False)
     assert short.noise_variance == pytest.approx(direct.noise_variance, rel=1e-6, abs=1e-12)
@@ -269,7 +269,7 @@ def test_arrays_that_do_not_belong_together_are_refused() -> None:
     m = blob_model(vertices=200)
     for change in (
         {"basis": m.basis[:, :3]},
-        {"mean": m.mean[:-1]},
+        {"mean": m.mean.ravel()[:-1]},
         {"stddev": np.zeros(0)},
         {"stddev": -m.stddev},
         {"stddev": 0 * m.stddev},

@@ -5,8 +5,9 @@ import pytest
 
 from shapespace import schemas
 from shapespace.batch.fit_records import Source, coefficient_row, failed_record, write_coefficients
+from shapespace.cohort.labels import Label, Labels
+from shapespace.cohort.table import Table
 from shapespace.errors import FileError, FileFormatError, InputError
-from shapespace.io.tables.label_table import Label
 from shapespace.recognise.classifiers import CLASSIFIERS
 from shapespace.recognise.labelled_scans import (
     ScanCoefficients,
@@ -254,6 +255,13 @@ def test_a_damaged_record_is_refused_by_name(changes):
 def test_labels_are_found_by_the_file_of_the_scan_and_by_the_name_of_the_fit():
     scans = [from_record("scan_2", record("anna")), ScanCoefficients("ben", "converged", "", np.ones(2), HASH),
              ScanCoefficients("carl", "converged", "", np.ones(2), HASH)]  # fmt: skip
-    found = with_labels(scans, {"anna": Label("smile", None, "Anna"), "ben": Label("", None, "Ben")})
+    table = Table({}, ("in/Anna.ply", "ben", "dora"), "l.csv")
+    found, notes = with_labels(
+        scans, Labels(table, (Label("smile", None, "Anna"), Label("", None, "Ben"), Label("x"))), "fits"
+    )
+    assert notes == [
+        "1 of 3 rows of l.csv has no specimen in fits and is left out (dora).",
+        "1 of 3 specimens in fits has no row in l.csv (carl).",
+    ]
     assert [(s.label, s.subject) for s in found] == [("smile", "Anna"), ("", "Ben"), ("", "")]
     assert one_model(found) == HASH

@@ -511,6 +511,56 @@ def test_tables_and_formulas_that_cannot_be_are_refused(formula: str, words: tup
     refused(table, formula, *words)
 
 
+ODD_NAMES = ("Group #", "body mass (g)", "a:b", "a-b", "x|y", "*~^", "2nd", "50 %", "größe,", "it's", "C(x)", "[1] {y}")
+
+
+@pytest.mark.parametrize("name", ODD_NAMES)
+@pytest.mark.parametrize(
+    "form", ["{0}", "C({0})", "log({0}) + age", "poly({0}, 2) * sex", "sex:{0} + sex", "({0} + age)^2"]
+)
+def test_any_column_can_be_named_in_backticks(name: str, form: str) -> None:
+    values = np.tile([1.0, 2.0, 4.0], 7)
+    columns = {**people(21), "plain": values.tolist()}
+    plain = design_of(f"~ {form.format('plain')}", cohort(columns).table)
+    odd = design_of(f"~ {form.format(f'`{name}`')}", cohort({**columns, name: values.tolist()}).table)
+    np.testing.assert_array_equal(odd.matrix, plain.matrix)
+    assert [term.label for term in odd.terms] == [term.label.replace("plain", name) for term in plain.terms]
+    assert name in {one.name.removeprefix("C(").removesuffix(")") for one in odd.variables} | {
+        one.name for one in odd.variables
+    }
+
+
+@pytest.mark.parametrize("formula", ["~ Group #", "~ sex + Group #", "~ C(Group #)", "~ `Group #` + Group #"])
+def test_a_name_that_needs_backticks_is_shown_with_them(formula: str) -> None:
+    refused(
+        {**people(), "Group #": ["a", "b"] * 18 + ["a"], "#": [1] * 37}, formula, "write `Group #` with its backticks"
+    )
+
+
+def test_few_whole_numbers_that_are_used_as_a_number_are_named_first() -> None:
+    table = {**people(24), "family": [13, 14, 15, 16] * 6, "Day #": [1, 2, 5] * 8, "two": [0, 1] * 12,
+             "half": [0.5, 1, 2] * 7 + [0.5] * 3, "years": list(range(24))}  # fmt: skip
+    result = compare(cohort(table), "~ family + `Day #` + two + half + years", QUICK)
+    told = result.cohort.cautions
+    assert result.tests[0].df == 1 and len(told) == 2
+    assert told[0] == (
+        "family has 4 different whole numbers (13, 14, 15, 16) and is used as a number, with 1 degree of freedom; if "
+        "they are codes of classes, write C(family), with 3."
+    )
+    assert "write C(`Day #`), with 2." in told[1]
+    assert analysis_report(result).summary[1:3] == told
+    classes = compare(cohort(table), "~ C(family) + log(`Day #`)", QUICK)
+    assert classes.cohort.cautions == () and [test.df for test in classes.tests] == [3, 1]
+
+
+def test_codes_that_are_used_as_classes_are_counted_and_single_ones_named() -> None:
+    table = {**people(24), "family": [13, 14, "15.0", 15] * 5 + [14, 15, 16, 15]}
+    notes = compare(cohort(table), "~ C(family)", QUICK).cohort.notes
+    assert "Shapes in each class of family: 15 12, 14 6, 13 5, 16 1." in notes
+    assert any(note.startswith("family has 1 class with one shape ('16')") for note in notes)
+    assert not any("family" in note for note in compare(cohort(table), "~ family", QUICK).cohort.notes)
+
+
 def test_missing_rows_are_left_out_when_asked_and_said() -> None:
     table = people() | {"holes": [None, None, *people()["age"][2:]]}
     found = compare(cohort(table), "~ holes", CompareConfig(permutations=20, maps=False, drop_missing=True))

@@ -3,29 +3,40 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from itertools import combinations
 
 from shapespace.cohort.table import Table, is_number
 
 _LISTED = 12
 """Largest number of classes whose counts are listed."""
+_FEWEST_CODES = 3
+"""Fewest classes that differ from a number; two classes have one degree of freedom too."""
 _COMPARED = 60
 """Largest number of classes that are compared letter by letter; columns with more contain names."""
 _LONG = 5
 """Shortest words that count as similar if one letter differs; shorter ones, such as left and lent, do not."""
 
 
-def class_notes(table: Table, columns: Iterable[str]) -> tuple[str, ...]:
-    """Return sentences on the classes in some columns of a table; none on columns of three numbers or more.
+def class_notes(table: Table, columns: Iterable[str], numbers: Collection[str] = ()) -> tuple[str, ...]:
+    """Return sentences on the classes in some columns of a table.
+
+    Args:
+        table: with the columns.
+        columns: that are used as classes, whatever they contain, or as numbers.
+        numbers: those that are used as numbers.
 
     Raises:
         InputError: there is no such column.
     """
-    return tuple(note for column in dict.fromkeys(columns) for note in notes_on_classes(column, table.texts(column)))
+    return tuple(
+        note
+        for column in dict.fromkeys(columns)
+        for note in notes_on_classes(column, table.texts(column), codes=column not in numbers)
+    )
 
 
-def notes_on_classes(column: str, cells: Sequence[str]) -> list[str]:
+def notes_on_classes(column: str, cells: Sequence[str], *, codes: bool = False) -> list[str]:
     """Return the number of shapes in each class, and sentences on classes that may be misspelt.
 
     If more than half of all shapes are the only ones of their class, the column contains names and no counts are given.
@@ -33,10 +44,14 @@ def notes_on_classes(column: str, cells: Sequence[str]) -> list[str]:
     Args:
         column: its name.
         cells: of all shapes; missing ones are empty.
+        codes: whether numbers are codes of classes.
     """
     counts = Counter(cell for cell in cells if cell)
+    if codes and all(map(is_number, counts)):
+        counts = Counter(f"{float(cell):g}" for cell in cells if cell)
     total = counts.total()
-    if not total or (len(counts) != 2 and 2 * sum(n for cell, n in counts.items() if is_number(cell)) > total):
+    is_numeric = 2 * sum(n for cell, n in counts.items() if is_number(cell)) > total
+    if not total or (len(counts) != 2 and is_numeric and not codes):
         # Two numbers are often codes of two groups.
         return []
     has_names = 2 * len(counts) > total
@@ -60,6 +75,26 @@ def notes_on_classes(column: str, cells: Sequence[str]) -> list[str]:
             f"differ only in {difference}; correct the table if they are the same."
         )
     return notes
+
+
+def number_caution(table: Table, column: str, classes: str) -> str:
+    """Return a sentence on a column of few different whole numbers that is used as a number; empty on other columns.
+
+    Args:
+        table: with the column.
+        column: of numbers.
+        classes: what to write for classes.
+    """
+    values = {float(value) for value in table.numbers(column)}
+    if not _FEWEST_CODES <= len(values) <= _LISTED or len(table) < 2 * len(values):
+        return ""
+    if not all(value.is_integer() for value in values):
+        return ""
+    listed = ", ".join(f"{value:g}" for value in sorted(values))
+    return (
+        f"{column} has {len(values)} different whole numbers ({listed}) and is used as a number, with 1 degree of "
+        f"freedom; if they are codes of classes, write {classes}, with {len(values) - 1}."
+    )
 
 
 def _similar(names: Sequence[str], *, letters: bool) -> list[tuple[str, str, str]]:

@@ -6,7 +6,7 @@ squares) needs the coefficients alone, whatever the number of vertices.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, TypeAlias
@@ -17,7 +17,7 @@ import numpy.typing as npt
 from shapespace.cohort.classes import class_notes
 from shapespace.cohort.incomplete import complete_by_population, completed_shapes
 from shapespace.cohort.shape_samples import ShapeSamples
-from shapespace.cohort.table import Table, list_names, numbers_as_text
+from shapespace.cohort.table import Table, cell_text, list_names, numbers_as_text
 from shapespace.errors import InputError
 from shapespace.geometry.landmark_alignment import AlignedLandmarks, project_to_tangent
 from shapespace.geometry.procrustes import Gauge, align_in_place, centroid_size, scale_to_tangent
@@ -137,6 +137,7 @@ class Cohort:
         landmarks: named points on the surfaces; a mapping of name to vertex may be given for those at vertices.
         fitted: of fits; None for other surfaces.
         notes: who was left out and why, a sentence each.
+        cautions: sentences on the use of columns that answers begin with.
         source: source of the shapes.
         unit: of lengths: `mm`, or empty for coordinates without a unit, such as those of unit centroid size.
         observed: (N, V) bool, False for vertices that are estimates; None if all are observed.
@@ -167,6 +168,7 @@ class Cohort:
     position_std: FloatArray | None = None
     samples: tuple[ShapeSamples | None, ...] = ()
     review: SurfaceReview = field(default_factory=SurfaceReview)
+    cautions: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -311,20 +313,21 @@ class Cohort:
             notes=(*self.notes, *notes),
         )
 
-    def complete(self, columns: Sequence[str], *, drop_missing: bool = False) -> Cohort:
+    def complete(self, columns: Sequence[str], *, drop_missing: bool = False, numbers: Collection[str] = ()) -> Cohort:
         """Return the cohort of the shapes with values in all `columns`, with notes on the excluded shapes and the
         classes.
 
         Args:
-            columns: of the table.
+            columns: of the table, used as classes if not in `numbers`.
             drop_missing: leave out the others, and say so in a note.
+            numbers: columns that are used as numbers; they must be among `columns`.
 
         Raises:
             InputError: there is no such column, something is missing and `drop_missing` is not set, or nobody is left.
         """
         missing = self.table.missing(columns)
         if not missing:
-            new = [note for note in class_notes(self.table, columns) if note not in self.notes]
+            new = [note for note in class_notes(self.table, columns, numbers) if note not in self.notes]
             return replace(self, notes=(*self.notes, *new)) if new else self
         excluded_names = list_names([self.names[row] for row in missing])
         columns = [column for column in dict.fromkeys(columns) if self.table.missing([column])]
@@ -341,7 +344,7 @@ class Cohort:
             f"({excluded_names})."
         )
         complete_shapes = self.take([row for row in range(len(self)) if row not in excluded], note)
-        return complete_shapes.complete(columns)
+        return complete_shapes.complete(columns, numbers=numbers)
 
     @staticmethod
     def of_shapes(
@@ -390,7 +393,7 @@ class Cohort:
             count_word = {1: "one", 2: "two"}.get(fewest, str(fewest))
             raise InputError(f"A cohort needs {count_word} or more finite shapes (N, V, 3), not {shapes.shape}.")
         shape_names = tuple(names) if names is not None else tuple(f"shape {k + 1}" for k in range(len(shapes)))
-        cells = {name: tuple(_cell(value) for value in values) for name, values in columns.items()}
+        cells = {name: tuple(map(cell_text, values)) for name, values in columns.items()}
         is_observed: BoolArray = ~np.logical_or.reduce(np.isnan(shapes), axis=2)
         is_known = is_observed if observed is None else np.logical_and(is_observed, observed)
         completed_rows = [row for row, own in enumerate(samples) if own is not None]
@@ -681,7 +684,3 @@ def _in_basis(rows: FloatArray, coefficients: FloatArray) -> tuple[FloatArray, F
         return read_only(rows), read_only(coefficients)
     q, r = np.linalg.qr(rows.T)
     return read_only(q.T), read_only(coefficients @ r.T)
-
-
-def _cell(value: object) -> str:
-    return "" if value is None or value != value else str(value)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from shapespace.cohort.cohort import Cohort, padded
-from shapespace.cohort.table import Table, list_names, name_key, note_unmatched, numbers_as_text, read_table
+from shapespace.cohort.table import Table, list_names, match_rows, name_key, numbers_as_text, read_table
 from shapespace.errors import FileFormatError, InputError
 from shapespace.geometry.landmark_alignment import AlignConfig, AlignedLandmarks, align_landmarks
 from shapespace.geometry.procrustes import Gauge, centroid_size
@@ -108,7 +108,7 @@ def _notes(folder: Path, record: AlignRecord) -> tuple[str, ...]:
 
 
 def read_landmark_cohort(
-    path: Path, table: Path | None, gauge: Gauge, onto: Cohort | None = None, least: int = 2
+    path: Path, table: Path | Table | None, gauge: Gauge, onto: Cohort | None = None, least: int = 2
 ) -> Cohort:
     """Return the cohort of a landmark file, aligned by default options, or of a folder that `align` wrote.
 
@@ -211,7 +211,7 @@ def landmark_cohort(cohort: Cohort, onto: Cohort | None = None) -> Cohort:
 def join_table(
     names: Sequence[str],
     columns: Mapping[str, tuple[str, ...]],
-    table: Path | None,
+    table: Path | Table | None,
     where: str,
     *,
     keep_unmatched: bool = False,
@@ -233,10 +233,11 @@ def join_table(
     every = range(len(names)) if keep_unmatched else sorted(range(len(names)), key=lambda k: name_key(names[k]))
     if table is None:
         return list(every), own.take(every), []
-    number = {stem_of(name): k for k, name in enumerate(names)} | {name: k for k, name in enumerate(names)}
-    given, keys = read_table(table, number)
-    row = {number[key]: k for k, key in enumerate(keys) if key in number}
-    rows, notes = [k for k in every if keep_unmatched or k in row], list[str]()
-    note_unmatched(notes, given, keys, number, [names[k] for k in row], names, where, remedy="name the specimens alike")
+    given = table if isinstance(table, Table) else read_table(table)
+    matched, notes = match_rows(
+        given, [(name, stem_of(name)) for name in names], where, remedy="name the specimens alike"
+    )
+    row = {number: k for k, number in matched.items()}
+    rows = [k for k in every if keep_unmatched or k in row]
     joined = {name: tuple(cells[row[k]] if k in row else "" for k in rows) for name, cells in given.columns.items()}
     return rows, Table({**own.take(rows).columns, **joined}, tuple(names[k] for k in rows), given.where), notes

@@ -7,21 +7,20 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias, cast, get_args
 
 import numpy as np
 
 from shapespace.cohort.cohort import Cohort, Fitted, ShapeSource
 from shapespace.cohort.landmark_cohort import has_landmarks, landmark_cohort, read_landmark_cohort
 from shapespace.cohort.shape_samples import ENDING, SampleFile, find_samples
-from shapespace.cohort.table import Table, list_names, name_key, note_unmatched, read_table
+from shapespace.cohort.table import Table, list_names, match_rows, name_key, names_of_file, read_table
 from shapespace.errors import InputError
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.landmarks.landmark_io import read_surface_landmarks
-from shapespace.io.meshes.mesh_io import stem_of
 from shapespace.model.additive import AdditiveModel, load_model
 from shapespace.model.shape_model import ShapeModel
-from shapespace.store.corresponding import SURFACE, surface_files, surface_stem
+from shapespace.store.corresponding import SURFACE, SurfaceFiles, surface_files, surface_stem
 from shapespace.store.results import Results, modes_of
 from shapespace.store.review_text import review_summary
 from shapespace.store.rows import META
@@ -83,7 +82,7 @@ class CohortConfig:
 
 
 def read_cohort(
-    data: Path | str,
+    data: Path | str | Any,
     config: CohortConfig | None = None,
     *,
     onto: Cohort | None = None,
@@ -98,7 +97,8 @@ def read_cohort(
 
     Args:
         data: a table whose column `file`, `scan`, `specimen`, `name` or `id` names a shape in each row
-            (coefficients.csv is one); a folder of results of fits, whose metadata are the table; or landmarks.
+            (coefficients.csv is one), as a file or a DataFrame; a folder of results of fits, whose metadata are the
+            table; or landmarks.
         config: which shapes; None for the defaults.
         onto: a cohort that these shapes, of which there may be one alone, are to be compared with.
         on_shape: called with (done, total) as surfaces are read.
@@ -109,15 +109,22 @@ def read_cohort(
         InputError: no row has a shape, fits of different models, the same scan twice, or fewer than two shapes.
         CorrespondenceError: meshes that are not in correspondence.
     """
-    data, config = Path(data), config or CohortConfig()
+    config = config or CohortConfig()
+    given: Table | None = None
+    if not isinstance(data, str | PathLike):
+        given = data if isinstance(data, Table) else Table.of(data)
+        if not config.shapes:
+            raise InputError("A table in memory needs the place of its shapes; give it as CohortConfig(shapes=...).")
+        data = config.shapes
+    data = Path(cast("str | PathLike[str]", data))
     source = Path(config.shapes) if config.shapes else data
     results = Results(source) if source.is_dir() else None
     if source.exists() and not (results is not None and len(results)) and has_landmarks(source):
-        table = data if config.shapes and source != data else None
+        table = given or (data if config.shapes and source != data else None)
         return read_landmark_cohort(source, table, config.gauge, onto, config.least)
     if config.geometry == "landmarks":
         least = 1 if onto is not None else config.least
-        surfaces = read_cohort(data, replace(config, geometry="surface", least=least), on_shape=on_shape)
+        surfaces = read_cohort(given or data, replace(config, geometry="surface", least=least), on_shape=on_shape)
         if surfaces.samples:
             note = (
                 "The samples of completed shapes are not used for landmarks, so p does not contain their uncertainty."
@@ -127,10 +134,7 @@ def read_cohort(
         if surfaces.landmarks is None and listed.is_file():
             surfaces = replace(surfaces, landmarks=read_surface_landmarks(listed))
         return replace(landmark_cohort(surfaces, onto), review=surfaces.review)
-    table, keys = (None, ()) if data.is_dir() else read_table(data)
-    if table is not None:
-        order = sorted(range(len(keys)), key=lambda row: name_key(keys[row]))
-        table, keys = table.take(order), tuple(keys[row] for row in order)
+    table = given or (None if data.is_dir() else read_table(data))
     folder = Path(config.shapes) if config.shapes else (data if table is None else data.parent)
     if not folder.is_dir():
         raise InputError(
@@ -139,13 +143,13 @@ def read_cohort(
         )
     results = Results(folder) if folder != source or results is None else results
     if len(results):
-        return _of_results(results, table, keys, config, onto, on_shape)
+        return _of_results(results, table, config, onto, on_shape)
     if table is None:
         raise InputError(
             f"{folder} holds neither results of fits nor landmark files; give a CSV table of its meshes, and the "
             "folder as --shapes."
         )
-    return _of_surfaces(folder, table, keys, config, onto, on_shape)
+    return _of_surfaces(folder, table, config, onto, on_shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +199,6 @@ def _rows(results: Results) -> list[_Row]:
 def _of_results(
     results: Results,
     table: Table | None,
-    keys: Sequence[str],
     config: CohortConfig,
     onto: Cohort | None,
     on_shape: Callable[[int, int], None] | None,
@@ -209,17 +212,11 @@ def _of_results(
         table = Table(cells, tuple(row.name for row in rows), str(results.folder))
         pairs = [(row, index) for index, row in enumerate(rows)]
     else:
-        by_key = _by_key(rows)
-        pairs = [(by_key[key], index) for index, key in enumerate(keys) if key in by_key]
-        note_unmatched(
-            notes=notes,
-            table=table,
-            keys=keys,
-            available=by_key,
-            used=[row.name for row, _ in pairs],
-            names=[row.name for row in rows],
-            where=results.folder,
+        matched, unmatched = match_rows(
+            table, [(row.name, *names_of_file(row.scan_name)) for row in rows], results.folder
         )
+        pairs = [(rows[k], index) for index, k in matched.items()]
+        notes += unmatched
     accepted = [(row, index) for row, index in pairs if row.status in used]
     for status, count in Counter(row.status for row, _ in pairs if row.status not in used).items():
         excluded_names = list_names([row.name for row, _ in pairs if row.status == status])
@@ -233,8 +230,8 @@ def _of_results(
     fits = [row for row, _ in accepted]
     _refuse_mixed(fits, results.folder)
     model, additive = _model_of(results, fits[0], None if config.model is None else Path(config.model))
-    stated = table.take([index for _, index in accepted])
     names = tuple(row.name for row in fits)
+    stated = replace(table.take([index for _, index in accepted]), rows=names)
     sizes = read_only([row.size_mm for row in fits])
     width = max(len(row.b) for row in fits)
     fitted = Fitted(
@@ -294,37 +291,22 @@ def _kind(
 def _of_surfaces(
     folder: Path,
     table: Table,
-    keys: Sequence[str],
     config: CohortConfig,
     onto: Cohort | None,
     on_shape: Callable[[int, int], None] | None,
 ) -> Cohort:
     listing = surface_files([folder])
-    in_table = set(keys)
+    matched, _ = _match_files(table, listing, folder)
     review = listing.review(
-        [file for file in listing.files if surface_stem(file) in in_table], "--doubtful",
+        [file for file, _ in matched], "--doubtful",
         accept=config.doubtful if config.accept_review is None else config.accept_review,
     )  # fmt: skip
     listing = listing if config.doubtful else listing.without_doubtful("--doubtful")
     notes = [*([f"{summary}."] if (summary := review_summary(review)) else []), *listing.notes]
     if config.gauge == "form":
         listing.refuse_mixed_units()
-    # A completion may be written in several formats; its samples are of the vertices of the PLY file.
-    files = {
-        surface_stem(file): file
-        for file in listing.files
-        if file.suffix.lower() == ".ply" or not (file.suffix.lower() == ".csv" or file.with_suffix(ENDING).is_file())
-    }
-    matched = [(files[key], row_index) for row_index, key in enumerate(keys) if key in files]
-    note_unmatched(
-        notes=notes,
-        table=table,
-        keys=keys,
-        available=files,
-        used=[surface_stem(file) for file, _ in matched],
-        names=list(files),
-        where=folder,
-    )
+    matched, unmatched = _match_files(table, listing, folder)
+    notes += unmatched
     least = config.least if onto is None else 1
     if len(matched) < least:
         raise InputError(
@@ -338,8 +320,9 @@ def _of_surfaces(
         if on_shape is not None:
             on_shape(n_read, len(matched))
     cohort = Cohort.of_meshes(
-        meshes, table.take([row_index for _, row_index in matched]), config.gauge, onto, config.least, samples
-    )
+        meshes, replace(table.take([row for _, row in matched]), rows=tuple(mesh.name for mesh in meshes)),
+        config.gauge, onto, config.least, samples,
+    )  # fmt: skip
     if 1 < cohort.imputations < config.imputations:
         notes.append(
             f"A completed shape has {cohort.imputations} samples, so there are as many imputations, not "
@@ -350,11 +333,16 @@ def _of_surfaces(
     return replace(cohort, notes=(*notes, *cohort.notes), source=source, review=review)
 
 
-def _by_key(rows: Sequence[_Row]) -> dict[str, _Row]:
-    """Return fits by scan name and by fit name; the fit name takes precedence."""
-    scans = Counter(stem_of(row.scan_name) for row in rows)
-    by_scan = {stem_of(row.scan_name): row for row in rows if scans[stem_of(row.scan_name)] == 1}
-    return by_scan | {row.name: row for row in rows}
+def _match_files(table: Table, listing: SurfaceFiles, folder: Path) -> tuple[list[tuple[Path, int]], list[str]]:
+    """Return the surface and the number of each row that has one, and notes as of `match_rows`."""
+    # A completion may be written in several formats; its samples are of the vertices of the PLY file.
+    files = {
+        surface_stem(file): file
+        for file in listing.files
+        if file.suffix.lower() == ".ply" or not (file.suffix.lower() == ".csv" or file.with_suffix(ENDING).is_file())
+    }
+    rows, notes = match_rows(table, [(name, file.name) for name, file in files.items()], folder)
+    return [(list(files.values())[k], row) for row, k in rows.items()], notes
 
 
 def _refuse_mixed(fits: Sequence[_Row], folder: Path) -> None:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import re
-from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+import unicodedata
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -57,6 +57,41 @@ class Table:
                 f"{self.where} has two columns whose names differ only in white space; rename one of them."
             )
         object.__setattr__(self, "columns", plain)
+
+    @staticmethod
+    def of(data: Any, where: str = "The table") -> Table:
+        """Return the table in a DataFrame of pandas or polars, or in a mapping of name to cells.
+
+        The first of the columns `file`, `scan`, `specimen`, `name` and `id` names the specimens, as in files; without
+        one, the index of a pandas DataFrame does, where it holds names.
+
+        Args:
+            data: the table.
+            where: what the table is called in messages.
+
+        Raises:
+            InputError: it is no table, has no rows or two columns of one name, or names no specimens.
+        """
+        own: list[Any] = list(
+            data.columns if hasattr(data, "columns") else data.keys() if hasattr(data, "keys") else ()
+        )
+        heads = [str(head).strip() for head in own]
+        if not heads:
+            raise InputError(f"{where} is no DataFrame or mapping with columns, but {type(data).__name__}; give one.")
+        if len(set(heads)) < len(heads):
+            raise InputError(f"{where} has two columns of one name; rename one of them.")
+        columns = {head: tuple(cell_text(value) for value in data[name]) for head, name in zip(heads, own, strict=True)}
+        key = key_column(heads)
+        index: Any = getattr(data, "index", None)
+        if key is not None:
+            rows = columns.pop(heads[key])
+        else:
+            named = key_column([str(getattr(index, "name", ""))]) is not None
+            rows = tuple(map(cell_text, index)) if hasattr(index, "__iter__") else ()
+            rows = rows if named or not all(map(is_number, rows)) else ()
+        if not rows or not all(rows):
+            raise InputError(f"{where} names no specimen in some row; it needs rows, and a column {' or '.join(KEYS)}.")
+        return Table(columns, rows, where)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -116,20 +151,25 @@ class Table:
         return Table(chosen, tuple(self.rows[row] for row in rows), self.where)
 
 
-def read_table(path: Path, specimens: Collection[str] = ()) -> tuple[Table, tuple[str, ...]]:
-    """Return a table, and the name of the shape of each row: without folder and ending, or as one of `specimens`.
+def read_table(path: Path, content: bytes | None = None) -> Table:
+    """Return a table whose rows are called as its key column names them; `match_rows` finds their specimens.
 
     The table is what `io.tables.table_rows` reads. The first of the columns `file`, `scan`, `specimen`, `name` and `id`
-    that it has, in any case, names the shapes. Columns of a coefficients.csv that came with the list of its scans lose
-    their `meta_`.
+    that it has, in any case, names the specimens. Columns of a coefficients.csv that came with the list of its scans
+    lose their `meta_`.
+
+    Args:
+        path: the file.
+        content: its bytes; None to read them.
 
     Raises:
         FileError: it cannot be read.
-        FileFormatError: it is no such table, or two of its rows are of one shape.
+        FileFormatError: it is no such table.
     """
-    check_file(path, _LARGEST_BYTES, "give a smaller table")
+    if content is None:
+        check_file(path, _LARGEST_BYTES, "give a smaller table")
     try:
-        lines = table_rows(read_bytes(path))
+        lines = table_rows(read_bytes(path) if content is None else content)
         heads = next(lines)
         rows = [[plain_cell(cell) for cell in line] for line in lines]
     except ValueError as error:
@@ -137,33 +177,18 @@ def read_table(path: Path, specimens: Collection[str] = ()) -> tuple[Table, tupl
         raise FileFormatError(f"{path} {error}{advice}.") from error
     key = key_column(heads)
     if key is None or not rows:
-        raise FileFormatError(f"{path} is no table of shapes; it needs rows, and a column {' or '.join(KEYS)}.")
-    names = heads[key]
-    places = [PurePath(row[key].replace("\\", "/")) for row in rows]
-    # Scans of one name in different folders are called by their folders too, as their fits are.
-    repeated = {stem for stem, count in Counter(stem_of(scan) for scan in places).items() if count > 1}
-    keys = tuple(_with_folders(scan) if stem_of(scan) in repeated else stem_of(scan) for scan in places)
-    if specimens:
-        # Names of specimens may have points, as those of files have before their ending.
-        cells = [row[key] for row in rows]
-        keys = tuple(stem if stem in specimens and cell not in specimens else cell
-                     for cell, stem in zip(cells, keys, strict=True))  # fmt: skip
-    if "" in keys:
+        raise FileFormatError(f"{path} is no table of specimens; it needs rows, and a column {' or '.join(KEYS)}.")
+    names = tuple(row[key] for row in rows)
+    if "" in names:
         raise FileFormatError(
-            f"{path} has no {names} in row {keys.index('') + 1}; name the shape, or leave the row out."
-        )
-    repeated_keys = [key for key, count in Counter(keys).items() if count > 1]
-    if repeated_keys:
-        raise FileFormatError(
-            f"{path} has two or more rows of {repeated_keys[0][:80]!r}{_others_note(len(repeated_keys) - 1)}; "
-            "keep one row for each shape."
+            f"{path} has no {heads[key]} in row {names.index('') + 1}; name the specimen, or leave the row out."
         )
     columns: dict[str, tuple[str, ...]] = {}
     for index, head in enumerate(heads):
-        if head and head not in (CHECKSUM, names):
+        if head and head not in (CHECKSUM, heads[key]):
             column = head.removeprefix(_META)
             columns[head if column in heads or not column else column] = tuple(row[index] for row in rows)
-    return Table(columns, keys, str(path)), keys
+    return Table(columns, names, str(path))
 
 
 def name_key(name: str) -> tuple[list[str], list[int]]:
@@ -172,8 +197,119 @@ def name_key(name: str) -> tuple[list[str], list[int]]:
     return re.split(r"[0-9]+", name), [int(digits) for digits in re.findall(r"[0-9]+", name)]
 
 
-def _with_folders(path: PurePath) -> str:
-    return "_".join((*(part for part in path.parent.parts if part not in (".", "/")), stem_of(path)))
+def match_rows(
+    table: Table,
+    specimens: Sequence[Sequence[str]],
+    where: Path | str,
+    remedy: str = "give the folder of its specimens with --shapes",
+) -> tuple[dict[int, int], list[str]]:
+    """Return the number of the specimen of each row that has one, by name, and sentences on rows and specimens without.
+
+    A row names its specimen, or the file of it with or without ending and folders, which may be joined by `_` as in the
+    names of fits. Case, white space at the ends and the Unicode form of letters count only where specimens differ in
+    nothing else.
+
+    Args:
+        table: as `read_table` reads it.
+        specimens: names of each specimen; the first one is that of messages.
+        where: place of the specimens, in messages.
+        remedy: advice if no row has a specimen.
+
+    Raises:
+        FileFormatError: two rows are of one specimen.
+        InputError: no row is of a specimen.
+    """
+    indices = [(form, _specimen_index(specimens, form)) for form in (str, fold_name)]
+    places = [PurePath(name.replace("\\", "/")) for name in table.rows]
+    # A file name that rows have in different folders names none of them.
+    folders: dict[str, set[str]] = {}
+    for place in places:
+        folders.setdefault(fold_name(stem_of(place)), set()).update({fold_name(str(place.parent))} - {"."})
+    matched: dict[int, int] = {}
+    owners: list[int | str] = []
+    for row, (name, place) in enumerate(zip(table.rows, places, strict=True)):
+        parts, stem = [part for part in place.parent.parts if part not in (".", "/")], stem_of(place)
+        named = [name, *("_".join((*parts[k:], stem)) for k in range(max(len(parts), 1)))]
+        named += [place.name, stem] if len(folders[fold_name(stem)]) < 2 else []
+        found = (index.get(form(one)) for one in named for form, index in indices)
+        number = next((k for k in found if k is not None), None)
+        if number is not None:
+            matched[row] = number
+        owners.append(fold_name(name) if number is None else number)
+    refuse_repeated(table.where, table.rows, owners)
+    names = [own[0] for own in specimens]
+    unknown = [name for row, name in enumerate(table.rows) if row not in matched]
+    if not matched:
+        raise InputError(
+            f"{where} holds no specimen of {table.where} (rows such as {list_names(unknown)}; specimens "
+            f"{list_names(names) or 'none'}); {remedy}."
+        )
+    used = set(matched.values())
+    unmatched = sorted(name for k, name in enumerate(names) if k not in used)
+    notes: list[str] = []
+    if unknown:
+        verb = "has no specimen in {0} and is" if len(unknown) == 1 else "have no specimen in {0} and are"
+        notes.append(
+            f"{len(unknown)} of {len(table)} rows of {table.where} {verb.format(where)} left out "
+            f"({list_names(unknown)})."
+        )
+    if unmatched:
+        notes.append(
+            f"{len(unmatched)} of {len(names)} specimens in {where} {'has' if len(unmatched) == 1 else 'have'} no row "
+            f"in {table.where} ({list_names(unmatched)})."
+        )
+    return {row: matched[row] for row in sorted(matched, key=lambda row: name_key(table.rows[row]))}, notes
+
+
+def refuse_repeated(where: Path | str, rows: Sequence[str], owners: Sequence[Hashable], noun: str = "specimen") -> None:
+    """Check that no two rows of a table, called `rows`, have the same owner.
+
+    Raises:
+        FileFormatError: two have; the sentence names them.
+    """
+    rows_by_owner: dict[Hashable, list[str]] = {}
+    for number, (name, owner) in enumerate(zip(rows, owners, strict=True), 1):
+        rows_by_owner.setdefault(owner, []).append(f"{number} ({name[:80]!r})")
+    repeated = [own for own in rows_by_owner.values() if len(own) > 1]
+    if repeated:
+        more = f"; so are those of {len(repeated) - 1} more" if len(repeated) > 1 else ""
+        raise FileFormatError(
+            f"{where}: the rows {' and '.join(repeated[0][:_NAMED])} are of one {noun}{more}; keep one row for each "
+            f"{noun}."
+        )
+
+
+def fold_name(name: str) -> str:
+    """Return a name without case, white space at its ends, and differences of the Unicode form of its letters."""
+    return unicodedata.normalize("NFC", name).casefold().strip()
+
+
+def names_of_file(path: PurePath | str) -> tuple[str, ...]:
+    """Return the names by which a row can mean the specimen in a file, for `match_rows`: the usual one first."""
+    folders = PurePath(path).parent.parts[1:]
+    stem = stem_of(path)
+    joined = ("_".join((*folders[-depth:], stem)) for depth in range(1, len(folders) + 1))
+    return tuple(dict.fromkeys((stem, PurePath(path).name, *joined)))
+
+
+def _specimen_index(specimens: Sequence[Sequence[str]], form: Callable[[str], str]) -> dict[str, int]:
+    """Return name -> specimen for names of one specimen alone; a first name goes before the further ones of others."""
+    index: dict[str, int] = {}
+    for depth in range(max(map(len, specimens), default=0)):
+        owners: dict[str, set[int]] = {}
+        for k, own in enumerate(specimens):
+            if depth < len(own):
+                owners.setdefault(form(own[depth]), set()).add(k)
+        index = {name: min(own) for name, own in owners.items() if len(own) == 1} | index
+    return index
+
+
+def cell_text(value: object) -> str:
+    """Return the text of a value of a column in memory; empty for a missing one."""
+    if isinstance(value, float) and value.is_integer():  # also NumPy's float64
+        return str(int(value))  # as of whole numbers in a column with missing values
+    text = "" if value is None else str(value)
+    return "" if text in ("<NA>", "NaT") else plain_cell(text)
 
 
 def plain_cell(cell: str) -> str:
@@ -201,40 +337,6 @@ def _others_note(count: int) -> str:
 def list_names(names: Sequence[str]) -> str:
     """Return the first of `names` in words, and how many more there are."""
     return ", ".join(names[:_NAMED]) + _others_note(len(names) - _NAMED)
-
-
-def note_unmatched(
-    notes: list[str],
-    table: Table,
-    keys: Sequence[str],
-    available: Mapping[str, object],
-    used: Sequence[str],
-    names: Sequence[str],
-    where: Path | str,
-    remedy: str = "give the folder of its shapes with --shapes",
-) -> None:
-    """Add a note on rows without a shape and shapes without a row.
-
-    Raises:
-        InputError: no row has a shape.
-    """
-    unknown = [key for key in keys if key not in available]
-    if len(unknown) == len(keys):
-        raise InputError(
-            f"{where} holds no shape of {table.where} (such as {list_names(unknown)}; there is {list_names(names)}); "
-            f"{remedy}."
-        )
-    if unknown:
-        notes.append(
-            f"{len(unknown)} of {len(keys)} rows of {table.where} are left out, whose shape is not in "
-            f"{where} ({list_names(unknown)})."
-        )
-    unmatched = sorted(set(names) - set(used))
-    if unmatched:
-        notes.append(
-            f"{len(unmatched)} of {len(names)} shapes in {where} have no row in {table.where} "
-            f"({list_names(unmatched)})."
-        )
 
 
 def numbers_as_text(values: FloatArray) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from shapespace.cohort.landmark_cohort import join_table, write_aligned
-from shapespace.cohort.table import Table
+from shapespace.cohort.table import Table, list_names, refuse_repeated
 from shapespace.commands.landmark_data import find_other_scales
 from shapespace.errors import FileFormatError, InputError
 from shapespace.geometry.landmark_alignment import AlignConfig, AlignedLandmarks, align_landmarks, find_outliers
@@ -87,7 +87,11 @@ def align(
 
 
 def _reflected(raw: LandmarkConfigurations, column: str, value: str) -> LandmarkConfigurations:
-    rows = [k for k, cell in enumerate(Table(raw.columns, raw.names, raw.where).texts(column)) if cell == value]
+    cells = Table(raw.columns, raw.names, raw.where).texts(column)
+    rows = [k for k, cell in enumerate(cells) if cell == value]
+    if not all(cells):
+        missing = list_names([name for name, cell in zip(raw.names, cells, strict=True) if not cell])
+        raise InputError(f"{raw.where}: {column} of {missing} is missing; fill it in, as --reflect needs it of all.")
     if not rows:
         raise InputError(f"{raw.where}: no specimen has {column} {value}; correct --reflect.")
     points = raw.points.copy()
@@ -101,7 +105,6 @@ def _structures(path: Path) -> dict[str, str]:
     landmark, structure = (key_column(header, (name,)) for name in ("landmark", "structure"))
     if landmark is None or structure is None:
         raise FileFormatError(f"{path} has no columns landmark and structure; write one row for each landmark.")
-    structures = {row[landmark]: row[structure] for row in rows}
-    if len(structures) < len(rows):
-        raise FileFormatError(f"{path} has two rows of one landmark; keep one for each.")
-    return structures
+    names = [row[landmark] for row in rows]
+    refuse_repeated(path, names, names, "landmark")
+    return {row[landmark]: row[structure] for row in rows}

@@ -14,6 +14,8 @@ from shapespace.batch.fit_records import read_record
 from shapespace.batch.fit_work import naming
 from shapespace.batch.progress import progress, waiting
 from shapespace.batch.result_folder import RECORD
+from shapespace.cohort.labels import read_labels
+from shapespace.cohort.table import names_of_file
 from shapespace.commands.about import ABOUT, read_about
 from shapespace.commands.look import training_shapes_note
 from shapespace.errors import InputError, MeshError, ShapespaceError
@@ -23,7 +25,6 @@ from shapespace.geometry.procrustes import Gauge
 from shapespace.io.files import make_folder, read_error
 from shapespace.io.landmarks.landmark_io import is_of_vertices, read_landmarks, read_surface_landmarks
 from shapespace.io.meshes.region_files import read_region
-from shapespace.io.tables.label_table import label_of, read_labels
 from shapespace.model.build_config import BuildConfig
 from shapespace.model.build_model import build_model, extend_model
 from shapespace.model.choose_modes import MOST_SHAPES
@@ -198,9 +199,10 @@ def build(
     notes += _missing(loaded, marks, config)
     with waiting(f"aligning {len(files)} meshes and finding their modes", quiet=quiet):
         if config.labels is not None:
-            additive = _additive(files, loaded, config.labels, config, gauge, marks)
+            additive, unmatched = _additive(files, loaded, config.labels, config, gauge, marks)
             additive = replace(additive, shape=replace(additive.shape, regions=regions))
             additive.save(output)
+            notes += unmatched
             notes.append(
                 f"It parts {additive.n_identity} modes of identity and {additive.n_expression} of expression, by "
                 f"{config.labels}."
@@ -525,11 +527,10 @@ def _additive(
     config: BuildFilesConfig,
     gauge: Gauge,
     landmarks: SurfaceLandmarks,
-) -> AdditiveModel:
+) -> tuple[AdditiveModel, list[str]]:
     from shapespace.model.additive import AdditiveModel
 
-    known = read_labels(labels)
-    mesh_labels = [label_of(known, file) for file in files]
+    mesh_labels, notes = read_labels(labels).match([names_of_file(file.resolve()) for file in files], "the meshes")
     own = [label for label in mesh_labels if label is not None and label.subject]
     if len(own) < len(files):
         lacking = [
@@ -539,7 +540,7 @@ def _additive(
             f"{labels} has no subject for {', '.join(lacking[:3])}; each mesh needs a label and a subject."
         )
     expression_modes = config.expression_variance
-    return AdditiveModel.fit(
+    model = AdditiveModel.fit(
         meshes,
         [label.subject for label in own],
         [label.text == NEUTRAL for label in own],
@@ -550,3 +551,4 @@ def _additive(
         provenance=config.model.provenance,
         licence=config.model.licence,
     )
+    return model, notes

@@ -9,7 +9,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from shapespace.batch.fit_work import Job
-from shapespace.errors import FileError, InputError
+from shapespace.cohort.table import fold_name, refuse_repeated
+from shapespace.errors import FileError, InputError, ShapespaceError
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import read_bytes
 from shapespace.io.meshes.mesh_folders import mesh_files
@@ -136,6 +137,8 @@ def _rows(file: Path) -> list[Given]:
             rows = [Given(_relative_to(file, line)) for line in lines if line and not line.startswith("#")]
         else:
             rows = _table(file, content)
+    except ShapespaceError:
+        raise
     except ValueError as error:
         raise InputError(f"{file} {error}; save it as a CSV table or an Excel workbook.") from error
     if not rows:
@@ -157,6 +160,7 @@ def _table(file: Path, content: bytes) -> list[Given]:
         raise InputError(f"{file} needs a column named {' or '.join(_PLACES)}; it has {', '.join(header)}.")
     own = {column, called_by, marks_by}
     rows: list[Given] = []
+    names: list[str] = []
     for number, line in enumerate(lines, 2):
         cells = [cell.strip() for cell in line]
         if any("\0" in cell for cell in cells):
@@ -167,8 +171,10 @@ def _table(file: Path, content: bytes) -> list[Given]:
             raise InputError(f"{file}: row {number} names no scan in the column {header[column]}.")
         if called and (called.startswith(".") or len(called.encode()) > _LONGEST or set(called) & set('/\\:*?"<>|\0')):
             raise InputError(f"{file}: row {number} has an id that no file can have, {called[:40]!r}; change it.")
+        names.append(called or source)
         known = {head: cells[index] for index, head in enumerate(header) if head and index not in own}
         rows.append(Given(_scan_source(file, source), called, known, file.parent / marks if marks else None))
+    refuse_repeated(file, names, [(fold_name(row.called), row.source) for row in rows])
     return rows
 
 

@@ -14,10 +14,10 @@ from shapespace.batch.fit_records import read_record
 from shapespace.batch.progress import telling_of_compiling
 from shapespace.batch.result_folder import RECORD
 from shapespace.cohort.classes import notes_on_classes
+from shapespace.cohort.labels import read_labels
 from shapespace.errors import InputError
 from shapespace.io.files import make_folder, read_bytes, read_error
 from shapespace.io.meshes.mesh_io import write_mesh
-from shapespace.io.tables.label_table import read_labels
 from shapespace.recognise.labelled_scans import (
     ScanCoefficients,
     from_record,
@@ -96,7 +96,9 @@ def recognise_train(
     from shapespace.recognise.predict import train_classifier
 
     problems: list[str] = []
-    scans = with_labels(read_scans(results, problems.append), read_labels(labels, of_subjects=False))
+    scans, unmatched = with_labels(
+        read_scans(results, problems.append), read_labels(labels, of_subjects=False), results
+    )
     projection: FloatArray | None = None
     if expression_of is not None:
         model, fitted_with = AdditiveModel.load(expression_of), one_model(scans)
@@ -113,7 +115,7 @@ def recognise_train(
     make_folder(output.absolute().parent)
     saved.save(output)
     classes = notes_on_classes("label", [scan.label for scan in scans])
-    return {**saved.facts(), "notes_on_classes": list(classes)}, [*problems, *notes]
+    return {**saved.facts(), "notes_on_classes": list(classes)}, [*problems, *unmatched, *notes]
 
 
 def recognise_predict(
@@ -146,7 +148,11 @@ def recognise_predict(
             "subject."
         )
     scans = read_scans(results, say)
-    answers = predict_scans(saved, with_labels(scans, read_labels(labels)) if labels is not None else scans)
+    if labels is not None:
+        scans, unmatched = with_labels(scans, read_labels(labels), results)
+        for note in unmatched:
+            say(note)
+    answers = predict_scans(saved, scans)
     make_folder(output.absolute().parent)
     write_answers(output, answers, saved.classes)
     counts: dict[str, int] = dict.fromkeys(("answered", "unsure", "doubtful", "failed", "neutral"), 0)

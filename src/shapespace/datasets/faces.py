@@ -25,7 +25,7 @@ from shapespace.errors import DataError, InputError
 from shapespace.geometry.loop import loop_operator
 from shapespace.geometry.normals import faces_of
 from shapespace.reprs import short_repr
-from shapespace.types import FloatArray, IntArray, Mesh, read_only
+from shapespace.types import FloatArray, IntArray, Mesh, generator_of, read_only
 
 LICENSE = "CC0-1.0"
 """Licence of the bundled faces and of everything the generator draws."""
@@ -151,15 +151,16 @@ class FaceGenerator:
 
     __repr__ = short_repr
 
-    def draw_person(self, rng: np.random.Generator, name: str = "person", *, wide: bool = False) -> Person:
+    def draw_person(self, rng: np.random.Generator | int, name: str = "person", *, wide: bool = False) -> Person:
         """Draw a plausible adult: bounded weights, symmetric but for a small asymmetry.
 
         Args:
-            rng: the only source of chance.
+            rng: generator or seed, the only source of chance.
             name: used in the names of the person's meshes.
             wide: whether the same person also differs by smooth changes at every scale (`Warp`), as real people do:
                 a model of such people follows real faces where one of the others is too narrow.
         """
+        rng = generator_of(rng, "draw_person")
         weights = dict.fromkeys(self.identity_names, 0.0)
         ethnicity = rng.dirichlet([0.6] * len(_ETHNICITIES))
         male, old, heavy = rng.beta(0.6, 0.6), 0.7 * rng.beta(0.9, 1.6), rng.beta(2.0, 2.0)
@@ -211,14 +212,14 @@ class FaceGenerator:
         return out
 
     def draw_expression(
-        self, name: str, intensity: float, rng: np.random.Generator, variation: float = 0.12
+        self, name: str, intensity: float, rng: np.random.Generator | int, variation: float = 0.12
     ) -> Expression:
         """Draw one way of showing an expression.
 
         Args:
             name: one of `EXPRESSIONS`.
             intensity: from 0 (neutral) to 1.
-            rng: the only source of chance.
+            rng: generator or seed, the only source of chance.
             variation: how much each unit varies from one drawing to the next, as a share of its weight.
 
         Raises:
@@ -226,15 +227,17 @@ class FaceGenerator:
         """
         if not 0 <= intensity <= 1:
             raise InputError(f"The intensity of an expression must lie between 0 and 1, not at {intensity!r}.")
+        rng = generator_of(rng, "draw_expression")
         return Expression(np.clip(intensity * self._recipe(name, rng, variation), 0, 1), name, float(intensity))
 
-    def mixed_expression(self, rng: np.random.Generator, variation: float = 0.03) -> Expression:
+    def mixed_expression(self, rng: np.random.Generator | int, variation: float = 0.03) -> Expression:
         """Draw a mixture of the six expressions, each at its own intensity, for a training set of one person.
 
         Args:
-            rng: the only source of chance.
+            rng: generator or seed, the only source of chance.
             variation: how much each unit varies, as a share of its weight.
         """
+        rng = generator_of(rng, "mixed_expression")
         names = [n for n in EXPRESSIONS if n != "neutral"]
         intensity = float(np.sqrt(rng.uniform()))
         shares = intensity * rng.dirichlet([0.5] * len(names))

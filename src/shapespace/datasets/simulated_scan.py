@@ -19,7 +19,7 @@ from shapespace.errors import InputError
 from shapespace.geometry import remesh
 from shapespace.geometry.normals import faces_of, vertex_normals
 from shapespace.reprs import short_repr
-from shapespace.types import BoolArray, FloatArray, Mesh, Similarity, read_only, require
+from shapespace.types import BoolArray, FloatArray, Mesh, Similarity, generator_of, read_only, require
 
 PLAIN_TRIANGLES = 20_000
 """Of a plain scan."""
@@ -106,7 +106,7 @@ def _rotation(vector: FloatArray) -> FloatArray:
 
 def simulate_scan(
     mesh: Mesh,
-    rng: np.random.Generator,
+    rng: np.random.Generator | int,
     *,
     triangles: int = 40_000,
     noise_mm: float = 0.2,
@@ -123,7 +123,7 @@ def simulate_scan(
 
     Args:
         mesh: the true surface, in mm, y up and facing +z.
-        rng: every random choice comes from it.
+        rng: generator or seed, from which every random choice comes.
         triangles: of the re-triangulated surface, before anything is cut away or added.
         noise_mm: standard deviation of the noise along the normals, in mm of the model's frame.
         T_scan_model: pose and scale of the scan; None leaves it in the model's frame.
@@ -145,6 +145,7 @@ def simulate_scan(
             f"A simulated scan needs at least 4 triangles, noise of at least 0 mm and a share of outliers in [0, 1), "
             f"not {triangles}, {noise_mm} and {outlier_fraction}."
         )
+    rng = generator_of(rng, "simulate_scan")
     T = T_scan_model or Similarity.identity()
     vertices, faces = retriangulate(mesh, rng, triangles, split=split)
     normals = vertex_normals(Mesh(vertices, faces.astype(np.int32)))

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from shapespace.errors import ModelFileError
+from shapespace.errors import FileError, ModelFileError
 from shapespace.formats.model_parts import LinearModel, Modes, scale_columns
 from shapespace.io.containers.archives import LARGEST_BYTES, npy_array, zip_members
 from shapespace.io.containers.json_files import check_file
@@ -44,6 +44,8 @@ class Gias:
             with open_file(path) as stream:
                 members = zip_members(stream, path.stat().st_size)
             mean, variance, modes = (_numbers(members[f"{name}.npy"]) for name in _NEEDED)
+        except FileError:
+            raise
         except (KeyError, ValueError, OSError) as error:
             problem = f"it has no {error}" if isinstance(error, KeyError) else str(error)
             raise ModelFileError(f"{path} holds no principal components of GIAS2 ({problem}); {_AGAIN}.") from error

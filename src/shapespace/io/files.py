@@ -50,12 +50,16 @@ _swept: set[Path] = set()
 
 def write_error(path: Path, error: OSError) -> FileError:
     """Return the one-sentence error for an `OSError` met while writing `path`."""
+    if isinstance(error, FileError):
+        return error
     hint = _WRITE_HINTS.get(error.errno or 0, error.strerror or str(error))
     return FileError(f"Cannot write {path}: {hint}.")
 
 
 def read_error(path: Path, error: OSError) -> FileError:
-    """Return the one-sentence error for an `OSError` met while reading `path`."""
+    """Return the one-sentence error for an `OSError` met while reading `path`; a `FileError` has its sentence."""
+    if isinstance(error, FileError):
+        return error
     if isinstance(error, FileNotFoundError):
         return FileError(f"Cannot read {path}: there is no such file; check the name.")
     if isinstance(error, IsADirectoryError):

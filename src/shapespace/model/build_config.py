@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from numbers import Real
+from typing import Literal, get_args
 
+from shapespace.errors import InputError
 from shapespace.geometry.procrustes import Gauge
 from shapespace.model.missing import MIN_SEEN
-from shapespace.types import IntArray
+from shapespace.model.pca import plain_modes
+from shapespace.model.representation import representation_named
+from shapespace.types import IntArray, generator_of
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -52,3 +56,18 @@ class BuildConfig:
     seed: int = 0
     out_of_core: bool | None = None
     without_training_shapes: bool = False
+
+    def __post_init__(self) -> None:
+        """Check each option.
+
+        Raises:
+            InputError: an option cannot be.
+        """
+        if self.modes != "auto":
+            plain_modes(self.modes)
+        if self.gauge not in get_args(Gauge):
+            raise InputError(f"There is no gauge {self.gauge!r}; choose form (rigid) or shape (with scale).")
+        representation_named(self.representation, self.control_points)
+        if not isinstance(self.min_seen, Real) or not 0 <= self.min_seen <= 1:
+            raise InputError(f"min_seen is a share of the meshes from 0 to 1, not {self.min_seen!r}.")
+        generator_of(self.seed, "BuildConfig.seed")

@@ -104,6 +104,25 @@ def principal_components(data: FloatArray, modes: int | float | None = None) -> 
     return PrincipalComponents(mean, basis, variance.copy(), total / (n - 1), n)
 
 
+def plain_modes(modes: object) -> int | float | None:
+    """Return a number of modes or a share of the variance as a plain number, or None for all.
+
+    Raises:
+        InputError: it is something else, below one, or no share.
+    """
+    if isinstance(modes, np.integer | np.floating):
+        modes = modes.item()
+    if modes is not None and (isinstance(modes, bool) or not isinstance(modes, int | float)):
+        raise InputError(
+            f"The modes must be a whole number, a share of the variance, or none to keep all, not {modes!r}."
+        )
+    if isinstance(modes, float):
+        check_share(modes)
+    elif modes is not None and modes < 1:
+        raise InputError(f"A shape model has one mode or more, not {modes}; give a number from 1.")
+    return modes
+
+
 def checked_modes(modes: int | float | None, n: int) -> int | float | None:
     """Return `modes` as asked for of n shapes: a plain number, a share of the variance, or None for all.
 
@@ -112,12 +131,7 @@ def checked_modes(modes: int | float | None, n: int) -> int | float | None:
     """
     if n < 2:
         raise InputError(f"A shape model needs at least two training shapes, not {n}.")
-    if isinstance(modes, np.integer):
-        modes = int(modes)
-    if modes is not None and not isinstance(cast(object, modes), (int, float)):
-        raise InputError(
-            f"The modes must be a whole number, a share of the variance, or none to keep all, not {modes!r}."
-        )
+    modes = plain_modes(modes)
     if isinstance(modes, int) and not 1 <= modes <= n - 1:
         raise InputError(
             f"{n} training shapes give at most {n - 1} modes, so {modes} cannot be had; "

@@ -27,8 +27,16 @@ from shapespace.model.foreign import Foreign, as_linear, is_foreign, load_foreig
 from shapespace.model.missing import MIN_SEEN
 from shapespace.model.representation import REPRESENTATIONS, Representation
 from shapespace.model.training_shapes import TrainingShapes
-from shapespace.reprs import short_repr
-from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, SurfaceLandmarks, read_only, require_path
+from shapespace.types import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Mesh,
+    SurfaceLandmarks,
+    generator_of,
+    read_only,
+    require_path,
+)  # fmt: skip
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -43,6 +51,8 @@ _SHARE_TOLERANCE = 1e-12  # share of variance; cumulative sums in float64 are of
 _TOLD = 300  # characters of a library's error that a message repeats
 _FILE = "_file"
 """Attribute that is no field: neither copies nor states of a model have it."""
+_VECTOR = "mean"
+"""In `ShapeModel.coding`: what the representation makes of the mean shape, where that is not its vertices."""
 _PLACES = "landmark_places"
 """In the state of a model: landmarks between vertices, as plain arrays."""
 _ROUNDING = 64 * float(np.finfo(float).eps)
@@ -58,7 +68,8 @@ class ShapeModel:
     `to_z` and `to_b` turn one into the other.
 
     Args:
-        mean: (D,) mm; D = 3V for vertices, 3mn for B-splines of m x n control points.
+        mean: (V, 3) vertices of the mean shape, mm. It may be given as (D,); D = 3V for vertices, 3mn for B-splines of
+            m x n control points.
         basis: (D, K) columns that move the vertices orthonormally; for vertices they are themselves orthonormal.
         stddev: (K,) of each coefficient, mm.
         total_variance: of all modes of the training set, kept or not, mm^2; of those left out where `held_out`.
@@ -67,7 +78,7 @@ class ShapeModel:
         gauge: `form` (rigid; size lives in the modes) or `shape` (size divided out).
         landmarks: named points on the surface; a mapping of name to vertex may be given for those at vertices.
         representation: a name of `REPRESENTATIONS`.
-        coding: the arrays of that representation; none for vertices.
+        coding: the arrays of that representation, and the mean in it; none for vertices.
         provenance: what it was made from, in words.
         licence: licence of the training data.
         held_out: whether variances are those of shapes that took no part in the modes, so that they hold for new ones.
@@ -107,14 +118,23 @@ class ShapeModel:
     training: TrainingShapes | None = field(default=None, repr=False)
     dropped_vertices: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int32), repr=False)
 
-    __repr__ = short_repr
+    def __repr__(self) -> str:
+        faces = "" if self.faces is None else f", {len(self.faces):,} triangles"
+        known = f" of {self.n_training} shapes" if self.is_n_training_known else ""
+        return (
+            f"<ShapeModel{known} with {self.n_vertices:,} vertices{faces}, {self.n_modes} modes, gauge {self.gauge}; "
+            f"{100 * self.cumulative_variance[-1]:.1f} % of the variance; {len(self.landmarks)} landmarks>"
+        )
 
     def __post_init__(self) -> None:
-        mean, basis, stddev = read_only(self.mean), read_only(self.basis), read_only(self.stddev)
+        given, basis, stddev = read_only(self.mean), read_only(self.basis), read_only(self.stddev)
+        # A copy of a B-spline model gives the vertices, which do not determine its control points.
+        mean = read_only(self.coding.get(_VECTOR, given) if given.ndim == 2 else given).reshape(-1)
         d, k = len(mean), len(stddev)
-        if mean.ndim != 1 or stddev.ndim != 1 or d % 3 or basis.shape != (d, k) or k < 1:
+        plain = given.ndim == 1 or given.shape[1:] == (3,)
+        if not plain or stddev.ndim != 1 or d % 3 or basis.shape != (d, k) or k < 1:
             raise InputError(
-                f"A shape model needs mean (D,), basis (D, K) and stddev (K,), not {mean.shape}, {basis.shape} "
+                f"A shape model needs mean (V, 3), basis (3V, K) and stddev (K,), not {given.shape}, {basis.shape} "
                 f"and {stddev.shape}."
             )
         if not (
@@ -134,14 +154,17 @@ class ShapeModel:
                     f"The residuals of {k} modes must be as many numbers from 0 up, not {residuals.shape}."
                 )
             object.__setattr__(self, "residuals", residuals)
-        object.__setattr__(self, "mean", mean)
         object.__setattr__(self, "basis", basis)
         object.__setattr__(self, "stddev", stddev)
         object.__setattr__(self, "landmarks", SurfaceLandmarks.of(self.landmarks))
         object.__setattr__(self, "total_variance", float(self.total_variance))
         object.__setattr__(self, "n_training", int(self.n_training))
-        object.__setattr__(self, "coding", MappingProxyType(dict(self._coder.arrays())))
+        arrays = dict(self._coder.arrays())
+        object.__setattr__(self, "coding", MappingProxyType({**arrays, _VECTOR: mean} if arrays else {}))
         checked = Mesh(self._coder.decode(mean), self.faces, name="model")
+        if given.ndim == 2 and arrays and not np.array_equal(given, checked.vertices):
+            raise InputError("The vertices of this mean are not those of its B-spline; give its control points (D,).")
+        object.__setattr__(self, "mean", checked.vertices)
         _refuse_impossible(stddev, checked.vertices)
         if self.training is not None:
             rows, rest = self.training.rest.shape
@@ -164,7 +187,7 @@ class ShapeModel:
 
     def __getstate__(self) -> dict[str, Any]:
         # For copies, other processes and skops, none of which takes read-only mappings.
-        plain = {name: dict(getattr(self, name)) for name in ("coding", "regions", "landmarks")}
+        plain = {name: dict(getattr(self, name)) for name in ("regions", "landmarks")}
         places = None if self.landmarks.are_vertices else self.landmarks.__getstate__()
         return {**self.fields(), **plain, _PLACES: places, "training": None}
 
@@ -236,6 +259,11 @@ class ShapeModel:
             self, meshes, shapes, config, scratch=scratch, keep_shapes=keep_shapes, log=tell
         )
 
+    @property
+    def _vector(self) -> FloatArray:
+        """(D,) the mean shape as its representation has it."""
+        return self.coding.get(_VECTOR, self.mean.reshape(-1))
+
     @cached_property
     def _coder(self) -> Representation:
         return REPRESENTATIONS[self.representation].from_arrays(self.coding)
@@ -250,10 +278,10 @@ class ShapeModel:
         """V, the number of vertices."""
         return len(self.mean_vertices)
 
-    @cached_property
+    @property
     def mean_vertices(self) -> FloatArray:
-        """Vertices of the mean shape, (V, 3) mm."""
-        return self._coder.decode(self.mean)
+        """Vertices of the mean shape, (V, 3) mm; the same as `mean`."""
+        return self.mean
 
     @cached_property
     def vertex_basis(self) -> FloatArray:
@@ -315,7 +343,7 @@ class ShapeModel:
             InputError: more coefficients than modes, or values that are not finite.
         """
         b = self._coefficients(b)
-        return self._coder.decode(self.mean + b @ self._modes[: len(b)])
+        return self._coder.decode(self._vector + b @ self._modes[: len(b)])
 
     def mesh(self, b: npt.ArrayLike = ()) -> Mesh:
         """Return the shape with coefficients `b` (k,) mm as a mesh with the model's triangles and landmarks."""
@@ -391,8 +419,19 @@ class ShapeModel:
             )
         return self.stddev[:count]
 
-    def sample(self, count: int, rng: np.random.Generator) -> FloatArray:
-        """Return coefficients (count, K), mm, drawn from the normal distribution of the model."""
+    def sample(self, count: int, rng: np.random.Generator | int) -> FloatArray:
+        """Return coefficients (count, K), mm, drawn from the normal distribution of the model.
+
+        Args:
+            count: number of shapes.
+            rng: generator, or a seed.
+
+        Raises:
+            InputError: neither a generator nor a seed from 0, or no number of shapes.
+        """
+        if not isinstance(count, int | np.integer) or count < 0:  # pyright: ignore[reportUnnecessaryIsInstance]
+            raise InputError(f"ShapeModel.sample takes a number of shapes, not {count!r}.")
+        rng = generator_of(rng, "ShapeModel.sample")
         return rng.standard_normal((count, self.n_modes)) * self.stddev
 
     def truncate(self, modes: int) -> ShapeModel:
@@ -425,7 +464,9 @@ class ShapeModel:
 
     def fields(self) -> model_file.ModelFields:
         """Return what the model is made of, by the names of its arguments."""
-        return cast(model_file.ModelFields, {f.name: getattr(self, f.name) for f in dataclasses.fields(self)})
+        plain = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        coding = {name: array for name, array in self.coding.items() if name != _VECTOR}
+        return cast(model_file.ModelFields, {**plain, "mean": self._vector, "coding": coding})
 
     def save(self, path: Path | str) -> None:
         """Write the model to one HDF5 file, whole or not at all.

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from shapespace.cohort.labels import Labels
+from shapespace.cohort.table import names_of_file
 from shapespace.errors import FileFormatError, InputError
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import read_bytes
-from shapespace.io.meshes.mesh_io import stem_of
-from shapespace.io.tables.label_table import Label
 from shapespace.io.tables.table_io import table_rows
 from shapespace.reprs import short_repr
 from shapespace.schemas import FitRecord
@@ -162,14 +162,22 @@ def _check(scan: ScanCoefficients, row_name: str) -> ScanCoefficients:
     return scan
 
 
-def with_labels(scans: Sequence[ScanCoefficients], labels: Mapping[str, Label]) -> list[ScanCoefficients]:
-    """Return `scans` with labels and subjects, found by the name of the scan's file or of the fit."""
-    matched: list[ScanCoefficients] = []
-    for scan in scans:
-        label = labels.get(stem_of(scan.file)) if scan.file else None
-        label = label or labels.get(scan.name) or labels.get(stem_of(scan.name))
-        matched.append(replace(scan, label=label.text, subject=label.subject) if label else scan)
-    return matched
+def with_labels(
+    scans: Sequence[ScanCoefficients], labels: Labels, where: Path | str = "the fits"
+) -> tuple[list[ScanCoefficients], list[str]]:
+    """Return `scans` with labels and subjects, found by the name of the fit or of the scan's file, and the sentences of
+    `match_rows`.
+
+    Raises:
+        FileFormatError: two rows are of one scan.
+        InputError: no row is of a scan.
+    """
+    found, notes = labels.match([(scan.name, *names_of_file(scan.file or scan.name)) for scan in scans], where)
+    matched = (
+        replace(scan, label=label.text, subject=label.subject) if label else scan
+        for scan, label in zip(scans, found, strict=True)
+    )
+    return list(matched), notes
 
 
 def one_model(scans: Sequence[ScanCoefficients]) -> str:

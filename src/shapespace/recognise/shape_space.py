@@ -41,6 +41,7 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
 
     Args:
         modes: as in `ShapeModel.fit`: a number, a share of the variance, "auto", or None for all.
+        n_components: the same by the name that scikit-learn has for it; give one of both.
         gauge: `form` or `shape`.
         align: False takes meshes as they stand, also in `transform`.
         alignment_vertices: indices that carry the alignment of the training meshes.
@@ -59,6 +60,7 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
         self,
         modes: int | float | Literal["auto"] | None = None,
         *,
+        n_components: int | float | Literal["auto"] | None = None,
         gauge: Gauge = "shape",
         align: bool = True,
         alignment_vertices: IntArray | None = None,
@@ -68,6 +70,7 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
         seed: int = 0,
     ) -> None:
         self.modes: int | float | Literal["auto"] | None = modes
+        self.n_components: int | float | Literal["auto"] | None = n_components
         self.gauge: Gauge = gauge
         self.align = align
         self.alignment_vertices = alignment_vertices
@@ -87,6 +90,11 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
             CorrespondenceError: the meshes differ in vertices or triangles.
             InputError: something else than meshes, too few of them, no variation, too many modes, unknown settings.
         """
+        if None not in (self.modes, self.n_components) and self.modes != self.n_components:
+            raise InputError(
+                f"modes is {self.modes!r} and n_components {self.n_components!r}, but both are the number of modes; "
+                "give one of them."
+            )
         if self.meshes not in ("corresponding", "scans"):
             raise InputError(f"There is no kind of meshes {self.meshes!r}; choose corresponding or scans.")
         if isinstance(self.model, str | PathLike):
@@ -103,7 +111,7 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
             raise InputError("A shape space is built from meshes in correspondence; give those, or a ready model.")
         return ShapeModel.fit(
             surfaces,
-            modes=self.modes,
+            modes=self.modes if self.n_components is None else self.n_components,
             gauge=self.gauge,
             align=self.align,
             alignment_vertices=self.alignment_vertices,

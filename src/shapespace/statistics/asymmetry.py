@@ -18,7 +18,7 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.cohort.cohort import Cohort, subjects_of
+from shapespace.cohort.cohort import SUBJECT, Cohort, subjects_of
 from shapespace.errors import InputError
 from shapespace.geometry.normals import vertex_normals
 from shapespace.geometry.procrustes import centroid_size
@@ -232,6 +232,7 @@ def measure_asymmetry(
     degrees_of_freedom: DegreesOfFreedom = "klingenberg",
     permutations: int = 999,
     seed: int = 0,
+    drop_missing: bool = False,
     progress: Progress | None = None,
 ) -> AsymmetryResult:
     """Return what the sides of the objects of a cohort differ by.
@@ -251,6 +252,7 @@ def measure_asymmetry(
             those of the `observations` alone, as in geomorph.
         permutations: number of permutations for p; 0 for none.
         seed: seed of the permutations.
+        drop_missing: exclude shapes with missing values in the table (default: an error).
         progress: called with (permutations done, in all).
 
     Raises:
@@ -262,6 +264,9 @@ def measure_asymmetry(
         raise InputError("The number of permutations and the seed must be 0 or more.")
     if degrees_of_freedom not in get_args(DegreesOfFreedom):
         raise InputError(f"There are no degrees of freedom {degrees_of_freedom!r}; choose klingenberg or observations.")
+    subject = subject or (SUBJECT if SUBJECT in cohort.table.columns else None)
+    wanted = [name for name in (subject, reference[0] if reference else None, side) if name]
+    cohort = cohort.complete(wanted, drop_missing=drop_missing)
     if side is not None:
         cohort, sides = match_sides(cohort, subject, side)
     else:

@@ -45,6 +45,7 @@ class ChangeConfig:
         permutations: number of permutations.
         seed: seed of the permutations.
         unequal_variances: allow groups of unequal dispersion (Welch's t, sign flips).
+        drop_missing: exclude shapes with missing values in the table (default: an error).
     """
 
     subject: str = "subject"
@@ -57,6 +58,7 @@ class ChangeConfig:
     permutations: int = 1000
     seed: int = 0
     unequal_variances: bool = False
+    drop_missing: bool = False
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

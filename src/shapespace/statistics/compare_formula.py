@@ -45,7 +45,8 @@ _DEEPEST = 30
 _SPLINE = 4
 """Number of columns of a polynomial or spline if the formula has none; 3 for cubic ones."""
 _TOKEN = re.compile(r"\s*(`[^`]*`|[\w.]+|\*\*|[-+*:/^()])")
-_PLAIN = re.compile(r"""[\w\s+\-*:/^().,~="'`]*""")
+_PLAIN = re.compile(r"""[\w\s+\-*:/^().,~="']*""")
+_QUOTED = re.compile(r"`([^`]*)`")
 _POWER = re.compile(r"\*\*|\^")
 _ALLOWED = f"columns and {', '.join(FUNCTIONS)} are all that may stand there."
 _CONTEXT = {"sqrt": np.sqrt}
@@ -229,14 +230,22 @@ def _cells(choices: Sequence[Sequence[str | float]], formula: str) -> list[tuple
     return list(itertools.product(*choices))
 
 
-def columns_of(formula: str, table: Table) -> tuple[str, ...]:
-    """Return the columns of the table that a formula names.
+def columns_of(formula: str, table: Table) -> dict[str, set[str]]:
+    """Return the columns of the table that a formula names, and the functions of each; "" for the column itself.
 
     Raises:
         InputError: it cannot be read, or names something else.
         ShapespaceError: the extra `statistics` is not installed.
     """
-    return tuple(dict.fromkeys(factor.name for term in _parsed(formula, table) for factor in term))
+    calls: dict[str, set[str]] = {}
+    for factor in itertools.chain.from_iterable(_parsed(formula, table)):
+        calls.setdefault(factor.name, set()).add(factor.call)
+    return calls
+
+
+def quoted(column: str) -> str:
+    """Return the name of a column as it is written in a formula, in backticks where it needs them."""
+    return column if column.isidentifier() else f"`{column}`"
 
 
 def random_effects_of(random: str, table: Table) -> tuple[tuple[frozenset[str], ...], str]:
@@ -382,17 +391,24 @@ def _parsed(formula: str, table: Table) -> list[list[_Factor]]:
     formulaic = require_package("formulaic", "A formula", INSTALL)
     where = f"The formula {formula[:80]!r}"
     right = formula.strip().removeprefix("~")
-    stars = len(re.findall(r"\*", _POWER.sub("", right)))
-    powers = len(_POWER.findall(right))
-    if "~" in right:
+    plain = _QUOTED.sub("x", right)
+    stars = len(re.findall(r"\*", _POWER.sub("", plain)))
+    powers = len(_POWER.findall(plain))
+    # Longer names first, as they contain the shorter ones.
+    odd = sorted((name for name in table.columns if not re.fullmatch(r"[\w.]+", name)), key=len, reverse=True)
+    unquoted = next((name for name in odd if name in _QUOTED.sub("", right)), None)
+    advice = "write one such as '~ sex + age'" if unquoted is None else f"write {quoted(unquoted)} with its backticks"
+    if "~" in plain:
         raise InputError(
             f"{where} has something before ~ or a second one; shape is what is explained, so write '~ sex'."
         )
-    if len(formula) > _LONGEST or stars > _MOST_STARS or powers > 1 or len(re.findall(r"\w+", right)) > _MOST_NAMES:
+    if len(formula) > _LONGEST or stars > _MOST_STARS or powers > 1 or len(re.findall(r"\w+", plain)) > _MOST_NAMES:
         raise InputError(f"{where} is too long; write a shorter one.")
-    if not _PLAIN.fullmatch(right) or re.search(r"(\*\*|\^)(?!\s*[23]\b)", right):
-        raise InputError(f"{where} holds something other than columns, + - * : / ^ and the functions of a formula.")
-    columns = _Bound(right, table, where).columns()
+    if not _PLAIN.fullmatch(plain) or re.search(r"(\*\*|\^)(?!\s*[23]\b)", plain):
+        raise InputError(
+            f"{where} holds something other than columns, + - * : / ^ and the functions of a formula; {advice}."
+        )
+    columns = _Bound(right, table, where, advice).columns()
     if columns > _MOST_COLUMNS:
         raise InputError(
             f"{where} makes up to {columns if columns < 10**9 else 'billions of'} columns, and {_MOST_COLUMNS} are "
@@ -406,7 +422,7 @@ def _parsed(formula: str, table: Table) -> list[list[_Factor]]:
         raise
     # The parser raises what it likes on what it cannot read.
     except Exception as error:
-        raise InputError(f"{where} cannot be read ({_first(error)}); write one such as '~ sex + age'.") from error
+        raise InputError(f"{where} cannot be read ({_first(error)}); {advice}.") from error
     if not keeps_mean:
         raise InputError(f"{where} leaves out the mean shape, without which effects mean nothing; drop the 0 or - 1.")
     if not drawn:
@@ -425,8 +441,8 @@ class _Size:
 class _Bound:
     """Upper bound of the number of columns of a formula, without expanding it; operators are those of R."""
 
-    def __init__(self, text: str, table: Table, where: str) -> None:
-        self.table, self.where = table, where
+    def __init__(self, text: str, table: Table, where: str, advice: str) -> None:
+        self.table, self.where, self.advice = table, where, advice
         self.tokens: list[str] = []
         position = 0
         while text[position:].strip():
@@ -451,7 +467,7 @@ class _Bound:
 
     def _unreadable(self) -> InputError:
         near = self.tokens[min(self.position, len(self.tokens) - 1)]
-        return InputError(f"{self.where} cannot be read near {near[:20]!r}; write one such as '~ sex + age'.")
+        return InputError(f"{self.where} cannot be read near {near[:20]!r}; {self.advice}.")
 
     def _next(self, *wanted: str) -> str:
         """Return the next token and go past it if it is one of those wanted, else an empty text."""
@@ -538,18 +554,25 @@ def _factor(factor: Any, table: Table, where: str) -> _Factor:
     text, kind = str(factor.expr), factor.eval_method.value
     if kind == "lookup":
         return _Factor(text, _known(text, table, where))
-    tree = ast.parse(text, mode="eval").body if kind == "python" else None
+    quoted_names: dict[str, str] = {}
+
+    def stand_in(match: re.Match[str]) -> str:
+        return quoted_names.setdefault(match[1], f"quoted_{len(quoted_names)}_")
+
+    tree = ast.parse(_QUOTED.sub(stand_in, text), mode="eval").body if kind == "python" else None
     if tree is None or not isinstance(tree, ast.Call) or not isinstance(tree.func, ast.Name):
         raise InputError(f"{where} holds {text[:60]!r}; {_ALLOWED}")
     if tree.func.id == "C" and not (len(tree.args) == 1 and isinstance(tree.args[0], ast.Name) and not tree.keywords):
         raise InputError(f"{where}: {text[:60]!r} must take one column and nothing else.")
-    return _Factor(text, _column(tree, table, where), tree.func.id, tree)
+    column = _column(tree, where)
+    name = next((name for name, own in quoted_names.items() if own == column), column)
+    return _Factor(_QUOTED.sub(r"\1", text), _known(name, table, where), tree.func.id, tree)
 
 
-def _column(tree: ast.expr, table: Table, where: str) -> str:
+def _column(tree: ast.expr, where: str) -> str:
     """Return the column in calls of `FUNCTIONS`, whose first argument is a column or a call, and others numbers."""
     if isinstance(tree, ast.Name):
-        return _known(tree.id, table, where)
+        return tree.id
     function = tree.func.id if isinstance(tree, ast.Call) and isinstance(tree.func, ast.Name) else ""
     if not isinstance(tree, ast.Call) or function not in FUNCTIONS or not tree.args:
         raise InputError(f"{where} holds {ast.unparse(tree)[:60]!r}; {_ALLOWED}")
@@ -557,7 +580,7 @@ def _column(tree: ast.expr, table: Table, where: str) -> str:
         constant = value.value if isinstance(value, ast.Constant) else None
         if not isinstance(constant, int | float) or not 0 <= constant <= _LARGEST_CONSTANT:
             raise InputError(f"{where} gives {function}() something other than a number up to {_LARGEST_CONSTANT}.")
-    return _column(tree.args[0], table, where)
+    return _column(tree.args[0], where)
 
 
 def _known(name: str, table: Table, where: str) -> str:

@@ -16,6 +16,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from msgspec import structs
 
+from shapespace.cohort.classes import number_caution
 from shapespace.cohort.cohort import Cohort, with_columns
 from shapespace.errors import InputError
 from shapespace.reprs import list_briefly, short_repr
@@ -28,6 +29,7 @@ from shapespace.statistics.compare_formula import (
     Variable,
     columns_of,
     design_of,
+    quoted,
     random_effects_of,
 )
 from shapespace.statistics.compare_maps import EffectMap, effect_maps
@@ -392,8 +394,22 @@ def compare(
     )
 
 
-def complete_cohort(cohort: Cohort, formulas: Sequence[str], columns: Sequence[str], *, drop_missing: bool) -> Cohort:
+def complete_cohort(
+    cohort: Cohort,
+    formulas: Sequence[str],
+    columns: Sequence[str],
+    *,
+    drop_missing: bool,
+    numbers: Sequence[str] = (),
+) -> Cohort:
     """Return the shapes with values in all columns and formulas, with `size` and `log_size` in the table.
+
+    Args:
+        cohort: the shapes.
+        formulas: of models; numbers in them that may be codes of classes are in the cohort's `cautions`.
+        columns: further columns, of classes.
+        drop_missing: leave out shapes with missing values (default: an error).
+        numbers: further columns, of numbers.
 
     Raises:
         InputError: no such column, missing values or sizes, or a formula that cannot be read.
@@ -401,14 +417,23 @@ def complete_cohort(cohort: Cohort, formulas: Sequence[str], columns: Sequence[s
     own = set(cohort.table.columns)
     sizes = {"size": cohort.sizes_mm, "log_size": np.log(cohort.sizes_mm)}
     cohort = with_columns(cohort, {name: v for name, v in sizes.items() if name not in own})
-    named = [*(column for formula in formulas for column in columns_of(formula, cohort.table)), *columns]
+    calls: dict[str, set[str]] = {}
+    for formula in formulas:
+        for column, own_calls in columns_of(formula, cohort.table).items():
+            calls.setdefault(column, set()).update(own_calls)
+    named = [*calls, *columns, *numbers]
     unknown = int(np.isnan(cohort.sizes_mm).sum())
     if unknown and not drop_missing and {"size", "log_size"} & set(named) - own:
         raise InputError(
             f"The size of {unknown} of {len(cohort)} shapes is not known in mm; fit them with --unit, or leave them "
             "out with --drop-missing."
         )
-    return cohort.complete(named, drop_missing=drop_missing)
+    table = cohort.table
+    in_formulas = [column for column in calls if "C" not in calls[column] and table.kind(column) == "number"]
+    cohort = cohort.complete(named, drop_missing=drop_missing, numbers={*in_formulas, *numbers} - {*columns})
+    plain = [column for column in in_formulas if "" in calls[column] and column not in (*columns, *numbers)]
+    cautions = [number_caution(cohort.table, column, f"C({quoted(column)})") for column in plain]
+    return replace(cohort, cautions=(*cohort.cautions, *filter(None, cautions)))
 
 
 def _error_terms(strata: Sequence[Stratum], design: Design, name: str, error: str) -> tuple[Term, Term]:

@@ -75,8 +75,9 @@ def change(
     require(cohort, Cohort, "change", "read one with shapespace.read_cohort")
     config = config or ChangeConfig()
     _refuse_unsuitable(cohort, config)
-    columns = [config.subject, time_column(cohort.table, config.time)]
-    cohort = cohort.complete([*columns, config.group] if config.group else columns)
+    time = time_column(cohort.table, config.time)
+    columns = [config.subject, time, *([config.group] if config.group else [])]
+    cohort = cohort.complete(columns, drop_missing=config.drop_missing, numbers=[time])
     visits = visits_of(cohort.table, config.subject, config.time, config.order)
     single = tuple(name for name, own in visits.by_subject.items() if len(own) < 2)
     if len(single) == len(visits.by_subject):

@@ -9,9 +9,8 @@ from functools import cached_property
 
 import numpy as np
 
-from shapespace.cohort.cohort import Cohort, subjects_of
+from shapespace.cohort.cohort import SUBJECT, Cohort, subjects_of
 from shapespace.cohort.proportions import widen_share
-from shapespace.cohort.table import list_names
 from shapespace.errors import InputError
 from shapespace.geometry.normals import vertex_normals
 from shapespace.reprs import describe_briefly, list_briefly
@@ -177,6 +176,7 @@ def regress(
     draws: int = 2000,
     confidence: float = 0.9,
     seed: int = 0,
+    drop_missing: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> RegressionResult:
     """Learn a number from shape, and measure on subjects left out how well.
@@ -194,6 +194,7 @@ def regress(
         draws: of subjects, for intervals of figures.
         confidence: coverage of intervals.
         seed: seed of folds and draws.
+        drop_missing: exclude shapes with missing values in the table (default: an error).
         progress: called with (steps done, in all).
 
     Raises:
@@ -202,6 +203,8 @@ def regress(
     """
     require(cohort, Cohort, "regress", "read one with shapespace.read_cohort")
     _check_options(folds, permutations, draws, confidence, seed)
+    subject = subject or (SUBJECT if SUBJECT in cohort.table.columns else None)
+    cohort = cohort.complete([target, *([subject] if subject else [])], drop_missing=drop_missing, numbers=[target])
     y = cohort.table.numbers(target)
     _check_target(cohort, target, y)
     subjects = subjects_of(cohort, subject)
@@ -327,12 +330,6 @@ def _check_options(folds: int, permutations: int, draws: int, confidence: float,
 
 
 def _check_target(cohort: Cohort, target: str, y: FloatArray) -> None:
-    missing = [cohort.names[row] for row in np.flatnonzero(np.isnan(y))]
-    if missing:
-        raise InputError(
-            f"{cohort.table.where}: {target} of {len(missing)} of {len(cohort)} shapes is missing "
-            f"({list_names(missing)}); fill it in, or leave them out with --drop-missing."
-        )
     if np.ptp(y) == 0:
         raise InputError(f"{cohort.table.where}: {target} is {y[0]:g} for all shapes, so there is nothing to learn.")
 

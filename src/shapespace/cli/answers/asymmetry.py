@@ -12,7 +12,6 @@ from shapespace.cli.options import given
 def run(arguments: argparse.Namespace) -> int:
     """Measure the asymmetry of a cohort, and write its report."""
     from shapespace.batch.progress import steps
-    from shapespace.cohort.cohort import SUBJECT
     from shapespace.cohort.landmark_cohort import has_landmarks
     from shapespace.errors import InputError
     from shapespace.report.analyses.asymmetry_report import asymmetry_report
@@ -26,9 +25,6 @@ def run(arguments: argparse.Namespace) -> int:
     source = Path(arguments.shapes or arguments.data)
     landmarks = arguments.geometry == "landmarks" or (source.exists() and has_landmarks(source))
     cohort = cohort_of(arguments, gauge=arguments.gauge or ("shape" if landmarks else "form"))
-    subject = arguments.subject or (SUBJECT if SUBJECT in cohort.table.columns else None)
-    wanted = [name for name in (subject, column, arguments.side) if name]
-    cohort = cohort.complete(wanted, drop_missing=arguments.drop_missing)
     pairs = None if arguments.pairs is None else read_pairs(arguments.pairs, cohort)
     options = given(arguments, measure_asymmetry, pairs=pairs, reference=(column, value) if column else None)
     with steps(None, "permuting", "shape", quiet=arguments.quiet) as step:

@@ -27,11 +27,6 @@ def run(arguments: argparse.Namespace) -> int:
         cohort = replace(cohort, landmarks=_landmarks(arguments.landmarks, cohort.n_vertices))
     regions = {name: read_region(path) for name, path in arguments.region} or None
     config = ChangeConfig(**given(arguments, ChangeConfig, regions=regions))
-    columns = [column for column in (arguments.subject, arguments.group) if column]
-    if arguments.drop_missing:
-        from shapespace.statistics.change_visits import time_column
-
-        cohort = cohort.complete([*columns, time_column(cohort.table, arguments.time)], drop_missing=True)
     with steps(None, "comparing", "subject", quiet=arguments.quiet) as step:
         result = change(cohort, config, progress=step)
     return finish(change_report(result), arguments)

@@ -11,7 +11,6 @@ from shapespace.cli.options import given
 def run(arguments: argparse.Namespace) -> int:
     """Fit a regression on shape, predict with it, and write the report."""
     from shapespace.batch.progress import steps
-    from shapespace.cohort.cohort import SUBJECT
     from shapespace.cohort.read import CohortConfig, read_cohort
     from shapespace.io.files import make_folder
     from shapespace.report.analyses.regression_report import prediction_report, regression_report
@@ -25,29 +24,26 @@ def run(arguments: argparse.Namespace) -> int:
         cohort = cohort_of(arguments, learned.gauge, least=1)
         return finish(prediction_report(learned, cohort, learned.predict(cohort)), arguments)
     cohort = cohort_of(arguments)
-    subject = arguments.subject or (SUBJECT if SUBJECT in cohort.table.columns else None)
-    wanted = [arguments.target, *([subject] if subject else [])]
-    cohort = cohort.complete(wanted, drop_missing=arguments.drop_missing)
     with steps(None, "learning", "fold", quiet=arguments.quiet) as step:
         result = regress(
             cohort,
             arguments.target,
-            subject=subject,
+            subject=arguments.subject,
             folds=arguments.folds,
             permutations=arguments.permutations,
             confidence=arguments.level,
             seed=arguments.seed,
+            drop_missing=arguments.drop_missing,
             progress=step,
         )
     new = None
     if arguments.predict is not None:
         config = CohortConfig(**given(arguments, CohortConfig, shapes=arguments.new_shapes, least=1))
         with steps(None, "reading", "shape", quiet=arguments.quiet) as step:
-            fresh = read_cohort(arguments.predict, config, onto=cohort, on_shape=step)
-        there = subject is not None and subject in fresh.table.columns
-        refuse_known(
-            result.subjects, fresh.table.texts(subject) if there and subject else fresh.names, fresh.table.where
-        )
+            fresh = read_cohort(arguments.predict, config, onto=result.cohort, on_shape=step)
+        own = [result.subject] if result.subject is not None and result.subject in fresh.table.columns else []
+        fresh = fresh.complete(own, drop_missing=arguments.drop_missing)
+        refuse_known(result.subjects, fresh.table.texts(own[0]) if own else fresh.names, fresh.table.where)
         new = (fresh, result.predictor.predict(fresh))
     make_folder(arguments.output)
     result.predictor.save(arguments.output / "predictor.npz")

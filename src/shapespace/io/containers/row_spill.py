@@ -51,13 +51,13 @@ class Spill:
                 self._reserve(size)
             elif path.stat().st_size != size:
                 raise FileFormatError(f"{path} is {path.stat().st_size} bytes long, not {size}; it is cut short.")
+        except FileFormatError:
+            self._file.close()
+            raise
         except OSError as error:
             self._file.close()
             path.unlink(missing_ok=True)
             raise write_error(path, error) from error
-        except FileFormatError:
-            self._file.close()
-            raise
 
     def _reserve(self, size: int) -> None:
         # A disk that is too small is reported now, and not after an hour.

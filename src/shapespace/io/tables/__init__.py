@@ -1,4 +1,4 @@
-"""Tables of subjects: CSV and Excel files, labels of scans.
+"""Tables of subjects: CSV and Excel files.
 
-Entry points: `table_io.read_table`, `label_table`. Imported by every layer above `geometry`.
+Entry points: `table_io.table_rows`, `table_io.read_rows`. Imported by every layer above `geometry`.
 """

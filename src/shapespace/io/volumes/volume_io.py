@@ -192,6 +192,8 @@ def _open_nifti(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tupl
 def _unpacking(path: Path) -> Generator[None]:
     try:
         yield
+    except FileError:
+        raise
     except (OSError, EOFError, zlib.error) as error:
         raise damage_error(path, f"its compressed data end early or are wrong; {CUT_SHORT}") from error
 

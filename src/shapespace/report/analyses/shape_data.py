@@ -10,7 +10,7 @@ import numpy as np
 from msgspec import structs
 from scipy.spatial.distance import pdist
 
-from shapespace.cohort.cohort import Cohort, subjects_of
+from shapespace.cohort.cohort import SUBJECT, Cohort
 from shapespace.report.analyses.analysis_report import AnalysisReport, Rows
 from shapespace.schemas import (
     CurvePart,
@@ -239,6 +239,12 @@ def _in_landmarks(report: AnalysisReport) -> AnalysisReport:
     )
 
 
+def _count_subjects(cohort: Cohort, column: str | None) -> int:
+    """Return the number of subjects; each shape of which none is known is of another one."""
+    cells = cohort.table.columns.get(column or SUBJECT, cohort.names)
+    return len({cell or (name,) for cell, name in zip(cells, cohort.names, strict=True)})
+
+
 def add_shape_data(report: AnalysisReport, cohort: Cohort, imputations: Imputations | None = None) -> AnalysisReport:
     """Return a report with its methods, the source of its shapes and the share of estimated vertices of each shape.
 
@@ -252,8 +258,9 @@ def add_shape_data(report: AnalysisReport, cohort: Cohort, imputations: Imputati
     sentence = _imputation_sentence(cohort, imputations)
     methods = report.methods
     if methods is None and len(cohort) > 1:
-        methods = methods_of(cohort, len(set(subjects_of(cohort, report.settings.get("subject")))))
-    report = replace(report, notes=notes, settings=settings, methods=methods)
+        methods = methods_of(cohort, _count_subjects(cohort, report.settings.get("subject")))
+    summary = (*report.summary[:1], *cohort.cautions, *report.summary[1:])
+    report = replace(report, summary=summary, notes=notes, settings=settings, methods=methods)
     if sentence and methods is not None:
         methods = structs.replace(methods, assumptions=(*methods.assumptions, sentence))
         report = replace(report, notes=(*notes, sentence), methods=methods)

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from shapespace.cohort.labels import Label
 from shapespace.errors import InputError, ShapespaceError
-from shapespace.io.tables.label_table import Label
 from shapespace.report.blocks import fit_tables as tables
 from shapespace.report.blocks import sections
 from shapespace.report.blocks.blocks import (
@@ -91,14 +91,14 @@ class FolderPage:
         self.recognised = (folder.root / recognition.STUDY.file).is_file()
         self.analyses = recognition.find_analyses(folder.root)
         self.label_note = ""
-        found_labels: Mapping[str, Label] = {}
+        found_labels: Sequence[Label | None] = [None] * len(fits)
         try:
             found_labels, self.label_note = find_labels(folder, fits, labels)
         except ShapespaceError as error:
             if labels is not None:
                 raise
             self.label_note = f"There are no labels: {error}"
-        self.fits = sorted((with_label(fit, found_labels) for fit in fits), key=sections.concern)
+        self.fits = sorted(map(with_label, fits, found_labels), key=sections.concern)
         self.main = _main_fits(self.fits)
         planned = sections.MODEL_PICTURES + min(len(fits), MOST_CARDS) + 4 + len(self.main) * sections.FIT_PICTURES
         self.page = Page(planned, on_step)

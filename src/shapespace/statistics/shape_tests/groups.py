@@ -13,7 +13,8 @@ import numpy as np
 from shapespace.cohort.cohort import Cohort
 from shapespace.errors import InputError
 from shapespace.schemas import TablePart
-from shapespace.statistics.compare_formula import columns_of, design_of
+from shapespace.statistics.compare_formula import design_of
+from shapespace.statistics.compare_shapes import complete_cohort
 from shapespace.statistics.compare_strata import means_of, span
 from shapespace.statistics.dispersion import unequal_variances
 from shapespace.statistics.shape_tests.ordination import discriminant_components, principal_components
@@ -496,8 +497,7 @@ def groups_of(
     cohort: Cohort, group: tuple[str, ...], drop_missing: bool, least: int, why: str, formula: str | None = None
 ) -> tuple[Cohort, Groups]:
     """Return the shapes without missing values in some columns and a formula, and their groups, as `Groups.of`."""
-    named = [*group, *(columns_of(formula, cohort.table) if formula else ())]
-    cohort = cohort.complete(named, drop_missing=drop_missing)
+    cohort = complete_cohort(cohort, [formula] if formula else [], group, drop_missing=drop_missing)
     return cohort, Groups.of(cohort, group, least=least, why=why)
 
 

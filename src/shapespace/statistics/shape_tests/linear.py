@@ -14,7 +14,7 @@ import numpy as np
 from shapespace.cohort.cohort import Cohort
 from shapespace.errors import InputError
 from shapespace.schemas import CurvePart, Part, Series, SurfaceMapPart, TablePart
-from shapespace.statistics.compare_formula import Design, design_of
+from shapespace.statistics.compare_formula import Design, design_of, quoted
 from shapespace.statistics.compare_shapes import CompareConfig, angles_between, complete_cohort, term_tests
 from shapespace.statistics.compare_strata import Stratum, independent_stratum, less, means_of
 from shapespace.statistics.methods import REDUCED_OF_EACH_TERM
@@ -167,8 +167,8 @@ def compare_pairs(
         InputError: no such column, a covariate that is constant within a group, models that are not nested or leave no
             residuals, or groups that are all the same in the model.
     """
-    named = [*group, *([covariate] if covariate else [])]
-    cohort = _complete(cohort, [formula, null], named, drop_missing=drop_missing)
+    numbers = [covariate] if covariate else []
+    cohort = _complete(cohort, [formula, null], group, drop_missing=drop_missing, numbers=numbers)
     groups = Groups.of(cohort, group)
     design, reduced, labels = _models(cohort, formula, null)
     if covariate is None:
@@ -227,10 +227,10 @@ def analyse_allometry(
     """
     if separate and group is None:
         raise InputError("Separate slopes need groups; name their column with --group.")
-    formula = _quoted(covariate)
+    formula = quoted(covariate)
     if group is not None:
         formula += f" * {_class_factor(cohort, group)}"
-    cohort = _complete(cohort, [formula], [], drop_missing=drop_missing)
+    cohort = _complete(cohort, [formula], [], drop_missing=drop_missing, numbers=[covariate])
     x, y = cohort.table.numbers(covariate), cohort.coefficients - cohort.coefficients.mean(axis=0)
     classes = ["all"] * len(cohort) if group is None else list(cohort.table.texts(group))
     names = sorted(set(classes))
@@ -405,17 +405,16 @@ def _jackknifed(name: str, value: tuple[float, float], left_out: Sequence[tuple[
     return Statistic(name=name, value=value[0], low=float(low), high=float(high))
 
 
-def _complete(cohort: Cohort, formulas: Sequence[str | None], columns: Sequence[str], *, drop_missing: bool) -> Cohort:
+def _complete(
+    cohort: Cohort, formulas: Sequence[str | None], columns: Sequence[str], *, drop_missing: bool,
+    numbers: Sequence[str] = (),
+) -> Cohort:  # fmt: skip
     given = [one for one in formulas if one is not None and one.strip(" ~") != "1"]
-    return complete_cohort(cohort, given, columns, drop_missing=drop_missing)
-
-
-def _quoted(column: str) -> str:
-    return column if column.isidentifier() else f"`{column}`"
+    return complete_cohort(cohort, given, columns, drop_missing=drop_missing, numbers=numbers)
 
 
 def _class_factor(cohort: Cohort, column: str) -> str:
-    return f"C({_quoted(column)})" if cohort.table.kind(column) == "number" else _quoted(column)
+    return f"C({quoted(column)})" if cohort.table.kind(column) == "number" else quoted(column)
 
 
 def _with_constant(columns: FloatArray) -> FloatArray:

@@ -335,10 +335,11 @@ class Studio:
     async def _table(self, request: Request) -> Response:
         content = await whole_body(request, _TABLE_BYTES, "The table is too large.")
         project = self._project.project
-        columns, cells = await run_in_threadpool(cells_of_table, content, project.state)
+        name = request.query_params.get("name", "")[:100] or "The table"
+        columns, cells, notes = await run_in_threadpool(cells_of_table, content, project.state, name)
         await run_in_threadpool(project.edit, None, with_cells(columns, cells))
         self._changed()
-        return json_response({"matched": len(cells), "notes": project.state.notes()})
+        return json_response({"matched": len(cells), "notes": [*notes, *project.state.notes()]})
 
     # Jobs
 

@@ -155,6 +155,14 @@ def checks(
 ) -> list[dict[str, str]]:
     """Return findings on a question before it is run: a level (`ok`, `warning`, `problem`) and a sentence each."""
     chosen = _specimens_of(project, shapes)
+    formula = str(options.get("--formula", ""))
+    used = {str(value) for value in options.values() if isinstance(value, str)}
+    columns = [column for column in project.state.columns if column in used or _in_formula(column, formula)]
+    missing = {column: sum(not one.cells.get(column) for one in chosen) for column in columns}
+    of_all = len(chosen)
+    drop_missing = bool(options.get("--drop-missing"))
+    if drop_missing:
+        chosen = [one for one in chosen if all(one.cells.get(column) for column in columns)]
     enough = len(chosen) >= 2
     take = "specimen takes" if len(chosen) == 1 else "specimens take"
     found = [{"level": "ok" if enough else "problem", "text": f"{len(chosen)} {take} part."}]
@@ -163,15 +171,12 @@ def checks(
         level = "problem" if members < 2 or not others else "warning" if members < 20 else "ok"
         text = f"{members} in the reference, {others} to score; percentiles have steps of 1 in {members + 1}."
         found.append({"level": level, "text": text})
-    formula = str(options.get("--formula", ""))
-    used = {str(value) for value in options.values() if isinstance(value, str)}
-    columns = [column for column in project.state.columns if column in used or _in_formula(column, formula)]
     for column in columns:
         cells = [one.cells.get(column, "") for one in chosen]
-        missing = cells.count("")
-        if missing:
-            text = f"{column} is missing for {missing} of {len(cells)} specimens; fill it in, or leave these out."
-            found.append({"level": "problem", "text": text})
+        if missing[column]:
+            what = "these are left out" if drop_missing else "fill it in, or leave these out with --drop-missing"
+            text = f"{column} is missing for {missing[column]} of {of_all} specimens; {what}."
+            found.append({"level": "warning" if drop_missing else "problem", "text": text})
         classes = {cell: cells.count(cell) for cell in dict.fromkeys(cells) if cell}
         if 0 < len(classes) <= 12:
             few = min(classes.values()) < 3

@@ -18,12 +18,13 @@ from msgspec.structs import replace
 
 from shapespace.batch.result_folder import names_for
 from shapespace.cohort.classes import notes_on_classes
+from shapespace.cohort.table import match_rows, names_of_file, read_table
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.containers.json_files import read_json
 from shapespace.io.files import atomic_path, make_folder, write_error, write_text
 from shapespace.io.meshes.mesh_folders import mesh_files
 from shapespace.io.meshes.mesh_io import MESH_FILE_ENDINGS, stem_of
-from shapespace.io.tables.table_io import key_column, table_rows, table_text
+from shapespace.io.tables.table_io import key_column, table_text
 from shapespace.schemas import json_text, read
 from shapespace.types import MM_PER_UNIT
 
@@ -464,35 +465,26 @@ def _landmarks(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
     return "change the landmarks", replace(state, landmarks=landmarks, landmarks_on=str(request.get("on", "")))
 
 
-def cells_of_table(content: bytes, state: State) -> tuple[list[str], dict[str, dict[str, str]]]:
-    """Return the columns of a table (CSV, TSV or .xlsx), and the cells of each specimen that it has a row of.
+def cells_of_table(
+    content: bytes, state: State, name: str = "The table"
+) -> tuple[list[str], dict[str, dict[str, str]], list[str]]:
+    """Return the columns of a table (CSV, TSV or .xlsx), the cells of each specimen that it has a row of, and sentences
+    on rows without a specimen and specimens without a row.
 
-    Rows are named by id or file name.
+    Rows are matched to ids and files as commands match them.
 
     Raises:
-        FileFormatError: it is no such table.
+        FileFormatError: it is no such table, or two rows are of one specimen.
         InputError: no row is of a specimen.
     """
-    try:
-        lines = table_rows(content)
-        header = next(lines)
-        rows = list(lines)
-    except (ValueError, StopIteration) as error:
-        raise FileFormatError(f"The table {error or 'is empty'}; save it as CSV or .xlsx with a header.") from error
-    key = key_column(header)
-    if key is None:
-        raise InputError("The table needs a column id, specimen, scan, file or name, with the names of the scans.")
-    columns = {k: head for k, head in enumerate(header) if head and k != key}
-    known = {one.id.casefold(): one.id for one in state.specimens}
-    cells: dict[str, dict[str, str]] = {}
-    for row in rows:
-        found = known.get(row[key].strip().casefold()) or known.get(_stem(row[key].strip()).casefold())
-        if found is not None:
-            cells[found] = {head: row[k].strip()[:_LONGEST_CELL] for k, head in columns.items()}
-    if not cells:
-        first = rows[0][key][:40] if rows else ""
-        raise InputError(f"No row of the table is of a specimen; its first row is {first!r}.")
-    return list(columns.values()), cells
+    table = read_table(Path(name), content)
+    named = [(one.id, *names_of_file(Path(one.file).name)) for one in state.specimens]
+    matched, notes = match_rows(table, named, "the project", "name the specimens alike")
+    cells = {
+        state.specimens[k].id: {head: column[row][:_LONGEST_CELL] for head, column in table.columns.items()}
+        for row, k in matched.items()
+    }
+    return list(table.columns), cells, notes
 
 
 def with_cells(columns: Sequence[str], cells: Mapping[str, Mapping[str, str]]) -> Callable[[State], tuple[str, State]]:
