@@ -478,10 +478,10 @@ def test_unequal_dispersion_of_two_groups_is_a_warning_in_the_summary_and_the_an
     )
     answer = analysis_report(found)
     (warning,) = [sentence for sentence in answer.summary if sentence.startswith("Warning: dispersion")]
-    assert "differences are found that do not exist" in warning and "--unequal-variances" in warning
+    assert "differences are found that do not exist" in warning and "--variances unequal" in warning
     kept = json.loads(answer.save(tmp_path).read_text())
     assert kept["methods"]["dispersions"][0]["equal"] is False
-    allowed = asked(uneven(), group="arm", permutations=199, stable="all", unequal_variances=True)
+    allowed = asked(uneven(), group="arm", permutations=199, stable="all", variances="unequal")
     assert allowed.group_difference is not None and allowed.group_difference.surface.unequal_variances
     assert not [sentence for sentence in analysis_report(allowed).summary if sentence.startswith("Warning: dispersion")]
     assert (

@@ -34,7 +34,7 @@ from shapespace.statistics.compare_maps import EffectMap, effect_maps
 from shapespace.statistics.compare_strata import Stratum, is_nested, less, span, unit_stratum
 from shapespace.statistics.compare_unequal import Units, is_between_units, units_of
 from shapespace.statistics.compare_within import ModelStrata, RepeatedMeasures, WithinSubjects, strata_of
-from shapespace.statistics.dispersion import DispersionTest
+from shapespace.statistics.dispersion import VARIANCES, DispersionTest, Variances
 from shapespace.statistics.effect_size import EFFECT_SIZES, EffectSize, effect_size, permutation_p
 from shapespace.statistics.methods import dispersion_record, methods_of, sample_sizes
 from shapespace.statistics.multiple_imputation import Imputations, over_imputations
@@ -75,13 +75,13 @@ class CompareConfig:
         drop_missing: exclude shapes with missing values in the table (default: an error).
         random: random effects: those within subjects that differ between subjects, such as `1 + time | subject`; all
             others are assumed to be equal in all subjects (default with blocks: all).
-        unequal_variances: allow classes of unequal dispersion: a variance for each subject, and sign flips of
-            residuals.
+        variances: of the classes: `equal` permutes residuals, `unequal` has a variance for each subject and flips the
+            signs of residuals, `auto` uses `unequal` if classes may differ in dispersion: p of its test is at most 0.3,
+            or 0.05 for classes of the same size.
         effect_size: transformation of F in the effect size Z: `box-cox`, as in RRPP from version 0.6, or `log`, as
             before.
         weights: of the vertices in the sums of squares: `confidence`, smaller where the position along the surface is
-            uncertain, if all surfaces are from a correspondence that has estimated this; `none`: all are equal, as
-            always with unequal variances.
+            uncertain, if all surfaces are from a correspondence that has estimated this; `none`: all are equal.
         errors: term -> error term, over whose mean square its F is computed, such as `genus` -> `genus:species`
             (default: the residuals).
         error_permutation: of tests with an error term: `units` permutes the mean residuals of its classes, such as
@@ -99,7 +99,7 @@ class CompareConfig:
     alpha: float = 0.05
     drop_missing: bool = False
     random: str | None = None
-    unequal_variances: bool = False
+    variances: Variances = "auto"
     effect_size: EffectSize = "box-cox"
     weights: VertexWeights = "confidence"
     errors: Mapping[str, str] = field(default_factory=dict[str, str])
@@ -117,7 +117,9 @@ class CompareConfig:
             raise InputError("The seed must be 0 or more, and the level of significance between 0 and 1.")
         if self.effect_size not in EFFECT_SIZES:
             raise InputError(f"There is no effect size {self.effect_size!r}; choose one of {', '.join(EFFECT_SIZES)}.")
-        if self.errors and self.unequal_variances:
+        if self.variances not in VARIANCES:
+            raise InputError(f"There are no variances {self.variances!r}; choose one of {', '.join(VARIANCES)}.")
+        if self.errors and self.variances == "unequal":
             raise InputError("Tests with error terms assume equal variances; leave out one of the two.")
         if self.coding == "treatment" and (self.blocks or self.random):
             raise InputError("Blocks and random terms need deviation coding; leave out the other coding.")
@@ -140,6 +142,9 @@ class TermTest:
         p: share of arrangements with an F as large, the observed one among them.
         arrangements: (P,) F of each, the observed one first.
         error: whose mean square F is divided by.
+        unequal_variances: whether F allows classes of unequal dispersion.
+        f_other: F under the other assumption on variances; None without classes, or where that is not available.
+        p_other: the same of p.
     """
 
     term: str
@@ -152,6 +157,9 @@ class TermTest:
     p: float
     arrangements: FloatArray
     error: str = "residuals"
+    unequal_variances: bool = False
+    f_other: float | None = None
+    p_other: float | None = None
 
     __repr__ = short_repr
 
@@ -270,6 +278,11 @@ class CompareResult(AnalysisResult):
         """(K,) of the shapes."""
         return read_only(self.cohort.coefficients.mean(axis=0))
 
+    @property
+    def unequal_variances(self) -> bool:
+        """Whether tests allow classes of unequal dispersion, where that is available."""
+        return any(test.unequal_variances for test in self.tests)
+
     def test(self, term: str) -> TermTest:
         """Return the test of a term.
 
@@ -299,6 +312,9 @@ def _update(result: CompareResult) -> CompareResult:
 @over_imputations(
     parts=("tests", "effects", "angles", "dispersions", "map", "along", "any_way", "bump"),
     finish=_update,
+    fixed=lambda result: {
+        "config": replace(result.config, variances="unequal" if result.unequal_variances else "equal")
+    },
 )
 def compare(
     cohort: Cohort,
@@ -338,7 +354,7 @@ def compare(
     design = design_of(formula, cohort.table, config.coding)
     subjects = None if config.blocks is None else cohort.table.texts(config.blocks)
     repeated = subjects is not None and len(set(subjects)) < len(subjects)
-    root = _weight_root(cohort) if config.weights == "confidence" and not config.unequal_variances else None
+    root = _weight_root(cohort) if config.weights == "confidence" else None
     owners = subjects if repeated else None
 
     def strata_from(coefficients: FloatArray) -> ModelStrata:
@@ -355,36 +371,39 @@ def compare(
     families = [_weighted(cohort, design, family) for family in _families(design, made)]
     total = len(design.terms) + len(families) * (1 + config.maps)
     step = StepCounter(total, progress).add
+    crossed = {one for term in design.terms if not is_nested(term, design.terms) for one in term.variables}
+    columns = {one.name: one.column for one in design.variables}
+    asked = config.variances == "unequal"
+    units = [units_of(stratum, design, owners) if asked or is_between_units(stratum) else None for stratum in strata]
+    dispersions = tuple(
+        test
+        for own in units
+        if own is not None
+        for test in own.dispersions(cohort.n_vertices, config.permutations, config.seed)
+        if columns[test.variable] in crossed  # classes within others are small
+    )
+    unequal = asked or (
+        config.variances == "auto" and not errors and not all(test.is_equality_plausible for test in dispersions)
+    )
     tests = tuple(
         test
-        for stratum in strata
-        for test in term_tests(
-            stratum, config, step, units_of(stratum, design, owners) if config.unequal_variances else None, errors
-        )
+        for stratum, own in zip(strata, units, strict=True)
+        for test in term_tests(stratum, config, step, own, errors, unequal=unequal)
     )
     effects = tuple(
         replace(effect, exploratory=_is_exploratory(effect, design, tests, config))
         for family in families
-        for effect in _effects(cohort, family, design, owners, config, root, step)
+        for effect in _effects(cohort, family, design, owners, config, root, step, unequal=unequal)
     )
-    crossed = {one for term in design.terms if not is_nested(term, design.terms) for one in term.variables}
-    columns = {one.name: one.column for one in design.variables}
-    dispersions = tuple(
-        test
-        for stratum in strata
-        if is_between_units(stratum)
-        for test in units_of(stratum, design, owners).dispersions(cohort.n_vertices, config.permutations, config.seed)
-        if columns[test.variable] in crossed  # classes within others are small
-    )
-    methods = _methods(cohort, design, strata, subjects, dispersions, config, errors)
+    methods = _methods(cohort, design, strata, subjects, dispersions, config, errors, tests)
     return CompareResult(
         cohort=cohort,
         design=design,
         config=config,
         tests=tests,
-        strata=tuple(_summarise_stratum(stratum, config, among if stratum is strata[0] else ()) for stratum in strata),
+        strata=tuple(_summarise_stratum(stratum, tests, among if stratum is strata[0] else ()) for stratum in strata),
         effects=effects,
-        angles=(*_parallel(design, made, config), *_between(effects)),
+        angles=(*_parallel(design, made, config, unequal=unequal), *_between(effects)),
         n_subjects=len(set(subjects)) if subjects is not None else len(cohort),
         dispersions=dispersions,
         methods=methods,
@@ -485,35 +504,35 @@ def _methods(
     dispersions: Sequence[DispersionTest],
     config: CompareConfig,
     errors: Mapping[str, Term],
+    tests: Sequence[TermTest],
 ) -> Methods:
     """Return sample sizes, tests and assumptions of a comparison."""
     owners = cohort.names if subjects is None else subjects
     unit = config.blocks or "shape"
     schemes: list[TestScheme] = []
+    allowing = {(test.term, test.stratum) for test in tests if test.unequal_variances}
     for stratum in strata:
         for term in stratum.terms:
             reduced = stratum.reduced(term, config.anova_type)
-            flips = config.unequal_variances or stratum.flips(reduced)
+            unequal = (term.label, stratum.name) in allowing
+            flips = unequal or stratum.flips(reduced)
             own, error = unit if is_between_units(stratum) else f"difference within a {unit}", errors.get(term.label)
             if error is not None and config.error_permutation == "units":
                 own, reduced = f"{error.label} unit", [one for one in reduced if one is not error]
             schemes.append(
                 TestScheme(
                     tested=(term.label,),
-                    statistic="F, unequal variances"
-                    if config.unequal_variances
-                    else "F"
-                    if error is None
-                    else f"F over {error.label}",
+                    statistic="F, unequal variances" if unequal else "F" if error is None else f"F over {error.label}",
                     stratum=stratum.name,
                     resampling="sign flips" if flips else "permutation",
                     unit=own,
                     reduced_model=tuple(other.label for other in reduced),
                     arrangements=config.permutations,
-                    unequal_variances=config.unequal_variances,
+                    unequal_variances=unequal,
                 )
             )
     classes = [(one.name, design.groups_of(one)) for one in design.variables if one.groups]
+    several = any(len(_pairs(one)) > 1 for one in design.variables)
     return methods_of(
         cohort,
         len(set(owners)),
@@ -521,12 +540,12 @@ def _methods(
         sizes=sample_sizes(owners, classes),
         tests=tuple(schemes),
         dispersions=tuple(dispersion_record(one, config.alpha) for one in dispersions),
-        unequal_variances=config.unequal_variances if classes else None,
+        unequal_variances=bool(allowing) if classes else None,
         effect_size=config.effect_size,
         r2_strata=tuple(stratum.name for stratum in strata),
         corrected_over=(
             *(("the vertices of a map (family-wise error, or false discovery rate)",) if config.maps else ()),
-            "the pairs of classes of a variable (p of all pairs)",
+            *(("the pairs of classes of a variable (p of all pairs)",) if several else ()),
         ),
     )
 
@@ -544,6 +563,8 @@ def term_tests(
     step: Callable[[], None] = lambda: None,
     units: Units | None = None,
     errors: Mapping[str, Term] | None = None,
+    *,
+    unequal: bool = False,
 ) -> Iterator[TermTest]:
     """Yield the tests of the terms of a stratum.
 
@@ -551,8 +572,9 @@ def term_tests(
         stratum: the stratum.
         config: of the comparison.
         step: called after each term.
-        units: of the stratum, to test with unequal variances; None assumes equal ones.
+        units: of the stratum, to test with unequal variances too; None where that is not available.
         errors: error terms by the names of terms; None for the residuals.
+        unequal: whether unequal variances are reported first if they are available.
 
     Raises:
         InputError: unequal variances, and a unit that the model fits exactly, or an error term without degrees of
@@ -564,20 +586,24 @@ def term_tests(
         residual = stratum.residual(reduced)
         own = _own_columns(stratum, term, config)
         rest = span(stratum.matrix - own @ (own.T @ stratum.matrix), stratum.matrix.shape[1] - own.shape[1])
-        count = config.permutations if units is None else 1
-        products = stratum.products(np.hstack([own, rest]), residual, count, config.seed, flips=stratum.flips(reduced))
+        products = stratum.products(
+            np.hstack([own, rest]), residual, config.permutations, config.seed, flips=stratum.flips(reduced)
+        )
         squares = (products**2).sum(axis=2)
         df = own.shape[1]
         explained = squares[:, :df].sum(axis=1)  # S2
         f = _ratio(explained / df, ((residual**2).sum() - squares.sum(axis=1)) / stratum.df_error)  # S3
-        if units is not None:
-            # Columns of the reduced model are not tested; each unit has its own variance.
-            f = units.estimate(
-                units.own(term, reduced), [term], reduced, config.permutations, config.seed, term.label
-            ).statistic()
-        error = (errors or {}).get(term.label)
+        error, other = (errors or {}).get(term.label), None
         if error is not None:
             f = _error_f(stratum, term, error, config)
+        elif units is not None and (config.variances == "unequal" or units.is_comparable):
+            # Columns of the reduced model are not tested; each unit has its own variance.
+            other = units.estimate(
+                units.own(term, reduced), [term], reduced, config.permutations, config.seed, term.label
+            ).statistic()
+        allowing = unequal and other is not None
+        if other is not None and allowing:
+            f, other = other, f
         yield TermTest(
             term=term.label,
             stratum=stratum.name,
@@ -589,6 +615,9 @@ def term_tests(
             p=permutation_p(f),
             arrangements=read_only(f),
             error="residuals" if error is None else error.label,
+            unequal_variances=allowing,
+            f_other=None if other is None else float(other[0]),
+            p_other=None if other is None else permutation_p(other),
         )
         step()
 
@@ -623,7 +652,8 @@ def _error_f(stratum: Stratum, term: Term, error: Term, config: CompareConfig) -
     return _ratio(mean_squares[0], mean_squares[1])
 
 
-def _summarise_stratum(stratum: Stratum, config: CompareConfig, among: Sequence[Stratum]) -> StratumSummary:
+def _summarise_stratum(stratum: Stratum, tests: Sequence[TermTest], among: Sequence[Stratum]) -> StratumSummary:
+    unequal = any(test.unequal_variances for test in tests if test.stratum == stratum.name)
     residual = stratum.residual(stratum.terms)
     return StratumSummary(
         stratum=stratum.name,
@@ -631,7 +661,7 @@ def _summarise_stratum(stratum: Stratum, config: CompareConfig, among: Sequence[
         squares=float((residual**2).sum()),
         df_total=len(stratum.matrix) - stratum.removed,
         squares_total=float((stratum.shapes**2).sum()),
-        log_arrangements=min(one.fewest_log_arrangements(flips=config.unequal_variances) for one in (stratum, *among)),
+        log_arrangements=min(one.fewest_log_arrangements(flips=unequal) for one in (stratum, *among)),
     )
 
 
@@ -768,9 +798,11 @@ def _effects(
     config: CompareConfig,
     root: FloatArray | None,
     step: Callable[[], None],
+    *,
+    unequal: bool,
 ) -> Iterator[ShapeEffect]:
     parts = [list(own) for _, own in itertools.groupby(family.ends, key=lambda ends: id(ends.stratum))]
-    made = [_tested_together(cohort, own, design, subjects, config, root) for own in parts]
+    made = [_tested_together(cohort, own, design, subjects, config, root, unequal=unequal) for own in parts]
     largest = np.max([f for f, _, _ in made for f in f], axis=0)
     mean = cohort.coefficients.mean(axis=0)
     step()
@@ -804,11 +836,16 @@ def _tested_together(
     subjects: Sequence[str] | None,
     config: CompareConfig,
     root: FloatArray | None,
+    *,
+    unequal: bool,
 ) -> tuple[FloatArray, FloatArray, Sequence[EffectMap | None]]:
     """Return F (E, P), weighted by `root`, changes (E, K) in mm and maps of E contrasts of one stratum."""
     stratum, reduced = family[0].stratum, family[0].reduced
-    if config.unequal_variances:
-        return _tested_unequal(cohort, family, units_of(stratum, design, subjects), config)
+    if unequal:
+        available = is_between_units(stratum) and stratum.width == 1
+        units = units_of(stratum, design, subjects) if available or config.variances == "unequal" else None
+        if units is not None and (config.variances == "unequal" or units.is_comparable):
+            return _tested_unequal(cohort, family, units, config, root)
     residual, flips = stratum.residual(reduced), stratum.flips(reduced)
     directions = np.stack([stratum.direction(ends.contrast) for ends in family])
     lengths = np.maximum(np.linalg.norm(directions, axis=1), 1e-300)
@@ -836,14 +873,14 @@ def _tested_together(
 
 
 def _tested_unequal(
-    cohort: Cohort, family: Sequence[_Contrast], units: Units, config: CompareConfig
+    cohort: Cohort, family: Sequence[_Contrast], units: Units, config: CompareConfig, root: FloatArray | None
 ) -> tuple[FloatArray, FloatArray, Sequence[EffectMap | None]]:
-    """Return F (E, P), changes (E, K) in mm and maps of E contrasts of one stratum, with unequal variances."""
+    """Return what `_tested_together` does, with unequal variances."""
     stratum = units.stratum
     if stratum.width > 1:
         raise InputError(
             f"Unequal variances are not available for several contrasts of {stratum.name} at once; leave out "
-            "--unequal-variances."
+            "--variances unequal."
         )
     statistics: list[FloatArray] = []
     changes: list[FloatArray] = []
@@ -853,8 +890,10 @@ def _tested_unequal(
         direction = stratum.direction(ends.contrast)
         own = (direction / max(float(np.linalg.norm(direction)), 1e-300))[:, None]
         label = f"{ends.low} to {ends.high}"
-        estimate = units.estimate(own, tested, ends.reduced, config.permutations, config.seed, label)
-        statistics.append(estimate.statistic())
+        run = (tested, ends.reduced, config.permutations, config.seed, label)
+        estimate = units.estimate(own, *run)
+        weighted = estimate if root is None else replace(units, shapes=units.shapes @ root).estimate(own, *run)
+        statistics.append(weighted.statistic())
         changes.append(direction @ stratum.shapes)
         maps += (
             effect_maps(
@@ -875,7 +914,7 @@ def _tested_unequal(
     return np.stack(statistics), np.stack(changes), maps
 
 
-def _parallel(design: Design, strata: ModelStrata, config: CompareConfig) -> Iterator[EffectAngle]:
+def _parallel(design: Design, strata: ModelStrata, config: CompareConfig, *, unequal: bool) -> Iterator[EffectAngle]:
     """Yield angles between what a variable changes in one class of another and in the next, where they interact.
 
     The arrangements are those of the model without the interaction, where these changes are the same.
@@ -892,7 +931,7 @@ def _parallel(design: Design, strata: ModelStrata, config: CompareConfig) -> Ite
         for (first, second), drawn in zip(pairs, _changes_in_pairs(design, strata, one, other, config), strict=False):
             angles = angles_between(*drawn)
             # Their arrangements assume equal variances.
-            p = None if config.unequal_variances else float((angles >= angles[0] - TIE).mean())
+            p = None if unequal else float((angles >= angles[0] - TIE).mean())
             yield EffectAngle(words[first], words[second], float(angles[0]), p)
 
 
