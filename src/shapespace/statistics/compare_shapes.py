@@ -31,7 +31,7 @@ from shapespace.statistics.compare_formula import (
     random_effects_of,
 )
 from shapespace.statistics.compare_maps import EffectMap, effect_maps
-from shapespace.statistics.compare_strata import Stratum, is_nested, less, span, unit_stratum
+from shapespace.statistics.compare_strata import Stratum, is_nested, less, span, unit_stratum, without_noise
 from shapespace.statistics.compare_unequal import Units, is_between_units, units_of
 from shapespace.statistics.compare_within import ModelStrata, RepeatedMeasures, WithinSubjects, strata_of
 from shapespace.statistics.dispersion import VARIANCES, DispersionTest, Variances
@@ -403,7 +403,7 @@ def compare(
         tests=tests,
         strata=tuple(_summarise_stratum(stratum, tests, among if stratum is strata[0] else ()) for stratum in strata),
         effects=effects,
-        angles=(*_parallel(design, made, config, unequal=unequal), *_between(effects)),
+        angles=(*_parallel(design, made, config, owners, unequal=unequal), *_between(effects)),
         n_subjects=len(set(subjects)) if subjects is not None else len(cohort),
         dispersions=dispersions,
         methods=methods,
@@ -914,7 +914,9 @@ def _tested_unequal(
     return np.stack(statistics), np.stack(changes), maps
 
 
-def _parallel(design: Design, strata: ModelStrata, config: CompareConfig, *, unequal: bool) -> Iterator[EffectAngle]:
+def _parallel(
+    design: Design, strata: ModelStrata, config: CompareConfig, owners: Sequence[str] | None, *, unequal: bool
+) -> Iterator[EffectAngle]:
     """Yield angles between what a variable changes in one class of another and in the next, where they interact.
 
     The arrangements are those of the model without the interaction, where these changes are the same.
@@ -928,17 +930,19 @@ def _parallel(design: Design, strata: ModelStrata, config: CompareConfig, *, une
         levels = other.levels[:MOST_LEVELS]
         words = [f"{_levels_text(one, *_pairs(one)[0])}, {other.describe(level)}" for level in levels]
         pairs = list(itertools.combinations(range(len(levels)), 2))
-        for (first, second), drawn in zip(pairs, _changes_in_pairs(design, strata, one, other, config), strict=False):
-            angles = angles_between(*drawn)
-            # Their arrangements assume equal variances.
-            p = None if unequal else float((angles >= angles[0] - TIE).mean())
-            yield EffectAngle(words[first], words[second], float(angles[0]), p)
+        for (first, second), (drawn, weights) in zip(
+            pairs, _changes_in_pairs(design, strata, one, other, config, owners, unequal=unequal), strict=False
+        ):
+            angle = float(angles_between(drawn[0][:1], drawn[1][:1])[0])
+            p = permutation_p(off_common_direction(*drawn, *weights))
+            yield EffectAngle(words[first], words[second], angle, p)
 
 
 def _changes_in_pairs(
-    design: Design, strata: ModelStrata, one: Variable, other: Variable, config: CompareConfig
-) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield the changes (P, K) by a variable in the two classes of each pair of another, in each arrangement.
+    design: Design, strata: ModelStrata, one: Variable, other: Variable, config: CompareConfig,
+    owners: Sequence[str] | None, *, unequal: bool,
+) -> Iterator[tuple[tuple[FloatArray, FloatArray], tuple[float, float]]]:  # fmt: skip
+    """Yield the changes (P, K) by a variable in the two classes of each pair of another, and their precisions.
 
     There are none if the changes of the two variables belong to different strata.
     """
@@ -946,40 +950,68 @@ def _changes_in_pairs(
     low, high = _pairs(one)[0]
     levels = other.levels[:MOST_LEVELS]
     within = strata.within
+    if (
+        within is not None
+        and within.holds(both)
+        and one.column in within.variables
+        and other.column in within.variables
+    ):
+        # Both within subjects: each arrangement exchanges the two changes in some subjects.
+        own = [within.effects.contrast(one.column, low, high, {other.column: level}) for level in levels]
+        for first, second in itertools.combinations(own, 2):
+            half, between = within.contrast_stratum((first - second) / 2, both, f"{one.name}:{other.name}")
+            middle, parts = within.contrast_stratum((first + second) / 2, frozenset({one.column}), one.name)
+            direction = middle.direction(parts.average({}))
+            mean, left = direction @ middle.shapes, middle.residual(middle.terms)
+            common = without_noise(mean, float((direction**2).sum() * (left**2).sum()) / max(middle.df_error, 1))
+            differ = half.direction(between.average({}))
+            flipped = half.products(differ[:, None], half.shapes, config.permutations, config.seed, flips=True)[:, 0]
+            mean = np.concatenate([mean[None], np.repeat(common[None], len(flipped) - 1, axis=0)])
+            yield (mean + flipped, mean - flipped), (1.0, 1.0)
+        return
+    stratum, contrasts = None, list[FloatArray]()
     if within is None or not within.holds(both):
         stratum = next((s for s in strata.every if any(term.variables == both for term in s.terms)), None)
         if stratum is not None and any(term.variables == frozenset({one.column}) for term in stratum.terms):
             contrasts = [design.contrast(one.column, low, high, {other.column: level}) for level in levels]
-            yield from itertools.combinations(_changes_of(stratum, both, contrasts, config), 2)
-        return
-    if one.column not in within.variables:
-        return
-    if other.column not in within.variables:
+    elif one.column in within.variables:
         contrast = within.effects.contrast(one.column, low, high)
         stratum, between = within.contrast_stratum(contrast, frozenset({one.column}), one.name)
         contrasts = [between.average({other.column: level}) for level in levels]
-        yield from itertools.combinations(_changes_of(stratum, both, contrasts, config), 2)
-        return
-    # Both within subjects: each arrangement exchanges the two changes in some subjects.
-    own = [within.effects.contrast(one.column, low, high, {other.column: level}) for level in levels]
-    for first, second in itertools.combinations(own, 2):
-        half, between = within.contrast_stratum((first - second) / 2, both, f"{one.name}:{other.name}")
-        middle, parts = within.contrast_stratum((first + second) / 2, frozenset({one.column}), one.name)
-        mean = middle.direction(parts.average({})) @ middle.shapes
-        differ = half.direction(between.average({}))
-        flipped = half.products(differ[:, None], half.shapes, config.permutations, config.seed, flips=True)[:, 0]
-        yield mean + flipped, mean - flipped
+    if stratum is not None and contrasts:
+        units = units_of(stratum, design, owners) if unequal and is_between_units(stratum) else None
+        changes = [_changes_of(stratum, both, own, config, units) for own in contrasts]
+        for (first, precise), (second, other_precise) in itertools.combinations(changes, 2):
+            yield (first, second), (precise, other_precise)
 
 
 def _changes_of(
-    stratum: Stratum, variables: frozenset[str], contrasts: Sequence[FloatArray], config: CompareConfig
-) -> list[FloatArray]:
-    """Return contrasts (P, K) in each arrangement of the model without the terms of some variables."""
-    reduced = stratum.without(variables)
-    residual = stratum.residual(reduced)
-    products = stratum.products(stratum.basis, residual, config.permutations, config.seed, flips=stratum.flips(reduced))
-    products += stratum.basis.T @ (stratum.shapes - residual)
-    return [np.einsum("m,pmk->pk", stratum.basis.T @ stratum.direction(one), products) for one in contrasts]
+    stratum: Stratum, variables: frozenset[str], contrast: FloatArray, config: CompareConfig, units: Units | None
+) -> tuple[FloatArray, float]:
+    """Return a contrast (P, K) in each arrangement of the model without the terms of some variables, and its precision.
+
+    The common change of that model is shortened to its length without noise; in `units` variances may differ.
+    """
+    reduced, direction = stratum.without(variables), stratum.direction(contrast)
+    if units is not None and units.is_comparable and stratum.width == 1:
+        tested = [term for term in stratum.terms if term not in reduced]
+        flips = units.flips(tested, reduced, config.permutations, config.seed, stratum.name)
+        residual, columns = flips.residual, units.columns(reduced)
+        variances = (residual**2).sum(axis=1)
+        changes = (direction @ flips.full) @ flips.fitted
+    else:
+        residual, columns = stratum.residual(reduced), stratum.matrix[:, stratum.columns_of(reduced)]
+        free = len(residual) - stratum.removed
+        variances = np.full(len(residual), (residual**2).sum() / max(free - columns.shape[1], 1))
+        products = stratum.products(
+            stratum.basis, residual, config.permutations, config.seed, flips=stratum.flips(reduced)
+        )
+        changes = math.sqrt(free / max(free - columns.shape[1], 1)) * ((direction @ stratum.basis) @ products)
+    fitted = np.linalg.pinv(columns).T @ (columns.T @ direction)
+    noise = float(fitted**2 @ variances)
+    changes = changes + without_noise(direction @ (stratum.shapes - residual), noise)
+    changes[0] = direction @ stratum.shapes
+    return changes, 1.0 / max(float(direction**2 @ variances), 1e-300)
 
 
 def _between(effects: Sequence[ShapeEffect]) -> Iterator[EffectAngle]:
@@ -994,6 +1026,17 @@ def angles_between(one: FloatArray, other: FloatArray) -> FloatArray:
     """Return the (P,) angles in degrees of vectors (P, K) (S10)."""
     lengths = np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
     return np.degrees(np.arccos(np.clip((one * other).sum(axis=1) / np.maximum(lengths, 1e-300), -1, 1)))
+
+
+def off_common_direction(one: FloatArray, other: FloatArray, weight: float, other_weight: float) -> FloatArray:
+    """Return the (P,) weighted squared distance of vectors (P, K) from vectors of one common direction (S16).
+
+    Unlike the angle it hardly depends on the length of the common vector, which is unknown.
+    """
+    first, second = weight * (one**2).sum(axis=1), other_weight * (other**2).sum(axis=1)
+    product = math.sqrt(weight * other_weight) * (one * other).sum(axis=1)
+    least = (first + second - np.hypot(first - second, 2.0 * product)) / 2.0
+    return np.where(product > 0, least, np.minimum(first, second))
 
 
 def _ratio(explained: FloatArray, left: FloatArray) -> FloatArray:

@@ -10,7 +10,14 @@ import numpy as np
 from shapespace.errors import InputError
 from shapespace.statistics.compare_formula import Design, Term, Variable
 from shapespace.statistics.compare_strata import Rows, Stratum, less, span
-from shapespace.statistics.dispersion import FULL_LEVERAGE, DispersionTest, Estimate, dispersion_test, unequal_variances
+from shapespace.statistics.dispersion import (
+    FULL_LEVERAGE,
+    DispersionTest,
+    Estimate,
+    UnequalVariances,
+    dispersion_test,
+    unequal_variances,
+)
 from shapespace.types import FloatArray
 
 
@@ -84,7 +91,13 @@ class Units:
         Raises:
             InputError: a unit that the model fits exactly.
         """
-        flips = unequal_variances(
+        return self.flips(terms, reduced, permutations, seed, name).estimate(own)
+
+    def flips(
+        self, terms: Sequence[Term], reduced: Sequence[Term], permutations: int, seed: int, name: str
+    ) -> UnequalVariances:
+        """Return the sign flips of the residuals of a reduced model, with arguments as `estimate` has them."""
+        return unequal_variances(
             shapes=self.shapes,
             full=self.full,
             reduced=self.columns(reduced),
@@ -93,7 +106,6 @@ class Units:
             seed=seed,
             where=name,
         )
-        return flips.estimate(own)
 
     def dispersions(self, n_vertices: int, permutations: int, seed: int) -> Iterator[DispersionTest]:
         """Yield the tests of equal dispersion of the classes of each variable that differs between units."""
