@@ -135,7 +135,7 @@ def morphospace_part(
     }
     note = f"Labels of axes give their share of the {_SHARES.get(result.method, 'variance')}."
     if result.method != "cva":
-        lengths, point = LengthFormat(cohort.unit), "landmark" if cohort.source.kind == "landmarks" else "vertex"
+        lengths, point = LengthFormat(cohort.unit), "landmark" if cohort.faces is None else "vertex"
         norm, rms = lengths.text(1.0), lengths.text(1.0 / math.sqrt(cohort.n_vertices))
         note += f" A score of {norm} is a Procrustes norm over all {cohort.n_vertices:,} points: {rms} RMS per {point}."
     if result.groups is not None:
