@@ -1,7 +1,8 @@
 """Measure the tests of docs/compare.md and docs/change.md in groups of unequal dispersion: level, power, and warnings.
 
-`python benchmarks/dispersion.py` prints the tables in Markdown. Shapes are 40 points of a curve whose displacements are
-smooth noise plus a share of independent noise, so that covariances have the few large eigenvalues of real shapes.
+`python benchmarks/dispersion.py` prints the tables in Markdown, `--only auto` the one of `--variances auto`. Shapes are
+40 points of a curve whose displacements are smooth noise plus a share of independent noise, so that covariances have
+the few large eigenvalues of real shapes.
 """
 
 from __future__ import annotations
@@ -16,11 +17,14 @@ from unittest.mock import patch
 
 import numpy as np
 
+import shapespace.statistics.compare_shapes as compare_module
 from shapespace.cohort.cohort import Cohort
-from shapespace.statistics import compare as compare_module
+from shapespace.cohort.table import Table
 from shapespace.statistics.compare_formula import Design as FormulaDesign
 from shapespace.statistics.compare_formula import design_of
-from shapespace.statistics.compare_shapes import CompareConfig, compare
+from shapespace.statistics.compare_shapes import CompareConfig, compare, term_tests
+from shapespace.statistics.compare_unequal import units_of
+from shapespace.statistics.compare_within import strata_of
 from shapespace.statistics.dispersion import dispersion_test
 from shapespace.statistics.map_tests import difference_test
 from shapespace.types import FloatArray
@@ -45,6 +49,8 @@ class Design:
         local: groups whose variation is concentrated on a third of the curve, so that covariances are not proportional.
         effect: difference of the second group's mean, at the middle of the curve.
         covariate: whether the model has a covariate, which is related to the group.
+        rough: whether coordinates vary independently.
+        scans: shapes of each subject, with as much noise as subjects vary.
     """
 
     name: str
@@ -53,6 +59,8 @@ class Design:
     local: tuple[bool, ...] = ()
     effect: float = 0.0
     covariate: bool = False
+    rough: bool = False
+    scans: int = 1
 
 
 COMPARED = (
@@ -71,6 +79,24 @@ COMPARED = (
     Design("20 v 20, equal SD, a difference", (20, 20), (1, 1), effect=0.8),
     Design("10 v 40, equal SD, a difference", (10, 40), (1, 1), effect=1.0),
     Design("5 v 15, equal SD, a difference", (5, 15), (1, 1), effect=1.6),
+)
+AUTO = (
+    *COMPARED,
+    Design("10 v 40, smaller group SD × 1.1", (10, 40), (1.1, 1)),
+    Design("10 v 40, smaller group SD × 1.2", (10, 40), (1.2, 1)),
+    Design("5 v 25, smaller group SD × 1.2", (5, 25), (1.2, 1)),
+    Design("20 v 60, same SD, other covariance", (20, 60), (1, 1), (True, False)),
+    Design("8 v 24, smaller group SD × 1.2, with age", (8, 24), (1.2, 1), covariate=True),
+    Design("10 v 40, smaller group SD × 2, independent", (10, 40), (2, 1), rough=True),
+    Design("10 v 40, smaller group SD × 1.2, independent", (10, 40), (1.2, 1), rough=True),
+    Design("12, 12, 12, SD × 3, 1, 1", (12, 12, 12), (3, 1, 1)),
+    Design("6, 6, 6, 30, SD × 1.5, 1, 1, 1", (6, 6, 6, 30), (1.5, 1, 1, 1)),
+    Design("5, 5, 25, 25, 25, SD × 2, 2, 1, 1, 1", (5, 5, 25, 25, 25), (2, 2, 1, 1, 1)),
+    Design("10 v 30 subjects, 2 scans each, SD × 1.5", (10, 30), (1.5, 1), scans=2),
+    Design("8 v 24 subjects, 3 scans each, SD × 1.2, with age", (8, 24), (1.2, 1), covariate=True, scans=3),
+    Design("5 v 25, equal SD, a difference", (5, 25), (1, 1), effect=1.5),
+    Design("6 v 12, equal SD, a difference", (6, 12), (1, 1), effect=1.6),
+    Design("15 v 30, equal SD, with age, a difference", (15, 30), (1, 1), effect=1.0, covariate=True),
 )
 CHANGED = (
     Design("5 v 15, equal SD", (5, 15), (1, 1)),
@@ -99,7 +125,8 @@ def draw(design: Design, rng: np.random.Generator, directions: int = 3) -> tuple
     noise = rng.normal(size=(len(codes), POINTS * directions))
     local = design.local or (False,) * len(design.counts)
     for group, (spread, own) in enumerate(zip(design.spread, local, strict=True)):
-        noise[codes == group] = spread * noise[codes == group] @ factor(local=own, directions=directions).T
+        root = np.eye(POINTS * directions) if design.rough else factor(local=own, directions=directions)
+        noise[codes == group] = spread * noise[codes == group] @ root.T
     # The same in all studies, so that the design of the formula is.
     age = np.random.default_rng(0).normal(size=len(codes)) + (0.8 * codes if design.covariate else 0.0)
     bump = np.zeros((POINTS, directions))
@@ -118,12 +145,44 @@ def compared(design: Design, study: int, permutations: int) -> FloatArray:
     cohort = Cohort.of_shapes(curve + noise.reshape(len(codes), POINTS, 3), table, align=False)
     out: list[bool] = []
     for unequal in (False, True):
-        options = CompareConfig(permutations=permutations, seed=study, unequal_variances=unequal)
+        options = CompareConfig(permutations=permutations, seed=study, variances="unequal" if unequal else "equal")
         found = compare(cohort, "~ group + age" if design.covariate else "~ group", options)
         maps = [effect.map for effect in found.effects if effect.name == "group" and effect.map is not None]
         # The family-wise error does not include the pairs of three groups, so only the first pair is counted.
         out += [found.test("group").p <= LEVEL, bool((maps[0].any_way.p_family <= LEVEL).any())]
     return np.array([*out, found.dispersions[0].p <= LEVEL], dtype=np.float64)
+
+
+@cache
+def formula_of(design: Design) -> FormulaDesign:
+    """Return the columns of the formula, which are the same in all studies of a design."""
+    _, codes, age = draw(design, np.random.default_rng(0))
+    cells = {"group": [f"g{code}" for code in codes], "age": [f"{value:.6f}" for value in age]}
+    names = tuple(f"s{k}" for k in range(len(codes) * design.scans))
+    table = Table({name: tuple(np.repeat(values, design.scans).tolist()) for name, values in cells.items()}, names)
+    return design_of("~ group + age" if design.covariate else "~ group", table)
+
+
+def chosen(design: Design, study: int, permutations: int) -> FloatArray:
+    """Return whether the term is significant with equal and unequal variances and by `auto`, and which that takes.
+
+    The strata are tested without reading a formula, maps or pairs, so that a study takes milliseconds.
+    """
+    rng = np.random.default_rng([1, study])
+    noise, codes, _ = draw(design, rng)
+    formula, subjects = formula_of(design), None
+    if design.scans > 1:
+        noise = np.repeat(noise, design.scans, axis=0)
+        noise = noise + rng.normal(size=noise.shape)
+        subjects = [f"s{k}" for k in np.repeat(np.arange(len(codes)), design.scans)]
+    stratum = strata_of(noise, formula, subjects, "subject", "II", None).every[0]
+    units = units_of(stratum, formula, subjects)
+    (spread,) = units.dispersions(POINTS, permutations, study)
+    options = CompareConfig(permutations=permutations, seed=study, effect_size="log")
+    test = next(one for one in term_tests(stratum, options, units=units) if one.term == "group")
+    assert test.p_other is not None
+    p = (test.p, test.p_other, test.p if spread.is_equality_plausible else test.p_other)
+    return np.array([*(one <= LEVEL for one in p), not spread.is_equality_plausible], dtype=np.float64)
 
 
 def changed(design: Design, study: int, permutations: int) -> FloatArray:
@@ -134,9 +193,8 @@ def changed(design: Design, study: int, permutations: int) -> FloatArray:
     for unequal in (False, True):
         test = difference_test(maps, codes == 1, np.ones(POINTS), permutations, study, unequal_variances=unequal)
         out += [test.omnibus_p <= LEVEL, bool((test.p <= LEVEL).any())]
-    residual = maps - np.stack([maps[codes == k].mean(axis=0) for k in (0, 1)])[codes]
-    leverage = 1.0 / np.bincount(codes)[codes]
-    spread = dispersion_test("group", residual, leverage, codes, ("g0", "g1"), POINTS, permutations, study)
+    full = np.eye(2)[codes] / np.sqrt(np.bincount(codes))
+    spread = dispersion_test("group", maps, full, codes, ("g0", "g1"), POINTS, permutations, study)
     assert spread is not None
     return np.array([*out, spread.p <= LEVEL], dtype=np.float64)
 
@@ -164,12 +222,12 @@ def _contrast_once(
 
 def table(
     title: str, designs: tuple[Design, ...], one: Callable[[Design, int, int], FloatArray], studies: int,
-    permutations: int,
+    permutations: int, header: str = "permutation: whole | map | unequal variances: whole | map | dispersion unequal",
 ) -> None:  # fmt: skip
     """Print the table of one command."""
     print(f"\n{title}, {studies} studies of each design\n")
-    print("| design | permutation: whole | map | unequal variances: whole | map | dispersion unequal |")
-    print("|---|---|---|---|---|---|")
+    print(f"| design | {header} |")
+    print("|---" * (2 + header.count("|")) + "|")
     for design in designs:
         began = time.perf_counter()
         share = np.mean([one(design, study, permutations) for study in range(studies)], axis=0)
@@ -183,7 +241,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--studies", type=int, default=1000)
     parser.add_argument("--permutations", type=int, default=200)
+    parser.add_argument("--only", choices=("auto",), help="print one table")
     given = parser.parse_args()
+    table("compare --variances auto", AUTO, chosen, given.studies, given.permutations,
+          "equal | unequal | auto | auto takes unequal")  # fmt: skip
+    if given.only:
+        return
     # Two thirds of the time of a small study are the formula, whose columns are the same in all studies of a design.
     with (
         patch.object(compare_module, "design_of", _design_once),

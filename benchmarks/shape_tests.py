@@ -1,6 +1,8 @@
 """Time each test of `shapespace test`, and the ordinations: 400 specimens, 500 landmarks in 3-D, 1,000 permutations.
 
 The data are simulated: two groups at two sites, replicates of each specimen, a covariate, two modules and a tree.
+`--angles STUDIES` prints the false positives of the angles of trajectories and slopes instead, in studies whose groups
+have the same change, of 0 to 4 standard errors.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ import numpy as np
 from shapespace.cohort.cohort import Cohort
 from shapespace.statistics.asymmetry import measure_asymmetry
 from shapespace.statistics.compare_shapes import CompareConfig, compare
+from shapespace.statistics.shape_tests.linear import compare_pairs, compare_trajectories
 from shapespace.statistics.shape_tests.ordination import ordinate
 from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS
 
@@ -57,10 +60,63 @@ def write_tree(path: Path, specimens: int) -> Path:
     return path
 
 
+LENGTHS = (0.0, 0.5, 1.0, 2.0, 4.0)
+"""Length of the common change, in standard errors of its estimate."""
+
+
+def simulate_angle(design: str, length: float, smooth: bool, seed: int) -> float:
+    """Return p of the angle between the same change of two groups, with 12 landmarks.
+
+    Args:
+        design: `cells` of 6 shapes of 2 groups at 2 times, or `slopes` of 20 shapes of each group on a covariate whose
+            standard deviation is 1 and 0.3.
+        length: of the change, in standard errors.
+        smooth: whether neighbouring landmarks vary together.
+        seed: of the study.
+    """
+    rng = np.random.default_rng([3, seed])
+    group, count = np.repeat([0, 1], 12 if design == "cells" else 20), 24 if design == "cells" else 40
+    x = np.tile(np.repeat([0.0, 1.0], 6), 2) if design == "cells" else rng.normal(size=40) * (1.0 - 0.7 * group)
+    along = np.linspace(0.0, 1.0, 12)
+    covariance = np.exp(-0.5 * ((along[:, None] - along) / 0.15) ** 2) + 0.1 * np.eye(12) if smooth else np.eye(12)
+    noise = np.einsum("lm,nmd->nld", np.linalg.cholesky(covariance), rng.normal(size=(count, 12, 3)))
+    within = x - np.array([x[group == k].mean() for k in (0, 1)])[group]
+    error = np.sqrt(3.0 * np.trace(covariance) / (within**2).sum())
+    change = rng.normal(size=(12, 3))
+    shapes = noise + x[:, None, None] * change * (length * error / np.linalg.norm(change))
+    table = {"group": [f"g{k}" for k in group], "x": [f"t{v:.0f}" for v in x] if design == "cells" else x.tolist()}
+    cohort = Cohort.of_shapes(shapes, table, align=False)
+    if design == "cells":
+        found = compare_trajectories(cohort, group=("group",), points="x", permutations=200, seed=seed)
+    else:
+        found = compare_pairs(
+            cohort, formula="~ group * x", group=("group",), covariate="x", permutations=200, seed=seed
+        )
+    p = found.statistic("angle, degrees").p
+    assert p is not None
+    return p
+
+
+def report_angles(studies: int) -> None:
+    """Print the share of studies with p of at most 5 %."""
+    print(f"| design, {studies} studies each | {' | '.join(f'{one:g}' for one in LENGTHS)} |")
+    print("|---" * (1 + len(LENGTHS)) + "|")
+    for design, smooth in (("cells", False), ("cells", True), ("slopes", False), ("slopes", True)):
+        cells: list[str] = []
+        for length in LENGTHS:
+            p = np.array([simulate_angle(design, length, smooth, seed) for seed in range(studies)])
+            cells.append(f"{100 * (p <= 0.05).mean():.1f} %")
+        print(f"| {design}, {'smooth' if smooth else 'independent'} | {' | '.join(cells)} |", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", help="name of one test")
+    parser.add_argument("--angles", type=int, metavar="STUDIES", help="print false positives of angles")
     arguments = parser.parse_args()
+    if arguments.angles:
+        report_angles(arguments.angles)
+        return
     cohort = simulated_cohort(SPECIMENS, LANDMARKS)
     with tempfile.TemporaryDirectory() as folder:
         modules = Path(folder, "modules.csv")

@@ -36,7 +36,17 @@ def test_a_table_becomes_a_report_with_all_its_numbers(run: Run, tmp_path: Path)
 
 def test_unequal_variances_effect_size_and_no_unit_are_settings_of_the_answer(run: Run, tmp_path: Path) -> None:
     table = people(run, tmp_path / "people", "--effect", "4")
-    more = ("--permutations", "40", "--no-maps", "--unequal-variances", "--effect-size", "log", "--no-unit", "--json")
+    more = (
+        "--permutations",
+        "40",
+        "--no-maps",
+        "--variances",
+        "unequal",
+        "--effect-size",
+        "log",
+        "--no-unit",
+        "--json",
+    )
     told = run("compare", table, "--formula", "~ sex", *more, "-o", tmp_path / "answer")
     assert told.code == 0, told.err
     settings, methods = told.facts["settings"], told.facts["methods"]

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from shapespace.cli import main
 from shapespace.cohort.cohort import Cohort
@@ -14,10 +15,10 @@ from shapespace.errors import FileFormatError, InputError
 from shapespace.io.tables.table_io import write_rows
 from shapespace.report import figures
 from shapespace.report.analyses.morphospace_report import morphospace_part, morphospace_report
-from shapespace.report.figures.morphospace_figures import ellipse, hull
+from shapespace.report.figures.morphospace_figures import ellipse, hull, morphospace_figure
 from shapespace.report.pages.write_html import write_report
 from shapespace.report.render.scene import pack_morphospace
-from shapespace.schemas import MorphospacePart
+from shapespace.schemas import MorphospacePart, TablePart
 from shapespace.statistics.compare_shapes import CompareConfig, compare
 from shapespace.statistics.shape_tests.ordination import ordinate
 from synthetic_shapes import blob, sphere
@@ -104,6 +105,25 @@ def test_ellipses_contain_95_percent_of_a_normal_group_and_hulls_all() -> None:
     # It is an ellipse of the group as car::dataEllipse draws it, which misses more new shapes in small groups.
     assert 0.85 < np.mean(inside) < 0.97
     assert hull(np.array([[0.0, 0], [1, 1], [2, 2]])).shape == (3, 2)
+
+
+def test_groups_of_four_have_no_ellipse_and_scores_state_their_rms_per_point() -> None:
+    shapes = planar().coefficients
+    part, arrays = morphospace_part(ordinate(planar(), group=("kind",)))
+    for count, drawn in ((4, False), (5, True)):
+        codes = np.concatenate([np.zeros(count), np.ones(len(shapes) - count)])
+        space = plot_of(structs.replace(part, groups=("few", "rest")), {**arrays, "groups": codes})
+        assert np.isfinite(space.radii).tolist() == [drawn, True]
+        lines = morphospace_figure(space).axes[0].lines
+        assert len(lines) == 2 + 1 + drawn and all(np.isfinite(np.asarray(line.get_xydata())).all() for line in lines)
+    assert f"{1 / np.sqrt(7):.4f} RMS per landmark." in part.note
+    result = ordinate(planar())
+    table = next(
+        one for one in morphospace_report(result).parts if isinstance(one, TablePart) and one.title == "Eigenvalues"
+    )
+    scores = (result.scores[:, :1] @ result.shape_axes[:1] @ result.cohort.basis).reshape(len(shapes), 7, -1)
+    rms = np.sqrt((scores**2).sum(axis=2).mean(axis=1))
+    assert table.rows[0][-1] == pytest.approx(np.sqrt((rms**2).sum() / (len(shapes) - 1)), rel=1e-6)
 
 
 @pytest.mark.parametrize("cohort", [planar(), surfaces()], ids=["planar", "surfaces"])

@@ -467,7 +467,7 @@ def uneven(arms: int = 16) -> Cohort:
 
 
 def test_unequal_dispersion_of_two_groups_is_a_warning_in_the_summary_and_the_analysis(tmp_path: Path) -> None:
-    found = asked(uneven(), group="arm", permutations=199, stable="all")
+    found = asked(uneven(), group="arm", permutations=199, stable="all", variances="equal")
     (one,) = found.methods.dispersions
     assert (
         not one.equal
@@ -478,12 +478,14 @@ def test_unequal_dispersion_of_two_groups_is_a_warning_in_the_summary_and_the_an
     )
     answer = analysis_report(found)
     (warning,) = [sentence for sentence in answer.summary if sentence.startswith("Warning: dispersion")]
-    assert "differences are found that do not exist" in warning and "--unequal-variances" in warning
+    assert "differences are found that do not exist" in warning and "--variances unequal" in warning
     kept = json.loads(answer.save(tmp_path).read_text())
     assert kept["methods"]["dispersions"][0]["equal"] is False
-    allowed = asked(uneven(), group="arm", permutations=199, stable="all", unequal_variances=True)
+    allowed = asked(uneven(), group="arm", permutations=199, stable="all", variances="unequal")
     assert allowed.group_difference is not None and allowed.group_difference.surface.unequal_variances
     assert not [sentence for sentence in analysis_report(allowed).summary if sentence.startswith("Warning: dispersion")]
+    chosen = asked(uneven(), group="arm", permutations=199, stable="all").group_difference
+    assert chosen is not None and chosen.surface.omnibus_p == allowed.group_difference.surface.omnibus_p
     assert (
         allowed.group_difference.surface.omnibus_p > found.group_difference.surface.omnibus_p
         if found.group_difference is not None
@@ -492,7 +494,7 @@ def test_unequal_dispersion_of_two_groups_is_a_warning_in_the_summary_and_the_an
 
 
 def test_the_methods_count_subjects_of_each_group_and_name_each_test() -> None:
-    found = asked(uneven(), group="arm", permutations=199, stable="all")
+    found = asked(uneven(), group="arm", permutations=199, stable="all", variances="equal")
     sizes = {one.classes: (one.subjects, one.shapes) for one in found.methods.sizes}
     assert sizes == {("control",): (12, 24), ("treated",): (4, 8)}
     assert [(one.resampling, one.statistic) for one in found.methods.tests] == [

@@ -17,17 +17,17 @@ from shapespace.geometry.normals import vertex_normals
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report.analyses.compare_report import compare_warnings
 from shapespace.report.analyses.result_tables import analysis_report
-from shapespace.schemas import PARTS, Analysis, TextPart, json_text
+from shapespace.schemas import PARTS, Analysis, TablePart, TextPart, json_text
 from shapespace.statistics import compare_maps
 from shapespace.statistics.compare_formula import FUNCTIONS, design_of, random_effects_of
-from shapespace.statistics.compare_shapes import CompareConfig, SquaresType, compare
+from shapespace.statistics.compare_shapes import CompareConfig, CompareResult, SquaresType, compare
 from shapespace.statistics.compare_within import strata_of
 from shapespace.statistics.effect_size import EFFECT_SIZES, effect_size
 from shapespace.types import FloatArray, IntArray, Mesh
 
 pytest.importorskip("formulaic", reason="the extra `statistics` is not installed")
 
-QUICK = CompareConfig(permutations=20, maps=False)
+QUICK = CompareConfig(permutations=20, maps=False, variances="equal")
 SIDE = 6
 
 
@@ -109,7 +109,7 @@ FORMULAS = {
 def test_sums_of_squares_r2_and_f_are_those_of_plain_least_squares(formula: str, squares: SquaresType) -> None:
     table, terms = people(), FORMULAS[formula]
     shapes = cohort(table)
-    found = compare(shapes, formula, CompareConfig(anova_type=squares, permutations=20, maps=False))
+    found = compare(shapes, formula, replace(QUICK, anova_type=squares))
     columns = pieces(table, terms)
     flat = np.stack([shapes.vertices(k).ravel() for k in range(len(shapes))])
     total = left(flat, [])[0]
@@ -314,7 +314,7 @@ def test_maps_are_those_of_a_plain_test_at_each_vertex(monkeypatch: pytest.Monke
     monkeypatch.setattr(compare_maps, "_BYTES", 7 * 3 * 8 * 2 * 11)
     table = people(25)
     shapes = cohort(table)
-    found = compare(shapes, "~ age + sex", CompareConfig(permutations=60)).effects[1]
+    found = compare(shapes, "~ age + sex", CompareConfig(permutations=60, variances="equal")).effects[1]
     stratum = strata_of(shapes.coefficients, design_of("~ age + sex", shapes.table), None, "").every[0]
     every = np.stack([shapes.vertices(k) for k in range(25)])
     normals = vertex_normals(Mesh(every.mean(axis=0), shapes.faces))
@@ -660,7 +660,7 @@ def unequal_groups(spread: float = 2.0, seed: int = 0, effect: float = 0.0) -> C
 
 def test_with_unequal_variances_f_of_two_classes_is_the_squared_welch_t_of_the_whole_and_of_each_vertex() -> None:
     shapes = unequal_groups()
-    found = compare(shapes, "~ sex", CompareConfig(permutations=20, unequal_variances=True))
+    found = compare(shapes, "~ sex", CompareConfig(permutations=20, variances="unequal"))
     flat = np.stack([shapes.vertices(k) for k in range(24)])
     one, other = flat[:6], flat[6:]
     variance = one.var(axis=0, ddof=1) / 6 + other.var(axis=0, ddof=1) / 18
@@ -675,7 +675,7 @@ def test_with_unequal_variances_f_of_two_classes_is_the_squared_welch_t_of_the_w
 def test_a_covariate_and_three_classes_keep_their_estimates_with_unequal_variances() -> None:
     table = people()
     plain = compare(cohort(table), "~ site * age", QUICK)
-    allowed = compare(cohort(table), "~ site * age", replace(QUICK, unequal_variances=True))
+    allowed = compare(cohort(table), "~ site * age", replace(QUICK, variances="unequal"))
     for one, other in zip(plain.effects, allowed.effects, strict=True):
         np.testing.assert_allclose(one.change, other.change, atol=1e-12)
     for one, other in zip(plain.tests, allowed.tests, strict=True):
@@ -685,24 +685,84 @@ def test_a_covariate_and_three_classes_keep_their_estimates_with_unequal_varianc
 
 
 def test_unequal_dispersion_warns_unless_the_test_allows_it_and_stands_in_the_analysis() -> None:
-    found = compare(unequal_groups(), "~ sex + age", CompareConfig(permutations=200, maps=False))
+    assumed = CompareConfig(permutations=200, maps=False, variances="equal")
+    found = compare(unequal_groups(), "~ sex + age", assumed)
     (test,) = found.dispersions
     assert test.variable == "sex" and test.p <= 0.01 and test.ratio == pytest.approx(2.0, abs=0.3)
     assert compare_warnings(found)[0].startswith("Warning: dispersion is unequal")
     assert "differences are found that do not exist" in compare_warnings(found)[0]
     analysis = json.loads(json_text(analysis_report(found).analysis()))
     assert analysis["methods"]["dispersions"][0]["equal"] is False and compare_warnings(found)[0] in analysis["summary"]
-    allowed = CompareConfig(permutations=200, maps=False, unequal_variances=True)
+    allowed = CompareConfig(permutations=200, maps=False, variances="unequal")
     assert not [one for one in compare_warnings(compare(unequal_groups(), "~ sex", allowed)) if "ispersion" in one]
-    equal = compare(unequal_groups(1.0), "~ sex", CompareConfig(permutations=200, maps=False))
+    equal = compare(unequal_groups(1.0), "~ sex", assumed)
     assert equal.methods.dispersions[0].equal and not [one for one in compare_warnings(equal) if "ispersion" in one]
+
+
+def test_auto_reports_the_test_that_holds_first_and_p_with_equal_variances_in_the_same_sentence() -> None:
+    run = CompareConfig(permutations=200, maps=False)
+    given = unequal_groups()
+    found, equal, unequal = (
+        compare(given, "~ sex + age", replace(run, variances=one)) for one in ("auto", "equal", "unequal")
+    )
+    for term in ("sex", "age"):
+        first, assumed, allowing = (result.test(term) for result in (found, equal, unequal))
+        assert (first.f, first.p) == (allowing.f, allowing.p) == (assumed.f_other, assumed.p_other)
+        assert (first.f_other, first.p_other) == (assumed.f, assumed.p)
+        assert first.unequal_variances and not assumed.unequal_variances
+    assert found.methods.unequal_variances and {one.resampling for one in found.methods.tests} == {"sign flips"}
+    assert [one.f for one in found.effects] == [one.f for one in unequal.effects]
+    report = analysis_report(found)
+    p = found.test("sex").p_other
+    assert f"without the assumption of equal variances; p {p:.3g} with it)" in report.summary[0]
+    (sex, _) = analysis_report(equal).summary[:2]
+    assert re.search(r"p 0\.005, which is too small: it assumes equal variances; p 0\.\d+ without this assumption", sex)
+    (table,) = [part for part in report.parts if isinstance(part, TablePart) and part.title == "What shape varies with"]
+    assert [column.name for column in table.columns[-2:]] == ["F, equal variances", "p, equal variances"]
+    assert table.rows[0][-1] == p and table.rows[-1][-1] is None
+
+
+def test_auto_assumes_equal_variances_of_alike_classes_and_of_terms_that_cannot_allow_others() -> None:
+    run = CompareConfig(permutations=200, maps=False)
+    points, _ = surface()
+
+    def chosen(seed: int, counts: tuple[int, int], spread: float) -> CompareResult:
+        sex = np.repeat(["female", "male"], counts)
+        noise = np.random.default_rng(seed).normal(size=(sum(counts), *points.shape))
+        noise[: counts[0]] *= spread
+        return compare(Cohort.of_shapes(points + noise, {"sex": sex.tolist()}, align=False), "~ sex", run)
+
+    (alike,) = chosen(3, (20, 20), 1.0).dispersions
+    assert alike.p > 0.05 and alike.is_equality_plausible
+    assert not chosen(3, (20, 20), 1.0).unequal_variances and chosen(3, (20, 20), 1.5).unequal_variances
+    single = chosen(0, (1, 12), 5.0)  # a class of one has no variance
+    assert not single.unequal_variances and single.test("sex").p_other is None
+    plausible = [replace(alike, counts=counts, p=0.2) for counts in ((20, 20), (10, 30))]
+    assert [one.is_equality_plausible for one in plausible] == [True, False]
+    with pytest.raises(InputError, match="no variances 'both'"):
+        CompareConfig(variances="both")  # type: ignore[arg-type]
+
+
+def test_unequal_variances_have_the_weights_of_the_vertices_in_f() -> None:
+    given = unequal_groups()
+    stddev = np.linspace(0.0, 5.0, SIDE * SIDE)
+    weighted = replace(given, position_std=stddev)
+    found = compare(weighted, "~ sex", replace(QUICK, variances="unequal"))
+    flat = np.stack([given.vertices(k) for k in range(24)])
+    variance = (flat - flat.mean(axis=0)).var() * 1.0
+    weight = (variance / (variance + stddev**2))[:, None]
+    one, other = flat[:6], flat[6:]
+    welch = one.var(axis=0, ddof=1) / 6 + other.var(axis=0, ddof=1) / 18
+    expected = ((one.mean(axis=0) - other.mean(axis=0)) ** 2 * weight).sum() / (welch * weight).sum()
+    assert found.test("sex").f == pytest.approx(expected, rel=1e-6)
+    assert found.effects[0].f == pytest.approx(expected, rel=1e-6)
 
 
 def test_groups_coded_as_two_numbers_are_groups() -> None:
     words = unequal_groups()
     codes = tuple("2" if sex == "male" else "1" for sex in words.table.texts("sex"))
     numbers = replace(words, table=Table({"sex": codes}, words.names))
-    for options in (QUICK, replace(QUICK, unequal_variances=True)):
+    for options in (QUICK, replace(QUICK, variances="unequal")):
         by_words, by_numbers = compare(words, "~ sex", options), compare(numbers, "~ sex", options)
         (one,), (other,) = by_words.dispersions, by_numbers.dispersions
         assert (other.counts, other.p) == (one.counts, one.p) and other.groups == ("1", "2")
@@ -723,7 +783,7 @@ def test_a_rare_one_of_two_numbers_is_compared_with_the_other() -> None:
 def test_the_number_of_arrangements_is_that_of_sign_flips_with_unequal_variances() -> None:
     table = {"group": ["a"] * 2 + ["b"] * 2}
     assert any("only 6 arrangements" in one for one in compare_warnings(compare(cohort(table), "~ group", QUICK)))
-    flipped = compare_warnings(compare(cohort(table), "~ group", replace(QUICK, unequal_variances=True)))
+    flipped = compare_warnings(compare(cohort(table), "~ group", replace(QUICK, variances="unequal")))
     assert any("only 8 arrangements" in one for one in flipped)
 
 
@@ -741,7 +801,7 @@ def test_random_terms_may_stand_in_brackets() -> None:
 
 def test_unequal_variances_warn_about_a_class_of_fewer_than_five() -> None:
     shapes = unequal_groups().take(range(2, 24))
-    found = compare(shapes, "~ sex", CompareConfig(permutations=40, maps=False, unequal_variances=True))
+    found = compare(shapes, "~ sex", CompareConfig(permutations=40, maps=False, variances="unequal"))
     assert compare_warnings(found)[0].startswith("Warning: sex has a class of 4 subjects")
 
 
@@ -758,7 +818,7 @@ def test_means_of_subjects_and_their_contrasts_between_groups_allow_unequal_vari
     noise = 0.3 * rng.normal(size=(56, *points.shape))
     shapes = points + noise + own[np.arange(56) // 4, (np.arange(56) // 2) % 2]
     given = Cohort.of_shapes(shapes, table, align=False)
-    options = CompareConfig(blocks="subject", permutations=40, maps=False, unequal_variances=True)
+    options = CompareConfig(blocks="subject", permutations=40, maps=False, variances="unequal")
     found = compare(given, "~ sex * visit", options)
     assert [(one.variable, one.stratum) for one in found.dispersions] == [
         ("sex", "between subject"), ("sex", "within subject: visit")
@@ -819,7 +879,7 @@ def replace_arrays(part: Any) -> Any:
 def test_a_map_is_exploratory_unless_its_term_is_significant_and_has_an_interval() -> None:
     def sentences(effect: float, seed: int) -> list[str]:
         found = compare(unequal_groups(1.0, seed, effect), "~ sex", CompareConfig(permutations=200, alpha=0.05))
-        return [one for one in analysis_report(found).summary if "of the vertices differ" in one]
+        return [one for one in analysis_report(found).summary if "vertices differ" in one]
 
     (shown,) = sentences(2.0, 0)
     assert "exploratory" not in shown and re.search(r"simultaneous 95 % interval [+-]\d.* to [+-]\d", shown)

@@ -131,15 +131,13 @@ def test_the_level_is_kept_where_the_smaller_group_is_more_variable() -> None:
 
 def test_equal_dispersions_are_rejected_at_the_level_and_unequal_ones_found() -> None:
     codes, _, full = one_way((10, 30))
-    leverage = (full**2).sum(axis=1)
     p: dict[float, list[float]] = {1.0: [], 1.7: []}
     for study, spread in itertools.product(range(STUDIES), p):
         shapes = np.random.default_rng([study, 1]).normal(size=(40, 12)) * np.where(codes == 0, spread, 1.0)[:, None]
-        residual = shapes - full @ (full.T @ shapes)
         found = dispersion_test(
             variable="sex",
-            residual=residual,
-            leverage=leverage,
+            shapes=shapes,
+            full=full,
             codes=codes,
             groups=("f", "m"),
             n_vertices=4,
@@ -152,14 +150,27 @@ def test_equal_dispersions_are_rejected_at_the_level_and_unequal_ones_found() ->
     assert np.mean(np.array(p[1.7]) <= 0.05) > 0.9
 
 
+def test_another_form_of_covariance_is_found_also_with_equal_dispersion_and_at_the_level_otherwise() -> None:
+    codes, _, full = one_way((8, 24))
+    p: dict[bool, list[float]] = {False: [], True: []}
+    for study, local in itertools.product(range(STUDIES), p):
+        shapes = np.random.default_rng([study, 2]).normal(size=(32, 12))
+        if local:
+            shapes[codes == 0] *= np.where(np.arange(12) < 3, 1.8, 0.4)
+        found = dispersion_test("sex", 3.0 * shapes, full, codes, ("f", "m"), 4, 99, study)
+        assert found is not None
+        p[local].append(found.p_form)
+    assert np.mean(np.array(p[False]) <= 0.05) <= 0.05 + 2.5 * (0.05 * 0.95 / STUDIES) ** 0.5
+    assert np.mean(np.array(p[True]) <= 0.05) > 0.8
+
+
 def test_dispersions_are_standard_deviations_about_the_group_mean_and_classes_of_one_are_left_out() -> None:
     codes, _, full = one_way((3, 8, 1))
     shapes = np.random.default_rng(4).normal(size=(12, 6)) * np.array([4.0, 1.0, 1.0])[codes][:, None]
-    residual = shapes - full @ (full.T @ shapes)
     found = dispersion_test(
         variable="site",
-        residual=residual,
-        leverage=(full**2).sum(axis=1),
+        shapes=shapes,
+        full=full,
         codes=codes,
         groups=("a", "b", "c"),
         n_vertices=2,
@@ -174,8 +185,8 @@ def test_dispersions_are_standard_deviations_about_the_group_mean_and_classes_of
     assert (
         dispersion_test(
             variable="site",
-            residual=residual[:4] * 0,
-            leverage=np.zeros(4),
+            shapes=shapes[:4] * 0,
+            full=full[:4] * 0,
             codes=codes[:4],
             groups=("a", "b"),
             n_vertices=2,
@@ -193,12 +204,11 @@ def test_dispersions_and_their_p_are_those_of_morphol_disparity(geomorph_referen
     cells = [f"{one}.{other}" for one, other in zip(table["species"], table["site"], strict=True)]
     codes = np.array([expected["groups"].index(cell) for cell in cells])
     counts = np.bincount(codes)
-    residual = shapes - np.stack([shapes[codes == k].mean(axis=0) for k in range(4)])[codes]
     names = tuple(expected["groups"])
     found = dispersion_test(
         variable="group",
-        residual=residual,
-        leverage=1 / counts[codes],
+        shapes=shapes,
+        full=np.eye(4)[codes] / np.sqrt(counts),
         codes=codes,
         groups=names,
         n_vertices=12,

@@ -148,7 +148,7 @@ def test_f_of_means_is_that_of_compare_with_equal_and_unequal_variances() -> Non
     cohort = simulated((8, 15, 11), shift=0.4, scales=(1.0, 1.5, 0.8))
     found = compare_means_and_covariances(cohort, group=GROUP, permutations=300)
     for name, unequal in (("F of means", False), ("F of means, unequal covariances", True)):
-        options = CompareConfig(permutations=300, maps=False, unequal_variances=unequal)
+        options = CompareConfig(permutations=300, maps=False, variances="unequal" if unequal else "equal")
         expected = compare(cohort, "~ group", options).test("group")
         assert found.statistic(name).value == pytest.approx(expected.f, rel=1e-9)
         assert found.statistic(name).p == pytest.approx(expected.p, abs=0.1)

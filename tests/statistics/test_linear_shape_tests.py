@@ -1,6 +1,6 @@
 """Trajectories, pairs of groups, allometry and repeatability: published results of geomorph, other libraries, nulls."""
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from scipy.spatial import procrustes
 from shapespace.cohort.cohort import Cohort, with_columns
 from shapespace.errors import InputError
 from shapespace.report.analyses.shape_test_report import shape_test_report
-from shapespace.statistics.compare_shapes import CompareConfig, SquaresType, compare
+from shapespace.statistics.compare_shapes import CompareConfig, SquaresType, compare, off_common_direction
 from shapespace.statistics.shape_tests.linear import (
     analyse_allometry,
     compare_pairs,
@@ -314,3 +314,37 @@ def test_designs_that_cannot_be_tested_are_refused() -> None:
     ):  # fmt: skip
         with pytest.raises(InputError, match=words):
             call()
+
+
+def test_the_distance_from_a_common_direction_is_the_smallest_over_all_directions() -> None:
+    rng = np.random.default_rng(2)
+    one, other, weights = rng.normal(size=(60, 2)), rng.normal(size=(60, 2)), (2.0, 0.5)
+    turns = np.radians(np.arange(0, 360, 0.05))
+    directions = np.stack([np.cos(turns), np.sin(turns)])
+    distances = [
+        weight * ((own**2).sum(axis=1)[:, None] - np.maximum(own @ directions, 0.0) ** 2)
+        for own, weight in zip((one, other), weights, strict=True)
+    ]
+    expected = (distances[0] + distances[1]).min(axis=1)
+    np.testing.assert_allclose(off_common_direction(one, other, *weights), expected, atol=1e-4)
+    parallel = off_common_direction(one, 3.0 * one, *weights)
+    np.testing.assert_allclose(parallel, 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("residuals", ["scaled", "raw"])
+def test_angles_without_a_common_change_are_rarely_significant_unless_its_length_is_taken_as_known(
+    residuals: Literal["scaled", "raw"],
+) -> None:
+    found = 0
+    for seed in range(20):
+        shapes = np.random.default_rng(seed).normal(size=(24, 12, 3))
+        table = {"group": ["a", "b"] * 12, "time": [f"t{k // 2 % 2}" for k in range(24)]}
+        given = Cohort.of_shapes(shapes, table, align=False)
+        result = compare_trajectories(
+            given, group=("group",), points="time", residuals=residuals, permutations=60, seed=seed
+        )
+        angle = result.statistic("angle, degrees")
+        assert 0 <= angle.value <= 180
+        assert angle.p is not None
+        found += angle.p <= 0.05
+    assert found <= 3 if residuals == "scaled" else found > 8

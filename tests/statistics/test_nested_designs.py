@@ -180,7 +180,7 @@ def test_designs_without_degrees_of_freedom_of_the_error_are_refused() -> None:
     with pytest.raises(InputError, match="genus:species"):  # one species in each genus
         nested(Cohort.of_shapes(shapes, table, align=False))
     with pytest.raises(InputError, match="equal variances"):
-        CompareConfig(errors=ERRORS, unequal_variances=True)
+        CompareConfig(errors=ERRORS, variances="unequal")
     with pytest.raises(InputError, match="deviation coding"):
         CompareConfig(random="1 | who", coding="treatment")
 

@@ -856,7 +856,7 @@ COMMANDS: tuple[Command, ...] = (
             advanced("--coding", source=COMPARE),
             advanced("--type", source=COMPARE, field="anova_type", dest="anova_type"),
             advanced("--level", "P", source=COMPARE, field="alpha"),
-            advanced("--unequal-variances", source=COMPARE),
+            advanced("--variances", source=COMPARE),
             advanced("--effect-size", source=COMPARE),
             advanced("--weights", source=COMPARE),
             advanced("--no-maps", help="skip the tests of each vertex", source=COMPARE),
@@ -900,7 +900,7 @@ COMMANDS: tuple[Command, ...] = (
                      "repeated (default: the regions of the model)", parse=values.named_file, repeat=True),
             advanced("--landmarks", "FILE", "CSV of name,vertex, or landmarks.csv of correspond (default: those of the "
                      "model)", parse=Path),
-            advanced("--unequal-variances", source=CHANGE),
+            advanced("--variances", source=CHANGE),
             advanced("--rate", source=CHANGE),
             advanced("--permutations", "N", source=CHANGE, parse=values.integer),
             advanced("--drop-missing", source=CHANGE),

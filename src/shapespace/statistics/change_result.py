@@ -19,7 +19,7 @@ from shapespace.statistics.change_align import stable_vertices
 from shapespace.statistics.change_maps import align_visits
 from shapespace.statistics.change_repeatability import Repeatability
 from shapespace.statistics.change_visits import visits_of
-from shapespace.statistics.dispersion import DispersionTest
+from shapespace.statistics.dispersion import DispersionTest, Variances
 from shapespace.statistics.map_tests import LEVEL, MapTest
 from shapespace.statistics.methods import dispersion_record, methods_of, sample_sizes
 from shapespace.types import BoolArray, FloatArray, Mesh, SurfaceLandmarks
@@ -44,7 +44,9 @@ class ChangeConfig:
         rate: analyse mm per unit of time instead of last minus first visit.
         permutations: number of permutations.
         seed: seed of the permutations.
-        unequal_variances: allow groups of unequal dispersion (Welch's t, sign flips).
+        variances: of the groups: `equal` permutes subjects, `unequal` computes Welch's t and flips signs, `auto` uses
+            `unequal` if groups may differ in dispersion: p of its test is at most 0.3, or 0.05 for groups of the same
+            size.
         drop_missing: exclude shapes with missing values in the table (default: an error).
     """
 
@@ -57,7 +59,7 @@ class ChangeConfig:
     rate: bool = False
     permutations: int = 1000
     seed: int = 0
-    unequal_variances: bool = False
+    variances: Variances = "auto"
     drop_missing: bool = False
 
 
@@ -266,7 +268,7 @@ class ChangeResult(AnalysisResult):
             dispersions=()
             if difference is None or difference.dispersion is None
             else (dispersion_record(difference.dispersion, LEVEL),),
-            unequal_variances=None if difference is None else self.config.unequal_variances,
+            unequal_variances=None if difference is None else difference.surface.unequal_variances,
             corrected_over=("the vertices of a map", "the parts in the table of volumes", "the landmarks of a table")
             if tests else (),
             assumptions=("Visits of a subject are aligned rigidly to its first by the stable part; p values do not "

@@ -33,10 +33,10 @@ from shapespace.statistics.compare_formula import (
     random_effects_of,
 )
 from shapespace.statistics.compare_maps import EffectMap, effect_maps
-from shapespace.statistics.compare_strata import Stratum, is_nested, less, span, unit_stratum
+from shapespace.statistics.compare_strata import Stratum, is_nested, less, span, unit_stratum, without_noise
 from shapespace.statistics.compare_unequal import Units, is_between_units, units_of
 from shapespace.statistics.compare_within import ModelStrata, RepeatedMeasures, WithinSubjects, strata_of
-from shapespace.statistics.dispersion import DispersionTest
+from shapespace.statistics.dispersion import VARIANCES, DispersionTest, Variances
 from shapespace.statistics.effect_size import EFFECT_SIZES, EffectSize, effect_size, permutation_p
 from shapespace.statistics.methods import dispersion_record, methods_of, sample_sizes
 from shapespace.statistics.multiple_imputation import Imputations, over_imputations
@@ -77,13 +77,13 @@ class CompareConfig:
         drop_missing: exclude shapes with missing values in the table (default: an error).
         random: random effects: those within subjects that differ between subjects, such as `1 + time | subject`; all
             others are assumed to be equal in all subjects (default with blocks: all).
-        unequal_variances: allow classes of unequal dispersion: a variance for each subject, and sign flips of
-            residuals.
+        variances: of the classes: `equal` permutes residuals, `unequal` has a variance for each subject and flips the
+            signs of residuals, `auto` uses `unequal` if classes may differ in dispersion: p of its test is at most 0.3,
+            or 0.05 for classes of the same size.
         effect_size: transformation of F in the effect size Z: `box-cox`, as in RRPP from version 0.6, or `log`, as
             before.
         weights: of the vertices in the sums of squares: `confidence`, smaller where the position along the surface is
-            uncertain, if all surfaces are from a correspondence that has estimated this; `none`: all are equal, as
-            always with unequal variances.
+            uncertain, if all surfaces are from a correspondence that has estimated this; `none`: all are equal.
         errors: term -> error term, over whose mean square its F is computed, such as `genus` -> `genus:species`
             (default: the residuals).
         error_permutation: of tests with an error term: `units` permutes the mean residuals of its classes, such as
@@ -101,7 +101,7 @@ class CompareConfig:
     alpha: float = 0.05
     drop_missing: bool = False
     random: str | None = None
-    unequal_variances: bool = False
+    variances: Variances = "auto"
     effect_size: EffectSize = "box-cox"
     weights: VertexWeights = "confidence"
     errors: Mapping[str, str] = field(default_factory=dict[str, str])
@@ -119,7 +119,9 @@ class CompareConfig:
             raise InputError("The seed must be 0 or more, and the level of significance between 0 and 1.")
         if self.effect_size not in EFFECT_SIZES:
             raise InputError(f"There is no effect size {self.effect_size!r}; choose one of {', '.join(EFFECT_SIZES)}.")
-        if self.errors and self.unequal_variances:
+        if self.variances not in VARIANCES:
+            raise InputError(f"There are no variances {self.variances!r}; choose one of {', '.join(VARIANCES)}.")
+        if self.errors and self.variances == "unequal":
             raise InputError("Tests with error terms assume equal variances; leave out one of the two.")
         if self.coding == "treatment" and (self.blocks or self.random):
             raise InputError("Blocks and random terms need deviation coding; leave out the other coding.")
@@ -142,6 +144,9 @@ class TermTest:
         p: share of arrangements with an F as large, the observed one among them.
         arrangements: (P,) F of each, the observed one first.
         error: whose mean square F is divided by.
+        unequal_variances: whether F allows classes of unequal dispersion.
+        f_other: F under the other assumption on variances; None without classes, or where that is not available.
+        p_other: the same of p.
     """
 
     term: str
@@ -154,6 +159,9 @@ class TermTest:
     p: float
     arrangements: FloatArray
     error: str = "residuals"
+    unequal_variances: bool = False
+    f_other: float | None = None
+    p_other: float | None = None
 
     __repr__ = short_repr
 
@@ -272,6 +280,11 @@ class CompareResult(AnalysisResult):
         """(K,) of the shapes."""
         return read_only(self.cohort.coefficients.mean(axis=0))
 
+    @property
+    def unequal_variances(self) -> bool:
+        """Whether tests allow classes of unequal dispersion, where that is available."""
+        return any(test.unequal_variances for test in self.tests)
+
     def test(self, term: str) -> TermTest:
         """Return the test of a term.
 
@@ -301,6 +314,9 @@ def _update(result: CompareResult) -> CompareResult:
 @over_imputations(
     parts=("tests", "effects", "angles", "dispersions", "map", "along", "any_way", "bump"),
     finish=_update,
+    fixed=lambda result: {
+        "config": replace(result.config, variances="unequal" if result.unequal_variances else "equal")
+    },
 )
 def compare(
     cohort: Cohort,
@@ -340,7 +356,7 @@ def compare(
     design = design_of(formula, cohort.table, config.coding)
     subjects = None if config.blocks is None else cohort.table.texts(config.blocks)
     repeated = subjects is not None and len(set(subjects)) < len(subjects)
-    root = _weight_root(cohort) if config.weights == "confidence" and not config.unequal_variances else None
+    root = _weight_root(cohort) if config.weights == "confidence" else None
     owners = subjects if repeated else None
 
     def strata_from(coefficients: FloatArray) -> ModelStrata:
@@ -357,36 +373,39 @@ def compare(
     families = [_weighted(cohort, design, family) for family in _families(design, made)]
     total = len(design.terms) + len(families) * (1 + config.maps)
     step = StepCounter(total, progress).add
+    crossed = {one for term in design.terms if not is_nested(term, design.terms) for one in term.variables}
+    columns = {one.name: one.column for one in design.variables}
+    asked = config.variances == "unequal"
+    units = [units_of(stratum, design, owners) if asked or is_between_units(stratum) else None for stratum in strata]
+    dispersions = tuple(
+        test
+        for own in units
+        if own is not None
+        for test in own.dispersions(cohort.n_vertices, config.permutations, config.seed)
+        if columns[test.variable] in crossed  # classes within others are small
+    )
+    unequal = asked or (
+        config.variances == "auto" and not errors and not all(test.is_equality_plausible for test in dispersions)
+    )
     tests = tuple(
         test
-        for stratum in strata
-        for test in term_tests(
-            stratum, config, step, units_of(stratum, design, owners) if config.unequal_variances else None, errors
-        )
+        for stratum, own in zip(strata, units, strict=True)
+        for test in term_tests(stratum, config, step, own, errors, unequal=unequal)
     )
     effects = tuple(
         replace(effect, exploratory=_is_exploratory(effect, design, tests, config))
         for family in families
-        for effect in _effects(cohort, family, design, owners, config, root, step)
+        for effect in _effects(cohort, family, design, owners, config, root, step, unequal=unequal)
     )
-    crossed = {one for term in design.terms if not is_nested(term, design.terms) for one in term.variables}
-    columns = {one.name: one.column for one in design.variables}
-    dispersions = tuple(
-        test
-        for stratum in strata
-        if is_between_units(stratum)
-        for test in units_of(stratum, design, owners).dispersions(cohort.n_vertices, config.permutations, config.seed)
-        if columns[test.variable] in crossed  # classes within others are small
-    )
-    methods = _methods(cohort, design, strata, subjects, dispersions, config, errors)
+    methods = _methods(cohort, design, strata, subjects, dispersions, config, errors, tests)
     return CompareResult(
         cohort=cohort,
         design=design,
         config=config,
         tests=tests,
-        strata=tuple(_summarise_stratum(stratum, config, among if stratum is strata[0] else ()) for stratum in strata),
+        strata=tuple(_summarise_stratum(stratum, tests, among if stratum is strata[0] else ()) for stratum in strata),
         effects=effects,
-        angles=(*_parallel(design, made, config), *_between(effects)),
+        angles=(*_parallel(design, made, config, owners, unequal=unequal), *_between(effects)),
         n_subjects=len(set(subjects)) if subjects is not None else len(cohort),
         dispersions=dispersions,
         methods=methods,
@@ -510,35 +529,35 @@ def _methods(
     dispersions: Sequence[DispersionTest],
     config: CompareConfig,
     errors: Mapping[str, Term],
+    tests: Sequence[TermTest],
 ) -> Methods:
     """Return sample sizes, tests and assumptions of a comparison."""
     owners = cohort.names if subjects is None else subjects
     unit = config.blocks or "shape"
     schemes: list[TestScheme] = []
+    allowing = {(test.term, test.stratum) for test in tests if test.unequal_variances}
     for stratum in strata:
         for term in stratum.terms:
             reduced = stratum.reduced(term, config.anova_type)
-            flips = config.unequal_variances or stratum.flips(reduced)
+            unequal = (term.label, stratum.name) in allowing
+            flips = unequal or stratum.flips(reduced)
             own, error = unit if is_between_units(stratum) else f"difference within a {unit}", errors.get(term.label)
             if error is not None and config.error_permutation == "units":
                 own, reduced = f"{error.label} unit", [one for one in reduced if one is not error]
             schemes.append(
                 TestScheme(
                     tested=(term.label,),
-                    statistic="F, unequal variances"
-                    if config.unequal_variances
-                    else "F"
-                    if error is None
-                    else f"F over {error.label}",
+                    statistic="F, unequal variances" if unequal else "F" if error is None else f"F over {error.label}",
                     stratum=stratum.name,
                     resampling="sign flips" if flips else "permutation",
                     unit=own,
                     reduced_model=tuple(other.label for other in reduced),
                     arrangements=config.permutations,
-                    unequal_variances=config.unequal_variances,
+                    unequal_variances=unequal,
                 )
             )
     classes = [(one.name, design.groups_of(one)) for one in design.variables if one.groups]
+    several = any(len(_pairs(one)) > 1 for one in design.variables)
     return methods_of(
         cohort,
         len(set(owners)),
@@ -546,12 +565,12 @@ def _methods(
         sizes=sample_sizes(owners, classes),
         tests=tuple(schemes),
         dispersions=tuple(dispersion_record(one, config.alpha) for one in dispersions),
-        unequal_variances=config.unequal_variances if classes else None,
+        unequal_variances=bool(allowing) if classes else None,
         effect_size=config.effect_size,
         r2_strata=tuple(stratum.name for stratum in strata),
         corrected_over=(
             *(("the vertices of a map (family-wise error, or false discovery rate)",) if config.maps else ()),
-            "the pairs of classes of a variable (p of all pairs)",
+            *(("the pairs of classes of a variable (p of all pairs)",) if several else ()),
         ),
     )
 
@@ -569,6 +588,8 @@ def term_tests(
     step: Callable[[], None] = lambda: None,
     units: Units | None = None,
     errors: Mapping[str, Term] | None = None,
+    *,
+    unequal: bool = False,
 ) -> Iterator[TermTest]:
     """Yield the tests of the terms of a stratum.
 
@@ -576,8 +597,9 @@ def term_tests(
         stratum: the stratum.
         config: of the comparison.
         step: called after each term.
-        units: of the stratum, to test with unequal variances; None assumes equal ones.
+        units: of the stratum, to test with unequal variances too; None where that is not available.
         errors: error terms by the names of terms; None for the residuals.
+        unequal: whether unequal variances are reported first if they are available.
 
     Raises:
         InputError: unequal variances, and a unit that the model fits exactly, or an error term without degrees of
@@ -589,20 +611,24 @@ def term_tests(
         residual = stratum.residual(reduced)
         own = _own_columns(stratum, term, config)
         rest = span(stratum.matrix - own @ (own.T @ stratum.matrix), stratum.matrix.shape[1] - own.shape[1])
-        count = config.permutations if units is None else 1
-        products = stratum.products(np.hstack([own, rest]), residual, count, config.seed, flips=stratum.flips(reduced))
+        products = stratum.products(
+            np.hstack([own, rest]), residual, config.permutations, config.seed, flips=stratum.flips(reduced)
+        )
         squares = (products**2).sum(axis=2)
         df = own.shape[1]
         explained = squares[:, :df].sum(axis=1)  # S2
         f = _ratio(explained / df, ((residual**2).sum() - squares.sum(axis=1)) / stratum.df_error)  # S3
-        if units is not None:
-            # Columns of the reduced model are not tested; each unit has its own variance.
-            f = units.estimate(
-                units.own(term, reduced), [term], reduced, config.permutations, config.seed, term.label
-            ).statistic()
-        error = (errors or {}).get(term.label)
+        error, other = (errors or {}).get(term.label), None
         if error is not None:
             f = _error_f(stratum, term, error, config)
+        elif units is not None and (config.variances == "unequal" or units.is_comparable):
+            # Columns of the reduced model are not tested; each unit has its own variance.
+            other = units.estimate(
+                units.own(term, reduced), [term], reduced, config.permutations, config.seed, term.label
+            ).statistic()
+        allowing = unequal and other is not None
+        if other is not None and allowing:
+            f, other = other, f
         yield TermTest(
             term=term.label,
             stratum=stratum.name,
@@ -614,6 +640,9 @@ def term_tests(
             p=permutation_p(f),
             arrangements=read_only(f),
             error="residuals" if error is None else error.label,
+            unequal_variances=allowing,
+            f_other=None if other is None else float(other[0]),
+            p_other=None if other is None else permutation_p(other),
         )
         step()
 
@@ -648,7 +677,8 @@ def _error_f(stratum: Stratum, term: Term, error: Term, config: CompareConfig) -
     return _ratio(mean_squares[0], mean_squares[1])
 
 
-def _summarise_stratum(stratum: Stratum, config: CompareConfig, among: Sequence[Stratum]) -> StratumSummary:
+def _summarise_stratum(stratum: Stratum, tests: Sequence[TermTest], among: Sequence[Stratum]) -> StratumSummary:
+    unequal = any(test.unequal_variances for test in tests if test.stratum == stratum.name)
     residual = stratum.residual(stratum.terms)
     return StratumSummary(
         stratum=stratum.name,
@@ -656,7 +686,7 @@ def _summarise_stratum(stratum: Stratum, config: CompareConfig, among: Sequence[
         squares=float((residual**2).sum()),
         df_total=len(stratum.matrix) - stratum.removed,
         squares_total=float((stratum.shapes**2).sum()),
-        log_arrangements=min(one.fewest_log_arrangements(flips=config.unequal_variances) for one in (stratum, *among)),
+        log_arrangements=min(one.fewest_log_arrangements(flips=unequal) for one in (stratum, *among)),
     )
 
 
@@ -793,9 +823,11 @@ def _effects(
     config: CompareConfig,
     root: FloatArray | None,
     step: Callable[[], None],
+    *,
+    unequal: bool,
 ) -> Iterator[ShapeEffect]:
     parts = [list(own) for _, own in itertools.groupby(family.ends, key=lambda ends: id(ends.stratum))]
-    made = [_tested_together(cohort, own, design, subjects, config, root) for own in parts]
+    made = [_tested_together(cohort, own, design, subjects, config, root, unequal=unequal) for own in parts]
     largest = np.max([f for f, _, _ in made for f in f], axis=0)
     mean = cohort.coefficients.mean(axis=0)
     step()
@@ -829,11 +861,16 @@ def _tested_together(
     subjects: Sequence[str] | None,
     config: CompareConfig,
     root: FloatArray | None,
+    *,
+    unequal: bool,
 ) -> tuple[FloatArray, FloatArray, Sequence[EffectMap | None]]:
     """Return F (E, P), weighted by `root`, changes (E, K) in mm and maps of E contrasts of one stratum."""
     stratum, reduced = family[0].stratum, family[0].reduced
-    if config.unequal_variances:
-        return _tested_unequal(cohort, family, units_of(stratum, design, subjects), config)
+    if unequal:
+        available = is_between_units(stratum) and stratum.width == 1
+        units = units_of(stratum, design, subjects) if available or config.variances == "unequal" else None
+        if units is not None and (config.variances == "unequal" or units.is_comparable):
+            return _tested_unequal(cohort, family, units, config, root)
     residual, flips = stratum.residual(reduced), stratum.flips(reduced)
     directions = np.stack([stratum.direction(ends.contrast) for ends in family])
     lengths = np.maximum(np.linalg.norm(directions, axis=1), 1e-300)
@@ -861,14 +898,14 @@ def _tested_together(
 
 
 def _tested_unequal(
-    cohort: Cohort, family: Sequence[_Contrast], units: Units, config: CompareConfig
+    cohort: Cohort, family: Sequence[_Contrast], units: Units, config: CompareConfig, root: FloatArray | None
 ) -> tuple[FloatArray, FloatArray, Sequence[EffectMap | None]]:
-    """Return F (E, P), changes (E, K) in mm and maps of E contrasts of one stratum, with unequal variances."""
+    """Return what `_tested_together` does, with unequal variances."""
     stratum = units.stratum
     if stratum.width > 1:
         raise InputError(
             f"Unequal variances are not available for several contrasts of {stratum.name} at once; leave out "
-            "--unequal-variances."
+            "--variances unequal."
         )
     statistics: list[FloatArray] = []
     changes: list[FloatArray] = []
@@ -878,8 +915,10 @@ def _tested_unequal(
         direction = stratum.direction(ends.contrast)
         own = (direction / max(float(np.linalg.norm(direction)), 1e-300))[:, None]
         label = f"{ends.low} to {ends.high}"
-        estimate = units.estimate(own, tested, ends.reduced, config.permutations, config.seed, label)
-        statistics.append(estimate.statistic())
+        run = (tested, ends.reduced, config.permutations, config.seed, label)
+        estimate = units.estimate(own, *run)
+        weighted = estimate if root is None else replace(units, shapes=units.shapes @ root).estimate(own, *run)
+        statistics.append(weighted.statistic())
         changes.append(direction @ stratum.shapes)
         maps += (
             effect_maps(
@@ -900,7 +939,9 @@ def _tested_unequal(
     return np.stack(statistics), np.stack(changes), maps
 
 
-def _parallel(design: Design, strata: ModelStrata, config: CompareConfig) -> Iterator[EffectAngle]:
+def _parallel(
+    design: Design, strata: ModelStrata, config: CompareConfig, owners: Sequence[str] | None, *, unequal: bool
+) -> Iterator[EffectAngle]:
     """Yield angles between what a variable changes in one class of another and in the next, where they interact.
 
     The arrangements are those of the model without the interaction, where these changes are the same.
@@ -914,17 +955,19 @@ def _parallel(design: Design, strata: ModelStrata, config: CompareConfig) -> Ite
         levels = other.levels[:MOST_LEVELS]
         words = [f"{_levels_text(one, *_pairs(one)[0])}, {other.describe(level)}" for level in levels]
         pairs = list(itertools.combinations(range(len(levels)), 2))
-        for (first, second), drawn in zip(pairs, _changes_in_pairs(design, strata, one, other, config), strict=False):
-            angles = angles_between(*drawn)
-            # Their arrangements assume equal variances.
-            p = None if config.unequal_variances else float((angles >= angles[0] - TIE).mean())
-            yield EffectAngle(words[first], words[second], float(angles[0]), p)
+        for (first, second), (drawn, weights) in zip(
+            pairs, _changes_in_pairs(design, strata, one, other, config, owners, unequal=unequal), strict=False
+        ):
+            angle = float(angles_between(drawn[0][:1], drawn[1][:1])[0])
+            p = permutation_p(off_common_direction(*drawn, *weights))
+            yield EffectAngle(words[first], words[second], angle, p)
 
 
 def _changes_in_pairs(
-    design: Design, strata: ModelStrata, one: Variable, other: Variable, config: CompareConfig
-) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield the changes (P, K) by a variable in the two classes of each pair of another, in each arrangement.
+    design: Design, strata: ModelStrata, one: Variable, other: Variable, config: CompareConfig,
+    owners: Sequence[str] | None, *, unequal: bool,
+) -> Iterator[tuple[tuple[FloatArray, FloatArray], tuple[float, float]]]:  # fmt: skip
+    """Yield the changes (P, K) by a variable in the two classes of each pair of another, and their precisions.
 
     There are none if the changes of the two variables belong to different strata.
     """
@@ -932,40 +975,68 @@ def _changes_in_pairs(
     low, high = _pairs(one)[0]
     levels = other.levels[:MOST_LEVELS]
     within = strata.within
+    if (
+        within is not None
+        and within.holds(both)
+        and one.column in within.variables
+        and other.column in within.variables
+    ):
+        # Both within subjects: each arrangement exchanges the two changes in some subjects.
+        own = [within.effects.contrast(one.column, low, high, {other.column: level}) for level in levels]
+        for first, second in itertools.combinations(own, 2):
+            half, between = within.contrast_stratum((first - second) / 2, both, f"{one.name}:{other.name}")
+            middle, parts = within.contrast_stratum((first + second) / 2, frozenset({one.column}), one.name)
+            direction = middle.direction(parts.average({}))
+            mean, left = direction @ middle.shapes, middle.residual(middle.terms)
+            common = without_noise(mean, float((direction**2).sum() * (left**2).sum()) / max(middle.df_error, 1))
+            differ = half.direction(between.average({}))
+            flipped = half.products(differ[:, None], half.shapes, config.permutations, config.seed, flips=True)[:, 0]
+            mean = np.concatenate([mean[None], np.repeat(common[None], len(flipped) - 1, axis=0)])
+            yield (mean + flipped, mean - flipped), (1.0, 1.0)
+        return
+    stratum, contrasts = None, list[FloatArray]()
     if within is None or not within.holds(both):
         stratum = next((s for s in strata.every if any(term.variables == both for term in s.terms)), None)
         if stratum is not None and any(term.variables == frozenset({one.column}) for term in stratum.terms):
             contrasts = [design.contrast(one.column, low, high, {other.column: level}) for level in levels]
-            yield from itertools.combinations(_changes_of(stratum, both, contrasts, config), 2)
-        return
-    if one.column not in within.variables:
-        return
-    if other.column not in within.variables:
+    elif one.column in within.variables:
         contrast = within.effects.contrast(one.column, low, high)
         stratum, between = within.contrast_stratum(contrast, frozenset({one.column}), one.name)
         contrasts = [between.average({other.column: level}) for level in levels]
-        yield from itertools.combinations(_changes_of(stratum, both, contrasts, config), 2)
-        return
-    # Both within subjects: each arrangement exchanges the two changes in some subjects.
-    own = [within.effects.contrast(one.column, low, high, {other.column: level}) for level in levels]
-    for first, second in itertools.combinations(own, 2):
-        half, between = within.contrast_stratum((first - second) / 2, both, f"{one.name}:{other.name}")
-        middle, parts = within.contrast_stratum((first + second) / 2, frozenset({one.column}), one.name)
-        mean = middle.direction(parts.average({})) @ middle.shapes
-        differ = half.direction(between.average({}))
-        flipped = half.products(differ[:, None], half.shapes, config.permutations, config.seed, flips=True)[:, 0]
-        yield mean + flipped, mean - flipped
+    if stratum is not None and contrasts:
+        units = units_of(stratum, design, owners) if unequal and is_between_units(stratum) else None
+        changes = [_changes_of(stratum, both, own, config, units) for own in contrasts]
+        for (first, precise), (second, other_precise) in itertools.combinations(changes, 2):
+            yield (first, second), (precise, other_precise)
 
 
 def _changes_of(
-    stratum: Stratum, variables: frozenset[str], contrasts: Sequence[FloatArray], config: CompareConfig
-) -> list[FloatArray]:
-    """Return contrasts (P, K) in each arrangement of the model without the terms of some variables."""
-    reduced = stratum.without(variables)
-    residual = stratum.residual(reduced)
-    products = stratum.products(stratum.basis, residual, config.permutations, config.seed, flips=stratum.flips(reduced))
-    products += stratum.basis.T @ (stratum.shapes - residual)
-    return [np.einsum("m,pmk->pk", stratum.basis.T @ stratum.direction(one), products) for one in contrasts]
+    stratum: Stratum, variables: frozenset[str], contrast: FloatArray, config: CompareConfig, units: Units | None
+) -> tuple[FloatArray, float]:
+    """Return a contrast (P, K) in each arrangement of the model without the terms of some variables, and its precision.
+
+    The common change of that model is shortened to its length without noise; in `units` variances may differ.
+    """
+    reduced, direction = stratum.without(variables), stratum.direction(contrast)
+    if units is not None and units.is_comparable and stratum.width == 1:
+        tested = [term for term in stratum.terms if term not in reduced]
+        flips = units.flips(tested, reduced, config.permutations, config.seed, stratum.name)
+        residual, columns = flips.residual, units.columns(reduced)
+        variances = (residual**2).sum(axis=1)
+        changes = (direction @ flips.full) @ flips.fitted
+    else:
+        residual, columns = stratum.residual(reduced), stratum.matrix[:, stratum.columns_of(reduced)]
+        free = len(residual) - stratum.removed
+        variances = np.full(len(residual), (residual**2).sum() / max(free - columns.shape[1], 1))
+        products = stratum.products(
+            stratum.basis, residual, config.permutations, config.seed, flips=stratum.flips(reduced)
+        )
+        changes = math.sqrt(free / max(free - columns.shape[1], 1)) * ((direction @ stratum.basis) @ products)
+    fitted = np.linalg.pinv(columns).T @ (columns.T @ direction)
+    noise = float(fitted**2 @ variances)
+    changes = changes + without_noise(direction @ (stratum.shapes - residual), noise)
+    changes[0] = direction @ stratum.shapes
+    return changes, 1.0 / max(float(direction**2 @ variances), 1e-300)
 
 
 def _between(effects: Sequence[ShapeEffect]) -> Iterator[EffectAngle]:
@@ -980,6 +1051,17 @@ def angles_between(one: FloatArray, other: FloatArray) -> FloatArray:
     """Return the (P,) angles in degrees of vectors (P, K) (S10)."""
     lengths = np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
     return np.degrees(np.arccos(np.clip((one * other).sum(axis=1) / np.maximum(lengths, 1e-300), -1, 1)))
+
+
+def off_common_direction(one: FloatArray, other: FloatArray, weight: float, other_weight: float) -> FloatArray:
+    """Return the (P,) weighted squared distance of vectors (P, K) from vectors of one common direction (S16).
+
+    Unlike the angle it hardly depends on the length of the common vector, which is unknown.
+    """
+    first, second = weight * (one**2).sum(axis=1), other_weight * (other**2).sum(axis=1)
+    product = math.sqrt(weight * other_weight) * (one * other).sum(axis=1)
+    least = (first + second - np.hypot(first - second, 2.0 * product)) / 2.0
+    return np.where(product > 0, least, np.minimum(first, second))
 
 
 def _ratio(explained: FloatArray, left: FloatArray) -> FloatArray:

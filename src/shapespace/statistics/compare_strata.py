@@ -212,6 +212,12 @@ class Stratum:
             yield start, (rows[:, :, None] * self.width + within).reshape(count, -1), signs
 
 
+def without_noise(vectors: FloatArray, noise: FloatArray | float) -> FloatArray:
+    """Return vectors (..., K) shortened to the length they have without noise of a total variance (...) (M56)."""
+    squares = np.maximum((vectors**2).sum(axis=-1), 1e-300)
+    return vectors * np.sqrt(np.maximum(1.0 - noise / squares, 0.0))[..., None]
+
+
 def less(shapes: FloatArray, columns: FloatArray) -> FloatArray:
     """Return the residuals (n, K) of shapes (n, K) on columns (n, m)."""
     if not columns.shape[1]:

@@ -10,7 +10,14 @@ import numpy as np
 from shapespace.errors import InputError
 from shapespace.statistics.compare_formula import Design, Term, Variable
 from shapespace.statistics.compare_strata import Rows, Stratum, less, span
-from shapespace.statistics.dispersion import DispersionTest, Estimate, dispersion_test, unequal_variances
+from shapespace.statistics.dispersion import (
+    FULL_LEVERAGE,
+    DispersionTest,
+    Estimate,
+    UnequalVariances,
+    dispersion_test,
+    unequal_variances,
+)
 from shapespace.types import FloatArray
 
 
@@ -40,6 +47,11 @@ class Units:
     def leverage(self) -> FloatArray:
         """(s,) diagonal of the hat matrix of the whole model."""
         return (self.full**2).sum(axis=1)
+
+    @property
+    def is_comparable(self) -> bool:
+        """Whether there are classes whose variances may differ, and no unit is fitted exactly by the whole model."""
+        return float(self.leverage.max()) <= 1.0 - FULL_LEVERAGE and bool(self.grouping(self.stratum.terms))
 
     def columns(self, terms: Sequence[Term]) -> FloatArray:
         """Return the (s, r) columns of the model of some terms, with the mean if it was removed."""
@@ -79,7 +91,13 @@ class Units:
         Raises:
             InputError: a unit that the model fits exactly.
         """
-        flips = unequal_variances(
+        return self.flips(terms, reduced, permutations, seed, name).estimate(own)
+
+    def flips(
+        self, terms: Sequence[Term], reduced: Sequence[Term], permutations: int, seed: int, name: str
+    ) -> UnequalVariances:
+        """Return the sign flips of the residuals of a reduced model, with arguments as `estimate` has them."""
+        return unequal_variances(
             shapes=self.shapes,
             full=self.full,
             reduced=self.columns(reduced),
@@ -88,17 +106,15 @@ class Units:
             seed=seed,
             where=name,
         )
-        return flips.estimate(own)
 
     def dispersions(self, n_vertices: int, permutations: int, seed: int) -> Iterator[DispersionTest]:
         """Yield the tests of equal dispersion of the classes of each variable that differs between units."""
-        residual = self.shapes - self.full @ (self.full.T @ self.shapes)
         for one in self.grouping(self.stratum.terms):
             codes = np.array([one.groups.index(value) for value in self._values(one)], dtype=np.intp)
             test = dispersion_test(
                 variable=one.name,
-                residual=residual,
-                leverage=self.leverage,
+                shapes=self.shapes,
+                full=self.full,
                 codes=codes,
                 groups=one.groups,
                 n_vertices=n_vertices * self.stratum.width,
@@ -135,7 +151,7 @@ def units_of(stratum: Stratum, design: Design, subjects: Sequence[str] | None) -
         raise InputError(
             f"Unequal variances are not available for {', '.join(term.label for term in stratum.terms)}, which "
             f"{'are' if len(stratum.terms) > 1 else 'is'} tested within subjects under the assumption that all respond "
-            "alike; leave out --random, or --unequal-variances."
+            "alike; leave out --random, or --variances unequal."
         )
     d, count = stratum.width, len(stratum.groups)
     shapes = stratum.shapes.reshape(count, -1)

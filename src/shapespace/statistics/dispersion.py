@@ -16,10 +16,10 @@ Sign flips keep the variance of each row, so covariances may differ between grou
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -31,14 +31,23 @@ from shapespace.types import FloatArray
 
 Codes: TypeAlias = npt.NDArray[np.intp]
 
+Variances: TypeAlias = Literal["auto", "equal", "unequal"]
+VARIANCES: tuple[Variances, ...] = ("auto", "equal", "unequal")
+"""Of the classes, in tests of means."""
+
 FEWEST_OF_GROUP = 5
 """Subjects per class below which the test with unequal variances has over 7 % false positives (docs/compare.md)."""
-_FULL_LEVERAGE = 1e-8
+FULL_LEVERAGE = 1e-8
 """Rows with 1 - leverage below this limit are fitted exactly, so their residual is zero."""
 _BATCH = 50
 """Number of sign flips drawn from one seed."""
 _STREAM = 3  # separates these permutations from those of other tests with the same seed
 _FLOOR = 1e-12  # share of the total; a variance below is rounding
+_FORM_STREAM = 5  # separates the permutations of the test of form from those of dispersion
+_DOUBTFUL = (0.3, 0.1)
+"""p of dispersion and of form below which classes of different size are not assumed to be alike (docs/compare.md)."""
+_UNEQUAL = (0.05, 0.05)
+"""The same for classes of one size, for which permutation is nearly correct."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +62,7 @@ class DispersionTest:
         stddev_mm: standard deviation of the shapes of each class about their mean, RMS over the vertices.
         f: F of the distances to the group mean.
         p: share of permutations of the distances with an F at least as large.
+        p_form: the same of a test whether covariances are proportional; 1 if a class has fewer than two contrasts.
         permutations: number of them, the observed one among them.
     """
 
@@ -63,7 +73,14 @@ class DispersionTest:
     stddev_mm: tuple[float, ...]
     f: float
     p: float
+    p_form: float
     permutations: int
+
+    @property
+    def is_equality_plausible(self) -> bool:
+        """Whether tests of means may assume equal covariances; classes of different size need more evidence for it."""
+        dispersion, form = _DOUBTFUL if np.ptp(self.counts) else _UNEQUAL
+        return self.p > dispersion and self.p_form > form
 
     @property
     def ratio(self) -> float:
@@ -80,8 +97,8 @@ class DispersionTest:
 
 def dispersion_test(
     variable: str,
-    residual: FloatArray,
-    leverage: FloatArray,
+    shapes: FloatArray,
+    full: FloatArray,
     codes: Codes,
     groups: tuple[str, ...],
     n_vertices: int,
@@ -93,8 +110,8 @@ def dispersion_test(
 
     Args:
         variable: name of the variable.
-        residual: (n, K) mm, of the whole model.
-        leverage: (n,) diagonal of its hat matrix.
+        shapes: (n, K) mm.
+        full: (n, m) orthonormal columns of the whole model, the mean among them.
         codes: (n,) class of each row.
         groups: names of the classes.
         n_vertices: of the shapes, for the root mean square.
@@ -105,7 +122,8 @@ def dispersion_test(
     Returns:
         the test; None if fewer than two classes have two members with a residual each.
     """
-    free = 1.0 - leverage > _FULL_LEVERAGE
+    residual, leverage = shapes - full @ (full.T @ shapes), (full**2).sum(axis=1)
+    free = 1.0 - leverage > FULL_LEVERAGE
     counts = np.bincount(codes[free], minlength=len(groups))
     used = [k for k in range(len(groups)) if counts[k] > 1]
     rows = free & np.isin(codes, used)
@@ -126,8 +144,46 @@ def dispersion_test(
         stddev_mm=tuple(float(v) for v in np.sqrt(variances / n_vertices)),
         f=float(f[0]),
         p=permutation_p(f),
+        p_form=_form_p(
+            [_contrasts(full[rows][own == k]).T @ shapes[rows][own == k] for k in range(len(used))], permutations, seed
+        ),
         permutations=permutations,
     )
+
+
+def _contrasts(columns: FloatArray) -> FloatArray:
+    """Return orthonormal contrasts (n, f) of the rows of a class, to which no column (n, m) of the model adds."""
+    u, s, _ = np.linalg.svd(columns)
+    return u[:, int((s > FULL_LEVERAGE).sum()) :]
+
+
+def _form_p(contrasts: Sequence[FloatArray], permutations: int, seed: int) -> float:
+    """Return p of the test whether the covariances of classes are proportional (Li and Chen, Ann. Stat. 40, 2012).
+
+    The statistic is the sum over pairs of classes of the squared distance of their covariances, each divided by its
+    trace, estimated without bias by the squared products of different contrasts.
+
+    Args:
+        contrasts: (f, K) of each class, mm.
+        permutations: number of permutations of the contrasts between classes, the observed one among them.
+        seed: of these.
+    """
+    counts = np.array([len(own) for own in contrasts])
+    squares = [float((own**2).sum()) for own in contrasts]
+    if counts.min() < 2 or min(squares) <= 0:
+        return 1.0
+    scaled = np.concatenate([own * np.sqrt(len(own) / s) for own, s in zip(contrasts, squares, strict=True)])
+    products = (scaled @ scaled.T) ** 2
+    np.fill_diagonal(products, 0.0)
+    members = np.repeat(np.eye(len(counts)), counts, axis=0)
+    # Off the diagonal all pairs of contrasts count; within a class those of different contrasts.
+    weights = -1.0 / np.outer(counts, counts)
+    np.fill_diagonal(weights, (len(counts) - 1) / (counts * (counts - 1)))
+    found = [
+        np.einsum("bik,bik->b", members[drawn] @ weights, products @ members[drawn])
+        for _, drawn in orders(len(products), permutations, seed, _FORM_STREAM)
+    ]
+    return permutation_p(np.concatenate(found))
 
 
 def _f_of_means(values: FloatArray, codes: Codes) -> FloatArray:
@@ -186,7 +242,7 @@ class UnequalVariances:
 
     def estimate(self, own: FloatArray) -> Estimate:
         """Return the size and the variance of an estimate along `own` (n, q), orthonormal columns within `full`."""
-        weights = (own**2).sum(axis=1) / np.maximum(1.0 - self.leverage, _FULL_LEVERAGE)
+        weights = (own**2).sum(axis=1) / np.maximum(1.0 - self.leverage, FULL_LEVERAGE)
         return Estimate(self, own.T @ self.full, weights)
 
 
@@ -277,9 +333,9 @@ def unequal_variances(
         InputError: a row that the model fits exactly, as the only member of a class.
     """
     leverage = (full**2).sum(axis=1)
-    if float(leverage.max()) > 1.0 - _FULL_LEVERAGE:
+    if float(leverage.max()) > 1.0 - FULL_LEVERAGE:
         raise InputError(
-            f"Unequal variances of {where}: {int((leverage > 1 - _FULL_LEVERAGE).sum())} of {len(shapes)} subjects "
+            f"Unequal variances of {where}: {int((leverage > 1 - FULL_LEVERAGE).sum())} of {len(shapes)} subjects "
             "are fitted exactly, as the only member of a class is, so their variance is unknown; leave them out, or "
             "merge their classes."
         )
@@ -287,11 +343,11 @@ def unequal_variances(
     if groups is not None:
         residual = shapes - full @ (full.T @ shapes)
         variances = np.bincount(groups, weights=(residual**2).sum(axis=1)) / np.maximum(
-            np.bincount(groups, weights=1.0 - leverage), _FULL_LEVERAGE
+            np.bincount(groups, weights=1.0 - leverage), FULL_LEVERAGE
         )
         weights = 1.0 / np.maximum(variances, _FLOOR * max(float(variances.max()), 1e-300))[groups]
     residual, own = weighted_residual(shapes, reduced, weights)
-    return UnequalVariances(full, residual, 1.0 / np.sqrt(np.maximum(1.0 - own, _FULL_LEVERAGE)), leverage,
+    return UnequalVariances(full, residual, 1.0 / np.sqrt(np.maximum(1.0 - own, FULL_LEVERAGE)), leverage,
                             permutations, seed)  # fmt: skip
 
 
@@ -332,7 +388,7 @@ def welch_flips(
     variances = ((off**2).sum(axis=1) @ members.T) / (counts - 1.0)
     weights = 1.0 / np.maximum(variances, _FLOOR * max(float(variances.max()), 1e-300))[second.astype(np.intp)]
     residual, own = weighted_residual(maps, mean, weights)
-    scale = 1.0 / np.sqrt(np.maximum(1.0 - own, _FULL_LEVERAGE))
+    scale = 1.0 / np.sqrt(np.maximum(1.0 - own, FULL_LEVERAGE))
     squares = members @ residual**2
     scaled = members @ (scale[:, None] * residual) ** 2
 

@@ -40,7 +40,7 @@ from shapespace.statistics.change_result import (
     change_or_rate,
 )
 from shapespace.statistics.change_visits import Visits, time_column, visits_of
-from shapespace.statistics.dispersion import DispersionTest, dispersion_test
+from shapespace.statistics.dispersion import VARIANCES, DispersionTest, dispersion_test
 from shapespace.statistics.map_tests import difference_test, mean_test
 from shapespace.statistics.observation_weights import weights_of
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, SurfaceLandmarks, require
@@ -138,6 +138,8 @@ def _refuse_unsuitable(cohort: Cohort, config: ChangeConfig) -> None:
     Raises:
         InputError: another gauge, no unit, no triangles, or options that are out of range.
     """
+    if config.variances not in VARIANCES:
+        raise InputError(f"There are no variances {config.variances!r}; choose one of {', '.join(VARIANCES)}.")
     if cohort.gauge != "form":
         raise InputError("Changes are in millimetres, but this cohort has sizes divided out; read it with gauge form.")
     if cohort.unit != "mm":
@@ -332,12 +334,10 @@ def _dispersion(result: ChangeResult, maps: FloatArray, second: BoolArray, area:
     config, codes = result.config, second.astype(np.intp)
     groups = tuple(sorted({subject.group for subject in result.subjects}))
     rooted = maps * np.sqrt(area / area.mean())
-    residual = rooted - np.stack([rooted[codes == k].mean(axis=0) for k in (0, 1)])[codes]
-    leverage = 1.0 / np.bincount(codes)[codes]
     return dispersion_test(
         variable=config.group or "",
-        residual=residual,
-        leverage=leverage,
+        shapes=rooted,
+        full=np.eye(2)[codes] / np.sqrt(np.bincount(codes)),
         codes=codes,
         groups=groups,
         n_vertices=maps.shape[1],
@@ -382,11 +382,14 @@ def _add_tests(result: ChangeResult, groups: Mapping[str, str]) -> ChangeResult:
     if groups:
         first_name, second_name = sorted(set(groups.values()))
         second = np.array([groups[subject.name] == second_name for subject in subjects])
-        unequal = config.unequal_variances
+        dispersion = _dispersion(result, maps, second, area)
+        unequal = config.variances == "unequal" or (
+            config.variances == "auto" and dispersion is not None and not dispersion.is_equality_plausible
+        )
         difference = GroupDifferenceTests(
             groups=(first_name, second_name),
             surface=difference_test(maps, second, area, *run, unequal_variances=unequal),
             volumes=difference_test(volumes, second, equal_weights, *run, unequal_variances=unequal),
-            dispersion=_dispersion(result, maps, second, area),
+            dispersion=dispersion,
         )
     return replace(result, blank=blank if blank.any() else None, mean_change=mean_change, group_difference=difference)

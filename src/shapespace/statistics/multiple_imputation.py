@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass, replace
 from functools import partial, wraps
+from inspect import signature
 from typing import Any, ParamSpec, TypeAlias, TypeVar, cast
 
 import numpy as np
@@ -20,7 +21,7 @@ from shapespace.cohort.cohort import Cohort
 from shapespace.step_counter import Progress
 from shapespace.types import FloatArray, read_only
 
-_P_VALUES = ("p", "p_family", "q", "p_value", "directional_p")
+_P_VALUES = ("p", "p_other", "p_family", "q", "p_value", "directional_p")
 _INTERVALS = (("value", "low", "high"), ("predicted", "low", "high"))
 _LABELS = ("term", "label", "source", "target")
 """Fields of results: p values, estimates with the ends of their intervals, and names of tests."""
@@ -120,6 +121,7 @@ def over_imputations(
     parts: Collection[str] = (),
     means: Collection[str] = (),
     finish: Callable[[Any], Any] = lambda result: result,
+    fixed: Callable[[Any], Mapping[str, Any]] = lambda result: {},
 ) -> Callable[[Callable[_Options, _Result]], Callable[_Options, _Result]]:
     """Return a decorator of an analysis: where its cohorts have samples, each imputation is analysed too, and combined.
 
@@ -130,6 +132,8 @@ def over_imputations(
         parts: fields whose content is searched for p values and intervals too.
         means: fields of the result that become means over the imputations.
         finish: to the combined result, to update what depends on p.
+        fixed: arguments of each imputation that follow from the result of the completed shapes, such as a choice of
+            the test.
     """
 
     def decorate(analyse: Callable[_Options, _Result]) -> Callable[_Options, _Result]:
@@ -141,7 +145,8 @@ def over_imputations(
             if count < 2:
                 return analyse(*args, **options)
             result = _analyse_one(analyse, *given, None, count)
-            each = [_figures(_analyse_one(analyse, *given, k, count), parts, means) for k in range(count)]
+            own = {**signature(analyse).bind(*args, **options).arguments, **fixed(result)}
+            each = [_figures(_analyse_one(analyse, (), own, k, count), parts, means) for k in range(count)]
             return finish(_pooled(result, each, parts, means))
 
         return analyse_all

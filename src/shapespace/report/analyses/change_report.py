@@ -106,7 +106,8 @@ def change_report(change: ChangeResult) -> AnalysisReport:
             "rate": config.rate,
             "permutations": config.permutations,
             "seed": config.seed,
-            "unequal_variances": config.unequal_variances,
+            "variances": config.variances,
+            "unequal_variances": change.methods.unequal_variances,
             "uncertainty": change.uncertainty,
         },
         model_hashes=model_hashes(change.cohort),
@@ -147,7 +148,7 @@ def _summary(change: ChangeResult) -> list[str]:
             f"The volume of {second} changed by {unit.text(difference)} {unit.name}{_per_time(change)} "
             f"more than that of {first}, {_p_text(float(change.group_difference.volumes.p[0]))}."
         )
-        unequal = change.config.unequal_variances
+        unequal = change.group_difference.surface.unequal_variances
         sentences += [
             dispersion_sentence(one, unequal, "mm")
             for one in change.methods.dispersions
@@ -194,8 +195,8 @@ def _test_sentence(change: ChangeResult, test: MapTest, quantity: str, other: st
     significant = test.p <= _LEVEL
     low, high = test.interval(vertex)
     vertices = (
-        f"vertex by vertex (family-wise error {100 * _LEVEL:g} %) {100 * significant.mean():.0f} % of the vertices "
-        "differ, "
+        f"vertex by vertex (family-wise error {100 * _LEVEL:g} %) {int(significant.sum()):,} of {len(significant):,} "
+        "vertices differ, "
         f"clearest by {test.effect[vertex]:+.2f} mm{_per_time(change)} (simultaneous 95 % interval {low:+.2f} to "
         f"{high:+.2f} "
         "mm)"

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from shapespace.cohort.cohort import Cohort
 from shapespace.report.analyses.analysis_report import AnalysisReport, LengthFormat, Rows
 from shapespace.report.analyses.methods_section import (
+    bias_of_p,
     dispersion_sentence,
     effect_size_sentence,
     is_dispersion_warning,
@@ -33,7 +34,7 @@ from shapespace.schemas import (
     TextPart,
 )
 from shapespace.statistics.compare_maps import EffectMap, Tested
-from shapespace.statistics.compare_shapes import MOST_LEVELS, CompareResult, ShapeEffect
+from shapespace.statistics.compare_shapes import MOST_LEVELS, CompareResult, ShapeEffect, TermTest
 from shapespace.statistics.observation_weights import blank_where
 from shapespace.types import BoolArray, FloatArray, Mesh
 
@@ -81,7 +82,8 @@ def compare_report(result: CompareResult) -> AnalysisReport:
             "permutations": result.config.permutations,
             "seed": result.config.seed,
             "level": result.config.alpha,
-            "unequal_variances": result.config.unequal_variances,
+            "variances": result.config.variances,
+            "unequal_variances": result.unequal_variances,
             "effect_size": result.config.effect_size,
             "coding": result.config.coding,
             "gauge": result.cohort.gauge,
@@ -107,15 +109,20 @@ def _special_settings(result: CompareResult) -> Iterator[tuple[str, Any]]:
 
 
 def _summary(result: CompareResult) -> Iterator[str]:
-    level, shapes = result.config.alpha, len(result.cohort)
-    kind = {"box-cox": "Box-Cox", "log": "log F"}[result.config.effect_size]
+    """Yield the results of terms with their limits, what limits all of them, the sample, and then maps."""
+    shapes, kind = len(result.cohort), {"box-cox": "Box-Cox", "log": "log F"}[result.config.effect_size]
     for test in result.tests:
         figures = f"R² {100 * test.r2:.1f} %, F {test.f:.2f}, Z {test.z:.1f} by {kind}, {_p_text(test.p)}"
         stratum = f" {test.stratum.partition(':')[0]}" if test.stratum else ""
-        if test.p <= level:
-            yield f"Shape differs with {test.term}{stratum} ({figures})."
+        limits = _limits(result, test)
+        if test.p <= result.config.alpha:
+            yield f"Shape differs with {test.term}{stratum} ({figures}{limits})."
         else:
-            yield f"No difference of shape with {test.term}{stratum} is found ({figures})."
+            yield f"No difference of shape with {test.term}{stratum} is found ({figures}{limits})."
+    yield from compare_warnings(result)
+    of_subjects = f" of {result.n_subjects} subjects" if result.n_subjects < shapes else ""
+    yield f"{shapes} shapes{of_subjects}, {result.config.permutations} arrangements, the observed one among them."
+    yield multiplicity_sentence(result.methods)
     for effect in result.effects:
         if effect.map is not None:
             yield _map_sentence(result, effect, effect.map)
@@ -123,15 +130,28 @@ def _summary(result: CompareResult) -> Iterator[str]:
                 yield f"{effect.label}: {blank_sentence(int(effect.map.blank.sum()), len(effect.map.blank))}"
             if effect.map.bump is not None and effect.map.bump_mm is not None:
                 yield _bump_sentence(result, effect, effect.map.bump, effect.map.bump_mm)
-    yield from compare_warnings(result)
-    of_subjects = f" of {result.n_subjects} subjects" if result.n_subjects < shapes else ""
-    yield f"{shapes} shapes{of_subjects}, {result.config.permutations} arrangements, the observed one among them."
-    yield multiplicity_sentence(result.methods)
+
+
+def _limits(result: CompareResult, test: TermTest) -> str:
+    """Return what limits a test: the assumption on variances, with p under the other one, or that it is violated."""
+    if test.unequal_variances:
+        other = "" if test.p_other is None else f"; {_p_text(test.p_other)} with it"
+        return f" without the assumption of equal variances{other}"
+    named = set(test.term.split(":"))
+    violated = [
+        one
+        for one in result.methods.dispersions
+        if one.stratum == test.stratum and one.variable in named and not one.equal
+    ]
+    if not violated:
+        return ""
+    other = "" if test.p_other is None else f"; {_p_text(test.p_other)} without this assumption"
+    return f", which is {bias_of_p(violated[0])}: it assumes equal variances{other}"
 
 
 def compare_warnings(result: CompareResult) -> tuple[str, ...]:
     """Return sentences on limitations of the tests."""
-    unequal = result.config.unequal_variances
+    unequal = result.unequal_variances
     return (
         *(
             dispersion_sentence(dispersion, unequal, result.cohort.unit)
@@ -245,8 +265,8 @@ def _map_sentence(result: CompareResult, effect: ShapeEffect, effect_map: Effect
     if not significant.any():
         return f"{effect.label}: no vertex differs ({scope})."
     return (
-        f"{effect.label}: {_EXPLORATORY if effect.exploratory else ''}{100 * significant.mean():.1f} % of the vertices "
-        f"differ ({scope}), the clearest by {_clearest(result, effect_map)}."
+        f"{effect.label}: {_EXPLORATORY if effect.exploratory else ''}{int(significant.sum()):,} of "
+        f"{len(significant):,} vertices differ ({scope}), the clearest by {_clearest(result, effect_map)}."
     )
 
 
@@ -299,18 +319,25 @@ def _term_parts(result: CompareResult) -> Iterator[Part]:
     rows: list[tuple[Any, ...]] = []
     for stratum in result.strata:
         tests = [test for test in result.tests if test.stratum == stratum.stratum]
-        rows += [(t.term, t.stratum, t.df, t.squares, t.squares / t.df, t.r2, t.f, t.z, t.p) for t in tests]
+        rows += [
+            (t.term, t.stratum, t.df, t.squares, t.squares / t.df, t.r2, t.f, t.z, t.p, t.f_other, t.p_other)
+            for t in tests
+        ]
         share = stratum.squares / stratum.squares_total
         rows.append(
-            ("residual", stratum.stratum, stratum.df, stratum.squares, stratum.squares / stratum.df, share, *[None] * 3)
+            ("residual", stratum.stratum, stratum.df, stratum.squares, stratum.squares / stratum.df, share, *[None] * 5)
         )
-        rows.append(("total", stratum.stratum, stratum.df_total, stratum.squares_total, None, None, *[None] * 3))
+        rows.append(("total", stratum.stratum, stratum.df_total, stratum.squares_total, None, None, *[None] * 5))
     columns = (
         _column("term"), _column("tested"), _column("df", "count"),
         _column(lengths.label("sum of squares", "²"), "number"),
         _column(lengths.label("mean square", "²"), "number"), _column("R²", "percent"), _column("F", "number"),
         _column("Z", "number"), _column("p", "p"),
     )  # fmt: skip
+    if any(test.p_other is not None for test in result.tests):
+        other = "equal" if result.unequal_variances else "unequal"
+        columns = (*columns, _column(f"F, {other} variances", "number"), _column(f"p, {other} variances", "p"))
+    rows = [row[: len(columns)] for row in rows]
     if not strata:
         columns = (*columns[:1], *columns[2:])
         rows = [(*row[:1], *row[2:]) for row in rows]
@@ -337,16 +364,32 @@ def _term_parts(result: CompareResult) -> Iterator[Part]:
 
 
 def _pair_parts(result: CompareResult) -> Iterator[Part]:
-    rows = tuple((e.name, e.label, e.distance_mm, e.rms_mm, e.f, e.z, e.p, e.p_family) for e in result.effects)
+    pairs = Counter(effect.name for effect in result.effects)
+    several = max(pairs.values(), default=0) > 1
+    rows = tuple(
+        (
+            e.name,
+            e.label,
+            e.distance_mm,
+            e.rms_mm,
+            e.f,
+            e.z,
+            e.p,
+            *[e.p_family if pairs[e.name] > 1 else None] * several,
+        )
+        for e in result.effects
+    )
     yield TablePart(
         title="How far apart",
         level=2,
         note="Distances of least-squares means: one variable changes, the others stay. The Procrustes distance is "
-        "summed over vertices, the RMS is a vertex's share. The last column counts all pairs of one variable.",
+        "summed over vertices, the RMS is a vertex's share."
+        f"{' The last column counts all pairs of one variable.' if several else ''}",
         columns=(
             _column("variable"), _column("from, to"), _lengths(result).column("Procrustes distance"),
             _lengths(result).column("RMS"),
-            _column("F", "number"), _column("Z", "number"), _column("p", "p"), _column("p of all pairs", "p"),
+            _column("F", "number"), _column("Z", "number"), _column("p", "p"),
+            *[_column("p of all pairs", "p")] * several,
         ),
         rows=rows,
     )  # fmt: skip
@@ -407,7 +450,7 @@ def _size_sentence(result: CompareResult, effect: ShapeEffect) -> str:
 
 
 def _f_sentence(result: CompareResult) -> str:
-    if result.config.unequal_variances:
+    if result.unequal_variances:
         return (
             "F is the squared effect divided by its variance, with a variance for each subject (of two classes the "
             "squared Welch t), compared with sign flips of residuals."
@@ -486,15 +529,45 @@ def _meshes(result: CompareResult) -> Iterator[tuple[str, Mesh]]:
 
 def _tables(result: CompareResult) -> Mapping[str, Rows]:
     terms: list[tuple[object, ...]] = [
-        (t.term, t.stratum, t.df, t.squares, t.r2, t.f, t.z, t.p, t.error) for t in result.tests
+        (
+            t.term,
+            t.stratum,
+            t.df,
+            t.squares,
+            t.r2,
+            t.f,
+            t.z,
+            t.p,
+            "unequal" if t.unequal_variances else "equal",
+            "" if t.f_other is None else t.f_other,
+            "" if t.p_other is None else t.p_other,
+            t.error,
+        )
+        for t in result.tests
     ]
     for left in result.strata:
         share = left.squares / left.squares_total
-        terms.append(("residual", left.stratum, left.df, left.squares, share, "", "", "", ""))
-        terms.append(("total", left.stratum, left.df_total, left.squares_total, 1.0, "", "", "", ""))
+        terms.append(("residual", left.stratum, left.df, left.squares, share, *[""] * 7))
+        terms.append(("total", left.stratum, left.df_total, left.squares_total, 1.0, *[""] * 7))
     field = _lengths(result).field
     tables: dict[str, Rows] = {
-        "terms.csv": (("term", "stratum", "df", field("squares", "2"), "r2", "f", "z", "p", "error"), terms),
+        "terms.csv": (
+            (
+                "term",
+                "stratum",
+                "df",
+                field("squares", "2"),
+                "r2",
+                "f",
+                "z",
+                "p",
+                "variances",
+                "f_other_variances",
+                "p_other_variances",
+                "error",
+            ),
+            terms,
+        ),
         "effects.csv": (
             (
                 "number",

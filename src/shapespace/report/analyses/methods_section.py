@@ -378,12 +378,19 @@ def dispersion_sentence(one: Dispersion, unequal_variances: bool | None, unit: s
     if unequal_variances:
         return f"Dispersion is unequal ({details}); the tests of means allow for it."
     effect = {
-        True: "smaller classes are more variable, so p values of means are too small and differences are found that do "
-        "not exist",
-        False: "smaller classes are less variable, so p values of means are too large and differences are missed",
-        None: "p values of means also respond to differences of dispersion",
+        True: "differences are found that do not exist",
+        False: "differences are missed",
+        None: "they also respond to differences of dispersion",
     }[one.smaller_is_more_variable]
-    return f"Warning: dispersion is unequal ({details}): {effect}. Use --unequal-variances (unequal_variances=True)."
+    return (
+        f"Warning: dispersion is unequal ({details}): p values of means are {bias_of_p(one)}, and {effect}. Use "
+        "--variances unequal."
+    )
+
+
+def bias_of_p(one: Dispersion) -> str:
+    """Return how unequal dispersion changes p values of means that assume equal variances."""
+    return {True: "too small", False: "too large", None: "approximate"}[one.smaller_is_more_variable]
 
 
 def is_dispersion_warning(one: Dispersion, *, unequal_variances: bool) -> bool:

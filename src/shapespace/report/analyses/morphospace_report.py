@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import InputError
-from shapespace.report.analyses.analysis_report import AnalysisReport, Rows
+from shapespace.report.analyses.analysis_report import AnalysisReport, LengthFormat, Rows
 from shapespace.report.analyses.methods_section import methods_parts
 from shapespace.report.analyses.shape_data import add_shape_data, model_hashes, scree_part, tangent_parts
 from shapespace.schemas import ConfusionPart, MorphospacePart, TablePart
@@ -133,9 +134,13 @@ def morphospace_part(
         "faces": np.zeros((0, 3), dtype=np.int32) if cohort.faces is None else cohort.faces,
     }
     note = f"Labels of axes give their share of the {_SHARES.get(result.method, 'variance')}."
+    if result.method != "cva":
+        lengths, point = LengthFormat(cohort.unit), "landmark" if cohort.faces is None else "vertex"
+        norm, rms = lengths.text(1.0), lengths.text(1.0 / math.sqrt(cohort.n_vertices))
+        note += f" A score of {norm} is a Procrustes norm over all {cohort.n_vertices:,} points: {rms} RMS per {point}."
     if result.groups is not None:
         arrays["groups"] = result.groups.codes
-        note += " Convex hulls and 95 % ellipses are those of the groups."
+        note += " Convex hulls are those of the groups, and 95 % ellipses those of groups of five shapes or more."
     if validated is not None:
         arrays["cross_validated"] = validated[:, :shown]
     if result.ancestors is not None and result.edges is not None:
@@ -182,9 +187,11 @@ def _confusion_parts(result: Ordination) -> Iterator[ConfusionPart]:
 
 def _eigenvalue_table(result: Ordination) -> TablePart:
     shares = result.explained_variance_ratio
-    values = np.stack([result.eigenvalues, shares, shares.cumsum()], axis=1)
-    rows = [(name, *map(float, row)) for name, row in zip(result.names, values, strict=True)]
-    columns = ("axis", "eigenvalue", "share", "cumulative")
+    values, columns = [result.eigenvalues, shares, shares.cumsum()], ["axis", "eigenvalue", "share", "cumulative"]
+    if result.method != "cva":
+        values.append(np.sqrt(result.eigenvalues / result.cohort.n_vertices))
+        columns.append(LengthFormat(result.cohort.unit).label("standard deviation, RMS per point"))
+    rows = [(name, *map(float, row)) for name, row in zip(result.names, np.stack(values, axis=1), strict=True)]
     return TablePart.of("Eigenvalues", columns, rows, percent=("share", "cumulative"))
 
 

@@ -150,8 +150,10 @@ def _maps(result: ScoreResult, order: list[int]) -> list[Part]:
     for k in order[:_MOST_MAPS]:
         beyond = ""
         if math.isfinite(result.z_limit):
-            share = float((np.abs(result.z[k]) > result.z_limit).sum() / max(np.isfinite(result.z[k]).sum(), 1))
-            beyond = f"{100 * share:.1f} % of the vertices lie beyond {result.z_limit:.1f} standard deviations."
+            beyond = (
+                f"{int((np.abs(result.z[k]) > result.z_limit).sum()):,} of {int(np.isfinite(result.z[k]).sum()):,} "
+                f"vertices lie beyond {result.z_limit:.1f} standard deviations."
+            )
         parts.append(
             SurfaceMapPart(
                 title=result.names[k], arrays=_FILE, values=f"z_{k + 1}", unit="standard deviations, outwards (+)",

@@ -45,7 +45,7 @@
         const [left, right, above, below] = [56, width - 14, 12, height - 44], [soft, rule] = ["--soft", "--line"].map((name) => style.getPropertyValue(name));
         const members = Array.from({ length: Math.max(groups.length, 1) }, () => []);
         for (let v = 0; v < n; v++) members[arrays.groups[v]].push(at(v));
-        const ellipses = members.map((points, g) => (shown.ellipses && points.length > 2 ? ellipseOf(points, facts.radii[g]) : []));
+        const ellipses = members.map((points, g) => (shown.ellipses && facts.radii[g] ? ellipseOf(points, facts.radii[g]) : []));
         const all = Array.from({ length: n + arrays.nodes.length / K }, (_, v) => at(v)).concat(...ellipses);
         const ends = [0, 1].map((axis) => all.reduce(([low, high], p) => [Math.min(low, p[axis]), Math.max(high, p[axis])], [Infinity, -Infinity]));
         const [[low, high], [bottom, top]] = ends;

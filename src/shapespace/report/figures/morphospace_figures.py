@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")  # in the order of those of widget-morphospace-drawing.js
+_FEWEST_OF_ELLIPSE = 5  # shapes; the radius of fewer is larger than the plot
 _ELLIPSE = 0.95  # probability
 _SPARSE = 5  # every fifth point of a grid line is kept, so that the page is small
 _MOST_GRID = 400
@@ -113,11 +114,13 @@ class Morphospace:
 
     @property
     def radii(self) -> FloatArray:
-        """(G,) Mahalanobis radius of the 95 % ellipse of each group; NaN with fewer than three shapes."""
+        """(G,) Mahalanobis radius of the 95 % ellipse of each group; NaN with fewer than five shapes."""
         # M18
         codes = self.arrays["groups"].astype(np.intp)
         counts = np.bincount(codes, minlength=max(len(self.part.groups), 1)).astype(np.float64)
-        return np.where(counts > 2, np.sqrt(2 * stats.f.ppf(_ELLIPSE, 2, np.maximum(counts - 1, 1))), np.nan)
+        return np.where(
+            counts >= _FEWEST_OF_ELLIPSE, np.sqrt(2 * stats.f.ppf(_ELLIPSE, 2, np.maximum(counts - 1, 1))), np.nan
+        )
 
 
 def _with_grid(space: Morphospace) -> Morphospace:
@@ -163,7 +166,8 @@ def morphospace_figure(space: Morphospace) -> Figure:
         label = escaped(short(space.part.groups[g], 30)) if space.part.groups else None
         if len(points) > 2 and space.part.groups:
             axes.fill(*hull(points).T, facecolor=(*colour, 0.10), edgecolor=(*colour, 0.7), lw=0.9, zorder=1.2)
-            axes.plot(*ellipse(points, float(radius)).T, color=colour, lw=1.0, ls=(0, (4, 2)), zorder=1.3)
+            if np.isfinite(radius):
+                axes.plot(*ellipse(points, float(radius)).T, color=colour, lw=1.0, ls=(0, (4, 2)), zorder=1.3)
         axes.scatter(
             *points.T, s=22 if len(plane) <= _MOST_DOTS_BIG else 8, color=colour, label=label, edgecolors="white",
             marker=MARKERS[(g + g // len(CATEGORIES)) % len(MARKERS)], linewidths=0.4, zorder=2,

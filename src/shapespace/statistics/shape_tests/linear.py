@@ -15,8 +15,14 @@ from shapespace.cohort.cohort import Cohort
 from shapespace.errors import InputError
 from shapespace.schemas import CurvePart, Part, Series, SurfaceMapPart, TablePart
 from shapespace.statistics.compare_formula import Design, design_of, quoted
-from shapespace.statistics.compare_shapes import CompareConfig, angles_between, complete_cohort, term_tests
-from shapespace.statistics.compare_strata import Stratum, independent_stratum, less, means_of
+from shapespace.statistics.compare_shapes import (
+    CompareConfig,
+    angles_between,
+    complete_cohort,
+    off_common_direction,
+    term_tests,
+)
+from shapespace.statistics.compare_strata import Stratum, independent_stratum, less, means_of, span, without_noise
 from shapespace.statistics.methods import REDUCED_OF_EACH_TERM
 from shapespace.statistics.shape_tests.permutations import Groups, Orders, orders
 from shapespace.statistics.shape_tests.shape_test_result import (
@@ -88,19 +94,23 @@ def compare_trajectories(
         )
     design, reduced, labels = _models(cohort, formula, null)
     estimator = _mean_estimator(design, np.eye(g * p)[cells])
+    steps = estimator.reshape(g, p, -1) - estimator.reshape(g, p, -1).mean(axis=1, keepdims=True)
+    excess = _excess(steps, reduced, cohort)
     batches: list[FloatArray] = []
+    angles: list[float] = []
     observed = np.zeros(0)
     for means in _permuted(estimator, reduced, cohort, residuals, permutations, seed, progress):
         paths = means.reshape(len(means), g, p, -1)
         observed = observed if observed.size else paths[0]
         length = np.linalg.norm(np.diff(paths, axis=2), axis=3).sum(axis=2)  # M31
         centred = paths - paths.mean(axis=2, keepdims=True)
-        vectors = np.linalg.eigh(centred @ centred.swapaxes(2, 3))[1][..., -1]
-        axis = np.einsum("bgpk,bgp->bgk", centred, vectors)  # M32
-        axis *= np.where(((paths[:, :, -1] - paths[:, :, 0]) * axis).sum(axis=2) < 0, -1.0, 1.0)[:, :, None]
+        axis = _principal_axes(centred)
+        if residuals == "scaled":
+            axis[bool(not batches) :] = _principal_axes(centred[bool(not batches) :] - excess)
         one, other = np.array(groups.pairs).T
         values = [np.abs(length[:, one] - length[:, other]).T,
-                  np.array([angles_between(axis[:, a], axis[:, b]) for a, b in groups.pairs])]  # fmt: skip
+                  _directions(axis, 1.0 / (steps**2).sum(axis=(1, 2)), groups, residuals)]  # fmt: skip
+        angles = angles if batches else [_angle(axis[0, a], axis[0, b]) for a, b in groups.pairs]
         if p > 2:
             aligned = _aligned(centred)
             values.append(np.linalg.norm(aligned[:, one] - aligned[:, other], axis=(2, 3)).T)
@@ -118,8 +128,45 @@ def compare_trajectories(
     return _pairs_result(
         "trajectory", cohort, groups, batches, names, (*group, points), labels,
         {"group": list(group), "points": list(stages), "formula": formula, "null": null, "residuals": residuals,
-         "permutations": permutations, "seed": seed}, (figure,),
+         "permutations": permutations, "seed": seed}, (figure,), angles,
     )  # fmt: skip
+
+
+def _principal_axes(centred: FloatArray) -> FloatArray:
+    """Return the first principal axes (b, G, K) of centred trajectories (b, G, P, K), towards the last point (M32)."""
+    vectors = np.linalg.eigh(centred @ centred.swapaxes(2, 3))[1][..., -1]
+    axis = np.einsum("bgpk,bgp->bgk", centred, vectors)
+    axis *= np.where(((centred[:, :, -1] - centred[:, :, 0]) * axis).sum(axis=2) < 0, -1.0, 1.0)[:, :, None]
+    return axis
+
+
+def _directions(vectors: FloatArray, weights: FloatArray, groups: Groups, residuals: Residuals) -> FloatArray:
+    """Return the statistics (pairs, b) of the angles of vectors (b, G, K): S16, or with raw residuals the angles."""
+    if residuals == "raw":
+        return np.array([angles_between(vectors[:, a], vectors[:, b]) for a, b in groups.pairs])
+    return np.array(
+        [off_common_direction(vectors[:, a], vectors[:, b], weights[a], weights[b]) for a, b in groups.pairs]
+    )
+
+
+def _angle(one: FloatArray, other: FloatArray) -> float:
+    return float(angles_between(one[None], other[None])[0])
+
+
+def _excess(estimators: FloatArray, reduced: FloatArray, cohort: Cohort) -> FloatArray:
+    """Return the part (G, r, K) of vectors of the reduced model by which noise makes them longer than they are.
+
+    Args:
+        estimators: (G, r, N) of the r vectors of each group, which are shortened together.
+        reduced: (N, q) columns of the reduced model.
+        cohort: the shapes.
+    """
+    residual, columns = less(cohort.coefficients, reduced), span(reduced)
+    vectors = estimators @ (cohort.coefficients - residual)
+    variance = float((residual**2).sum()) / (len(residual) - columns.shape[1])
+    noise = variance * ((estimators @ columns) ** 2).sum(axis=(1, 2))
+    flat = vectors.reshape(len(vectors), -1)
+    return vectors - without_noise(flat, noise).reshape(vectors.shape)
 
 
 def _aligned(centred: FloatArray) -> FloatArray:
@@ -184,18 +231,23 @@ def compare_pairs(
             f"{'the interaction of the groups with the covariate' if covariate else 'the groups'}."
         )
     batches: list[FloatArray] = []
+    angles: list[float] = []
+    excess = _excess(estimator[:, None], reduced, cohort)[:, 0]
     one, other = np.array(groups.pairs).T
     for vectors in _permuted(estimator, reduced, cohort, residuals, permutations, seed, progress):
         values = [np.linalg.norm(vectors[:, one] - vectors[:, other], axis=2).T]
         if covariate is not None:
             length = np.linalg.norm(vectors, axis=2)
-            values += [np.abs(length[:, one] - length[:, other]).T,
-                       np.array([angles_between(vectors[:, a], vectors[:, b]) for a, b in groups.pairs])]  # fmt: skip
+            values.append(np.abs(length[:, one] - length[:, other]).T)
+            angles = angles if batches else [_angle(vectors[0, a], vectors[0, b]) for a, b in groups.pairs]
+            if residuals == "scaled":
+                vectors[bool(not batches) :] -= excess
+            values.append(_directions(vectors, 1.0 / (estimator**2).sum(axis=1), groups, residuals))
         batches.append(np.array(values))
     return _pairs_result(
         "pairwise", cohort, groups, batches, names, group, labels,
         {"formula": formula, "group": list(group), "covariate": covariate, "null": null, "residuals": residuals,
-         "permutations": permutations, "seed": seed},
+         "permutations": permutations, "seed": seed}, angles=angles,
     )  # fmt: skip
 
 
@@ -480,14 +532,25 @@ def _permuted(
 def _pairs_result(
     name: str, cohort: Cohort, groups: Groups, batches: Sequence[FloatArray], names: Sequence[str],
     classes: Sequence[str], reduced_model: tuple[str, ...], settings: dict[str, Any], figures: tuple[Part, ...] = (),
+    angles: Sequence[float] = (),
 ) -> ShapeTestResult:  # fmt: skip
-    """Return the result of statistics of pairs of groups, from batches (statistics, pairs, b) of permutations."""
+    """Return the result of statistics of pairs of groups, from batches (statistics, pairs, b) of permutations.
+
+    `angles` are the values of angles, whose arrangements are of another statistic unless residuals are raw.
+    """
     values = np.concatenate(batches, axis=2)
     statistics = [
         one for name_of_one, own in zip(names, values, strict=False)
         for one in pair_statistics(name_of_one, own, groups.pair_names)
     ]  # fmt: skip
-    rows = [(one.name, one.tested, one.value, float(np.quantile(one.arrangements, 1 - LEVEL)), one.z, one.p)
+    if settings["residuals"] == "scaled":
+        known = dict(zip(groups.pair_names, angles, strict=False))
+        statistics = [
+            replace(one, value=known[one.tested], arrangements=np.zeros(0)) if one.name.startswith("angle") else one
+            for one in statistics
+        ]
+    rows = [(one.name, one.tested, one.value,
+             float(np.quantile(one.arrangements, 1 - LEVEL)) if len(one.arrangements) else None, one.z, one.p)
             for one in statistics]  # fmt: skip
     table = TablePart.of("Pairs of groups", ("statistic", "groups", "value", "95 % limit", "Z", "p"), rows)
     return ShapeTestResult(
