@@ -449,16 +449,17 @@ class SurfaceReview(Struct, frozen=True, kw_only=True):
         every = [set(own) for own in codes]
         known: tuple[ReviewCode, ...] = get_args(ReviewCode)
         counts = {code: sum(code in own for own in every) for code in known}
-        reasons = {code: counts[code] for code in known if counts[code]}
+        reasons: dict[ReviewCode, int] = {code: counts[code] for code in known if counts[code]}
         return SurfaceReview(surfaces=len(every), needs_review=sum(map(bool, every)), reasons=reasons)
 
     def __add__(self, other: SurfaceReview) -> SurfaceReview:
         codes: tuple[ReviewCode, ...] = get_args(ReviewCode)
-        counts = {code: self.reasons.get(code, 0) + other.reasons.get(code, 0) for code in codes}
+        counts: dict[ReviewCode, int] = {code: self.reasons.get(code, 0) + other.reasons.get(code, 0) for code in codes}
+        reasons: dict[ReviewCode, int] = {code: count for code, count in counts.items() if count}
         return SurfaceReview(
             surfaces=self.surfaces + other.surfaces,
             needs_review=self.needs_review + other.needs_review,
-            reasons={code: count for code, count in counts.items() if count},
+            reasons=reasons,
         )
 
     @property

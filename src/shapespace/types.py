@@ -578,8 +578,8 @@ def are_same_triangles(first: IntArray | None, second: IntArray | None) -> bool:
         return first is second
     if first.shape != second.shape or np.array_equal(first, second):
         return first.shape == second.shape
-    corners = (np.sort(first, axis=1), np.sort(second, axis=1))
-    return np.array_equal(*(rows[np.lexsort(rows.T)] for rows in corners))
+    one, other = np.sort(first, axis=1), np.sort(second, axis=1)
+    return np.array_equal(one[np.lexsort(one.T)], other[np.lexsort(other.T)])
 
 
 def common_faces(meshes: Iterable[Mesh]) -> IntArray | None:

@@ -234,6 +234,10 @@ FILES: dict[str, Callable[[int], bytes]] = {
     "many.csv": lambda size: b"".join(b"a%d,0,0,0\n" % k for k in range(size // 14)),
     "many.bnd": lambda size: repeated(b"1 0 0 0\n", size),
     "many.lm3": lambda size: b"%d\n" % (size // 8) + b"a\n0 0 0\n" * (size // 8),
+    "many.landmarkascii": lambda size: (
+        b"# AmiraMesh 3D ASCII 2.0\ndefine Markers %d\nMarkers { float[3] Coordinates } @1\n@1\n" % (size // 6)
+        + b"0 0 0\n" * (size // 6)
+    ),
     "many.fcsv": lambda size: b"".join(b"%d,0,0,0\n" % k for k in range(size // 11)),
     "heads.fcsv": lambda size: repeated(b"#columns=x,y,z\n", size),
     "many.tps": lambda size: b"LM3=%d\n" % (size // 6) + b"0 0 0\n" * (size // 6),

@@ -174,6 +174,9 @@ LANDMARKS: dict[str, list[bytes]] = {
     ".bnd": [BND.encode()],
     ".lm3": [LM3.encode()],
     ".fcsv": [*marked(".fcsv"), FCSV.encode()],
+    ".landmarkascii": [
+        b"# AmiraMesh 3D ASCII 2.0\ndefine Markers 2\nMarkers { float[3] Coordinates } @1\n@1\n1 2 3\n4 5 6\n"
+    ],
     ".tps": [TPS.encode()],
     ".tlms": [b"nose 1 1.5 -2 3\nchin 0 0 0 0\near_left 1 1e3 0 2\n"],
     ".txt": [b"# c\nname x y z\nnose 1 2 3\nchin 4,5,6\n", b"1 2 3\n4 5 6\n"],

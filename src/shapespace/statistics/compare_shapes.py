@@ -1061,7 +1061,7 @@ def off_common_direction(one: FloatArray, other: FloatArray, weight: float, othe
     first, second = weight * (one**2).sum(axis=1), other_weight * (other**2).sum(axis=1)
     product = math.sqrt(weight * other_weight) * (one * other).sum(axis=1)
     least = (first + second - np.hypot(first - second, 2.0 * product)) / 2.0
-    return np.where(product > 0, least, np.minimum(first, second))
+    return np.asarray(np.where(product > 0, least, np.minimum(first, second)), dtype=np.float64)
 
 
 def _ratio(explained: FloatArray, left: FloatArray) -> FloatArray:

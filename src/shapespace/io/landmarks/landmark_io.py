@@ -543,7 +543,7 @@ def _read_fcsv(data: bytes, path: Path) -> Pairs:
     for row in csv_rows(data, path):
         entry = dict(zip(columns, row, strict=False))
         name = entry.get("label") or entry.get("id") or ""
-        if len(row) > len(columns) + _FCSV_EXTRA and not any("." in row[columns.index(axis)] for axis in "xyz"):
+        if len(row) > len(columns) + _FCSV_EXTRA and not any("." in entry.get(axis, "") for axis in "xyz"):
             raise damage_error(path, f"landmark '{name[:60]}' has {len(row)} cells, perhaps for decimal commas; "
                                "export it again with decimal points")  # fmt: skip
         point = _point((entry.get(axis) for axis in "xyz"), f"landmark '{name[:60]}'", path)

@@ -16,7 +16,7 @@ from shapespace.io.landmarks.landmark_configurations import LandmarkConfiguratio
 from shapespace.io.parsing import CUT_SHORT, damage_error, numeric_text
 from shapespace.io.tables.table_io import MISSING
 from shapespace.reprs import first_names
-from shapespace.types import FloatArray
+from shapespace.types import FloatArray, IntArray
 
 _NAMED = 3  # specimens in a sentence
 _CLOSED = "="
@@ -153,10 +153,12 @@ def _resampled(parts: Sequence[list[list[list[float]]]], path: Path) -> tuple[li
         _array([[row for curve in own for row in curve]], [f"specimen {number}"], path)
         out.append([[]])
         for curve, count in zip(own[1:], least[1:], strict=True):
-            ring = np.array([*curve, *curve[:1]])
+            ring: FloatArray = np.array([*curve, *curve[:1]], dtype=np.float64)
             along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(ring, axis=0), axis=1)))
-            places = np.linspace(0.0, along[-1], count, endpoint=False)
-            out[-1].append(np.stack([np.interp(places, along, axis) for axis in ring.T], axis=1).tolist())
+            places = along[-1] / count * np.arange(count)
+            k: IntArray = np.asarray(np.searchsorted(along, places, side="right") - 1, dtype=np.int32)
+            share = (places - along[k]) / (along[k + 1] - along[k])
+            out[-1].append((ring[k] + share[:, None] * (ring[k + 1] - ring[k])).tolist())
     return out, " and ".join(map(str, least[1:]))
 
 
