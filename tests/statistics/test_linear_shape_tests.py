@@ -59,7 +59,9 @@ def test_published_analyses_of_variance_are_reproduced(
             (plethodon, "~ log(Csize) * species + site", lm[f"plethcov_{squares}"]),
             (pupfish, "~ lcs + Sex * Pop", geomorph_reference["pupfish_lm"][f"pup_{squares}"]),
         ):
-            options = CompareConfig(anova_type=squares, permutations=400, maps=False, coding="treatment")
+            options = CompareConfig(
+                anova_type=squares, permutations=400, maps=False, coding="treatment", variances="equal"
+            )
             result = compare(cohort, formula, options)
             for k, term in enumerate(expected["terms"]):
                 test = result.test(term)

@@ -435,7 +435,7 @@ def measure_quality(
     progress: OnStep | None = None,
     run: Runner = run_here,
 ) -> ModelQuality:
-    """Measure the shape space of meshes in correspondence, or as much of a model as it tells by itself.
+    """Measure the shape space of meshes in correspondence; of a model, what its spectrum determines.
 
     Args:
         target: at least three meshes, mm, or whatever else `as_mesh` takes; or a model, of which only compactness and

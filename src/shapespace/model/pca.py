@@ -112,7 +112,7 @@ def plain_modes(modes: object) -> int | float | None:
     """
     if isinstance(modes, np.integer | np.floating):
         modes = modes.item()
-    if modes is not None and (isinstance(modes, bool) or not isinstance(modes, int | float)):
+    if modes is not None and not isinstance(modes, int | float):
         raise InputError(
             f"The modes must be a whole number, a share of the variance, or none to keep all, not {modes!r}."
         )

@@ -1054,7 +1054,7 @@ def angles_between(one: FloatArray, other: FloatArray) -> FloatArray:
 
 
 def off_common_direction(one: FloatArray, other: FloatArray, weight: float, other_weight: float) -> FloatArray:
-    """Return the (P,) weighted squared distance of vectors (P, K) from vectors of one common direction (S16).
+    """Return the (P,) weighted squared distance of vectors (P, K) from vectors of one common direction (S10a).
 
     Unlike the angle it hardly depends on the length of the common vector, which is unknown.
     """

@@ -213,7 +213,7 @@ class Stratum:
 
 
 def without_noise(vectors: FloatArray, noise: FloatArray | float) -> FloatArray:
-    """Return vectors (..., K) shortened to the length they have without noise of a total variance (...) (M56)."""
+    """Return vectors (..., K) shortened to the length they have without noise of a total variance (...) (M33a)."""
     squares = np.maximum((vectors**2).sum(axis=-1), 1e-300)
     return vectors * np.sqrt(np.maximum(1.0 - noise / squares, 0.0))[..., None]
 

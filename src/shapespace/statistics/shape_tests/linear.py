@@ -141,7 +141,7 @@ def _principal_axes(centred: FloatArray) -> FloatArray:
 
 
 def _directions(vectors: FloatArray, weights: FloatArray, groups: Groups, residuals: Residuals) -> FloatArray:
-    """Return the statistics (pairs, b) of the angles of vectors (b, G, K): S16, or with raw residuals the angles."""
+    """Return the statistics (pairs, b) of the angles of vectors (b, G, K): S10a, or with raw residuals the angles."""
     if residuals == "raw":
         return np.array([angles_between(vectors[:, a], vectors[:, b]) for a, b in groups.pairs])
     return np.array(
