@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.stats import chi2
 
 from shapespace.errors import FitError
 from shapespace.fit.completion.leave_one_out import LeftOutErrors, leave_one_out, root_of
@@ -60,7 +61,8 @@ class ShapePosterior:
         noise_mm: robust standard deviation of the residuals, mm of the model's frame.
         followed: (V,) True where a scan point is matched.
         mismatch_mm: RMS distance of the scan's points from the surface, each up to 5 % of the model's size.
-        covered_mismatch_mm: that of the points that do not lie beyond the border of the model.
+        covered_mismatch_mm: robust RMS distance of the points that do not lie beyond the border of the model: the 90 %
+            quantile over that of a normal distribution, as scans contain hair, stands and stray points.
         n_modes: K.
         step: (P,) from the parameters of the surface to the mean of its linearised posterior; about zero if settled.
         left_out: errors of completions of the training shapes by models of the others; None without them.
@@ -79,17 +81,6 @@ class ShapePosterior:
     n_modes: int
     step: FloatArray
     left_out: LeftOutErrors | None
-
-    def left_out_mismatch_mm(self) -> FloatArray:
-        """Return (n,) the RMS distance along the normals of left-out shapes from their completions, mm.
-
-        It is over the vertices that the scan shows; empty without training shapes.
-        """
-        if self.left_out is None:
-            return np.zeros(0)
-        rows = np.einsum("vd,vdp->vp", self.surface.normals, self.rows())[self.followed]
-        off = rows @ self.left_out.errors.T.astype(np.float32)
-        return np.sqrt((off**2).mean(axis=0)).astype(np.float64)
 
     def log_density(self) -> float:
         """Return the log density of scan and shape up to a constant, with as many observations as patches (E9)."""
@@ -198,8 +189,8 @@ def shape_posterior(
     return ShapePosterior(
         iterate.T_scan_model, iterate.surface, iterate.b, covariance, line.variance, line.amplitude,
         line.weighted.sigma_mm, line.followed, float(np.sqrt(squared.mean())),
-        float(np.sqrt(squared[covered].mean())) if covered.any() else np.inf, model.n_modes, mean - line.theta,
-        left_out,
+        float(np.sqrt(np.quantile(squared[covered], 0.9) / chi2.ppf(0.9, 1))) if covered.any() else np.inf,
+        model.n_modes, mean - line.theta, left_out,
     )  # fmt: skip
 
 

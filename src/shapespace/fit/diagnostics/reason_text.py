@@ -80,9 +80,9 @@ _TEXTS: Mapping[ReasonCode, Callable[[Mapping[str, Any]], str]] = MappingProxyTy
             "noise first"
         ),
         ReasonCode.SCAN_UNEXPLAINED: lambda d: (
-            f"the model does not explain the scan: it lies {d['mismatch_mm']:.2f} mm (RMS) from the completed surface, "
-            f"where left-out training shapes lie at most {d['usual_mm']:.2f} mm from theirs; it is probably another "
-            "object, or contains parts of others"
+            f"the model does not explain the scan: it lies {d['mismatch_mm']:.2f} mm (RMS of nine tenths) from the "
+            f"completed surface, and training shapes lie {d['usual_mm']:.2f} mm from the mean shape; it is probably "
+            "another object, or contains parts of others"
         ),
         ReasonCode.SCAN_OFF_MODEL: lambda d: (
             f"the model does not explain the scan: outside of the model it varies {d['off_model']:.0f} times as much "
