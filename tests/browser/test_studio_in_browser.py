@@ -235,8 +235,8 @@ def test_what_was_dropped_edited_and_excluded_is_there_after_a_restart(open_tab,
         tab.until("document.querySelectorAll('[data-testid^=card-]').length === 4")
         tab.until("document.querySelectorAll('[data-testid^=card-] img').length === 3")
         # The table is taken after the scans; an undo before would take it back.
-        tab.until("document.querySelector('[data-testid=upload-notes]')?.innerText.includes('bones.csv')")
-        assert "bone_001" in tab.page.get_by_test_id("upload-notes").inner_text()
+        tab.until("document.querySelector('[data-testid=upload-notes]')?.textContent.includes('bones.csv')")
+        assert "bone_001" in tab.page.get_by_test_id("upload-notes").text_content()
         tab.page.get_by_test_id("include-bone_002").click()
         tab.page.get_by_test_id("undo").click()
         tab.page.get_by_test_id("include-bone_000").click()
