@@ -576,8 +576,10 @@ def are_same_triangles(first: IntArray | None, second: IntArray | None) -> bool:
     """Whether two arrays (F, 3) are the same triangles, in any order, orientation and from any of their corners."""
     if first is None or second is None:
         return first is second
-    if first.shape != second.shape or np.array_equal(first, second):
-        return first.shape == second.shape
+    if first.shape != second.shape:
+        return False
+    if np.array_equal(first, second):
+        return True
     one, other = np.sort(first, axis=1), np.sort(second, axis=1)
     return np.array_equal(one[np.lexsort(one.T)], other[np.lexsort(other.T)])
 

@@ -38,6 +38,7 @@ _COMMA_OF_NUMBER = re.compile(rb"(?<![^\s;<>])([+-]?\d*),(\d+(?:[eE][+-]?\d+)?)(
 _NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _OTHER_ROLES = frozenset({"separator", "point"})
 """Of commas and points in numbers, none of which is together with decimal commas in one file."""
+_COMMA_AT_NUMBER = re.compile(rb",[+\-.\d]")
 _LEADING_ZERO = re.compile(rb"0\d+")
 _THOUSANDS = re.compile(rb"[+-]?\d{1,3}(,\d{3})+\.|[+-]?\d{1,3}(\.\d{3})+,")
 
@@ -47,7 +48,7 @@ def damage_error(path: Path, problem: str) -> FileFormatError:
     return FileFormatError(f"Cannot read {path}: {problem}.")
 
 
-def is_number(text: str) -> bool:
+def is_number(text: str | bytes) -> bool:
     """Return whether text is a number, not-a-number and infinity included."""
     try:
         float(text)
@@ -76,7 +77,8 @@ def numeric_text(data: bytes, path: Path, start: int = 0, *, commas_separate: bo
         FileFormatError: commas that can be read in two ways, or numbers with decimal commas and with points.
     """
     data = plain_text(data)
-    if data.find(b",", start) < 0:
+    # Most files have no such comma, or one in a comment; their lines are not looked at one by one.
+    if data.find(b",", start) < 0 or not (commas_separate or _COMMA_AT_NUMBER.search(data, start)):
         return data
     out, first = list[bytes](), dict[str, int]()
     for number, line in enumerate(data[start:].splitlines(), data.count(b"\n", 0, start) + 1):

@@ -441,7 +441,7 @@ def _write_pp(landmarks: Mapping[str, FloatArray]) -> str:
 def csv_rows(data: bytes, path: Path) -> list[list[str]]:
     """Return the rows of UTF-8 text separated by commas, semicolons or tabs, without white space around cells.
 
-    Empty lines and comments (`#`) are left out.
+    Empty lines and comments (`#`) are skipped.
 
     Raises:
         FileFormatError: it is something else.

@@ -53,7 +53,7 @@ def parse_tps(text: str, path: Path) -> LandmarkConfigurations:
 
     The inner points of a curve slide between their neighbours. SCALE= is applied if all specimens have it, as in
     geomorph. IMAGE=, COMMENT= and other keys become columns. Outlines are closed curves in files without landmarks, and
-    are left out of others.
+    are not read from others.
     """
     parts, values = zip(*tps_specimens(text, path), strict=True)
     images = [re.sub(r"\.\w{1,5}$", "", one.get("image", "")) for one in values]

@@ -7,7 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
-from shapespace.io.parsing import CUT_SHORT, damage_error, floats, ints, join_parts, line_blocks, mesh_of, numeric_text
+from shapespace.io.parsing import (
+    CUT_SHORT,
+    damage_error,
+    floats,
+    ints,
+    is_number,
+    join_parts,
+    line_blocks,
+    mesh_of,
+    numeric_text,
+)
 from shapespace.types import FloatArray, Mesh
 
 _COMMENTS = (b"#", b"//", b"%")
@@ -33,7 +43,7 @@ def read_xyz(data: bytes, path: Path) -> Mesh:
     for lines in line_blocks(numeric_text(data, path, commas_separate=True)):
         rows = [line.replace(b";", b" ").split() for line in lines if not line.lstrip().startswith(_COMMENTS)]
         rows = [row for row in rows if row]
-        if rows and not lines_before and not width and not _is_number(rows[0][0]) and len(rows[0]) >= 3:
+        if rows and not lines_before and not width and not is_number(rows[0][0]) and len(rows[0]) >= 3:
             rows = rows[1:]
         counts = [row[0] for row in rows if len(row) == 1]
         points = [row for row in rows if len(row) > 1]
@@ -41,7 +51,7 @@ def read_xyz(data: bytes, path: Path) -> Mesh:
             width = width or len(points[0])
             if any(len(row) != width for row in points) or width < 3:
                 raise damage_error(path, f"it is no table of points with three or more columns, {width} in each row")
-            if not all(map(_is_number, points[0])) and not lines_before:
+            if not all(map(is_number, points[0])) and not lines_before:
                 raise damage_error(path, "it has words beside its points (a molecule perhaps), so it is no scan")
             coordinates = chain.from_iterable(row[:3] for row in points)
             parts.append(floats(coordinates, path).reshape(-1, 3))
@@ -52,11 +62,3 @@ def read_xyz(data: bytes, path: Path) -> Mesh:
     if declared and declared != lines_before:
         raise damage_error(path, f"it declares {declared} points, but {lines_before} follow; {CUT_SHORT}")
     return mesh_of(join_parts(parts, np.float64, 3), None, path)
-
-
-def _is_number(word: bytes) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
