@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 from completion import organs
 from mirrored import molars
+from missing import femur_file
 from scipy.stats import chi2
 
 from shapespace.correspondence.groupwise import correspond
@@ -146,7 +147,10 @@ def wrong_objects(size: float, seed: int, others: list[Mesh]) -> Iterator[Mesh]:
 
 
 def print_wrong(surfaces: list[Mesh], scans: list[Mesh], seed: int) -> None:
-    """Print how many other objects are converged with a model of 18 of the bones, and with one of 18 faces."""
+    """Print how many other objects are converged with models of 18 bones, of 18 faces, and with the open femur model.
+
+    The open femur model does not contain its training shapes.
+    """
     faces, rng = load_faces(), np.random.default_rng(seed)
     chosen = rng.permutation(len(surfaces))
     heads = [faces.face(faces.draw_person(rng)) for _ in range(22)]
@@ -155,6 +159,9 @@ def print_wrong(surfaces: list[Mesh], scans: list[Mesh], seed: int) -> None:
     count_converged(
         bones_model, f"bones, seed {seed}", wrong_objects(rms_size(bones_model.mean_vertices), seed, heads[18:])
     )
+    femur_model = ShapeModel.load(femur_file())
+    of_size = wrong_objects(rms_size(femur_model.mean_vertices), seed, heads[18:])
+    count_converged(femur_model, f"open femur model, seed {seed}", of_size)
     others = [scans[k] for k in chosen[18:22]]
     count_converged(
         faces_model, f"faces, seed {seed}", wrong_objects(rms_size(faces_model.mean_vertices), seed, others)

@@ -61,7 +61,7 @@ PathTo: TypeAlias = str | os.PathLike[str]
 
 @dataclass(frozen=True)
 class FitConfig:
-    """What is common to fits by any method.
+    """Settings that all fitting methods share.
 
     Args:
         method: method that fits the placed model: a name of `METHODS` for its default settings, or an object such as
@@ -361,8 +361,8 @@ def _place(
     T_scan_model: Similarity | None,
 ) -> _Placed:
     """Crop and repair the scan, find its unit, and find where to begin; landmarks are those of the `whole` model."""
-    landmarks, notes = landmarks_in_frame_of(scan, landmarks or {})
-    notes = [*notes]
+    landmarks, turned = landmarks_in_frame_of(scan, landmarks or {})
+    notes = list(turned)
     if config.crop:
         scan, cropped = Crop.of(config.crop).cut(scan, full_model, landmarks, config.unit)
         notes.append(cropped)

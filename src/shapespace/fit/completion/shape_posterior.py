@@ -60,9 +60,10 @@ class ShapePosterior:
         amplitude: variance of the off-model variation in units of the one that the spectrum predicts (E3).
         noise_mm: robust standard deviation of the residuals, mm of the model's frame.
         followed: (V,) True where a scan point is matched.
-        mismatch_mm: RMS distance of the scan's points from the surface, each up to 5 % of the model's size.
+        mismatch_mm: RMS distance of the scan's points from the surface, each up to 5 % of the model's size;
+            not-a-number if settled.
         covered_mismatch_mm: robust RMS distance of the points that do not lie beyond the border of the model: the 90 %
-            quantile over that of a normal distribution, as scans contain hair, stands and stray points.
+            quantile over that of a normal distribution, as scans contain hair, stands and stray points; likewise.
         n_modes: K.
         step: (P,) from the parameters of the surface to the mean of its linearised posterior; about zero if settled.
         left_out: errors of completions of the training shapes by models of the others; None without them.
@@ -181,17 +182,27 @@ def shape_posterior(
         raise FitError(
             f"{target.mesh.name}: what it shows does not determine the pose; give landmarks (--landmarks)."
         ) from error
-    # The walks of the fit may end in another fold of the surface.
-    surface = Mesh(iterate.surface.vertices, model.faces)
-    matches = build_engine(surface).query(iterate.T_scan_model.inverse().apply(matcher.points_mm))
-    squared = np.minimum(matches.distance, _FAR * size_mm) ** 2
-    covered = ~on_boundary(matches, surface, boundary_vertices(surface))
+    # A settled posterior is part of each fit of a partial scan, which does not use them.
+    mismatch_mm, covered_mismatch_mm = np.nan, np.nan
+    if not settled:
+        points = iterate.T_scan_model.inverse().apply(matcher.points_mm)
+        mismatch_mm, covered_mismatch_mm = _mismatches_mm(
+            Mesh(iterate.surface.vertices, model.faces), points, _FAR * size_mm
+        )
     return ShapePosterior(
         iterate.T_scan_model, iterate.surface, iterate.b, covariance, line.variance, line.amplitude,
-        line.weighted.sigma_mm, line.followed, float(np.sqrt(squared.mean())),
-        float(np.sqrt(np.quantile(squared[covered], 0.9) / chi2.ppf(0.9, 1))) if covered.any() else np.inf,
-        model.n_modes, mean - line.theta, left_out,
+        line.weighted.sigma_mm, line.followed, mismatch_mm, covered_mismatch_mm, model.n_modes, mean - line.theta,
+        left_out,
     )  # fmt: skip
+
+
+def _mismatches_mm(surface: Mesh, points: FloatArray, far_mm: float) -> tuple[float, float]:
+    """Return `mismatch_mm` and `covered_mismatch_mm` of points (M, 3), each distance up to `far_mm`."""
+    matches = build_engine(surface).query(points)  # the walks of the fit may end in another fold of the surface
+    squared = np.minimum(matches.distance, far_mm) ** 2
+    covered = ~on_boundary(matches, surface, boundary_vertices(surface))
+    robust = np.sqrt(np.quantile(squared[covered], 0.9) / chi2.ppf(0.9, 1)) if covered.any() else np.inf
+    return float(np.sqrt(squared.mean())), float(robust)
 
 
 def _known_shapes(model: ShapeModel) -> FloatArray | None:
