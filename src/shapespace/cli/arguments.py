@@ -50,7 +50,8 @@ class CommandParser(argparse.ArgumentParser):
     ) -> Any:
         """Parse arguments after adding the options."""
         self._add_options(help_level="basic")
-        if self._command:  # before what is missing, and not in the parser of all commands, whose usage is another
+        # Before the check of required options; the parser of all commands would print another usage.
+        if self._command:
             known = [name for name in self._option_string_actions if name.startswith("--")]
             for text in itertools.takewhile(lambda text: text != "--", args):
                 option = text.partition("=")[0]

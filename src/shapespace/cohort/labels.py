@@ -21,8 +21,8 @@ class Label:
 
     Args:
         text: its class, such as an expression; empty where the table has only its subject.
-        intensity: from 0 to 1, or None where the table does not say.
-        subject: whom it shows, or empty.
+        intensity: from 0 to 1, or None if the table has none.
+        subject: name of the subject, or empty.
     """
 
     text: str
@@ -64,8 +64,8 @@ def read_labels(path: Path, *, of_subjects: bool = True, of_any: bool = False) -
 
     Args:
         path: the table.
-        of_subjects: whether subjects may stand for classes where there is no other column.
-        of_any: whether the first other column of classes, of which several scans have one, may as well.
+        of_subjects: use subjects as classes if the table has no column of classes.
+        of_any: use the first column of words with repeated values as classes, before subjects.
 
     Raises:
         FileError: it cannot be read.

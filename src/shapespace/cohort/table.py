@@ -192,8 +192,7 @@ def read_table(path: Path, content: bytes | None = None) -> Table:
 
 
 def name_key(name: str) -> tuple[list[str], list[int]]:
-    """Return the key by which rows are sorted, with numbers in names by their value: permutations of rows and so p
-    then do not depend on their order in a file."""
+    """Return the sort key of a name, with its numbers by value; p does not depend on the order of rows in a file."""
     return re.split(r"[0-9]+", name), [int(digits) for digits in re.findall(r"[0-9]+", name)]
 
 

@@ -125,7 +125,7 @@ def stray_landmarks(scan: Mesh) -> dict[str, float]:
 
 
 def with_own_landmarks(scan: Mesh) -> tuple[Mesh, list[str]]:
-    """Return `scan` with the landmarks of its surface, in its frame, and sentences on those changed or left out."""
+    """Return `scan` with the landmarks near its surface, in its frame, and sentences on turned and excluded ones."""
     points, notes = landmarks_in_frame_of(scan, scan.landmarks)
     scan = replace(scan, landmarks=points)
     off = stray_landmarks(scan)

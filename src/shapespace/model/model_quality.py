@@ -91,7 +91,7 @@ class Curve:
 
 @dataclass(frozen=True, eq=False)
 class ModelQuality:
-    """What was measured of a shape space; None where the shapes or the model do not tell.
+    """Quality measures of a shape space; None where the shapes or the model do not determine one.
 
     Args:
         compactness: shares of the variance; the interval is by jackknife over shapes, none for a model alone.

@@ -41,7 +41,7 @@ _KEYS = {"confidence": "level"}
 
 @dataclass(frozen=True, eq=False)
 class Predictions:
-    """What is predicted of n shapes.
+    """Predicted values of n shapes.
 
     Args:
         names: of them.

@@ -179,7 +179,7 @@ def regress(
     drop_missing: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> RegressionResult:
-    """Learn a number from shape, and measure on subjects left out how well.
+    """Predict a number from shape, and estimate the error of prediction on left-out subjects.
 
     If completed shapes have samples, each imputation is analysed too; p, measures and predictions of the cohort combine
     them by Rubin's rules.
