@@ -13,8 +13,8 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.model.additive import AdditiveModel
 from bilinear import BilinearModel
+from shapespace.model.additive import AdditiveModel
 from shapespace.model.pca import modes_for_variance
 from shapespace.recognise.hierarchy import ExpressionByType, FaceTypes
 from shapespace.types import BoolArray, FloatArray, IntArray
