@@ -10,7 +10,6 @@ from refusals import refusal_of
 from shapespace.errors import InputError
 from shapespace.io.landmarks.configuration_io import is_configurations, read_configurations
 from shapespace.io.landmarks.landmark_io import read_landmarks
-from shapespace.io.meshes.mesh_io import read_mesh
 
 POINTS = np.arange(18.0).reshape(6, 3) ** 1.5
 
@@ -146,19 +145,3 @@ def test_amira_landmarks_are_read(decimal: str, write) -> None:
     refused = {"2 sets": AMIRA.replace("Sets 1", "Sets 2"), "declares 3": AMIRA.replace("Markers 2", "Markers 3")}
     for why, text in refused.items():
         assert why in refusal_of(read_landmarks, write("b.landmarkAscii", text))
-
-
-LINES = (
-    "# vtk DataFile Version 3.0\na\nASCII\nDATASET POLYDATA\nPOINTS 3 float\n1 2 3\n4 5 6\n7 8 9\nLINES 1 4\n3 0 1 2\n"
-)
-VTP_LINES = (
-    '<VTKFile type="PolyData"><PolyData><Piece NumberOfPoints="3" NumberOfLines="1"><Points>'
-    '<DataArray type="Float32" format="ascii">1 2 3 4 5 6 7 8 9</DataArray></Points></Piece></PolyData></VTKFile>'
-)
-
-
-@pytest.mark.parametrize(("name", "text"), [("a.vtk", LINES), ("a.vtp", VTP_LINES)])
-def test_lines_of_vtk_are_named(name: str, text: str, write) -> None:
-    found = read_mesh(write(name, text))
-    assert found.faces is None and any("lines" in note for note in found.notes)
-    np.testing.assert_array_equal(found.vertices, [[1, 2, 3], [4, 5, 6], [7, 8, 9]])

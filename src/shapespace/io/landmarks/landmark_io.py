@@ -565,10 +565,10 @@ def _read_tps(data: bytes, path: Path) -> Pairs:
     specimens = list(tps_specimens(data.decode("utf-8-sig", "replace"), path))
     if len(specimens) != 1:
         raise damage_error(path, f"it has {len(specimens)} specimens, so save each in a file of its own")
-    [(parts, _)] = specimens
-    if any(len(row) == 2 for row in parts[0]):
+    [(rows, curves, _)] = specimens
+    if any(len(row) == 2 for row in rows):
         raise damage_error(path, "its landmarks are of two dimensions (LM=), and those of a surface have three (LM3=)")
-    rows = [row for part in parts for row in part]
+    rows = [*rows, *(row for curve, _ in curves for row in curve)]
     return [(f"point_{i}", None if np.isnan(p).any() else _point(p, f"point_{i}", path)) for i, p in enumerate(rows)]
 
 
