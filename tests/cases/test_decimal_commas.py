@@ -32,6 +32,10 @@ def prefixed(word: str) -> str:
     return "".join(f"{word} {row}\n" for row in ROWS.splitlines())
 
 
+WRL = (
+    "#VRML V2.0 utf8\nShape {{ geometry IndexedFaceSet {{ coord Coordinate {{ point [\n{}] }} "
+    "coordIndex [0,1,2,-1] }} }}"
+)
 MESHES = {
     "a.xyz": ROWS,
     "b.xyz": "x,y,z\n" + ROWS.replace(" ", "\t"),
@@ -46,7 +50,18 @@ MESHES = {
     "b.vtk": VTK.format(ROWS.replace("\n", " ")),
     "a.vtp": VTP.format(ROWS),
     "a.pcd": PCD.format(ROWS),
+    "a.wrl": WRL.format(ROWS),
+    "b.wrl": WRL.format(ROWS.replace("\n", ",\n")),
 }
+
+
+@pytest.mark.parametrize(
+    "rows", ["0 0 0,1 0 0,0 2 0", "0 0 0, 1 0 0, 0 2 0,", "0,0,0,1,0,0,0,2,0", "0, 0, 0,\n1,0,0\n0 2 0"]
+)
+def test_commas_between_numbers_of_vrml_stay_what_they_are(rows: str, write) -> None:
+    np.testing.assert_array_equal(
+        read_mesh(write("a.wrl", WRL.format(rows))).vertices, [[0, 0, 0], [1, 0, 0], [0, 2, 0]]
+    )
 
 
 @pytest.mark.parametrize("name", MESHES)

@@ -1,10 +1,10 @@
-"""Readers of label volumes: NIfTI (`.nii`, `.nii.gz`) and NRRD (`.nrrd`, header and data in one file), as RAS
-millimetres.
+"""Readers of label volumes: NIfTI (`.nii`, `.nii.gz`), NRRD (`.nrrd`, header and data in one file) and MetaImage
+(`.mha`, `.mhd`), as RAS millimetres.
 
-nibabel and pynrrd read the headers; the voxels are decoded here, so that a header that declares more than its file
-holds, a volume that takes more memory than allowed, and a compressed stream that grows without end are refused before
-memory is taken. Voxels are decompressed and converted in pieces of 1 MiB, up to the declared size and no further. No
-other file is opened.
+nibabel and pynrrd read the headers of NIfTI and NRRD; the voxels are decoded here, so that a header that declares more
+than its file holds, a volume that takes more memory than allowed, and a compressed stream that grows without end are
+refused before memory is taken. Voxels are decompressed and converted in pieces of 1 MiB, up to the declared size and no
+further. No other file is opened, except the data file of `.mhd` in the same folder.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ import gzip
 import io
 import math
 import os
+import re
 import zlib
 from collections.abc import Generator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import IO, Any, BinaryIO, cast
@@ -30,7 +31,7 @@ from shapespace.io.files import open_file, read_error
 from shapespace.io.parsing import CUT_SHORT, damage_error
 from shapespace.types import MAX_MEMORY_BYTES, FloatArray, LabelVolume, Segment
 
-VOLUME_ENDINGS = (".nii", ".nii.gz", ".nrrd")
+VOLUME_ENDINGS = (".nii", ".nii.gz", ".nrrd", ".mha", ".mhd")
 """The endings that `read_volume` takes."""
 
 _MOST_BYTES = 1 << 31  # 2 GiB
@@ -60,6 +61,9 @@ _NRRD_TYPES = {
     "f4": ("float",),
     "f8": ("double",),
 }
+_META_TYPES = {"char": "signed char", "long": "int", "ulong": "uint", "ulong long": "ulonglong"}
+"""Type of MetaImage after `MET_` -> name in NRRD, where they differ; others have the same."""
+_META_END = re.compile(rb"^ElementDataFile\s*=[ \t]*(.*?)[ \t]*\r?(?:\n|\Z)", re.MULTILINE)
 # Sign of each axis of a space that takes it to right, anterior, superior.
 _NRRD_SPACES = {
     "right-anterior-superior": (1, 1, 1), "ras": (1, 1, 1),
@@ -136,7 +140,8 @@ def read_volume(path: Path | str, *, max_memory_bytes: int = MAX_MEMORY_BYTES) -
 
     Returns:
         Its labels, and the affine from voxels to RAS millimetres: of NIfTI the sform, else the qform; of NRRD space
-        directions and origin, with LPS and LAS turned to RAS, and units to millimetres. Segments of 3D Slicer have
+        directions and origin, with LPS and LAS turned to RAS, and units to millimetres; of MetaImage TransformMatrix,
+        Offset and ElementSpacing, which are in LPS. Segments of 3D Slicer have
         their names; those that overlap are in layers.
 
     Raises:
@@ -156,8 +161,8 @@ def read_volume(path: Path | str, *, max_memory_bytes: int = MAX_MEMORY_BYTES) -
         try:
             size = os.fstat(file.fileno()).st_size
             _check_size(size, path)
-            is_nrrd = name.endswith(".nrrd")
-            head, stream = (_open_nrrd if is_nrrd else _open_nifti)(file, size, stack, path)
+            read = _open_nrrd if name.endswith(".nrrd") else _open_nifti if ".nii" in name[-7:] else _open_meta
+            head, stream = read(file, size, stack, path)
         except OSError as error:
             raise read_error(path, error) from error
         order, shape = _spatial_order(head, path)
@@ -372,6 +377,76 @@ def _open_nrrd(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tuple
         _check_declared(head, _BZIP2_SPARE + _BZIP2_GROWTH * (size - start), path)
         return head, stack.enter_context(bz2.BZ2File(file))
     raise damage_error(path, f"its encoding is '{encoding}', but only raw, gzip and bzip2 are read; save it again")
+
+
+def _open_meta(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tuple[_VolumeHeader, IO[bytes]]:
+    """Return the header of a MetaImage file, and a stream at its first voxel."""
+    data = file.read(_MOST_HEADER)
+    end = _META_END.search(data)
+    if end is None:
+        raise damage_error(path, "its header is not that of a MetaImage volume; export it again as .mha")
+    lines = (line.partition("=") for line in data[: end.start()].decode("latin-1").splitlines())
+    fields = {key.strip().lower(): value.strip() for key, _, value in lines}
+
+    def numbers(*keys: str) -> FloatArray | None:
+        return next((np.array(fields[key].split(), dtype=np.float64) for key in keys if key in fields), None)
+
+    def is_true(*keys: str) -> bool:
+        return any(fields.get(key, "").lower() in ("true", "1") for key in keys)
+
+    kind = fields.get("elementtype", "").lower().removeprefix("met_").replace("_", " ")
+    try:
+        steps, turn = numbers("elementspacing", "elementsize"), numbers("transformmatrix", "rotation", "orientation")
+        origin = numbers("offset", "position", "origin")
+        if steps is not None:
+            steps = (np.eye(len(steps)) if turn is None else turn.reshape(-1, len(steps))) * steps[:, None]
+        known: dict[str, Any] = {
+            "type": _META_TYPES.get(kind, kind),
+            "endian": "big" if is_true("binarydatabyteordermsb", "elementbyteordermsb") else "little",
+            "sizes": fields.get("dimsize", "").split(),
+            "dimension": fields.get("ndims"),
+            "space": "lps",
+            "space directions": steps,
+            "space origin": np.zeros(3) if origin is None else origin,
+        }
+        skip = int(fields.get("headersize", "0"))
+    except ValueError as error:
+        raise damage_error(path, f"its header is damaged ({_first_words(error)}), so export it again") from error
+    head = _nrrd_head(known, path)
+    head = replace(head, notes=(_UNORIENTED,)) if turn is None else head
+    if fields.get("elementnumberofchannels", "1") != "1" or fields.get("binarydata", "true").lower() == "false":
+        raise damage_error(path, "its voxels have several values or are text; save one label per voxel, as binary data")
+    name, start = end[1].decode("utf-8", "replace"), end.end()
+    if name.upper() != "LOCAL":
+        if not name or name.upper().startswith("LIST") or re.search(r"[/\\%]", name):
+            raise damage_error(path, f"its data are not in one file in its folder ({name[:60]!r}); save it as .mha")
+        file = stack.enter_context(open_file(path.with_name(name)))
+        size = os.fstat(file.fileno()).st_size
+        start = size - head.bytes if skip < 0 else skip
+    file.seek(max(start, 0))
+    if is_true("compresseddata"):
+        _check_declared(head, _DEFLATE_GROWTH * (size - start), path)
+        return head, cast("IO[bytes]", _ZlibStream(file))
+    _check_declared(head, size - start, path)
+    return head, file
+
+
+class _ZlibStream(io.RawIOBase):
+    """The bytes that a zlib stream in a file unpacks to."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file, self._unpacking = file, zlib.decompressobj()
+
+    def readinto(self, buffer: Any) -> int:
+        """Unpack as much as fits in the buffer, and return how many bytes there are, 0 at the end."""
+        data = b""
+        while not data and not self._unpacking.eof:
+            packed = self._unpacking.unconsumed_tail or self._file.read(_PIECE)
+            if not packed:
+                raise EOFError
+            data = self._unpacking.decompress(packed, len(buffer))
+        buffer[: len(data)] = data
+        return len(data)
 
 
 def _nrrd_head(fields: dict[str, Any], path: Path) -> _VolumeHeader:
