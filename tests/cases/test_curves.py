@@ -167,7 +167,7 @@ def test_outlines_beside_landmarks_are_closed_curves(write) -> None:
     assert raw.points.shape == (6, 203, 2) and [closed for _, closed in raw.curves] == [True, True]
     assert residuals(align_landmarks(raw)).max() < 1e-3
     other = tps([parts[0], (parts[1][0], [], parts[1][2][:1])])
-    assert "has 3 landmarks, curves of [200] points" in refusal_of(read_configurations, write("b.tps", other))
+    assert "has 3 landmarks, curves of [200 (closed)] points" in refusal_of(read_configurations, write("b.tps", other))
 
 
 def markup(points: FloatArray, label: str, kind: str) -> dict[str, object]:

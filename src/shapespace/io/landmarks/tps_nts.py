@@ -74,9 +74,11 @@ def parse_tps(text: str, path: Path, curve_points: int | None = None) -> Landmar
     closed = [is_closed for _, is_closed in curves[0]]
     for name, rows, own in zip(names, specimens, curves, strict=True):
         if len(rows) != len(specimens[0]) or [is_closed for _, is_closed in own] != closed:
+            numbers = [", ".join(f"{len(curve)}{' (closed)' * closed}" for curve, closed in part)[:60]
+                       for part in (own, curves[0])]  # fmt: skip
             has, expected = (
-                f"{len(part)} landmarks" + f", curves of {[len(curve) for curve, _ in others]} points" * bool(others)
-                for part, others in ((rows, own), (specimens[0], curves[0]))
+                f"{len(part)} landmarks" + f", curves of [{number}] points" * bool(number)
+                for part, number in zip((rows, specimens[0]), numbers, strict=True)
             )
             problem = f"specimen {name[:60]!r} has {has} and {names[0][:60]!r} has {expected}"
             raise damage_error(path, f"{problem}; digitise the same for all, with NA for missing landmarks")
