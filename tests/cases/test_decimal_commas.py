@@ -152,3 +152,21 @@ def test_tables_name_the_decimal_comma(write) -> None:
 def test_nts_may_have_decimal_commas(tmp_path: Path, write) -> None:
     found = read_configurations(write("a.nts", "1 2L 4 0 DIM=2\na b\n1,5 2,5 3,5 4\n0,5 1 2 3\n"))
     np.testing.assert_array_equal(found.points, [[[1.5, 2.5], [3.5, 4]], [[0.5, 1], [2, 3]]])
+
+
+@pytest.mark.parametrize("space", ["\u00a0", "\u2009", "\u202f"])
+def test_spaces_for_thousands_are_named(space: str, write) -> None:
+    for name, head in (("a.xyz", ""), ("a.obj", "v ")):
+        assert "spaces for thousands in line 1" in refused_mesh(write(name, f"{head}1{space}234,5 2,0 3,0\n"))
+    assert "spaces for thousands in line 2" in refused_landmarks(write("a.tps", f"LM3=1\n1{space}234.5 2 3\nID=a\n"))
+    assert len(read_mesh(write("b.xyz", f"# made{space}by 1{space}b\n1 2 3\n")).vertices) == 1
+
+
+def test_the_rest_of_a_number_after_a_space_is_no_coordinate(write) -> None:
+    assert "line 1 ('v 1 000,5 2,0 3,0')" in refused_mesh(write("a.obj", "v 1 000,5 2,0 3,0\n"))
+
+
+def test_semicolons_separate_coordinates_of_tps(write) -> None:
+    for rows in ("1.5;2.5\n2;3\n", "1,5; 2,5\n2;3\n"):
+        found = read_configurations(write("a.tps", f"LM=2\n{rows}ID=a\n"))
+        np.testing.assert_array_equal(found.points, [[[1.5, 2.5], [2, 3]]])

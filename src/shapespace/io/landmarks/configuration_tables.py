@@ -20,7 +20,7 @@ from shapespace.types import FloatArray
 
 _AXIS_FIRST = re.compile(r"([xyz])[ ._-]?(\d+)", re.IGNORECASE)
 _AXIS_LAST = re.compile(r"(.*\d|.+?)(?:(?<=\d)|[ ._-])([xyz])", re.IGNORECASE)
-_NUMBERED = re.compile(r"(?:raw|proc)?coord[ ._-]?\d+", re.IGNORECASE)
+_NUMBERED = re.compile(r"(?:(?:raw|proc)[ ._-]?)?coord[ ._-]?\d+", re.IGNORECASE)
 """Columns of coordinates of MorphoJ, whose names have no axis."""
 _LANDMARK = ("landmark", "landmarks", "lm", "point", "semilandmark")
 _KEYS = (*KEYS, "individual", "label", "identifier")

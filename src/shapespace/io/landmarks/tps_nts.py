@@ -63,7 +63,7 @@ def parse_tps(text: str, path: Path, curve_points: int | None = None) -> Landmar
     have it, as in geomorph. IMAGE=, COMMENT= and other keys become columns.
     """
     specimens, curves, values = zip(*tps_specimens(text, path), strict=True)
-    images = [re.sub(r"\.\w{1,5}$", "", one.get("image", "")) for one in values]
+    images = _names_of_files([one.get("image", "") for one in values], r"\.\w{1,5}$")
     names = tuple(
         one.get("id") or image or f"specimen {k}" for k, (one, image) in enumerate(zip(values, images, strict=True), 1)
     )
@@ -142,7 +142,12 @@ def _specimen(block: str, number: int, path: Path) -> tuple[Rows, list[tuple[Row
                 declared = f"specimen {number} declares {value[:20]!r} points"
                 raise damage_error(path, f"{declared}, and {len(rows)} rows of coordinates follow; {CUT_SHORT}")
             at += count
-            parts.append(([coordinates(row.split(), path, lambda _: f"specimen {number}") for row in rows], is_outline))
+            parts.append(
+                (
+                    [coordinates(row.replace(";", " ").split(), path, lambda _: f"specimen {number}") for row in rows],
+                    is_outline,
+                )
+            )
             if is_outline and count < LEAST_OUTLINE:
                 del parts[-1]
                 values[_LEFT_OUT] = ""
@@ -151,6 +156,13 @@ def _specimen(block: str, number: int, path: Path) -> tuple[Rows, list[tuple[Row
         else:
             values[key] = value
     return parts[0][0], parts[1:], values
+
+
+def _names_of_files(files: Sequence[str], ending: str) -> list[str]:
+    """Return the names of files without an ending, and without their folders if they differ otherwise."""
+    names = [re.sub(ending, "", file, flags=re.IGNORECASE) for file in files]
+    bases = [re.split(r"[/\\]", name)[-1] for name in names]
+    return bases if len(set(bases)) == len(set(names)) else names
 
 
 def _arrays(specimens: Sequence[Rows], names: Sequence[str], path: Path) -> list[FloatArray]:
@@ -219,18 +231,21 @@ def parse_nts(text: str, path: Path) -> LandmarkConfigurations:
 def parse_dta(text: str, path: Path) -> LandmarkConfigurations:
     """Return the landmarks of a file of IDAV Landmark, which is NTS with the names of meshes."""
     raw = parse_nts(text, path)
-    return replace(raw, names=tuple(re.sub(r"\.(ply|obj|stl)$", "", name, flags=re.IGNORECASE) for name in raw.names))
+    return replace(raw, names=tuple(_names_of_files(raw.names, r"\.(ply|obj|stl|off|vtk|vtp)(\.gz)?$")))
 
 
 def parse_morphologika(text: str, path: Path) -> LandmarkConfigurations:
     """Return the landmarks of a Morphologika file; its labels and groups become columns."""
     data = text.encode("utf-8", "replace")
-    data = numeric_text(data, path, max(data.lower().find(b"[rawpoints]"), 0), commas_separate=True)
+    rows = re.search(rb"\[\s*rawpoints\s*\][^\[]*", data, re.IGNORECASE)
+    if rows is not None:
+        data = numeric_text(data[: rows.end()], path, rows.start(), commas_separate=True) + data[rows.end() :]
     sections, own = dict[str, list[str]](), list[str]()
     for line in filter(None, map(str.strip, data.decode().splitlines())):
-        if section := re.fullmatch(r"\[\s*(\w+)\s*\].*", line):
+        if section := re.fullmatch(r"\[\s*(\w+)\s*\]\s*(.*)", line):
             own = sections.setdefault(section[1].lower(), [])
-        elif not line.startswith("'"):
+            line = section[2]
+        if line and not line.startswith(("'", "#")):
             own.append(line)
     try:
         n, p, width = (int(sections[key][0]) for key in ("individuals", "landmarks", "dimensions"))
@@ -244,7 +259,7 @@ def parse_morphologika(text: str, path: Path) -> LandmarkConfigurations:
         raise damage_error(path, f"{declared}, and has {len(names)} names and {len(words)} coordinates; {CUT_SHORT}")
     points = np.array(coordinates(words, path, lambda k: f"specimen {names[k // (p * width)]!r}"))
     labels, rows = " ".join(sections.get("labels", [])).split(), sections.get("labelvalues", [])
-    cells = [[row] if len(labels) == 1 else row.split() for row in rows]
+    cells = [[row] if len(labels) == 1 else row.split("\t" if "\t" in row else None) for row in rows]
     if labels and (len(cells) != n or any(len(row) != len(labels) for row in cells)):
         raise damage_error(
             path, f"its [labelvalues] are not {n} rows with a value for each of {', '.join(labels)[:60]}"

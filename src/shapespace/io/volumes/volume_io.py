@@ -48,7 +48,7 @@ _HEADS = {348: "Nifti1Header", 540: "Nifti2Header"}
 _SINGLE, _PAIR = (b"n+1", b"n+2"), (b"ni1", b"ni2")
 _MAGIC_AT = {348: 344, 540: 4}
 _NIFTI_MM = {"unknown": 1.0, "mm": 1.0, "meter": 1e3, "micron": 1e-3}
-_NRRD_MM = {"": 1.0, "mm": 1.0, "millimeter": 1.0, "m": 1e3, "meter": 1e3, "cm": 10.0, "um": 1e-3, "µm": 1e-3}
+MM_OF_UNITS = {"": 1.0, "mm": 1.0, "millimeter": 1.0, "m": 1e3, "meter": 1e3, "cm": 10.0, "um": 1e-3, "µm": 1e-3}
 _NRRD_TYPES = {
     "i1": ("signed char", "int8", "int8_t"),
     "u1": ("uchar", "unsigned char", "uint8", "uint8_t"),
@@ -356,7 +356,7 @@ def _open_nrrd(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tuple
         raise damage_error(path, f"its header has no end; {CUT_SHORT}")
     start = sum(min(header_ends))
     try:
-        fields: dict[str, Any] = dict(nrrd.read_header(io.BytesIO(data[:start])))
+        fields: dict[str, Any] = dict(nrrd.read_header(io.StringIO(data[:start].decode("utf-8", "replace"))))
     except Exception as error:
         # What pynrrd raises of a header that was tampered with is of any kind.
         raise damage_error(path, f"its header is damaged ({_first_words(error)}), so export it again") from error
@@ -464,7 +464,8 @@ def _nrrd_head(fields: dict[str, Any], path: Path) -> _VolumeHeader:
         if len(shape) != int(fields["dimension"]):
             raise ValueError("sizes and dimension disagree")
         affine, notes, axes = _nrrd_affine(fields, path)
-        segments = tuple(_segment(fields, n) for n in range(len(fields)) if f"Segment{n}_ID" in fields)
+        numbers = sorted(int(match[1]) for key in fields if (match := re.fullmatch(r"Segment(\d{1,9})_ID", key)))
+        segments = tuple(_segment(fields, n) for n in numbers)
     except InputError:
         raise
     except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
@@ -497,11 +498,11 @@ def _nrrd_affine(fields: dict[str, Any], path: Path) -> tuple[FloatArray, tuple[
     if signs is None and space not in ("", "3d-right-handed", "scanner-xyz"):
         raise InputError(f"{path}: its space is '{space[:60]}', which is not known; save it as LPS or RAS.")
     units = {str(unit).strip('" ').lower() for unit in fields.get("space units") or ("mm",)}
-    if len(units) != 1 or (unit := units.pop()) not in _NRRD_MM:
+    if len(units) != 1 or (unit := units.pop()) not in MM_OF_UNITS:
         raise InputError(f"{path}: its space units are not one of mm, cm, m and um; save it in mm.")
     origin = np.asarray(fields.get("space origin", np.zeros(3)), dtype=np.float64).reshape(3)
     turn = np.diag(np.array(signs or (1, 1, 1), dtype=np.float64))
-    affine = _in_mm(_affine(turn @ np.array(list(rows.values())).T, turn @ origin), _NRRD_MM[unit])
+    affine = _in_mm(_affine(turn @ np.array(list(rows.values())).T, turn @ origin), MM_OF_UNITS[unit])
     return affine, () if signs else (_UNORIENTED,), tuple(rows)
 
 
