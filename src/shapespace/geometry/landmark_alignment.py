@@ -321,48 +321,38 @@ def match_curves(configurations: LandmarkConfigurations, mean: FloatArray | None
         mean: (L, D) to match; None for the mean of the specimens, found in turns with the starts.
     """
     points, curves = configurations.points, [(np.array(at), closed) for at, closed in configurations.curves]
-    complete = np.array(
-        [[np.isfinite(x[at]).all() and len(at) > 2 for at, _ in curves] for x in points], dtype=np.bool_
-    )
-    if not complete.size or (mean is None and not complete.all(axis=1).any()):
+    usable = np.array([[len(at) > 2 and np.isfinite(x[at]).all() and np.ptp(x[at]) > 0 for at, _ in curves]
+                       for x in points], dtype=np.bool_)  # fmt: skip
+    whole = np.logical_and(np.isfinite(points).all(axis=(1, 2)), usable.all(axis=1))
+    if not curves or (mean is None and not whole.any()):
         return configurations
-    shift, is_reversed = np.zeros(complete.shape), np.zeros(complete.shape, dtype=np.bool_)
-    target = points[int(np.argmax(complete.all(axis=1)))] if mean is None else mean
-    moved = points.copy()
+    on_curves = [i for at, _ in curves for i in at.tolist()]
+    shift, is_reversed = np.zeros(usable.shape), np.zeros(usable.shape, dtype=np.bool_)
+    target: FloatArray = points[int(np.argmax(whole))] if mean is None else mean
+    moved, change = points.copy(), np.inf
     for step in range(_MATCHING_ITERATIONS):
-        change, x = 0.0, np.empty_like(moved)
-        for k, own in enumerate(complete):
+        if step and mean is None:
+            target = superimpose(moved[whole], AlignConfig(tangent=False)).coords.mean(axis=0)
+        change = 0.0
+        for k, c in np.argwhere(usable).tolist():
+            at, closed = curves[c]
             # In the first step, a curve is placed by the landmarks and by the curves before it.
-            known = np.isfinite(moved[k] + target).all(axis=1)
-            if step == 0:
-                known[[i for at, _ in curves for i in at]] = False
-            for c in np.flatnonzero(own).tolist():
-                at, closed = curves[c]
-                known[at] = False
-                by, reverse = _best_start(moved[k], target, known, at, closed)
-                is_reversed[k, c] ^= reverse
-                # Numbers of points run backwards along a reversed curve.
-                shift[k, c] += -by if is_reversed[k, c] else by
-                if by or reverse:
-                    moved[k, at] = _restarted(points[k, at], shift[k, c], is_reversed[k, c], closed)
-                change = max(change, abs(by), float(reverse))
-                known[at] = True
-            centred = moved[k] - np.nanmean(moved[k][known], axis=0)
-            x[k] = centred / np.linalg.norm(centred[known])
+            known = np.isfinite(moved[k]).all(axis=1)
+            known[on_curves[on_curves.index(at[0]) :] if step == 0 else at] = False
+            by, reverse = _best_start(moved[k], target, known, at, closed)
+            is_reversed[k, c] ^= reverse
+            # Numbers of points run backwards along a reversed curve.
+            shift[k, c] += -by if is_reversed[k, c] else by
+            if by or reverse:
+                moved[k, at] = _restarted(points[k, at], shift[k, c], bool(is_reversed[k, c]), closed)
+            change = max(change, abs(by), float(reverse))
         if change < _STILL:
             break
-        if mean is None:
-            seen = np.isfinite(x).all(axis=2)
-            products = np.einsum("nli,lj->nij", np.where((seen & np.isfinite(target).all(axis=1))[..., None], x, 0.0),
-                                 np.nan_to_num(target - np.nanmean(target, axis=0)))  # fmt: skip
-            turned = np.where(seen[..., None], x, 0.0) @ fit_rotations(products).transpose(0, 2, 1)
-            with np.errstate(invalid="ignore"):
-                target = turned.sum(axis=0) / seen.sum(axis=0)[:, None]
     notes = list[str]()
     for c, (at, closed) in enumerate(curves):
         # Fewer specimens are digitised in the other direction.
         if mean is None and 2 * is_reversed[:, c].sum() > len(points):
-            for k in np.flatnonzero(complete[:, c]).tolist():
+            for k in np.flatnonzero(usable[:, c]).tolist():
                 moved[k, at] = moved[k, np.append(at[0], at[:0:-1]) if closed else at[::-1]]
                 is_reversed[k, c] ^= True
         if is_reversed[:, c].any():
