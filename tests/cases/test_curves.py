@@ -200,6 +200,37 @@ def test_curves_of_slicer_with_other_numbers_of_points_and_default_names_are_mat
     assert residuals(align_landmarks(raw)).max() < 1e-3
 
 
+@pytest.mark.parametrize("names", [
+    ("{}_landmarks", "{}_curve"), ("{}", "{} curve"), ("points-{}", "curve-{}"), ("{}.F", "{}.C"),
+])  # fmt: skip
+@pytest.mark.parametrize("stem", ["s{}", "case_{}", "{}"])
+def test_files_of_one_specimen_are_joined_however_they_are_called(
+    names: tuple[str, str], stem: str, tmp_path: Path
+) -> None:
+    rng = np.random.default_rng(11)
+    expected: dict[str, FloatArray] = {}
+    for k in range(3):
+        points, curve = rng.normal(size=(4, 3)), rng.normal(size=(5, 3))
+        name = stem.format(k)
+        save(tmp_path / f"{names[0].format(name)}.mrk.json", markup(points, "F-", "Fiducial"))
+        save(tmp_path / f"{names[1].format(name)}.mrk.json", markup(curve, "F-", "Curve"))
+        expected[name] = np.concatenate([points, curve])
+    found = read_configurations(tmp_path)
+    assert set(found.names) == set(expected) and [len(at) for at, _ in found.curves] == [5]
+    for name, points in zip(found.names, found.points, strict=True):
+        np.testing.assert_array_equal(points, expected[name])
+
+
+def test_curves_of_several_sides_are_specimens_of_their_own(tmp_path: Path) -> None:
+    for name in ("a_left", "a_right", "b_left", "b_right"):
+        save(tmp_path / f"{name}.mrk.json", markup(np.random.default_rng(12).normal(size=(4, 3)), "C-", "Curve"))
+    assert read_configurations(tmp_path).names == ("a_left", "a_right", "b_left", "b_right")
+
+
+def test_lines_of_obj_are_named(write) -> None:
+    assert any("lines (l)" in note for note in read_mesh(write("a.obj", "v 1 2 3\nv 4 5 6\nl 1 2\n")).notes)
+
+
 def test_curves_of_one_name_are_the_same_in_any_order(tmp_path: Path) -> None:
     ridge, rim = (np.random.default_rng(k).normal(size=(6, 3)) for k in (8, 9))
     save(tmp_path / "a.mrk.json", markup(ridge, "ridge-", "Curve"), markup(rim, "rim-", "Curve"))

@@ -47,6 +47,8 @@ from shapespace.reprs import first_names
 
 _TEXTS = {".nts": parse_nts, ".dta": parse_dta}
 _MANY = (".tps", *_TEXTS)
+_SPECIMEN_OF_FILE = (r"(?P<name>.+?)(?:[ ._-](?P<kind>[^ ._-]+))?", r"(?:(?P<kind>[^ ._-]+)[ ._-])?(?P<name>.+)")
+"""Names of files of one specimen: NAME_landmarks and NAME_curve, or landmarks_NAME and curve_NAME."""
 _LINES = (".vtk", ".vtp")
 """Endings of files that may hold lines, which are curves, or surfaces."""
 _MORPHOLOGIKA = re.compile(rb"^(?:\xef\xbb\xbf)?\s*\[\s*individuals\s*\]", re.IGNORECASE | re.MULTILINE)
@@ -252,9 +254,7 @@ def _read_folder(folder: Path, curve_points: int | None) -> LandmarkConfiguratio
         [_read_file(file, None) if ending in _MANY else _read_specimen(file, ending) for file in files[ending]]
     )
     if len(parts) < len(files[ending]):
-        notes.append(
-            f"{len(files[ending])} files are joined to {len(parts)} specimens by the first part of their names."
-        )
+        notes.append(f"{len(files[ending])} files are joined to {len(parts)} specimens by their names.")
     labelled = [_with_labels_of(parts[0], part) for part in parts]
     if renamed := [Path(old.where).name for old, new in zip(parts, labelled, strict=True) if new is not old]:
         notes.append(
@@ -289,7 +289,7 @@ def _read_folder(folder: Path, curve_points: int | None) -> LandmarkConfiguratio
 def _prefixes(part: LandmarkConfigurations) -> dict[int, tuple[int, str, str]]:
     """Return landmark -> its curve, -1 for none, and the parts before and of the number in its label, such as `F-1`."""
     curve = {point: k for k, (points, _) in enumerate(part.curves) for point in points}
-    found = {k: re.fullmatch(r"(.*[-_])(\d+)", label) for k, label in enumerate(part.landmarks)}
+    found = {k: re.fullmatch(r"(|.*[-_ ])(\d+)", label) for k, label in enumerate(part.landmarks)}
     return {k: (curve.get(k, -1), match[1], match[2]) for k, match in found.items() if match}
 
 
@@ -347,16 +347,20 @@ def _with_equal_curves(
 
 
 def _join_files(parts: Sequence[LandmarkConfigurations]) -> Sequence[LandmarkConfigurations]:
-    """Return one part of each specimen where the files NAME_a and NAME_b have its landmarks and its curves."""
-    split = [re.split(r"[ ._-](?=[^ ._-]+$)", part.names[0], maxsplit=1) for part in parts if len(part) == 1]
-    groups: dict[str, list[LandmarkConfigurations]] = {}
-    for words, part in zip(split, parts, strict=False):
-        groups.setdefault(words[0], []).append(part)
-    kinds = {tuple(sorted(tuple(words[1:]) for words in split if words[0] == stem)) for stem in groups}
-    has_curves = [bool(part.curves) for part in parts]
-    if len(split) < len(parts) or len(kinds) != 1 or len(groups) == len(parts) or len(set(has_curves)) == 1:
-        return parts
-    return [_joined(stem, sorted(own, key=lambda one: bool(one.curves))) for stem, own in groups.items()]
+    """Return one part of each specimen where files such as NAME_a and NAME_b have its landmarks and its curves."""
+    points = sorted((re.escape(part.names[0]) for part in parts if not part.curves), key=len, reverse=True)
+    own_names = rf"(?P<name>{'|'.join(points)})(?:[ ._-](?P<kind>.+))?"
+    for pattern in (own_names, *_SPECIMEN_OF_FILE) if all(len(part) == 1 for part in parts) else ():
+        kinds, groups = dict[str, list[str | None]](), dict[str, list[LandmarkConfigurations]]()
+        for part in parts:
+            if match := re.fullmatch(pattern, part.names[0]):
+                kinds.setdefault(match["name"], []).append(match["kind"])
+                groups.setdefault(match["name"], []).append(part)
+        is_mixed = all({bool(part.curves) for part in own} == {True, False} for own in groups.values())
+        is_complete = sum(map(len, groups.values())) == len(parts)
+        if is_mixed and is_complete and len({frozenset(own) for own in kinds.values()}) == 1:
+            return [_joined(name, sorted(own, key=lambda one: bool(one.curves))) for name, own in groups.items()]
+    return parts
 
 
 def _joined(name: str, parts: Sequence[LandmarkConfigurations]) -> LandmarkConfigurations:
@@ -368,7 +372,7 @@ def _joined(name: str, parts: Sequence[LandmarkConfigurations]) -> LandmarkConfi
         names=(name,),
         points=np.concatenate([part.points for part in parts], axis=1),
         landmarks=tuple(
-            label if counts[label] == 1 else f"{part.names[0].removeprefix(name)[1:]}_{label}"
+            label if counts[label] == 1 else f"{part.names[0].replace(name, '').strip(' ._-')}_{label}"
             for part in parts
             for label in part.landmarks
         ),
