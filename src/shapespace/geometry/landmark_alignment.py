@@ -378,7 +378,7 @@ def _best_start(x: FloatArray, mean: FloatArray, known: BoolArray, at: IntArray,
     ]) + base  # fmt: skip
     if not closed:
         R = fit_rotations(products[:, 0])
-        away = []
+        away = list[float]()
         for order, rotation in zip(orders, R, strict=True):
             both = np.concatenate([x[known], order]) @ rotation.T, np.concatenate([mean[known], target])
             one, two = (part - part.mean(axis=0) for part in both)

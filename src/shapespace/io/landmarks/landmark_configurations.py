@@ -158,7 +158,7 @@ def spaced_points(path: FloatArray, count: int) -> FloatArray:
     """Return `count` points of a polyline (M, D) at equal distances along it, ends included."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     at: FloatArray = np.linspace(0.0, float(along[-1]), count)
-    return np.stack([np.interp(at, along, values) for values in path.T], axis=1)
+    return np.stack([np.interp(at, along, path[:, axis]) for axis in range(path.shape[1])], axis=1)
 
 
 def mark_missing(raw: LandmarkConfigurations) -> LandmarkConfigurations:

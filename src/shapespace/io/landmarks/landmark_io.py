@@ -357,8 +357,8 @@ def _slicer(value: Any, path: Path) -> Pairs:
     out: Pairs = []
     for markup in value["markups"]:
         sign = _sign_of_frame(str(markup.get("coordinateSystem", "LPS")), path)
-        units = markup.get("coordinateUnits", "mm")
-        unit = str(units[0] if isinstance(units, list) and units else units).strip().lower()
+        # One unit, or a list of that of each axis.
+        unit = next(iter(re.findall(r"\w+", str(markup.get("coordinateUnits") or "mm").lower())), "mm")
         if unit not in MM_OF_UNITS:
             raise damage_error(path, f"its coordinate units are {unit[:20]!r}, so save it in mm")
         for entry in markup["controlPoints"]:

@@ -63,6 +63,7 @@ _NRRD_TYPES = {
 }
 _META_TYPES = {"char": "signed char", "long": "int", "ulong": "uint", "ulong long": "ulonglong"}
 """Type of MetaImage after `MET_` -> name in NRRD, where they differ; others have the same."""
+_TRUE = ("true", "1")
 _META_END = re.compile(rb"^ElementDataFile\s*=[ \t]*(.*?)[ \t]*\r?(?:\n|\Z)", re.MULTILINE)
 # Sign of each axis of a space that takes it to right, anterior, superior.
 _NRRD_SPACES = {
@@ -366,17 +367,24 @@ def _open_nrrd(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tuple
         raise damage_error(path, "its header skips a part of the data, which is not read; save it again")
     head = _nrrd_head(fields, path)
     encoding = str(fields.get("encoding", "")).lower()
+    encoding = {"gz": "gzip", "bz2": "bzip2"}.get(encoding, encoding)
+    if encoding not in ("raw", "gzip", "bzip2"):
+        raise damage_error(path, f"its encoding is '{encoding}', but only raw, gzip and bzip2 are read; save it again")
     file.seek(start)
-    if encoding == "raw":
-        _check_declared(head, size - start, path)
-        return head, file
-    if encoding in ("gzip", "gz"):
-        _check_declared(head, _DEFLATE_GROWTH * (size - start), path)
-        return head, cast("IO[bytes]", stack.enter_context(gzip.GzipFile(fileobj=file)))
-    if encoding in ("bzip2", "bz2"):
-        _check_declared(head, _BZIP2_SPARE + _BZIP2_GROWTH * (size - start), path)
-        return head, stack.enter_context(bz2.BZ2File(file))
-    raise damage_error(path, f"its encoding is '{encoding}', but only raw, gzip and bzip2 are read; save it again")
+    return head, _voxel_stream(file, encoding, head, size - start, stack, path)
+
+
+def _voxel_stream(
+    file: BinaryIO, encoding: str, head: _VolumeHeader, size: int, stack: ExitStack, path: Path
+) -> IO[bytes]:
+    """Return a stream of the voxels in the `size` bytes that follow in a file, which can hold what is declared."""
+    growth = {"raw": size, "bzip2": _BZIP2_SPARE + _BZIP2_GROWTH * size}
+    _check_declared(head, growth.get(encoding, _DEFLATE_GROWTH * size), path)
+    if encoding == "gzip":
+        return cast("IO[bytes]", stack.enter_context(gzip.GzipFile(fileobj=file)))
+    if encoding == "bzip2":
+        return stack.enter_context(bz2.BZ2File(file))
+    return file if encoding == "raw" else cast("IO[bytes]", _ZlibStream(file))
 
 
 def _open_meta(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tuple[_VolumeHeader, IO[bytes]]:
@@ -391,9 +399,7 @@ def _open_meta(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tuple
     def numbers(*keys: str) -> FloatArray | None:
         return next((np.array(fields[key].split(), dtype=np.float64) for key in keys if key in fields), None)
 
-    def is_true(*keys: str) -> bool:
-        return any(fields.get(key, "").lower() in ("true", "1") for key in keys)
-
+    big = fields.get("binarydatabyteordermsb", fields.get("elementbyteordermsb", ""))
     kind = fields.get("elementtype", "").lower().removeprefix("met_").replace("_", " ")
     try:
         steps, turn = numbers("elementspacing", "elementsize"), numbers("transformmatrix", "rotation", "orientation")
@@ -402,7 +408,7 @@ def _open_meta(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tuple
             steps = (np.eye(len(steps)) if turn is None else turn.reshape(-1, len(steps))) * steps[:, None]
         known: dict[str, Any] = {
             "type": _META_TYPES.get(kind, kind),
-            "endian": "big" if is_true("binarydatabyteordermsb", "elementbyteordermsb") else "little",
+            "endian": "big" if big.lower() in _TRUE else "little",
             "sizes": fields.get("dimsize", "").split(),
             "dimension": fields.get("ndims"),
             "space": "lps",
@@ -420,15 +426,12 @@ def _open_meta(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tuple
     if name.upper() != "LOCAL":
         if not name or name.upper().startswith("LIST") or re.search(r"[/\\%]", name):
             raise damage_error(path, f"its data are not in one file in its folder ({name[:60]!r}); save it as .mha")
-        file = stack.enter_context(open_file(path.with_name(name)))
+        file = stack.enter_context(open_file(path.parent / name))
         size = os.fstat(file.fileno()).st_size
         start = size - head.bytes if skip < 0 else skip
     file.seek(max(start, 0))
-    if is_true("compresseddata"):
-        _check_declared(head, _DEFLATE_GROWTH * (size - start), path)
-        return head, cast("IO[bytes]", _ZlibStream(file))
-    _check_declared(head, size - start, path)
-    return head, file
+    encoding = "zlib" if fields.get("compresseddata", "").lower() in _TRUE else "raw"
+    return head, _voxel_stream(file, encoding, head, size - start, stack, path)
 
 
 class _ZlibStream(io.RawIOBase):
