@@ -9,6 +9,7 @@ import pytest
 
 from refusals import refusal_of
 from shapespace.cohort.landmark_cohort import has_landmarks
+from shapespace.commands.align import align
 from shapespace.geometry.landmark_alignment import AlignConfig, AlignedLandmarks, align_landmarks, match_curves
 from shapespace.io.landmarks.configuration_io import is_configurations, read_configurations
 from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations
@@ -318,3 +319,16 @@ def test_sliders_of_the_user_replace_those_of_curves(write) -> None:
     found = read_configurations(path, sliders=[write("s.csv", "before,slide,after\n1,2,3\n")])
     assert found.curves == () and found.curve_sliders.tolist() == [[0, 1, 2]]
     np.testing.assert_array_equal(replace(found, notes=()).points[0], x)
+
+
+def test_figures_draw_the_lines_of_curves_unless_links_are_given(tmp_path: Path) -> None:
+    x = outline(np.zeros(3), np.linspace(0, 6, 5), 2)
+    text = tps([(np.eye(2), [x[:3]], [posed(x, np.random.default_rng(k))]) for k in range(3)])
+    (tmp_path / "a.tps").write_text(text)
+    raw = read_configurations(tmp_path / "a.tps")
+    assert raw.curve_links == ((3, 4), (4, 5), (6, 7), (7, 8), (8, 9), (9, 10), (10, 6))
+    align(tmp_path / "a.tps", tmp_path / "out", curve_points=4)
+    assert json.loads((tmp_path / "out" / "orientation.json").read_text())["links"][-1] == [10, 7]
+    (tmp_path / "links.csv").write_text("1,2\n")
+    align(tmp_path / "a.tps", tmp_path / "out")
+    assert json.loads((tmp_path / "out" / "orientation.json").read_text())["links"] == [[1, 2]]

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from itertools import pairwise
 from pathlib import Path
-
-from msgspec import structs
 
 from shapespace.cohort.landmark_cohort import join_table, write_aligned
 from shapespace.cohort.table import Table, list_names, refuse_repeated
@@ -74,11 +71,7 @@ def align(
         raw = replace(raw, columns=covariates.columns, notes=(*raw.notes, *notes))
     if reflect is not None:
         raw = _reflected(raw, *reflect)
-    orientation = find_orientation(None, [data if data.is_dir() else data.parent], raw.landmarks)
-    if raw.curves and not (orientation and orientation.links):
-        rings = [[*points, *points[:1]] if closed else points for points, closed in raw.curves]
-        lines = tuple((first + 1, second + 1) for ring in rings for first, second in pairwise(ring))
-        orientation = structs.replace(orientation or Orientation(), links=lines)
+    orientation = find_orientation(None, [data if data.is_dir() else data.parent], raw.landmarks, raw.curve_links)
     aligned = align_landmarks(raw, config)
     findings = find_outliers(aligned)
     record = AlignRecord(

@@ -153,7 +153,8 @@ def plot_configurations(
 
     raw = read_configurations(data, sliders=sliders)
     aligned = align_landmarks(raw)
-    orientation = find_orientation(None, [data if data.is_dir() else data.parent], raw.landmarks) or Orientation()
+    folders = [data if data.is_dir() else data.parent]
+    orientation = find_orientation(None, folders, raw.landmarks, raw.curve_links) or Orientation()
     if links is not None:
         orientation = structs.replace(orientation, links=read_links(links, raw.landmarks))
     with figures.publication_style(), figures.oriented(orientation):

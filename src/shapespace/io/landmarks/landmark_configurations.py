@@ -86,14 +86,23 @@ class LandmarkConfigurations:
         return int(self.points.shape[2])
 
     @property
+    def curve_links(self) -> tuple[tuple[int, int], ...]:
+        """Pairs of neighbours along the curves, numbers from 1."""
+        return tuple((a + 1, b + 1) for points, closed in self.curves for a, b in pairwise(_ring(points, closed)))
+
+    @property
     def observed(self) -> BoolArray:
         """(N, L) whether a landmark is there."""
         return np.logical_not(np.logical_or.reduce(np.isnan(self.points), axis=2))
 
 
+def _ring(points: tuple[int, ...], closed: bool) -> tuple[int, ...]:
+    return (*points, *points[:1]) if closed else points
+
+
 def _sliders_of_curves(curves: Sequence[Curve]) -> IntArray:
     """Return (M, 3) the points before, sliding and after: all but ends of open curves and starts of closed ones."""
-    rings = [[*points, *points[:1]] if closed else points for points, closed in curves]
+    rings = [_ring(points, closed) for points, closed in curves]
     triples = [triple for ring in rings for triple in zip(ring, ring[1:], ring[2:], strict=False)]
     return np.reshape(triples, (-1, 3)).astype(np.int32)
 
