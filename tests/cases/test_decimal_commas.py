@@ -32,6 +32,10 @@ def prefixed(word: str) -> str:
     return "".join(f"{word} {row}\n" for row in ROWS.splitlines())
 
 
+WRL = (
+    "#VRML V2.0 utf8\nShape {{ geometry IndexedFaceSet {{ coord Coordinate {{ point [\n{}] }} "
+    "coordIndex [0,1,2,-1] }} }}"
+)
 MESHES = {
     "a.xyz": ROWS,
     "b.xyz": "x,y,z\n" + ROWS.replace(" ", "\t"),
@@ -46,7 +50,18 @@ MESHES = {
     "b.vtk": VTK.format(ROWS.replace("\n", " ")),
     "a.vtp": VTP.format(ROWS),
     "a.pcd": PCD.format(ROWS),
+    "a.wrl": WRL.format(ROWS),
+    "b.wrl": WRL.format(ROWS.replace("\n", ",\n")),
 }
+
+
+@pytest.mark.parametrize(
+    "rows", ["0 0 0,1 0 0,0 2 0", "0 0 0, 1 0 0, 0 2 0,", "0,0,0,1,0,0,0,2,0", "0, 0, 0,\n1,0,0\n0 2 0"]
+)
+def test_commas_between_numbers_of_vrml_stay_what_they_are(rows: str, write) -> None:
+    np.testing.assert_array_equal(
+        read_mesh(write("a.wrl", WRL.format(rows))).vertices, [[0, 0, 0], [1, 0, 0], [0, 2, 0]]
+    )
 
 
 @pytest.mark.parametrize("name", MESHES)
@@ -137,3 +152,21 @@ def test_tables_name_the_decimal_comma(write) -> None:
 def test_nts_may_have_decimal_commas(tmp_path: Path, write) -> None:
     found = read_configurations(write("a.nts", "1 2L 4 0 DIM=2\na b\n1,5 2,5 3,5 4\n0,5 1 2 3\n"))
     np.testing.assert_array_equal(found.points, [[[1.5, 2.5], [3.5, 4]], [[0.5, 1], [2, 3]]])
+
+
+@pytest.mark.parametrize("space", ["\u00a0", "\u2009", "\u202f"])
+def test_spaces_for_thousands_are_named(space: str, write) -> None:
+    for name, head in (("a.xyz", ""), ("a.obj", "v ")):
+        assert "spaces for thousands in line 1" in refused_mesh(write(name, f"{head}1{space}234,5 2,0 3,0\n"))
+    assert "spaces for thousands in line 2" in refused_landmarks(write("a.tps", f"LM3=1\n1{space}234.5 2 3\nID=a\n"))
+    assert len(read_mesh(write("b.xyz", f"# made{space}by 1{space}b\n1 2 3\n")).vertices) == 1
+
+
+def test_the_rest_of_a_number_after_a_space_is_no_coordinate(write) -> None:
+    assert "line 1 ('v 1 000,5 2,0 3,0')" in refused_mesh(write("a.obj", "v 1 000,5 2,0 3,0\n"))
+
+
+def test_semicolons_separate_coordinates_of_tps(write) -> None:
+    for rows in ("1.5;2.5\n2;3\n", "1,5; 2,5\n2;3\n"):
+        found = read_configurations(write("a.tps", f"LM=2\n{rows}ID=a\n"))
+        np.testing.assert_array_equal(found.points, [[[1.5, 2.5], [2, 3]]])

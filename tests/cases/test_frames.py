@@ -95,6 +95,8 @@ AS_3D_SLICER_WRITES = {
     "a.stl": ascii_stl("3D Slicer output. SPACE=RAS"),
     "title.vtk": vtk_text("3D Slicer output. SPACE=RAS"),
     "field.vtk": vtk_text("vtk output", "FIELD FieldData 1\nSPACE 1 1 string\nRAS\n"),
+    "long.ply": PLY.replace("=RAS", " = right-anterior-superior"),
+    "lower.vtp": vtp_text(f'{SPACE_FIELD.replace("SPACE", "space")} format="ascii">82 65 83 0</Array>'),
     "ascii.vtp": vtp_text(f'{SPACE_FIELD} format="ascii">82 65 83 0</Array>'),
     "binary.vtp": vtp_text(f'{SPACE_FIELD} format="binary">{CODES}</Array>'),
     "appended.vtp": vtp_text(
@@ -111,7 +113,12 @@ def test_the_mark_ras_is_honoured_and_no_mark_means_as_it_is(name: str, tmp_path
     assert np.array_equal(np.sort(ras, axis=0), np.sort(V, axis=0))
     for other in ("LPS", "XYZ"):
         codes = base64.b64encode((4).to_bytes(4, "little") + other.encode() + b"\0").decode()
-        text_of = text.replace("RAS", other).replace("82 65 83 0", "76 80 83 0").replace(CODES, codes)
+        text_of = (
+            text.replace("RAS", other)
+            .replace("right-anterior-superior", other)
+            .replace("82 65 83 0", "76 80 83 0")
+            .replace(CODES, codes)
+        )
         path.write_bytes(text_of.encode())
         assert np.array_equal(read_mesh(path).vertices, ras) and not read_mesh(path).notes
 
@@ -261,3 +268,15 @@ def test_segments_in_one_layer_have_names_too() -> None:
     assert surface_of_volume(volume, "all").labels == ("bone", "tooth")
     with pytest.raises(InputError, match="there is no label none in it; it has bone, tooth"):
         surface_of_volume(volume, "none")
+
+
+def test_names_of_segments_may_have_any_letters_and_their_numbers_gaps(tmp_path: Path) -> None:
+    nrrd = pytest.importorskip("nrrd", reason="the extra `volumes` is not installed")
+    layers, header = layered()
+    header = {key.replace("Segment1_", "Segment400_"): value for key, value in header.items()}
+    path = tmp_path / "a.seg.nrrd"
+    nrrd.write(str(path), layers, header, index_order="F")
+    path.write_bytes(path.read_bytes().replace(b":=cartilage", ":=Knörpel".encode()))
+    volume = read_volume(path)
+    assert [segment.name for segment in volume.segments] == ["bone", "left, tooth", "Knörpel"]
+    assert surface_of_volume(volume, "Knörpel").voxels == (layers[1] == 1).sum()

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from refusals import refusal_of
-from shapespace.errors import InputError
+from shapespace.cli import main
+from shapespace.errors import FileFormatError, InputError
 from shapespace.io.landmarks.configuration_io import is_configurations, read_configurations
 from shapespace.io.landmarks.landmark_io import read_landmarks
-from shapespace.io.meshes.mesh_io import read_mesh
 
 POINTS = np.arange(18.0).reshape(6, 3) ** 1.5
 
@@ -148,17 +148,74 @@ def test_amira_landmarks_are_read(decimal: str, write) -> None:
         assert why in refusal_of(read_landmarks, write("b.landmarkAscii", text))
 
 
-LINES = (
-    "# vtk DataFile Version 3.0\na\nASCII\nDATASET POLYDATA\nPOINTS 3 float\n1 2 3\n4 5 6\n7 8 9\nLINES 1 4\n3 0 1 2\n"
-)
-VTP_LINES = (
-    '<VTKFile type="PolyData"><PolyData><Piece NumberOfPoints="3" NumberOfLines="1"><Points>'
-    '<DataArray type="Float32" format="ascii">1 2 3 4 5 6 7 8 9</DataArray></Points></Piece></PolyData></VTKFile>'
-)
+def test_raw_coordinates_that_fit_both_are_read_with_the_dimensions(write) -> None:
+    path = write("a.txt", raw_table(12))
+    for dimensions in (2, 3):
+        found = read_configurations(path, dimensions=dimensions)
+        np.testing.assert_array_equal(found.points[0], np.arange(12).reshape(-1, dimensions))
+    assert "--dimensions 2 (or 3)" in refusal_of(read_configurations, path)
+    for count, dimensions, said in ((9, 2, "not a multiple of 2"), (8, 3, "not a multiple of 3"), (7, 2, "neither")):
+        name = write(f"{count}.txt", raw_table(count))
+        with pytest.raises(FileFormatError, match=said):
+            read_configurations(name, dimensions=dimensions)
+    with pytest.raises(InputError, match="has landmarks in 2-D; leave --dimensions 3 out"):
+        read_configurations(write("a.tps", "LM=2\n1 2\n3 4\n"), dimensions=3)
 
 
-@pytest.mark.parametrize(("name", "text"), [("a.vtk", LINES), ("a.vtp", VTP_LINES)])
-def test_lines_of_vtk_are_named(name: str, text: str, write) -> None:
-    found = read_mesh(write(name, text))
-    assert found.faces is None and any("lines" in note for note in found.notes)
-    np.testing.assert_array_equal(found.vertices, [[1, 2, 3], [4, 5, 6], [7, 8, 9]])
+def test_the_dimensions_of_a_morphoj_table_lead_to_an_analysis(write, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(0)
+    header = ["Id", *(f"Raw coord {k}" for k in range(1, 13)), "sex"]
+    rows = [[f"s{k}", *(f"{x:.4f}".replace(".", ",") for x in np.arange(12) ** 1.3 + rng.normal(size=12)), "fm"[k % 2]]
+            for k in range(10)]  # fmt: skip
+    path = write("a.txt", "\n".join("\t".join(row) for row in [header, *rows]) + "\n")
+    out = path.parent
+    assert main(["align", str(path), "-o", str(out / "b")]) == 2 and "--dimensions" in capsys.readouterr().err
+    assert main(["align", str(path), "-o", str(out / "b"), "--dimensions", "3"]) == 0
+    assert main(["landmarks", "convert", str(path), "-o", str(out / "c.csv"), "--dimensions", "2"]) == 0
+    assert read_configurations(out / "c.csv").points.shape == (10, 6, 2)
+    for data in ("b", "c.csv"):
+        compare = ["compare", str(out / data), "--formula", "~ sex", "-o", str(out / "d"), "--permutations", "99"]
+        assert main(compare) == 0
+
+
+def test_other_writings_of_morphologika_are_read(write) -> None:
+    lines = MORPHOLOGIKA.replace("\r\n", "\n").removeprefix("\ufeff")
+    sections = ["[" + part for part in lines.split("[")[1:]]
+    for text in (
+        "".join(sections[::-1]), lines.replace("]\n2", "] 2"), lines.replace("[", "[ ").replace("]", " ]").upper(),
+        lines.replace("'#", "#"), lines.replace(" ", "\t").replace("first\tone", "first one").replace("b,\t2", "b, 2"),
+    ):  # fmt: skip
+        found = read_configurations(write("a.txt", text))
+        assert [name.lower() for name in found.names] == ["first one", "b, 2"]
+        np.testing.assert_array_equal(found.points, [[[1, 2], [3, 4.5]], [[np.nan] * 2, [7, 8]]])
+    spaced = lines.replace("sex age", "sex\tplace").replace("F 1", "F\tNew York").replace("M 2", "M\tRome")
+    assert read_configurations(write("b.txt", spaced)).columns["place"] == ("New York", "Rome")
+
+
+@pytest.mark.parametrize("folder", ["C:\\data\\", "data/"])
+def test_specimens_are_called_as_their_files_without_folders(folder: str, write) -> None:
+    block = "LM=2\n1 2\n3 4\nIMAGE={}\nID=0\n"
+    both = [f"{folder}a.jpg", f"{folder}b.jpg"]
+    assert read_configurations(write("a.tps", "".join(map(block.format, both)))).names == ("a", "b")
+    twins = ["left/a.jpg", "right/a.jpg"]
+    assert read_configurations(write("b.tps", "".join(map(block.format, twins)))).names == ("left/a", "right/a")
+    idav = f"1 2L 6 0 DIM=3\n{folder}a.PLY {folder}b.ply.gz\n1 2 3\n4 5 6\n0 0 0\n7 8 9\n"
+    assert read_configurations(write("a.dta", idav)).names == ("a", "b")
+
+
+@pytest.mark.parametrize(("system", "sign"), [
+    ("RAS", -1), (" ras ", -1), ("0", -1), (0, -1), ("right-anterior-superior", -1), ("LPS", 1), (1, 1),
+    ("left-posterior-superior", 1),
+])  # fmt: skip
+def test_the_frame_of_slicer_has_several_writings(system: object, sign: int, tmp_path: Path) -> None:
+    save(tmp_path / "a.mrk.json", {**markup(POINTS[:1] + 1, "L"), "coordinateSystem": system})
+    np.testing.assert_array_equal(read_landmarks(tmp_path / "a.mrk.json")["L1"], (POINTS[0] + 1) * (sign, sign, 1))
+
+
+@pytest.mark.parametrize(("unit", "mm"), [("mm", 1), ("cm", 10), ("m", 1000), (["um", "um", "um"], 1e-3), ("ell", 0)])
+def test_the_unit_of_slicer_is_converted_to_millimetres(unit: object, mm: float, tmp_path: Path) -> None:
+    save(tmp_path / "a.mrk.json", {**markup(POINTS[2:3], "L"), "coordinateUnits": unit})
+    if not mm:
+        assert "coordinate units are 'ell'" in refusal_of(read_landmarks, tmp_path / "a.mrk.json")
+    else:
+        np.testing.assert_allclose(read_landmarks(tmp_path / "a.mrk.json")["L1"], mm * POINTS[2], rtol=1e-12)

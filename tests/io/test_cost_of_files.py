@@ -25,6 +25,7 @@ from shapespace.errors import FileError, FileFormatError, ShapespaceError
 from shapespace.io import read_limits as limits
 from shapespace.io.files import sha256_of_file
 from shapespace.io.landmarks import landmark_io as landmarks
+from shapespace.io.landmarks.configuration_io import read_configurations
 from shapespace.io.landmarks.landmark_io import LANDMARK_FORMATS, READ_ONLY_LANDMARKS, read_landmarks, write_landmarks
 from shapespace.io.meshes import mesh_io as meshes
 from shapespace.io.meshes.mesh_io import MESH_ENDINGS, read_mesh, write_mesh
@@ -209,6 +210,7 @@ FILES: dict[str, Callable[[int], bytes]] = {
     "packed.vtk": vtk(lambda size: repeated(b"POLYGONS 0 0\n", size), b"BINARY"),
     "fields.vtk": vtk(lambda size: repeated(b"FIELD a 1 b 1 0 int\n", size)),
     "cells.vtk": vtk(vtk_cells),
+    "curves.vtk": vtk(lambda size: repeated(b"2 0 0\n", size, b"LINES %d %d\n" % (size // 6, size // 6 * 3))),
     "offset.vtp": vtp_on_one_offset,
     "bomb.vtp": vtp_bomb,
     "text.vtp": vtp_text,
@@ -258,6 +260,8 @@ FILES: dict[str, Callable[[int], bytes]] = {
 
 
 def read(path: Path) -> object:
+    if path.name == "curves.vtk":
+        return read_configurations(path)
     ending = next(e for e in (*MESH_ENDINGS, *LANDMARK_FORMATS, *READ_ONLY_LANDMARKS) if path.name.endswith(e))
     try:
         return read_mesh(path) if ending in MESH_ENDINGS else read_landmarks(path)

@@ -25,6 +25,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from shapespace.errors import ShapespaceError
+from shapespace.io.landmarks.configuration_io import read_configurations
 from shapespace.io.landmarks.landmark_io import (
     LANDMARK_FORMATS,
     READ_ONLY_LANDMARKS,
@@ -108,6 +109,30 @@ LISTS = (
     b"element face 2\nproperty list uchar int vertex_indices\nproperty list uchar float texcoord\nend_header\n"
     b"0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 1 2 2 .5 .5\n4 0 1 2 3 0\n"
 )
+
+
+CURVES: dict[str, list[bytes]] = {
+    ".vtk": [
+        b"# vtk DataFile Version 3.0\na\nASCII\nDATASET POLYDATA\nPOINTS 5 float\n0 0 0 1 0 0 1 1 0 0 1 0 2 2 2\n"
+        b"LINES 4 13\n2 0 1\n2 2 1\n3 2 3 0\n2 3 4\n"
+    ],
+    ".vtp": [
+        b"<VTKFile type='PolyData'><PolyData><Piece NumberOfPoints='3'><Points>"
+        b"<DataArray type='Float32' format='ascii'>0 0 0 1 0 0 1 1 0</DataArray></Points>"
+        b"<Lines><DataArray type='Int64' Name='connectivity' format='ascii'>"
+        b"0 1 1 2 0</DataArray><DataArray type='Int64' Name='offsets' format='ascii'>2 5</DataArray></Lines></Piece>"
+        b"</PolyData></VTKFile>"
+    ],
+    ".tps": [
+        b"LM=1\n1 2\nCURVES=1\nPOINTS=2\n1 2\n3 4\nOUTLINES=1\nPOINTS=4\n0 0\n1 0\n1 1\n0 0\nID=a\n"
+        b"LM=1\n1 2\nCURVES=1\nPOINTS=3\n1 2\n3 4\nNA NA\nOUTLINES=1\nPOINTS=3\n0 0\n1 0\n1 1\nID=b\n"
+    ],
+    ".mrk.json": [
+        json.dumps({"markups": [{"type": kind, "controlPoints": [
+            {"label": f"{kind}-{k}", "position": [k, k * k, 1]} for k in range(4)
+        ]} for kind in ("Fiducial", "Curve", "ClosedCurve")]}).encode()
+    ],
+}  # fmt: skip
 
 
 def written(mesh: Mesh, ending: str) -> list[bytes]:
@@ -306,6 +331,16 @@ def fuzz(read: Callable[[Path], object], path: Path, samples: list[bytes]) -> No
 @pytest.mark.parametrize("ending", MESHES)
 def test_a_damaged_mesh_file_is_a_mesh_or_one_sentence(ending: str, tmp_path: Path) -> None:
     fuzz(read_mesh, tmp_path / f"bad{ending}", MESHES[ending])
+
+
+@pytest.mark.parametrize("ending", [".vtk", ".vtp", ".tps", ".mrk.json"])
+def test_a_damaged_file_of_curves_is_curves_or_one_sentence(ending: str, tmp_path: Path) -> None:
+    def read(path: Path) -> dict[str, np.ndarray]:
+        found = read_configurations(path)
+        assert all(0 <= k < found.points.shape[1] for at, _ in found.curves for k in at)
+        return dict.fromkeys(found.landmarks, np.zeros(3))
+
+    fuzz(read, tmp_path / f"a{ending}", CURVES[ending])
 
 
 def test_a_damaged_packed_file_is_a_mesh_or_one_sentence(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ import bz2
 import gzip
 import struct
 import tracemalloc
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,34 @@ def write_nrrd(path: Path, labels: Any = LABELS, **header: Any) -> Path:
     return path
 
 
+META = (
+    b"ObjectType = Image\nNDims = 3\nBinaryData = True\nBinaryDataByteOrderMSB = False\nElementSpacing = 1 2 3\n"
+    b"DimSize = 5 6 7\nElementType = MET_UCHAR\nElementDataFile = LOCAL\n"
+)
+
+
+def write_meta(path: Path, labels: Any = LABELS, *, lps: Any = TILTED, kind: Any = np.uint8, packed: bool = False,
+               data_file: str = "LOCAL", head: str = "") -> Path:  # fmt: skip
+    """Write MetaImage as ITK does: TransformMatrix has the direction of each axis in a row, in LPS."""
+    names = {"u1": "UCHAR", "i2": "SHORT", "u4": "UINT", "i8": "LONG_LONG", "f4": "FLOAT"}
+    kind = np.dtype(kind)
+    steps = np.linalg.norm(lps[:3, :3], axis=0)
+    rows, voxels = (lps[:3, :3] / steps).T, np.asarray(labels).astype(kind).tobytes(order="F")
+    voxels = zlib.compress(voxels) if packed else voxels
+    text = (
+        f"ObjectType = Image\nNDims = 3\nBinaryData = True\nBinaryDataByteOrderMSB = {kind.byteorder == '>'}\n"
+        f"CompressedData = {packed}\nTransformMatrix = {' '.join(map(repr, rows.ravel().tolist()))}\n"
+        f"Offset = {' '.join(map(repr, lps[:3, 3].tolist()))}\nCenterOfRotation = 0 0 0\n"
+        f"AnatomicalOrientation = RAI\nElementSpacing = {' '.join(map(repr, steps.tolist()))}\n"
+        f"DimSize = {' '.join(map(str, np.shape(labels)))}\n{head}ElementType = MET_{names[kind.str[1:]]}\n"
+        f"ElementDataFile = {data_file}\n"
+    )
+    if data_file != "LOCAL":
+        (path.parent / data_file).write_bytes(voxels)
+    path.write_bytes(text.encode() + voxels * (data_file == "LOCAL"))
+    return path
+
+
 def patched(path: Path, at: int, content: bytes) -> Path:
     data = path.read_bytes()
     path.write_bytes(data[:at] + content + data[at + len(content) :])
@@ -63,6 +92,29 @@ def test_nrrd_labels_are_those_written(encoding: str, kind: Any, tmp_path: Path)
     volume = read_volume(tmp_path / "a.nrrd")
     assert (volume.labels == LABELS).all()
     assert np.allclose(volume.affine, TILTED)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("kind", ["u1", "<i2", ">i2", ">u4", "<i8", "<f4"])
+@pytest.mark.parametrize("name", ["a.mha", "A.MHD"])
+def test_metaimage_labels_and_frame_are_those_of_itk(name: str, kind: str, packed: bool, tmp_path: Path) -> None:
+    data_file = "LOCAL" if name == "a.mha" else "a b.zraw"
+    volume = read_volume(write_meta(tmp_path / name, kind=kind, packed=packed, data_file=data_file))
+    assert (volume.labels == LABELS).all() and volume.notes == ()
+    assert np.allclose(volume.affine, np.diag([-1.0, -1, 1, 1]) @ TILTED)
+
+
+def test_a_data_file_of_metaimage_may_have_a_header_of_its_own(tmp_path: Path) -> None:
+    for skip in (-1, 40):
+        path = write_meta(tmp_path / "a.mhd", data_file="a.raw", head=f"HeaderSize = {skip}\n")
+        _put(tmp_path / "a.raw", b"h" * 40 + (tmp_path / "a.raw").read_bytes())
+        assert (read_volume(path).labels == LABELS).all()
+
+
+def test_metaimage_without_a_matrix_lies_along_the_axes_with_a_note(tmp_path: Path) -> None:
+    volume = read_volume(_put(tmp_path / "a.mha", META + LABELS.astype(np.uint8).tobytes(order="F")))
+    assert (volume.labels == LABELS).all() and np.allclose(volume.affine, np.diag([-1.0, -2, 3, 1]))
+    assert len(volume.notes) == 1 and "left and right may be swapped" in volume.notes[0]
 
 
 @pytest.mark.parametrize(
@@ -151,7 +203,22 @@ BAD: dict[str, tuple[Callable[[Path], Path], str]] = {
     "empty file": (lambda d: _put(d / "a.nii", b""), "it is empty"),
     "text": (lambda d: _put(d / "a.nii", b"Dear reader, this is no volume." * 20), "not that of a NIfTI"),
     "text as nrrd": (lambda d: _put(d / "a.nrrd", b"Dear reader, this is no volume." * 20), "not that of a NRRD"),
-    "other ending": (lambda d: _put(d / "a.mha", b"x"), ".nii.gz"),
+    "other ending": (lambda d: _put(d / "a.mnc", b"x"), ".nii.gz"),
+    "text as mha": (lambda d: _put(d / "a.mha", b"Dear reader, this is no volume." * 20), "not that of a MetaImage"),
+    "cut short, mha": (lambda d: _cut(write_meta(d / "a.mha")), "more than the file can hold"),
+    "cut short, mha zlib": (lambda d: _put(d / "a.mha", write_meta(d / "a.mha", packed=True).read_bytes()[:-20]),
+                            "cut short"),
+    "checksum, mha zlib": (lambda d: _flip(write_meta(d / "a.mha", packed=True), -1), "or are wrong"),
+    "mhd elsewhere": (lambda d: _put(d / "a.mhd", META.replace(b"LOCAL", b"../a.raw")), "in one file in its folder"),
+    "mhd in slices": (lambda d: _put(d / "a.mhd", META.replace(b"LOCAL", b"LIST")), "not in one file in its folder"),
+    "mhd without data": (lambda d: _put(d / "a.mhd", META.replace(b"LOCAL", b"a.mhd")), "more than the file can hold"),
+    "mha of vectors": (lambda d: _put(d / "a.mha", b"ElementNumberOfChannels = 3\n" + META), "several values"),
+    "mha without spacing": (lambda d: _put(d / "a.mha", META.replace(b"Spacing", b"Space")), "how large a voxel is"),
+    "mha of words": (lambda d: _put(d / "a.mha", META.replace(b"5 6 7", b"five")), "is damaged"),
+    "mha of no size": (lambda d: _put(d / "a.mha", META.replace(b"5 6 7", b"0 6 7")), "there are none"),
+    "mha of slices": (lambda d: _put(d / "a.mha", META.replace(b"5 6 7", b"5 6").replace(b"NDims = 3", b"NDims = 2")
+                                     .replace(b"1 2 3", b"1 2")), "three dimensions"),
+    "huge mha": (lambda d: _put(d / "a.mha", META.replace(b"5 6 7", b"9999 9999 9999")), "over the bound"),
     "cut short": (lambda d: _cut(write_nifti(d / "a.nii")), "than the file can hold"),
     "cut short, gz": (lambda d: _cut(write_nifti(d / "a.nii.gz", np.arange(8000).reshape(20, 20, 20) % 251)),
                       "end early"),
@@ -236,10 +303,13 @@ def test_what_is_no_sound_volume_is_refused_in_one_sentence(kind: str, tmp_path:
     assert ";" in sentence or ", so " in sentence, f"no advice: {sentence}"
 
 
-@pytest.mark.parametrize("pack", [gzip.compress, bz2.compress])
+@pytest.mark.parametrize("pack", [gzip.compress, bz2.compress, zlib.compress])
 def test_what_grows_beyond_its_header_takes_no_more_memory_than_declared(pack: Any, tmp_path: Path) -> None:
     encoding = b"gzip" if pack is gzip.compress else b"bzip2"
     path = _put(tmp_path / "a.nrrd", _nrrd_text(20, encoding) + pack(bytes(200_000_000)))
+    if pack is zlib.compress:
+        head = b"CompressedData = True\n" + META.replace(b"5 6 7", b"20 20 20")
+        path = _put(tmp_path / "a.mha", head + pack(bytes(200_000_000)))
     tracemalloc.start()
     try:
         assert read_volume(path).labels.shape == (20, 20, 20)
@@ -290,10 +360,13 @@ def test_reading_takes_the_memory_of_the_labels_alone(name: str, kind: Any, tmp_
 
 
 @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(name=st.sampled_from(["a.nii", "a.nii.gz", "a.nrrd"]), data=st.data())
+@given(name=st.sampled_from(["a.nii", "a.nii.gz", "a.nrrd", "a.mha", "z.mha"]), data=st.data())
 def test_damage_ends_in_a_volume_or_in_a_sentence(name: str, data: st.DataObject, tmp_path: Path) -> None:
     path = tmp_path / name
-    write_nrrd(path) if name.endswith(".nrrd") else write_nifti(path)
+    if name.endswith(".mha"):
+        write_meta(path, packed=name == "z.mha")
+    else:
+        write_nrrd(path) if name.endswith(".nrrd") else write_nifti(path)
     content = bytearray(path.read_bytes())
     for _ in range(data.draw(st.integers(1, 4))):
         content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
@@ -314,7 +387,15 @@ def test_the_sentence_says_how_to_get_what_is_missing(tmp_path: Path, monkeypatc
 
 @pytest.mark.parametrize(
     ("file", "name"),
-    [("a.nii", "a"), ("a.NII.gz", "a"), ("a.b.nrrd", "a.b"), ("a.seg.nrrd", "a"), ("nii", "nii"), (".nii", ".nii")],
+    [
+        ("a.nii", "a"),
+        ("a.NII.gz", "a"),
+        ("a.b.nrrd", "a.b"),
+        ("a.seg.nrrd", "a"),
+        ("a.mhd", "a"),
+        ("nii", "nii"),
+        (".nii", ".nii"),
+    ],
 )
 def test_a_name_is_that_of_the_file_without_its_ending(file: str, name: str) -> None:
     assert volume_name(Path(file)) == name

@@ -671,6 +671,8 @@ COMMANDS: tuple[Command, ...] = (
             basic("--to", "FORMAT", source=LANDMARKS_CONVERT),
             _SLIDERS,
             basic("--object", "NAME", source=LANDMARKS_CONVERT, field="object_name"),
+            basic("--curve-points", "N", source=LANDMARKS_CONVERT, parse=values.positive),
+            basic("--dimensions", "D", source=LANDMARKS_CONVERT, parse=values.positive),
         ),
         (
             "Coordinates are exact. Prints what was scaled, taken as missing or left out. Sliders are written next to "
@@ -726,13 +728,18 @@ COMMANDS: tuple[Command, ...] = (
             _OUTPUT,
             basic("--table", "TABLE", source=ALIGN_FILES, parse=Path),
             basic("--sliders", "FILE", "semilandmarks, numbered from 1: rows of before, slide, after for curves, or "
-                  "one column for surfaces; can be repeated", parse=Path, repeat=True),
+                  "one column for surfaces; can be repeated", source=ALIGN_FILES, parse=Path, repeat=True,
+                  default=[]),
             basic("--slide-by", source=ALIGN),
+            basic("--curve-points", "N", source=ALIGN_FILES, parse=values.positive),
+            basic("--dimensions", "D", source=ALIGN_FILES, parse=values.positive),
             basic("--missing", source=ALIGN),
             basic("--separate", "FILE", source=ALIGN_FILES, parse=Path),
             basic("--reflect", "COLUMN=VALUE", "specimens that are reflected before the alignment, such as side=left"),
             basic("--gauge", source=ALIGN),
             advanced("--no-tangent", help="do not project shapes onto the tangent space", source=ALIGN),
+            advanced("--no-match-curves", help="keep the first points of closed curves and the directions of curves",
+                     source=ALIGN),
             advanced("--tolerance", "T", source=ALIGN),
             advanced("--iterations", "N", source=ALIGN, parse=values.positive),
         ),

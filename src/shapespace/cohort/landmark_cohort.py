@@ -11,13 +11,14 @@ import numpy as np
 from shapespace.cohort.cohort import Cohort, padded
 from shapespace.cohort.table import Table, list_names, match_rows, name_key, numbers_as_text, read_table
 from shapespace.errors import FileFormatError, InputError
-from shapespace.geometry.landmark_alignment import AlignConfig, AlignedLandmarks, align_landmarks
+from shapespace.geometry.landmark_alignment import AlignConfig, AlignedLandmarks, align_landmarks, match_curves
 from shapespace.geometry.procrustes import Gauge, centroid_size
 from shapespace.io.containers.json_files import read_json
 from shapespace.io.files import make_folder, write_text
 from shapespace.io.landmarks.configuration_io import (
     RECORD,
     is_configurations,
+    is_lines,
     read_configurations,
     write_configurations,
 )
@@ -38,7 +39,7 @@ def has_landmarks(path: Path) -> bool:
     """Return whether a path is a landmark file, a folder of such files without meshes, or one that `align` wrote."""
     if not path.is_dir() or (path / RECORD).is_file():
         return path.is_dir() or is_configurations(path)
-    return is_configurations(path) and not any(ending_of(file) in MESH_ENDINGS for file in path.iterdir())
+    return is_configurations(path) and all(map(is_lines, (f for f in path.iterdir() if ending_of(f) in MESH_ENDINGS)))
 
 
 def write_aligned(folder: Path, aligned: AlignedLandmarks, record: AlignRecord) -> None:
@@ -135,9 +136,11 @@ def read_landmark_cohort(
             return _onto(coords, source.landmarks, covariates, onto, notes, source.sizes[rows])
         cohort = Cohort.of_landmarks(source, gauge=gauge).take(rows)
         return replace(cohort, table=covariates, notes=(*notes, *cohort.notes))
-    if onto is not None:
-        return _onto(source.points[rows], source.landmarks, covariates, onto, [*source.notes, *notes])
     raw = replace(source, names=covariates.rows, points=source.points[rows], columns={})
+    if onto is not None:
+        mean = onto.vertices(onto.coefficients.mean(axis=0))[:, : onto.dimensions]
+        raw = match_curves(raw, mean) if raw.points.shape[1:] == mean.shape else raw
+        return _onto(raw.points, raw.landmarks, covariates, onto, [*raw.notes, *notes])
     cohort = Cohort.of_landmarks(align_landmarks(raw, AlignConfig(gauge=gauge)), covariates)
     note = "The landmarks are aligned by generalised Procrustes analysis with default options."
     return replace(cohort, notes=(*notes, note, *cohort.notes))

@@ -10,7 +10,13 @@ from shapespace.cohort.landmark_cohort import join_table, write_aligned
 from shapespace.cohort.table import Table, list_names, refuse_repeated
 from shapespace.commands.landmark_data import find_other_scales
 from shapespace.errors import FileFormatError, InputError
-from shapespace.geometry.landmark_alignment import AlignConfig, AlignedLandmarks, align_landmarks, find_outliers
+from shapespace.geometry.landmark_alignment import (
+    AlignConfig,
+    AlignedLandmarks,
+    align_landmarks,
+    find_outliers,
+    with_criterion,
+)
 from shapespace.io.files import make_folder, write_text
 from shapespace.io.landmarks.configuration_io import read_configurations
 from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations
@@ -31,10 +37,13 @@ def align(
     sliders: Sequence[Path] = (),
     separate: Path | None = None,
     reflect: tuple[str, str] | None = None,
+    curve_points: int | None = None,
+    dimensions: int | None = None,
 ) -> tuple[AlignedLandmarks, AlignRecord]:
     """Align the landmarks of many specimens, name specimens to check, and write all to a folder.
 
-    links.csv and orientation.json next to the data become orientation.json in the folder, for its figures.
+    links.csv and orientation.json next to the data become orientation.json in the folder, for its figures. Without
+    links, figures draw the curves.
 
     Args:
         data: landmark file, or folder of them.
@@ -44,14 +53,17 @@ def align(
         sliders: files of semilandmarks: rows of before, slide, after for curves; a single column for surfaces.
         separate: table of landmark and structure, for structures that are aligned separately.
         reflect: column and value of specimens that are reflected before the alignment, such as left sides.
+        curve_points: points of each curve or outline, at equal distances (default: as in the file if all specimens
+            have the same number, else their least number; of outlines at most 100)
+        dimensions: 2 or 3, of raw coordinates of MorphoJ whose number fits both (default: by their number)
 
     Raises:
         FileError: something cannot be read or written.
         FileFormatError: something is damaged.
         InputError: landmarks that cannot be aligned.
     """
-    config = config or AlignConfig()
-    raw = read_configurations(data, sliders=sliders)
+    raw = read_configurations(data, sliders=sliders, curve_points=curve_points, dimensions=dimensions)
+    config = with_criterion(config or AlignConfig(), raw)
     if separate is not None:
         config = replace(config, structures=_structures(separate))
     if table is not None:
@@ -59,7 +71,7 @@ def align(
         raw = replace(raw, columns=covariates.columns, notes=(*raw.notes, *notes))
     if reflect is not None:
         raw = _reflected(raw, *reflect)
-    orientation = find_orientation(None, [data if data.is_dir() else data.parent], raw.landmarks)
+    orientation = find_orientation(None, [data if data.is_dir() else data.parent], raw.landmarks, raw.curve_links)
     aligned = align_landmarks(raw, config)
     findings = find_outliers(aligned)
     record = AlignRecord(
@@ -70,7 +82,8 @@ def align(
         unit="mm" if aligned.unit == "mm" else "",
         gauge=aligned.gauge,
         tangent=aligned.tangent,
-        settings=to_json({**asdict(config), "reflect": reflect, "curve_semilandmarks": len(raw.curve_sliders),
+        settings=to_json({**asdict(config), "reflect": reflect, "curves": len(raw.curves),
+                          "curve_semilandmarks": len(raw.curve_sliders),
                           "surface_semilandmarks": len(raw.surface_sliders)}),
         estimated=int(aligned.estimated.sum()),
         iterations=aligned.iterations,

@@ -24,7 +24,14 @@ _OTHER_SCALE = 4.0
 
 
 def convert_landmarks(
-    source: Path, output: Path, *, to: str | None = None, sliders: Sequence[Path] = (), object_name: str | None = None
+    source: Path,
+    output: Path,
+    *,
+    to: str | None = None,
+    sliders: Sequence[Path] = (),
+    object_name: str | None = None,
+    curve_points: int | None = None,
+    dimensions: int | None = None,
 ) -> tuple[LandmarkConfigurations, tuple[str, ...]]:
     """Write the landmarks of many specimens in another format; return them, and sentences on what changed.
 
@@ -37,6 +44,8 @@ def convert_landmarks(
             mrk.json or fcsv (default: by the ending of OUT)
         sliders: CSV of the semilandmarks as geomorph has them: before, slide, after, or surface; can be repeated
         object_name: array of an R file with several, such as plethodon$land
+        curve_points: points of each curve or outline, at equal distances (default: see `align`)
+        dimensions: 2 or 3, of raw coordinates of MorphoJ whose number fits both (default: by their number)
 
     Raises:
         FileError: something cannot be read or written.
@@ -44,7 +53,9 @@ def convert_landmarks(
     """
     if source.resolve() == output.resolve():
         raise InputError(f"{output} is the file to convert; give another name to write to.")
-    raw = read_configurations(source, name=object_name, sliders=sliders)
+    raw = read_configurations(
+        source, name=object_name, sliders=sliders, curve_points=curve_points, dimensions=dimensions
+    )
     notes = [*raw.notes, *write_configurations(output, raw, to)]
     for name, text in slider_texts(raw).items():
         path = output.with_name(f"{output.name.removesuffix(output.suffix)}.{name}")
@@ -142,7 +153,8 @@ def plot_configurations(
 
     raw = read_configurations(data, sliders=sliders)
     aligned = align_landmarks(raw)
-    orientation = find_orientation(None, [data if data.is_dir() else data.parent], raw.landmarks) or Orientation()
+    folders = [data if data.is_dir() else data.parent]
+    orientation = find_orientation(None, folders, raw.landmarks, raw.curve_links) or Orientation()
     if links is not None:
         orientation = structs.replace(orientation, links=read_links(links, raw.landmarks))
     with figures.publication_style(), figures.oriented(orientation):

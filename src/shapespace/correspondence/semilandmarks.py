@@ -20,6 +20,7 @@ from shapespace.correspondence.landmark_transfer import MarkedSpecimens, Transfe
 from shapespace.errors import InputError
 from shapespace.geometry.closest import ClosestPointEngine, build_engine
 from shapespace.geometry.normals import face_areas, faces_of, vertex_areas, vertex_normals
+from shapespace.io.landmarks.landmark_configurations import spaced_points
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
 
 _RINGS, _PER_EDGE, _SWEEPS = 3, (0.2, 0.5), 150
@@ -193,7 +194,7 @@ class _MeanSurface:
             raise InputError(f"{label} has {one.points} points; give 1 or more.")
         segments = [self._path(a, b, label) for a, b in pairwise(chain)]
         path = np.concatenate([*(segment[:-1] for segment in segments), segments[-1][-1:]])
-        path = _resampled(path, max(len(path), _PER_GAP * (one.points + 1)))
+        path = spaced_points(path, max(len(path), _PER_GAP * (one.points + 1)))
         if one.kind == "patch":
             samples = self._samples(path, one)
             spread = samples[:: max(1, len(samples) // one.points)][: one.points]
@@ -226,10 +227,10 @@ class _MeanSurface:
             path = np.concatenate([ends[:1], self.mesh.vertices[vertices[::-1]], ends[1:]])
             edges = np.linalg.norm(np.diff(path, axis=0), axis=1).sum() / self._edge
             for per_edge in _PER_EDGE:
-                path = _resampled(path, 4 + int(per_edge * edges))
+                path = spaced_points(path, 4 + int(per_edge * edges))
                 for _ in range(_SWEEPS):
                     path[1:-1] = self._engine.query(np.ascontiguousarray(0.5 * (path[:-2] + path[2:]))).points
-            fine = self._engine.query(_resampled(path, 4 * len(path))).points
+            fine = self._engine.query(spaced_points(path, 4 * len(path))).points
             self._paths[start, end] = np.concatenate([ends[:1], fine[1:-1], ends[1:]])
         return self._paths[start, end] if (start, end) == (a, b) else self._paths[start, end][::-1]
 
@@ -299,13 +300,6 @@ def _boundary(one: SemilandmarkSet, curves: Mapping[str, Sequence[str]]) -> list
                 "closed; list curves and landmarks in the order around the patch."
             )
     return chain
-
-
-def _resampled(path: FloatArray, count: int) -> FloatArray:
-    """Return `count` evenly spaced points of a polyline (M, 3), ends included."""
-    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
-    at: FloatArray = np.linspace(0.0, float(length[-1]), count)
-    return np.stack([np.interp(at, length, path[:, axis]) for axis in range(3)], axis=1)
 
 
 def _evenly_spaced(path: FloatArray, count: int, engine: ClosestPointEngine) -> FloatArray:

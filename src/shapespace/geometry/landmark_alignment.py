@@ -38,6 +38,8 @@ _OUTLIER = 2.5, 0.5
 largest of more displacements has a longer tail; 5 % of clean sets of 20 to 400 specimens exceed it (simulated)."""
 _MAD = 1.4826  # standard deviations of a normal distribution in a median absolute deviation
 _LEAST_SPREAD = 0.01  # of log displacements; specimens within 1 % of each other are alike
+_MATCHING_ITERATIONS = 20  # of starts of curves and mean in turns; simulated outlines need 3 to 8
+_STILL = 1e-3  # points by which a start still moves, below the accuracy of a digitised outline
 _ROUNDING = 1e-9  # of the size; displacements below it are rounding
 _MIRRORED, _SWAPPED = 0.5, 0.6
 """A specimen is mirrored, or has swapped landmarks, if reflection or exchange reduces its Procrustes distance to this
@@ -55,7 +57,9 @@ class AlignConfig:
         gauge: `shape` scales each specimen to unit centroid size; `form` keeps its size.
         tangent: project shapes orthogonally onto the tangent space at their mean.
         slide_by: criterion that sliding semilandmarks minimise: `bending-energy` of the thin-plate spline from the
-            mean, or `procrustes`, the distance from the mean.
+            mean, or `procrustes`, the distance from the mean (default: bending-energy; for outlines and other data
+            where at most as many landmarks as dimensions do not slide, procrustes, because affine movements of all
+            points along a curve have no bending energy)
         missing: estimation of missing landmarks from complete specimens: by thin-plate spline of their mean (`tps`), by
             `regression` on the scores of partial least squares, or `refuse`.
         structures: structure of each landmark; structures are aligned separately, and combined at their relative
@@ -63,20 +67,23 @@ class AlignConfig:
         tolerance: change of the summed squared distances from the mean, in units of the squared centroid size, that
             ends the alignment.
         iterations: largest number of iterations (default: 5, or 10 with semilandmarks, as in geomorph).
+        match_curves: move the start of closed curves, and reverse curves, where this brings a specimen nearer to the
+            mean; False keeps those of the file.
     """
 
     gauge: Gauge = "shape"
     tangent: bool = True
-    slide_by: SlidingCriterion = "bending-energy"
+    slide_by: SlidingCriterion | None = None
     missing: MissingMethod = "tps"
     structures: Mapping[str, str] | None = None
     tolerance: float = 1e-4
     iterations: int | None = None
+    match_curves: bool = True
 
     def __post_init__(self) -> None:
         for name, value, choices in (
             ("gauge", self.gauge, get_args(Gauge)),
-            ("slide_by", self.slide_by, get_args(SlidingCriterion)),
+            ("slide_by", self.slide_by or "procrustes", get_args(SlidingCriterion)),
             ("missing", self.missing, get_args(MissingMethod)),
         ):
             if value not in choices:
@@ -187,7 +194,9 @@ def align_landmarks(configurations: LandmarkConfigurations, config: AlignConfig 
         InputError: one specimen, fewer than three landmarks, landmarks on a line, too many missing ones, sliders that
             cannot be, or structures that do not name each landmark.
     """
-    config = config or AlignConfig()
+    config = with_criterion(config or AlignConfig(), configurations)
+    if config.match_curves and len(configurations) > 1:
+        configurations = match_curves(configurations)
     points, notes = _complete(configurations, config)
     _refuse_sliders(configurations)
     chosen = _structures(configurations, config)
@@ -231,6 +240,13 @@ def align_landmarks(configurations: LandmarkConfigurations, config: AlignConfig 
     )
 
 
+def with_criterion(config: AlignConfig, configurations: LandmarkConfigurations) -> AlignConfig:
+    """Return a configuration with the criterion by which the semilandmarks of these landmarks slide."""
+    sliding = {*configurations.curve_sliders[:, 1].tolist(), *configurations.surface_sliders.tolist()}
+    is_held = len(configurations.landmarks) - len(sliding) > configurations.dimensions
+    return replace(config, slide_by=config.slide_by or ("bending-energy" if is_held else "procrustes"))
+
+
 @dataclass(frozen=True, eq=False)
 class Superimposition:
     """Coordinates (N, L, D) after generalised Procrustes analysis, and how it ended."""
@@ -270,7 +286,7 @@ def superimpose(
     while not converged and iterations < most:
         iterations += 1
         if slides:
-            B = bending_energy_matrix(mean) if config.slide_by == "bending-energy" else None
+            B = None if config.slide_by == "procrustes" else bending_energy_matrix(mean)
             slid = np.stack([_slid(x, mean, curves, surface, B) for x in coords])
             previous, squares = squares, n * float((slid.mean(axis=0) ** 2).sum())
             coords = _rotated(slid, mean)
@@ -291,6 +307,111 @@ def superimpose(
     if config.gauge == "form":
         return Superimposition(coords * unit, iterations, converged)
     return Superimposition(project_to_tangent(coords) if config.tangent else coords, iterations, converged)
+
+
+def match_curves(configurations: LandmarkConfigurations, mean: FloatArray | None = None) -> LandmarkConfigurations:
+    """Return landmarks whose curves start at the same place and run in the same direction in all specimens.
+
+    The start of a closed curve is anywhere between its points, where the Procrustes distance from the mean is least. A
+    closed curve in the plane runs round as in the mean, another one as the distance from the mean is less. An open
+    curve is reversed if this halves its distance from the mean. Curves with missing points stay as they are.
+
+    Args:
+        configurations: of specimens in any poses and sizes.
+        mean: (L, D) to match; None for the mean of the specimens, found in turns with the starts.
+    """
+    points, curves = configurations.points, [(np.array(at), closed) for at, closed in configurations.curves]
+    usable = np.array([[len(at) > 2 and np.isfinite(x[at]).all() and np.ptp(x[at]) > 0 for at, _ in curves]
+                       for x in points], dtype=np.bool_)  # fmt: skip
+    whole = np.logical_and(np.isfinite(points).all(axis=(1, 2)), usable.all(axis=1))
+    if not curves or (mean is None and not whole.any()):
+        return configurations
+    on_curves = [i for at, _ in curves for i in at.tolist()]
+    shift, is_reversed = np.zeros(usable.shape), np.zeros(usable.shape, dtype=np.bool_)
+    target: FloatArray = points[int(np.argmax(whole))] if mean is None else mean
+    moved, change = points.copy(), np.inf
+    for step in range(_MATCHING_ITERATIONS):
+        if step and mean is None:
+            target = superimpose(moved[whole], AlignConfig(tangent=False)).coords.mean(axis=0)
+        change = 0.0
+        for k, c in np.argwhere(usable).tolist():
+            at, closed = curves[c]
+            # In the first step, a curve is placed by the landmarks and by the curves before it.
+            known = np.isfinite(moved[k]).all(axis=1)
+            known[on_curves[on_curves.index(at[0]) :] if step == 0 else at] = False
+            by, reverse = _best_start(moved[k], target, known, at, closed)
+            is_reversed[k, c] ^= reverse
+            # Numbers of points run backwards along a reversed curve.
+            shift[k, c] += -by if is_reversed[k, c] else by
+            if by or reverse:
+                moved[k, at] = _restarted(points[k, at], shift[k, c], bool(is_reversed[k, c]), closed)
+            change = max(change, abs(by), float(reverse))
+        if change < _STILL:
+            break
+    notes = list[str]()
+    for c, (at, closed) in enumerate(curves):
+        # Fewer specimens are digitised in the other direction.
+        if mean is None and 2 * is_reversed[:, c].sum() > len(points):
+            for k in np.flatnonzero(usable[:, c]).tolist():
+                moved[k, at] = moved[k, np.append(at[0], at[:0:-1]) if closed else at[::-1]]
+                is_reversed[k, c] ^= True
+        if is_reversed[:, c].any():
+            names = list_briefly([configurations.names[k] for k in np.flatnonzero(is_reversed[:, c]).tolist()])
+            notes.append(f"Curve {c + 1} runs in the other direction in {names}, and is reversed there.")
+    if any(closed for _, closed in curves):
+        notes.append("Closed curves start where they fit the mean best; --no-match-curves keeps their first points.")
+    return replace(configurations, points=read_only(moved), notes=(*configurations.notes, *notes))
+
+
+def _best_start(x: FloatArray, mean: FloatArray, known: BoolArray, at: IntArray, closed: bool) -> tuple[float, bool]:
+    """Return by how many points, and whether reversed before, a curve fits the mean best, with the `known` points."""
+    own, target, n = x[at], mean[at], int(known.sum()) + len(at)
+    base = x[known].T @ mean[known] - np.outer(x[known].sum(axis=0) + own.sum(axis=0),
+                                               mean[known].sum(axis=0) + target.sum(axis=0)) / n  # fmt: skip
+    orders = [own, np.roll(own[::-1], 1, axis=0) if closed else own[::-1]]
+    same_area = _area(target) * _area(own) if closed and x.shape[1] == 2 else 0.0
+    # Sums over the points for all starts, by the theorem of correlation.
+    spectrum = np.conj(np.fft.rfft(target, axis=0))[:, None, :]
+    products = np.stack([
+        np.fft.irfft(np.fft.rfft(order, axis=0)[:, :, None] * spectrum, n=len(at), axis=0)[: None if closed else 1]
+        for order in orders
+    ]) + base  # fmt: skip
+    if not closed:
+        R = fit_rotations(products[:, 0])
+        away = list[float]()
+        for order, rotation in zip(orders, R, strict=True):
+            both = np.concatenate([x[known], order]) @ rotation.T, np.concatenate([mean[known], target])
+            one, two = (part - part.mean(axis=0) for part in both)
+            one = one * ((one * two).sum() / (one**2).sum())
+            away.append(float(np.linalg.norm((one - two)[-len(at) :])))
+        return 0.0, away[1] < _MIRRORED * away[0]
+    singular = np.linalg.svd(products, compute_uv=False)
+    score = singular.sum(axis=2) - 2 * singular[..., -1] * (np.linalg.det(products) < 0)
+    if same_area:
+        score[int(same_area > 0)] = -np.inf
+    order, start = (int(i) for i in np.unravel_index(int(np.argmax(score)), score.shape))
+    before, best, after = (float(score[order, (start + i) % len(at)]) for i in (-1, 0, 1))
+    curvature = before - 2 * best + after
+    fraction = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
+    return (start + fraction + len(at) / 2) % len(at) - len(at) / 2, order == 1
+
+
+def _restarted(own: FloatArray, shift: float, is_reversed: bool, closed: bool) -> FloatArray:
+    """Return a curve (P, D) reversed, and then started `shift` points later, by periodic cubic splines."""
+    if not closed:
+        return own[::-1] if is_reversed else own
+    from scipy.interpolate import CubicSpline
+
+    ring = np.concatenate([own, own[:1]])
+    places = np.arange(len(own))
+    at = (shift + (-places if is_reversed else places)) % len(own)
+    return np.asarray(CubicSpline(np.arange(len(ring)), ring, bc_type="periodic")(at), dtype=np.float64)
+
+
+def _area(ring: FloatArray) -> float:
+    """Return the signed area of a closed curve (P, 2) in the plane."""
+    x, y = ring.T
+    return 0.5 * float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum())
 
 
 def project_to_tangent(coords: FloatArray, mean: FloatArray | None = None) -> FloatArray:

@@ -28,7 +28,7 @@ _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 SPACE = "SPACE=LPS"
 """Mark of the frame in headers of meshes, as 3D Slicer writes it."""
 # As a comment, or as a field of legacy VTK, whose text has its length before it in binary files.
-_RAS = re.compile(rb"\bSPACE(?:\s*[=:]\s*|\s+1\s+1\s+\w*string\s+)\W?RAS\b", re.IGNORECASE)
+_RAS = re.compile(rb"\bSPACE(?:\s*[=:]\s*|\s+1\s+1\s+\w*string\s+)\W?(?:RAS|right-anterior-superior)\b", re.IGNORECASE)
 _RAS_NOTE = "Its header states the frame RAS; it was converted to LPS."
 _COMMENT = re.compile(rb"\s*(#|//|%|comment\b|.*=)")
 """Lines with no coordinates: comments, and those of TPS with a key; the attributes of XML have none either."""
@@ -39,7 +39,9 @@ _NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _OTHER_ROLES = frozenset({"separator", "point"})
 """Of commas and points in numbers, none of which is together with decimal commas in one file."""
 _COMMA_AT_NUMBER = re.compile(rb",[+\-.\d]")
-_LEADING_ZERO = re.compile(rb"0\d+")
+_LEADING_ZERO, _LEADING_ZEROS = re.compile(rb"0\d+"), re.compile(rb"[+-]?0\d")
+_THIN_SPACES = ("\u00a0".encode(), "\u2009".encode(), "\u202f".encode())
+_THOUSANDS_WITH_SPACES = re.compile(rb"\d{1,3}(?:\xc2\xa0|\xe2\x80[\x89\xaf])\d{3}")
 _THOUSANDS = re.compile(rb"[+-]?\d{1,3}(,\d{3})+\.|[+-]?\d{1,3}(\.\d{3})+,")
 
 
@@ -77,6 +79,11 @@ def numeric_text(data: bytes, path: Path, start: int = 0, *, commas_separate: bo
         FileFormatError: commas that can be read in two ways, or numbers with decimal commas and with points.
     """
     data = plain_text(data)
+    if any(space in data for space in _THIN_SPACES) and (cut := _THOUSANDS_WITH_SPACES.search(data, start)):
+        number, here = data.count(b"\n", 0, cut.start()) + 1, " ".join(cut[0].decode().split())
+        raise damage_error(
+            path, f"it has spaces for thousands in line {number} ({here!r}); export it again without them"
+        )
     # Most files have no such comma, or one in a comment; their lines are not looked at one by one.
     if data.find(b",", start) < 0 or not (commas_separate or _COMMA_AT_NUMBER.search(data, start)):
         return data
@@ -114,7 +121,9 @@ def _role_of_commas(line: bytes, commas_separate: bool) -> str:
     has_points = is_numeric and any(b"." in word for word in plain)
     if decimal and len(words) > commas_separate and (is_numeric or (commas_separate and lists)):
         between = commas_separate and re.search(rb",[\s;]|[\s;],", line.strip())
-        return "unclear" if has_points or lists or between else "decimal"
+        # A word that begins with zeros is the rest of a number that a space cuts into thousands.
+        is_cut = any(map(_LEADING_ZEROS.match, decimal))
+        return "unclear" if has_points or lists or between or is_cut else "decimal"
     if commas_separate and has_comma:
         cells = b",".join([*lists, *plain]).split(b",")
         # Thousands, or the digits after a decimal comma, which begin with a zero as no whole number does.

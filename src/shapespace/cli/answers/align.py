@@ -20,8 +20,8 @@ def run(arguments: argparse.Namespace) -> int:
     column, equals, value = (arguments.reflect or "").partition("=")
     if arguments.reflect and not (column and equals and value):
         raise InputError(f"--reflect is {arguments.reflect!r}; write COLUMN=VALUE, such as side=left.")
-    files = {"table": arguments.table, "sliders": arguments.sliders, "separate": arguments.separate}
-    _, record = align(arguments.data, arguments.output, config, **files, reflect=(column, value) if column else None)
+    options = given(arguments, align, reflect=(column, value) if column else None)
+    _, record = align(arguments.data, arguments.output, config, **options)
     for note in record.notes:
         say(note)
     if arguments.json:

@@ -15,9 +15,12 @@ from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.io.files import make_folder, read_bytes, write_text
 from shapespace.io.landmarks.configuration_tables import header_kind, long_text, morphoj_texts, parse_table, wide_text
 from shapespace.io.landmarks.landmark_configurations import (
+    NO_SLIDERS,
+    Curve,
     LandmarkConfigurations,
+    consecutive_curves,
+    equal_curves,
     read_landmark_numbers,
-    sliders_of_curves,
 )
 from shapespace.io.landmarks.landmark_io import (
     LANDMARK_FORMATS,
@@ -27,13 +30,27 @@ from shapespace.io.landmarks.landmark_io import (
     slicer_curves,
 )
 from shapespace.io.landmarks.r_arrays import R_ENDINGS, parse_r
-from shapespace.io.landmarks.tps_nts import nts_text, parse_dta, parse_morphologika, parse_nts, parse_tps, tps_text
+from shapespace.io.landmarks.tps_nts import (
+    LEAST_OUTLINE,
+    nts_text,
+    parse_dta,
+    parse_morphologika,
+    parse_nts,
+    parse_tps,
+    tps_text,
+)
+from shapespace.io.meshes.vtk import LINE_NOTE, read_vtk_lines
 from shapespace.io.parsing import damage_error, is_number
 from shapespace.io.read_limits import LARGEST_CONFIGURATIONS_FILE_BYTES
 from shapespace.io.tables.table_io import decoded_text, table_rows, table_text
 from shapespace.reprs import first_names
 
-_TEXTS = {".tps": parse_tps, ".nts": parse_nts, ".dta": parse_dta}
+_TEXTS = {".nts": parse_nts, ".dta": parse_dta}
+_MANY = (".tps", *_TEXTS)
+_SPECIMEN_OF_FILE = (r"(?P<name>.+?)(?:[ ._-](?P<kind>[^ ._-]+))?", r"(?:(?P<kind>[^ ._-]+)[ ._-])?(?P<name>.+)")
+"""Names of files of one specimen: NAME_landmarks and NAME_curve, or landmarks_NAME and curve_NAME."""
+_LINES = (".vtk", ".vtp")
+"""Endings of files that may hold lines, which are curves, or surfaces."""
 _MORPHOLOGIKA = re.compile(rb"^(?:\xef\xbb\xbf)?\s*\[\s*individuals\s*\]", re.IGNORECASE | re.MULTILINE)
 _HEAD_BYTES = 2**16  # 64 KiB hold the sections before the coordinates
 _TABLES = (".csv", ".txt", ".tsv", ".xlsx")
@@ -56,20 +73,29 @@ FOLDER_FORMATS = ("mrk.json", "fcsv")
 
 
 def read_configurations(
-    path: Path | str, *, name: str | None = None, sliders: Sequence[Path] = ()
+    path: Path | str,
+    *,
+    name: str | None = None,
+    sliders: Sequence[Path] = (),
+    curve_points: int | None = None,
+    dimensions: int | None = None,
 ) -> LandmarkConfigurations:
     """Read the landmarks of many specimens, missing ones as not-a-number.
 
-    Formats: TPS with curves and scale, NTS, IDAV Landmark (.dta), Morphologika (.txt), wide and long tables (CSV,
-    Excel), MorphoJ tables (.txt), arrays of R
-    (.rda, .RData, .rds), and folders with a file for each specimen in any format of `read_landmarks`, TPS or NTS.
-    Values that are scaled, left out or taken as missing are in the notes.
+    Formats: TPS with curves, outlines and scale, NTS, IDAV Landmark (.dta), Morphologika (.txt), wide and long tables
+    (CSV, Excel), MorphoJ tables (.txt), arrays of R (.rda, .RData, .rds), and folders with a file for each specimen in
+    any format of `read_landmarks`, TPS, NTS, or lines of VTK (.vtk, .vtp). Points of curves are semilandmarks; curves
+    with other numbers of points are resampled at equal distances. Values that are scaled, left out or taken as missing
+    are in the notes.
 
     Args:
         path: the file or folder.
         name: of the array, for R files with several.
         sliders: tables of semilandmarks, as geomorph has them: before, slide, after; or surface alone. Each replaces
             those in `path`.
+        curve_points: number of points to which each curve is resampled; None for the least number of a specimen, at
+            most 100, where specimens differ.
+        dimensions: 2 or 3, of a MorphoJ table of raw coordinates whose number fits both.
 
     Raises:
         FileError: it cannot be read, or is too long.
@@ -77,20 +103,33 @@ def read_configurations(
         InputError: two specimens have one name.
         ShapespaceError: the extra `r`, which R files need, is not installed.
     """
-    raw = _read_folder(Path(path)) if Path(path).is_dir() else _read_file(Path(path), name)
+    path = Path(path)
+    if curve_points is not None and curve_points < LEAST_OUTLINE:
+        raise InputError(
+            f"A curve of {curve_points} points has no shape; give {LEAST_OUTLINE} or more with --curve-points."
+        )
+    if dimensions not in (None, 2, 3):
+        raise InputError(f"Landmarks have 2 or 3 dimensions, not {dimensions}; correct --dimensions.")
+    raw = _read_folder(path, curve_points) if path.is_dir() else _read_file(path, name, curve_points, dimensions)
+    if dimensions not in (None, raw.dimensions):
+        raise InputError(f"{path} has landmarks in {raw.dimensions}-D; leave --dimensions {dimensions} out.")
     for file in sliders:
         form = "before, slide, after, or one landmark on the surface,"
         numbers = read_landmark_numbers(file, raw.landmarks, (1, 3), form) - 1
         is_surface = numbers.shape[1] == 1
-        raw = replace(raw, **({"surface_sliders": numbers[:, 0]} if is_surface else {"curve_sliders": numbers}))
-    return raw
+        changed = {"surface_sliders": numbers[:, 0]} if is_surface else {"curve_sliders": numbers, "curves": ()}
+        raw = replace(raw, **changed)
+    note = f"{len(raw.curve_sliders)} points of {len(raw.curves)} curve{'s' * (len(raw.curves) > 1)} are semilandmarks."
+    return replace(raw, notes=(*raw.notes, note)) if raw.curves else raw
 
 
-def _read_file(path: Path, name: str | None) -> LandmarkConfigurations:
+def _read_file(
+    path: Path, name: str | None, curve_points: int | None = None, dimensions: int | None = None
+) -> LandmarkConfigurations:
     suffix = path.suffix.lower()
-    single = next((ending for ending in _SINGLE if path.name.lower().endswith(ending)), None)
-    if not (suffix in (*_TEXTS, *_TABLES, *R_ENDINGS) or single):
-        endings = ", ".join(dict.fromkeys((*_TEXTS, *_TABLES, *R_ENDINGS, *_SINGLE)))
+    single = next((ending for ending in (*_SINGLE, *_LINES) if path.name.lower().endswith(ending)), None)
+    if not (suffix in (*_MANY, *_TABLES, *R_ENDINGS) or single):
+        endings = ", ".join(dict.fromkeys((*_MANY, *_TABLES, *R_ENDINGS, *_SINGLE, *_LINES)))
         raise damage_error(path, f"the ending {suffix!r} is none of landmark files ({endings})")
     data = read_bytes(path, LARGEST_CONFIGURATIONS_FILE_BYTES)
     if not data.strip():
@@ -100,16 +139,19 @@ def _read_file(path: Path, name: str | None) -> LandmarkConfigurations:
     if name is not None:
         raise InputError(f"{path} is no file of R, whose arrays have names; leave --object out.")
     is_morphologika = _is_morphologika(data)
-    if suffix in _TEXTS or is_morphologika or re.match(rb"\s*LM3?\s*=", data, re.IGNORECASE):
+    if suffix in _MANY or is_morphologika or re.match(rb"\s*LM3?\s*=", data, re.IGNORECASE):
         try:
             text = decoded_text(data)
         except ValueError as error:
             raise FileFormatError(f"{path} {error}; export it again.") from error
-        return (parse_morphologika if is_morphologika else _TEXTS.get(suffix, parse_tps))(text, path)
+        if is_morphologika:
+            return parse_morphologika(text, path)
+        return _TEXTS[suffix](text, path) if suffix in _TEXTS else parse_tps(text, path, curve_points)
     kind = _header_kind(data) if suffix in _TABLES else "single"
     if single is None or kind in ("wide", "long") or (suffix == ".csv" and kind != "single"):
-        return parse_table(data, path)
-    return _read_specimen(path, single)
+        return parse_table(data, path, dimensions)
+    [raw] = _with_equal_curves([_read_specimen(path, single)], path, curve_points)
+    return raw
 
 
 def is_configurations(path: Path | str) -> bool:
@@ -117,14 +159,27 @@ def is_configurations(path: Path | str) -> bool:
     path = Path(path)
     if path.is_dir():
         names = [file.name.lower() for file in path.iterdir()]
-        return any(n.endswith((*_TEXTS, *_SINGLE)) for n in names) and not any(n.endswith(".fit.json") for n in names)
+        lines = min((file for file in path.iterdir() if file.suffix.lower() in _LINES), default=None)
+        has_landmarks = any(n.endswith((*_MANY, *_SINGLE)) for n in names) or (lines is not None and is_lines(lines))
+        return has_landmarks and not any(n.endswith(".fit.json") for n in names)
     if path.suffix.lower() not in _TABLES:
-        return path.is_file() and path.suffix.lower() in (*_TEXTS, *R_ENDINGS)
+        return path.is_file() and (path.suffix.lower() in (*_MANY, *R_ENDINGS) or is_lines(path))
     try:
         data = read_bytes(path, LARGEST_CONFIGURATIONS_FILE_BYTES)
         return _is_morphologika(data) or _header_kind(data) in ("wide", "long")
     except ShapespaceError:
         return False
+
+
+def is_lines(path: Path) -> bool:
+    """Return whether a file is VTK with lines and no surface, which are curves."""
+    if path.suffix.lower() not in _LINES:
+        return False
+    try:
+        mesh, lines = read_vtk_lines(read_bytes(path, LARGEST_CONFIGURATIONS_FILE_BYTES), path)
+    except ShapespaceError:
+        return False
+    return mesh.faces is None and bool(lines)
 
 
 def _is_morphologika(data: bytes) -> bool:
@@ -139,22 +194,33 @@ def _header_kind(data: bytes) -> str:
 
 
 def _read_specimen(path: Path, ending: str) -> LandmarkConfigurations:
-    points = read_landmarks(path, keep_absent=True)
-    is_numbered = all(re.fullmatch(r"point_\d+", label) for label in points)
-    number, curves = {label: k for k, label in enumerate(points)}, list[tuple[list[int], bool]]()
-    if ending == ".mrk.json":
-        found = slicer_curves(read_bytes(path, LARGEST_CONFIGURATIONS_FILE_BYTES), path)
-        curves = [([number[label] for label in labels], closed) for labels, closed in found]
-    sliders = sliders_of_curves(curves)
-    note = f"{len(sliders)} points of curves (Curve, ClosedCurve) are semilandmarks."
+    curves, notes = tuple[Curve, ...](), list[str]()
+    data = read_bytes(path, LARGEST_CONFIGURATIONS_FILE_BYTES)
+    if ending in _LINES:
+        mesh, lines = read_vtk_lines(data, path)
+        if not lines:
+            raise damage_error(path, "it has no lines, which would be curves; give landmarks, or surfaces to a command "
+                               "that takes surfaces")  # fmt: skip
+        points, labels = mesh.vertices[[k for line, _ in lines for k in line]], ()
+        curves = consecutive_curves(0, [line for line, _ in lines], [closed for _, closed in lines])
+        notes += [note for note in mesh.notes if note != LINE_NOTE]
+    else:
+        named = read_landmarks(path, keep_absent=True)
+        points, labels = np.array(list(named.values())), tuple(named)
+        if ending == ".mrk.json":
+            number = {label: k for k, label in enumerate(labels)}
+            found = slicer_curves(data, path)
+            curves = tuple((tuple(number[label] for label in own), closed) for own, closed in found if own)
+        if all(re.fullmatch(r"point_\d+", label) for label in labels):
+            labels = ()
     return LandmarkConfigurations(
         names=(path.name[: -len(ending)].removesuffix(".landmarks"),),
-        points=np.array([list(points.values())]),
-        landmarks=() if is_numbered else tuple(points),
+        points=points[None],
+        landmarks=labels,
         unit="mm" if ending in _MILLIMETRES else "",
-        curve_sliders=sliders,
+        curves=curves,
         where=str(path),
-        notes=(note,) if len(sliders) else (),
+        notes=tuple(notes),
     )
 
 
@@ -164,14 +230,14 @@ def _is_other_table(file: Path) -> bool:
     return bool(row) and not header_kind(row) and not any(map(is_number, row[1:4]))
 
 
-def _read_folder(folder: Path) -> LandmarkConfigurations:
+def _read_folder(folder: Path, curve_points: int | None) -> LandmarkConfigurations:
     """Return the landmarks in the files of the most frequent ending, in the order of the first file."""
     if (folder / RECORD).is_file():
         raise InputError(
             f"{folder} is a folder that align wrote; give the landmark file that it was made from, or write its shapes "
             "to a landmark file with shapespace export."
         )
-    endings = (*_TEXTS, *_SINGLE)
+    endings = (*_MANY, *_SINGLE, *_LINES)
     files: dict[str, list[Path]] = {}
     for file in sorted(folder.iterdir()):
         ending = next((ending for ending in endings if file.name.lower().endswith(ending)), None)
@@ -179,26 +245,27 @@ def _read_folder(folder: Path) -> LandmarkConfigurations:
             files.setdefault(ending, []).append(file)
     if all(ending == ".csv" and all(map(_is_other_table, listed)) for ending, listed in files.items()):
         raise damage_error(folder, f"it has no landmark files, which end with {', '.join(endings)} (.csv: name,x,y,z)")
-    # Slicer's markups first among equally many: they mark missing landmarks.
-    ending = max(files, key=lambda one: (len(files[one]), one == ".mrk.json"))
+    # Files of VTK are surfaces where there are others, and Slicer's markups first among equally many: they mark missing
+    # landmarks.
+    ending = max(files, key=lambda one: (one not in _LINES, len(files[one]), one == ".mrk.json"))
     others = [file.name for other, listed in files.items() if other != ending for file in listed]
     notes = [f"{len(others)} files without {ending} are left out ({first_names(others, _NAMED)})."] if others else []
-    first, *rest = parts = _join_files(
-        [_read_file(file, None) if ending in _TEXTS else _read_specimen(file, ending) for file in files[ending]]
+    parts = _join_files(
+        [_read_file(file, None) if ending in _MANY else _read_specimen(file, ending) for file in files[ending]]
     )
     if len(parts) < len(files[ending]):
+        notes.append(f"{len(files[ending])} files are joined to {len(parts)} specimens by their names.")
+    labelled = [_with_labels_of(parts[0], part) for part in parts]
+    if renamed := [Path(old.where).name for old, new in zip(parts, labelled, strict=True) if new is not old]:
         notes.append(
-            f"{len(files[ending])} files are joined to {len(parts)} specimens by the first part of their names."
+            f"Labels of {first_names(renamed, _NAMED)} differ from {Path(parts[0].where).name} before the number, and "
+            "are matched by number; lists and curves by their order."
         )
-    points, renamed = [first.points], list[str]()
+    parts = labelled
+    first, *rest = parts = _with_equal_curves(parts, folder, curve_points)
+    points = [first.points]
     for part in rest:
         file, place = Path(part.where), {name: k for k, name in enumerate(part.landmarks)}
-        if (
-            place.keys() != set(first.landmarks)
-            and set(own := _numbering(part)) == set(keys := _numbering(first)) != set()
-        ):
-            place = {label: own.index(key) for label, key in zip(first.landmarks, keys, strict=True)}
-            renamed.append(file.name)
         if part.dimensions != first.dimensions or place.keys() != set(first.landmarks):
             has, expected = (f"{len(one.landmarks)} landmarks in {one.dimensions}-D" for one in (part, first))
             other = first_names(sorted(place.keys() ^ set(first.landmarks)), _NAMED)
@@ -208,11 +275,6 @@ def _read_folder(folder: Path) -> LandmarkConfigurations:
                 "or as undefined where one is missing"
             )  # fmt: skip
         points.append(part.points[:, [place[name] for name in first.landmarks]])
-    if renamed:
-        notes.append(
-            f"Labels of {first_names(renamed, _NAMED)} differ from {Path(first.where).name} before the number, "
-            "and are matched by number."
-        )  # fmt: skip
     keys = dict.fromkeys(key for part in parts for key in part.columns)
     return replace(
         first,
@@ -224,29 +286,81 @@ def _read_folder(folder: Path) -> LandmarkConfigurations:
     )
 
 
-def _numbering(part: LandmarkConfigurations) -> list[tuple[bool, str]]:
-    """Return whether a landmark is on a curve, and the number in its label, such as `F-1`; empty if labels have others.
+def _prefixes(part: LandmarkConfigurations) -> dict[int, tuple[int, str, str]]:
+    """Return landmark -> its curve, -1 for none, and the parts before and of the number in its label, such as `F-1`."""
+    curve = {point: k for k, (points, _) in enumerate(part.curves) for point in points}
+    found = {k: re.fullmatch(r"(|.*[-_ ])(\d+)", label) for k, label in enumerate(part.landmarks)}
+    return {k: (curve.get(k, -1), match[1], match[2]) for k, match in found.items() if match}
 
-    3D Slicer calls points as their node and a number by default, and nodes of one name get `_1`, `_2` and so on.
+
+def _with_labels_of(first: LandmarkConfigurations, part: LandmarkConfigurations) -> LandmarkConfigurations:
+    """Return a part with the labels of the first where they differ before the number alone.
+
+    3D Slicer calls points as their node and a number by default, and nodes of one name get `_1`, `_2` and so on. Lists
+    and curves are matched by their order.
     """
-    on_curve = np.isin(np.arange(len(part.landmarks)), part.curve_sliders).tolist()
-    found = [re.fullmatch(r"(.*[-_])(\d+)", label) for label in part.landmarks]
-    keys = [(is_on, match[2]) for is_on, match in zip(on_curve, found, strict=True) if match]
-    prefixes = {(is_on, match[1]) for is_on, match in zip(on_curve, found, strict=True) if match}
-    return keys if len(keys) == len(found) and len(prefixes) == len(set(on_curve)) else []
+    theirs, own = (
+        sorted(dict.fromkeys((curve, prefix) for curve, prefix, _ in _prefixes(one).values()), key=lambda key: key[0])
+        for one in (first, part)
+    )
+    new = {key: prefix for key, (_, prefix) in zip(own, theirs, strict=False) if key[1] != prefix}
+    is_shared = {prefix for _, prefix in new} & {prefix for _, prefix in theirs}
+    if not new or is_shared or [curve for curve, _ in own] != [curve for curve, _ in theirs]:
+        return part
+    labels = {k: f"{new[curve, prefix]}{number}" for k, (curve, prefix, number) in _prefixes(part).items()
+              if (curve, prefix) in new}  # fmt: skip
+    renamed = tuple(labels.get(k, label) for k, label in enumerate(part.landmarks))
+    return replace(part, landmarks=renamed)
+
+
+def _with_equal_curves(
+    parts: Sequence[LandmarkConfigurations], path: Path, count: int | None
+) -> list[LandmarkConfigurations]:
+    """Return parts whose curves have the same numbers of points, after the other landmarks, or `count` of them."""
+    names = [[re.sub(r"\d+$", "", part.landmarks[points[0]]) for points, _ in part.curves] for part in parts]
+    curves = list[Sequence[Curve]]()
+    for part, own in zip(parts, names, strict=True):
+        # Curves of the same names may be in another order.
+        rank = [names[0].index(name) if set(own) == set(names[0]) else 0 for name in own]
+        curves.append([part.curves[int(k)] for k in np.argsort(rank, kind="stable")])
+    closed = [is_closed for _, is_closed in curves[0]]
+    if not closed or any([is_closed for _, is_closed in own] != closed for own in curves):
+        return list(parts)
+    given = [[x[list(at)] for at, _ in own] for part, own in zip(parts, curves, strict=True) for x in part.points]
+    specimens = [name for part in parts for name in part.names]
+    made, notes = equal_curves(given, closed, specimens, path, count)
+    if [list(map(len, own)) for own in made] == [list(map(len, own)) for own in given]:
+        return list(parts)
+    at, out = 0, list[LandmarkConfigurations]()
+    for part in parts:
+        fixed = sorted(set(range(len(part.landmarks))) - {point for own, _ in part.curves for point in own})
+        points = [np.concatenate([x[fixed], *own]) for x, own in zip(part.points, made[at:], strict=False)]
+        at += len(part)
+        labels = [f"{name}{k + 1}" for name, own in zip(names[0], made[0], strict=True) for k in range(len(own))]
+        is_numbered = all(label.isdecimal() for label in part.landmarks)
+        out.append(replace(
+            part, points=np.array(points), curves=consecutive_curves(len(fixed), made[0], closed),
+            landmarks=() if is_numbered else (*(part.landmarks[k] for k in fixed), *labels),
+            curve_sliders=NO_SLIDERS, notes=(*part.notes, *notes),
+        ))  # fmt: skip
+    return out
 
 
 def _join_files(parts: Sequence[LandmarkConfigurations]) -> Sequence[LandmarkConfigurations]:
-    """Return one part of each specimen where the files NAME_a and NAME_b have its landmarks and its curves."""
-    split = [re.split(r"[ ._-](?=[^ ._-]+$)", part.names[0], maxsplit=1) for part in parts if len(part) == 1]
-    groups: dict[str, list[LandmarkConfigurations]] = {}
-    for words, part in zip(split, parts, strict=False):
-        groups.setdefault(words[0], []).append(part)
-    kinds = {tuple(sorted(tuple(words[1:]) for words in split if words[0] == stem)) for stem in groups}
-    has_curves = [bool(len(part.curve_sliders)) for part in parts]
-    if len(split) < len(parts) or len(kinds) != 1 or len(groups) == len(parts) or len(set(has_curves)) == 1:
-        return parts
-    return [_joined(stem, sorted(own, key=lambda one: len(one.curve_sliders) > 0)) for stem, own in groups.items()]
+    """Return one part of each specimen where files such as NAME_a and NAME_b have its landmarks and its curves."""
+    points = sorted((re.escape(part.names[0]) for part in parts if not part.curves), key=len, reverse=True)
+    own_names = rf"(?P<name>{'|'.join(points)})(?:[ ._-](?P<kind>.+))?"
+    for pattern in (own_names, *_SPECIMEN_OF_FILE) if all(len(part) == 1 for part in parts) else ():
+        kinds, groups = dict[str, list[str | None]](), dict[str, list[LandmarkConfigurations]]()
+        for part in parts:
+            if match := re.fullmatch(pattern, part.names[0]):
+                kinds.setdefault(match["name"], []).append(match["kind"])
+                groups.setdefault(match["name"], []).append(part)
+        is_mixed = all({bool(part.curves) for part in own} == {True, False} for own in groups.values())
+        is_complete = sum(map(len, groups.values())) == len(parts)
+        if is_mixed and is_complete and len({frozenset(own) for own in kinds.values()}) == 1:
+            return [_joined(name, sorted(own, key=lambda one: bool(one.curves))) for name, own in groups.items()]
+    return parts
 
 
 def _joined(name: str, parts: Sequence[LandmarkConfigurations]) -> LandmarkConfigurations:
@@ -258,11 +372,15 @@ def _joined(name: str, parts: Sequence[LandmarkConfigurations]) -> LandmarkConfi
         names=(name,),
         points=np.concatenate([part.points for part in parts], axis=1),
         landmarks=tuple(
-            label if counts[label] == 1 else f"{part.names[0].removeprefix(name)[1:]}_{label}"
+            label if counts[label] == 1 else f"{part.names[0].replace(name, '').strip(' ._-')}_{label}"
             for part in parts
             for label in part.landmarks
         ),
-        curve_sliders=np.concatenate([p.curve_sliders + at for p, at in zip(parts, starts, strict=False)]),
+        curves=tuple(
+            (tuple(point + at for point in points), closed)
+            for part, at in zip(parts, starts, strict=False)
+            for points, closed in part.curves
+        ),
         notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
     )
 

@@ -20,7 +20,7 @@ from shapespace.types import FloatArray
 
 _AXIS_FIRST = re.compile(r"([xyz])[ ._-]?(\d+)", re.IGNORECASE)
 _AXIS_LAST = re.compile(r"(.*\d|.+?)(?:(?<=\d)|[ ._-])([xyz])", re.IGNORECASE)
-_NUMBERED = re.compile(r"(?:raw|proc)?coord[ ._-]?\d+", re.IGNORECASE)
+_NUMBERED = re.compile(r"(?:(?:raw|proc)[ ._-]?)?coord[ ._-]?\d+", re.IGNORECASE)
 """Columns of coordinates of MorphoJ, whose names have no axis."""
 _LANDMARK = ("landmark", "landmarks", "lm", "point", "semilandmark")
 _KEYS = (*KEYS, "individual", "label", "identifier")
@@ -38,11 +38,14 @@ def header_kind(header: Sequence[str]) -> str:
     return "wide" if sum({"x", "y"} <= set(axes) for axes in _landmark_columns(header).values()) > 1 else ""
 
 
-def _landmark_columns(header: Sequence[str]) -> dict[str, dict[str, int]]:
-    """Return landmark -> axis -> column for the styles x1, X.1, 1.X, 1X, lm1_x and nose_x."""
+def _landmark_columns(header: Sequence[str], width: int | None = None) -> dict[str, dict[str, int]]:
+    """Return landmark -> axis -> column for the styles x1, X.1, 1.X, 1X, lm1_x and nose_x.
+
+    Coordinates of MorphoJ, which are numbered, have the given width; None for that of their number, 3 before 2.
+    """
     columns: dict[str, dict[str, int]] = {}
     if numbered := [column for column, name in enumerate(header) if _NUMBERED.fullmatch(name.strip())]:
-        width = 2 if len(numbered) % 3 else 3
+        width = width or (2 if len(numbered) % 3 else 3)
         starts = range(0, len(numbered), width)
         return {str(k): dict(zip("xyz", numbered[at : at + width], strict=False)) for k, at in enumerate(starts, 1)}
     for column, name in enumerate(header):
@@ -58,21 +61,30 @@ def _landmark_columns(header: Sequence[str]) -> dict[str, dict[str, int]]:
     }
 
 
-def parse_table(content: bytes, path: Path) -> LandmarkConfigurations:
-    """Return the landmarks in a wide or long table (CSV, tab-separated or Excel), with its other columns."""
+def parse_table(content: bytes, path: Path, dimensions: int | None = None) -> LandmarkConfigurations:
+    """Return the landmarks in a wide or long table (CSV, tab-separated or Excel), with its other columns.
+
+    Args:
+        content: the file.
+        path: for messages.
+        dimensions: 2 or 3, of coordinates of MorphoJ whose number fits both.
+    """
     header, *rows = read_rows(path, content)
     kind = header_kind(header)
     if kind not in ("wide", "long"):
         known = "such as x1, y1, x2, y2 or specimen, landmark, x, y"
         raise damage_error(path, f"its header has no landmark columns, {known} ({', '.join(header)[:60]})")
-    numbered = [name for name in header if _NUMBERED.fullmatch(name.strip())]
-    if numbered and len(numbered) % 6 in (0, 1, 5):
-        problem = f"its {len(numbered)} columns of coordinates of MorphoJ ({numbered[0]}, ...) can be 2-D or 3-D"
-        advice = "name the columns x1, y1, x2, y2 or x1, y1, z1, x2, y2, z2, and so on"
-        raise damage_error(path, f"{problem}; {advice}")
+    count = sum(_NUMBERED.fullmatch(name.strip()) is not None for name in header)
+    if count and count % (dimensions or 6) in ((0, 1, 5) if dimensions is None else range(1, dimensions)):
+        fits = "fit neither 2-D nor 3-D" if count % 6 in (1, 5) else f"are not a multiple of {dimensions}"
+        fits = "fit 2-D and 3-D" if count % 6 == 0 else fits
+        advice = (
+            "convert it with shapespace landmarks convert --dimensions 2 (or 3), or name the columns x1, y1, x2, y2"
+        )
+        raise damage_error(path, f"its {count} columns of coordinates of MorphoJ {fits}; {advice}, and so on")
     if not rows:
         raise damage_error(path, "it has no specimens below its header")
-    return mark_missing((_wide if kind == "wide" else _long)(header, rows, path))
+    return mark_missing(_long(header, rows, path) if kind == "long" else _wide(header, rows, path, dimensions))
 
 
 def _axes(columns: Mapping[str, Mapping[str, int]], path: Path) -> str:
@@ -84,8 +96,10 @@ def _axes(columns: Mapping[str, Mapping[str, int]], path: Path) -> str:
     return axes
 
 
-def _wide(header: Sequence[str], rows: Sequence[Sequence[str]], path: Path) -> LandmarkConfigurations:
-    columns = _landmark_columns(header)
+def _wide(
+    header: Sequence[str], rows: Sequence[Sequence[str]], path: Path, dimensions: int | None
+) -> LandmarkConfigurations:
+    columns = _landmark_columns(header, dimensions)
     labels, width = tuple(columns), _axes(columns, path)
     used = [one[axis] for one in columns.values() for axis in width]
     key = 0 if header[0].lower() in _KEYS else key_column(header, _KEYS)

@@ -20,7 +20,8 @@ from shapespace.io.landmarks.tps_nts import tps_specimens
 from shapespace.io.parsing import CUT_SHORT, damage_error, is_number, json_value, numeric_text, xml_root
 from shapespace.io.read_limits import LARGEST_LANDMARK_FILE_BYTES
 from shapespace.io.tables.table_io import MISSING, csv_lines, rows_text, unescape_formula
-from shapespace.types import FloatArray, SurfaceLandmarks
+from shapespace.io.volumes.volume_io import MM_OF_UNITS
+from shapespace.types import RAS_TO_LPS, FloatArray, SurfaceLandmarks
 
 Pairs = list[tuple[str, FloatArray | None]]
 """Names and points (3,) in the order of a file; None for a landmark that is marked as absent."""
@@ -355,16 +356,27 @@ def _write_ljson(landmarks: Mapping[str, FloatArray]) -> str:
 def _slicer(value: Any, path: Path) -> Pairs:
     out: Pairs = []
     for markup in value["markups"]:
-        system = str(markup.get("coordinateSystem", "LPS")).upper()
-        if system not in ("LPS", "RAS"):
-            raise damage_error(path, f"its coordinate system is '{system[:20]}', neither LPS nor RAS")
-        sign = np.array([-1.0, -1.0, 1.0]) if system == "RAS" else np.ones(3)
+        sign = _sign_of_frame(str(markup.get("coordinateSystem", "LPS")), path)
+        # One unit, or a list of that of each axis.
+        unit = next(iter(re.findall(r"\w+", str(markup.get("coordinateUnits") or "mm").lower())), "mm")
+        if unit not in MM_OF_UNITS:
+            raise damage_error(path, f"its coordinate units are {unit[:20]!r}, so save it in mm")
         for entry in markup["controlPoints"]:
             name = str(entry.get("label") or entry.get("id") or "").strip()
             is_absent = entry.get("positionStatus", "defined") != "defined"
-            point = None if is_absent else sign * _point(entry["position"], f"landmark '{name[:60]}'", path) + 0.0
+            xyz = None if is_absent else _point(entry["position"], f"landmark '{name[:60]}'", path)
+            point = None if xyz is None else MM_OF_UNITS[unit] * sign * xyz + 0.0
             out.append((name, point))
     return out
+
+
+def _sign_of_frame(system: str, path: Path) -> FloatArray:
+    """Return the signs (3,) that take coordinates of 3D Slicer to LPS; 0 is RAS and 1 LPS in files of old versions."""
+    letters = "".join(word[:1] for word in system.strip().upper().split("-"))
+    frame = {"0": "RAS", "1": "LPS"}.get(letters, letters if "-" in system else system.strip().upper())
+    if frame not in ("LPS", "RAS"):
+        raise damage_error(path, f"its coordinate system is '{system[:20]}', neither LPS nor RAS")
+    return np.array(RAS_TO_LPS if frame == "RAS" else [1.0, 1.0, 1.0])
 
 
 def slicer_curves(data: bytes, path: Path) -> list[tuple[list[str], bool]]:
@@ -533,12 +545,10 @@ def _read_fcsv(data: bytes, path: Path) -> Pairs:
             if name.strip().lower() == "columns":
                 columns = [cell.strip() for cell in value.split(",")]
             elif name.strip().lower() == "coordinatesystem":
-                system = {"0": "RAS", "1": "LPS"}.get(value.strip(), value.strip().upper())
-    if system not in ("LPS", "RAS"):
-        raise damage_error(path, f"its coordinate system is '{system[:20]}', neither LPS nor RAS")
+                system = value
+    sign = _sign_of_frame(system, path)
     if not {"x", "y", "z"} <= set(columns):
         raise damage_error(path, "its columns are not those of 3D Slicer's fiducials, so export it again")
-    sign = np.array([-1.0, -1.0, 1.0]) if system == "RAS" else np.ones(3)
     out: Pairs = []
     for row in csv_rows(data, path):
         entry = dict(zip(columns, row, strict=False))
@@ -565,10 +575,10 @@ def _read_tps(data: bytes, path: Path) -> Pairs:
     specimens = list(tps_specimens(data.decode("utf-8-sig", "replace"), path))
     if len(specimens) != 1:
         raise damage_error(path, f"it has {len(specimens)} specimens, so save each in a file of its own")
-    [(parts, _)] = specimens
-    if any(len(row) == 2 for row in parts[0]):
+    [(rows, curves, _)] = specimens
+    if any(len(row) == 2 for row in rows):
         raise damage_error(path, "its landmarks are of two dimensions (LM=), and those of a surface have three (LM3=)")
-    rows = [row for part in parts for row in part]
+    rows = [*rows, *(row for curve, _ in curves for row in curve)]
     return [(f"point_{i}", None if np.isnan(p).any() else _point(p, f"point_{i}", path)) for i, p in enumerate(rows)]
 
 

@@ -6,21 +6,29 @@ import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import pairwise, takewhile
+from itertools import takewhile
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
 from shapespace.errors import InputError
-from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations, mark_missing, sliders_of_curves
+from shapespace.io.landmarks.landmark_configurations import (
+    LandmarkConfigurations,
+    consecutive_curves,
+    equal_curves,
+    mark_missing,
+)
 from shapespace.io.parsing import CUT_SHORT, damage_error, numeric_text
 from shapespace.io.tables.table_io import MISSING
 from shapespace.reprs import first_names
-from shapespace.types import FloatArray, IntArray
+from shapespace.types import FloatArray
 
 _NAMED = 3  # specimens in a sentence
-_CLOSED = "="
-"""Key of values, which no file has, of specimens whose curves are outlines."""
+_LEFT_OUT = "="
+"""Key of values, which no file has, of specimens with an outline of fewer points than enclose an area."""
+LEAST_OUTLINE = 3  # points that enclose an area
+Rows: TypeAlias = list[list[float]]
 _NTS_HEADER = re.compile(
     r"1\s+(\d{1,9})\s*([LBE]?)\s+(\d{1,9})\s*(L?)\s+([01])(?:\s+([^\sD]\S*))?(?:\s+DIM\s*=\s*([23]))?\s*", re.IGNORECASE
 )
@@ -48,15 +56,14 @@ def coordinates(
     return numbers
 
 
-def parse_tps(text: str, path: Path) -> LandmarkConfigurations:
-    """Return the landmarks of a TPS file; the points of curves are semilandmarks after the landmarks.
+def parse_tps(text: str, path: Path, curve_points: int | None = None) -> LandmarkConfigurations:
+    """Return the landmarks of a TPS file; the points of curves and outlines are semilandmarks after the landmarks.
 
-    The inner points of a curve slide between their neighbours. SCALE= is applied if all specimens have it, as in
-    geomorph. IMAGE=, COMMENT= and other keys become columns. Outlines are closed curves in files without landmarks, and
-    are not read from others.
+    Outlines are closed curves. Curves with other numbers of points are resampled. SCALE= is applied if all specimens
+    have it, as in geomorph. IMAGE=, COMMENT= and other keys become columns.
     """
-    parts, values = zip(*tps_specimens(text, path), strict=True)
-    images = [re.sub(r"\.\w{1,5}$", "", one.get("image", "")) for one in values]
+    specimens, curves, values = zip(*tps_specimens(text, path), strict=True)
+    images = _names_of_files([one.get("image", "") for one in values], r"\.\w{1,5}$")
     names = tuple(
         one.get("id") or image or f"specimen {k}" for k, (one, image) in enumerate(zip(values, images, strict=True), 1)
     )
@@ -64,21 +71,23 @@ def parse_tps(text: str, path: Path) -> LandmarkConfigurations:
     if len(set(names)) < len(names) == len(set(images)) and all(images):
         names = tuple(images)
         notes.append("Specimens are called as their IMAGE=, since values of ID= are repeated.")
-    closed = all(_CLOSED in one for one in values)
-    if closed and len({len(own) for own in parts}) == 1 and len(set(map(str, [list(map(len, p)) for p in parts]))) > 1:
-        parts, least = _resampled(parts, path)
-        notes.append(
-            f"Outlines are resampled to {least} points at equal distances, since their numbers of points differ."
-        )
-    counts = [list(map(len, own)) for own in parts]
-    for name, count in zip(names, counts, strict=True):
-        if count != counts[0]:
+    closed = [is_closed for _, is_closed in curves[0]]
+    for name, rows, own in zip(names, specimens, curves, strict=True):
+        if len(rows) != len(specimens[0]) or [is_closed for _, is_closed in own] != closed:
+            numbers = [", ".join(f"{len(curve)}{' (closed)' * closed}" for curve, closed in part)[:60]
+                       for part in (own, curves[0])]  # fmt: skip
             has, expected = (
-                f"{c[0]} landmarks" + f", curves of {c[1:]} points" * (len(c) > 1) for c in (count, counts[0])
+                f"{len(part)} landmarks" + f", curves of [{number}] points" * bool(number)
+                for part, number in zip((rows, specimens[0]), numbers, strict=True)
             )
             problem = f"specimen {name[:60]!r} has {has} and {names[0][:60]!r} has {expected}"
             raise damage_error(path, f"{problem}; digitise the same for all, with NA for missing landmarks")
-    points = _array([[row for part in own for row in part] for own in parts], names, path)
+    parts = [[rows, *(curve for curve, _ in own)] for rows, own in zip(specimens, curves, strict=True)]
+    arrays = _arrays([[row for part in own for row in part] for own in parts], names, path)
+    split = [np.split(array, np.cumsum([*map(len, own[:-1])])) for array, own in zip(arrays, parts, strict=True)]
+    resampled, changes = equal_curves([own[1:] for own in split], closed, names, path, curve_points)
+    points = np.stack([np.concatenate([own[0], *others]) for own, others in zip(split, resampled, strict=True)])
+    notes += changes
     unscaled = [name for name, one in zip(names, values, strict=True) if "scale" not in one]
     scales = np.ones(len(names))
     if not unscaled:
@@ -94,24 +103,19 @@ def parse_tps(text: str, path: Path) -> LandmarkConfigurations:
         )
     elif points.shape[2] == 2:
         notes.append("No specimen has SCALE=, so sizes are in the unit of the file, such as pixels.")
-    if any("outlines" in one for one in values) and not closed:
-        notes.append("Outlines (OUTLINES=) are left out.")
-    ends = np.cumsum(counts[0]).tolist()
-    sliders = sliders_of_curves([(range(a, b), closed) for a, b in pairwise(ends)])
-    if len(sliders):
-        kind = "points after the first of {} outlines" if closed else "inner points of {} curves"
-        notes.append(f"{len(sliders)} {kind.format(len(ends) - 1)} are semilandmarks.")
-    keys = dict.fromkeys(key for one in values for key in one if key not in ("id", "scale", "outlines", _CLOSED))
+    if any(_LEFT_OUT in one for one in values):
+        notes.append("Outlines (OUTLINES=) of fewer than 3 points are left out.")
+    keys = dict.fromkeys(key for one in values for key in one if key not in ("id", "scale", _LEFT_OUT))
     raw = mark_missing(LandmarkConfigurations(
         names=names, points=points, columns={key: tuple(one.get(key, "") for one in values) for key in keys},
-        curve_sliders=sliders,
+        curves=consecutive_curves(len(specimens[0]), resampled[0], closed),
         where=str(path), notes=tuple(notes),
     ))  # fmt: skip
     return replace(raw, points=raw.points * scales[:, None, None])
 
 
-def tps_specimens(text: str, path: Path) -> Iterator[tuple[list[list[list[float]]], dict[str, str]]]:
-    """Yield the rows of coordinates of the landmarks and of each curve of a specimen, and the values of other keys."""
+def tps_specimens(text: str, path: Path) -> Iterator[tuple[Rows, list[tuple[Rows, bool]], dict[str, str]]]:
+    """Yield the coordinates of the landmarks of a specimen, its curves with whether they are closed, and other keys."""
     text = numeric_text(text.encode("utf-8", "replace"), path, commas_separate=True).decode()
     lines = "\n".join(line.strip() for line in text.splitlines() if line.strip())
     start, *blocks = re.split(r"^(?=LM3?\s*=)", lines, flags=re.IGNORECASE | re.MULTILINE)
@@ -121,9 +125,9 @@ def tps_specimens(text: str, path: Path) -> Iterator[tuple[list[list[list[float]
         yield _specimen(block, number, path)
 
 
-def _specimen(block: str, number: int, path: Path) -> tuple[list[list[list[float]]], dict[str, str]]:
-    lines, parts, values = block.splitlines(), list[list[list[float]]](), dict[str, str]()
-    outlines = list[list[list[float]]]()
+def _specimen(block: str, number: int, path: Path) -> tuple[Rows, list[tuple[Rows, bool]], dict[str, str]]:
+    lines, values = block.splitlines(), dict[str, str]()
+    parts = list[tuple[Rows, bool]]()
     at, is_outline = 0, False
     while at < len(lines):
         key, equals, value = (part.strip() for part in lines[at].partition("="))
@@ -131,7 +135,6 @@ def _specimen(block: str, number: int, path: Path) -> tuple[list[list[list[float
         if not equals:
             problem = f"specimen {number} has more rows of coordinates than it declares"
             raise damage_error(path, f"{problem} ({lines[at - 1][:40]!r})")
-        is_outline = key == "outlines" or (is_outline and key != "curves")
         if key in ("lm", "lm3", "points", "points3"):
             count = int(value) if re.fullmatch(r"\d{1,10}", value) else -1
             rows = list(takewhile(lambda row: "=" not in row, lines[at : at + max(count, 0)]))
@@ -139,31 +142,31 @@ def _specimen(block: str, number: int, path: Path) -> tuple[list[list[list[float
                 declared = f"specimen {number} declares {value[:20]!r} points"
                 raise damage_error(path, f"{declared}, and {len(rows)} rows of coordinates follow; {CUT_SHORT}")
             at += count
-            points = [coordinates(row.split(), path, lambda _: f"specimen {number}") for row in rows]
-            (outlines if is_outline else parts).append(points)
-        elif key != "curves":
+            parts.append(
+                (
+                    [coordinates(row.replace(";", " ").split(), path, lambda _: f"specimen {number}") for row in rows],
+                    is_outline,
+                )
+            )
+            if is_outline and count < LEAST_OUTLINE:
+                del parts[-1]
+                values[_LEFT_OUT] = ""
+        elif key in ("curves", "outlines"):
+            is_outline = key == "outlines"
+        else:
             values[key] = value
-    return (parts, values) if any(parts) or not outlines else ([[], *outlines], {**values, _CLOSED: ""})
+    return parts[0][0], parts[1:], values
 
 
-def _resampled(parts: Sequence[list[list[list[float]]]], path: Path) -> tuple[list[list[list[list[float]]]], str]:
-    """Return outlines with the least number of points that a specimen has, by arc length from their first points."""
-    least, out = [min(map(len, own)) for own in zip(*parts, strict=True)], list[list[list[list[float]]]]()
-    for number, own in enumerate(parts, 1):
-        _array([[row for curve in own for row in curve]], [f"specimen {number}"], path)
-        out.append([[]])
-        for curve, count in zip(own[1:], least[1:], strict=True):
-            ring: FloatArray = np.array([*curve, *curve[:1]], dtype=np.float64)
-            along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(ring, axis=0), axis=1)))
-            places = along[-1] / count * np.arange(count)
-            k: IntArray = np.asarray(np.searchsorted(along, places, side="right") - 1, dtype=np.int32)
-            share = (places - along[k]) / (along[k + 1] - along[k])
-            out[-1].append((ring[k] + share[:, None] * (ring[k + 1] - ring[k])).tolist())
-    return out, " and ".join(map(str, least[1:]))
+def _names_of_files(files: Sequence[str], ending: str) -> list[str]:
+    """Return the names of files without an ending, and without their folders if they differ otherwise."""
+    names = [re.sub(ending, "", file, flags=re.IGNORECASE) for file in files]
+    bases = [re.split(r"[/\\]", name)[-1] for name in names]
+    return bases if len(set(bases)) == len(set(names)) else names
 
 
-def _array(specimens: Sequence[list[list[float]]], names: Sequence[str], path: Path) -> FloatArray:
-    """Return (N, L, D) coordinates; a row of not-a-number alone may have any width."""
+def _arrays(specimens: Sequence[Rows], names: Sequence[str], path: Path) -> list[FloatArray]:
+    """Return the (L, D) coordinates of each specimen; a row of not-a-number alone may have any width."""
     rows = [(name, row) for name, points in zip(names, specimens, strict=True) for row in points]
     widths = {len(row): name for name, row in reversed(rows) if not all(map(math.isnan, row))}
     if set(widths) not in ({2}, {3}):
@@ -171,8 +174,10 @@ def _array(specimens: Sequence[list[list[float]]], names: Sequence[str], path: P
         advice = "do not mix 2-D and 3-D landmarks" if len(widths) > 1 else "landmarks need 2 or 3 coordinates each"
         raise damage_error(path, f"it has {has or 'no landmarks'}; {advice}")
     [width] = widths
-    flat = [row if len(row) == width else [math.nan] * width for _, row in rows]
-    return np.array(flat, dtype=np.float64).reshape(len(specimens), -1, width)
+    return [
+        np.array([row if len(row) == width else [math.nan] * width for row in points]).reshape(-1, width)
+        for points in specimens
+    ]
 
 
 def tps_text(specimens: Mapping[str, FloatArray], values: Mapping[str, Sequence[str]] | None = None) -> str:
@@ -226,18 +231,21 @@ def parse_nts(text: str, path: Path) -> LandmarkConfigurations:
 def parse_dta(text: str, path: Path) -> LandmarkConfigurations:
     """Return the landmarks of a file of IDAV Landmark, which is NTS with the names of meshes."""
     raw = parse_nts(text, path)
-    return replace(raw, names=tuple(re.sub(r"\.(ply|obj|stl)$", "", name, flags=re.IGNORECASE) for name in raw.names))
+    return replace(raw, names=tuple(_names_of_files(raw.names, r"\.(ply|obj|stl|off|vtk|vtp)(\.gz)?$")))
 
 
 def parse_morphologika(text: str, path: Path) -> LandmarkConfigurations:
     """Return the landmarks of a Morphologika file; its labels and groups become columns."""
     data = text.encode("utf-8", "replace")
-    data = numeric_text(data, path, max(data.lower().find(b"[rawpoints]"), 0), commas_separate=True)
+    rows = re.search(rb"\[\s*rawpoints\s*\][^\[]*", data, re.IGNORECASE)
+    if rows is not None:
+        data = numeric_text(data[: rows.end()], path, rows.start(), commas_separate=True) + data[rows.end() :]
     sections, own = dict[str, list[str]](), list[str]()
     for line in filter(None, map(str.strip, data.decode().splitlines())):
-        if section := re.fullmatch(r"\[\s*(\w+)\s*\].*", line):
+        if section := re.fullmatch(r"\[\s*(\w+)\s*\]\s*(.*)", line):
             own = sections.setdefault(section[1].lower(), [])
-        elif not line.startswith("'"):
+            line = section[2]
+        if line and not line.startswith(("'", "#")):
             own.append(line)
     try:
         n, p, width = (int(sections[key][0]) for key in ("individuals", "landmarks", "dimensions"))
@@ -251,7 +259,7 @@ def parse_morphologika(text: str, path: Path) -> LandmarkConfigurations:
         raise damage_error(path, f"{declared}, and has {len(names)} names and {len(words)} coordinates; {CUT_SHORT}")
     points = np.array(coordinates(words, path, lambda k: f"specimen {names[k // (p * width)]!r}"))
     labels, rows = " ".join(sections.get("labels", [])).split(), sections.get("labelvalues", [])
-    cells = [[row] if len(labels) == 1 else row.split() for row in rows]
+    cells = [[row] if len(labels) == 1 else row.split("\t" if "\t" in row else None) for row in rows]
     if labels and (len(cells) != n or any(len(row) != len(labels) for row in cells)):
         raise damage_error(
             path, f"its [labelvalues] are not {n} rows with a value for each of {', '.join(labels)[:60]}"

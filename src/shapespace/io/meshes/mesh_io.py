@@ -23,9 +23,8 @@ from shapespace.io.meshes.pcd import read_pcd
 from shapespace.io.meshes.ply import probe_ply, read_ply, write_ply
 from shapespace.io.meshes.stl import probe_stl, read_stl, write_stl
 from shapespace.io.meshes.vrml import read_vrml
-from shapespace.io.meshes.vtk import read_vtk, read_vtp, write_vtk, write_vtp
+from shapespace.io.meshes.vtk import read_vtk, write_vtk, write_vtp
 from shapespace.io.meshes.xyz import read_xyz
-from shapespace.io.parsing import plain_text
 from shapespace.io.read_limits import LARGEST_MESH_FILE_BYTES
 from shapespace.types import Mesh, require
 
@@ -164,20 +163,14 @@ def _format(path: Path, verb: str) -> MeshFormat:
     return mesh_format
 
 
-def _read_any_vtk(data: bytes, path: Path) -> Mesh:
-    # Both endings are used for both formats, so the content decides.
-    data = plain_text(data)
-    return read_vtp(data, path) if data.lstrip()[:1] == b"<" else read_vtk(data, path)
-
-
 MESH_FORMATS: Mapping[str, MeshFormat] = MappingProxyType(
     {
         ".ply": MeshFormat("PLY", read_ply, write_ply),
         ".obj": MeshFormat("Wavefront OBJ", read_obj, write_obj),
         ".stl": MeshFormat("STL", read_stl, write_stl, exact=False, point_clouds=False, keeps_vertices=False),
         ".off": MeshFormat("OFF", read_off, write_off),
-        ".vtk": MeshFormat("legacy VTK", _read_any_vtk, write_vtk),
-        ".vtp": MeshFormat("XML VTK", _read_any_vtk, write_vtp),
+        ".vtk": MeshFormat("legacy VTK", read_vtk, write_vtk),
+        ".vtp": MeshFormat("XML VTK", read_vtk, write_vtp),
         ".glb": MeshFormat("binary glTF", read_gltf, write_glb, exact=False),
         ".gltf": MeshFormat("glTF", read_gltf, write_gltf, exact=False),
     }

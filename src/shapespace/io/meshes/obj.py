@@ -78,6 +78,8 @@ def read_obj(data: bytes, path: Path) -> Mesh:
     notes: tuple[str, ...] = ()
     if vertex_colours is None:
         vertex_colours, notes = texture_colours(data, count, path)
+    if b"\nl " in data:
+        notes = (*notes, "Its lines (l) are no surface, and their points alone are read; save them as VTK for curves.")
     header = data[: data.find(b"\nv")]
     return mesh_of(np.concatenate(vertices), join_parts(faces, np.int64, 3), path, vertex_colours, notes, header=header)
 

@@ -22,6 +22,7 @@ from shapespace.io.parsing import (
     floats_of,
     ints_of,
     mesh_of,
+    numeric_text,
     plain_text,
 )
 from shapespace.io.read_limits import Allowance
@@ -31,11 +32,25 @@ from shapespace.types import FloatArray, Mesh
 _SKIPPED = re.compile(rb'(?:(?:"(?:[^"\\]|\\.)*+(?:"|\\?\Z)|#[^\r\n]*)[\s,]*+)++', re.DOTALL)
 _TO_BRACKET = re.compile(rb"[^{}\[\]]*+")
 _HEXADECIMAL = re.compile(rb"(?<!\S)0[xX][0-9a-fA-F]{1,16}(?!\S)")
+_TIGHT_COMMA, _LAST_COMMA, _WORD = re.compile(rb"\d,\d"), re.compile(rb",(?=\s|\Z)"), re.compile(rb"\S+")
+_DECIMAL = re.compile(rb"(?<!\S)[+-]?\d*,\d+(?:[eE][+-]?\d+)?(?!\S)")
 _DEEPEST = 500  # nodes; limit on damaged files
 _POINTS = (b"Coordinate", b"Coordinate3", b"CoordinateDouble")
 _MOVES_OF_VRML_1 = (b"MatrixTransform", b"Translation", b"Rotation", b"Scale")
 _FIELDS = {b"translation": 3, b"rotation": 4, b"scale": 3, b"scaleFactor": 3, b"scaleOrientation": 4, b"center": 3}
 _KNOWN = {b"USE", b"ccw", b"vertexOrdering", *_FIELDS}
+
+
+def _with_points(text: bytes, path: Path) -> bytes:
+    """Return the coordinates of points with decimal points.
+
+    Commas separate numbers in VRML. Those between points alone are in fewer than half of the words between white space.
+    """
+    if _TIGHT_COMMA.search(text):
+        spaced = _LAST_COMMA.sub(b" ", text)
+        words, decimals = (sum(1 for _ in pattern.finditer(spaced)) for pattern in (_WORD, _DECIMAL))
+        text = numeric_text(spaced, path) if 2 * decimals > words else text
+    return text
 
 
 @dataclass
@@ -127,7 +142,7 @@ class _Scene:
         """Take a list that holds no nodes."""
         node = self.stack[-1] if self.stack else _Node(b"")
         if name == b"point" and node.kind in _POINTS:
-            points = floats_of(text.replace(b",", b" "), self.path)
+            points = floats_of(_with_points(text, self.path).replace(b",", b" "), self.path)
             if len(points) % 3:
                 raise damage_error(self.path, f"its points have {len(points)} numbers, not three each; {CUT_SHORT}")
             self.blocks.append((points.reshape(-1, 3), node.frame))

@@ -10,9 +10,10 @@ import re
 import xml.etree.ElementTree as ET
 import zlib
 from abc import ABC, abstractmethod
+from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -62,9 +63,13 @@ _MAX_INFLATION = 1040
 _COLOUR_WIDTHS = (3, 4)  # RGB and RGBA
 _MOST_ATTRIBUTES = 100  # arrays searched for colours; limit on damaged files
 
-_LINE_NOTES = ("Its lines are not read, only their points; give curves as landmarks, such as curves of 3D Slicer.",)
+LINE_NOTE = (
+    "Its lines are no part of a surface, and their points alone are read; shapespace align reads them as curves."
+)
 
 Values = npt.NDArray[Any]
+Cells: TypeAlias = tuple[IndexArray, IndexArray]
+"""Numbers of corners of cells, and their corners one after another."""
 
 
 class _Cursor(ABC):
@@ -165,19 +170,67 @@ class _BinaryCursor(_Cursor):
 
 
 def read_vtk(data: bytes, path: Path) -> Mesh:
-    """Read legacy VTK poly data, ascii or binary, with the cells of VTK before and after 5.1.
+    """Read VTK poly data, legacy or XML, as the content shows: both endings are used for both formats.
 
-    Polygons become fans and triangle strips triangles; vertex and line cells are passed over.
+    Polygons become fans and triangle strips triangles; vertex and line cells are passed over, the latter with a note.
+    Legacy files are ascii or binary, with the cells of VTK before or after 5.1; arrays of XML are ascii, inline base64
+    or appended, plain or packed by zlib, and pieces are joined.
 
     Args:
         data: the whole file.
         path: its name, for messages and the mesh's name.
 
     Raises:
-        FileFormatError: it is not legacy VTK poly data, or it is cut short.
+        FileFormatError: it is not VTK poly data, is cut short, or is compressed otherwise than by zlib.
         MeshError: faces that point past the end of the vertices.
     """
+    return _read(data, path)[0]
+
+
+def read_vtk_lines(data: bytes, path: Path) -> tuple[Mesh, list[tuple[list[int], bool]]]:
+    """Read VTK poly data and the polylines of its lines: numbers of vertices along them, and whether they are closed.
+
+    Lines that meet at a point, where no third one is, are one polyline. Errors are those of `read_vtk`.
+    """
+    mesh, given = _read(data, path)
+    corners = join_parts([corners for _, corners in given], np.int64)
+    if len(corners) and not 0 <= int(corners.min()) <= int(corners.max()) < len(mesh.vertices):
+        raise damage_error(path, f"it has lines that point past its points; {CUT_SHORT}")
+    sizes = join_parts([counts for counts, _ in given], np.int64)
+    Allowance(len(data), path).part(len(sizes))
+    lines = np.split(corners, np.cumsum(sizes)[:-1])
+    # Pieces and cells may each have their own copy of a point.
+    _, first, place = np.unique(mesh.vertices, axis=0, return_index=True, return_inverse=True)
+    cells = [first[place.reshape(-1)[line]].tolist() for line in lines if len(line) > 1]
+    at_end = defaultdict[int, list[int]](list)
+    for k, cell in enumerate(cells):
+        at_end[cell[0]].append(k)
+        at_end[cell[-1]].append(k)
+    left, out = set(range(len(cells))), list[tuple[list[int], bool]]()
+    for k, cell in enumerate(cells):
+        if k not in left:
+            continue
+        left.remove(k)
+        path_of_points = list[int](cell)
+        for _ in range(2):
+            while path_of_points[0] != (end := path_of_points[-1]) and len(at_end[end]) == 2 and left & {*at_end[end]}:
+                [following] = left & {*at_end[end]}
+                left.remove(following)
+                own = cells[following]
+                path_of_points += own[1:] if own[0] == end else own[-2::-1]
+            path_of_points.reverse()
+        is_closed = path_of_points[0] == path_of_points[-1]
+        out.append((path_of_points[:-1] if is_closed else path_of_points, is_closed))
+    return mesh, out
+
+
+def _read(data: bytes, path: Path) -> tuple[Mesh, list[Cells]]:
+    """Return the mesh and its lines."""
     data = plain_text(data)
+    return _read_xml(data, path) if data.lstrip()[:1] == b"<" else _read_legacy(data, path)
+
+
+def _read_legacy(data: bytes, path: Path) -> tuple[Mesh, list[Cells]]:
     head = data[:1024].split(b"\n", 3)
     header = head[1:2]
     if len(head) < 4 or not head[0].startswith(b"# vtk DataFile"):
@@ -198,7 +251,7 @@ def read_vtk(data: bytes, path: Path) -> Mesh:
         raise damage_error(path, f"it has '{kind}', not DATASET POLYDATA; extract its surface first")
     vertices: FloatArray | None = None
     faces: list[IndexArray] = []
-    notes: tuple[str, ...] = ()
+    lines: list[Cells] = []
     while (word := cursor.word()) not in (b"", b"POINT_DATA", b"CELL_DATA"):
         allowance.part()
         if word == b"POINTS":
@@ -211,7 +264,7 @@ def read_vtk(data: bytes, path: Path) -> Mesh:
             elif word == b"TRIANGLE_STRIPS":
                 faces.append(strip_triangles(counts, corners))
             elif word == b"LINES" and len(counts):
-                notes = _LINE_NOTES
+                lines.append((counts, corners))
         elif word == b"FIELD":
             begin = cursor.position
             cursor.word()
@@ -228,7 +281,8 @@ def read_vtk(data: bytes, path: Path) -> Mesh:
     if vertices is None:
         raise damage_error(path, f"it has no POINTS; {CUT_SHORT}")
     colours = _legacy_colours(cursor, len(vertices)) if word == b"POINT_DATA" else None
-    return mesh_of(vertices, join_parts(faces, np.int64, 3), path, colours, notes, header=b"\n".join(header))
+    notes = (LINE_NOTE,) if lines else ()
+    return mesh_of(vertices, join_parts(faces, np.int64, 3), path, colours, notes, header=b"\n".join(header)), lines
 
 
 def _legacy_colours(cursor: _Cursor, vertices: int) -> ByteArray | None:
@@ -314,7 +368,7 @@ def _kind(name: str, path: Path) -> str:
     return _LEGACY[name]
 
 
-def _legacy_cells(cursor: _Cursor, path: Path) -> tuple[IndexArray, IndexArray]:
+def _legacy_cells(cursor: _Cursor, path: Path) -> Cells:
     first, second = _count(cursor, path), _count(cursor, path)
     if cursor.skip_if_offsets():
         offsets = cursor.array(first, _next_kind(cursor, path)).astype(np.int64)
@@ -340,7 +394,7 @@ def _legacy_cells(cursor: _Cursor, path: Path) -> tuple[IndexArray, IndexArray]:
     return counts, packed[keep]
 
 
-def _from_offsets(offsets: IndexArray, corners: IndexArray, path: Path) -> tuple[IndexArray, IndexArray]:
+def _from_offsets(offsets: IndexArray, corners: IndexArray, path: Path) -> Cells:
     """Return sizes of cells and their corners, from offsets that run from 0 to the number of corners."""
     if not len(offsets):
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
@@ -379,17 +433,7 @@ class _Xml:
     allowance: Allowance
 
 
-def read_vtp(data: bytes, path: Path) -> Mesh:
-    """Read XML VTK poly data: ascii, inline base64 or appended, plain or zlib; pieces are joined.
-
-    Args:
-        data: the whole file.
-        path: its name, for messages and the mesh's name.
-
-    Raises:
-        FileFormatError: it is not XML poly data, is cut short, or is compressed otherwise than by zlib.
-        MeshError: faces that point past the end of the vertices.
-    """
+def _read_xml(data: bytes, path: Path) -> tuple[Mesh, list[Cells]]:
     head, mark, tail = data.partition(b"<AppendedData")
     appended = b""
     if mark:
@@ -419,22 +463,26 @@ def read_vtp(data: bytes, path: Path) -> Mesh:
     points: list[FloatArray] = []
     colours: list[ByteArray | None] = []
     faces: list[IndexArray] = []
+    lines: list[Cells] = []
     n_vertices = 0
     for piece in root.iterfind("PolyData/Piece"):
         xml.allowance.part()
         vertices = _piece_points(piece, xml)
-        for section, cut in (("Polys", fan_triangles), ("Strips", strip_triangles)):
+        for section, cut in (("Polys", fan_triangles), ("Strips", strip_triangles), ("Lines", None)):
             arrays = {a.get("Name"): a for a in piece.iterfind(f"{section}/DataArray")}
             if not {"connectivity", "offsets"} <= arrays.keys():
                 continue
-            face_ends = _data_array(arrays["offsets"], xml).astype(np.int64)
+            cell_ends = _data_array(arrays["offsets"], xml).astype(np.int64)
             corners = _data_array(arrays["connectivity"], xml).astype(np.int64)
-            if not len(face_ends):
+            if not len(cell_ends):
                 continue
             xml.allowance.take(3 * len(corners), 8)
-            triangles = cut(*_from_offsets(np.concatenate([[0], face_ends]), corners, path))
+            counts, corners = _from_offsets(np.concatenate([[0], cell_ends]), corners, path)
+            if cut is None:
+                lines.append((counts, corners + n_vertices))
+                continue
             # Checked piece by piece: joined, an index past one piece would point into the next.
-            faces.append(_faces_of(mesh_of(vertices, triangles, path)) + n_vertices)
+            faces.append(_faces_of(mesh_of(vertices, cut(counts, corners), path)) + n_vertices)
         points.append(vertices)
         colours.append(_piece_colours(piece, len(vertices), xml))
         n_vertices += len(vertices)
@@ -442,13 +490,12 @@ def read_vtp(data: bytes, path: Path) -> Mesh:
         raise damage_error(path, f"it holds no points; {CUT_SHORT}")
     known_colours = [part for part in colours if part is not None]
     vertex_colours = np.concatenate(known_colours) if len(known_colours) == len(colours) else None
-    has_lines = any(piece.get("NumberOfLines", "0") != "0" for piece in root.iterfind("PolyData/Piece"))
-    notes = _LINE_NOTES if has_lines else ()
-    spaces = [_data_array(a, xml).astype(np.uint8) for a in root.iterfind("PolyData/FieldData/*[@Name='SPACE']")]
+    fields = root.iterfind("PolyData/FieldData/*")
+    spaces = [_data_array(a, xml).astype(np.uint8) for a in fields if a.get("Name", "").upper() == "SPACE"]
     return mesh_of(
-        np.concatenate(points), join_parts(faces, np.int64, 3), path, vertex_colours, notes,
+        np.concatenate(points), join_parts(faces, np.int64, 3), path, vertex_colours, (LINE_NOTE,) if lines else (),
         header=b"".join(b" SPACE=" + codes.tobytes() for codes in spaces),
-    )  # fmt: skip
+    ), lines  # fmt: skip
 
 
 def _faces_of(mesh: Mesh) -> IndexArray:

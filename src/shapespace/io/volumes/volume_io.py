@@ -1,10 +1,10 @@
-"""Readers of label volumes: NIfTI (`.nii`, `.nii.gz`) and NRRD (`.nrrd`, header and data in one file), as RAS
-millimetres.
+"""Readers of label volumes: NIfTI (`.nii`, `.nii.gz`), NRRD (`.nrrd`, header and data in one file) and MetaImage
+(`.mha`, `.mhd`), as RAS millimetres.
 
-nibabel and pynrrd read the headers; the voxels are decoded here, so that a header that declares more than its file
-holds, a volume that takes more memory than allowed, and a compressed stream that grows without end are refused before
-memory is taken. Voxels are decompressed and converted in pieces of 1 MiB, up to the declared size and no further. No
-other file is opened.
+nibabel and pynrrd read the headers of NIfTI and NRRD; the voxels are decoded here, so that a header that declares more
+than its file holds, a volume that takes more memory than allowed, and a compressed stream that grows without end are
+refused before memory is taken. Voxels are decompressed and converted in pieces of 1 MiB, up to the declared size and no
+further. No other file is opened, except the data file of `.mhd` in the same folder.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ import gzip
 import io
 import math
 import os
+import re
 import zlib
 from collections.abc import Generator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import IO, Any, BinaryIO, cast
@@ -30,7 +31,7 @@ from shapespace.io.files import open_file, read_error
 from shapespace.io.parsing import CUT_SHORT, damage_error
 from shapespace.types import MAX_MEMORY_BYTES, FloatArray, LabelVolume, Segment
 
-VOLUME_ENDINGS = (".nii", ".nii.gz", ".nrrd")
+VOLUME_ENDINGS = (".nii", ".nii.gz", ".nrrd", ".mha", ".mhd")
 """The endings that `read_volume` takes."""
 
 _MOST_BYTES = 1 << 31  # 2 GiB
@@ -47,7 +48,7 @@ _HEADS = {348: "Nifti1Header", 540: "Nifti2Header"}
 _SINGLE, _PAIR = (b"n+1", b"n+2"), (b"ni1", b"ni2")
 _MAGIC_AT = {348: 344, 540: 4}
 _NIFTI_MM = {"unknown": 1.0, "mm": 1.0, "meter": 1e3, "micron": 1e-3}
-_NRRD_MM = {"": 1.0, "mm": 1.0, "millimeter": 1.0, "m": 1e3, "meter": 1e3, "cm": 10.0, "um": 1e-3, "µm": 1e-3}
+MM_OF_UNITS = {"": 1.0, "mm": 1.0, "millimeter": 1.0, "m": 1e3, "meter": 1e3, "cm": 10.0, "um": 1e-3, "µm": 1e-3}
 _NRRD_TYPES = {
     "i1": ("signed char", "int8", "int8_t"),
     "u1": ("uchar", "unsigned char", "uint8", "uint8_t"),
@@ -60,6 +61,10 @@ _NRRD_TYPES = {
     "f4": ("float",),
     "f8": ("double",),
 }
+_META_TYPES = {"char": "signed char", "long": "int", "ulong": "uint", "ulong long": "ulonglong"}
+"""Type of MetaImage after `MET_` -> name in NRRD, where they differ; others have the same."""
+_TRUE = ("true", "1")
+_META_END = re.compile(rb"^ElementDataFile\s*=[ \t]*(.*?)[ \t]*\r?(?:\n|\Z)", re.MULTILINE)
 # Sign of each axis of a space that takes it to right, anterior, superior.
 _NRRD_SPACES = {
     "right-anterior-superior": (1, 1, 1), "ras": (1, 1, 1),
@@ -136,7 +141,8 @@ def read_volume(path: Path | str, *, max_memory_bytes: int = MAX_MEMORY_BYTES) -
 
     Returns:
         Its labels, and the affine from voxels to RAS millimetres: of NIfTI the sform, else the qform; of NRRD space
-        directions and origin, with LPS and LAS turned to RAS, and units to millimetres. Segments of 3D Slicer have
+        directions and origin, with LPS and LAS turned to RAS, and units to millimetres; of MetaImage TransformMatrix,
+        Offset and ElementSpacing, which are in LPS. Segments of 3D Slicer have
         their names; those that overlap are in layers.
 
     Raises:
@@ -156,8 +162,8 @@ def read_volume(path: Path | str, *, max_memory_bytes: int = MAX_MEMORY_BYTES) -
         try:
             size = os.fstat(file.fileno()).st_size
             _check_size(size, path)
-            is_nrrd = name.endswith(".nrrd")
-            head, stream = (_open_nrrd if is_nrrd else _open_nifti)(file, size, stack, path)
+            read = _open_nrrd if name.endswith(".nrrd") else _open_nifti if ".nii" in name[-7:] else _open_meta
+            head, stream = read(file, size, stack, path)
         except OSError as error:
             raise read_error(path, error) from error
         order, shape = _spatial_order(head, path)
@@ -351,7 +357,7 @@ def _open_nrrd(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tuple
         raise damage_error(path, f"its header has no end; {CUT_SHORT}")
     start = sum(min(header_ends))
     try:
-        fields: dict[str, Any] = dict(nrrd.read_header(io.BytesIO(data[:start])))
+        fields: dict[str, Any] = dict(nrrd.read_header(io.StringIO(data[:start].decode("utf-8", "replace"))))
     except Exception as error:
         # What pynrrd raises of a header that was tampered with is of any kind.
         raise damage_error(path, f"its header is damaged ({_first_words(error)}), so export it again") from error
@@ -361,17 +367,89 @@ def _open_nrrd(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tuple
         raise damage_error(path, "its header skips a part of the data, which is not read; save it again")
     head = _nrrd_head(fields, path)
     encoding = str(fields.get("encoding", "")).lower()
+    encoding = {"gz": "gzip", "bz2": "bzip2"}.get(encoding, encoding)
+    if encoding not in ("raw", "gzip", "bzip2"):
+        raise damage_error(path, f"its encoding is '{encoding}', but only raw, gzip and bzip2 are read; save it again")
     file.seek(start)
-    if encoding == "raw":
-        _check_declared(head, size - start, path)
-        return head, file
-    if encoding in ("gzip", "gz"):
-        _check_declared(head, _DEFLATE_GROWTH * (size - start), path)
-        return head, cast("IO[bytes]", stack.enter_context(gzip.GzipFile(fileobj=file)))
-    if encoding in ("bzip2", "bz2"):
-        _check_declared(head, _BZIP2_SPARE + _BZIP2_GROWTH * (size - start), path)
-        return head, stack.enter_context(bz2.BZ2File(file))
-    raise damage_error(path, f"its encoding is '{encoding}', but only raw, gzip and bzip2 are read; save it again")
+    return head, _voxel_stream(file, encoding, head, size - start, stack, path)
+
+
+def _voxel_stream(
+    file: BinaryIO, encoding: str, head: _VolumeHeader, size: int, stack: ExitStack, path: Path
+) -> IO[bytes]:
+    """Return a stream of the voxels in the `size` bytes that follow in a file, which can hold what is declared."""
+    growth = {"raw": size, "bzip2": _BZIP2_SPARE + _BZIP2_GROWTH * size}
+    _check_declared(head, growth.get(encoding, _DEFLATE_GROWTH * size), path)
+    if encoding == "gzip":
+        return cast("IO[bytes]", stack.enter_context(gzip.GzipFile(fileobj=file)))
+    if encoding == "bzip2":
+        return stack.enter_context(bz2.BZ2File(file))
+    return file if encoding == "raw" else cast("IO[bytes]", _ZlibStream(file))
+
+
+def _open_meta(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tuple[_VolumeHeader, IO[bytes]]:
+    """Return the header of a MetaImage file, and a stream at its first voxel."""
+    data = file.read(_MOST_HEADER)
+    end = _META_END.search(data)
+    if end is None:
+        raise damage_error(path, "its header is not that of a MetaImage volume; export it again as .mha")
+    lines = (line.partition("=") for line in data[: end.start()].decode("latin-1").splitlines())
+    fields = {key.strip().lower(): value.strip() for key, _, value in lines}
+
+    def numbers(*keys: str) -> FloatArray | None:
+        return next((np.array(fields[key].split(), dtype=np.float64) for key in keys if key in fields), None)
+
+    big = fields.get("binarydatabyteordermsb", fields.get("elementbyteordermsb", ""))
+    kind = fields.get("elementtype", "").lower().removeprefix("met_").replace("_", " ")
+    try:
+        steps, turn = numbers("elementspacing", "elementsize"), numbers("transformmatrix", "rotation", "orientation")
+        origin = numbers("offset", "position", "origin")
+        if steps is not None:
+            steps = (np.eye(len(steps)) if turn is None else turn.reshape(-1, len(steps))) * steps[:, None]
+        known: dict[str, Any] = {
+            "type": _META_TYPES.get(kind, kind),
+            "endian": "big" if big.lower() in _TRUE else "little",
+            "sizes": fields.get("dimsize", "").split(),
+            "dimension": fields.get("ndims"),
+            "space": "lps",
+            "space directions": steps,
+            "space origin": np.zeros(3) if origin is None else origin,
+        }
+        skip = int(fields.get("headersize", "0"))
+    except ValueError as error:
+        raise damage_error(path, f"its header is damaged ({_first_words(error)}), so export it again") from error
+    head = _nrrd_head(known, path)
+    head = replace(head, notes=(_UNORIENTED,)) if turn is None else head
+    if fields.get("elementnumberofchannels", "1") != "1" or fields.get("binarydata", "true").lower() == "false":
+        raise damage_error(path, "its voxels have several values or are text; save one label per voxel, as binary data")
+    name, start = end[1].decode("utf-8", "replace"), end.end()
+    if name.upper() != "LOCAL":
+        if not name or name.upper().startswith("LIST") or re.search(r"[/\\%]", name):
+            raise damage_error(path, f"its data are not in one file in its folder ({name[:60]!r}); save it as .mha")
+        file = stack.enter_context(open_file(path.parent / name))
+        size = os.fstat(file.fileno()).st_size
+        start = size - head.bytes if skip < 0 else skip
+    file.seek(max(start, 0))
+    encoding = "zlib" if fields.get("compresseddata", "").lower() in _TRUE else "raw"
+    return head, _voxel_stream(file, encoding, head, size - start, stack, path)
+
+
+class _ZlibStream(io.RawIOBase):
+    """The bytes that a zlib stream in a file unpacks to."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file, self._unpacking = file, zlib.decompressobj()
+
+    def readinto(self, buffer: Any) -> int:
+        """Unpack as much as fits in the buffer, and return how many bytes there are, 0 at the end."""
+        data = b""
+        while not data and not self._unpacking.eof:
+            packed = self._unpacking.unconsumed_tail or self._file.read(_PIECE)
+            if not packed:
+                raise EOFError
+            data = self._unpacking.decompress(packed, len(buffer))
+        buffer[: len(data)] = data
+        return len(data)
 
 
 def _nrrd_head(fields: dict[str, Any], path: Path) -> _VolumeHeader:
@@ -389,7 +467,8 @@ def _nrrd_head(fields: dict[str, Any], path: Path) -> _VolumeHeader:
         if len(shape) != int(fields["dimension"]):
             raise ValueError("sizes and dimension disagree")
         affine, notes, axes = _nrrd_affine(fields, path)
-        segments = tuple(_segment(fields, n) for n in range(len(fields)) if f"Segment{n}_ID" in fields)
+        numbers = sorted(int(match[1]) for key in fields if (match := re.fullmatch(r"Segment(\d{1,9})_ID", key)))
+        segments = tuple(_segment(fields, n) for n in numbers)
     except InputError:
         raise
     except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
@@ -422,11 +501,11 @@ def _nrrd_affine(fields: dict[str, Any], path: Path) -> tuple[FloatArray, tuple[
     if signs is None and space not in ("", "3d-right-handed", "scanner-xyz"):
         raise InputError(f"{path}: its space is '{space[:60]}', which is not known; save it as LPS or RAS.")
     units = {str(unit).strip('" ').lower() for unit in fields.get("space units") or ("mm",)}
-    if len(units) != 1 or (unit := units.pop()) not in _NRRD_MM:
+    if len(units) != 1 or (unit := units.pop()) not in MM_OF_UNITS:
         raise InputError(f"{path}: its space units are not one of mm, cm, m and um; save it in mm.")
     origin = np.asarray(fields.get("space origin", np.zeros(3)), dtype=np.float64).reshape(3)
     turn = np.diag(np.array(signs or (1, 1, 1), dtype=np.float64))
-    affine = _in_mm(_affine(turn @ np.array(list(rows.values())).T, turn @ origin), _NRRD_MM[unit])
+    affine = _in_mm(_affine(turn @ np.array(list(rows.values())).T, turn @ origin), MM_OF_UNITS[unit])
     return affine, () if signs else (_UNORIENTED,), tuple(rows)
 
 

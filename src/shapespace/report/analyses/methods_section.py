@@ -146,6 +146,8 @@ def alignment_text(record: AlignRecord) -> str:
         + ("with scaling to unit centroid size" if record.gauge == "shape" else "without scaling")
         + (", and projected orthogonally to the tangent space at their mean." if tangent else "."),
     ]
+    if settings.get("curves") and settings.get("match_curves"):
+        sentences.append("Starts of closed curves and directions of curves were chosen by the Procrustes distance.")
     if curves or surface:
         by = str(settings.get("slide_by", "bending-energy")).replace("-", " ")
         sentences.append(

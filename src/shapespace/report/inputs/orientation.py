@@ -21,7 +21,10 @@ _AGAIN = 'write {"views": [{"name": "dorsal", "toward_viewer": [0, 0, 1], "up": 
 
 
 def find_orientation(
-    path: Path | None, folders: Sequence[Path], landmarks: Sequence[str] | None = None
+    path: Path | None,
+    folders: Sequence[Path],
+    landmarks: Sequence[str] | None = None,
+    curve_links: tuple[tuple[int, int], ...] = (),
 ) -> Orientation | None:
     """Return the orientation of a file, or of orientation.json and links.csv in the first folders that have them.
 
@@ -29,6 +32,7 @@ def find_orientation(
         path: the file; None searches the folders.
         folders: of the shapes.
         landmarks: names of the landmarks, which links.csv may have; None for numbers alone.
+        curve_links: links where the files have none.
 
     Raises:
         FileError: a file cannot be read.
@@ -48,8 +52,9 @@ def find_orientation(
             raise FileFormatError(f"{path}: {error}") from error
         if any(number < 1 for link in orientation.links for number in link):
             raise FileFormatError(f"{path}: a link has a landmark below 1; number landmarks from 1.")
-    if links is not None and not orientation.links:
-        orientation = structs.replace(orientation, links=read_links(links, landmarks))
+    if not orientation.links:
+        pairs = curve_links if links is None else read_links(links, landmarks)
+        orientation = structs.replace(orientation, links=pairs)
     return orientation if orientation.views or orientation.links else None
 
 
