@@ -54,7 +54,7 @@ def test_mirrored_copies_have_the_same_triangles(reported: Path, run: Run, tmp_p
         ("08_curve_in_file", (5, 10, 3), 2, "are semilandmarks"),
         ("08b_curve_in_own_file", (4, 10, 3), 2, "8 files are joined to 4 specimens"),
         ("03_same_id_other_image.tps", (8, 6, 2), 0, "called as their IMAGE="),
-        ("04_outlines_only.tps", (6, 60, 2), 59, "outlines are semilandmarks"),
+        ("04_outlines_only.tps", (6, 60, 2), 59, "59 points of 1 curve are semilandmarks"),
         ("11_idav.dta", (6, 6, 3), 0, "1 missing landmark is an estimate"),
         ("12_morphologika.txt", (4, 6, 3), 0, ""),
     ],
@@ -65,6 +65,21 @@ def test_landmarks_of_other_tools_are_aligned(
     found = read_configurations(reported / name)
     assert found.points.shape == shape and len(found.curve_sliders) == n_sliders
     assert told in run("align", reported / name, "-o", tmp_path)
+
+
+def test_raw_coordinates_of_morphoj_of_two_or_three_dimensions(reported: Path, run: Run, tmp_path: Path) -> None:
+    table = reported / "14b_morphoj_upper_raw.txt"
+    assert "--dimensions 2 (or 3)" in run("align", table, "-o", tmp_path, code=2)
+    run("align", table, "--dimensions", 3, "-o", tmp_path / "aligned")
+    run("landmarks", "convert", table, "--dimensions", 3, "-o", tmp_path / "a.csv")
+    assert read_configurations(tmp_path / "a.csv").points.shape == (8, 4, 3)
+
+
+def test_lines_of_vtk_are_a_curve(reported: Path, run: Run) -> None:
+    found = read_configurations(reported / "24_contour.vtk")
+    ((points, is_closed),) = found.curves
+    assert is_closed and len(points) == found.points.shape[1]
+    assert "align reads them as curves" in run("check", reported / "24_contour.vtk")
 
 
 def test_a_segment_of_overlapping_ones(reported: Path, run: Run, tmp_path: Path) -> None:
