@@ -56,7 +56,7 @@ def _form(summary: str, options: Sequence[Option], first: tuple[str, ...]) -> di
     offered = [
         option
         for option in options
-        if not option.is_positional and not option.hidden and not _FILES & set(option.spellings)
+        if not option.is_positional and not _FILES & set(option.spellings)
     ]
     order = {flag: place for place, flag in enumerate(first)}
     described = [_described(option, visible=option.spellings[-1] in order) for option in offered]

@@ -346,9 +346,7 @@ def distances_text(fit: SavedFit) -> str:
     """Return the mean distances of one fit both ways, what they are over, and the shares seen."""
     to_scan, to_model = mm(fit.distance_mm("model_to_scan")), mm(fit.distance_mm("scan_to_model"))
     overlap = fit.record.shown
-    if overlap is None:
-        return f"On average: the whole model to the scan {to_scan}, the scan to the model {to_model}."
-    seen, covered = overlap.model_seen_share, overlap.scan_covered_share
+    seen, covered = (overlap.model_seen_share, overlap.scan_covered_share) if overlap else (None, None)
     return (
         f"On average, over what the scan shows: model to scan {to_scan}{_over(seen, 'model')}, scan to model "
         f"{to_model}{_over(covered, 'scan')}."

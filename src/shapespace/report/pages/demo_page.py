@@ -128,8 +128,6 @@ class DemoPage:
         counts = Counter(fit.status for fit in fits)
         tests = [fit.entry for fit in fits if fit.entry.intensity and fit.status != "failed"]
         distances = [fit.distance_mm("model_to_scan") for fit in fits if fit.entry in tests]
-        over_overlap = fits and all(fit.has_overlap_distances for fit in fits if fit.entry in tests)
-        where = ", over what it shows" if over_overlap else ""
         errors = _mean([entry.vertex_error_mm.mean for entry in tests if entry.vertex_error_mm])
         floors = _mean([entry.floor_mm.mean for entry in tests if entry.floor_mm])
         blind = "fits converged with nothing found against them; the plain method is blind to some errors"
@@ -137,7 +135,7 @@ class DemoPage:
         tiles = [
             (str(counts["converged"]), f"of {total}", blind),
             (modes, "", "modes hold 98.5 % of the variance of one person's expressions"),
-            (*_number_and_unit(_mean(distances)), f"mean closest distance of the test faces, model to scan{where}"),
+            (*_number_and_unit(_mean(distances)), "mean closest distance, test faces to scans, over what these show"),
             (*_number_and_unit(errors), f"their true vertex error; the model's best possible is {mm(floors)}"),
         ]
         rest = ", ".join(

@@ -179,8 +179,6 @@ class FolderPage:
             (str(counts["failed"] + counts["unreadable"]), "", "without a result"),
         ]
         to_scan = "from model to scan, over what the scan shows"
-        if not all(fit.has_overlap_distances for fit in trusted):
-            to_scan = "from the whole model to the scan"
         for value, label in (
             (_median([fit.expected_error_mm for fit in trusted]), "vertex error that such a fit expects of itself"),
             (_median([fit.distance_mm("model_to_scan") for fit in trusted]), f"mean distance {to_scan}"),

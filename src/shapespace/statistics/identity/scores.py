@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import TypeAlias
-from warnings import warn
 
 import numpy as np
 from scipy.spatial.distance import cdist
@@ -51,21 +50,6 @@ SCORES: Mapping[str, Callable[[Samples], Scorer]] = MappingProxyType(
 """Similarity scores of two scans: by the two-covariance model (PLDA), by the angle and by the distance of whitened
 coefficients of identity, and by the plain distance of the shapes, RMS over vertices in mm. No score is a likelihood
 ratio."""
-
-
-_FORMER = {"likelihood-ratio": "plda"}
-
-
-def score_name(name: str) -> str:
-    """Return the current name of a score, with a warning for a former name."""
-    if name not in _FORMER:
-        return name
-    warn(
-        f"The score {name!r} is now called {_FORMER[name]!r}, since only calibrated scores are likelihood ratios.",
-        DeprecationWarning,
-        stacklevel=3,
-    )
-    return _FORMER[name]
 
 
 def refuse_unknown_scores(names: Sequence[str]) -> None:

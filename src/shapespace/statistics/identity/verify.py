@@ -14,7 +14,6 @@ from shapespace.reprs import list_briefly, short_repr
 from shapespace.statistics.analysis_result import AnalysisResult
 from shapespace.statistics.identity.calibration import calibrated, cllr, cllr_min
 from shapespace.statistics.identity.rates import Pairs, RateEstimate, Roc, Sweep, people_drawn, rate_estimate, resampled
-from shapespace.statistics.identity.scores import score_name
 from shapespace.statistics.identity.trial import IdentityConfig, Trial, scores_of, trial_of
 from shapespace.types import BoolArray, FloatArray, IntArray, require
 
@@ -100,7 +99,6 @@ class VerificationResult(AnalysisResult):
     config: IdentityConfig
 
     def __getitem__(self, name: str) -> VerificationRates:
-        name = score_name(name)
         return next(one for one in self.scores if one.name == name)
 
     def __repr__(self) -> str:
