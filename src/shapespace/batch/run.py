@@ -137,5 +137,3 @@ def fit_many(
         finally:
             sink.close()
     return counts
-
-

@@ -38,7 +38,7 @@ class CommandParser(argparse.ArgumentParser):
 
     Args:
         command: None for a parser of commands.
-        keywords: as of argparse.
+        **keywords: See `argparse.ArgumentParser`.
     """
 
     def __init__(self, *, command: Command | None = None, **keywords: Any) -> None:

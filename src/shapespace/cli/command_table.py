@@ -91,7 +91,7 @@ class Command:
         summary: what it does, without a capital and a full stop.
         examples: command lines.
         run: takes the parsed arguments, and returns the exit code.
-        options: its arguments in the order of the help.
+        arguments: Its arguments in the order of the help.
         details: paragraphs on what it reads and writes, for `--help-all` and the reference.
         json: whether it prints facts, with `--json`.
         defaults: further attributes of the parsed arguments.
