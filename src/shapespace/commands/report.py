@@ -1,7 +1,5 @@
 """What `report` does."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from shapespace.batch.progress import progress

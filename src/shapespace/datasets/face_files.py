@@ -1,7 +1,5 @@
 """Files of simulated faces in correspondence, or of raw scans of them, with their labels and landmarks."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Registry of model formats, and detection of the format of a file."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

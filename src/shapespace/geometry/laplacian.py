@@ -1,7 +1,5 @@
 """The Laplacian of a surface, by cotangents."""
 
-from __future__ import annotations
-
 from typing import Any, cast
 
 import numpy as np

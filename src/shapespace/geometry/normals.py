@@ -1,7 +1,5 @@
 """What can be said of a surface from its vertices and triangles alone: areas, normals, boundary, samples."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

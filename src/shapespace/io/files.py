@@ -1,7 +1,5 @@
 """Atomic writing of files, hashes, and errors that name the file."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import hashlib

@@ -1,7 +1,5 @@
 """Memory available for arrays, from the system and the limits of a container."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

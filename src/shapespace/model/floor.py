@@ -1,7 +1,5 @@
 """The error that a model leaves where every correspondence is known: what no fit can do better than."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

@@ -5,8 +5,6 @@ something else. Source: Abadir, Distaso and Zikes, J. Econometrics 2014, for eig
 eigenvectors.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

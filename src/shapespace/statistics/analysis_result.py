@@ -1,7 +1,5 @@
 """Base class of the results of analyses: how they are saved and shown, which the layer `report` implements."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from shapespace.lazy import lazy_import

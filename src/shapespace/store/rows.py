@@ -1,7 +1,5 @@
 """Fits as rows of coefficients.csv and of the tables of a store."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

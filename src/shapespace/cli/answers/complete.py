@@ -1,7 +1,5 @@
 """`shapespace complete`: the missing part of partial scans, with its distribution."""
 
-from __future__ import annotations
-
 import argparse
 
 from shapespace.cli.answers.common import finish

@@ -7,8 +7,6 @@ models built with mirrored shapes. Only the part outside the model's span is kep
 own, so that b keeps its meaning.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 

@@ -1,7 +1,5 @@
 """Reader of gzip files with a limit on the unpacked size."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import zlib

@@ -3,8 +3,6 @@
 Tables may have a column `CHECKSUM` that shows any later change of a row; they are plain CSV to other programs.
 """
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import io

@@ -1,7 +1,5 @@
 """Sentences, cells and curves shared by the reports of verification and identification."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
