@@ -95,14 +95,9 @@ def random_similarity(
         raise InputError(f"The range of scales must be positive and in order, not {scale_range}.")
     axis = rng.standard_normal(3)
     angle = math.radians(rng.uniform(0.0, max_angle_deg))
-    rotation = _rotation(angle * axis / np.linalg.norm(axis))
+    rotation = np.asarray(Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix(), dtype=np.float64)
     scale = math.exp(rng.uniform(math.log(low), math.log(high)))
     return Similarity(scale, rotation, rng.uniform(-translation_mm, translation_mm, 3))
-
-
-def _rotation(vector: FloatArray) -> FloatArray:
-    """Return the rotation (3, 3) about `vector` (3,) by its length in radians."""
-    return np.asarray(Rotation.from_rotvec(vector).as_matrix(), dtype=np.float64)
 
 
 def simulate_scan(
