@@ -11,6 +11,7 @@ import numpy as np
 
 from shapespace.errors import FileFormatError
 from shapespace.model.shape_model import ShapeModel
+from shapespace.report import figures
 from shapespace.report.blocks import fit_tables as tables
 from shapespace.report.blocks import sections
 from shapespace.report.blocks.blocks import Block, Facts, Figure, Folded, Notice, Table, Text, Tiles, text_table
@@ -155,8 +156,6 @@ class DemoPage:
 
     def main_figure(self) -> list[Block]:
         """Return the middle test face and the scans of experiment 2 with their fits."""
-        from shapespace.report import figures
-
         fits, _ = self.readable(self.demo.experiment1.fits)
         usable = [fit for fit in _tests(fits) if fit.pictured]
         usable.sort(key=lambda fit: fit.summary_mm("final", "model_to_scan", "mean"))
@@ -247,8 +246,6 @@ class DemoPage:
 
     def training(self, one: ExpressionsOfOne) -> Figure:
         """Return some of the training faces."""
-        from shapespace.report import figures
-
         examples = one.training_examples[: 8 if self.demo.quick else 12]
         meshes = [self.folder.mesh(example.file) for example in examples]
         labels = [example.label for example in examples]
@@ -264,8 +261,6 @@ class DemoPage:
 
     def test_faces(self, tests: Sequence[SavedFit]) -> list[Block]:
         """Return the scans of the test faces."""
-        from shapespace.report import figures
-
         pictured, absent = self.pictured(tests)
         if not pictured:
             return [absent if absent.items else Text("No test face was fitted.", "broken")]
@@ -290,8 +285,6 @@ class DemoPage:
 
     def all_fitted(self, tests: Sequence[SavedFit]) -> list[Block]:
         """Return every test face with its fitted model."""
-        from shapespace.report import figures
-
         pictured, absent = self.pictured(tests)
         if not pictured:
             return [absent]
@@ -324,8 +317,6 @@ class DemoPage:
 
     def maps(self, tests: Sequence[SavedFit]) -> list[Block]:
         """Return threshold maps and distance maps of the test faces."""
-        from shapespace.report import figures
-
         pictured, absent = self.pictured(tests)
         if not pictured:
             return [absent]
