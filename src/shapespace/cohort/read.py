@@ -1,5 +1,7 @@
 """Cohorts from files: fit results, or surfaces in correspondence, with a table of covariates."""
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

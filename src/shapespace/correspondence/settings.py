@@ -1,5 +1,7 @@
 """Settings of a correspondence, and the unit of its lengths."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias

@@ -4,6 +4,8 @@ The surface is head, face, ears and neck of an adult in millimetres: y up, the f
 left, the pupils of the average adult 62 mm apart. A face is linear in its weights; only the weights are random.
 """
 
+from __future__ import annotations
+
 import functools
 import importlib.resources
 import io

@@ -1,5 +1,7 @@
 """Placing named points on a surface: the triangle that is closest to each, and barycentric coordinates in it."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import replace
 

@@ -1,5 +1,7 @@
 """Conversion of meshes from and to other tools by the attributes of their objects; none of these tools is required."""
 
+from __future__ import annotations
+
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path

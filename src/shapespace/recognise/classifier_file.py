@@ -4,6 +4,8 @@ skops writes the pipeline as a schema in JSON and arrays in .npy. Beside them st
 model's hash, the classes, how it was trained. Nothing in the file is run: types that are not in `TRUSTED` are refused.
 """
 
+from __future__ import annotations
+
 import io
 import json
 import math

@@ -1,5 +1,7 @@
 """Training of a classifier on labelled fits, and prediction for other fits, one row per scan."""
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,5 +1,7 @@
 """Base class of the results of analyses: how they are saved and shown, which the layer `report` implements."""
 
+from __future__ import annotations
+
 from pathlib import Path
 
 from shapespace.lazy import lazy_import

@@ -6,6 +6,8 @@ their sum is the symmetric part of a shape, half their difference the asymmetric
 given, which is how far the sides are apart.
 """
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

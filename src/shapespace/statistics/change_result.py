@@ -1,5 +1,7 @@
 """Options and results of the analysis of changes between visits."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,5 +1,7 @@
 """Results of fits in a folder, from single files or shards of a store, read one at a time or as rows."""
 
+from __future__ import annotations
+
 import difflib
 import io
 import os

@@ -1,5 +1,7 @@
 """Diagnostics of a robust fit, from which its status and its expected error are computed."""
 
+from __future__ import annotations
+
 from dataclasses import asdict, dataclass
 
 

@@ -13,6 +13,8 @@ fitted to simulated scans whose truth is known, make the estimate. A fit failed 
   expected error.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace

@@ -1,5 +1,7 @@
 """The paper's modified ICP as a method: its settings, its two phases, its doubts."""
 
+from __future__ import annotations
+
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from functools import partial

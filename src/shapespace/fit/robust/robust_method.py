@@ -1,5 +1,7 @@
 """The robust fit as a method: its settings, and what is doubted and said of it."""
 
+from __future__ import annotations
+
 from collections.abc import Generator
 from dataclasses import asdict, dataclass, replace
 from typing import ClassVar

@@ -1,5 +1,7 @@
 """Every setting of the robust method, in one place."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
 
 

@@ -4,6 +4,8 @@ They are searched for only if the evidence of the fit suggests them: much of the
 surface, or matched points far apart. All lengths are shares of the model's size.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Identification of the enrolled person that a scan shows: ranks, and miss rates of open-set searches."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 

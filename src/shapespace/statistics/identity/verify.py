@@ -1,6 +1,8 @@
 """Are two scans of one person: error rates of verification with their spread over people, and calibrated likelihood
 ratios."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, cast

@@ -3,6 +3,8 @@
 Equations Mn are those of docs/morphometrics.md.
 """
 
+from __future__ import annotations
+
 import itertools
 import math
 from collections.abc import Sequence

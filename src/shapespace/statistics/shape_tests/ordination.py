@@ -3,6 +3,8 @@
 Equations Mn are those of docs/morphometrics.md.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial

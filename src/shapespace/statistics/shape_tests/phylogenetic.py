@@ -3,6 +3,8 @@
 The shapes of a cohort are those of the tips, one for each. Equations Mn are those of docs/morphometrics.md.
 """
 
+from __future__ import annotations
+
 from dataclasses import replace
 from pathlib import Path
 

@@ -3,6 +3,8 @@
 Equations Mn are those of docs/morphometrics.md.
 """
 
+from __future__ import annotations
+
 import math
 import re
 from collections.abc import Callable
