@@ -1,7 +1,5 @@
 """Exceptions of shapespace, each with one sentence on the problem, the file or argument, and the remedy."""
 
-from __future__ import annotations
-
 
 class ShapespaceError(Exception):
     """Base of every error that shapespace raises on purpose."""
