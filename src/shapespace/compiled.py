@@ -1,5 +1,7 @@
 """Compilation of loops by Numba on first use, with a cache on disk."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from typing import Any, ParamSpec, TypeVar, cast

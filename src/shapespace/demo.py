@@ -4,6 +4,8 @@ Experiment 1: expressions of one person. Experiment 2: a model of many people an
 is written as plain files, and the report reads nothing but those.
 """
 
+from __future__ import annotations
+
 import platform
 import shutil
 import time

@@ -4,6 +4,8 @@ Imports point down only. A model can be plotted and a result saved all the same,
 does it: this list is all there is of that.
 """
 
+from __future__ import annotations
+
 import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module

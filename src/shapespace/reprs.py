@@ -1,5 +1,7 @@
 """One-line representations of objects that contain arrays."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from typing import Any, cast

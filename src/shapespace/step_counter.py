@@ -1,5 +1,7 @@
 """Progress of long computations."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias

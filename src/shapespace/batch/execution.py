@@ -1,5 +1,7 @@
 """Execution settings from the command line."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 

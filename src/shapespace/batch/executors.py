@@ -4,6 +4,8 @@ All executors have one interface, `Executor.run`, and one contract: each task ha
 that its workers do not survive is given up with a reason while the others continue.
 """
 
+from __future__ import annotations
+
 import time
 from collections import deque
 from collections.abc import Generator, Iterator, Sequence

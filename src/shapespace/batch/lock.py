@@ -1,5 +1,7 @@
 """One run at a time into one folder."""
 
+from __future__ import annotations
+
 import contextlib
 import os
 from collections.abc import Generator

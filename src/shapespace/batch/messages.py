@@ -1,5 +1,7 @@
 """Messages that the processes of a command print only once together: that code is being compiled."""
 
+from __future__ import annotations
+
 import atexit
 import os
 import shutil

@@ -1,5 +1,7 @@
 """Progress of long steps: a bar in a terminal, otherwise log lines at growing intervals."""
 
+from __future__ import annotations
+
 import contextlib
 import json
 import os

@@ -1,5 +1,7 @@
 """Model quality by an executor: its folds and random shapes as tasks."""
 
+from __future__ import annotations
+
 import contextlib
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass

@@ -1,5 +1,7 @@
 """Fit many scans: a scan that cannot be fitted becomes a failed record, and an interruption loses no finished fit."""
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

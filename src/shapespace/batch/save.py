@@ -1,5 +1,7 @@
 """Write a fit made in Python as the command line does."""
 
+from __future__ import annotations
+
 import hashlib
 import re
 from pathlib import Path

@@ -4,6 +4,8 @@ A sink finds the results of earlier runs that are still valid, takes each record
 folder however the run ends. `fit_many` holds the lock of the folder while the sink is in use.
 """
 
+from __future__ import annotations
+
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,5 +1,7 @@
 """Single results into the shards of a store: first the shard, then the manifest, and only then the single files go."""
 
+from __future__ import annotations
+
 import contextlib
 import hashlib
 import json

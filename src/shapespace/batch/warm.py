@@ -3,6 +3,8 @@
 A small fit does it, since machine code is made for the arrays that it meets.
 """
 
+from __future__ import annotations
+
 import contextlib
 import sys
 

@@ -1,5 +1,7 @@
 """Imported by the server of `workers`, and by nothing else: warms it up, so that its copies are warm."""
 
+from __future__ import annotations
+
 import contextlib
 import os
 

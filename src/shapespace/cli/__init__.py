@@ -4,6 +4,8 @@ Exit codes: 0 done; 1 some of several scans failed (or, under --strict, are doub
 input; 130 stopped by Ctrl-C, 143 by SIGTERM and 129 by SIGHUP, files valid.
 """
 
+from __future__ import annotations
+
 import contextlib
 import io
 import os

@@ -1,5 +1,7 @@
 """The parser of the command line, built from the table of commands."""
 
+from __future__ import annotations
+
 import argparse
 import difflib
 import itertools

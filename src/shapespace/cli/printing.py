@@ -1,5 +1,7 @@
 """How the command line speaks: sentences on standard error, lines and JSON on standard output."""
 
+from __future__ import annotations
+
 import json
 import math
 import sys

@@ -1,5 +1,7 @@
 """Classes of a table: counts, and likely misspellings (classes with one shape, and classes with similar names)."""
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from itertools import combinations

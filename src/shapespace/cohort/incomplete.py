@@ -3,6 +3,8 @@
 The estimates depend on the shapes alone, never on the table, so that permutations of its rows stay exchangeable.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,5 +1,7 @@
 """Labels of scans from a table such as `shapespace data faces` writes."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

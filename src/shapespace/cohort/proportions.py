@@ -7,6 +7,8 @@ and scans of one subject depend on each other. The share of errors is at most th
 happen, where each subject counts alike, so the bound is valid for it too.
 """
 
+from __future__ import annotations
+
 import numpy as np
 
 from shapespace.types import FloatArray

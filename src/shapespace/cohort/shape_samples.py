@@ -1,5 +1,7 @@
 """Samples of completed shapes, next to their surfaces; one sample at a time is in memory."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol

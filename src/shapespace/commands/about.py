@@ -1,5 +1,7 @@
 """Provenance and licence, left beside simulated faces for the models that are made of them."""
 
+from __future__ import annotations
+
 import json
 from pathlib import Path
 

@@ -1,5 +1,7 @@
 """Files of the report of an analysis, and its HTML page."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from pathlib import Path
 

@@ -1,5 +1,7 @@
 """What `complete` does: a model and partial scans in files to completed surfaces and samples in a folder."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path

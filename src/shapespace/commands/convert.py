@@ -1,5 +1,7 @@
 """What `convert` does: shape models from the formats of other tools to shapespace's own, and on to others."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,5 +1,7 @@
 """What `data` does: open data sets, and simulated faces and organs."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,5 +1,7 @@
 """What `export` does: fits of a store as single files or as one table, and cohorts as files of other programs."""
 
+from __future__ import annotations
+
 import io
 import re
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence

@@ -1,5 +1,7 @@
 """The scans that a command is given: files, folders, patterns, addresses, and lists of any of these."""
 
+from __future__ import annotations
+
 import glob
 import os
 from collections.abc import Callable, Sequence

@@ -1,5 +1,7 @@
 """What `landmarks` does: landmarks of marked specimens carried to all scans of a correspondence, and checked."""
 
+from __future__ import annotations
+
 import os
 from collections import Counter
 from collections.abc import Callable, Mapping

@@ -1,5 +1,7 @@
 """What `quality` does: compactness, generalisation and specificity of a model, a folder in correspondence, or two."""
 
+from __future__ import annotations
+
 import importlib.util
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace

@@ -1,5 +1,7 @@
 """What `recognise` does: train, predict, transfer, study."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -1,5 +1,7 @@
 """What `report` does."""
 
+from __future__ import annotations
+
 from pathlib import Path
 
 from shapespace.batch.progress import progress

@@ -1,5 +1,7 @@
 """What `surface` does: label volumes in files to surfaces in files."""
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path

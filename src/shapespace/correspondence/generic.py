@@ -1,5 +1,7 @@
 """A shape model of one shape: the modes of a smooth Gaussian process on it, before other shapes are known (C2)."""
 
+from __future__ import annotations
+
 import numpy as np
 from threadpoolctl import threadpool_limits
 

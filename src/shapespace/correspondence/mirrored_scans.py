@@ -4,6 +4,8 @@ A few scans are anchors. Each scan and its mirror image are compared with each a
 The sides of anchors and scans that explain the scores best are those of the collection.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product

@@ -5,6 +5,8 @@ others: the poses a -> b, b -> c and c -> a do not close. The poses of the scans
 comparisons.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -1,5 +1,7 @@
 """Comparisons of scans: copies of the same surface, and their units."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

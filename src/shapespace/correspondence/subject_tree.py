@@ -1,5 +1,7 @@
 """The order in which the scans of a subject are registered, each from another scan of the same subject."""
 
+from __future__ import annotations
+
 from collections.abc import Hashable, Sequence
 
 import numpy as np

@@ -5,6 +5,8 @@ Database For Facial Behavior Research*, FGR 2006, A. Savran et al., *Bosphorus D
 2008, and public code that reads them.
 """
 
+from __future__ import annotations
+
 import os
 import re
 from collections import Counter

@@ -1,5 +1,7 @@
 """Files of simulated faces in correspondence, or of raw scans of them, with their labels and landmarks."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from pathlib import Path
 

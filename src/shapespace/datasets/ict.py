@@ -5,6 +5,8 @@ those of its README. Its files are in centimetres; everything here is in millime
 looks along +z, and +x is the person's own left.
 """
 
+from __future__ import annotations
+
 import difflib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -11,6 +11,8 @@ of the file, so its SHA-256 verifies a download bit by bit even where the hash o
 Source: https://github.com/USC-ICT/ICT-FaceKit, README, "Face Model Topology" (MIT licence).
 """
 
+from __future__ import annotations
+
 import hashlib
 import zipfile
 import zlib

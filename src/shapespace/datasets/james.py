@@ -1,5 +1,7 @@
 """James: a real 3dMD head scan with hair, ears and collar, and 68 landmarks (BSD, from menpo3d)."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from pathlib import Path
 

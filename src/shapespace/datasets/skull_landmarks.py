@@ -4,6 +4,8 @@ Twelve landmarks are digitised on photographs: coordinates are pixels, each spec
 the two species differ more where both live than where each lives alone, and larger skulls have longer snouts.
 """
 
+from __future__ import annotations
+
 from pathlib import Path
 
 import numpy as np

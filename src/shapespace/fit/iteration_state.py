@@ -1,5 +1,7 @@
 """What an iteration knows, and when to stop: shared by both phases."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
 from typing import TypeVar

@@ -1,5 +1,7 @@
 """Protocol of a fitting method: an object that owns its settings, its loop, its doubts and its reason."""
 
+from __future__ import annotations
+
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Protocol

@@ -1,5 +1,7 @@
 """Fitting methods by name."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from typing import Any

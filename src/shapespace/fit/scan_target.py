@@ -1,5 +1,7 @@
 """The scan as a fit sees it: its surface to be searched, its normals, its border."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cached_property
 

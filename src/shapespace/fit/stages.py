@@ -1,5 +1,7 @@
 """A fit as plain arrays, from which all pictures of it are made."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Which parts of the model the scan decided: followed, rejected, at the scan's border, or not seen at all."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from shapespace.types import IntArray

@@ -1,5 +1,7 @@
 """eos `.bin`: a cereal archive of one morphable model, little-endian, without names or a magic number."""
 
+from __future__ import annotations
+
 import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path

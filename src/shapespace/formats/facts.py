@@ -1,5 +1,7 @@
 """Metadata of a model (landmarks, provenance, licence) as JSON, for formats with a free text field."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping
 from dataclasses import replace

@@ -1,5 +1,7 @@
 """FLAME and the SMPL family: a template and blend shapes in metres, as `.npz` or as a pickle."""
 
+from __future__ import annotations
+
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,5 +1,7 @@
 """GIAS2: principal components in `NAME.pc.npz`, and the mean surface in `NAME_mean.*` beside them."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,5 +1,7 @@
 """glTF 2.0 morph targets: a mesh with the displacement of each mode, for Blender, three.js and game engines."""
 
+from __future__ import annotations
+
 import mmap
 import re
 from collections.abc import Mapping, Sequence

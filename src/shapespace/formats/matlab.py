@@ -1,5 +1,7 @@
 """Face models in MATLAB files: the Basel Face Model of 2009, LSFM and LYHM, also in version 7.3 (HDF5)."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

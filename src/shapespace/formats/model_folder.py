@@ -1,5 +1,7 @@
 """Atomic writing of folders."""
 
+from __future__ import annotations
+
 import shutil
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,5 +1,7 @@
 """MONAI-Physio (PhysioTwin4D): `pca_model.json`, and `pca_mean_surface.vtp` beside it."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from pathlib import Path
 

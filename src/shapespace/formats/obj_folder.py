@@ -1,5 +1,7 @@
 """Folders of OBJ files, one per shape, in the layout of ICT-FaceKit: a neutral mesh, identities and expressions."""
 
+from __future__ import annotations
+
 import json
 import re
 from collections.abc import Sequence

@@ -1,5 +1,7 @@
 """Registry of model formats, and detection of the format of a file."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -1,5 +1,7 @@
 """scalismo's `.h5.json`: the tree of a statismo file as text, in HDF5/JSON of The HDF Group."""
 
+from __future__ import annotations
+
 import json
 import math
 import uuid

@@ -4,6 +4,8 @@ Keys and columns as ShapeWorks 6 writes them (Libs/Project): `world_particles_D`
 D, text files of `x y z` rows, and `groomed_D`, the surface on which the local particles lie.
 """
 
+from __future__ import annotations
+
 import json
 import re
 from collections.abc import Mapping, Sequence

@@ -5,6 +5,8 @@ where the points are; all are recognised by what the tree contains. A Morphable 
 scalismo-faces) is three such models in one: shape, colour, expression.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,5 +1,7 @@
 """Conversion of a model to the tree of groups of statismo 0.9, and to HDF5."""
 
+from __future__ import annotations
+
 import io
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -4,6 +4,8 @@ A function of (u, v) is sum_ij N_i(u) N_j(v) c_ij with m x n coefficients (contr
 uniform clamped knots (de Boor, A Practical Guide to Splines, 2001).
 """
 
+from __future__ import annotations
+
 from typing import Any, cast
 
 import numpy as np

@@ -6,6 +6,8 @@ Collision Detection, 2005, section 5.1.5); a triangle without area is its three 
 float64; of triangles that share the closest point, any may be named.
 """
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import numpy as np

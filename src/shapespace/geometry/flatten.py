@@ -6,6 +6,8 @@ is closed by one vertex of its own. `cylinder_map` is the height field to compar
 the axis meets the surface more than once.
 """
 
+from __future__ import annotations
+
 from typing import Any, cast
 
 import numpy as np

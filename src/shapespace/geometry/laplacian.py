@@ -1,5 +1,7 @@
 """The Laplacian of a surface, by cotangents."""
 
+from __future__ import annotations
+
 from typing import Any, cast
 
 import numpy as np

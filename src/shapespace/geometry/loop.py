@@ -1,5 +1,7 @@
 """Loop subdivision of a triangle mesh as one sparse matrix, so that a whole basis is refined by one product."""
 
+from __future__ import annotations
+
 from typing import Any, cast
 
 import numpy as np

@@ -1,5 +1,7 @@
 """What can be said of a surface from its vertices and triangles alone: areas, normals, boundary, samples."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 
 import numpy as np

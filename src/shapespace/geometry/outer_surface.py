@@ -4,6 +4,8 @@ Surfaces of CT scans also contain marrow cavities, trabeculae and canals. They n
 counts is the exposure of a triangle: the share of all directions from which it is visible.
 """
 
+from __future__ import annotations
+
 from dataclasses import replace
 
 import numpy as np

@@ -4,6 +4,8 @@ Gower, Psychometrika 40(1), 1975; Goodall, JRSS B 53(2), 1991. Equations Cn are 
 docs/missing.md.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Literal, TypeAlias

@@ -1,5 +1,7 @@
 """Finer and coarser triangles on a surface, by libigl, which is asked only what it answers without fault."""
 
+from __future__ import annotations
+
 from typing import Any, cast
 
 import numpy as np

@@ -4,6 +4,8 @@ Sources: Arun, Huang and Blostein, PAMI 9(5), 1987; Umeyama, PAMI 13(4), 1991. `
 paper prints and what is right.
 """
 
+from __future__ import annotations
+
 import numpy as np
 
 from shapespace.errors import InputError

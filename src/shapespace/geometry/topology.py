@@ -1,5 +1,7 @@
 """What the mesh doctor asks of a surface, compiled, in linear time and little memory: equal rows, edges, pieces."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import numpy as np

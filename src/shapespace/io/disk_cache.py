@@ -5,6 +5,8 @@ An entry that is damaged, or cannot be read or written, counts as missing: the c
 all entries, as `shapespace cache --clear` does; those in memory are in `memory_cache`.
 """
 
+from __future__ import annotations
+
 import contextlib
 import hashlib
 import os

@@ -1,5 +1,7 @@
 """Atomic writing of files, hashes, and errors that name the file."""
 
+from __future__ import annotations
+
 import contextlib
 import errno
 import hashlib

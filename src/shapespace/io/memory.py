@@ -1,5 +1,7 @@
 """Memory available for arrays, from the system and the limits of a container."""
 
+from __future__ import annotations
+
 import os
 from pathlib import Path
 

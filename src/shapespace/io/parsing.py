@@ -1,5 +1,7 @@
 """Parsing functions of all readers: numbers from text, polygons to triangles, untrusted XML and JSON."""
 
+from __future__ import annotations
+
 import json
 import re
 import xml.etree.ElementTree as ET

@@ -4,6 +4,8 @@ Readers go through each byte once, so that time and memory grow with the file. W
 be used again and again, or unpacks it, an `Allowance` stops the file that is small and makes much.
 """
 
+from __future__ import annotations
+
 from pathlib import Path
 
 from shapespace.errors import FileFormatError

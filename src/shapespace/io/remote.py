@@ -1,5 +1,7 @@
 """Scans at remote addresses that fsspec supports, such as s3://bucket/scan.ply, copied for a fit."""
 
+from __future__ import annotations
+
 import contextlib
 import hashlib
 import tempfile

@@ -5,6 +5,8 @@ In that process they see one open file and can open no other, are held to a shar
 and texts come back, in proportion to the size of the file.
 """
 
+from __future__ import annotations
+
 import json
 import os
 import subprocess

@@ -3,6 +3,8 @@
 Its standard input is the file. It writes one line of JSON on what it found and, after it, the bytes of the arrays.
 """
 
+from __future__ import annotations
+
 import codecs
 import json
 import math

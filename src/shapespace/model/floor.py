@@ -1,5 +1,7 @@
 """The error that a model leaves where every correspondence is known: what no fit can do better than."""
 
+from __future__ import annotations
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 

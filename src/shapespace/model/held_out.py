@@ -5,6 +5,8 @@ something else. Source: Abadir, Distaso and Zikes, J. Econometrics 2014, for eig
 eigenvectors.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

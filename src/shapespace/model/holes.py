@@ -1,5 +1,7 @@
 """Vertices that some training shapes lack, filled by what the other shapes have there and by a smooth difference."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

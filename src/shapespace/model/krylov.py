@@ -5,6 +5,8 @@ Software III, 1977; Musco and Musco, NeurIPS 2015, for how few products it takes
 matrix is that of shapes on a disk, one pass over them.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,6 +4,8 @@ What modes leave varies as they do, only locally, so their covariance damped wit
 and Ehrhardt, Medical Image Analysis 38, 2017). Its total variance is measured on shapes left out.
 """
 
+from __future__ import annotations
+
 import numpy as np
 from scipy.linalg import eigh
 

@@ -8,6 +8,8 @@ by a smooth factor of the rank. How far the factor may leave 1 is estimated from
 MacKay, Neural Computation 4(3), 1992), so that a few move it a little and many as far as they must.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

@@ -7,6 +7,8 @@ them from its pose. Sources: Goodall, JRSS B 53(2), 1991, section 4; for the edg
 and Pastur, Math. USSR-Sbornik 1(4), 1967.
 """
 
+from __future__ import annotations
+
 import numpy as np
 
 from shapespace.geometry.procrustes import Gauge

@@ -1,5 +1,7 @@
 """Scores of predicted classes and their probabilities."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias

@@ -1,5 +1,7 @@
 """Maps of the vertices and regions at which classes differ."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from typing import Any
 

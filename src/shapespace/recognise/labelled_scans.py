@@ -1,5 +1,7 @@
 """Coefficients of fitted scans with labels, from records or a coefficients.csv, in the order given."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

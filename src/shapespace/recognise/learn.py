@@ -1,5 +1,7 @@
 """Imports from scikit-learn and skops, with one error message if they are not installed."""
 
+from __future__ import annotations
+
 from typing import Any, cast
 
 from shapespace.errors import ShapespaceError

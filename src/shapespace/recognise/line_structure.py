@@ -4,6 +4,8 @@ With v_i = (b_i - b_neutral) / stddev, samples of one expression at rising
 intensity are expected on a line through neutral, and different expressions on different lines.
 """
 
+from __future__ import annotations
+
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

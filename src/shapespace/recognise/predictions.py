@@ -5,6 +5,8 @@ that the shape model behind them may be another one in each fold, made without t
 finite stands for a fit that failed: it gets no answer, and counts as wrong. Such training rows are left out.
 """
 
+from __future__ import annotations
+
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

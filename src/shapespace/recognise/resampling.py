@@ -1,5 +1,7 @@
 """Permutation tests, learning curves and mode importance of classifiers."""
 
+from __future__ import annotations
+
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,5 +1,7 @@
 """Rigid alignment of a surface to itself at another time, by what did not change: named, or found robustly."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple

@@ -1,5 +1,7 @@
 """What a surface did from visit to visit: displacement along its normals, volume swept, and what is known of both."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 

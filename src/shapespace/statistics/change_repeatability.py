@@ -1,5 +1,7 @@
 """Repeatability from rescans: within-subject standard deviation, smallest detectable change and ICC."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Visits of subjects from a table: who was scanned when, in which order, and which scans repeat another."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date

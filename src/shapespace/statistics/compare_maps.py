@@ -7,6 +7,8 @@ shrunk by Ledoit and Wolf, J. Multivariate Analysis 88, 2004, towards that of th
 Nichols and Holmes, Human Brain Mapping 15, 2001; Benjamini and Hochberg, JRSS B 57(1), 1995.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -7,6 +7,8 @@ are permuted between subjects. An effect that is assumed to be the same in all s
 cells from the subject's mean, which are permuted within subjects (Winkler et al., NeuroImage 123, 2015).
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

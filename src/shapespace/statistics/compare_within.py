@@ -7,6 +7,8 @@ measures with the error of subject by condition, and in the two-stage analysis o
 1982; Holmes and Friston, NeuroImage 7, 1998).
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 

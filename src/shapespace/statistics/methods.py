@@ -1,5 +1,7 @@
 """Content of a methods section: sample sizes, the analysed space, and tests of equal dispersion."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import Any
 

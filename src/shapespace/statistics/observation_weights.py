@@ -4,6 +4,8 @@ An estimated vertex is computed from the observed vertices of its shape and from
 additional observation.
 """
 
+from __future__ import annotations
+
 import numpy as np
 
 from shapespace.cohort.cohort import Cohort

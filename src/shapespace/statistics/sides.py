@@ -1,5 +1,7 @@
 """The sides of an object: which vertices mirror which, found from the mean or given, and shapes beside their images."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,5 +1,7 @@
 """The manifest of a store: its shards, with the size and hash of each file."""
 
+from __future__ import annotations
+
 import hashlib
 import json
 import re

@@ -1,5 +1,7 @@
 """Reasons to review surfaces in correspondence, in English."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Callable, Mapping
 

@@ -1,5 +1,7 @@
 """Fits as rows of coefficients.csv and of the tables of a store."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,5 +1,7 @@
 """Parts of recognition.json, which the report draws: tables, confusion matrices, curves and maps."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version as version_of

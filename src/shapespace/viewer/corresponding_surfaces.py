@@ -1,5 +1,7 @@
 """Data of the viewer's page of corresponding surfaces: single surfaces, and the position of a vertex on all of them."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from functools import lru_cache

@@ -1,5 +1,7 @@
 """Access control of the viewer: the token, the Host and Origin headers, and the security headers of every response."""
 
+from __future__ import annotations
+
 import hmac
 import secrets
 from collections.abc import Mapping

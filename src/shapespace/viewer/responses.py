@@ -1,5 +1,7 @@
 """Responses that both applications of the viewer share: static files, JSON, bytes, and errors as sentences."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 

@@ -1,5 +1,7 @@
 """The viewer's application: the page, its model and fits, and the scans that the user uploads."""
 
+from __future__ import annotations
+
 import asyncio
 import secrets
 import shutil

@@ -1,5 +1,7 @@
 """The viewer's application for a folder of corresponding surfaces; it only reads."""
 
+from __future__ import annotations
+
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import FileResponse, Response

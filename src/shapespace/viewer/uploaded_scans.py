@@ -1,5 +1,7 @@
 """Uploaded scans: a folder for each one, a queue of fits in processes of their own, and bounds on what is kept."""
 
+from __future__ import annotations
+
 import secrets
 import shutil
 import threading

@@ -1,5 +1,7 @@
 """`shapespace compare`: linear models of shape on groups and covariates."""
 
+from __future__ import annotations
+
 import argparse
 
 from shapespace.cli.answers.common import cohort_of, finish

@@ -1,5 +1,7 @@
 """`shapespace complete`: the missing part of partial scans, with its distribution."""
 
+from __future__ import annotations
+
 import argparse
 
 from shapespace.cli.answers.common import finish

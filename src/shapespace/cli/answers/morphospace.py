@@ -1,5 +1,7 @@
 """`shapespace morphospace`: ordinations of shapes."""
 
+from __future__ import annotations
+
 import argparse
 
 from shapespace.cli.answers.common import cohort_of, finish

@@ -1,5 +1,7 @@
 """`shapespace score`: where new subjects lie in a reference population."""
 
+from __future__ import annotations
+
 import argparse
 
 from shapespace.cli.answers.common import cohort_of, finish

@@ -1,5 +1,7 @@
 """`shapespace test`: tests of shape, from their table."""
 
+from __future__ import annotations
+
 import argparse
 from pkgutil import resolve_name
 

@@ -5,6 +5,8 @@ was: at the same vertices, along their normals, in a free pose. It is completed 
 linear algebra in the coefficients of the shapes. Equation numbers are those of docs/completion.md.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

@@ -3,6 +3,8 @@
 Equation numbers are those of docs/completion.md.
 """
 
+from __future__ import annotations
+
 import numpy as np
 from scipy.spatial import cKDTree
 

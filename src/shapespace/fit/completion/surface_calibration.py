@@ -3,6 +3,8 @@
 Equation numbers are those of docs/completion.md.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -12,6 +12,8 @@ neighbours. First d is a field of vectors whose amplitude goes by what the fit l
 normals takes up the details. Where nothing is seen both fade, and the surface stays what the model says.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

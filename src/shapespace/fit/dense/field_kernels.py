@@ -1,5 +1,7 @@
 """Compiled loops of the dense stage: a smooth field on a surface by conjugate gradients."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from shapespace.compiled import compiled

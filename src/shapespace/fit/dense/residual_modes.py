@@ -7,6 +7,8 @@ models built with mirrored shapes. Only the part outside the model's span is kep
 own, so that b keeps its meaning.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 

@@ -1,5 +1,7 @@
 """Find what is odd about a scan or a model that makes a robust fit doubtful, from the evidence of the fit."""
 
+from __future__ import annotations
+
 from typing import Literal, TypeAlias
 
 from shapespace.fit.diagnostics.evidence import FitEvidence, ScanEvidence

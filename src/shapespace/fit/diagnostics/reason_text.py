@@ -1,5 +1,7 @@
 """The English text of reasons: the only place where codes become sentences."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any

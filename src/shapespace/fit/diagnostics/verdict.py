@@ -1,5 +1,7 @@
 """The verdict on what is returned: pose, coefficients and surface must agree with each other, whatever the method."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from shapespace.fit.diagnostics.reasons import Reason, ReasonCode

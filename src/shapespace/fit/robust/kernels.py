@@ -1,5 +1,7 @@
 """The loops of the robust fit, compiled: normals, the walk to the closest point of a moving model, and its rows."""
 
+from __future__ import annotations
+
 import numpy as np
 import numpy.typing as npt
 

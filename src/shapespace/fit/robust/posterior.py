@@ -7,6 +7,8 @@ the Hessian is divided by a temperature before the prior joins it again: what th
 Equation numbers are those of docs/robust.md.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

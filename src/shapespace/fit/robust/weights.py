@@ -1,5 +1,7 @@
 """How much a match counts, by its residual: robust weights of which one is chosen by name."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 
 import numpy as np

@@ -6,6 +6,8 @@ fitted as well, and the two are compared by the distances both ways and the prio
 of `start_from_any_pose` comes first; only if the reflected scan fits about as well, or better, is it fitted completely.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass, replace
 

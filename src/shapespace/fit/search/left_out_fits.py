@@ -1,5 +1,7 @@
 """Fits of training shapes, each by the model of the others: how a right scan of another shape looks to a model."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from dataclasses import replace
 

@@ -5,6 +5,8 @@ Matches are exact. Residuals have no side, so the winding of triangles does not 
 search (docs/architecture.md).
 """
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import numpy as np

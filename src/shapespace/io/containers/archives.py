@@ -1,5 +1,7 @@
 """Readers of untrusted zip archives of arrays, such as .npz files: no pickles, memory proportional to the file size."""
 
+from __future__ import annotations
+
 import io
 import math
 import zipfile

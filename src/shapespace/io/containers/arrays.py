@@ -1,5 +1,7 @@
 """Named arrays in one `.npz` file, written atomically; a damaged file is treated as missing."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast

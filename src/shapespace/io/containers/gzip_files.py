@@ -1,5 +1,7 @@
 """Reader of gzip files with a limit on the unpacked size."""
 
+from __future__ import annotations
+
 import gzip
 import io
 import zlib

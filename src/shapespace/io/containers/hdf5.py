@@ -5,6 +5,8 @@ anything else is read. A content hash over the arrays and attributes themselves 
 but never reads: see `hdf5_parts`.
 """
 
+from __future__ import annotations
+
 import hashlib
 import io
 import json

@@ -8,6 +8,8 @@ taken more often than `_MOST` times, and arrays and texts together are no larger
 named.
 """
 
+from __future__ import annotations
+
 import math
 import struct
 from typing import Any, Final, TypeAlias

@@ -1,5 +1,7 @@
 """Reader and writer of untrusted JSON files, with limits on size, depth and numbers."""
 
+from __future__ import annotations
+
 import json
 import math
 import stat

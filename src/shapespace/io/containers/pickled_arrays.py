@@ -5,6 +5,8 @@ looked up in a short list of what arrays are made of (numpy, sparse matrices, ch
 else it names is refused.
 """
 
+from __future__ import annotations
+
 import math
 import pickletools
 import re

@@ -4,6 +4,8 @@ The file holds panels of columns one after the other, each a C-ordered (rows, wi
 that both a block of rows and a block of columns are read in long runs. There is no header.
 """
 
+from __future__ import annotations
+
 import os
 from collections.abc import Iterator
 from io import FileIO

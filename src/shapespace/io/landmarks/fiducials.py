@@ -1,5 +1,7 @@
 """Landmarks predicted by a fit, with their standard deviations, as files of other programs."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -1,5 +1,7 @@
 """Landmark arrays of R (geomorph): p landmarks x k dimensions x n specimens in .rda, .RData and .rds files."""
 
+from __future__ import annotations
+
 import bz2
 import contextlib
 import gzip

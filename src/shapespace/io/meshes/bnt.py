@@ -6,6 +6,8 @@ five runs of rows · columns float64: x, y, z in mm, and two image coordinates f
 point.
 """
 
+from __future__ import annotations
+
 import math
 import struct
 from pathlib import Path

@@ -3,6 +3,8 @@
 trimesh reads glTF too, but it decodes textures, merges by material and reports damage by internal errors.
 """
 
+from __future__ import annotations
+
 import base64
 import binascii
 import json

@@ -1,5 +1,7 @@
 """Meshes in MATLAB files: a structure with `Vertices` and `Faces`, as in MeshMonk."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

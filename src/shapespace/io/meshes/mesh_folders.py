@@ -1,5 +1,7 @@
 """Lists of meshes and other files in folders, with notes on the files that are skipped."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,5 +1,7 @@
 """Wavefront OBJ: `v` and `f` lines and vertex colours; texture seams, normals and groups are ignored."""
 
+from __future__ import annotations
+
 from itertools import chain
 from pathlib import Path
 

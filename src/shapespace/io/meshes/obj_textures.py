@@ -1,5 +1,7 @@
 """Vertex colours of OBJ surfaces from the textures of their materials (`mtllib`, `map_Kd`)."""
 
+from __future__ import annotations
+
 import re
 from array import array
 from collections.abc import Iterable

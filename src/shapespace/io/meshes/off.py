@@ -1,5 +1,7 @@
 """OFF, the text format of Geomview; normals, texture coordinates and face colours are ignored."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Iterator
 from itertools import chain, islice

@@ -3,6 +3,8 @@
 After "The PCD (Point Cloud Data) file format", https://pointclouds.org/documentation/tutorials/pcd_file_format.html.
 """
 
+from __future__ import annotations
+
 from itertools import chain
 from pathlib import Path
 

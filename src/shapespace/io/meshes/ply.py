@@ -1,5 +1,7 @@
 """PLY, ascii and binary, as described by G. Turk, "The PLY Polygon File Format" (1994)."""
 
+from __future__ import annotations
+
 from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass

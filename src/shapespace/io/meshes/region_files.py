@@ -1,5 +1,7 @@
 """Regions of a model: lists of its vertices in text files."""
 
+from __future__ import annotations
+
 from pathlib import Path
 
 from shapespace.errors import FileFormatError

@@ -1,5 +1,7 @@
 """STL, ascii and binary: triangles whose equal corners become one vertex."""
 
+from __future__ import annotations
+
 from itertools import chain
 from pathlib import Path
 

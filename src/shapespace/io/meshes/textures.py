@@ -3,6 +3,8 @@
 What cannot be read leaves a surface without colours and says so in a note: a fit needs the shape alone.
 """
 
+from __future__ import annotations
+
 import io
 import warnings
 from collections.abc import Callable

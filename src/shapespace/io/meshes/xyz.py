@@ -1,5 +1,7 @@
 """Rows of points in text: `.xyz` of scanners and CloudCompare, and `.pts` of Leica, with the number of points first."""
 
+from __future__ import annotations
+
 from itertools import chain
 from pathlib import Path
 

@@ -3,6 +3,8 @@
 Tables may have a column `CHECKSUM` that shows any later change of a row; they are plain CSV to other programs.
 """
 
+from __future__ import annotations
+
 import csv
 import hashlib
 import io

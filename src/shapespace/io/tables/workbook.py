@@ -4,6 +4,8 @@ Numbers are the text that the file stores, dates are ISO 8601, cells with the er
 value that was computed last; nothing is computed.
 """
 
+from __future__ import annotations
+
 import io
 import re
 import xml.etree.ElementTree as ET

@@ -1,5 +1,7 @@
 """Report of an analysis and its files: analysis.json with the parts, and tables, arrays and meshes beside it."""
 
+from __future__ import annotations
+
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,5 +1,7 @@
 """Report of asymmetry: sentences, ANOVA, tables, maps and morphs."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any

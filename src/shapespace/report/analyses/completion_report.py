@@ -1,5 +1,7 @@
 """Report of completions: the surfaces, their uncertainty as colour, samples as morphs, and intervals of quantities."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
 from typing import Any
 

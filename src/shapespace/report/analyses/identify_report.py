@@ -1,5 +1,7 @@
 """Report of identification."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 from shapespace.report.analyses.analysis_report import AnalysisReport

@@ -1,5 +1,7 @@
 """Sentences, cells and curves shared by the reports of verification and identification."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any

@@ -1,5 +1,7 @@
 """Report of an ordination: the morphospace, its scree plot, and scores, loadings and eigenvalues as tables."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator, Mapping
 from typing import Any

@@ -1,5 +1,7 @@
 """Report of scores against a reference: sentences, tables, maps and morphs."""
 
+from __future__ import annotations
+
 import math
 from typing import Any
 

@@ -1,5 +1,7 @@
 """Source of the shapes of an analysis and share of estimated vertices: notes, settings and a table of its report."""
 
+from __future__ import annotations
+
 import re
 from dataclasses import replace
 from typing import Any

@@ -1,5 +1,7 @@
 """Report of verification."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Tables of fits and of scores."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from math import isfinite, nan
 from typing import Any, cast

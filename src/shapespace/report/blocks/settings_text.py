@@ -1,5 +1,7 @@
 """The settings of fits in words: what was chosen first, and all numbers of the method folded away."""
 
+from __future__ import annotations
+
 import inspect
 import re
 from collections.abc import Mapping, Sequence

@@ -1,5 +1,7 @@
 """Figures of cohort analyses: maps on a surface, pairs of shapes, histograms."""
 
+from __future__ import annotations
+
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar

@@ -1,5 +1,7 @@
 """Figures of a correspondence: checkerboards, missing vertices, distances, and convergence."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Figures of one fit: stages, signed distances, convergence, and coefficients."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

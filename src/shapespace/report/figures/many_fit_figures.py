@@ -1,5 +1,7 @@
 """Figures of many fits: distances, and grids of pictures."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from typing import Any
 

@@ -1,5 +1,7 @@
 """Figures of a shape model: mean, modes, spectrum and quality."""
 
+from __future__ import annotations
+
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path

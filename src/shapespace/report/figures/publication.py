@@ -1,5 +1,7 @@
 """Figures for papers: size of print, embedded fonts, and files that are the same for the same figure."""
 
+from __future__ import annotations
+
 import base64
 import io
 import re

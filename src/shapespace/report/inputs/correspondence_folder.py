@@ -1,5 +1,7 @@
 """Reader of the output folder of `shapespace correspond`, for report, viewer and terminal, one surface at a time."""
 
+from __future__ import annotations
+
 import contextlib
 import math
 from collections.abc import Callable, Sequence

@@ -3,6 +3,8 @@
 Of each fit some forty bytes and its coefficients are kept (float32), no record and no surface.
 """
 
+from __future__ import annotations
+
 import heapq
 import re
 from collections import Counter

@@ -1,5 +1,7 @@
 """Named views of an object, such as dorsal and lateral, in which all figures draw it."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from pathlib import Path
 

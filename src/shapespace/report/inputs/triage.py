@@ -1,5 +1,7 @@
 """Triage of scans in correspondence: scans to review first, with reasons."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite, nan

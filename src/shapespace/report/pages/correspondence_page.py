@@ -1,5 +1,7 @@
 """The report of a folder that `shapespace correspond` wrote."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from math import isfinite, nan

@@ -1,5 +1,7 @@
 """The report of a folder of very many fits: all of them in numbers, those to look at with their pictures."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from pathlib import Path
 

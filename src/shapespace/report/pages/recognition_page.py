@@ -3,6 +3,8 @@
 The file lists the parts in order. A damaged part is replaced by an error message.
 """
 
+from __future__ import annotations
+
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path

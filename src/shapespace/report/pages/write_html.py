@@ -1,5 +1,7 @@
 """One self-contained HTML file from saved results: of the demo, of fits, of a correspondence. It runs no fit."""
 
+from __future__ import annotations
+
 from importlib.util import find_spec
 from pathlib import Path
 

@@ -1,5 +1,7 @@
 """A checkerboard for all surfaces in correspondence: projected onto the mean shape, carried over by vertices."""
 
+from __future__ import annotations
+
 import math
 
 import numpy as np

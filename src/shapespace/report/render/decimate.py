@@ -1,5 +1,7 @@
 """Decimation of surfaces and point clouds for transfer, without new points."""
 
+from __future__ import annotations
+
 import math
 
 import numpy as np

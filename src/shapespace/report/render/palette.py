@@ -5,6 +5,8 @@ at equal lengths. The sequential one is pale where nothing is wrong, so that a s
 darkens all the way; the diverging one has a pale middle and arms of equal lightness.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, TypeAlias

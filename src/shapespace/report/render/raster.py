@@ -1,5 +1,7 @@
 """Compiled loops of the renderer: visibility of triangles and balls, and interpolation."""
 
+from __future__ import annotations
+
 import math
 
 import numpy as np

@@ -1,5 +1,7 @@
 """The studio's application: its page, the state of the project, edits, jobs, and the pages of results."""
 
+from __future__ import annotations
+
 import asyncio
 import json
 import threading

@@ -1,5 +1,7 @@
 """The jobs of a project: commands that run one after the other in processes of their own, and their results."""
 
+from __future__ import annotations
+
 import contextlib
 import json
 import shlex

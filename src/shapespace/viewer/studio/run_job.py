@@ -7,6 +7,8 @@ FOLDER/log.txt, and its exit code to FOLDER/exit.json at the end. A file FOLDER/
 does.
 """
 
+from __future__ import annotations
+
 import json
 import os
 import signal

@@ -1,5 +1,7 @@
 """Checks and pictures of specimens, made in other processes and kept in the project."""
 
+from __future__ import annotations
+
 import contextlib
 import hashlib
 import json

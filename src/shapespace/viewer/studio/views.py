@@ -1,5 +1,7 @@
 """The pages of results in the studio: those of the viewer, and the reports of analyses, under `/view/NUMBER/`."""
 
+from __future__ import annotations
+
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
