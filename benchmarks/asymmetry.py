@@ -20,9 +20,8 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from shapespace.cohort.cohort import Cohort, Fitted
-from shapespace.datasets.faces import load_faces
+from shapespace.datasets.faces import Warp, load_faces
 from shapespace.datasets.simulated_scan import Hole, random_similarity, simulate_scan
-from shapespace.datasets.warp import Warp
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.geometry.mirror_plane import FLIP, mirrored
 from shapespace.geometry.normals import vertex_normals

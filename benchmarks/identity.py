@@ -24,12 +24,11 @@ import numpy as np
 from identity_scans import CONDITIONS, fit_harder, people_there, read_harder, study_config
 
 from shapespace.model.additive import AdditiveModel
-from shapespace.statistics.identity.calibration import cllr
 from shapespace.statistics.identity.identify import Searches, identification_rates, joined, search
 from shapespace.statistics.identity.rates import Pairs, RateEstimate, Sweep, people_drawn
 from shapespace.statistics.identity.samples import Samples
 from shapespace.statistics.identity.scores import SCORES
-from shapespace.statistics.identity.verify import VerificationRates, verification_rates
+from shapespace.statistics.identity.verify import VerificationRates, cllr, verification_rates
 from shapespace.types import FloatArray, IntArray
 from simulated import StudyConfig, prepare_folder, run_fits
 from study_fits import STATUSES, model_path, person_path, read_fits

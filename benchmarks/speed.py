@@ -35,9 +35,7 @@ from tqdm import tqdm
 
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.method_choices import METHODS
-from shapespace.fit.paper.paper_method import Paper
-from shapespace.fit.paper.shape_icp import shape_icp
-from shapespace.fit.paper.similarity_icp import similarity_icp
+from shapespace.fit.paper.paper_method import Paper, shape_icp, similarity_icp
 from shapespace.fit.result import FitResult
 from shapespace.geometry.closest import ENGINES, build_engine
 from shapespace.model.shape_model import ShapeModel

@@ -73,8 +73,6 @@ Where several meshes are expected, a folder stands for all meshes in it, in the 
 Skipped folders and broken links are named on standard error; names that begin with a dot and files of other kinds are
 not.
 
-A renamed option works under its old name for one release, and prints the new name.
-
 ## Commands
 
 | command | does |
@@ -140,7 +138,7 @@ def page(command: Command) -> str:
     text += f"```text\n{command.usage}\n```\n\n"
     text += "".join(f"{paragraph}\n\n" for paragraph in command.details)
     text += "Example:\n\n```text\n" + "\n".join(command.examples) + "\n```\n"
-    shown = [option for option in command.options if not option.hidden]
+    shown = command.options
     for title, some in (
         ("Arguments", [option for option in shown if option.is_positional]),
         ("Options", [option for option in shown if option.basic and not option.is_positional]),
@@ -156,7 +154,7 @@ def row(option: Option) -> str:
     """Return the row of an option in the table of its command."""
     value = option.metavar or "|".join(option.accepted)
     names = [option.metavar] if option.is_positional else [f"{name} {value}".strip() for name in option.spellings]
-    text = option.text + (f" (formerly `{option.formerly}`)" if option.formerly else "")
+    text = option.text
     cells = [", ".join(f"`{name}`" for name in names), text]
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
 

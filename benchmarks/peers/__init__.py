@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from types import ModuleType
 
 from shapespace.fit.iteration_state import StopRule
-from shapespace.fit.paper.similarity_icp import similarity_icp
+from shapespace.fit.paper.paper_method import similarity_icp
 from shapespace.geometry.closest import build_engine
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh, Similarity

@@ -5,7 +5,6 @@ The names of the main path are here; the packages in `_PACKAGES` have the others
 
 from importlib import import_module
 from typing import TYPE_CHECKING
-from warnings import warn
 
 from shapespace.lazy import lazy_names
 from shapespace.version import __version__
@@ -69,49 +68,6 @@ __all__ = [
 
 _PACKAGES = ("correspondence", "datasets", "fit", "geometry", "io", "model", "recognise", "statistics", "store")
 """Packages with public names of their own."""
-_MOVED = {
-    "CLASSIFIERS": "recognise.CLASSIFIERS",
-    "AdditiveModel": "model.AdditiveModel",
-    "AsymmetryResult": "statistics.AsymmetryResult",
-    "ChangeConfig": "statistics.ChangeConfig",
-    "ChangeResult": "statistics.ChangeResult",
-    "ChangeSettings": "statistics.ChangeConfig",
-    "CohortOptions": "CohortConfig",
-    "CompareConfig": "statistics.CompareConfig",
-    "CompareOptions": "statistics.CompareConfig",
-    "CompareResult": "statistics.CompareResult",
-    "CorrespondSettings": "CorrespondConfig",
-    "IdentityConfig": "statistics.IdentityConfig",
-    "IdentityOptions": "statistics.IdentityConfig",
-    "LabelVolume": "io.LabelVolume",
-    "ModelQuality": "model.ModelQuality",
-    "Paper": "fit.Paper",
-    "Predictor": "statistics.Predictor",
-    "QualityConfig": "model.QualityConfig",
-    "QualitySettings": "model.QualityConfig",
-    "RegressionResult": "statistics.RegressionResult",
-    "Results": "store.Results",
-    "Robust": "fit.Robust",
-    "ScoreConfig": "statistics.ScoreConfig",
-    "ScoreOptions": "statistics.ScoreConfig",
-    "ScoreResult": "statistics.ScoreResult",
-    "Similarity": "geometry.Similarity",
-    "SurfaceLandmarks": "geometry.SurfaceLandmarks",
-    "VolumeSurface": "geometry.VolumeSurface",
-    "change": "statistics.change",
-    "compare": "statistics.compare",
-    "identify": "statistics.identify",
-    "measure_asymmetry": "statistics.measure_asymmetry",
-    "measure_quality": "model.measure_quality",
-    "place_landmarks": "geometry.place_landmarks",
-    "read_landmarks": "io.read_landmarks",
-    "read_volume": "io.read_volume",
-    "regress": "statistics.regress",
-    "score": "statistics.score",
-    "surface_of_volume": "geometry.surface_of_volume",
-    "verify": "statistics.verify",
-}
-"""Former name -> where it is, below `shapespace`; the former one works in this release, with a warning."""
 _name, __dir__ = lazy_names(
     __name__,
     {
@@ -141,8 +97,4 @@ _name, __dir__ = lazy_names(
 def __getattr__(name: str) -> object:
     if name in _PACKAGES:
         return import_module(f"shapespace.{name}")
-    if name not in _MOVED:
-        return _name(name)
-    package, _, current = _MOVED[name].rpartition(".")
-    warn(f"shapespace.{name} is now shapespace.{_MOVED[name]}.", DeprecationWarning, stacklevel=2)
-    return getattr(import_module(f"shapespace.{package}" if package else "shapespace"), current)
+    return _name(name)

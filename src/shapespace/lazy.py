@@ -17,7 +17,6 @@ from shapespace.errors import ShapespaceError
 
 LAZY_FUNCTIONS: Mapping[str, str] = MappingProxyType(
     {
-        "analysis_report": "report.analyses.result_tables",
         "build_model": "model.build_model",
         "extend_model": "model.build_model",
         "html_of_additive_model": "report.notebook.notebook_results",
@@ -63,21 +62,6 @@ class OpenViewer(Protocol):
         ...
 
 
-class SavedReport(Protocol):
-    """The report of an analysis: its sentences, and files."""
-
-    @property
-    def summary(self) -> tuple[str, ...]:
-        """The main results, a sentence each."""
-        ...
-
-    def save(self, folder: Path | str) -> Path:
-        """Write the report to a folder, and return the path of analysis.json."""
-        ...
-
-
-@overload
-def lazy_import(name: Literal["analysis_report"]) -> Callable[[object], SavedReport]: ...
 @overload
 def lazy_import(name: Literal["save_analysis"]) -> Callable[[object, Path | str], Path]: ...
 @overload

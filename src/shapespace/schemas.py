@@ -185,13 +185,12 @@ class FitRecord(Struct, frozen=True, kw_only=True):
 
     Args:
         id: SHA-256 of scan, model, landmarks, settings and version; the fitted surface's header has it too. Empty for a
-            scan that could not be fitted, and in records of earlier versions.
+            scan that could not be fitted.
         metadata: of the scan, by the columns of the list that named it.
         given_up: of a scan that its workers did not survive, the run that gave it up; else empty.
         status: the verdict; `unreadable` stands in place of a record that cannot be read, and in no file.
         reason: one sentence on why.
-        reasons: the same as codes with data; empty for a scan that could not be fitted, and in records of earlier
-            versions.
+        reasons: the same as codes with data; empty for a scan that could not be fitted.
         scan: the scan.
         model: the model.
         landmarks: the landmarks from which the fit started.
@@ -204,12 +203,11 @@ class FitRecord(Struct, frozen=True, kw_only=True):
         found_landmarks: the model's landmarks, on the dense surface where there is one, by name.
         distances_mm: by stage, over the whole model and every scan point within its rim.
         size_mm: root mean square distance of the fitted surface's vertices from their middle.
-        n_vertices: of that surface, V; None, as the next three are, in records of earlier versions.
+        n_vertices: of that surface, V.
         centroid_size_mm: root of the sum of those squares, which is size_mm times the root of V.
         extents_mm: of that surface along its principal axes, the longest first,
         area_mm2: and its area; None without triangles.
-        shown: distances of the final stage over what the scan shows; None, as the next is, in records of earlier
-            versions.
+        shown: distances of the final stage over what the scan shows.
         shown_dense: of the dense surface, where there is one.
     """
 
@@ -363,7 +361,7 @@ class Case(DemoModel, frozen=True, kw_only=True):
 
     Args:
         fit: by the method of the paper.
-        robust: by the robust method; None in the file of an older demo.
+        robust: by the robust method.
     """
 
     short: str = ""
@@ -475,11 +473,11 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
         name: NAME of the result files.
         path: of the scan, relative to the folder where there is such a path.
         hash: SHA-256 of its content.
-        status: `converged`, `doubtful` or `excluded`; of earlier versions `corresponding` or `set aside`.
+        status: `converged`, `doubtful` or `excluded`.
         reason: why it is excluded.
         probability: that its surface is right, as far as the other scans show.
         doubt: why it is doubtful.
-        review: further reasons to review the surface, the most unusual first; None in records of earlier versions.
+        review: further reasons to review the surface, the most unusual first.
         seen_share: share of the template's vertices that it shows; the others are estimates.
         covered_share: share of its points that the template reaches, leaving out those beyond the template's rim.
         area_share: area of its surface in correspondence beside that of the scan; well below 1 where the template lacks
@@ -511,11 +509,11 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
     name: str
     path: str
     hash: str
-    status: Literal["converged", "doubtful", "excluded", "corresponding", "set aside"]
+    status: Literal["converged", "doubtful", "excluded"]
     reason: str = ""
     probability: float | None = None
     doubt: str = ""
-    review: list[ReviewReason] | None = None
+    review: list[ReviewReason] = []
     seen_share: float | None = None
     covered_share: float | None = None
     area_share: float | None = None
@@ -541,13 +539,13 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
     @property
     def is_excluded(self) -> bool:
         """Whether the scan has no surface."""
-        return self.status in ("excluded", "set aside")
+        return self.status == "excluded"
 
     @property
     def review_codes(self) -> list[ReviewCode]:
         """Why the surface needs review; empty if it does not."""
         codes: list[ReviewCode] = ["doubtful"] if self.doubt else []
-        return codes + [reason.code for reason in self.review or ()]
+        return codes + [reason.code for reason in self.review]
 
 
 class CorrespondenceRecord(Struct, frozen=True, kw_only=True):

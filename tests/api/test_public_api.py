@@ -61,13 +61,5 @@ def test_every_name_of_a_package_is_there_and_listed_once(package: ModuleType) -
         _ = package.nonsense
 
 
-@pytest.mark.parametrize("former", ss._MOVED)  # pyright: ignore[reportPrivateUsage]
-def test_a_former_name_works_with_a_warning_that_states_the_present_one(former: str) -> None:
-    present = ss._MOVED[former]  # pyright: ignore[reportPrivateUsage]
-    with pytest.warns(DeprecationWarning, match=rf"shapespace\.{former} is now shapespace\.{present}\."):
-        of = getattr(ss, former)
-    assert of is API["names"]()[present.rpartition(".")[2]]
-
-
 def test_the_top_level_has_the_main_path_alone() -> None:
     assert len(ss.__all__) <= 25

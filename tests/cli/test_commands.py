@@ -523,19 +523,6 @@ def test_two_jobs_give_what_one_gives(run: Run, world: World, fitted: Path, tmp_
         assert (tmp_path / name).read_bytes() == (fitted / name).read_bytes()
 
 
-def test_resume_changes_nothing_and_is_said_to_be_no_longer_needed(run: Run, world: World, tmp_path: Path) -> None:
-    command = ("fit", world.model, world.scan, "-o", tmp_path, "--quiet")
-    assert run(*command).code == 0
-    before = (tmp_path / "scan_0.fit.json").stat().st_mtime_ns
-    outcome = run(*command, "--resume")
-    assert outcome.code == 0 and (tmp_path / "scan_0.fit.json").stat().st_mtime_ns == before
-    needless = "shapespace: --resume is no longer needed, since valid results are kept by default."
-    assert outcome.err.splitlines().count(needless) == 1
-    assert outcome.err.replace(f"{needless}\n", "") == run(*command).err
-    assert "--resume" not in run("fit", "--help").out
-    assert run(*command, "--resume", "--again").code == 2
-
-
 def test_resume_fits_only_what_is_missing_or_changed(run: Run, world: World, tmp_path: Path) -> None:
     command = ("fit", world.model, *world.scans[:2], "-o", tmp_path)
     assert run(*command).code == 0

@@ -1,6 +1,5 @@
 """Options are those of the classes and functions that take them, and help lists the basic ones first."""
 
-import argparse
 import contextlib
 import dataclasses
 import importlib
@@ -58,7 +57,7 @@ def test_fields_read_from_source_text_are_those_of_the_imported_class_or_functio
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
 def test_help_lists_at_most_ten_options_and_help_all_the_others(command: Command) -> None:
     basic = [o for o in command.options if o.basic and not o.is_positional]
-    every = [o for o in command.options if not o.is_positional and not o.hidden]
+    every = [o for o in command.options if not o.is_positional]
     assert len(basic) <= MOST_BASIC
     help_options = {"--help", "--help-all"}
     text = printed(*command.name.split(), "--help")
@@ -69,28 +68,7 @@ def test_help_lists_at_most_ten_options_and_help_all_the_others(command: Command
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
 def test_every_option_has_a_help_text(command: Command) -> None:
-    assert all(option.text for option in command.options if not option.hidden)
-
-
-@pytest.mark.parametrize(("old", "new", "words"), [
-    ("--landmark-sd", "--landmark-std", ["fit", "m.h5", "scan.ply", "-o", "out"]),
-    ("--landmark-error", "--landmark-std", ["correspond", "scans", "-o", "out"]),
-])  # fmt: skip
-def test_a_renamed_option_works_and_prints_its_new_name(
-    old: str, new: str, words: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    parsed: argparse.Namespace = cli.parser().parse_args([*words, old, "0.5"])
-    assert parsed.landmark_std == 0.5
-    assert (
-        capsys.readouterr().err == f"shapespace: {old} is now called {new}; the old name works in this release only.\n"
-    )
-    assert cli.parser().parse_args([*words, new, "0.5"]).landmark_std == 0.5
-    assert capsys.readouterr().err == ""
-
-
-def test_the_folder_of_the_demo_has_the_spelling_of_all_commands_and_its_earlier_one() -> None:
-    for name in ("-o", "--output", "--out"):
-        assert str(cli.parser().parse_args(["demo", name, "there"]).out) == "there"
+    assert all(option.text for option in command.options)
 
 
 def test_an_option_of_no_command_is_refused_with_the_usage_of_the_command(run: Run) -> None:

@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from shapespace.batch.fit_records import write_fitted_mesh
-from shapespace.fit.fit_colours import carried_colours
 from shapespace.fit.fit_scan import FitConfig, fit_scan
-from shapespace.fit.result import FitResult
+from shapespace.fit.result import FitResult, carried_colours
 from shapespace.fit.stages import stage_arrays
 from shapespace.fit.vertex_regions import MATCHED
 from shapespace.geometry.closest import build_engine

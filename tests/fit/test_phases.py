@@ -8,9 +8,7 @@ import pytest
 from shapespace.errors import FitError, InputError
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.iteration_state import IcpState, StopRule
-from shapespace.fit.paper.paper_method import Paper
-from shapespace.fit.paper.shape_icp import shape_icp
-from shapespace.fit.paper.similarity_icp import similarity_icp
+from shapespace.fit.paper.paper_method import Paper, shape_icp, similarity_icp
 from shapespace.geometry.closest import ENGINES, build_engine
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.shape_model import ShapeModel

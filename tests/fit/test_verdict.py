@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from shapespace.errors import InputError
-from shapespace.fit.dense.model_span import in_span
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.method_choices import METHODS
 from shapespace.fit.result import FitResult
 from shapespace.fit.robust.normal_equations import Estimate
 from shapespace.fit.robust.posterior import variance_of_new_shapes
 from shapespace.fit.robust.prepared_model import prepare
+from shapespace.fit.robust.robust_icp import in_span
 from shapespace.geometry.distance import surface_distances
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh, Similarity

@@ -10,7 +10,7 @@ from shapespace.datasets.simulated_scan import Hole, random_similarity, simulate
 from shapespace.fit.fit_scan import FitConfig, FitResult, fit_scan
 from shapespace.fit.iteration_state import StopRule
 from shapespace.fit.method_choices import method_named
-from shapespace.fit.paper.similarity_icp import similarity_icp
+from shapespace.fit.paper.paper_method import similarity_icp
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.shape_model import ShapeModel

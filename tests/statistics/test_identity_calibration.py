@@ -5,8 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
-from shapespace.statistics.identity.calibration import calibrated, cllr, cllr_min
 from shapespace.statistics.identity.rates import Pairs
+from shapespace.statistics.identity.verify import calibrated, cllr, cllr_min
 
 pytest.importorskip("sklearn", reason="the extra `statistics` is not installed")
 

@@ -7,7 +7,6 @@ from scipy.stats import binomtest, norm
 from shapespace.errors import InputError
 from shapespace.statistics.identity.identify import Searches, identification_rates, search
 from shapespace.statistics.identity.rates import Pairs, Sweep, people_drawn, rate_estimate, resampled
-from shapespace.statistics.identity.trial import IdentityConfig
 from shapespace.statistics.identity.verify import verification_rates
 
 pytest.importorskip("sklearn", reason="the extra `statistics` is not installed")
@@ -180,11 +179,6 @@ def test_perfect_verification_and_identification_state_an_upper_bound_everywhere
     ranks = identification_rates("cosine", searches, 20, people)
     assert (ranks.rank_1.low, ranks.rank_1.high) == (pytest.approx(1 - bound), 1.0)
     assert ranks.fnir[0.1].high == pytest.approx(bound) and ranks.band[0, 0] == pytest.approx(1 - bound)
-
-
-def test_the_former_name_of_the_plda_score_still_works_and_warns():
-    with pytest.warns(DeprecationWarning, match="'likelihood-ratio' is now called 'plda'"):
-        assert IdentityConfig(scores=("likelihood-ratio", "cosine")).scores == ("plda", "cosine")
 
 
 def test_the_same_seed_draws_the_same_people_and_only_those_tested():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,7 +11,7 @@ from shapespace.batch.executors import Executor, Serial
 from shapespace.batch.fit_work import FitTask, FitWork, Job
 from shapespace.batch.lock import only_writer
 from shapespace.batch.result_folder import names_for
-from shapespace.batch.sinks import FolderSink, Sink
+from shapespace.batch.sinks import Sink
 from shapespace.fit.fit_scan import FitConfig
 from shapespace.fit.iteration_state import IcpState
 from shapespace.io.files import make_folder
@@ -138,21 +137,3 @@ def fit_many(
         finally:
             sink.close()
     return counts
-
-
-def fit_files(
-    jobs: Sequence[Job],
-    model: ShapeModel,
-    model_file: Path,
-    folder: Path,
-    config: FitConfig,
-    *,
-    executor: Executor | None = None,
-    resume: bool = False,
-    stages: bool = False,
-) -> list[FitRecord]:
-    """Fit all `jobs` into a folder. Deprecated: use `fit_many` with a `FolderSink`."""
-    warnings.warn("fit_files is deprecated; use fit_many with a FolderSink.", DeprecationWarning, stacklevel=2)
-    sink = FolderSink(folder)
-    fit_many(jobs, BatchConfig(model, model_file, config, stages, resume), executor or Serial(), sink)
-    return [sink.records[job.name] for job in jobs]

@@ -38,7 +38,7 @@ class CommandParser(argparse.ArgumentParser):
 
     Args:
         command: None for a parser of commands.
-        keywords: as of argparse.
+        **keywords: See `argparse.ArgumentParser`.
     """
 
     def __init__(self, *, command: Command | None = None, **keywords: Any) -> None:
@@ -85,7 +85,7 @@ class CommandParser(argparse.ArgumentParser):
         if command is None or self.description is not None:
             return
         self.set_defaults(run=command.run, command=command, **command.defaults)
-        more = sum(not option.basic and not option.hidden for option in command.options)
+        more = sum(not option.basic for option in command.options)
         self.usage, self.description = command.usage, _sentence(command.summary)
         self.epilog = "example: " + "\n         ".join(command.examples)
         if help_level == "all":
@@ -104,7 +104,7 @@ class CommandParser(argparse.ArgumentParser):
                 if option.either not in exclusive:
                     exclusive[option.either] = group.add_mutually_exclusive_group(required=option.required)
                 group = exclusive[option.either]
-            option.add_to(group, in_help=not option.hidden and (option.basic or help_level == "all"))
+            option.add_to(group, in_help=option.basic or help_level == "all")
 
 
 class _HelpAll(argparse.Action):

@@ -91,7 +91,7 @@ class Command:
         summary: what it does, without a capital and a full stop.
         examples: command lines.
         run: takes the parsed arguments, and returns the exit code.
-        options: its arguments in the order of the help.
+        arguments: Its arguments in the order of the help.
         details: paragraphs on what it reads and writes, for `--help-all` and the reference.
         json: whether it prints facts, with `--json`.
         defaults: further attributes of the parsed arguments.
@@ -117,12 +117,12 @@ class Command:
         endings = {"+": "...", "*": "...]", "?": "]"}
         words = ["shapespace", self.name]
         for option in self.options:
-            if option.is_positional and not option.hidden:
+            if option.is_positional:
                 start = "[" if option.nargs in ("*", "?") else ""
                 words.append(f"{start}{option.metavar}{endings.get(option.nargs or '', '')}")
         needed: dict[str, list[str]] = {}
         for option in self.options:
-            if option.required and not option.hidden:
+            if option.required:
                 needed.setdefault(option.either or option.names, []).append(f"{option.spellings[0]} {option.metavar}")
         words += [f"({' | '.join(either)})" if len(either) > 1 else either[0] for either in needed.values()]
         return " ".join([*words, "[options]"])
@@ -148,7 +148,6 @@ _IDENTITY_RULES = (
     "Scans are compared by the coefficients of their fits. DATA is a table or a folder of fits, as of compare, change, "
     "asymmetry, regress and score."
 )
-_TARGET = "target"
 _MODES, _TARGET = "modes", "target"
 _CHANGE = "change"
 
@@ -263,7 +262,7 @@ COMMANDS: tuple[Command, ...] = (
         "run both experiments of the paper on simulated faces, ending in a report", ("shapespace demo --quick",),
         run.demo,
         (
-            basic("-o --output --out", "DIR", "output folder; results of an earlier demo in it are replaced",
+            basic("-o --output", "DIR", "output folder; results of an earlier demo in it are replaced",
                   default=Path("shapespace-demo"), parse=Path, dest="out"),
             basic("--quick", source=DEMO),
             basic("--no-open", help="do not open the report in a browser"),
@@ -409,8 +408,7 @@ COMMANDS: tuple[Command, ...] = (
             advanced("--pose", source=CORRESPOND),
             advanced("--outer", source=CORRESPOND),
             advanced("--ignore-colours", source=CORRESPOND),
-            advanced("--landmark-std", "SHARE", source=CORRESPOND, field="landmark_uncertainty", parse=values.share,
-                     formerly="--landmark-error"),
+            advanced("--landmark-std", "SHARE", source=CORRESPOND, field="landmark_uncertainty", parse=values.share),
             advanced("--rounds", "N", source=CORRESPOND, parse=values.positive),
             _RECURSIVE,
             advanced("--strict", help="exclude scans with coordinates that are NaN or infinite (default: remove the "
@@ -537,13 +535,10 @@ COMMANDS: tuple[Command, ...] = (
                      "on its triangles; the robust method always uses the triangles"),
             advanced("--scale", source=FIT),
             advanced("--max-iterations", "N", source=FIT, parse=values.positive),
-            advanced("--landmark-std", "MM", source=FIT, field="landmark_stddev_mm", parse=values.std_mm,
-                     formerly="--landmark-sd"),
+            advanced("--landmark-std", "MM", source=FIT, field="landmark_stddev_mm", parse=values.std_mm),
             advanced("--crop", "KIND:NUMBERS", source=FIT),
             *_execution("scans"),
             advanced("--again", help="fit all scans again, also those with valid results", either="results"),
-            # It has no effect; to be removed after the next release.
-            advanced("--resume", either="results", hidden=True),
             advanced("--store",
                      help="write the results to few files (the default from 10,000 scans on, and in a folder "
                      "with such files); then only counts are printed"),
@@ -664,10 +659,8 @@ COMMANDS: tuple[Command, ...] = (
          "shapespace landmarks convert plethodon.rda -o morphoj.txt"), run.landmarks_convert,
         (
             _LANDMARK_DATA,
-            basic("out", "OUT", "the same as --output", parse=Path, nargs="?", required=True, either=_TARGET,
-                  hidden=True),
             basic("-o --output", "OUT", "file; a folder for formats with a file for each specimen", parse=Path,
-                  required=True, either=_TARGET),
+                  required=True),
             basic("--to", "FORMAT", source=LANDMARKS_CONVERT),
             _SLIDERS,
             basic("--object", "NAME", source=LANDMARKS_CONVERT, field="object_name"),

@@ -53,11 +53,7 @@ def forms(commands: Mapping[str, tuple[str, Sequence[Option]]]) -> dict[str, dic
 
 
 def _form(summary: str, options: Sequence[Option], first: tuple[str, ...]) -> dict[str, Any]:
-    offered = [
-        option
-        for option in options
-        if not option.is_positional and not option.hidden and not _FILES & set(option.spellings)
-    ]
+    offered = [option for option in options if not option.is_positional and not _FILES & set(option.spellings)]
     order = {flag: place for place, flag in enumerate(first)}
     described = [_described(option, visible=option.spellings[-1] in order) for option in offered]
     described.sort(key=lambda one: order.get(one["flag"], len(order)))

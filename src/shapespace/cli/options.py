@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any, TypeAlias, cast
 
 from shapespace.cli import values
-from shapespace.cli.printing import warn
 
 Container: TypeAlias = argparse._ActionsContainer  # pyright: ignore[reportPrivateUsage]
 """A parser, or a group of its options."""
@@ -86,9 +85,7 @@ class Option:
         nargs: as of argparse.
         repeat: whether it can be given several times.
         dest: attribute of the parsed arguments; empty for the long spelling.
-        formerly: an earlier spelling, which still works in this release, with a message.
         either: name of a group of options of which only one can be given; one must, if they are `required`.
-        hidden: whether no help lists it.
     """
 
     names: str
@@ -104,9 +101,7 @@ class Option:
     nargs: str | None = None
     repeat: bool = False
     dest: str = ""
-    formerly: str = ""
     either: str = ""
-    hidden: bool = False
 
     @property
     def spellings(self) -> list[str]:
@@ -167,11 +162,6 @@ class Option:
 
     def add_to(self, group: Container, *, in_help: bool) -> None:
         """Add it to a parser or a group of one; `shown` is whether its help is."""
-        if self.formerly:
-            group.add_argument(
-                self.formerly, dest=self.attribute, type=self.parse or self._parser(), action=_Renamed, new=self.names,
-                default=NO_DEFAULT, help=argparse.SUPPRESS,
-            )  # fmt: skip
         text = self.text.replace("%", "%%").replace("`", "")
         keywords: dict[str, Any] = {"help": text if in_help else argparse.SUPPRESS}
         if self.is_flag:
@@ -197,19 +187,6 @@ basic = Option
 """An option that `--help` lists."""
 advanced = partial(Option, basic=False)
 """An option that only `--help-all` lists."""
-
-
-class _Renamed(argparse.Action):
-    """An earlier spelling of an option that takes a value."""
-
-    def __init__(self, option_strings: Sequence[str], dest: str, *, new: str, **keywords: Any) -> None:
-        super().__init__(option_strings, dest, **keywords)
-        self.new = new
-
-    def __call__(self, _: object, namespace: argparse.Namespace, values: Any, option_string: str | None = None) -> None:
-        """Set the value, and print the new spelling."""
-        warn(f"{option_string} is now called {self.new}; the old name works in this release only.")
-        setattr(namespace, self.dest, values)
 
 
 def given(arguments: argparse.Namespace, taker: Callable[..., Any], **instead: Any) -> dict[str, Any]:

@@ -336,8 +336,6 @@ def info(arguments: argparse.Namespace) -> int:
 
 def fit(arguments: argparse.Namespace) -> int:
     """Fit a model to scans."""
-    if arguments.resume:
-        warn("--resume is no longer needed, since valid results are kept by default.")
     several = len(arguments.scans) > 1 or not Path(arguments.scans[0]).is_file()
     if several and arguments.jobs != 1 and arguments.executor == "local":
         from shapespace.batch.workers import start_loading
@@ -459,7 +457,7 @@ def landmarks_convert(arguments: argparse.Namespace) -> int:
     from shapespace.commands.landmark_data import convert_landmarks
     from shapespace.report.blocks.wording import counted
 
-    output = arguments.output or arguments.out
+    output = arguments.output
     found, notes = convert_landmarks(arguments.data, output, **given(arguments, convert_landmarks))
     for note in notes:
         say(note)
@@ -727,7 +725,7 @@ def _print_correspondence(summary: CorrespondenceRecord, records: Sequence[Corre
     seen = sum(record.seen_share or 0.0 for record in there) / len(there)
     unusual = [record for record in there if record.review and not record.doubt]
     for record in unusual[:_LISTED]:
-        warn(f"{record.name} needs review: {'; '.join(describe_review(record, record.review or ()))}")
+        warn(f"{record.name} needs review: {'; '.join(describe_review(record))}")
     if len(unusual) > _LISTED:
         warn(f"and {len(unusual) - _LISTED} more surfaces need review")
     doubtful = sum(bool(record.doubt) for record in there)

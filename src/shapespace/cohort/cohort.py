@@ -405,7 +405,11 @@ class Cohort:
         sizes = read_only([centroid_size(shape) for shape in shapes])
         if onto is not None:
             gauge, analysed = onto.gauge, onto.analysed
-            _refuse_other_vertices(shapes, onto)
+            if shapes.shape[1] != onto.n_vertices:
+                noun = "landmarks" if onto.source.kind == "landmarks" else "vertices"
+                raise InputError(
+                    f"Shapes of {shapes.shape[1]} {noun} cannot be compared with those of {onto.n_vertices}."
+                )
             if analysed is not None:
                 mask = None if is_observed[:, analysed].all() else np.logical_and(is_observed, analysed)
             if mask is not None:
@@ -601,12 +605,6 @@ def _align_to(shapes: FloatArray, onto: Cohort) -> None:
             aligned = mean.mean(axis=0) + (aligned - aligned.mean(axis=0)) / along
         shapes[k] = mean_shape
         shapes[k, part] = aligned
-
-
-def _refuse_other_vertices(shapes: FloatArray, onto: Cohort) -> None:
-    if shapes.shape[1] != onto.n_vertices:
-        noun = "landmarks" if onto.source.kind == "landmarks" else "vertices"
-        raise InputError(f"Shapes of {shapes.shape[1]} {noun} cannot be compared with those of {onto.n_vertices}.")
 
 
 def _complete_by(onto: Cohort, shapes: FloatArray, observed: BoolArray, names: Sequence[str]) -> FloatArray:

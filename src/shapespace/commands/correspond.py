@@ -72,7 +72,7 @@ class CorrespondFiles:
         template: a mesh to begin with, or None.
         model: to begin with, or None.
         landmarks: a folder of files that are named as the scans, or None.
-        where: scans are registered.
+        execution: Executor of the registrations.
         recursive: take scans in folders below those given too.
         strict: exclude scans with triangles that use vertices with non-finite coordinates.
         subjects: column of the list of scans that names the subjects, or None.

@@ -48,7 +48,7 @@ class BatchSettings:
         config: settings of each fit.
         landmarks: a file of the one scan there is, or a folder with a file for each, named as the scans; None where
             there are none, or a list of scans names them.
-        where: they are fitted.
+        execution: Executor of the fits.
         again: fit also scans whose results still hold.
         stages: also write the surfaces at each stage.
         recursive: take scans in folders below those given too.

@@ -85,7 +85,7 @@ def quality(
         targets: models, or folders of meshes in correspondence.
         output: the folder to write to.
         options: what to measure.
-        where: folds and random shapes are done.
+        execution: Executor of folds and random shapes.
         quiet: no progress.
 
     Raises:

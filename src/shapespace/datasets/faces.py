@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.datasets.warp import Warp
 from shapespace.errors import DataError, InputError
 from shapespace.geometry.loop import loop_operator
+from shapespace.geometry.mirror_plane import FLIP
 from shapespace.geometry.normals import faces_of
 from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, IntArray, Mesh, generator_of, read_only
@@ -396,3 +396,46 @@ def _generator(data: Mapping[str, npt.NDArray[Any]]) -> FaceGenerator:
         _generic=read_only(generic),
         _loop=operator,
     )
+
+
+# Smooth random deformations at several scales, for variation beyond a fixed set of shapes
+
+_WAVES = 96  # random Fourier features of the field
+
+
+@dataclass(frozen=True)
+class Warp:
+    """Amplitude and length scales of a random deformation, mm for a head.
+
+    Args:
+        stretch: standard deviation of the logarithm of the stretch along each axis; the volume stays.
+        fields: (length over which a field is smooth, its standard deviation along each axis), from coarse to fine.
+        lopsided: of the part that differs from side to side, beside that of the part both sides share.
+    """
+
+    stretch: float = 0.04
+    fields: tuple[tuple[float, float], ...] = ((60.0, 2.6), (25.0, 1.4), (12.0, 0.6))
+    lopsided: float = 0.3
+
+    def draw(self, x: FloatArray, mirror: IntArray, rng: np.random.Generator) -> FloatArray:
+        """Draw displacements (V, 3) of the vertices `x` (V, 3), mm.
+
+        Args:
+            x: x to the left, so that a change of sign mirrors it.
+            mirror: (V,) the vertex on the other side.
+            rng: the only source of chance.
+        """
+        stretch = np.exp(self.stretch * rng.standard_normal(3))
+        out = x * (stretch / stretch.prod() ** (1 / 3) - 1.0)
+        for length_mm, stddev_mm in self.fields:
+            component = _field(x, length_mm, rng)
+            other = component[mirror] * FLIP
+            out += stddev_mm / np.sqrt(2.0) * (component + other + self.lopsided * (component - other))
+        return out
+
+
+def _field(x: FloatArray, length_mm: float, rng: np.random.Generator) -> FloatArray:
+    """Return (V, 3) of variance 1 along each axis, smooth over `length_mm`."""
+    waves, phases = rng.standard_normal((_WAVES, 3)) / length_mm, rng.uniform(0.0, 2.0 * np.pi, _WAVES)
+    heights = rng.standard_normal((_WAVES, 3))
+    return np.asarray(np.sqrt(2.0 / _WAVES) * np.cos(x @ waves.T + phases) @ heights, dtype=np.float64)

@@ -16,7 +16,6 @@ from shapespace.fit.diagnostics.evidence import FitEvidence
 from shapespace.fit.diagnostics.odd_scans import Chirality, chirality_of
 from shapespace.fit.diagnostics.reason_text import sentence_of
 from shapespace.fit.diagnostics.reasons import Reason
-from shapespace.fit.fit_colours import carried_colours
 from shapespace.fit.iteration_state import IcpState
 from shapespace.fit.vertex_regions import MATCHED, SHOWN
 from shapespace.geometry.closest import ClosestPoints
@@ -24,7 +23,7 @@ from shapespace.geometry.distance import DistanceSummary, SurfaceDistances
 from shapespace.lazy import OpenViewer, lazy_import
 from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import describe_briefly, short_repr
-from shapespace.types import BoolArray, ByteArray, FloatArray, IntArray, Mesh, Similarity
+from shapespace.types import GREY, BoolArray, ByteArray, FloatArray, IntArray, Mesh, Similarity
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -307,3 +306,23 @@ class FitResult:
         if surface.vertices is not None:
             return surface.vertices
         return surface.T_scan_model.apply(self.model.reconstruct(surface.b))
+
+
+# The colours of a scan on the surface that was fitted to it
+
+
+def carried_colours(colours: ByteArray, scan: Mesh, closest: ClosestPoints, seen: BoolArray) -> ByteArray:
+    """Return the colours (V, 3) at the closest points of a surface's vertices, between the scan's vertices linearly.
+
+    Args:
+        colours: (S, 3) of the scan's vertices.
+        scan: its surface or points.
+        closest: the closest points of the scan to V vertices.
+        seen: (V,) False where the scan shows nothing that the surface follows: there it is `GREY`.
+    """
+    if closest.triangle is None or closest.barycentric is None or scan.faces is None:
+        interpolated = colours[closest.vertex]
+    else:
+        corners = colours[scan.faces[closest.triangle]].astype(np.float64)
+        interpolated = np.rint(np.einsum("vc,vcd->vd", closest.barycentric, corners)).clip(0, 255).astype(np.uint8)
+    return np.where(seen[:, None], interpolated, np.uint8(GREY))

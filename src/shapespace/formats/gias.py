@@ -63,7 +63,9 @@ class Gias:
             displacements = displacements * spread.reshape(-1, 1)
             notes.append("Each coordinate was divided by its standard deviation, which is undone.")
         scores = _optional(members, "projectedWeights")
-        surface = _surface(path)
+        stem = path.name[: -len(".pc.npz")] if path.name.lower().endswith(".pc.npz") else path.stem
+        candidates = (path.with_name(f"{stem}_mean{ending}") for ending in MESH_ENDINGS)
+        surface = next((candidate for candidate in candidates if candidate.is_file()), None)
         faces: IntArray | None = None
         if surface is None:
             notes.append("There is no surface of its mean beside it (NAME_mean.ply), so it is a point model.")
@@ -96,12 +98,6 @@ def _optional(members: dict[str, bytes], name: str) -> FloatArray | None:
         return _numbers(members[f"{name}.npy"])
     except (KeyError, ValueError):
         return None
-
-
-def _surface(path: Path) -> Path | None:
-    stem = path.name[: -len(".pc.npz")] if path.name.lower().endswith(".pc.npz") else path.stem
-    candidates = (path.with_name(f"{stem}_mean{ending}") for ending in MESH_ENDINGS)
-    return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
 def _fitting(surface: Path, mean: FloatArray, path: Path) -> tuple[FloatArray, IntArray | None, bool]:

@@ -63,7 +63,7 @@ def read_hdf5_sandboxed(path: Path, leave: Sequence[str] = ()) -> Tree:
 
     Raises:
         FileError: it cannot be read.
-        ApartError: it is damaged, reaches outside itself, or unfolds to far more than its size.
+        SandboxError: The file is damaged, reaches outside itself, or unfolds to far more than its size.
     """
     return _read(path, {"kind": "hdf5", "leave": list(leave)})
 
@@ -73,7 +73,7 @@ def read_matlab_sandboxed(path: Path, variables: Sequence[str]) -> Tree:
 
     Raises:
         FileError: it cannot be read.
-        ApartError: as of `read_hdf5_sandboxed`.
+        SandboxError: See `read_hdf5_sandboxed`.
     """
     return _read(path, {"kind": "matlab", "wanted": list(variables)})
 

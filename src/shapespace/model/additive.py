@@ -8,7 +8,6 @@ Knothe and Vetter, FG 2008, for the additive model of expressions.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -233,11 +232,6 @@ class AdditiveModel:
             raise InputError("The covariance of coefficients must be positive definite.")
         known, turned = np.maximum(1.0 / values - 1.0, 0.0), self.rotation @ vectors
         return FitInformation((turned * known) @ turned.T, turned @ ((known + 1.0) * (vectors.T @ z)))
-
-    def told(self, z: npt.ArrayLike, z_covariance: npt.ArrayLike) -> FitInformation:
-        """Return `information`; the former name, for this release."""
-        warnings.warn("This method is now AdditiveModel.information.", DeprecationWarning, stacklevel=2)
-        return self.information(z, z_covariance)
 
     def tie(
         self, fits: Sequence[FitInformation], neutral: Sequence[bool] | None = None

@@ -1,7 +1,6 @@
 """The model file: one HDF5 file with everything that the model is.
 
-Version 2 stores landmarks as triangles and barycentric coordinates. A model whose landmarks are all vertices is still
-written as version 1, which stores vertices: earlier versions of shapespace can read it, and it keeps its hash.
+Landmarks are stored as triangles and barycentric coordinates.
 """
 
 from __future__ import annotations
@@ -25,9 +24,7 @@ from shapespace.types import FloatArray, IntArray, SurfaceLandmarks
 from shapespace.version import __version__
 
 FORMAT_NAME = "shapespace model"
-FORMAT_VERSION = 2  # of the model file; 2 added landmarks between vertices, other models are still written as 1
-_VERSION_OF_VERTICES = 1
-"""The version that stores landmarks as vertices."""
+FORMAT_VERSION = 2  # version 1, which no release wrote, had landmarks as vertices
 _HELD_OUT = "held out"
 _RESIDUALS = "residuals"
 _REGIONS = "regions"
@@ -40,7 +37,7 @@ _EVERY_MODEL = (
 )  # fmt: skip
 """What is not of one representation."""
 _LONGEST_DETAIL = 200  # characters of a library's error that a message repeats
-_WHOLE_NUMBERS = ("faces", "control_counts", "degree", _REGIONS, _CORNERS)
+_WHOLE_NUMBERS = ("faces", "control_counts", "degree", _REGIONS, _CORNERS, _DROPPED)
 
 
 class _FileAttributes(Struct, frozen=True):
@@ -53,8 +50,8 @@ class _FileAttributes(Struct, frozen=True):
     representation: str
     provenance: str
     licence: str
-    variance_divisor: str = ""
-    n_training_known: str = "yes"
+    variance_divisor: str
+    n_training_known: str
     regions: str = "{}"
 
 
@@ -95,13 +92,12 @@ def save(
     """Write `model`, and what a larger model adds to it, to `path`, whole or not at all."""
     arrays, attributes = _contents(model)
     made_by: dict[str, Attribute] = {"model_hash": hash_of(model), "software_version": __version__}
-    if not model["is_n_training_known"]:  # no part of the hash, which files of earlier versions have without it
-        made_by["n_training_known"] = "no"
+    made_by["n_training_known"] = "yes" if model["is_n_training_known"] else "no"
     if (training := model["training"]) is not None:  # no part of the hash: a shared model without them is the same
         arrays |= {_TRAINING: training.coefficients, _TRAINING_SIZE: training.log_scale}
         arrays |= {_TRAINING_REST: training.rest} if training.rest.size else {}
-    if (dropped := model["dropped_vertices"]).size:  # no part of the hash; float64, which earlier versions skip
-        arrays[_DROPPED] = dropped.astype(np.float64)
+    if model["dropped_vertices"].size:  # no part of the hash
+        arrays[_DROPPED] = model["dropped_vertices"]
     write_hdf5(path, {**arrays, **(more_arrays or {})}, {**attributes, **(more_attributes or {}), **made_by})
 
 
@@ -113,13 +109,12 @@ def _contents(model: ModelFields) -> tuple[dict[str, npt.NDArray[Any]], dict[str
     if model["residuals"] is not None:
         arrays[_RESIDUALS] = model["residuals"]
     arrays.update(model["coding"])
-    landmarks = model["landmarks"]
-    if has_places := not landmarks.are_vertices:
+    if landmarks := model["landmarks"]:
         arrays[_CORNERS], arrays[_BARYCENTRIC] = landmarks.corners, landmarks.barycentric
         arrays[_DISTANCE] = landmarks.distance_mm
     attributes: dict[str, Attribute] = {
         "format": FORMAT_NAME,
-        "format_version": FORMAT_VERSION if has_places else _VERSION_OF_VERTICES,
+        "format_version": FORMAT_VERSION,
         "units": "mm",
         "variance_divisor": _HELD_OUT if model["held_out"] else "N - 1",
         "gauge": model["gauge"],
@@ -148,25 +143,11 @@ def _regions(text: str, vertices: IntArray | None) -> dict[str, IntArray]:
     return dict(zip(counts, np.split(vertices, ends[:-1]), strict=True)) if vertices is not None else {}
 
 
-def _landmarks(vertices: Mapping[str, int], arrays: Mapping[str, npt.NDArray[Any]]) -> SurfaceLandmarks:
-    """Return landmarks of version 2: their arrays, with the names of the attribute and its nearest vertices."""
-    landmarks = SurfaceLandmarks(tuple(vertices), arrays[_CORNERS], arrays[_BARYCENTRIC], arrays[_DISTANCE])
-    if dict(landmarks) != dict(vertices):
-        raise ValueError("landmarks do not belong to their triangles")
-    return landmarks
-
-
 def _training_shapes(arrays: Mapping[str, npt.NDArray[Any]]) -> TrainingShapes | None:
     if not {_TRAINING, _TRAINING_REST, _TRAINING_SIZE} & arrays.keys():
         return None
     rest = arrays.get(_TRAINING_REST, np.zeros((arrays["mean"].size, 0)))
     return TrainingShapes(arrays[_TRAINING], rest, arrays[_TRAINING_SIZE])
-
-
-def _dropped_vertices(numbers: FloatArray) -> IntArray:
-    if numbers.ndim != 1 or not ((numbers >= 0) & (numbers < 2**31) & (numbers % 1 == 0)).all():
-        raise ValueError("dropped vertices must be whole numbers")
-    return numbers.astype(np.int32)
 
 
 def load(path: Path) -> ModelFields:
@@ -183,10 +164,10 @@ def load(path: Path) -> ModelFields:
     if attributes.get("format") != FORMAT_NAME:
         raise ModelFileError(f"{path} is HDF5 but not a shapespace model; give a file written by shapespace build.")
     version = attributes.get("format_version")
-    if version not in (_VERSION_OF_VERTICES, FORMAT_VERSION):
+    if version != FORMAT_VERSION:
         raise ModelFileError(
-            f"{path} is a model of format version {str(version)[:40]}, but this shapespace reads "
-            f"versions {_VERSION_OF_VERTICES} and {FORMAT_VERSION}; update shapespace."
+            f"{path} is a model of format version {str(version)[:40]}, but this shapespace reads version "
+            f"{FORMAT_VERSION}; build the model again, or update shapespace."
         )
     try:
         attributes_of_file = msgspec.convert(attributes, _FileAttributes)
@@ -201,6 +182,10 @@ def load(path: Path) -> ModelFields:
                 raise ValueError("a column of basis is not of length 1")
         # What was read is a view of the whole file, which is let go here.
         owned = {name: array.copy() for name, array in arrays.items()}
+        places = (owned[name] for name in (_CORNERS, _BARYCENTRIC, _DISTANCE)) if vertices else ()
+        landmarks = SurfaceLandmarks(tuple(vertices), *places)
+        if dict(landmarks) != vertices:
+            raise ValueError("landmarks do not belong to their triangles")
         return {
             "mean": owned["mean"],
             "basis": owned["basis"],
@@ -209,7 +194,7 @@ def load(path: Path) -> ModelFields:
             "total_variance": attributes_of_file.total_variance,
             "n_training": attributes_of_file.n_training,
             "gauge": attributes_of_file.gauge,
-            "landmarks": _landmarks(vertices, owned) if version == FORMAT_VERSION else SurfaceLandmarks.of(vertices),
+            "landmarks": landmarks,
             "representation": attributes_of_file.representation,
             "coding": {name: array for name, array in owned.items() if name not in _EVERY_MODEL},
             "provenance": attributes_of_file.provenance,
@@ -219,7 +204,7 @@ def load(path: Path) -> ModelFields:
             "regions": _regions(attributes_of_file.regions, owned.get(_REGIONS)),
             "is_n_training_known": attributes_of_file.n_training_known != "no",
             "training": _training_shapes(owned),
-            "dropped_vertices": _dropped_vertices(owned.get(_DROPPED, np.zeros(0))),
+            "dropped_vertices": owned.get(_DROPPED, np.zeros(0, dtype=np.int32)),
         }
     except (KeyError, ValueError, InputError) as error:
         reason = str(error)[:_LONGEST_DETAIL].replace("`", "").replace("Object missing", "missing")

@@ -15,7 +15,6 @@ vertices.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -105,7 +104,6 @@ def ppca(
     shapes: FloatArray,
     observed: BoolArray,
     modes: int,
-    on_round: Callable[[int, float], None] | None = None,
 ) -> Ppca:
     """Return the probabilistic principal components of aligned `shapes`.
 
@@ -113,7 +111,6 @@ def ppca(
         shapes: (N, V, 3) mm; missing vertices have an initial guess, such as the mean.
         observed: (N, V), each vertex in at least one shape.
         modes: K, below N; those without evidence vanish.
-        on_round: called with the round and the bound of the log probability.
     """
     patterns, n_observed = Patterns.of(observed), 3 * int(observed.sum())
     about = shapes.mean(axis=0)
@@ -131,8 +128,6 @@ def ppca(
         spread = np.einsum("pkk,p->k", W_covariance[:, :modes, :modes], patterns.weight)
         width = ((W[:, :, :modes] ** 2).sum(axis=(0, 1)) + spread) / (3 * len(about))  # C25
         bounds.append(of_y + of_W - 0.5 * (n_observed * np.log(noise) + 3 * len(about) * float(np.log(width).sum())))
-        if on_round is not None:
-            on_round(len(bounds), bounds[-1])
         converged = len(bounds) > 1 and bounds[-1] - bounds[-2] <= _CONVERGED * n_observed  # C26
         if converged or len(bounds) == _MOST_ROUNDS:
             W[:, :, modes] += about

@@ -53,8 +53,6 @@ _FILE = "_file"
 """Attribute that is no field: neither copies nor states of a model have it."""
 _VECTOR = "mean"
 """In `ShapeModel.coding`: what the representation makes of the mean shape, where that is not its vertices."""
-_PLACES = "landmark_places"
-"""In the state of a model: landmarks between vertices, as plain arrays."""
 _ROUNDING = 64 * float(np.finfo(float).eps)
 _WIDEST = 1e6
 """Standard deviations lie between these shares of the norm of the mean shape's vertices about their middle."""
@@ -187,15 +185,11 @@ class ShapeModel:
 
     def __getstate__(self) -> dict[str, Any]:
         # For copies, other processes and skops, none of which takes read-only mappings.
-        plain = {name: dict(getattr(self, name)) for name in ("regions", "landmarks")}
-        places = None if self.landmarks.are_vertices else self.landmarks.__getstate__()
-        return {**self.fields(), **plain, _PLACES: places, "training": None}
+        plain = {"regions": dict(self.regions), "landmarks": self.landmarks.__getstate__()}
+        return {**self.fields(), **plain, "training": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        fields = dict(state)  # without places in states of earlier versions
-        if places := fields.pop(_PLACES, None):
-            fields["landmarks"] = SurfaceLandmarks(**places)
-        self.__init__(**fields)  # type: ignore[misc]
+        self.__init__(**{**state, "landmarks": SurfaceLandmarks(**state["landmarks"])})  # type: ignore[misc]
 
     @classmethod
     def fit(

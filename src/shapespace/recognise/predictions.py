@@ -8,7 +8,7 @@ finite stands for a fit that failed: it gets no answer, and counts as wrong. Suc
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -160,7 +160,6 @@ def nested_predictions(
     inner_folds: int = 4,
     seed: int = 0,
     modes: Sequence[int | None] = MODES,
-    on_fold: Callable[[int, int], None] | None = None,
 ) -> Predictions:
     """Predict the test samples of each fold with hyperparameters selected in its training subjects alone.
 
@@ -174,7 +173,6 @@ def nested_predictions(
         inner_folds: folds of the training people.
         seed: of the inner folds and the classifiers.
         modes: numbers of leading modes to choose from; None is all.
-        on_fold: called with the number of folds done and of all.
 
     Raises:
         InputError: no folds, an unknown classifier, too few people, or a class in too few of them.
@@ -183,12 +181,8 @@ def nested_predictions(
     refuse_unknown(classifiers)
     if not classifiers or not modes:
         raise InputError("Nested cross-validation needs at least one classifier and one number of modes.")
-    results: list[tuple[FloatArray, Choice]] = []
     with threadpool_limits(1):  # small matrices: more threads cost more than they give
-        for number, fold in enumerate(folds, 1):
-            results.append(_nested(fold, classes, classifiers, inner_folds, seed, modes))
-            if on_fold is not None:
-                on_fold(number, len(folds))
+        results = [_nested(fold, classes, classifiers, inner_folds, seed, modes) for fold in folds]
     return _gather(folds, classes, results)
 
 

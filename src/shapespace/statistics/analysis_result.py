@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
-from warnings import warn
 
-from shapespace.lazy import SavedReport, lazy_import
+from shapespace.lazy import lazy_import
 
 
 class AnalysisResult:
@@ -26,11 +25,6 @@ class AnalysisResult:
             FileError: the folder cannot be written, or the disk is full.
         """
         return lazy_import("save_analysis")(self, folder)
-
-    def answer(self) -> SavedReport:
-        """Return the report; deprecated, use `save`."""
-        warn("answer().save(folder) is now called save(folder).", DeprecationWarning, stacklevel=2)
-        return lazy_import("analysis_report")(self)
 
     def _repr_html_(self) -> str:
         return lazy_import("html_of_analysis")(self)

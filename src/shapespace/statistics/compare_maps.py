@@ -135,7 +135,7 @@ def effect_maps(
         bump_width_mm: standard deviation of the bumps; None seeks none.
         weights: (E, V) factors of F; None for 1.
         estimates: E, whose statistics allow unequal variances; None takes the pooled variance of `residual`.
-        level: of significance, and one minus the confidence of intervals.
+        alpha: Level of significance, and one minus the confidence of intervals.
     """
     P, m, K = products.shape
     E, V = len(along), cohort.n_vertices

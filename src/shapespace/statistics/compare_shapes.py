@@ -252,7 +252,7 @@ class CompareResult(AnalysisResult):
         design: the columns.
         config: options of the comparison.
         tests: of the terms.
-        remainders: of the strata.
+        strata: Residual degrees of freedom and sums of squares of each stratum.
         effects: of the variables, and of pairs of them that interact.
         angles: between effects.
         n_subjects: number of subjects; that of shapes where all are independent.

@@ -51,19 +51,16 @@ def methods_of(cohort: Cohort, subjects: int, **known: Any) -> Methods:
     return Methods(subjects=subjects, **{**facts, **known})
 
 
-def sample_sizes(
-    subjects: Sequence[str], variables: Sequence[tuple[str, Sequence[str]]], *, cells: bool = True
-) -> tuple[SampleSize, ...]:
+def sample_sizes(subjects: Sequence[str], variables: Sequence[tuple[str, Sequence[str]]]) -> tuple[SampleSize, ...]:
     """Return the subjects and shapes of each class of each variable, and of each combination of their classes.
 
     Args:
         subjects: of each shape.
         variables: name and the class of each shape.
-        cells: whether to count combinations of two variables or more.
     """
     sizes: list[SampleSize] = []
     sets: list[tuple[tuple[str, Sequence[str]], ...]] = [(one,) for one in variables]
-    if cells and len(variables) > 1:
+    if len(variables) > 1:
         sets.append(tuple(variables))
     for chosen in sets:
         members: dict[tuple[str, ...], list[str]] = {}

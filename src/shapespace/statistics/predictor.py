@@ -35,8 +35,6 @@ _ROUNDING = 1e-9  # relative slack, so that training shapes never count as outsi
 _AGAIN = "make it again with shapespace regress"
 _FLOATS = ("mean", "weights", "intercepts", "residuals", "share")
 _FACTS = ("target", "gauge", "model_hash", "lowest", "highest", "farthest_mm", "subjects", "confidence", "method")
-_KEYS = {"confidence": "level"}
-"""Field -> its key in files of version 1, where they differ."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +179,7 @@ class Predictor:
         Raises:
             FileError: the folder cannot be written.
         """
-        facts = {_KEYS.get(name, name): getattr(self, name) for name in _FACTS}
+        facts = {name: getattr(self, name) for name in _FACTS}
         text = json.dumps({"format": FORMAT, "format_version": VERSION, **facts}, allow_nan=False)
         arrays: dict[str, npt.NDArray[Any]] = {name: getattr(self, name) for name in _FLOATS}
         write_arrays(Path(path), {**arrays, "fold": self.fold.astype(np.int64), "facts": np.array(text)})
@@ -230,7 +228,7 @@ def _facts(arrays: Mapping[str, npt.NDArray[Any]]) -> dict[str, Any]:
     if facts.get("format") != FORMAT or facts.get("format_version") != VERSION:
         raise ValueError("another format")
     texts = {name: facts[name] for name in ("target", "gauge", "model_hash", "method")}
-    numbers = {name: float(facts[_KEYS.get(name, name)]) for name in ("lowest", "highest", "farthest_mm", "confidence")}
+    numbers = {name: float(facts[name]) for name in ("lowest", "highest", "farthest_mm", "confidence")}
     if not all(isinstance(text, str) for text in texts.values()) or texts["gauge"] not in ("form", "shape"):
         raise ValueError("facts of another kind")
     if not all(map(math.isfinite, numbers.values())):

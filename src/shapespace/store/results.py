@@ -450,12 +450,13 @@ def _store_at(_resolved: Path, folder: Path, _changed: int) -> ResultStore | Non
     return None if manifest is None else ResultStore(folder, manifest)
 
 
-def is_stored_at(path: Path) -> bool:
-    """Return whether a store in the folder of `path` contains the content of a single file of that name."""
+def _stored_at(path: Path) -> tuple[Results, str, str] | None:
+    """Return the store that contains the content of the file `path`, its name and kind there; None if none does."""
     name, kind = split_file_name(path.name)
     if not kind or path.is_file() or (results := results_at(path.parent)) is None:
-        return False
-    return name in results and (kind == "record" or results.has(name, kind))
+        return None
+    is_there = name in results and (kind == "record" or results.has(name, kind))
+    return (results, name, kind) if is_there else None
 
 
 def has_written_landmarks(record: Path) -> bool:
@@ -468,7 +469,7 @@ def has_written_landmarks(record: Path) -> bool:
 
 def is_result(path: Path) -> bool:
     """Return whether `path` is a file, or a store in its folder keeps what such a file would hold."""
-    return path.is_file() or is_stored_at(path)
+    return path.is_file() or _stored_at(path) is not None
 
 
 def mesh_at(path: Path) -> Mesh:
@@ -477,10 +478,8 @@ def mesh_at(path: Path) -> Mesh:
     Raises:
         As `read_mesh`, and FileFormatError: the store is damaged.
     """
-    if is_stored_at(path):
-        name, kind = split_file_name(path.name)
-        results = results_at(path.parent)
-        assert results is not None
+    if stored := _stored_at(path):
+        results, name, kind = stored
         return results.surface(name, kind)
     return read_mesh(path)
 
@@ -492,10 +491,8 @@ def bytes_at(path: Path) -> bytes:
         FileError: it cannot be read.
         FileFormatError: the store is damaged.
     """
-    if is_stored_at(path):
-        name, kind = split_file_name(path.name)
-        results = results_at(path.parent)
-        assert results is not None
+    if stored := _stored_at(path):
+        results, name, kind = stored
         return results.stages(name) if kind == "stages" else results.record_bytes(name)
     return read_bytes(path)
 
@@ -512,7 +509,7 @@ def json_at(path: Path, remedy: str, most_bytes: int = LARGEST_BYTES) -> Any:
         FileError: it cannot be read.
         FileFormatError: it is too large, or not plain JSON.
     """
-    if not is_stored_at(path):
+    if _stored_at(path) is None:
         return read_json(path, remedy, most_bytes)
     content = bytes_at(path)
     if len(content) > most_bytes:
@@ -527,7 +524,7 @@ def arrays_at(path: Path, remedy: str) -> dict[str, npt.NDArray[Any]]:
         FileError: it cannot be read.
         FileFormatError: it is damaged, or holds other things than arrays.
     """
-    if not is_stored_at(path):
+    if _stored_at(path) is None:
         return read_arrays(path, remedy)
     content = bytes_at(path)
     try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 
 from shapespace.schemas import CorrespondRecord, ReviewCode, ReviewReason, SurfaceReview
 
@@ -37,15 +37,10 @@ _DESCRIBED: Mapping[ReviewCode, Callable[[ReviewReason], str]] = {
 }
 
 
-def describe_review(record: CorrespondRecord, reasons: Sequence[ReviewReason]) -> tuple[str, ...]:
-    """Return the reasons to review a surface as clauses, the doubt about its correspondence first.
-
-    Args:
-        record: of the scan.
-        reasons: from `CorrespondRecord.review`, or computed for a record of an earlier version.
-    """
+def describe_review(record: CorrespondRecord) -> tuple[str, ...]:
+    """Return the reasons to review a surface as clauses, the doubt about its correspondence first."""
     doubt = (record.doubt,) if record.doubt else ()
-    return (*doubt, *(_DESCRIBED[reason.code](reason) for reason in reasons))
+    return (*doubt, *(_DESCRIBED[reason.code](reason) for reason in record.review))
 
 
 def review_summary(review: SurfaceReview) -> str:

@@ -107,7 +107,7 @@ def _distance_column(direction: str, measure: str) -> str:
 
 def _overlap_cells(record: FitRecord) -> dict[str, Any]:
     overlap = record.shown
-    if overlap is None:  # of a fit by an earlier version
+    if overlap is None:
         return {}
     cells: dict[str, Any] = {key: getattr(overlap, key) for key in _SHARES}
     for direction in _DIRECTIONS:

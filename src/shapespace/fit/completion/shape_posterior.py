@@ -274,7 +274,10 @@ class _Linearised:
         model = problem.prepared.model
         first = POSE + model.n_modes
         stddev = _AMPLITUDE_STDDEV if model.is_n_training_known else _OF_UNKNOWN_MODEL
-        amplitude, log_evidence = _likeliest_amplitude(data, prior, first, stddev)
+        # The variance of the off-model variation that scan and spectrum make likeliest, and its evidence (E3).
+        score = [data.log_evidence(_scaled(prior, first, a)) - 0.5 * (np.log(a) / stddev) ** 2 for a in _AMPLITUDES]
+        best = int(np.argmax(score))
+        amplitude, log_evidence = float(_AMPLITUDES[best]), score[best]
         variance = _scaled(prior, first, amplitude)
         return _Linearised(weighted, gathered.seen, data, theta, amplitude, variance, log_evidence)
 
@@ -318,10 +321,3 @@ class _Data:
 def _scaled(prior: FloatArray, first: int, amplitude: float) -> FloatArray:
     """Return the prior variances with those from `first` on times `amplitude`."""
     return np.concatenate([prior[:first], amplitude * prior[first:]])
-
-
-def _likeliest_amplitude(data: _Data, prior: FloatArray, first: int, stddev: float) -> tuple[float, float]:
-    """Return the variance of the off-model variation that scan and spectrum make likeliest, and its evidence (E3)."""
-    score = [data.log_evidence(_scaled(prior, first, a)) - 0.5 * (np.log(a) / stddev) ** 2 for a in _AMPLITUDES]
-    best = int(np.argmax(score))
-    return float(_AMPLITUDES[best]), score[best]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar
@@ -11,17 +11,16 @@ import numpy as np
 
 from shapespace.errors import InputError
 from shapespace.fit.diagnostics.reasons import Reason, ReasonCode
-from shapespace.fit.iteration_state import Fitted, IcpState, StopRule
+from shapespace.fit.iteration_state import Fitted, IcpState, StopRule, largest_motion
 from shapespace.fit.method import Ended, Limits
-from shapespace.fit.paper.shape_icp import shape_icp
-from shapespace.fit.paper.similarity_icp import similarity_icp
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.search.initialisation import Start
 from shapespace.fit.vertex_regions import all_followed
-from shapespace.geometry.closest import ENGINES
+from shapespace.geometry.closest import ENGINES, ClosestPointEngine
+from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.pca import modes_for_variance
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import FloatArray
+from shapespace.types import FloatArray, Similarity
 
 # Set on simulated scans: clean ones stay far from each bound, cut ones cross at least one.
 _SHRUNK_BY_SHAPE = 0.85
@@ -156,3 +155,114 @@ def _hotelling_bound(k: int, n: int) -> float:
     if n <= k + 1:
         return float("inf")
     return float((n**2 - 1) / (n * (n - k)) * fdtri(k, n - k, 1.0 - _IMPLAUSIBLE))
+
+
+# Phase 2 (section 3.2 of the paper): correspondence, similarity and projection in turn
+
+
+def shape_icp(
+    model: ShapeModel,
+    scan: ClosestPointEngine,
+    T_scan_model: Similarity,
+    stop: StopRule,
+    *,
+    b: FloatArray | None = None,
+    with_scale: bool = True,
+) -> Iterator[IcpState]:
+    """Yield the start and each iteration of phase 2, until the RMS closest distance stops falling.
+
+    Each of the three steps lowers sum_j |c_j - y_j|^2 or leaves it, so the RMS in the scan's frame never rises.
+
+    Args:
+        model: mean and modes.
+        scan: search structure of the scan, in the scan's mm frame.
+        T_scan_model: where phase 1 ended.
+        stop: the stopping rule.
+        b: (K,) coefficients to start from, mm; None for the mean.
+        with_scale: False holds the scale of the start.
+
+    Raises:
+        InputError: the matches determine no similarity, or the fit has diverged.
+    """
+    b = np.zeros(model.n_modes) if b is None else b
+    Q = model.reconstruct(b)  # P6
+    y = T_scan_model.apply(Q)
+    matched = scan.query(y)
+    rms_model_mm = [matched.rms / T_scan_model.scale]
+    yield IcpState(2, 0, T_scan_model, b, matched.rms, np.inf)
+
+    for iteration in range(1, stop.max_iterations + 1):
+        c = matched.points  # step 1: closest points of the current deformed model
+        T_scan_model = fit_pose(Q, c, T_scan_model, with_scale)  # step 2: P8-P18
+        Q_matched = T_scan_model.inverse().apply(c)  # in model order and in the model's frame
+        b = model.project(Q_matched, align=False)  # step 3: b = P^T (Q - Q_bar), P19
+        Q = model.reconstruct(b)  # P6: the deformed model
+        moved, y = y, T_scan_model.apply(Q)
+        matched = scan.query(y, near=matched)
+        rms_model_mm.append(matched.rms / T_scan_model.scale)
+        motion_mm = largest_motion(y - moved)
+        stopped = stop.why(rms_model_mm, motion_mm / T_scan_model.scale)  # step 4
+        yield IcpState(
+            phase=2,
+            iteration=iteration,
+            T_scan_model=T_scan_model,
+            b=b,
+            rms_mm=matched.rms,
+            motion_mm=motion_mm,
+            stopped=stopped,
+        )
+        if stopped:
+            return
+
+
+# Phase 1 (section 3.1 of the paper): similarity ICP of the mean shape
+
+
+def similarity_icp(
+    model: ShapeModel, scan: ClosestPointEngine, T_scan_model: Similarity, stop: StopRule, *, with_scale: bool = True
+) -> Iterator[IcpState]:
+    """Yield the start and each iteration of phase 1, until the RMS closest distance stops falling.
+
+    Args:
+        model: its mean shape is moved, its modes are not used.
+        scan: search structure of the scan, in the scan's mm frame.
+        T_scan_model: the start.
+        stop: the stopping rule.
+        with_scale: False holds the scale of the start.
+
+    Raises:
+        InputError: the matches determine no similarity, or the pose has diverged.
+    """
+    Q_mean, b = model.mean_vertices, np.zeros(model.n_modes)
+    p = T_scan_model.apply(Q_mean)
+    matched = scan.query(p)
+    rms_model_mm = [matched.rms / T_scan_model.scale]
+    yield IcpState(1, 0, T_scan_model, b, matched.rms, np.inf)
+
+    for iteration in range(1, stop.max_iterations + 1):
+        p_prime = matched.points  # P7: the closest scan point of each model vertex
+        T_scan_model = fit_pose(Q_mean, p_prime, T_scan_model, with_scale)  # P8-P18
+        moved, p = p, T_scan_model.apply(Q_mean)
+        matched = scan.query(p, near=matched)
+        rms_model_mm.append(matched.rms / T_scan_model.scale)
+        motion_mm = largest_motion(p - moved)
+        stopped = stop.why(rms_model_mm, motion_mm / T_scan_model.scale)
+        yield IcpState(
+            phase=1,
+            iteration=iteration,
+            T_scan_model=T_scan_model,
+            b=b,
+            rms_mm=matched.rms,
+            motion_mm=motion_mm,
+            stopped=stopped,
+        )
+        if stopped:
+            return
+
+
+def fit_pose(source: np.ndarray, target: np.ndarray, before: Similarity, with_scale: bool) -> Similarity:
+    """Return the least-squares pose of `source` on `target` (V, 3); without scale, that of `before` is kept."""
+    if with_scale:
+        return fit_similarity(source, target)
+    rigid = fit_similarity(before.scale * source, target, with_scale=False)
+    return Similarity(before.scale, rigid.rotation, rigid.translation)

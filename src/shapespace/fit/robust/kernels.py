@@ -208,7 +208,7 @@ def compare_into(
     """
     for i in range(len(to_scan)):
         nx, ny, nz = model_normals[i, 0], model_normals[i, 1], model_normals[i, 2]
-        # Sums in the order of NumPy's `einsum`, so that fits are those of earlier versions.
+        # Sums in the order of NumPy's `einsum`.
         residual[i] = to_scan[i, 0] * nx + to_scan[i, 2] * nz + to_scan[i, 1] * ny  # R5
         if len(scan_normals) > 0:
             x, y, z = scan_normals[i, 0], scan_normals[i, 1], scan_normals[i, 2]

@@ -24,14 +24,12 @@ import numpy as np
 from scipy.linalg import LinAlgError
 
 from shapespace.errors import FitError
-from shapespace.fit.dense.model_span import in_span
 from shapespace.fit.dense.residual_modes import residual_modes
 from shapespace.fit.diagnostics.evidence import MatchEvidence
 from shapespace.fit.iteration_state import IcpState, RobustFitted
 from shapespace.fit.landmark_terms import LandmarkConstraint, worth
-from shapespace.fit.robust.final_matches import FinalMatches
-from shapespace.fit.robust.matching import Gathered, Matcher, Matches, MatchHint, Weights
-from shapespace.fit.robust.normal_equations import Estimate, NormalEquations, Prior, normal_equations
+from shapespace.fit.robust.matching import Gathered, Matcher, Matches, MatchHint, Weights, match_vertices
+from shapespace.fit.robust.normal_equations import Estimate, NormalEquations, Prior, normal_equations, small_similarity
 from shapespace.fit.robust.posterior import (
     Posterior,
     covariance_of_landmarks,
@@ -41,11 +39,14 @@ from shapespace.fit.robust.posterior import (
 )
 from shapespace.fit.robust.prepared_model import LinearShape, ModelSurface, PreparedModel, prepare
 from shapespace.fit.robust.robust_settings import Level, RobustSettings
-from shapespace.fit.robust.weights import spread, tails
+from shapespace.fit.robust.weights import match_weights, spread, tails
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.search.initialisation import Start
+from shapespace.fit.vertex_regions import BORDER, FOLLOWED, REJECTED, UNSEEN
+from shapespace.geometry.closest import on_boundary
 from shapespace.geometry.kdtree import KdTree
 from shapespace.geometry.normals import rms_size
+from shapespace.geometry.similarity import POSE
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Similarity
 
@@ -530,3 +531,106 @@ def _states(
 
 def _some(index: IntArray, count: int | None, rng: np.random.Generator) -> IntArray:
     return index if count is None or count >= len(index) else np.sort(rng.choice(index, count, replace=False))
+
+
+# How a robust fit ended at each vertex of the model, found when it is asked for
+
+_COUNTS = 0.5
+"""A match that counts less than this was left out, in the main."""
+_SPACINGS = 4.0
+"""Nearest points of a cloud lie to the side by half its spacing as a rule; so many times that is a hole."""
+_FINEST = 0.01
+"""Of the model's size: what lies nearer than this is followed, however exact the rest is."""
+
+
+@dataclass(frozen=True, eq=False)
+class FinalMatches:
+    """What decides the regions at the end of a robust fit; called, it finds them.
+
+    Args:
+        target: the scan.
+        T_scan_model: the final pose, in the scan's mm frame.
+        surface: the final one, in the model's frame.
+        winding: -1 where the scan's normals are reversed, else 1.
+        normal_cosine: matches whose normals disagree more than this do not count.
+        weight: name of the weight.
+        width_mm: scale of the residuals at the end.
+        far_mm: scale of the distances at the end.
+    """
+
+    target: ScanTarget
+    T_scan_model: Similarity
+    surface: ModelSurface
+    winding: float
+    normal_cosine: float
+    weight: str
+    width_mm: float
+    far_mm: float
+
+    def __call__(self) -> IntArray:
+        """Return the code of each vertex, (V,)."""
+        every = np.arange(len(self.surface.vertices), dtype=np.int32)
+        matches = match_vertices(
+            target=self.target,
+            engine=self.target.engine,
+            T_scan_model=self.T_scan_model,
+            surface=self.surface,
+            vertex=every,
+            near=None,
+            winding=self.winding,
+            normal_cosine=self.normal_cosine,
+        )
+        w = match_weights(
+            self.weight, matches.residual, np.zeros(len(every)), matches.allowed, self.width_mm, self.far_mm
+        )
+        near_mm = max(self.width_mm, _FINEST * rms_size(self.surface.vertices))
+        sideways = np.sqrt(np.maximum(matches.distance**2 - matches.residual**2, 0.0))
+        counted = (w > _COUNTS) | (matches.allowed & (np.abs(matches.residual) < near_mm))
+        regions = np.where(counted, FOLLOWED, REJECTED)
+        # Where the nearest point of the scan lies off to the side, the scan has nothing at the vertex itself.
+        regions[sideways > max(self.far_mm, _SPACINGS * float(np.median(sideways)))] = UNSEEN
+        at_rim = on_boundary(matches.near, self.target.mesh, self.target.rim)
+        regions[at_rim] = np.where(sideways[at_rim] > near_mm, UNSEEN, BORDER)
+        return regions.astype(np.int32)
+
+
+# Projection of a fitted surface onto the span of the model
+
+
+def in_span(
+    prepared: PreparedModel,
+    vertices: FloatArray,
+    estimate: Estimate,
+    prior_stddev: FloatArray,
+    uncertainty_mm: float,
+    modes: int,
+    *,
+    with_scale: bool,
+) -> Estimate:
+    """Return the likeliest pose and first `modes` coefficients given the surface `vertices` (R18, R19).
+
+    Args:
+        prepared: the model.
+        vertices: (V, 3) in the model's order, in its frame.
+        estimate: pose of that frame in the scan's; what the modes left out have done to the pose is given back to it.
+        prior_stddev: (K,) of the coefficients, mm.
+        uncertainty_mm: how well the surface is known, RMS over its vertices.
+        modes: how many.
+        with_scale: False keeps the scale.
+    """
+    P, free = prepared.model.vertex_basis[:, :modes], POSE if with_scale else POSE - 1
+    pose, inside = prepared.pose[:, :free], prepared.pose_in_span[:modes, :free]
+    noise = uncertainty_mm**2 / 3.0
+    kept_share = prior_stddev[:modes] ** 2 / (prior_stddev[:modes] ** 2 + noise)
+    y = (vertices - prepared.model.mean_vertices).ravel()
+    b = P.T @ y
+    # What leaves the span may have moved the pose as far as it reaches itself, and hardly further.
+    residual_energy = max(float(y @ y - b @ b), 0.0) + len(y) * noise
+    unit = 1.0 / np.linalg.norm(pose, axis=0)
+    normal = (pose.T @ pose - (inside.T * kept_share) @ inside) * np.outer(unit, unit)
+    normal[np.diag_indices(free)] += noise / residual_energy
+    delta = np.zeros(POSE)
+    delta[:free] = unit * np.linalg.solve(normal, unit * (pose.T @ y - inside.T @ (kept_share * b)))  # R18
+    small = small_similarity(delta)
+    y = (small.inverse().apply(vertices) - prepared.model.mean_vertices).ravel()
+    return Estimate(estimate.T_scan_model @ small, kept_share * (P.T @ y))  # R19

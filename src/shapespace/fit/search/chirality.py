@@ -3,7 +3,7 @@
 Left and right bones, or a scan exported with one axis negated, differ by a reflection that no pose undoes. A model with
 enough modes follows the mirror image too, so that the distances alone do not reveal it. Therefore the reflected scan is
 fitted as well, and the two are compared by the distances both ways and the prior of the coefficients. The cheap search
-of `any_pose` comes first; only where the reflected scan fits about as well, or better, is it fitted completely.
+of `start_from_any_pose` comes first; only if the reflected scan fits about as well, or better, is it fitted completely.
 """
 
 from __future__ import annotations

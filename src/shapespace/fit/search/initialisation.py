@@ -1,7 +1,7 @@
 """Initialisation of a fit: the unit of the scan, and a pose from landmarks or by global search.
 
 A start with centroids together holds to about 45 degrees. Beyond that, and where it does not fit clearly, many
-rotations are tried (`any_pose`), and what they reach with the leading modes free is compared both ways.
+rotations are tried (`start_from_any_pose`), and what they reach with the leading modes free is compared both ways.
 """
 
 from __future__ import annotations

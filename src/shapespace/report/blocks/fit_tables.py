@@ -45,21 +45,16 @@ def _error(of: Callable[[SavedFit], VertexErrors | None], measure: str) -> _Make
     return lambda fit: length(getattr(of(fit), measure, nan))
 
 
-def _distance(direction: Direction, measure: Measure, *, over_overlap: bool) -> _Make:
-    """Return what makes the cell of a distance over what the scan shows, or over all in fits that do not tell that."""
-    return lambda fit: length(fit.distance_mm(direction, measure) if fit.has_overlap_distances == over_overlap else nan)
+def _distance(direction: Direction, measure: Measure) -> _Make:
+    return lambda fit: length(fit.distance_mm(direction, measure))
 
 
 def _share(key: str) -> _Make:
-    return lambda fit: number(100 * _known(getattr(fit.record.shown, key, None)), 0)
+    def cell(fit: SavedFit) -> Cell:
+        share = getattr(fit.record.shown, key, None)
+        return number(nan if share is None else 100 * share, 0)
 
-
-def _known(share: float | None) -> float:
-    return nan if share is None else share
-
-
-def _counted(fit: SavedFit) -> Cell:
-    return number(nan if fit.has_overlap_distances else 100 * fit.summary_mm("final", "scan_to_model", "fraction"), 0)
+    return cell
 
 
 def _total(values: Mapping[str, float], digits: int) -> Cell:
@@ -71,17 +66,12 @@ _NUMBERS: list[tuple[str, _Make]] = [
     ("True vertex error, max", _error(lambda fit: fit.entry.vertex_error_mm, "max")),
     ("Floor of that, mean", _error(lambda fit: fit.entry.floor_mm, "mean")),
     ("Expected vertex error", lambda fit: length(fit.expected_error_mm)),
-    ("Model to scan where shown, mean", _distance("model_to_scan", "mean", over_overlap=True)),
-    ("Model to scan where shown, 95 %", _distance("model_to_scan", "p95", over_overlap=True)),
-    ("Scan to model where covered, mean", _distance("scan_to_model", "mean", over_overlap=True)),
-    ("Scan to model where covered, 95 %", _distance("scan_to_model", "p95", over_overlap=True)),
+    ("Model to scan where shown, mean", _distance("model_to_scan", "mean")),
+    ("Model to scan where shown, 95 %", _distance("model_to_scan", "p95")),
+    ("Scan to model where covered, mean", _distance("scan_to_model", "mean")),
+    ("Scan to model where covered, 95 %", _distance("scan_to_model", "p95")),
     ("Model shown, %", _share("model_seen_share")),
     ("Scan covered, %", _share("scan_covered_share")),
-    ("Scan to model, mean", _distance("scan_to_model", "mean", over_overlap=False)),
-    ("Scan to model, 95 %", _distance("scan_to_model", "p95", over_overlap=False)),
-    ("Whole model to scan, mean", _distance("model_to_scan", "mean", over_overlap=False)),
-    ("Whole model to scan, max", _distance("model_to_scan", "max", over_overlap=False)),
-    ("Scan counted, %", _counted),
     ("RMS of z", lambda fit: number(float(np.sqrt(np.mean(np.square(fit.record.z)))) if fit.record.z else nan, 1)),
     ("Steps", lambda fit: _total(fit.record.iterations, 0)),
     ("Seconds", lambda fit: _total(fit.record.seconds, 1)),

@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import structs
 
-from shapespace.correspondence.scan_status import SurfaceMeasures, find_review_reasons
 from shapespace.errors import FileFormatError, ShapespaceError
 from shapespace.geometry.mirror_plane import mirror_image
 from shapespace.geometry.normals import (
@@ -29,7 +28,7 @@ from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.report.blocks.wording import printable, without_folders
 from shapespace.report.inputs.saved_fits import Folder
 from shapespace.report.inputs.staged_fit import nice_ceiling
-from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, ReviewReason, read
+from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, read
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity, are_same_triangles
 
 _FEWEST_VERTICES = 3  # a triangle
@@ -248,19 +247,6 @@ class Corresponded:
             std = np.sqrt(squares / np.maximum(counts, 1)) if names and np.isfinite(squares).all() else None
             self._population = Population(tuple(names), counts, np.array(sizes), unread, std)
         return self._population
-
-    def reviews(self) -> dict[str, list[ReviewReason]]:
-        """Return the reasons to review each surface, by the name of its scan.
-
-        They are those of the records; for records of earlier versions, which have none, they are computed.
-        """
-        records = self.corresponding
-        if all(record.review is not None for record in records):
-            return {record.name: record.review or [] for record in records}
-        population = self.population()
-        sizes = dict(zip(population.names, population.sizes.tolist(), strict=True))
-        measures = [SurfaceMeasures.of_record(self.records[name], size) for name, size in sizes.items()]
-        return dict(zip(sizes, find_review_reasons(measures, self.settled), strict=True))
 
     @property
     def settled(self) -> float:

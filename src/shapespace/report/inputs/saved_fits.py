@@ -166,21 +166,9 @@ class SavedFit:
         return _known(getattr(getattr(summary, direction), measure)) if summary else math.nan
 
     def distance_mm(self, direction: Direction, measure: Measure = "mean") -> float:
-        """Return a distance of the final stage over the overlap, in mm; NaN if there is none.
-
-        Records of earlier versions do not have it, see `has_overlap_distances`; of them it is that of `summary_mm`.
-        """
+        """Return a distance of the final stage over the overlap, in mm; NaN if there is none."""
         overlap = self.record.shown
-        return (
-            _known(getattr(getattr(overlap, direction), measure))
-            if overlap
-            else self.summary_mm("final", direction, measure)
-        )
-
-    @property
-    def has_overlap_distances(self) -> bool:
-        """Whether distances are over the overlap."""
-        return self.record.shown is not None
+        return _known(getattr(getattr(overlap, direction), measure)) if overlap else math.nan
 
     @property
     def expected_error_mm(self) -> float:

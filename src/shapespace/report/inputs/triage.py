@@ -36,11 +36,11 @@ class Concern:
 
 def concerns_of(folder: Corresponded) -> dict[str, Concern]:
     """Return the concerns about each readable scan in correspondence, by name."""
-    reviews, concerns = folder.reviews(), dict[str, Concern]()
+    concerns: dict[str, Concern] = {}
     for name in folder.population().names:
-        record, reasons = folder.records[name], reviews[name]
-        weight = _DOUBTFUL_WEIGHT if record.doubt else max((reason.excess for reason in reasons), default=0.0)
-        concerns[name] = Concern(weight, describe_review(record, reasons))
+        record = folder.records[name]
+        weight = _DOUBTFUL_WEIGHT if record.doubt else max((reason.excess for reason in record.review), default=0.0)
+        concerns[name] = Concern(weight, describe_review(record))
     return concerns
 
 

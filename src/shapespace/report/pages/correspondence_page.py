@@ -11,6 +11,7 @@ import numpy as np
 
 from shapespace.errors import FileFormatError, ShapespaceError
 from shapespace.geometry.closest import build_engine
+from shapespace.report import figures
 from shapespace.report.blocks import sections
 from shapespace.report.blocks.blocks import (
     Block,
@@ -225,8 +226,6 @@ class CorrespondencePage:
 
     def same_places(self) -> list[Block]:
         """Return a checkerboard on the mean shape, carried to the worst scans and to some of the others."""
-        from shapespace.report import figures
-
         pictured = self._boards()
         if not pictured:
             return [Text("There is no surface to show.", "broken")]
@@ -264,8 +263,6 @@ class CorrespondencePage:
 
     def nearness(self) -> list[Block]:
         """Return the distances of all scans, and where vertices are missing."""
-        from shapespace.report import figures
-
         if not self.records:
             return [Text("There is no scan in correspondence.", "broken")]
         shares = np.array([[self.share(r, w) for w in ("mean", "p95", "p99", "max")] for r in self.records])
@@ -316,8 +313,6 @@ class CorrespondencePage:
 
     def _confidence(self) -> list[Block]:
         """Return how sure the position of each vertex along the surface is; nothing for surfaces of older versions."""
-        from shapespace.report import figures
-
         std = self.all.position_std
         if std is None:
             return []
@@ -476,8 +471,6 @@ class CorrespondencePage:
 
     def rounds(self) -> list[Block]:
         """Return by how much vertices moved in each round, and what it cost."""
-        from shapespace.report import figures
-
         run = self.result.run
         figure = self.page.figure(
             figures.movement_figure(run.rounds, [record.moved_share for record in self.records], self.result.settled),

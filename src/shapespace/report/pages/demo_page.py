@@ -11,6 +11,7 @@ import numpy as np
 
 from shapespace.errors import FileFormatError
 from shapespace.model.shape_model import ShapeModel
+from shapespace.report import figures
 from shapespace.report.blocks import fit_tables as tables
 from shapespace.report.blocks import sections
 from shapespace.report.blocks.blocks import Block, Facts, Figure, Folded, Notice, Table, Text, Tiles, text_table
@@ -128,8 +129,6 @@ class DemoPage:
         counts = Counter(fit.status for fit in fits)
         tests = [fit.entry for fit in fits if fit.entry.intensity and fit.status != "failed"]
         distances = [fit.distance_mm("model_to_scan") for fit in fits if fit.entry in tests]
-        over_overlap = fits and all(fit.has_overlap_distances for fit in fits if fit.entry in tests)
-        where = ", over what it shows" if over_overlap else ""
         errors = _mean([entry.vertex_error_mm.mean for entry in tests if entry.vertex_error_mm])
         floors = _mean([entry.floor_mm.mean for entry in tests if entry.floor_mm])
         blind = "fits converged with nothing found against them; the plain method is blind to some errors"
@@ -137,7 +136,7 @@ class DemoPage:
         tiles = [
             (str(counts["converged"]), f"of {total}", blind),
             (modes, "", "modes hold 98.5 % of the variance of one person's expressions"),
-            (*_number_and_unit(_mean(distances)), f"mean closest distance of the test faces, model to scan{where}"),
+            (*_number_and_unit(_mean(distances)), "mean closest distance, test faces to scans, over what these show"),
             (*_number_and_unit(errors), f"their true vertex error; the model's best possible is {mm(floors)}"),
         ]
         rest = ", ".join(
@@ -157,8 +156,6 @@ class DemoPage:
 
     def main_figure(self) -> list[Block]:
         """Return the middle test face and the scans of experiment 2 with their fits."""
-        from shapespace.report import figures
-
         fits, _ = self.readable(self.demo.experiment1.fits)
         usable = [fit for fit in _tests(fits) if fit.pictured]
         usable.sort(key=lambda fit: fit.summary_mm("final", "model_to_scan", "mean"))
@@ -249,8 +246,6 @@ class DemoPage:
 
     def training(self, one: ExpressionsOfOne) -> Figure:
         """Return some of the training faces."""
-        from shapespace.report import figures
-
         examples = one.training_examples[: 8 if self.demo.quick else 12]
         meshes = [self.folder.mesh(example.file) for example in examples]
         labels = [example.label for example in examples]
@@ -266,8 +261,6 @@ class DemoPage:
 
     def test_faces(self, tests: Sequence[SavedFit]) -> list[Block]:
         """Return the scans of the test faces."""
-        from shapespace.report import figures
-
         pictured, absent = self.pictured(tests)
         if not pictured:
             return [absent if absent.items else Text("No test face was fitted.", "broken")]
@@ -292,8 +285,6 @@ class DemoPage:
 
     def all_fitted(self, tests: Sequence[SavedFit]) -> list[Block]:
         """Return every test face with its fitted model."""
-        from shapespace.report import figures
-
         pictured, absent = self.pictured(tests)
         if not pictured:
             return [absent]
@@ -326,8 +317,6 @@ class DemoPage:
 
     def maps(self, tests: Sequence[SavedFit]) -> list[Block]:
         """Return threshold maps and distance maps of the test faces."""
-        from shapespace.report import figures
-
         pictured, absent = self.pictured(tests)
         if not pictured:
             return [absent]

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from shapespace.report import figures
 from shapespace.report.blocks import fit_tables as tables
 from shapespace.report.blocks import sections
 from shapespace.report.blocks.blocks import (
@@ -177,8 +178,6 @@ class ManyPage(FolderPage):
         ]
 
     def _histograms(self) -> Block:
-        from shapespace.report import figures
-
         every = counted(len(self.population), "fit")
         measures = {words: self.population.measures[key] for key, words in MEASURES.items()}
         return self.page.figure(
@@ -193,8 +192,6 @@ class ManyPage(FolderPage):
         return self.population.z[self.population.trusted]
 
     def _coefficients(self) -> Block:
-        from shapespace.report import figures
-
         return self.page.figure(
             figures.coefficients_spread(self._trusted_z(), title="How widely each coefficient spreads"),
             "Percentiles of each coefficient over the trusted fits, in standard deviations of the model. Where the "
@@ -204,8 +201,6 @@ class ManyPage(FolderPage):
         )
 
     def _density(self) -> Block:
-        from shapespace.report import figures
-
         trusted = self.population.trusted
         return self.page.figure(
             figures.density_figure(self._trusted_z(), self._far[trusted], title="Where in the shape space"),
@@ -267,8 +262,6 @@ class ManyPage(FolderPage):
 
     def by(self, column: ListedColumn) -> list[Block]:
         """Return how the fits go with one column."""
-        from shapespace.report import figures
-
         people, trusted = self.population, self.population.trusted
         # Errors are of trusted fits; the number of the others is given beside them.
         measures = {words: np.where(trusted, people.measures[key], np.nan) for key, words in MEASURES.items()}

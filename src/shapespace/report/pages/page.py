@@ -135,7 +135,7 @@ class Page:
 
         Args:
             widget: as of `blocks.Turning`, as all the others but
-            payload: what it shows, from `report.scene`.
+            payload: what it shows, from `report.render.scene`.
             poster: the still.
             caption: of both.
             label: what it is.

@@ -13,7 +13,6 @@ from shapespace.errors import InputError
 from shapespace.reprs import list_briefly, short_repr
 from shapespace.statistics.analysis_result import AnalysisResult
 from shapespace.statistics.identity.rates import RateEstimate, people_drawn, rate_estimate
-from shapespace.statistics.identity.scores import score_name
 from shapespace.statistics.identity.trial import IdentityConfig, Trial, scores_of, trial_of
 from shapespace.types import BoolArray, FloatArray, IntArray, require
 
@@ -121,7 +120,6 @@ class IdentificationResult(AnalysisResult):
     config: IdentityConfig
 
     def __getitem__(self, name: str) -> IdentificationRates:
-        name = score_name(name)
         return next(one for one in self.scores if one.name == name)
 
     def __repr__(self) -> str:

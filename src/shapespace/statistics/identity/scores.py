@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
-from typing import TypeAlias
-from warnings import warn
+from typing import TypeAlias, cast
 
 import numpy as np
+from scipy.linalg import eigh
 from scipy.spatial.distance import cdist
 
 from shapespace.errors import InputError
-from shapespace.statistics.identity.plda import TwoCovariance
+from shapespace.lazy import require_package
 from shapespace.statistics.identity.samples import Samples
-from shapespace.types import FloatArray
+from shapespace.types import FloatArray, read_only
 
 Scorer: TypeAlias = Callable[[Samples, Samples], FloatArray]
 """(gallery, probes) -> (G, P) scores, alike if the two change places."""
@@ -53,21 +54,6 @@ coefficients of identity, and by the plain distance of the shapes, RMS over vert
 ratio."""
 
 
-_FORMER = {"likelihood-ratio": "plda"}
-
-
-def score_name(name: str) -> str:
-    """Return the current name of a score, with a warning for a former name."""
-    if name not in _FORMER:
-        return name
-    warn(
-        f"The score {name!r} is now called {_FORMER[name]!r}, since only calibrated scores are likelihood ratios.",
-        DeprecationWarning,
-        stacklevel=3,
-    )
-    return _FORMER[name]
-
-
 def refuse_unknown_scores(names: Sequence[str]) -> None:
     """Check that `names` are scores.
 
@@ -77,3 +63,105 @@ def refuse_unknown_scores(names: Sequence[str]) -> None:
     unknown = [name for name in names if name not in SCORES]
     if unknown or not names:
         raise InputError(f"Scores are {', '.join(SCORES)}, not {', '.join(unknown) or 'none at all'}.")
+
+
+# PLDA: a score of two scans being of one person, by normal within- and between-person covariance
+
+# bounds as shares of the variance within and between people, so that both stay positive
+_MOST_NOISE, _LEAST_BETWEEN = 0.9, 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class TwoCovariance:
+    """Between- and within-person covariance, in the coordinates in which both are diagonal.
+
+    Args:
+        mean: (K,) of all people.
+        basis: (K, K) columns v with v^T W v = 1, so that basis^T B basis is diagonal.
+        between: (K,) that diagonal.
+        noise: (K,) share of the covariance within that is taken for errors of fits.
+        noise_scale: (K,) of the variances that fits state, so that those of training make up `noise` on average.
+        people: learned from.
+        scans: learned from.
+    """
+
+    mean: FloatArray
+    basis: FloatArray
+    between: FloatArray
+    noise: FloatArray
+    noise_scale: FloatArray
+    people: int
+    scans: int
+
+    @staticmethod
+    def learn(training: Samples) -> TwoCovariance:
+        """Return the covariances of `training`, shrunk as far as Ledoit and Wolf find it needs (2004).
+
+        The errors that fits state are part of the covariance within. Where they exceed nine tenths of it they are
+        scaled down to that: files keep their diagonal alone, which overstates the error in those directions in which
+        errors of several coefficients cancel.
+
+        Raises:
+            InputError: fewer than three people, or nobody of them has two scans.
+            ShapespaceError: scikit-learn is not installed.
+        """
+        shrunk = require_package("sklearn.covariance", "The PLDA score", "'shapespace[statistics]'").ledoit_wolf
+        names, whose = np.unique(np.asarray(training.subjects), return_inverse=True)
+        counts = np.bincount(whose, minlength=len(names)).astype(np.float64)
+        if len(names) < 3 or counts.max(initial=0.0) < 2:
+            raise InputError(
+                f"The PLDA score is trained on subjects who are not tested, and there are {len(names)}, of whom "
+                f"{int((counts > 1).sum())} have two scans; give three subjects or more and several scans of each, or "
+                "leave it out of --scores."
+            )
+        n, k = training.x.shape
+        means = np.zeros((len(names), k))
+        np.add.at(means, whose, training.x)
+        means /= counts[:, None]
+        mean = means.mean(axis=0)
+        own = training.x - means[whose]
+        several = counts[whose] > 1
+        freedom = several.sum() - (counts > 1).sum()
+        within = cast(FloatArray, shrunk(own[several], assume_centered=True)[0]) * (several.sum() / freedom)
+        spread = cast(FloatArray, shrunk(means - mean, assume_centered=True)[0]) * (len(names) / (len(names) - 1))
+        between = _less(spread, within * float((1.0 / counts).mean()), _LEAST_BETWEEN)  # S61
+        values, basis = cast(tuple[FloatArray, FloatArray], eigh(between, within))
+        stated = training.variance.mean(axis=0) @ basis**2
+        noise = np.minimum(stated, _MOST_NOISE)
+        scale = np.divide(noise, stated, out=np.ones_like(noise), where=stated > 0)
+        arrays = (mean, basis, np.maximum(values, 0.0), noise, scale)
+        return TwoCovariance(*map(read_only, arrays), people=len(names), scans=n)
+
+    def score(self, gallery: Samples, probes: Samples) -> FloatArray:
+        """Return (G, P) scores: natural log likelihood, by the model, of one person minus that of two.
+
+        They are likelihood ratios only if the normal model and its covariances are right, which a small training set
+        does not ensure; `calibrated` makes likelihood ratios of them.
+
+        The covariance within of each scan has its own errors in the place of those of the training; their diagonal in
+        the coordinates of `basis` is used.
+        """
+        g, p = (samples.x - self.mean for samples in (gallery, probes))
+        g, p = g @ self.basis, p @ self.basis
+        # Total variances, (G, K) and (P, K).
+        of_g, of_p = (self.between + self.within(one) for one in (gallery, probes))
+        alone = (p**2 / of_p + np.log(of_p)).sum(axis=1)
+        out = np.empty((len(g), len(p)))
+        for row, (x, total) in enumerate(zip(g, of_g, strict=True)):
+            # Of the probe given the gallery scan, if they are of one person.
+            pull = self.between / total
+            left = of_p - self.between * pull  # S63
+            together = ((p - pull * x) ** 2 / left + np.log(left)).sum(axis=1)
+            out[row] = 0.5 * (alone - together)  # S62
+        return out
+
+    def within(self, samples: Samples) -> FloatArray:
+        """Return (N, K) variances within a person, of which 1 is usual, in the coordinates of `basis`."""
+        return 1.0 - self.noise + self.noise_scale * (samples.variance @ self.basis**2)
+
+
+def _less(total: FloatArray, part: FloatArray, least: float) -> FloatArray:
+    """Return `whole` less `part`, of which in no direction less than the share `least` of `whole` is left."""
+    shares, vectors = eigh(part, total)
+    back = np.linalg.inv(vectors)
+    return (back.T * np.maximum(1.0 - shares, least)) @ back

@@ -15,7 +15,7 @@ from shapespace.errors import InputError
 from shapespace.reprs import short_repr
 from shapespace.statistics.identity.rates import Pairs
 from shapespace.statistics.identity.samples import Samples, samples_of
-from shapespace.statistics.identity.scores import SCORES, refuse_unknown_scores, score_name
+from shapespace.statistics.identity.scores import SCORES, refuse_unknown_scores
 from shapespace.types import BoolArray, FloatArray, IntArray
 
 ROLES = ("gallery", "probe", "train")
@@ -62,7 +62,7 @@ class IdentityConfig:
     drop_missing: bool = False
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "scores", tuple(map(score_name, self.scores)))
+        object.__setattr__(self, "scores", tuple(self.scores))
 
 
 @dataclass(frozen=True)

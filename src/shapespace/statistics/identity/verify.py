@@ -5,16 +5,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.proportions import widen_share
+from shapespace.lazy import require_package
 from shapespace.reprs import list_briefly, short_repr
 from shapespace.statistics.analysis_result import AnalysisResult
-from shapespace.statistics.identity.calibration import calibrated, cllr, cllr_min
 from shapespace.statistics.identity.rates import Pairs, RateEstimate, Roc, Sweep, people_drawn, rate_estimate, resampled
-from shapespace.statistics.identity.scores import score_name
 from shapespace.statistics.identity.trial import IdentityConfig, Trial, scores_of, trial_of
 from shapespace.types import BoolArray, FloatArray, IntArray, require
 
@@ -100,7 +100,6 @@ class VerificationResult(AnalysisResult):
     config: IdentityConfig
 
     def __getitem__(self, name: str) -> VerificationRates:
-        name = score_name(name)
         return next(one for one in self.scores if one.name == name)
 
     def __repr__(self) -> str:
@@ -251,3 +250,60 @@ def _with_value(values: tuple[str, ...], value: str, pairs: Pairs, *, all_pairs:
     has: BoolArray = np.array([one == value for one in values], dtype=np.bool_)
     probe = has[pairs.rows[:, 1]]
     return probe | has[pairs.rows[:, 0]] if all_pairs else probe
+
+
+# Scores as likelihood ratios, and what they cost: Cllr, and Cllr-min of the best monotone calibration
+
+_NEEDS, _INSTALL = "Calibration of scores", "'shapespace[statistics]'"
+
+
+def cllr(llr: FloatArray, same: BoolArray, weights: FloatArray | None = None) -> float:
+    """Return the cost of log likelihood ratios (M,), natural, in bits; both kinds of pairs count alike."""
+    w = np.ones(len(llr)) if weights is None else weights
+    cost = np.logaddexp(0.0, np.where(same, -llr, llr)) / np.log(2.0)
+    return float(0.5 * (np.average(cost[same], weights=w[same]) + np.average(cost[~same], weights=w[~same])))
+
+
+def cllr_min(score: FloatArray, same: BoolArray) -> float:
+    """Return the least cost of any rising function of the scores, by pooling adjacent violators.
+
+    Raises:
+        ShapespaceError: scikit-learn is not installed.
+    """
+    isotonic = require_package("sklearn.isotonic", _NEEDS, _INSTALL).IsotonicRegression
+    genuine = int(same.sum())
+    weights = np.where(same, 0.5 / genuine, 0.5 / (len(same) - genuine))
+    rule = isotonic(y_min=0.0, y_max=1.0).fit(score, same.astype(np.float64), sample_weight=weights)
+    p = cast(FloatArray, rule.predict(score))
+    p = np.clip(p, 0.0, 1.0)
+    with np.errstate(divide="ignore"):
+        return cllr(np.log(p) - np.log1p(-p), same)
+
+
+def calibrated(score: FloatArray, pairs: Pairs, group: IntArray) -> FloatArray | None:
+    """Return the log likelihood ratio (M,), natural, of each score, by a logistic regression on other people.
+
+    Args:
+        score: (M,).
+        pairs: of whom.
+        group: (P,) of each person; a pair is calibrated by pairs of people of neither's group.
+
+    Returns:
+        None where some groups leave no pairs of both kinds to learn from.
+
+    Raises:
+        ShapespaceError: scikit-learn is not installed.
+    """
+    make: Any = require_package("sklearn.linear_model", _NEEDS, _INSTALL).LogisticRegression
+    one, other = group[pairs.one], group[pairs.other]
+    out = np.full(len(score), np.nan)
+    for a, b in sorted({(min(p), max(p)) for p in zip(one.tolist(), other.tolist(), strict=True)}):
+        own = ((one == a) & (other == b)) | ((one == b) & (other == a))
+        known = ~np.isin(one, (a, b)) & ~np.isin(other, (a, b))
+        if pairs.same[known].all() or not pairs.same[known].any():
+            return None
+        mean, scale = score[known].mean(), score[known].std() or 1.0
+        # Both kinds of pairs count alike, so the log odds are the log likelihood ratio.
+        rule = make(class_weight="balanced").fit((score[known, None] - mean) / scale, pairs.same[known])
+        out[own] = rule.decision_function((score[own, None] - mean) / scale)
+    return out
