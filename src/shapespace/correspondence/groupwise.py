@@ -24,7 +24,6 @@ from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.isometry import common_symmetries
 from shapespace.correspondence.kinds import Collection, find_kinds, is_outlier
 from shapespace.correspondence.landmark_guide import ScanLandmarks, consensus_landmarks
-from shapespace.correspondence.mirrored_scans import ASYMMETRIC, Sides, solve_sides
 from shapespace.correspondence.pose_consensus import (
     SAME_POSE_DEG,
     TEMPLATE,
@@ -57,6 +56,7 @@ from shapespace.errors import InputError, ShapespaceError
 from shapespace.geometry.distortion import Distortion
 from shapespace.geometry.landmark_placement import place_landmarks
 from shapespace.geometry.mirror_plane import FLIP, mirror_image
+from shapespace.geometry.mirrored_scans import ASYMMETRIC, Sides, solve_sides
 from shapespace.geometry.normals import rms_size
 from shapespace.geometry.procrustes import align_to_weighted_mean
 from shapespace.geometry.similarity import fit_similarity

@@ -7,7 +7,7 @@ written as version 1, which stores vertices: earlier versions of shapespace can 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -56,6 +56,7 @@ class _FileAttributes(Struct, frozen=True):
     variance_divisor: str = ""
     n_training_known: str = "yes"
     regions: str = "{}"
+    notes: str = "[]"
 
 
 class ModelFields(TypedDict):
@@ -79,6 +80,7 @@ class ModelFields(TypedDict):
     is_n_training_known: bool
     training: TrainingShapes | None
     dropped_vertices: IntArray
+    notes: Sequence[str]
 
 
 def hash_of(model: ModelFields) -> str:
@@ -97,6 +99,8 @@ def save(
     made_by: dict[str, Attribute] = {"model_hash": hash_of(model), "software_version": __version__}
     if not model["is_n_training_known"]:  # no part of the hash, which files of earlier versions have without it
         made_by["n_training_known"] = "no"
+    if notes := model["notes"]:
+        made_by["notes"] = json.dumps(notes)
     if (training := model["training"]) is not None:  # no part of the hash: a shared model without them is the same
         arrays |= {_TRAINING: training.coefficients, _TRAINING_SIZE: training.log_scale}
         arrays |= {_TRAINING_REST: training.rest} if training.rest.size else {}
@@ -220,6 +224,7 @@ def load(path: Path) -> ModelFields:
             "is_n_training_known": attributes_of_file.n_training_known != "no",
             "training": _training_shapes(owned),
             "dropped_vertices": _dropped_vertices(owned.get(_DROPPED, np.zeros(0))),
+            "notes": msgspec.convert(plain_json(attributes_of_file.notes), tuple[str, ...]),
         }
     except (KeyError, ValueError, InputError) as error:
         reason = str(error)[:_LONGEST_DETAIL].replace("`", "").replace("Object missing", "missing")
