@@ -51,7 +51,7 @@ def test_options_of_a_model_are_refused_at_once(options: dict[str, Any], told: s
 
 @pytest.mark.parametrize("options", [{}, {"modes": 3}, {"modes": np.int64(3)}, {"modes": 0.9}, {"modes": "auto"}])
 def test_options_that_can_be_are_kept(options: dict[str, Any]) -> None:
-    assert ss.BuildConfig(**options).modes == options.get("modes")
+    assert ss.BuildConfig(**options).modes == options.get("modes", "all")
 
 
 def test_the_mean_of_a_model_is_its_vertices() -> None:

@@ -774,14 +774,16 @@ def add_scans(
     config = config or CorrespondConfig()
     kept = len(finished.surfaces)
     scans = list(as_meshes(scans, "add_scans"))
-    repaired, broken = repaired_scans(scans, config)
-    raw, unusable = repaired_scans(finished.scans, config)
+    repaired, broken, notes = repaired_scans(scans, config)
+    raw, unusable, notes_of_raw = repaired_scans(finished.scans, config)
     if unusable:
         raise InputError(f"A scan of the finished correspondence is {next(iter(unusable.values()))}")
     raw |= {kept + i: scan for i, scan in repaired.items()}
     reasons = {kept + i: reason for i, reason in broken.items()}
     names = [mesh.name for mesh in (*finished.surfaces, *scans)]
-    first = FirstTemplate(finished.mean, "The template is the mean of the finished correspondence.", raw, reasons)
+    notes = notes_of_raw | {kept + i: sentences for i, sentences in notes.items()}
+    origin = "The template is the mean of the finished correspondence."
+    first = FirstTemplate(finished.mean, origin, raw, reasons, notes)
     problem = _Problem.of(names, first, config)
     start = _finished_state(problem, finished)
     states = _added_states(problem, start, [i for i in raw if i >= kept], run)
@@ -1002,6 +1004,7 @@ def _scan_result(
         evidence=evidence,
         position_std=T.scale * position_std,
         measures=_measures(state.template, registration, moved),
+        notes=problem.first.notes[i],
     )
 
 
