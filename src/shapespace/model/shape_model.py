@@ -370,9 +370,11 @@ class ShapeModel:
         """
         shape = without_estimates(shape) if isinstance(shape, Mesh) else shape
         vertices = shape.vertices if isinstance(shape, Mesh) else np.asarray(shape, dtype=np.float64)
-        if vertices.shape == (self.n_vertices + len(self.dropped_vertices), 3):
+        if vertices.ndim != 2 or vertices.shape[1] != 3:
+            raise InputError(f"A shape to be projected must have the shape (V, 3), not {vertices.shape}.")
+        if len(vertices) == self.n_vertices + len(self.dropped_vertices):
             vertices = np.delete(vertices, self.dropped_vertices, axis=0)
-        if vertices.shape != (self.n_vertices, 3):
+        if len(vertices) != self.n_vertices:
             name = shape.name if isinstance(shape, Mesh) else "The shape"
             raise CorrespondenceError(
                 f"{name} has {len(vertices)} vertices but the model has {self.n_vertices}; only shapes in the "
