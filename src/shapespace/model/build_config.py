@@ -42,6 +42,10 @@ class BuildConfig:
             vertices would need more than four fifths of the free memory.
         without_training_shapes: omit the training shapes, from which their surfaces can be reconstructed, from the
             model, for example before you share a model of people; its results are then not calibrated.
+
+    Example:
+        >>> ss.build_model(meshes, ss.BuildConfig(modes=0.9, gauge="form")).gauge
+        'form'
     """
 
     modes: Modes = "all"

@@ -67,6 +67,10 @@ def build_model(
         InputError: too few meshes, values that are not finite, no variation, an unknown representation,
             control points that cannot be; streamed meshes with missing vertices, or for B-splines.
         FileError: the disk has no room for the file.
+
+    Example:
+        >>> ss.build_model(meshes, ss.BuildConfig(modes=3)).n_modes
+        3
     """
     config, log = config or BuildConfig(), log or _silent
     require(config, BuildConfig, "build_model", "give the options as BuildConfig(...)")

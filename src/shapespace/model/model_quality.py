@@ -71,6 +71,11 @@ class Curve:
         low: (n,) where its 95 % interval begins.
         high: (n,) where it ends.
         each: (S, n) of each shape or sample, where the mean is over them.
+
+    Example:
+        >>> quality = ss.model.measure_quality(meshes, config=ss.model.QualityConfig(folds=2, samples=2))
+        >>> len(quality.compactness.mean) == len(quality.compactness.counts)
+        True
     """
 
     counts: IntArray
@@ -110,6 +115,11 @@ class ModelQuality:
         seed: of all that is drawn.
         missing_share: of the vertices, over all shapes; nothing is measured there.
         left_out_vertices: that less than half of the shapes show, so that nothing is measured of them at all.
+
+    Example:
+        >>> quality = ss.model.measure_quality(meshes, config=ss.model.QualityConfig(folds=2, samples=2))
+        >>> quality.shapes
+        6
     """
 
     compactness: Curve

@@ -261,6 +261,12 @@ class CompareResult(AnalysisResult):
         methods: sample sizes, tests and assumptions.
         repeated_measures: how several shapes of a subject enter the tests; None where all shapes are independent.
         imputations: those that p values combine; None without samples of completed shapes.
+
+    Example:
+        >>> config = ss.statistics.CompareConfig(permutations=99)
+        >>> result = ss.statistics.compare(cohort, "~ group", config)
+        >>> [test.term for test in result.tests]
+        ['group']
     """
 
     cohort: Cohort

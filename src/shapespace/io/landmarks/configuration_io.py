@@ -76,6 +76,11 @@ def read_configurations(
         FileFormatError: it is damaged, is in none of the formats, or its specimens have other landmarks.
         InputError: two specimens have one name.
         ShapespaceError: the extra `r`, which R files need, is not installed.
+
+    Example:
+        >>> _ = ss.io.write_configurations("landmarks.tps", configurations)
+        >>> ss.io.read_configurations("landmarks.tps").points.shape
+        (6, 10, 3)
     """
     raw = _read_folder(Path(path)) if Path(path).is_dir() else _read_file(Path(path), name)
     for file in sliders:
@@ -287,6 +292,10 @@ def write_configurations(path: Path | str, raw: LandmarkConfigurations, format: 
     Raises:
         InputError: an unknown format, or one that cannot hold these landmarks.
         FileError: it cannot be written.
+
+    Example:
+        >>> ss.io.write_configurations("specimens.csv", configurations)
+        ()
     """
     path = Path(path)
     if format is None:
