@@ -34,7 +34,7 @@ def command_with_stages(root: Path, records: Mapping[str, FitRecord]) -> str:
     first = next(iter(records.values()))
     scans = [record.scan.path or "SCAN" for record in records.values()]
     is_plain = len(records) == 1 and first.landmarks is None and not first.metadata
-    if not is_plain and _listed(root / FitRecord.LIST) == records.keys():
+    if not is_plain and _listed(root / FitRecord.LIST) == set(records):
         scans = [FitRecord.LIST]
     elif len(scans) > _MOST_SCANS:
         scans = ["SCANS"]
