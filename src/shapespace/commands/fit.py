@@ -123,7 +123,8 @@ def fit_scans(
 def _write_list(folder: Path, jobs: Sequence[Job]) -> None:
     """Write the list of the scans whose results are in a folder, by which `fit` takes them again.
 
-    It has the scans of this run, and those of the earlier list whose results are still there.
+    It has the scans of this run, and those of the earlier list whose results are still there. One scan without
+    landmarks and metadata needs no list.
 
     Raises:
         FileError: the folder cannot be written, or the disk is full.
@@ -140,6 +141,8 @@ def _write_list(folder: Path, jobs: Sequence[Job]) -> None:
             places["landmarks"] = Source.of_file(job.landmarks, "", folder).path
         rows[job.name] = {**job.metadata, "id": job.name, **places}
     columns = list(dict.fromkeys(["id", "scan", *(column for row in rows.values() for column in row)]))
+    if len(rows) == 1 and len(columns) == 2 and not file.exists():
+        return
     write_text(file, table_text(columns, [[row.get(column, "") for column in columns] for row in rows.values()]))
 
 
