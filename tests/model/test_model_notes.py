@@ -14,6 +14,7 @@ from shapespace.model.additive import AdditiveModel
 from shapespace.model.build_config import BuildConfig
 from shapespace.model.build_model import build_model, extend_model
 from shapespace.report.blocks.wording import training_text
+from shapespace.statistics.compare_shapes import complete_cohort
 from shapespace.types import FloatArray, Mesh
 from synthetic_shapes import training_meshes
 
@@ -162,3 +163,14 @@ def test_flat_shapes_have_no_side() -> None:
     mean = rng.normal(0, 30, (20, 3)) * [1, 1, 0]
     shapes = [mean + rng.normal(0, 2, mean.shape) * [1, 1, 0] for _ in range(8)]
     assert build_model([Mesh(x * [1, -1 if k < 3 else 1, 1]) for k, x in enumerate(shapes)]).notes == ()
+
+
+def test_an_analysis_begins_with_the_mirror_images() -> None:
+    shapes = np.stack([mesh.vertices for mesh in training_meshes(8, 200)])
+    for mirrored in ((), (2, 5)):
+        sided = shapes * np.where(np.isin(np.arange(8), mirrored)[:, None, None], (-1.0, 1.0, 1.0), 1.0)
+        cohort = ss.Cohort.of_shapes(sided, {"group": list("abababab")})
+        cautions = complete_cohort(cohort, ["~ group"], [], drop_missing=False).cautions
+        assert [text.partition(" of the others")[0] for text in cautions] == (
+            ["2 of 8 shapes are mirror images"] if mirrored else []
+        )
