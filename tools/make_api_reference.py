@@ -1,4 +1,4 @@
-"""Write the entries of docs/api.md: signature, first sentence of the docstring, source and example of each public name.
+"""Write the entries of docs/api.md: first sentence of the docstring, source, signature and example of each public name.
 
 The order and the texts between the entries are those of the page. A test compares the page, and asks for this command:
 
@@ -46,18 +46,26 @@ def example(name: str, pages: dict[str, str]) -> str:
     return most if counts[most] else ""
 
 
+def own_example(of: Any) -> list[str]:
+    """Return the lines of the example in a docstring; none if there is none."""
+    found = re.search(r"^Example:\n((?:    .*\n?)+)", inspect.getdoc(of) or "", re.MULTILINE)
+    return [line.removeprefix("    ") for line in found[1].splitlines()] if found else []
+
+
 def page() -> str:
     """Return the page with its entries written anew."""
     names = runpy.run_path(str(ROOT / "tools" / "public_api.py"))["names"]()
-    pages = {file.name: "\n".join(CODE.findall(file.read_text("utf-8"))) for file in DOCS.glob("*.md")}
+    pages = {file.name: "\n".join(CODE.findall(file.read_text("utf-8"))) for file in DOCS.glob("*.md") if file != PAGE}
 
     def entry(match: re.Match[str]) -> str:
         name, of = match[1], names[match[1]]
         file = inspect.getsourcefile(inspect.unwrap(of)) if callable(of) else None
         links = [f"[source](../{Path(file).relative_to(ROOT).as_posix()})"] if file else []
-        shown_on = example(name, pages)
+        shown_on, own = example(name, pages), own_example(of)
         links += [f"[example]({shown_on})"] if shown_on else []
         lines = [f"- `{name}`: {sentence(of, match[2])}. {', '.join(links)}".rstrip(), f"  `{signature(name, of)}`"]
+        if own:
+            lines += ["  ```pycon", *(f"  {line}" for line in own), "  ```"]
         return "\n".join(lines) + "\n"
 
     return ENTRY.sub(entry, PAGE.read_text("utf-8"))

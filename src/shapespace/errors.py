@@ -2,7 +2,15 @@
 
 
 class ShapespaceError(Exception):
-    """Base of every error that shapespace raises on purpose."""
+    """Base of every error that shapespace raises on purpose.
+
+    Example:
+        >>> try:
+        ...     ss.build_model(meshes[:1])
+        ... except ss.ShapespaceError as error:
+        ...     print(error)
+        A shape model needs at least two meshes, not 1; with one there is nothing that varies.
+    """
 
 
 class InputError(ShapespaceError, ValueError):

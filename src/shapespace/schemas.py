@@ -213,6 +213,7 @@ class FitRecord(Struct, frozen=True, kw_only=True):
 
     CALLED: ClassVar = "the record of a fit"
     FORMAT: ClassVar = "shapespace fit"
+    LIST: ClassVar = "scans.csv"
     VERSION: ClassVar = 1
 
     format: str = FORMAT

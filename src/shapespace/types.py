@@ -149,6 +149,8 @@ class Mesh:
                 raw = raw.reshape(0, 3)
             if raw.ndim != 2 or raw.shape[1] != 3:
                 raise MeshError(f"{self.name}: faces must have the shape (F, 3), not {raw.shape}.")
+            if raw.dtype.kind == "f" and (raw % 1 != 0).any():
+                raise MeshError(f"{self.name}: faces must be whole numbers, the indices of vertices.")
             if raw.size and (raw.min() < 0 or raw.max() >= len(vertices)):
                 bad = int(raw.max()) if raw.max() >= len(vertices) else int(raw.min())
                 raise MeshError(
@@ -291,6 +293,11 @@ class SurfaceLandmarks(Mapping[str, int]):
 
     Raises:
         InputError: arrays whose shapes do not belong together, repeated names, or coordinates that are not barycentric.
+
+    Example:
+        >>> marks = ss.geometry.SurfaceLandmarks.of({"tip": 7})
+        >>> bool((marks.positions(meshes[0].vertices)["tip"] == meshes[0].vertices[7]).all())
+        True
     """
 
     names: tuple[str, ...] = ()
@@ -435,7 +442,7 @@ class SurfaceLandmarks(Mapping[str, int]):
         """
         for name, corner in zip(self.names, self.corners.max(axis=1), strict=True):
             if corner >= n_vertices:
-                raise InputError(f"Landmark {name!r} is at vertex {corner}, which the model does not have.")
+                raise InputError(f"Landmark {name!r} is at vertex {corner}, which the surface does not have.")
 
     @cached_property
     def _nearest(self) -> Mapping[str, int]:
@@ -453,6 +460,11 @@ class Similarity:
 
     Raises:
         InputError: a scale that is not positive, or a matrix that is not a rotation.
+
+    Example:
+        >>> T = ss.geometry.Similarity(2.0, np.eye(3), np.zeros(3))
+        >>> T.apply([[1.0, 2.0, 3.0]])
+        array([[2., 4., 6.]])
     """
 
     scale: float

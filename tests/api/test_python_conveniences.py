@@ -2,6 +2,7 @@
 
 import dataclasses
 import pickle
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,7 @@ def test_options_of_a_model_are_refused_at_once(options: dict[str, Any], told: s
 
 @pytest.mark.parametrize("options", [{}, {"modes": 3}, {"modes": np.int64(3)}, {"modes": 0.9}, {"modes": "auto"}])
 def test_options_that_can_be_are_kept(options: dict[str, Any]) -> None:
-    assert ss.BuildConfig(**options).modes == options.get("modes")
+    assert ss.BuildConfig(**options).modes == options.get("modes", "all")
 
 
 def test_the_mean_of_a_model_is_its_vertices() -> None:
@@ -139,3 +140,28 @@ def test_a_table_in_memory_is_taken_where_a_file_is(tmp_path: Path) -> None:
     assert Table.of(numbered).rows == ("7", "8")
     with pytest.raises(InputError, match="names no specimen"):
         Table.of(pandas.DataFrame({"n": [1, 2]}))
+
+
+V, F = np.arange(60.0).reshape(20, 3) ** 1.5, np.array([[0, 1, 2], [2, 3, 4]])
+SHAPES = np.stack([V + k * np.sin(V) for k in range(4)])
+WRONG_ARRAYS: dict[str, tuple[Callable[[], object], str]] = {
+    "vertices": (lambda: ss.Mesh(V[:, :2]), r"\(V, 3\), not \(20, 2\)"),
+    "faces": (lambda: ss.Mesh(V, F + 30), "points at vertex 34.*correct the faces"),
+    "fractions": (lambda: ss.Mesh(V, F + 0.5), "whole numbers"),
+    "model": (lambda: ss.ShapeModel(V, np.eye(60)[:, :1], np.ones(1), 1.0, 2, faces=F + 30), "correct the faces"),
+    "projected": (lambda: ss.build_model(SHAPES).project(V[:, :2]), r"\(V, 3\), not \(20, 2\)"),
+    "fitted": (lambda: ss.fit_scan(ss.build_model(SHAPES), V + np.nan), "with finite coordinates in it; correct"),
+    "scans": (lambda: ss.correspond([ss.Mesh(V + np.nan, F)] * 2), "with finite coordinates in it; correct"),
+    "cohort": (lambda: ss.Cohort.of_shapes(SHAPES[0], {}), r"\(N, V, 3\), not \(20, 3\)"),
+    "faces of a cohort": (lambda: ss.Cohort.of_shapes(SHAPES, {}, faces=F + 30), "points at vertex 34"),
+    "landmarks of a cohort": (lambda: ss.Cohort.of_shapes(SHAPES, {}, landmarks={"a": 99}), "'a' is at vertex 99"),
+    "observed": (lambda: ss.Cohort.of_shapes(SHAPES, {}, observed=np.ones((3, 3), bool)), r"\(N, V\) \(4, 20\), not"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_ARRAYS)
+def test_a_wrong_array_is_named_and_no_file_is_blamed(case: str) -> None:
+    make, told = WRONG_ARRAYS[case]
+    with pytest.raises((InputError, MeshError), match=told) as caught:
+        make()
+    assert "damaged" not in str(caught.value) and "cut short" not in str(caught.value)

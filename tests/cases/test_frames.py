@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from shapespace.cli import main
+from shapespace.correspondence.groupwise import correspond
 from shapespace.correspondence.landmark_guide import with_own_landmarks
+from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.errors import InputError
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.geometry.closest import build_engine
@@ -183,6 +185,21 @@ def test_a_fit_ends_the_same_with_landmarks_a_half_turn_off() -> None:
     right, other = (fit_scan(model, raw.scan, FitConfig(unit="mm"), landmarks=points) for points in (marks, turned))
     assert other.status == right.status == "converged" and np.array_equal(other.b, right.b)
     assert sum("half turn" in note for note in other.notes) == 1 and not any("half turn" in n for n in right.notes)
+
+
+def test_a_correspondence_carries_the_note_that_landmarks_were_turned() -> None:
+    scans: list[Mesh] = []
+    for k, bump in enumerate((1.0, 1.05, 1.1)):
+        marks = {name: point * (1, bump, 1) for name, point in MARKS.items()}
+        scans.append(Mesh(SCAN.vertices * (1, bump, 1), SCAN.faces, marks, f"s{k}"))
+    points = {name: point * RAS_TO_LPS for name, point in scans[1].landmarks.items()}
+    scans[1] = Mesh(scans[1].vertices, scans[1].faces, points, "s1")
+    config = CorrespondConfig(vertices=300, rounds=1, mirror="never")
+    made = correspond(scans, config)
+    assert [["half turn" in note for note in scan.notes] for scan in made.scans] == [[], [True], []]
+    assert made.scans[1].landmarks < 0.05 * rms_size(SCAN.vertices)  # which are on the right side
+    of_template = correspond([scans[0], scans[2]], config, template=scans[1])
+    assert "half turn about z" in of_template.why
 
 
 def slicer_points(points: dict[str, FloatArray], system: str) -> str:

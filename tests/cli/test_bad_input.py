@@ -350,17 +350,17 @@ def test_one_mesh_is_too_few_and_two_make_one_mode(run: Run, world: World, tmp_p
     meshes = sorted(world.meshes.glob("*.ply"))
     alone = build(run, meshes[:1], tmp_path / "m.h5", "--modes", "all")
     assert alone.code == 2 and "at least two" in alone.err
-    pair = build(run, meshes[:2], tmp_path / "m.h5", "--json")
+    pair = build(run, meshes[:2], tmp_path / "m.h5", "--json", "--modes", "auto")
     assert pair.code == 0 and pair.facts["modes"] == 1
     assert "cannot be cross-validated, so all modes are kept" in pair.err
 
 
-def test_more_modes_than_meshes_can_give_are_refused(run: Run, world: World, tmp_path: Path) -> None:
+def test_a_model_has_at_most_the_modes_that_the_meshes_determine(run: Run, world: World, tmp_path: Path) -> None:
     meshes = sorted(world.meshes.glob("*.ply"))
     for modes in (12, 10**9):
         outcome = build(run, meshes, tmp_path / "m.h5", "--modes", modes)
-        assert outcome.code == 2
-        assert "at most 11 modes" in outcome.err and "ask for 1 to 11" in outcome.err
+        assert outcome.code == 0 and "11 modes of" in outcome.out
+        assert f"determine 11 modes, so the model has 11 and not the {modes} asked for." in outcome.err
 
 
 def test_equal_training_meshes_are_refused(run: Run, world: World, tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ def test_a_store_holds_what_single_files_hold_and_is_kept(run: Run, world: World
     assert run("fit", world.model, raw, "-o", tmp_path / "single", *FAST).code == 1
     first = run(*store)
     assert first.code == 1 and "5 scans: 4 max_iterations, 1 failed" in first.out
-    assert {path.name for path in (tmp_path / "store").iterdir()} == {"manifest.json", "table", "surfaces"}
+    assert {path.name for path in (tmp_path / "store").iterdir()} == {"manifest.json", "table", "surfaces", "scans.csv"}
     assert run("export", tmp_path / "store", "--table", tmp_path / "fits.csv").code == 0
     assert rows(tmp_path / "fits.csv") == rows(tmp_path / "single" / "coefficients.csv")
     assert run("export", tmp_path / "store", "s001", "-o", tmp_path / "one").code == 0

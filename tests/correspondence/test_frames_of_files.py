@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 import shapespace as ss
 from raw_blobs import dispersion_mm, raw_blob
 from shapespace.correspondence import groupwise
-from shapespace.correspondence.mirrored_scans import Sides
 from shapespace.correspondence.register import ElasticSettings
 from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.errors import InputError
+from shapespace.geometry.mirrored_scans import Sides
 from shapespace.types import FloatArray, Mesh, Similarity
 from synthetic_shapes import sphere
 

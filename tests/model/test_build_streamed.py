@@ -139,7 +139,6 @@ def test_what_cannot_be_added_to_ends_in_a_sentence(
         for streams in (["--add", kept], ["--out-of-core"], ["--keep-shapes"]):
             assert "models of vertices" in refused(capsys, *streams, folder / "new", "-o", out, *option)
     assert "--min-seen" in refused(capsys, folder / "new", "-o", out, "--out-of-core", "--min-seen", MIN_SEEN)
-    assert "modes" in refused(capsys, "--add", kept, folder / "new", "-o", out, "--modes", COUNT)
     hole = tmp_path / "hole.ply"
     mesh = training_meshes(1, 200)[0]
     write_mesh(hole, mesh.with_vertices(np.where(np.arange(200)[:, None] == 3, np.nan, mesh.vertices)))

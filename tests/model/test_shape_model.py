@@ -163,9 +163,10 @@ def test_auto_finds_about_as_many_modes_as_there_are(noise_mm: float) -> None:
         assert ShapeModel.fit(noisy, modes=0.999).n_modes > 20
 
 
-def test_auto_needs_four_shapes_and_gives_the_same_twice() -> None:
-    with pytest.raises(InputError, match="at least four"):
-        ShapeModel.fit(training_meshes(vertices=200)[:3], modes="auto")
+def test_auto_needs_four_shapes_keeps_all_of_fewer_and_gives_the_same_twice() -> None:
+    few = ShapeModel.fit(training_meshes(vertices=200)[:3], modes="auto")
+    assert few.n_modes == 2
+    assert few.notes == ("With 3 meshes the number of modes cannot be cross-validated, so all modes are kept.",)
     one, two = (ShapeModel.fit(training_meshes(vertices=200)[:9], modes="auto", seed=3) for _ in range(2))
     assert one.content_hash == two.content_hash
 
@@ -243,12 +244,10 @@ def test_equal_meshes_are_refused_even_in_other_poses(gauge: str, moved: bool) -
         ShapeModel.fit(meshes, gauge=gauge)
 
 
-def test_too_few_meshes_and_too_many_modes_are_refused() -> None:
+def test_too_few_meshes_are_refused() -> None:
     for n in (0, 1):
         with pytest.raises(InputError, match="at least two"):
             ShapeModel.fit(training_meshes(vertices=200)[:n])
-    with pytest.raises(InputError, match="4 training shapes give at most 3 modes"):
-        ShapeModel.fit(training_meshes(vertices=200)[:4], modes=4)
 
 
 def test_coefficients_and_shapes_that_do_not_fit_are_refused(model: ShapeModel) -> None:

@@ -230,7 +230,7 @@ def test_a_landmark_goes_where_its_triangle_is_cut_away_and_not_otherwise(
         assert list(part.landmarks) == left and part.n_vertices == VERTICES - 1
     for name in left:
         np.testing.assert_allclose(region.mesh().landmarks[name], model.mesh().landmarks[name], atol=1e-12)
-    with pytest.raises(InputError, match="which the model does not have"):
+    with pytest.raises(InputError, match="which the surface does not have"):
         ShapeModel.fit(holed, landmarks=SurfaceLandmarks(("a",), np.array([[0, 1, 60]]), np.full((1, 3), 1 / 3)))
 
 

@@ -179,7 +179,10 @@ def test_without_stages_scans_and_fitted_surfaces_are_drawn_with_their_distances
     page = report(fits)
     words = Page(page).words
     assert 'class="broken"' not in page and "No picture: the scan is" not in words
-    assert "shapespace fit ../model.h5 ../scans -o . --stages" in words
+    scans = sorted(f"../scans/{path.name}" for path in (fits.parent / "scans").glob("*.ply"))
+    [command] = re.findall(r"shapespace fit (\S+) (.*) -o \. --stages", words)
+    assert command[0] == "../model.h5" and set(command[1].split()) <= set(scans)
+    assert len(command[1].split()) == len(list(fits.glob("*.fit.json")))
     alts = [str(image["alt"]) for image in Page(page).images()]
     assert [alt for alt in alts if alt.startswith("able: the scan, scan and model over each other, and a map")]
     assert [alt for alt in alts if alt.startswith("Signed distance maps of charlie")]

@@ -124,6 +124,24 @@ def test_a_role_that_is_none_is_refused():
         verify(with_columns(cohort(), role=("enrol",) * 36), FEW)
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"gallery": "Visit #=0", "probe": "expression=fear"},
+        {"gallery": "expression=neutral", "probe": "Visit #!=0"},
+        {"gallery": "expression=neutral", "train": "`Visit #`=0"},
+    ],
+)
+def test_missing_cells_of_the_columns_of_expressions_are_counted(options):
+    visits = ("", *("1" if k % 3 else "0" for k in range(1, 36)))
+    shapes = with_columns(cohort(), **{"Visit #": visits})
+    with pytest.raises(InputError, match=r"Visit # of 1 of 36 shapes is missing .*--drop-missing"):
+        trial_of(shapes, replace(FEW, **options))
+    if "train" not in options:  # which would be learned from people who are tested
+        trial = trial_of(shapes, replace(FEW, drop_missing=True, **options))
+        assert len(trial.cohort) == 35 and any("1 of 36 shapes are left out" in note for note in trial.notes)
+
+
 def test_scans_of_nobody_are_refused_or_left_out():
     shapes = cohort()
     whose = ("", *shapes.table.texts("subject")[1:])

@@ -2,7 +2,9 @@
 
 import json
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +16,10 @@ from shapespace.commands.inputs import given_scans
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.types import Mesh
-from shapespace.viewer.studio.job_commands import order
+from shapespace.viewer.studio.job_commands import checks, order
 from shapespace.viewer.studio.jobs import Job, Order, history
 from shapespace.viewer.studio.project import Project, StaleError, cells_of_table, change_of, with_cells
+from synthetic_shapes import training_meshes
 
 
 def tetrahedron(path: Path, size: float) -> Path:
@@ -224,3 +227,64 @@ def test_each_action_is_a_command_line_that_the_parser_takes(project: Project, t
         written = {path.name: path.read_text() for path in (project.folder / "inputs").glob("*.csv")}
         assert "anna" in written["0004-reference.csv"] and "carl" not in written["0004-reference.csv"]
         assert "carl" in written["0004.csv"] and "anna" not in written["0004.csv"]
+
+
+GROUPS = {f"s{k:02}": ("a" if k % 2 else "b", f"g{k % 3}", str(20 + 3 * k)) for k in range(12)}
+
+
+@pytest.fixture
+def analysed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Project:
+    """Twelve specimens in correspondence, with a table whose columns need backticks, in an order other than by name."""
+    made = Project.open(tmp_path / "bones", create=True)
+    (made.folder / "correspondence-1").mkdir()
+    for name, mesh in zip(GROUPS, training_meshes(12, 150), strict=True):
+        write_mesh(made.folder / "correspondence-1" / f"{name}.ply", mesh)
+        made.add(tetrahedron(made.new_file(f"{name}.ply"), 1.0 + int(name[1:])), "training")
+    rows = (f"{name},{','.join(GROUPS[name])}" for name in sorted(GROUPS, key=lambda name: (name[::-1], name)))
+    join_table(made, "\n".join(["id,Group #,sex (m/f),age", *rows]).encode())
+    monkeypatch.chdir(made.folder)
+    return made
+
+
+def answer_of(arguments: Sequence[object], capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    capsys.readouterr()
+    assert main([*map(str, arguments), "--json", "--quiet"]) == 0, capsys.readouterr().err
+    answer = json.loads(capsys.readouterr().out)
+    return {key: value for key, value in answer.items() if key not in ("report", "folder", "created")}
+
+
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [
+        ("compare", {"--formula": "~ `Group #` + age", "--permutations": "199", "--seed": "4"}),
+        ("regress", {"--target": "age", "--seed": "4"}),
+        ("morphospace", {"--group": "sex (m/f)", "--method": "cva"}),
+    ],
+)
+def test_the_studio_and_the_command_give_the_same_answer(
+    analysed: Project, kind: str, options: dict[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    described = forms(summaries_and_options())
+    done = [Job(number=1, kind="correspond", arguments=("x",), output="correspondence-1", status="done")]
+    found = checks(analysed, described, kind, options, done[0])
+    assert [one for one in found if one["level"] == "problem"] == []
+    made = order(analysed, done, described, kind, options, None, 2)
+    studio = answer_of(made.arguments, capsys)
+    lines = [f"{name},{','.join(cells)}" for name, cells in reversed(GROUPS.items())]
+    Path("table.csv").write_text("\n".join(["specimen,Group #,sex (m/f),age", *lines]))
+    given = [word for item in options.items() for word in item]
+    command = answer_of([kind, "table.csv", "--shapes", "correspondence-1", "-o", "out", *given], capsys)
+    assert studio == command
+
+
+def test_a_test_of_shape_does_not_depend_on_the_order_of_the_rows(
+    analysed: Project, capsys: pytest.CaptureFixture[str]
+) -> None:
+    answers: list[dict[str, Any]] = []
+    options = ["--formula", "~ `Group #`", "--group", "Group #", "--permutations", "199"]
+    for step in (1, -1):
+        lines = [f"{name},{cells[1]}" for name, cells in list(GROUPS.items())[::step]]
+        Path("table.csv").write_text("\n".join(["specimen,Group #", *lines]))
+        shapes = ["table.csv", "--shapes", "correspondence-1", "-o", "out"]
+        answers.append(answer_of(["test", "pairwise", *shapes, *options], capsys))
+    assert answers[0] == answers[1]

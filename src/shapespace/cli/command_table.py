@@ -193,11 +193,10 @@ def _figures() -> tuple[Option, ...]:
     )
 
 
-def _gauge(default: str | None = "shape") -> tuple[Option, ...]:
-    """Return the options of the gauge; without a default it is that of the data."""
-    by_data = "" if default else "form keeps size, shape divides size out (default: shape for landmarks, else form)"
+def _gauge() -> tuple[Option, ...]:
+    """Return the options of the gauge and the unit."""
     return (
-        advanced("--gauge", help=by_data, source=COHORT, default=default),
+        advanced("--gauge", source=COHORT),
         advanced("--no-unit",
                  help="the coordinates have no unit, as those of digitised landmarks: lengths are not written "
                  "in mm"),
@@ -426,11 +425,11 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command(
         "build", "build a shape model from corresponding meshes: Procrustes and PCA",
-        ("shapespace build faces/*.ply -o model.h5 --modes auto",), run.build,
+        ("shapespace build faces/*.ply -o model.h5 --variance 0.98",), run.build,
         (
             basic("meshes", "MESH", "mesh files, or folders of them", nargs="+", parse=Path),
             basic("-o --output", "MODEL.h5", "the model", parse=Path, required=True),
-            basic("--modes", "K|auto|all", source=BUILD, parse=values.modes, default="auto", either=_MODES),
+            basic("--modes", "K|auto|all", source=BUILD, parse=values.modes, either=_MODES),
             basic("--variance", "SHARE", "as many modes as explain this share of the variance, such as 0.98",
                   parse=values.share, either=_MODES),
             basic("--gauge", source=BUILD_FILES),
@@ -924,7 +923,7 @@ COMMANDS: tuple[Command, ...] = (
             advanced("--permutations", "P", source=ASYMMETRY, parse=values.integer),
             advanced("--drop-missing", source=ASYMMETRY),
             advanced("--seed", "S", source=ASYMMETRY, parse=values.integer),
-            *_gauge(None),
+            *_gauge(),
         ),
     ),
     Command(

@@ -201,6 +201,8 @@ def given(arguments: argparse.Namespace, taker: Callable[..., Any], **instead: A
     for option in arguments.command.options:
         if option.source is not None and option.source.name == taker.__name__ and hasattr(arguments, option.attribute):
             value = getattr(arguments, option.attribute)
+            if option.is_flag and not value:
+                continue  # the class sets its default, which may be to decide itself
             chosen[option.field_name] = not value if option.negates else value
     return {**chosen, **instead}
 

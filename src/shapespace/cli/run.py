@@ -248,10 +248,8 @@ def build(arguments: argparse.Namespace) -> int:
     from shapespace.commands.look import model_facts
     from shapespace.model.build_config import BuildConfig
 
-    modes = None if arguments.modes == "all" else arguments.modes
-    if arguments.variance is not None:
-        modes = arguments.variance
-    model_options = given(arguments, BuildConfig, modes=modes, out_of_core=arguments.out_of_core or None)
+    modes = arguments.modes if arguments.variance is None else arguments.variance
+    model_options = given(arguments, BuildConfig, modes=modes)
     file_options = given(arguments, BuildFilesConfig, regions=dict(arguments.region))
     config = BuildFilesConfig(model=BuildConfig(**model_options), **file_options)
     if config.streams:

@@ -392,6 +392,11 @@ class Cohort:
         if shapes.ndim != 3 or shapes.shape[2] != 3 or len(shapes) < fewest or np.isinf(shapes).any():
             count_word = {1: "one", 2: "two"}.get(fewest, str(fewest))
             raise InputError(f"A cohort needs {count_word} or more finite shapes (N, V, 3), not {shapes.shape}.")
+        Mesh(shapes[0], faces, name="The cohort")  # refuses faces of other vertices
+        if landmarks is not None:
+            SurfaceLandmarks.of(landmarks).check(shapes.shape[1])
+        if observed is not None and np.shape(observed) != shapes.shape[:2]:
+            raise InputError(f"observed must have the shape (N, V) {shapes.shape[:2]}, not {np.shape(observed)}.")
         shape_names = tuple(names) if names is not None else tuple(f"shape {k + 1}" for k in range(len(shapes)))
         cells = {name: tuple(map(cell_text, values)) for name, values in columns.items()}
         is_observed: BoolArray = ~np.logical_or.reduce(np.isnan(shapes), axis=2)

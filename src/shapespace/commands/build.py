@@ -27,7 +27,6 @@ from shapespace.io.landmarks.landmark_io import is_of_vertices, read_landmarks, 
 from shapespace.io.meshes.region_files import read_region
 from shapespace.model.build_config import BuildConfig
 from shapespace.model.build_model import build_model, extend_model
-from shapespace.model.choose_modes import MOST_SHAPES
 from shapespace.model.missing import MIN_SEEN, ObservedMeshes
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel, region_vertices
@@ -68,7 +67,7 @@ class BuildFilesConfig:
             of fitted surfaces).
         regions: name -> file with its vertices of the meshes, kept in the model for fits that are held to one.
         labels: separate identity and expression: CSV of file, subject and label, with a neutral face of each subject;
-            the number of modes then counts modes of identity (default 0.995 of the variance).
+            the number of modes then counts modes of identity (`auto`: 0.995 of the variance).
         expression_variance: for a model of identity and expression: share of the expression variance that its
             expression modes explain (default 0.99).
         keep_shapes: keep the aligned shapes as MODEL.h5.shapes, so that meshes can be added later (4 bytes per
@@ -175,12 +174,6 @@ def build(
     }
     config = _with_origin(files, config, notes)
     config = _with_words(config, provenance_with_review(config.model.provenance, review), config.model.licence)
-    count = len(files) + (0 if parent is None else parent.n_training)
-    if config.model.modes == "auto" and count < 4:
-        config = replace(config, model=replace(config.model, modes=None))
-        notes.append(f"With {count} meshes the number of modes cannot be cross-validated, so all modes are kept.")
-    if config.model.modes == "auto" and count > MOST_SHAPES:
-        notes.append(f"The number of modes is chosen by {MOST_SHAPES} of the {count} shapes, drawn by --seed.")
     if not isinstance(loaded, list):
         model = _streamed(
             meshes=on_disk,
@@ -207,7 +200,7 @@ def build(
                 f"It parts {additive.n_identity} modes of identity and {additive.n_expression} of expression, by "
                 f"{config.labels}."
             )
-            return additive.shape, [*notes, training_shapes_note(additive.shape)]
+            return additive.shape, notes + _model_notes(additive.shape, config)
         chosen = replace(config.model, gauge=gauge, landmarks=marks, min_seen=_min_seen(config), out_of_core=False)
         model = build_model(loaded, chosen)
         if regions:
@@ -221,11 +214,7 @@ def build(
 
 def _model_notes(model: ShapeModel, config: BuildFilesConfig) -> list[str]:
     """Return what the user should know of the model itself."""
-    notes = _odd_size(model, config.unit)
-    if model.left_out:
-        count_text = "1 mode is" if model.left_out == 1 else f"{model.left_out} modes are"
-        notes.append(f"{count_text} left out, since alignment or rounding made them and no shape did.")
-    return [*notes, training_shapes_note(model)]
+    return [*model.notes, *_odd_size(model, config.unit), training_shapes_note(model)]
 
 
 def shapes_folder(model: Path) -> Path:

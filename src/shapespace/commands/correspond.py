@@ -23,15 +23,13 @@ from shapespace.batch.result_folder import names_for
 from shapespace.commands.inputs import given_scans, with_ids
 from shapespace.commands.landmark_files import LandmarkFiles
 from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
-from shapespace.correspondence.first_template import first_template
+from shapespace.correspondence.first_template import first_template, usable_scan
 from shapespace.correspondence.groupwise import ENOUGH_TO_JUDGE, correspond
-from shapespace.correspondence.landmark_guide import with_own_landmarks
 from shapespace.correspondence.registration import RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.scan_set import copies, unit_ratios
 from shapespace.correspondence.scan_status import SurfaceMeasures, find_review_reasons
 from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.errors import InputError, ShapespaceError
-from shapespace.geometry.doctor import NON_FINITE, repair
 from shapespace.geometry.landmark_placement import far_landmarks, place_landmarks
 from shapespace.geometry.mirror_plane import mirror_image
 from shapespace.geometry.normals import face_areas, faces_of, rms_size, without_estimates
@@ -165,9 +163,6 @@ def _corresponding(
     say_excluded(read.unread, len(jobs), say)
     scans, notes = read.scans, read.notes
     marks.report_unused(say)
-    if template is not None:
-        for sentence in with_own_landmarks(template)[1]:
-            say(f"{template.name}: {sentence}")
     settings, config = asdict(config), replace(config, outer=False)  # the scans are without inner surfaces now
     rounds = RoundsWithProgress(folder / ROUNDS_FOLDER, files.execution, quiet=quiet)
     with telling_of_compiling(quiet=quiet), waiting("choosing the template", quiet=quiet):
@@ -368,7 +363,7 @@ def read_scans(
                 if outer and (visible := outer_surface(own)) is not own:
                     removed.append(1 - len(faces_of(visible)) / len(faces_of(own)))
                     own = visible
-                read.scans[job.name], read.notes[job.name] = scan, notes = _looked_at(own, strict=strict)
+                read.scans[job.name], read.notes[job.name] = scan, notes = usable_scan(own, strict=strict)
                 if scan.landmarks:
                     placed = place_landmarks(scan, scan.landmarks)
                     read.landmark_distances[job.name] = dict(zip(placed, placed.distance_mm.tolist(), strict=True))
@@ -382,18 +377,6 @@ def read_scans(
             "their triangles on average."
         )
     return read
-
-
-def _looked_at(scan: Mesh, *, strict: bool) -> tuple[Mesh, list[str]]:
-    """Return the repaired scan, and notes for the user.
-
-    Raises:
-        MeshError: it cannot be used.
-    """
-    mesh, findings = repair(scan, strict=strict)
-    notes = [f"{one.problem} {one.action}" for one in findings if one.level == "note" or NON_FINITE in one.problem]
-    mesh, sentences = with_own_landmarks(mesh)
-    return mesh, [*notes, *sentences]
 
 
 def report_landmarks(records: Sequence[CorrespondRecord], read: ScansRead, say: Say) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from shapespace.batch.execution import ExecutionConfig
 from shapespace.batch.executors import Serial
+from shapespace.batch.fit_records import Source
 from shapespace.batch.fit_work import Job
 from shapespace.batch.progress import progress, telling_of_compiling
 from shapespace.batch.result_folder import RECORD
@@ -24,10 +25,11 @@ from shapespace.errors import InputError, ShapespaceError
 from shapespace.fit.fit_scan import FitConfig
 from shapespace.fit.iteration_state import IcpState
 from shapespace.geometry.doctor import NON_FINITE
-from shapespace.io.files import make_folder, remove_file, write_bytes
+from shapespace.io.files import make_folder, read_bytes, remove_file, write_bytes, write_text
 from shapespace.io.landmarks.fiducials import FIDUCIAL_ENDINGS
 from shapespace.io.meshes.mesh_io import probe_mesh, read_mesh
 from shapespace.io.remote import is_address
+from shapespace.io.tables.table_io import table_rows, table_text
 from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import first_names
 from shapespace.schemas import FitRecord
@@ -114,7 +116,34 @@ def fit_scans(
         counts = fit_many(work, config, executor, sink, on_plan=watch.plan, on_done=watch.done, on_state=watch.state)
         if len(work) > 1 or stored:
             watch.say_removed()
+    _write_list(folder, work)
     return dict.fromkeys(_STATUSES, 0) | counts, {job.name: sink.records[job.name] for job in work if sink.records}
+
+
+def _write_list(folder: Path, jobs: Sequence[Job]) -> None:
+    """Write the list of the scans whose results are in a folder, by which `fit` takes them again.
+
+    It has the scans of this run, and those of the earlier list whose results are still there. One scan without
+    landmarks and metadata needs no list.
+
+    Raises:
+        FileError: the folder cannot be written, or the disk is full.
+    """
+    file, is_store = folder / FitRecord.LIST, read_manifest(folder) is not None
+    rows: dict[str, Mapping[str, str]] = {}
+    with suppress(ShapespaceError, ValueError, KeyError):  # there is none, or it was changed and is not ours
+        header, *earlier = table_rows(read_bytes(file))
+        known = [dict(zip(header, row, strict=True)) for row in earlier]
+        rows = {row["id"]: row for row in known if is_store or (folder / f"{row['id']}{RECORD}").is_file()}
+    for job in jobs:
+        places = {"scan": job.address or Source.of_file(job.scan, "", folder).path}
+        if job.landmarks is not None:
+            places["landmarks"] = Source.of_file(job.landmarks, "", folder).path
+        rows[job.name] = {**job.metadata, "id": job.name, **places}
+    columns = list(dict.fromkeys(["id", "scan", *(column for row in rows.values() for column in row)]))
+    if len(rows) == 1 and len(columns) == 2 and not file.exists():
+        return
+    write_text(file, table_text(columns, [[row.get(column, "") for column in columns] for row in rows.values()]))
 
 
 @dataclass(frozen=True)

@@ -223,6 +223,7 @@ def model_facts(model: ShapeModel) -> dict[str, Any]:
         **({} if counts is None else {"control_points": counts.tolist()}),
         "provenance": model.provenance,
         "licence": model.licence,
+        **({"notes": list(model.notes)} if model.notes else {}),
         "hash": model.content_hash,
     }
 

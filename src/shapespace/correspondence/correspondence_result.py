@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -42,6 +43,12 @@ class Corresponding:
         measures: of the quality of the surface; None if excluded.
         review: reasons to review the surface, in addition to `doubt`, by its measures; the most unusual first. Empty
             for scans that were added to a finished correspondence, since its records have the measures of the others.
+        notes: sentences on the repairs of the scan and on its landmarks, such as that they were turned by a half turn.
+
+    Example:
+        >>> correspondence = ss.correspond(meshes[:3], ss.CorrespondConfig(vertices=200, rounds=1, mirror="never"))
+        >>> correspondence.scans[0].status
+        'converged'
     """
 
     name: str
@@ -63,6 +70,7 @@ class Corresponding:
     position_std: FloatArray | None = None
     measures: SurfaceMeasures | None = None
     review: tuple[ReviewReason, ...] = ()
+    notes: Sequence[str] = ()
 
     __repr__ = short_repr
 
@@ -86,6 +94,11 @@ class Correspondence:
             and where they were not compared.
         groups: names of the scans in correspondence, then of those of each other kind of object; empty where all are of
             one kind.
+
+    Example:
+        >>> correspondence = ss.correspond(meshes[:3], ss.CorrespondConfig(vertices=200, rounds=1, mirror="never"))
+        >>> len(correspondence.meshes()) == len(meshes[:3])
+        True
     """
 
     template: Mesh

@@ -13,7 +13,7 @@ from shapespace.correspondence.scan_set import copies
 from shapespace.correspondence.settings import FEWEST, SIZE, CorrespondConfig
 from shapespace.correspondence.template import check_template, choose_template, clean_scan, resample
 from shapespace.errors import InputError, MeshError
-from shapespace.geometry.doctor import repair
+from shapespace.geometry.doctor import NON_FINITE, repair
 from shapespace.geometry.normals import faces_of, rms_size
 from shapespace.geometry.outer_surface import outer_surface
 from shapespace.model.shape_model import ShapeModel
@@ -31,6 +31,7 @@ class FirstTemplate:
         origin: where it comes from, in a sentence.
         repaired: the scans that can be used, by their number.
         broken: why the others cannot.
+        notes: sentences on the repairs of the scans and on their landmarks, by number.
         guide: a model whose mean is the template, of the same size and place.
     """
 
@@ -38,6 +39,7 @@ class FirstTemplate:
     origin: str
     repaired: Mapping[int, Mesh]
     broken: Mapping[int, str]
+    notes: Mapping[int, Sequence[str]]
     guide: ShapeModel | None = None
 
 
@@ -59,7 +61,7 @@ def first_template(
         raise InputError(f"Landmarks have an uncertainty above 0, not {config.landmark_uncertainty}; give another.")
     if template is not None and model is not None:
         raise InputError("Both a template and a model are given, and the model's mean is a template; leave one out.")
-    repaired, broken = repaired_scans(scans, config)
+    repaired, broken, notes = repaired_scans(scans, config)
     if len(repaired) < FEWEST:
         raise InputError(f"Hardly any of the scans can be used: {'; '.join(broken.values())}")
     if len(copies(list(repaired.values()))) == len(repaired) - 1:
@@ -67,8 +69,8 @@ def first_template(
     if model is not None:
         mesh, origin = _mean_of(model), "The template is the mean of the model given."
     elif template is not None:
-        mesh, _ = with_own_landmarks(check_template(template))
-        origin = f"{template.name} was given as the template."
+        mesh, sentences = with_own_landmarks(check_template(template))
+        origin = " ".join([f"{template.name} was given as the template.", *sentences])
     else:
         mesh, origin = _chosen_scan(repaired, config)
     scale = SIZE / rms_size(mesh.vertices)
@@ -77,21 +79,36 @@ def first_template(
     if contradicts_most(mesh, repaired.values(), config.landmark_uncertainty):
         mesh = mesh.with_vertices(mesh.vertices, {})
         origin += " Its landmarks contradict those of most scans, so the first round goes without them."
-    return FirstTemplate(mesh, origin, repaired, broken, None if model is None else _transformed(model, T))
+    return FirstTemplate(mesh, origin, repaired, broken, notes, None if model is None else _transformed(model, T))
 
 
-def repaired_scans(scans: Sequence[Mesh], config: CorrespondConfig) -> tuple[dict[int, Mesh], dict[int, str]]:
-    """Return the scans that can be used, by number, and why the others cannot."""
+def usable_scan(scan: Mesh, *, strict: bool = False) -> tuple[Mesh, list[str]]:
+    """Return the repaired scan with the landmarks near its surface, and sentences on repairs and landmarks.
+
+    Raises:
+        MeshError: it cannot be used.
+    """
+    mesh, findings = repair(scan, strict=strict)
+    notes = [f"{one.problem} {one.action}" for one in findings if one.level == "note" or NON_FINITE in one.problem]
+    mesh, sentences = with_own_landmarks(mesh)
+    return mesh, [*notes, *sentences]
+
+
+def repaired_scans(
+    scans: Sequence[Mesh], config: CorrespondConfig
+) -> tuple[dict[int, Mesh], dict[int, str], dict[int, list[str]]]:
+    """Return the scans that can be used, by number, why the others cannot, and sentences on the repairs."""
     repaired: dict[int, Mesh] = {}
+    notes: dict[int, list[str]] = {}
     broken: dict[int, str] = {}
     for i, scan in enumerate(scans):
         try:
-            repaired[i], _ = with_own_landmarks(repair(outer_surface(scan) if config.outer else scan)[0])
+            repaired[i], notes[i] = usable_scan(outer_surface(scan) if config.outer else scan)
         except MeshError as error:
             broken[i] = f"broken: {error}"
     if config.ignore_colours:
         repaired = {i: replace(scan, colours=None) for i, scan in repaired.items()}
-    return repaired, broken
+    return repaired, broken, notes
 
 
 def _mean_of(model: ShapeModel) -> Mesh:

@@ -24,7 +24,6 @@ from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.isometry import common_symmetries
 from shapespace.correspondence.kinds import Collection, find_kinds, is_outlier
 from shapespace.correspondence.landmark_guide import ScanLandmarks, consensus_landmarks
-from shapespace.correspondence.mirrored_scans import ASYMMETRIC, Sides, solve_sides
 from shapespace.correspondence.pose_consensus import (
     SAME_POSE_DEG,
     TEMPLATE,
@@ -57,6 +56,7 @@ from shapespace.errors import InputError, ShapespaceError
 from shapespace.geometry.distortion import Distortion
 from shapespace.geometry.landmark_placement import place_landmarks
 from shapespace.geometry.mirror_plane import FLIP, mirror_image
+from shapespace.geometry.mirrored_scans import ASYMMETRIC, Sides, solve_sides
 from shapespace.geometry.normals import rms_size
 from shapespace.geometry.procrustes import align_to_weighted_mean
 from shapespace.geometry.similarity import fit_similarity
@@ -774,14 +774,16 @@ def add_scans(
     config = config or CorrespondConfig()
     kept = len(finished.surfaces)
     scans = list(as_meshes(scans, "add_scans"))
-    repaired, broken = repaired_scans(scans, config)
-    raw, unusable = repaired_scans(finished.scans, config)
+    repaired, broken, notes = repaired_scans(scans, config)
+    raw, unusable, notes_of_raw = repaired_scans(finished.scans, config)
     if unusable:
         raise InputError(f"A scan of the finished correspondence is {next(iter(unusable.values()))}")
     raw |= {kept + i: scan for i, scan in repaired.items()}
     reasons = {kept + i: reason for i, reason in broken.items()}
     names = [mesh.name for mesh in (*finished.surfaces, *scans)]
-    first = FirstTemplate(finished.mean, "The template is the mean of the finished correspondence.", raw, reasons)
+    notes = notes_of_raw | {kept + i: sentences for i, sentences in notes.items()}
+    origin = "The template is the mean of the finished correspondence."
+    first = FirstTemplate(finished.mean, origin, raw, reasons, notes)
     problem = _Problem.of(names, first, config)
     start = _finished_state(problem, finished)
     states = _added_states(problem, start, [i for i in raw if i >= kept], run)
@@ -1002,6 +1004,7 @@ def _scan_result(
         evidence=evidence,
         position_std=T.scale * position_std,
         measures=_measures(state.template, registration, moved),
+        notes=problem.first.notes[i],
     )
 
 

@@ -135,6 +135,11 @@ class FaceGenerator:
         identity_names: the I shapes that make a person.
         unit_names: the U = 52 units that make an expression; mouthClose only makes sense against an open jaw, and
             tongueOut moves nothing, since the surface has no tongue.
+
+    Example:
+        >>> generator = ss.load_faces()
+        >>> generator.face(generator.draw_person(0)).vertices.shape
+        (12731, 3)
     """
 
     template: Mesh

@@ -62,6 +62,11 @@ class SimulatedScan:
         truth_landmarks: name -> (3,), the landmarks of the model's mesh in the frame of the scan.
         T_scan_model: from the model's frame to the scan's.
         on_surface: (S,) bool, which vertices of the scan belong to the true surface, and are no outliers.
+
+    Example:
+        >>> simulated = ss.datasets.simulate_scan(meshes[0], 0, triangles=2000)
+        >>> simulated.truth_vertices.shape == meshes[0].vertices.shape
+        True
     """
 
     scan: Mesh

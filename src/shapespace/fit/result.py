@@ -38,6 +38,10 @@ class OverlapDistances:
         scan_to_model: over the scan's vertices that the model covers.
         model_seen_share: share of the model's vertices that the scan shows.
         scan_covered_share: share of the scan's vertices that the model covers.
+
+    Example:
+        >>> 0 <= fit.overlap_distances.model_seen_share <= 1
+        True
     """
 
     model_to_scan: DistanceSummary
@@ -62,6 +66,10 @@ class Stage:
         vertices: (V, 3) in the scan's frame and unit where the surface is not the model's with b; else None.
         seen: (V,) False where the scan does not show such a surface; else None.
         moved_mm: RMS displacement of such a surface along its normals over seen vertices, mm of the scan.
+
+    Example:
+        >>> sorted(fit.stages)
+        ['before', 'final', 'initial']
     """
 
     T_scan_model: Similarity
@@ -114,6 +122,11 @@ class FitResult:
             scan's frame, mm of the scan (docs/landmarks.md); None of the paper's method, and without those outside
             the region that the fit was held to.
         files: of `model`, `scan` and `landmarks`, as far as they were read from files.
+
+    Example:
+        >>> fit = ss.fit_scan(model, meshes[1])
+        >>> fit.b.shape, fit.surface().vertices.shape == meshes[1].vertices.shape
+        ((5,), True)
     """
 
     scan_name: str

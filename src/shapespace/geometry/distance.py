@@ -59,6 +59,11 @@ class SurfaceDistances:
             where the model has no triangles.
         scan_outside: (S,) the same of each scan vertex.
         model_counted: (V,) False outside the region that they are held to; None where that is the whole model.
+
+    Example:
+        >>> distances = ss.surface_distances(meshes[0], meshes[1])
+        >>> distances.model_to_scan_mm.shape == (len(meshes[0].vertices),)
+        True
     """
 
     model_to_scan_mm: FloatArray
@@ -113,6 +118,10 @@ def surface_distances(
         scan_engine: the scan's search structure when it is there already.
         mm_per_length: length of one unit of this frame, mm.
         region: (V,) the model's vertices that count; the scan is then measured to what lies between them. None for all.
+
+    Example:
+        >>> bool(ss.surface_distances(meshes[0], meshes[1]).model_to_scan_mm.mean() > 0)
+        True
     """
     require(model, Mesh, "surface_distances", "convert it with shapespace.as_mesh")
     require(scan, Mesh, "surface_distances", "convert it with shapespace.as_mesh")

@@ -201,7 +201,8 @@ def _examine_and_repair(mesh: Mesh, *, strict: bool) -> _RepairState:
     if not state.report.usable:
         return state
     if not len(state.vertices):
-        return state.reported("refused", "There are no points in it.", "export the scan again.")
+        problem = "There are no points with finite coordinates in it."
+        return state.reported("refused", problem, "correct its coordinates, or export the scan again.")
     if np.abs(state.vertices).max() > _ABSURD:
         return state.reported("refused", "Its coordinates are too large to be lengths.", "export the scan again.")
     state = _merge_vertices(state)

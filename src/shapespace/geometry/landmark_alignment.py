@@ -69,6 +69,11 @@ class AlignConfig:
         iterations: largest number of iterations (default: 5, or 10 with semilandmarks, as in geomorph).
         match_curves: move the start of closed curves, and reverse curves, where this brings a specimen nearer to the
             mean; False keeps those of the file.
+
+    Example:
+        >>> config = ss.geometry.AlignConfig(gauge="form")
+        >>> ss.geometry.align_landmarks(configurations, config).gauge
+        'form'
     """
 
     gauge: Gauge = "shape"
@@ -110,6 +115,11 @@ class AlignedLandmarks:
         converged: False if the iterations ended before the criterion was met.
         where: what the data are called in messages.
         notes: a sentence each.
+
+    Example:
+        >>> aligned = ss.geometry.align_landmarks(configurations)
+        >>> aligned.sizes.shape
+        (6,)
     """
 
     names: tuple[str, ...]
@@ -164,6 +174,11 @@ class LandmarkFinding:
         value: of an outlier, the displacement of its most displaced landmark in units of the median of this landmark;
             or the share to which its Procrustes distance from the mean falls by exchange or reflection.
         landmarks: the two swapped ones, or the most displaced one of an outlier.
+
+    Example:
+        >>> findings = ss.geometry.find_outliers(ss.geometry.align_landmarks(configurations))
+        >>> [finding.reason for finding in findings]
+        []
     """
 
     specimen: str
@@ -193,6 +208,10 @@ def align_landmarks(configurations: LandmarkConfigurations, config: AlignConfig 
     Raises:
         InputError: one specimen, fewer than three landmarks, landmarks on a line, too many missing ones, sliders that
             cannot be, or structures that do not name each landmark.
+
+    Example:
+        >>> ss.geometry.align_landmarks(configurations).coords.shape
+        (6, 10, 3)
     """
     config = with_criterion(config or AlignConfig(), configurations)
     if config.match_curves and len(configurations) > 1:
@@ -469,6 +488,11 @@ def find_outliers(aligned: AlignedLandmarks) -> tuple[LandmarkFinding, ...]:
 
     Args:
         aligned: three or more specimens; with fewer nothing is found.
+
+    Example:
+        >>> findings = ss.geometry.find_outliers(ss.geometry.align_landmarks(configurations))
+        >>> isinstance(findings, (list, tuple))
+        True
     """
     if len(aligned) < 3:
         return ()

@@ -72,6 +72,13 @@ class VolumeSurface:
         at_border: voxels on the border of the volume, where the surface is closed though the object may go on.
         volume_mm3: what the surface encloses.
         notes: sentences on what should be known.
+
+    Example:
+        >>> labels = np.zeros((9, 9, 9), dtype=np.uint8)
+        >>> labels[3:6, 3:6, 3:6] = 1
+        >>> surface = ss.geometry.surface_of_volume(ss.io.LabelVolume(labels, np.eye(4)))
+        >>> surface.voxels
+        27
     """
 
     mesh: Mesh

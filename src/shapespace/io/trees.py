@@ -38,6 +38,10 @@ class Tree:
         lengths: (M,) length of the branch above each node, in the unit of the file; 0 for the root.
         where: what the tree is called in messages.
         notes: a sentence each on what was left out or is unusual.
+
+    Example:
+        >>> ss.io.Tree(tips=("a", "b"), parents=np.array([2, 2, -1]), lengths=np.array([1.0, 1.0, 0.0])).tips
+        ('a', 'b')
     """
 
     tips: tuple[str, ...]
@@ -137,6 +141,10 @@ def read_tree(path: Path | str) -> Tree:
         FileFormatError: it is no tree, is too large, names a tip twice or not at all, or a branch has no length or a
             negative one.
         ShapespaceError: the extra `phylogeny` is not installed.
+
+    Example:
+        >>> ss.io.read_tree("tree.nwk").tips
+        ('a', 'b', 'c', 'd', 'e', 'f')
     """
     path = Path(path)
     dendropy = require_package("dendropy", "A phylogenetic tree", "'shapespace[phylogeny]'")

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +19,7 @@ from scipy.linalg import eigh
 
 from shapespace.errors import InputError, ModelFileError
 from shapespace.formats.model_parts import LinearModel
+from shapespace.geometry.mirrored_scans import mirrored_note
 from shapespace.geometry.normals import without_estimates
 from shapespace.geometry.procrustes import Gauge, align_in_place
 from shapespace.geometry.similarity import fit_similarity
@@ -25,11 +27,12 @@ from shapespace.io.containers.hdf5 import read_hdf5
 from shapespace.io.interop import as_meshes
 from shapespace.lazy import lazy_import
 from shapespace.model import model_file
+from shapespace.model.choose_modes import modes_notes
 from shapespace.model.foreign import Foreign, is_foreign, load_foreign, parted
 from shapespace.model.held_out import held_out_shapes
 from shapespace.model.local_modes import local_modes
 from shapespace.model.new_shapes import HeldOut, variances_of_new_shapes
-from shapespace.model.pca import modes_for_variance, principal_components
+from shapespace.model.pca import modes_for_variance, plain_modes, principal_components
 from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks, common_faces, read_only
@@ -98,8 +101,8 @@ class AdditiveModel:
         subjects: Sequence[str],
         neutral: Sequence[bool],
         *,
-        identity_modes: int | float | None = None,
-        expression_modes: int | float | None = 0.99,
+        identity_modes: int | float | Literal["all"] | None = "all",
+        expression_modes: int | float | Literal["all"] | None = 0.99,
         gauge: Gauge = "shape",
         alignment_vertices: IntArray | None = None,
         local_identity_modes: int | None = None,
@@ -119,7 +122,8 @@ class AdditiveModel:
             meshes: at least two neutral ones, and one or more expressions of people whose neutral is there.
             subjects: (N,) whom each shows.
             neutral: (N,) whether it is the neutral face; a person's neutrals are averaged.
-            identity_modes: a number; a float below 1 for a share of the variance; None for all.
+            identity_modes: a number, fewer if the meshes determine fewer; a float below 1 for a share of the variance;
+                `all`.
             expression_modes: the same for expressions.
             local_identity_modes: how many smooth local modes of identity there are at most beside those of the people;
                 None for 150, or for none where `identity_modes` is a number. The less is left outside the people's,
@@ -138,6 +142,7 @@ class AdditiveModel:
             CorrespondenceError: the meshes differ in vertices or triangles.
             InputError: too few of them, or an expression without its person's neutral.
         """
+        identity_modes, expression_modes = plain_modes(identity_modes), plain_modes(expression_modes)
         meshes = [without_estimates(mesh) for mesh in as_meshes(meshes, "AdditiveModel.fit")]
         faces = common_faces(meshes)
         neutrals, shapes, people, expressive = _neutrals_and_expressions(meshes, subjects, neutral, kin)
@@ -166,6 +171,11 @@ class AdditiveModel:
             provenance=provenance,
             licence=licence,
             held_out=True,
+            notes=[
+                *mirrored_note(lambda i: meshes[i].vertices, lambda i: meshes[i].name, len(meshes)),
+                *modes_notes(identity_modes, A.shape[1], len(people), "neutral shapes"),
+                *modes_notes(expression_modes, B.shape[1], len(expressive), "expressions"),
+            ],
         )
         return cls(model, rotation, A.shape[1])
 
@@ -439,9 +449,7 @@ def _modes_through_zero(
     if isinstance(wanted, float):
         count = min(count, modes_for_variance(values, wanted))
     elif wanted is not None:
-        if not 1 <= wanted <= count:
-            raise InputError(f"These expressions give 1 to {count} modes, so {wanted} cannot be had.")
-        count = wanted
+        count = min(count, wanted)
     values, vectors = values[:count], vectors[:, :count]
     modes = data.T @ (vectors / np.sqrt(values * len(data)))
     modes *= np.sign(modes[np.abs(modes).argmax(axis=0), np.arange(count)])

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from numbers import Real
-from typing import Literal, get_args
+from typing import get_args
 
 from shapespace.errors import InputError
 from shapespace.geometry.procrustes import Gauge
 from shapespace.model.missing import MIN_SEEN
-from shapespace.model.pca import plain_modes
+from shapespace.model.pca import Modes, plain_modes
 from shapespace.model.representation import representation_named
 from shapespace.types import IntArray, generator_of
 
@@ -20,8 +20,9 @@ class BuildConfig:
     """Options of a shape model.
 
     Args:
-        modes: number of modes (in Python also a float below 1, a share of the variance); `auto`: cross-validation on
-            held-out vertices, of a random sample of 2,000 meshes if there are more; `all` (in Python None).
+        modes: number of modes (in Python also a float below 1, a share of the variance), fewer if the meshes determine
+            fewer; `all`; `auto`: cross-validation on held-out vertices, of a random sample of 2,000 meshes if there are
+            more, and `all` of fewer than four.
         gauge: `form`: size is part of the modes, and fits are rigid; `shape`: size is divided out, and fits have a free
             scale.
         align: whether to align the meshes.
@@ -41,9 +42,13 @@ class BuildConfig:
             vertices would need more than four fifths of the free memory.
         without_training_shapes: omit the training shapes, from which their surfaces can be reconstructed, from the
             model, for example before you share a model of people; its results are then not calibrated.
+
+    Example:
+        >>> ss.build_model(meshes, ss.BuildConfig(modes=0.9, gauge="form")).gauge
+        'form'
     """
 
-    modes: int | float | Literal["auto"] | None = None
+    modes: Modes = "all"
     gauge: Gauge = "shape"
     align: bool = True
     alignment_vertices: IntArray | None = None
@@ -64,7 +69,7 @@ class BuildConfig:
             InputError: an option cannot be.
         """
         if self.modes != "auto":
-            plain_modes(self.modes)
+            object.__setattr__(self, "modes", plain_modes(self.modes) or "all")
         if self.gauge not in get_args(Gauge):
             raise InputError(f"There is no gauge {self.gauge!r}; choose form (rigid) or shape (with scale).")
         representation_named(self.representation, self.control_points)

@@ -7,19 +7,20 @@ from contextlib import AbstractContextManager
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from shapespace.errors import InputError
+from shapespace.geometry.mirrored_scans import mirrored_note
 from shapespace.geometry.normals import without_estimates
 from shapespace.geometry.procrustes import Gauge, align_in_place, centroid_size, scale_to_tangent
 from shapespace.io.interop import MeshLike, as_meshes
 from shapespace.model.build_config import BuildConfig
-from shapespace.model.choose_modes import choose_modes
+from shapespace.model.choose_modes import modes_notes, number_of_modes
 from shapespace.model.holes import fill_holes
 from shapespace.model.missing import CompletedShapes, ObservedMeshes, complete
-from shapespace.model.pca import PrincipalComponents, principal_components
+from shapespace.model.pca import Modes, PrincipalComponents, principal_components
 from shapespace.model.representation import Representation, Vertices, representation_named
 from shapespace.model.shape_model import ShapeModel
 from shapespace.model.spurious import below_precision, made_by_alignment, rounding_mm
@@ -63,9 +64,13 @@ def build_model(
     Raises:
         CorrespondenceError: the meshes differ in vertices or triangles.
         MeshError: for B-splines: the surface cannot be spread out on a square.
-        InputError: too few meshes, values that are not finite, no variation, too many modes asked for, an unknown
-            representation, control points that cannot be; streamed meshes with missing vertices, or for B-splines.
+        InputError: too few meshes, values that are not finite, no variation, an unknown representation,
+            control points that cannot be; streamed meshes with missing vertices, or for B-splines.
         FileError: the disk has no room for the file.
+
+    Example:
+        >>> ss.build_model(meshes, ss.BuildConfig(modes=3)).n_modes
+        3
     """
     config, log = config or BuildConfig(), log or _silent
     require(config, BuildConfig, "build_model", "give the options as BuildConfig(...)")
@@ -91,7 +96,7 @@ def build_model(
         )
         if len(meshes):
             SurfaceLandmarks.of(landmarks).check(len(meshes[0].vertices))
-        return _of_streamed(stream, config, landmarks, keep_shapes, log)
+        return _of_streamed(stream, meshes, config, landmarks, keep_shapes, log)
     meshes = [without_estimates(meshes[index]) for index in range(len(meshes))]
     faces, dropped = common_faces(meshes), np.zeros(0, dtype=np.int32)
     if not kind.takes_holes and len(meshes) > 1:
@@ -111,12 +116,14 @@ def build_model(
     if completed is not None:
         pc = completed.components(config.modes, config.seed)
     elif isinstance(coder, Vertices):
-        pc = _components(coder.encode(shapes), config.modes, config.seed)
+        data = coder.encode(shapes)
+        pc = principal_components(data, number_of_modes(config.modes, data, config.seed))
     else:
         pc = _components_of_codes(coder, shapes, config.modes, config.seed)
     model = _of_components(
         pc,
         coder,
+        modes=config.modes,
         rounding=rounding,
         align=align,
         alignment_vertices=alignment_vertices,
@@ -128,7 +135,7 @@ def build_model(
         licence=config.licence,
         dropped_vertices=dropped,
     )
-    return _with_training(model, aligned.__getitem__, sizes, config)
+    return _finished(model, aligned.__getitem__, names.__getitem__, sizes, config)
 
 
 def extend_model(
@@ -179,7 +186,7 @@ def extend_model(
         tell=log,
     )
     config = replace(config, provenance=config.provenance or model.provenance, licence=config.licence or model.licence)
-    return _of_streamed(stream, config, model.landmarks, keep_shapes, log)
+    return _of_streamed(stream, meshes, config, model.landmarks, keep_shapes, log)
 
 
 def _silent(_: str) -> None:
@@ -188,6 +195,7 @@ def _silent(_: str) -> None:
 
 def _of_streamed(
     stream: AbstractContextManager[Aligned],
+    meshes: Meshes,
     config: BuildConfig,
     landmarks: Mapping[str, int],
     keep_shapes: Path | None,
@@ -198,6 +206,7 @@ def _of_streamed(
         model = _of_components(
             aligned.components(config.modes, config.seed, log),
             Vertices(),
+            modes=config.modes,
             rounding=training.rounding,
             align=training.align,
             alignment_vertices=training.alignment_vertices,
@@ -208,7 +217,14 @@ def _of_streamed(
             licence=config.licence,
         )
         sizes = np.ones(len(training.sizes)) if config.without_training_shapes else aligned.relative_sizes()
-        model = _with_training(model, aligned.shape, sizes, config)
+        before = training.sizes.size - len(meshes)
+        model = _finished(
+            model,
+            aligned.shape,
+            lambda i: f"shape {i + 1} of the model" if i < before else meshes[i - before].name,
+            sizes,
+            config,
+        )
         if keep_shapes is not None:
             aligned.keep(keep_shapes, model.content_hash)
     return model
@@ -219,17 +235,23 @@ def _sizes(shapes: FloatArray, observed: BoolArray) -> FloatArray:
     return np.array([centroid_size(shapes[i, observed[i]]) for i in range(len(shapes))])
 
 
-def _with_training(
-    model: ShapeModel, shape: Callable[[int], FloatArray], sizes: FloatArray, config: BuildConfig
+def _finished(
+    model: ShapeModel,
+    shape: Callable[[int], FloatArray],
+    name: Callable[[int], str],
+    sizes: FloatArray,
+    config: BuildConfig,
 ) -> ShapeModel:
-    """Return the model with its training shapes, whose vertices (V, 3) `shape` returns, unless `config` omits them.
+    """Return the model with a note on mirrored shapes, and with its training shapes, unless `config` omits them.
 
     Args:
         model: without them.
-        shape: returns an aligned shape by its index.
+        shape: returns the vertices (V, 3) of an aligned shape by its index.
+        name: returns the name of a shape by its index.
         sizes: (N,) before alignment, relative to those after it.
         config: options.
     """
+    model = replace(model, notes=[*mirrored_note(shape, name, len(sizes)), *model.notes])
     if config.without_training_shapes:
         return model
     sizes = sizes if model.gauge == "shape" else np.ones(len(sizes))
@@ -241,6 +263,7 @@ def _of_components(
     pc: PrincipalComponents,
     coder: Representation,
     *,
+    modes: Modes,
     rounding: float,
     align: bool,
     alignment_vertices: IntArray | None,
@@ -257,12 +280,18 @@ def _of_components(
             "The training meshes differ by no more than their alignment and their rounding make of them, so there "
             "is no variation to model; give different ones."
         )
+    kept, left_out = int((~spurious).sum()), int(spurious.sum())
+    notes = modes_notes(modes, kept, pc.n_samples)
+    if left_out:
+        count_text = "1 mode is" if left_out == 1 else f"{left_out} modes are"
+        notes.append(f"{count_text} left out, since alignment or rounding made them and no shape did.")
     return ShapeModel(
         mean=pc.mean,
         basis=pc.basis[:, ~spurious],
         stddev=np.sqrt(pc.variance[~spurious]),
         residuals=None if pc.residuals is None else pc.residuals[~spurious],
-        left_out=int(spurious.sum()),
+        left_out=left_out,
+        notes=notes,
         total_variance=pc.total_variance,
         n_training=pc.n_samples,
         gauge=gauge,
@@ -293,13 +322,7 @@ def _aligned(
     return shapes, None
 
 
-def _components(data: FloatArray, modes: int | float | Literal["auto"] | None, seed: int) -> PrincipalComponents:
-    return principal_components(data, choose_modes(data, seed=seed).modes if modes == "auto" else modes)
-
-
-def _components_of_codes(
-    coder: Representation, shapes: FloatArray, modes: int | float | Literal["auto"] | None, seed: int
-) -> PrincipalComponents:
+def _components_of_codes(coder: Representation, shapes: FloatArray, modes: Modes, seed: int) -> PrincipalComponents:
     """Return mean and basis in codes, orthonormal in the vertices that they decode to; `shapes` is overwritten.
 
     What coding loses counts as variance that the modes leave over.
@@ -310,7 +333,7 @@ def _components_of_codes(
     for shape, code in zip(shapes, codes, strict=True):
         shape[:] = coder.decode(code)
     data = shapes.reshape(len(shapes), -1)
-    pc = _components(data, modes, seed)
+    pc = principal_components(data, number_of_modes(modes, data, seed))
     # Modes are sums of the training shapes, and the same sums of their codes decode to them.
     shares = (data @ pc.basis - pc.mean @ pc.basis) / (pc.variance * (len(data) - 1))
     mean = codes.mean(axis=0)

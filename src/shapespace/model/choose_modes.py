@@ -11,8 +11,11 @@ import numpy as np
 from scipy.linalg import eigh
 
 from shapespace.errors import InputError
+from shapespace.model.pca import Modes
 from shapespace.types import BoolArray, FloatArray, IntArray
 
+FEWEST_SHAPES = 4
+"""Fewer leave no folds in which the number of modes can be chosen."""
 MOST_SHAPES = 2000
 """Of more, so many are drawn: the choice takes the cube of their number, and its standard error is small by then."""
 _LEAST_NOISE = 1e-6  # share of the first variance per dimension, so that the likelihood of noise-free shapes is finite
@@ -57,9 +60,9 @@ def choose_modes(data: FloatArray, *, folds: int = 5, seed: int = 0, counted: Bo
         InputError: fewer than four shapes.
     """
     n, d = data.shape
-    if n < 4:
+    if n < FEWEST_SHAPES:
         raise InputError(
-            f"Choosing the number of modes by cross-validation needs at least four shapes, not {n}; "
+            f"Choosing the number of modes by cross-validation needs at least {FEWEST_SHAPES} shapes, not {n}; "
             "ask for a number of modes or a share of the variance instead."
         )
     if n > MOST_SHAPES:
@@ -84,6 +87,25 @@ def choose_modes(data: FloatArray, *, folds: int = 5, seed: int = 0, counted: Bo
     best = int(mean.argmin())
     choice = int(np.flatnonzero(mean <= mean[best] + standard_error[best])[0])
     return ModeChoice(int(candidates[choice]), candidates, mean, standard_error)
+
+
+def number_of_modes(modes: Modes, data: FloatArray, seed: int, counted: BoolArray | None = None) -> Modes:
+    """Return `modes`, or of `auto` the choice by `choose_modes`; of fewer than `FEWEST_SHAPES` shapes all."""
+    if modes != "auto":
+        return modes
+    return choose_modes(data, seed=seed, counted=counted).modes if len(data) >= FEWEST_SHAPES else "all"
+
+
+def modes_notes(modes: Modes, kept: int, shapes: int, noun: str = "training shapes") -> list[str]:
+    """Return why a model of so many shapes has `kept` modes, in a sentence, if that is not the number asked for."""
+    if modes == "auto" and shapes < FEWEST_SHAPES:
+        return [f"With {shapes} meshes the number of modes cannot be cross-validated, so all modes are kept."]
+    if modes == "auto" and shapes > MOST_SHAPES:
+        return [f"The number of modes is chosen by {MOST_SHAPES} of the {shapes} shapes, drawn by the seed."]
+    if isinstance(modes, int) and kept < modes:
+        count = "1 mode" if kept == 1 else f"{kept} modes"
+        return [f"The {shapes} {noun} determine {count}, so the model has {kept} and not the {modes} asked for."]
+    return []
 
 
 def drawn(n: int, seed: int) -> IntArray:

@@ -106,6 +106,7 @@ def load_foreign(path: Path, mm: float | None = None, expressions: Path | None =
         "is_n_training_known": linear.n_training is not None,
         "training": None,
         "dropped_vertices": np.zeros(0, dtype=np.int32),
+        "notes": (),
     }
     return Foreign(fields, rotation, n_identity, model_format.title, tuple(notes))
 

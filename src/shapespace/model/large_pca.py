@@ -18,6 +18,7 @@ from shapespace.io.memory import available_bytes
 from shapespace.model.krylov import KeptPasses, Leading, Stop, leading
 from shapespace.model.pca import (
     ALL_EQUAL,
+    Modes,
     PrincipalComponents,
     check_share,
     checked_modes,
@@ -43,7 +44,7 @@ _FEW, _NO_VARIATION = 8, 1e-12
 
 def large_components(
     shapes: Spill,
-    modes: int | float | None,
+    modes: Modes,
     *,
     seed: int = 0,
     passes: KeptPasses | None = None,
@@ -59,7 +60,7 @@ def large_components(
         on_pass: called with the number of a pass and the largest residual after it as a share of the first variance.
 
     Raises:
-        InputError: values that are not finite, no variation, more modes than the shapes give, or than memory holds.
+        InputError: values that are not finite, no variation, or more modes than memory holds.
         FileError: the file cannot be read, or a pass not kept.
     """
     n, d = shapes.rows, shapes.columns
@@ -87,11 +88,11 @@ def large_components(
     return PrincipalComponents(mean, rows.T, variance, total, n, residuals)
 
 
-def checked_large_modes(modes: int | float | None, n: int, d: int) -> int | float | None:
+def checked_large_modes(modes: Modes, n: int, d: int) -> int | float | None:
     """Return `modes` as asked for of n shapes of d numbers on a disk, before they are looked at.
 
     Raises:
-        InputError: more modes than the shapes give, or than memory holds.
+        InputError: more modes than memory holds.
     """
     modes = checked_modes(modes, n)
     if isinstance(modes, float):
@@ -99,8 +100,8 @@ def checked_large_modes(modes: int | float | None, n: int, d: int) -> int | floa
     count = n - 1 if modes is None else modes if isinstance(modes, int) else 1
     if modes is None and n > EXACT:
         raise InputError(
-            f"All modes of {n} shapes cannot be found; ask for a number of them (--modes) or a share of the variance "
-            "(--variance)."
+            f"All modes of {n} shapes cannot be found; ask for a number of them or auto (--modes), or a share of the "
+            "variance (--variance)."
         )
     free = available_bytes()
     if free is not None and 3 * 8 * count * d > free:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from scipy.linalg import eigh
@@ -20,8 +19,15 @@ from shapespace.errors import InputError
 from shapespace.geometry.normals import part_of
 from shapespace.geometry.procrustes import Gauge, align_in_place, centroid_size, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.model.choose_modes import choose_modes
-from shapespace.model.pca import PrincipalComponents, checked_modes, fix_signs, modes_for_variance, principal_components
+from shapespace.model.choose_modes import number_of_modes
+from shapespace.model.pca import (
+    Modes,
+    PrincipalComponents,
+    checked_modes,
+    fix_signs,
+    modes_for_variance,
+    principal_components,
+)
 from shapespace.model.ppca import Ppca, ppca
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity, SurfaceLandmarks
 
@@ -121,17 +127,15 @@ class CompletedShapes:
     observed: BoolArray
     fitted: Ppca
 
-    def components(self, modes: int | float | Literal["auto"] | None, seed: int) -> PrincipalComponents:
+    def components(self, modes: Modes, seed: int) -> PrincipalComponents:
         """Return mean and modes, as `principal_components` does of whole shapes.
 
         Raises:
-            InputError: more modes than the shapes can give, no variation, or too few shapes to choose their number.
+            InputError: no variation.
         """
         n = len(self.shapes)
         data = self.shapes.reshape(n, -1)
-        if modes == "auto":
-            modes = choose_modes(data, seed=seed, counted=self.observed).modes
-        modes = checked_modes(modes, n)
+        modes = checked_modes(number_of_modes(modes, data, seed, self.observed), n)
         components = principal_components(data)
         conditional, total = self._conditional_covariance(components.basis)
         values, vectors = eigh(np.diag(components.variance) + conditional / (n - 1))  # C29

@@ -6,7 +6,7 @@ Landmarks are stored as triangles and barycentric coordinates.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -53,6 +53,7 @@ class _FileAttributes(Struct, frozen=True):
     variance_divisor: str
     n_training_known: str
     regions: str = "{}"
+    notes: str = "[]"
 
 
 class ModelFields(TypedDict):
@@ -76,6 +77,7 @@ class ModelFields(TypedDict):
     is_n_training_known: bool
     training: TrainingShapes | None
     dropped_vertices: IntArray
+    notes: Sequence[str]
 
 
 def hash_of(model: ModelFields) -> str:
@@ -93,6 +95,8 @@ def save(
     arrays, attributes = _contents(model)
     made_by: dict[str, Attribute] = {"model_hash": hash_of(model), "software_version": __version__}
     made_by["n_training_known"] = "yes" if model["is_n_training_known"] else "no"
+    if notes := model["notes"]:
+        made_by["notes"] = json.dumps(notes)
     if (training := model["training"]) is not None:  # no part of the hash: a shared model without them is the same
         arrays |= {_TRAINING: training.coefficients, _TRAINING_SIZE: training.log_scale}
         arrays |= {_TRAINING_REST: training.rest} if training.rest.size else {}
@@ -205,6 +209,7 @@ def load(path: Path) -> ModelFields:
             "is_n_training_known": attributes_of_file.n_training_known != "no",
             "training": _training_shapes(owned),
             "dropped_vertices": owned.get(_DROPPED, np.zeros(0, dtype=np.int32)),
+            "notes": msgspec.convert(plain_json(attributes_of_file.notes), tuple[str, ...]),
         }
     except (KeyError, ValueError, InputError) as error:
         reason = str(error)[:_LONGEST_DETAIL].replace("`", "").replace("Object missing", "missing")

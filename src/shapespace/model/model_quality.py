@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy as np
 
@@ -25,7 +25,9 @@ from shapespace.geometry.procrustes import Gauge
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.interop import MeshLike, as_meshes
 from shapespace.lazy import lazy_import
+from shapespace.model.choose_modes import FEWEST_SHAPES
 from shapespace.model.missing import MIN_SEEN, ObservedMeshes
+from shapespace.model.pca import Modes
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import short_repr
@@ -36,7 +38,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _FEWEST = 3  # shapes; without one of them two are left, and fewer have no mode
-_FEWEST_TO_CHOOSE = 4  # shapes; fewer leave no folds in which modes can be chosen
 _MOST_COUNTS, _MOST_SPECIFIC = 12, 6
 """Numbers of modes that are tried; specificity takes longest."""
 _POINTS = 1000
@@ -70,6 +71,11 @@ class Curve:
         low: (n,) where its 95 % interval begins.
         high: (n,) where it ends.
         each: (S, n) of each shape or sample, where the mean is over them.
+
+    Example:
+        >>> quality = ss.model.measure_quality(meshes, config=ss.model.QualityConfig(folds=2, samples=2))
+        >>> len(quality.compactness.mean) == len(quality.compactness.counts)
+        True
     """
 
     counts: IntArray
@@ -109,6 +115,11 @@ class ModelQuality:
         seed: of all that is drawn.
         missing_share: of the vertices, over all shapes; nothing is measured there.
         left_out_vertices: that less than half of the shapes show, so that nothing is measured of them at all.
+
+    Example:
+        >>> quality = ss.model.measure_quality(meshes, config=ss.model.QualityConfig(folds=2, samples=2))
+        >>> quality.shapes
+        6
     """
 
     compactness: Curve
@@ -217,7 +228,7 @@ class QualityConfig:
         if self.samples < 2 or (self.modes is not None and self.modes < 1):
             raise InputError("Quality needs at least two samples, and at least one mode.")
 
-    def space(self, meshes: Sequence[Mesh], modes: Literal["auto"] | None = None) -> _Space:
+    def space(self, meshes: Sequence[Mesh], modes: Modes = "all") -> _Space:
         """Return the shape space of `meshes`, of the vertices that at least two of them show."""
         included = np.ones(len(meshes[0].vertices), dtype=np.bool_)
         if not representation_named(self.representation, self.control_points).takes_holes:
@@ -511,7 +522,7 @@ def _of_meshes(
         reconstruction=of_unseen[0],
         reconstruction_vertices=of_unseen[1],
         by_shapes=Curve.over(errors[:, len(counts) :, 0], shapes.sizes, config.seed),
-        supported_modes=config.space(meshes, "auto").model.n_modes if len(meshes) >= _FEWEST_TO_CHOOSE else None,
+        supported_modes=config.space(meshes, "auto").model.n_modes if len(meshes) >= FEWEST_SHAPES else None,
         shapes=len(meshes),
         folds=len(shapes.folds),
         points=_points(space.model.n_vertices),

@@ -8,13 +8,15 @@ one, so that nothing as large as the data is ever copied. Alignment is not done 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, Literal, TypeAlias, cast
 
 import numpy as np
 
 from shapespace.errors import InputError
 from shapespace.types import FloatArray
 
+Modes: TypeAlias = int | float | Literal["auto", "all"] | None
+"""Modes to keep: a number, a share of the variance below 1, `auto` (`choose_modes`), or `all`, which None is too."""
 _BLOCK = 1024  # coordinates at a time, so that no centred copy of all data is in memory
 _CANCELLATION = 1e4
 """Beyond this ratio of raw to centred sum of squares, centring the Gram matrix would cost too many digits."""
@@ -72,16 +74,15 @@ def modes_for_variance(variance: FloatArray, share: float, total: float | None =
     return int(min(np.searchsorted(cumulative, share * (1 - 1e-12)) + 1, len(variance)))
 
 
-def principal_components(data: FloatArray, modes: int | float | None = None) -> PrincipalComponents:
+def principal_components(data: FloatArray, modes: Modes = "all") -> PrincipalComponents:
     """Return the exact principal components of `data`.
 
     Args:
         data: (N, D) float64, one shape a row; C order avoids a copy.
-        modes: how many, at most N - 1; a float below 1 for a share of the variance; None for all that vary.
+        modes: how many, fewer if the samples determine fewer; a float below 1 for a share of the variance; `all`.
 
     Raises:
-        InputError: fewer than two samples, values that are not finite, no variation at all, or more modes asked
-            for than the samples can give.
+        InputError: fewer than two samples, values that are not finite, or no variation at all.
     """
     n, d = data.shape
     from scipy.linalg import eigh  # takes a moment, which whoever only reads models need not wait for
@@ -112,32 +113,27 @@ def plain_modes(modes: object) -> int | float | None:
     """
     if isinstance(modes, np.integer | np.floating):
         modes = modes.item()
-    if modes is not None and not isinstance(modes, int | float):
-        raise InputError(
-            f"The modes must be a whole number, a share of the variance, or none to keep all, not {modes!r}."
-        )
+    if modes is None or modes == "all":
+        return None
+    if not isinstance(modes, int | float):
+        raise InputError(f"The modes must be a whole number, a share of the variance, or all, not {modes!r}.")
     if isinstance(modes, float):
         check_share(modes)
-    elif modes is not None and modes < 1:
+    elif modes < 1:
         raise InputError(f"A shape model has one mode or more, not {modes}; give a number from 1.")
     return modes
 
 
-def checked_modes(modes: int | float | None, n: int) -> int | float | None:
-    """Return `modes` as asked for of n shapes: a plain number, a share of the variance, or None for all.
+def checked_modes(modes: Modes, n: int) -> int | float | None:
+    """Return the modes to be computed of n shapes: a number of at most n - 1, a share of the variance, or None for all.
 
     Raises:
-        InputError: it is something else, or more than so many shapes give, or there are fewer than two shapes.
+        InputError: it is something else, or there are fewer than two shapes.
     """
     if n < 2:
         raise InputError(f"A shape model needs at least two training shapes, not {n}.")
     modes = plain_modes(modes)
-    if isinstance(modes, int) and not 1 <= modes <= n - 1:
-        raise InputError(
-            f"{n} training shapes give at most {n - 1} modes, so {modes} cannot be had; "
-            f"ask for 1 to {n - 1} or add shapes."
-        )
-    return modes
+    return min(modes, n - 1) if isinstance(modes, int) else modes
 
 
 def varying(variance: FloatArray) -> FloatArray:

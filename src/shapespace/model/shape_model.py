@@ -9,7 +9,7 @@ from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +25,7 @@ from shapespace.model import model_file
 from shapespace.model.build_config import BuildConfig
 from shapespace.model.foreign import Foreign, as_linear, is_foreign, load_foreign
 from shapespace.model.missing import MIN_SEEN
+from shapespace.model.pca import Modes
 from shapespace.model.representation import REPRESENTATIONS, Representation
 from shapespace.model.training_shapes import TrainingShapes
 from shapespace.types import (
@@ -91,6 +92,7 @@ class ShapeModel:
             copies and other processes do not have them.
         dropped_vertices: (U,) int32 vertices of the training meshes that are not in the model, since too few meshes
             observe them; its own are the V others in order. `project` takes shapes with and without them.
+        notes: sentences on its training shapes and its number of modes; the content hash does not depend on them.
 
     Raises:
         InputError: arrays whose shapes do not belong together, or standard deviations that cannot be.
@@ -115,13 +117,15 @@ class ShapeModel:
     regions: Mapping[str, IntArray] = field(default_factory=lambda: dict[str, IntArray]())
     training: TrainingShapes | None = field(default=None, repr=False)
     dropped_vertices: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int32), repr=False)
+    notes: Sequence[str] = ()
 
     def __repr__(self) -> str:
         faces = "" if self.faces is None else f", {len(self.faces):,} triangles"
         known = f" of {self.n_training} shapes" if self.is_n_training_known else ""
+        notes = f"; {len(self.notes)} in notes" if self.notes else ""
         return (
             f"<ShapeModel{known} with {self.n_vertices:,} vertices{faces}, {self.n_modes} modes, gauge {self.gauge}; "
-            f"{100 * self.cumulative_variance[-1]:.1f} % of the variance; {len(self.landmarks)} landmarks>"
+            f"{100 * self.cumulative_variance[-1]:.1f} % of the variance; {len(self.landmarks)} landmarks{notes}>"
         )
 
     def __post_init__(self) -> None:
@@ -182,6 +186,7 @@ class ShapeModel:
             str(name): region_vertices(vertices, len(checked.vertices), name) for name, vertices in self.regions.items()
         }
         object.__setattr__(self, "regions", MappingProxyType(regions))
+        object.__setattr__(self, "notes", tuple(self.notes))
 
     def __getstate__(self) -> dict[str, Any]:
         # For copies, other processes and skops, none of which takes read-only mappings.
@@ -196,7 +201,7 @@ class ShapeModel:
         cls,
         meshes: Meshes | Sequence[MeshLike] | str | PathLike[str],
         *,
-        modes: int | float | Literal["auto"] | None = None,
+        modes: Modes = "all",
         gauge: Gauge = "shape",
         align: bool = True,
         alignment_vertices: IntArray | None = None,
@@ -239,7 +244,7 @@ class ShapeModel:
         meshes: Meshes,
         shapes: Path,
         *,
-        modes: int | float | Literal["auto"] | None = None,
+        modes: Modes = "all",
         provenance: str = "",
         licence: str = "",
         seed: int = 0,
@@ -359,9 +364,11 @@ class ShapeModel:
         """
         shape = without_estimates(shape) if isinstance(shape, Mesh) else shape
         vertices = shape.vertices if isinstance(shape, Mesh) else np.asarray(shape, dtype=np.float64)
-        if vertices.shape == (self.n_vertices + len(self.dropped_vertices), 3):
+        if vertices.ndim != 2 or vertices.shape[1] != 3:
+            raise InputError(f"A shape to be projected must have the shape (V, 3), not {vertices.shape}.")
+        if len(vertices) == self.n_vertices + len(self.dropped_vertices):
             vertices = np.delete(vertices, self.dropped_vertices, axis=0)
-        if vertices.shape != (self.n_vertices, 3):
+        if len(vertices) != self.n_vertices:
             name = shape.name if isinstance(shape, Mesh) else "The shape"
             raise CorrespondenceError(
                 f"{name} has {len(vertices)} vertices but the model has {self.n_vertices}; only shapes in the "

@@ -14,7 +14,7 @@ import tempfile
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeAlias, cast
+from typing import Any, Protocol, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -35,10 +35,10 @@ from shapespace.io.containers.arrays import read_arrays, write_arrays
 from shapespace.io.containers.row_spill import Spill
 from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_error, write_text
 from shapespace.io.memory import available_bytes
-from shapespace.model.choose_modes import choose_modes, drawn
+from shapespace.model.choose_modes import drawn, number_of_modes
 from shapespace.model.krylov import KeptPasses
 from shapespace.model.large_pca import checked_large_modes, large_components
-from shapespace.model.pca import ALL_EQUAL, PrincipalComponents
+from shapespace.model.pca import ALL_EQUAL, Modes, PrincipalComponents
 from shapespace.model.spurious import rounding_mm
 from shapespace.model.training_shapes import TrainingShapes
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, common_faces
@@ -192,7 +192,7 @@ class Aligned:
     training: KeptShapes
     passes: KeptPasses | None
 
-    def components(self, modes: int | float | Literal["auto"] | None, seed: int, tell: Tell) -> PrincipalComponents:
+    def components(self, modes: Modes, seed: int, tell: Tell) -> PrincipalComponents:
         """Return mean and modes, as `principal_components` does of shapes in memory.
 
         Raises:
@@ -200,7 +200,7 @@ class Aligned:
         """
         if modes == "auto":
             tell("choosing the number of modes")
-            modes = choose_modes(_sample(self.shapes, seed), seed=seed).modes
+            modes = number_of_modes(modes, _sample(self.shapes, seed), seed)
         pc = large_components(
             self.shapes,
             modes,
@@ -269,7 +269,7 @@ def aligned_on_disk(
     alignment_vertices: IntArray | None,
     scratch: Scratch | None,
     onto: KeptShapes | None,
-    modes: int | float | Literal["auto"] | None,
+    modes: Modes,
     tell: Tell,
 ) -> Generator[Aligned]:
     """Yield the shapes of `meshes`, and before them those of `onto`, aligned in a file that vanishes with the block.

@@ -105,6 +105,11 @@ class SavedClassifier:
         versions: of the software that trained it.
         projection: (Ke, K) from the model's coefficients to those of expression, which it then sees alone; None sees
             the model's own.
+
+    Example:
+        >>> saved, notes = ss.train_classifier(scans, classifier="knn")
+        >>> saved.modes
+        4
     """
 
     pipeline: Pipeline

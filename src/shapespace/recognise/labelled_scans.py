@@ -68,7 +68,7 @@ def from_record(name: str, record: FitRecord) -> ScanCoefficients:
         FileFormatError: the record lacks what recognition needs, or it is damaged.
     """
     if record.status != "failed" and not record.z:
-        raise FileFormatError(f"The record of {name} is damaged or not whole; fit the scan again.")
+        raise FileFormatError(f"The record of {name} is incomplete or contradicts itself; fit the scan again.")
     z = None if record.status == "failed" else read_only(np.asarray(record.z, dtype=np.float64))
     scan = ScanCoefficients(name, record.status, record.reason, z, record.model.hash, file=record.scan.name)
     return _check(scan, f"The record of {name}")

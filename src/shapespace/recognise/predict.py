@@ -41,6 +41,12 @@ class ScanPrediction:
         probabilities: (C,), or None where no probabilities can be given.
         reason: why there is no class; empty where there is one.
         neutral: whether it is a neutral face that others are compared with, which needs no answer.
+
+    Example:
+        >>> from shapespace.recognise.predict import predict_scans
+        >>> saved, notes = ss.train_classifier(scans)
+        >>> predict_scans(saved, scans[:1])[0].status
+        'converged'
     """
 
     scan: str
@@ -83,6 +89,11 @@ def train_classifier(
     Raises:
         InputError: an unknown classifier, fits of different models, too few labels, people without a neutral face,
             or more modes than there are.
+
+    Example:
+        >>> saved, notes = ss.train_classifier(scans, modes=3)
+        >>> saved.classes
+        ('smile', 'surprise')
     """
     if classifier not in CLASSIFIERS:
         raise InputError(f"There is no classifier {classifier!r}; choose among {', '.join(CLASSIFIERS)}.")

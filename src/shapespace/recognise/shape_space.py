@@ -15,6 +15,7 @@ from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.result import FitResult
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.interop import MeshLike, as_mesh, as_meshes
+from shapespace.model.pca import Modes
 from shapespace.model.shape_model import ShapeModel
 from shapespace.recognise.labelled_scans import from_record
 from shapespace.recognise.learn import BaseEstimator, TransformerMixin, check_is_fitted
@@ -40,8 +41,9 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
     says why. A doubtful fit keeps its coefficients here: see `status` of the fit.
 
     Args:
-        modes: as in `ShapeModel.fit`: a number, a share of the variance, "auto", or None for all.
-        n_components: the same by the name that scikit-learn has for it; give one of both.
+        modes: as in `BuildConfig`: a number, a share of the variance, "auto" or "all". A warning states notes of the
+            model, such as that the meshes determine fewer modes.
+        n_components: the same by the name that scikit-learn has for it, None to use `modes`; give one of both.
         gauge: `form` or `shape`.
         align: False takes meshes as they stand, also in `transform`.
         alignment_vertices: indices that carry the alignment of the training meshes.
@@ -58,9 +60,9 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
 
     def __init__(
         self,
-        modes: int | float | Literal["auto"] | None = None,
+        modes: Modes = "all",
         *,
-        n_components: int | float | Literal["auto"] | None = None,
+        n_components: Modes = None,
         gauge: Gauge = "shape",
         align: bool = True,
         alignment_vertices: IntArray | None = None,
@@ -69,8 +71,8 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
         config: FitConfig | None = None,
         seed: int = 0,
     ) -> None:
-        self.modes: int | float | Literal["auto"] | None = modes
-        self.n_components: int | float | Literal["auto"] | None = n_components
+        self.modes: Modes = modes
+        self.n_components: Modes = n_components
         self.gauge: Gauge = gauge
         self.align = align
         self.alignment_vertices = alignment_vertices
@@ -88,9 +90,9 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
 
         Raises:
             CorrespondenceError: the meshes differ in vertices or triangles.
-            InputError: something else than meshes, too few of them, no variation, too many modes, unknown settings.
+            InputError: something else than meshes, too few of them, no variation, unknown settings.
         """
-        if None not in (self.modes, self.n_components) and self.modes != self.n_components:
+        if self.n_components is not None and self.modes not in (None, "all", self.n_components):
             raise InputError(
                 f"modes is {self.modes!r} and n_components {self.n_components!r}, but both are the number of modes; "
                 "give one of them."
@@ -109,7 +111,7 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
         surfaces = _items(X)
         if any(isinstance(item, FitResult | FitRecord | Mapping) for item in surfaces):
             raise InputError("A shape space is built from meshes in correspondence; give those, or a ready model.")
-        return ShapeModel.fit(
+        model = ShapeModel.fit(
             surfaces,
             modes=self.modes if self.n_components is None else self.n_components,
             gauge=self.gauge,
@@ -117,6 +119,9 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
             alignment_vertices=self.alignment_vertices,
             seed=self.seed,
         )
+        for note in model.notes:
+            warnings.warn(note, stacklevel=3)
+        return model
 
     def transform(self, X: Surfaces) -> FloatArray:
         """Return coefficients z (n, K) in standard deviations of the model; rows of failed fits are NaN.

@@ -124,6 +124,12 @@ class AsymmetryResult(AnalysisResult):
             `observations`.
         degrees_of_freedom: of the ANOVA of shape.
         imputations: those that p values combine; None without samples of completed shapes.
+
+    Example:
+        >>> whole = ss.Cohort.of_shapes([mesh.vertices for mesh in meshes], {}, faces=meshes[0].faces)
+        >>> result = ss.statistics.measure_asymmetry(whole, permutations=99)
+        >>> len(result.subjects)
+        6
     """
 
     cohort: Cohort

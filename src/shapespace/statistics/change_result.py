@@ -222,6 +222,13 @@ class ChangeResult(AnalysisResult):
         is_closed: whether the surface is closed.
         is_model_only: whether the surfaces contain only variation of the model of the fits.
         blank: (V,) bool, where maps are blank because too few subjects observe the vertex; None if nowhere.
+
+    Example:
+        >>> visits = [size * mesh.vertices for mesh in meshes for size in (1.0, 1.01)]
+        >>> columns = {"subject": np.repeat(list("abcdef"), 2), "visit": [1, 2] * 6}
+        >>> forms = ss.Cohort.of_shapes(visits, columns, faces=meshes[0].faces, gauge="form")
+        >>> len(ss.statistics.change(forms, ss.statistics.ChangeConfig(time="visit")).subjects)
+        6
     """
 
     cohort: Cohort

@@ -19,6 +19,7 @@ from msgspec import structs
 from shapespace.cohort.classes import number_caution
 from shapespace.cohort.cohort import Cohort, with_columns
 from shapespace.errors import InputError
+from shapespace.geometry.mirrored_scans import mirrored_note
 from shapespace.reprs import list_briefly, short_repr
 from shapespace.schemas import Methods, TestScheme
 from shapespace.statistics.analysis_result import AnalysisResult
@@ -260,6 +261,12 @@ class CompareResult(AnalysisResult):
         methods: sample sizes, tests and assumptions.
         repeated_measures: how several shapes of a subject enter the tests; None where all shapes are independent.
         imputations: those that p values combine; None without samples of completed shapes.
+
+    Example:
+        >>> config = ss.statistics.CompareConfig(permutations=99)
+        >>> result = ss.statistics.compare(cohort, "~ group", config)
+        >>> [test.term for test in result.tests]
+        ['group']
     """
 
     cohort: Cohort
@@ -452,7 +459,8 @@ def complete_cohort(
     cohort = cohort.complete(named, drop_missing=drop_missing, numbers={*in_formulas, *numbers} - {*columns})
     plain = [column for column in in_formulas if "" in calls[column] and column not in (*columns, *numbers)]
     cautions = [number_caution(cohort.table, column, f"C({quoted(column)})") for column in plain]
-    return replace(cohort, cautions=(*cohort.cautions, *filter(None, cautions)))
+    mirrored = mirrored_note(cohort.vertices, cohort.names.__getitem__, len(cohort))
+    return replace(cohort, cautions=(*cohort.cautions, *mirrored, *filter(None, cautions)))
 
 
 def _error_terms(strata: Sequence[Stratum], design: Design, name: str, error: str) -> tuple[Term, Term]:

@@ -47,6 +47,12 @@ class Predictions:
         low, high: (n,) interval.
         outside: n sentences on what lies outside what was learned from; empty where nothing does.
         imputations: those that predictions combine; None without samples of completed shapes.
+
+    Example:
+        >>> predictor = ss.statistics.regress(cohort, "age", subject="subject").predictor
+        >>> predictions = predictor.predict(cohort)
+        >>> bool((predictions.low <= predictions.value).all())
+        True
     """
 
     names: tuple[str, ...]
@@ -81,6 +87,11 @@ class Predictor:
         subjects: how many were learned from.
         confidence: level of the intervals.
         method: in words.
+
+    Example:
+        >>> predictor = ss.statistics.regress(cohort, "age", subject="subject").predictor
+        >>> predictor.target
+        'age'
     """
 
     target: str

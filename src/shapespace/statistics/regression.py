@@ -77,6 +77,11 @@ class RegressionResult(AnalysisResult):
         seed: of folds, permutations and draws.
         subject: column of the subjects, as given; None for the default.
         imputations: those that p, predictions and measures combine; None without samples of completed shapes.
+
+    Example:
+        >>> result = ss.statistics.regress(cohort, "age", subject="subject")
+        >>> result.predicted.shape
+        (24,)
     """
 
     cohort: Cohort

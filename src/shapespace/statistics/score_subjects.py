@@ -105,6 +105,11 @@ class ScoreResult(AnalysisResult):
         notes: who was left out and why, and what should be known.
         imputations: those that scores combine; None without samples of completed shapes.
         review: number of the surfaces of reference and subjects that need review.
+
+    Example:
+        >>> result = ss.statistics.score(cohort.take(range(20)), cohort.take(range(20, 24)))
+        >>> result.distance.shape
+        (4,)
     """
 
     names: tuple[str, ...]

@@ -147,6 +147,12 @@ class QuantityEstimate:
         level: probability of the interval.
         calibrated_on: number of training shapes left out in turn from which mean, standard deviation and interval are
             estimated; 0 if they are those of the samples, and not calibrated.
+
+    Example:
+        >>> completion = ss.complete(model, meshes[0], ss.CompletionConfig(samples=4))
+        >>> width = completion.estimate(lambda mesh: float(np.ptp(mesh.vertices[:, 0])), "width", "mm")
+        >>> width.low <= width.value <= width.high
+        True
     """
 
     name: str
@@ -178,6 +184,11 @@ class Completion:
         T_scan_model: pose of the posterior, from the model's frame (mm) to the frame and unit of the scan.
         calibration: completions of the training shapes by models of the others, from which intervals, skill and status
             are estimated; None if the model neither contains nor counts its training shapes.
+
+    Example:
+        >>> completion = ss.complete(model, meshes[0], ss.CompletionConfig(samples=4))
+        >>> completion.vertices.shape == meshes[0].vertices.shape
+        True
     """
 
     fit: FitResult

@@ -96,6 +96,10 @@ class FitEvidence(ScanEvidence):
         displaced_bound: largest `displaced_share` of left-out training shapes; None where they were not fitted.
         second_instance_mm: distance of a second instance in the scan; None where none was found.
         second_instance_gap_mm: gap between the two instances, negative if they overlap; None where none was found.
+
+    Example:
+        >>> 0 <= fit.evidence.model_matched_share <= 1
+        True
     """
 
     expected_error_mm: float

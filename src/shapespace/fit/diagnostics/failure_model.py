@@ -211,6 +211,10 @@ class ErrorEstimate:
         error_low_mm: lower end of the interval that holds the error of 90 % of such fits.
         error_high_mm: upper end of that interval.
         failure_probability: that the fit failed, if as many fits fail as among those that the model was fitted to.
+
+    Example:
+        >>> fit.evidence.error_low_mm <= fit.evidence.expected_error_mm <= fit.evidence.error_high_mm
+        True
     """
 
     expected_error_mm: float

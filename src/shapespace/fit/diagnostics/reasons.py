@@ -8,7 +8,12 @@ from enum import StrEnum
 
 
 class ReasonCode(StrEnum):
-    """Reasons for a status; the value is the code in NAME.fit.json, the comment lists the data."""
+    """Reasons for a status; the value is the code in NAME.fit.json, the comment lists the data.
+
+    Example:
+        >>> [reason.code for reason in fit.reasons if reason.code is ss.fit.ReasonCode.OTHER]
+        []
+    """
 
     # status converged
     CONVERGED = "converged"  # spread_mm, model_matched_share; mirrored_apart_mm if the chirality is undecidable

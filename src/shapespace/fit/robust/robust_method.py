@@ -52,6 +52,11 @@ class Robust(RobustSettings):
     """Pose and shape at once, from both directions, robustly, with the prior (docs/robust.md).
 
     Its settings are those of `RobustSettings`.
+
+    Example:
+        >>> config = ss.FitConfig(ss.fit.Robust(weight="huber"))
+        >>> ss.fit_scan(model, meshes[1], config).method
+        'robust'
     """
 
     name: ClassVar[str] = "robust"

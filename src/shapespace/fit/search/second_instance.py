@@ -58,6 +58,10 @@ class SecondInstance:
         away_mm: distance of its centroid from that of the first, mm of the scan.
         gap_mm: gap between the two along the line through their centroids, mm of the scan; negative where they
             overlap.
+
+    Example:
+        >>> fit.evidence.second_instance_mm is None  # a second face in the scan
+        True
     """
 
     away_mm: float

@@ -102,6 +102,11 @@ def read_configurations(
         FileFormatError: it is damaged, is in none of the formats, or its specimens have other landmarks.
         InputError: two specimens have one name.
         ShapespaceError: the extra `r`, which R files need, is not installed.
+
+    Example:
+        >>> _ = ss.io.write_configurations("landmarks.tps", configurations)
+        >>> ss.io.read_configurations("landmarks.tps").points.shape
+        (6, 10, 3)
     """
     path = Path(path)
     if curve_points is not None and curve_points < LEAST_OUTLINE:
@@ -405,6 +410,10 @@ def write_configurations(path: Path | str, raw: LandmarkConfigurations, format: 
     Raises:
         InputError: an unknown format, or one that cannot hold these landmarks.
         FileError: it cannot be written.
+
+    Example:
+        >>> ss.io.write_configurations("specimens.csv", configurations)
+        ()
     """
     path = Path(path)
     if format is None:

@@ -46,6 +46,11 @@ class LandmarkConfigurations:
         unit: of the coordinates, `mm` or empty for none.
         where: what the data are called in messages, such as the file.
         notes: what was changed or left out while reading, a sentence each.
+
+    Example:
+        >>> points = np.stack([mesh.vertices[:4] for mesh in meshes])
+        >>> len(ss.io.LandmarkConfigurations(names=list("abcdef"), points=points))
+        6
     """
 
     names: tuple[str, ...]

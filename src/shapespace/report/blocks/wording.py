@@ -45,9 +45,10 @@ def counted(count: int, one: str, many: str | None = None) -> str:
 
 
 def training_text(model: ShapeModel) -> str:
-    """Return the number of training shapes, and how many of them the model contains."""
+    """Return the number of training shapes, how many of them the model contains, and the notes on them."""
     text = counted(model.n_training, "shape")
-    return text if model.training is None else f"{text}, of which the model contains {len(model.training):,}"
+    text = text if model.training is None else f"{text}, of which the model contains {len(model.training):,}"
+    return ". ".join((text, *(note.rstrip(".") for note in model.notes)))
 
 
 def listed(items: Sequence[str], most: int = 12) -> str:

@@ -104,8 +104,9 @@ def html_of_correspondence(correspondence: Correspondence) -> str:
     ]
     heads = ["scan", "status", "share of the mean shape seen", "share of the scan covered"]
     blocks = _table(heads, cells, "The scans, excluded ones first", len(correspondence.scans))
+    notes = [f"{scan.name}: {note}" for scan in correspondence.scans for note in scan.notes]
     draw = _surface(correspondence.template, "The mean shape.")
-    return notebook_html(correspondence, "Correspondence", [correspondence.why], rows, draw, blocks=blocks)
+    return notebook_html(correspondence, "Correspondence", [correspondence.why, *notes], rows, draw, blocks=blocks)
 
 
 def html_of_volume_surface(surface: VolumeSurface) -> str:

@@ -34,6 +34,7 @@ from shapespace.report.blocks.blocks import (
 )
 from shapespace.report.blocks.settings_text import settings_blocks
 from shapespace.report.blocks.wording import DASH, STATUS_WORDS, counted, isfinite, listed, mm, printable
+from shapespace.report.inputs.repeated_fit import command_with_stages
 from shapespace.report.inputs.saved_fits import (
     Folder,
     SavedFit,
@@ -272,9 +273,6 @@ class FolderPage:
         absent = Notice("Not in the pictures", self.not_drawn())
         if any(fit.entry.stages for fit in fitted):
             return [absent]
-        record = fitted[0].record
-        scan = record.scan.path or "SCAN"
-        scans = str(Path(scan).parent) if len(fitted) > 1 else scan
         return [
             absent,
             Text(
@@ -283,7 +281,7 @@ class FolderPage:
                 "before the fit and after phase 1, the regions and the iterations:",
                 "soft",
             ),
-            Command(f"shapespace fit {record.model.path or 'MODEL.h5'} {scans} -o . --stages"),
+            Command(command_with_stages(self.folder.root, {fit.name: fit.record for fit in self.fits})),
         ]
 
     def not_drawn(self) -> list[str]:

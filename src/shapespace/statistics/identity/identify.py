@@ -110,6 +110,11 @@ class IdentificationResult(AnalysisResult):
         trained_on: number of training people; the smallest of all rounds.
         trial: roles of the scans.
         config: options of the analysis.
+
+    Example:
+        >>> result = ss.statistics.identify(cohort, ss.statistics.IdentityConfig(scores=("distance",), draws=20))
+        >>> bool(result["distance"].cmc[-1] <= 1)
+        True
     """
 
     scores: tuple[IdentificationRates, ...]
@@ -165,6 +170,11 @@ def identify(
     Raises:
         InputError: as `trial_of`, or too few people to learn from.
         ShapespaceError: scikit-learn is not installed.
+
+    Example:
+        >>> config = ss.statistics.IdentityConfig(scores=("distance",), draws=20)
+        >>> bool(ss.statistics.identify(cohort, config)["distance"].cmc[0] <= 1)
+        True
     """
     require(cohort, Cohort, "identify", "read one with shapespace.read_cohort")
     config = config or IdentityConfig()

@@ -127,10 +127,7 @@ def rows_of(table: Table, expression: str) -> list[int]:
     Raises:
         InputError: it is none, there is no such column, or it names no row.
     """
-    match = re.fullmatch(r"\s*([^=!]+?)\s*(!?=)\s*(.+?)\s*", expression)
-    if match is None:
-        raise InputError(f"{expression!r} names no scans; write a column and its values, such as expression=neutral.")
-    column, sign, text = match.groups()
+    column, sign, text = _parts_of(expression)
     values = {value.strip() for value in text.split(",")}
     cells = table.texts(column)
     rows = [row for row, cell in enumerate(cells) if (cell in values) == (sign == "=")]
@@ -138,6 +135,14 @@ def rows_of(table: Table, expression: str) -> list[int]:
         there = list_names(sorted(set(cells) - {""}))
         raise InputError(f"{table.where}: no scan has {expression}; {column} is {there or 'empty'}.")
     return rows
+
+
+def _parts_of(expression: str) -> tuple[str, str, str]:
+    """Return the column, the sign and the values of an expression that names rows."""
+    match = re.fullmatch(r"\s*([^=!]+?)\s*(!?=)\s*(.+?)\s*", expression)
+    if match is None:
+        raise InputError(f"{expression!r} names no scans; write a column and its values, such as expression=neutral.")
+    return match[1].strip("`"), match[2], match[3]
 
 
 def trial_of(cohort: Cohort, config: IdentityConfig, *, enrol: bool = False) -> Trial:
@@ -156,7 +161,9 @@ def trial_of(cohort: Cohort, config: IdentityConfig, *, enrol: bool = False) -> 
     role = config.role
     if role is None and "role" in cohort.table.columns and not (config.gallery or config.probe or config.train):
         role = "role"
-    used = [config.subject, *([role] if role else []), *([config.by] if config.by else [])]
+    expressions = () if role else (config.train, config.gallery, config.probe)
+    named = [_parts_of(expression)[0] for expression in expressions if expression]
+    used = list(dict.fromkeys(column for column in (config.subject, role, config.by, *named) if column))
     cohort = cohort.complete(used, drop_missing=config.drop_missing)
     table, notes = cohort.table, list(cohort.notes)
     subjects = table.texts(config.subject)

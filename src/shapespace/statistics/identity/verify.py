@@ -90,6 +90,11 @@ class VerificationResult(AnalysisResult):
         trained_on: number of training people; the smallest of all rounds.
         trial: roles of the scans.
         config: options of the analysis.
+
+    Example:
+        >>> result = ss.statistics.verify(cohort, ss.statistics.IdentityConfig(scores=("distance",), draws=20))
+        >>> len(result.people)
+        12
     """
 
     scores: tuple[VerificationRates, ...]

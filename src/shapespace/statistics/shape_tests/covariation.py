@@ -60,6 +60,11 @@ def fit_pls(
     Raises:
         InputError: columns and modules or neither, columns that are no numbers, a block without variance, or modules
             that the shapes do not have.
+
+    Example:
+        >>> result = ss.statistics.fit_pls(cohort, columns=["age"], permutations=99)
+        >>> 0 < result.statistics[0].p <= 1
+        True
     """
     if bool(columns) == (modules is not None):
         raise InputError("Partial least squares needs --columns of the table as the first block, or --modules.")
@@ -132,6 +137,11 @@ def estimate_modularity(
 
     Raises:
         InputError: modules that these shapes do not have, too many points, or modules without covariances.
+
+    Example:
+        >>> result = ss.statistics.estimate_modularity(landmarked, modules="modules.csv", permutations=99)
+        >>> 0 < result.statistics[0].p <= 1
+        True
     """
     cohort, points = _modules(cohort.complete((), drop_missing=drop_missing), modules)
     flat = [point for own in points.values() for point in own]
@@ -172,6 +182,11 @@ def compare_effect_sizes(first: Statistic, second: Statistic) -> Statistic:
 
     Raises:
         InputError: a statistic without permutations.
+
+    Example:
+        >>> results = [ss.statistics.fit_pls(part, columns=["age"], permutations=99) for part in (cohort, landmarked)]
+        >>> 0 < ss.statistics.compare_effect_sizes(*(result.statistics[0] for result in results)).p <= 1
+        True
     """
     if first.z is None or second.z is None or min(len(first.arrangements), len(second.arrangements)) < 3:
         raise InputError("Effect sizes are compared by Z, which needs permutations; repeat both tests with them.")

@@ -68,6 +68,11 @@ def compare_disparity(
 
     Raises:
         InputError: no such column, a group of one shape, a formula that cannot be read, or partial with a formula.
+
+    Example:
+        >>> result = ss.statistics.compare_disparity(cohort, group=["group"], permutations=99)
+        >>> 0 < result.statistics[0].p <= 1
+        True
     """
     if partial and formula is not None:
         raise InputError("Partial disparities are about the mean of all shapes; leave out --formula or --partial.")
@@ -137,6 +142,11 @@ def compare_means_and_covariances(
 
     Raises:
         InputError: no such column, a group of fewer than three shapes, or components with a singular covariance.
+
+    Example:
+        >>> result = ss.statistics.compare_means_and_covariances(cohort, group=["group"], components=2, permutations=99)
+        >>> 0 < result.statistics[0].p <= 1
+        True
     """
     cohort, groups = groups_of(cohort, group, drop_missing, 3, "a covariance matrix")
     n, counts = len(cohort), groups.counts
@@ -246,6 +256,11 @@ def assess_equivalence(
     Raises:
         InputError: no margin or two, a margin that is not above 0, fewer than 20 bootstrap samples, no such column, or
             a group of fewer than three shapes.
+
+    Example:
+        >>> result = ss.statistics.assess_equivalence(cohort, group=["group"], margin_sd=2.0, permutations=99)
+        >>> 0 < result.statistics[0].p <= 1
+        True
     """
     given = margin if margin_sd is None else margin_sd
     if (margin is None) == (margin_sd is None) or given is None or not 0 < given < np.inf:
@@ -380,6 +395,11 @@ def discriminate(
 
     Raises:
         InputError: no such column, a group of fewer than three shapes, or a covariance within groups that is singular.
+
+    Example:
+        >>> result = ss.statistics.discriminate(cohort, group=["group"], components=2, permutations=99)
+        >>> 0 < result.statistics[0].p <= 1
+        True
     """
     cohort, groups = groups_of(cohort, group, drop_missing, 3, "a leave-one-out classification")
     n, counts, g = len(cohort), groups.counts, len(groups.names)

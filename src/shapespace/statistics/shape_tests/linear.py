@@ -73,6 +73,11 @@ def compare_trajectories(
     Raises:
         InputError: no such column, a group without shapes at a point, fewer than two points, or models that are not
             nested or leave no residuals.
+
+    Example:
+        >>> result = ss.statistics.compare_trajectories(cohort, group=["group"], points="visit", permutations=99)
+        >>> result.name
+        'trajectory'
     """
     if formula is None:
         formula = " * ".join(_class_factor(cohort, column) for column in (*group, points))
@@ -213,6 +218,11 @@ def compare_pairs(
     Raises:
         InputError: no such column, a covariate that is constant within a group, models that are not nested or leave no
             residuals, or groups that are all the same in the model.
+
+    Example:
+        >>> result = ss.statistics.compare_pairs(cohort, formula="~ group", group=["group"], permutations=99)
+        >>> 0 < result.statistics[0].p <= 1
+        True
     """
     numbers = [covariate] if covariate else []
     cohort = _complete(cohort, [formula, null], group, drop_missing=drop_missing, numbers=numbers)
@@ -276,6 +286,11 @@ def analyse_allometry(
 
     Raises:
         InputError: no such column, a covariate that is constant, too few shapes, or separate slopes without groups.
+
+    Example:
+        >>> result = ss.statistics.analyse_allometry(cohort, group="group", permutations=99)
+        >>> 0 < result.statistics[0].p <= 1
+        True
     """
     if separate and group is None:
         raise InputError("Separate slopes need groups; name their column with --group.")
@@ -354,6 +369,11 @@ def measure_repeatability(
 
     Raises:
         InputError: no such column, one subject, no replicates, or subjects without some sessions.
+
+    Example:
+        >>> result = ss.statistics.measure_repeatability(cohort, subject="subject", permutations=99)
+        >>> result.name
+        'repeatability'
     """
     named = [subject, *([session] if session else [])]
     cohort = cohort.complete(named, drop_missing=drop_missing)

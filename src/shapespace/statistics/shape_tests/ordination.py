@@ -51,6 +51,11 @@ class Ordination:
         ancestors: (M, A) scores of the internal nodes of a tree; None without.
         edges: (E, 2) parent and child of each branch: shapes from 0, internal nodes from N; None without.
         notes: sentences on the method.
+
+    Example:
+        >>> ordination = ss.statistics.ordinate(cohort)
+        >>> bool(ordination.eigenvalues[0] >= ordination.eigenvalues[1])
+        True
     """
 
     method: OrdinationMethod
@@ -122,6 +127,10 @@ def ordinate(
     Raises:
         InputError: no groups or no tree for a method that needs them, fewer than three shapes, shapes that do not
             differ, or a within-group covariance that is singular.
+
+    Example:
+        >>> ss.statistics.ordinate(cohort).scores.shape[0]
+        24
     """
     cohort = cohort.complete(group, drop_missing=drop_missing)
     if len(cohort) < 3:

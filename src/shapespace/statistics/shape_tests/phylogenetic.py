@@ -74,6 +74,11 @@ def estimate_phylogenetic_signal(
 
     Raises:
         InputError: shapes without tip, fewer than three, or tips without a distance between them.
+
+    Example:
+        >>> result = ss.statistics.estimate_phylogenetic_signal(species, tree=tree, permutations=99)
+        >>> 0 < result.statistics[0].p <= 1
+        True
     """
     cohort, tree = _on_tree(cohort.complete((), drop_missing=drop_missing), tree)
     n = len(cohort)
@@ -127,6 +132,11 @@ def fit_pgls(
     Raises:
         InputError: a formula that cannot be read, terms that follow from others, missing values, shapes without tip,
             tips without a distance between them, or too few shapes.
+
+    Example:
+        >>> result = ss.statistics.fit_pgls(species, formula="~ length", tree=tree, permutations=99)
+        >>> 0 < result.statistics[0].p <= 1
+        True
     """
     config = CompareConfig(anova_type=anova_type, permutations=permutations, seed=seed, maps=False)
     cohort, tree = _on_tree(complete_cohort(cohort, [formula], [], drop_missing=drop_missing), tree)

@@ -58,6 +58,12 @@ def plan_sample_size(
     Raises:
         InputError: no such column, a group of fewer than three shapes, sizes below 2, an effect that cannot be read or
             is not above 0, or fewer than 20 permutations.
+
+    Example:
+        >>> settings = {"sizes": (5, 10), "simulations": 20, "permutations": 50}
+        >>> plan = ss.statistics.plan_sample_size(cohort, group=["group"], **settings)
+        >>> plan.name
+        'power'
     """
     if not sizes or min(sizes) < 2 or simulations < 1 or permutations < 1 / LEVEL:
         raise InputError("Planning needs sizes of 2 or more, 1 or more simulations and 20 or more permutations.")

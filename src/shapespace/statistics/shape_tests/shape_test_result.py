@@ -32,6 +32,11 @@ class Statistic:
         z: effect size, the value in standard deviations of its arrangements; None without.
         low, high: confidence interval; None without.
         arrangements: (P,) the statistic of each arrangement, the observed one first; empty without a test.
+
+    Example:
+        >>> statistic = ss.statistics.compare_disparity(cohort, group=["group"], permutations=99).statistics[0]
+        >>> 0 < statistic.p <= 1
+        True
     """
 
     name: str
@@ -97,6 +102,11 @@ class ShapeTestResult(AnalysisResult):
         assumptions: sentences on assumptions of the test, for the methods.
         level: of significance.
         subject: column of the independent units; None where all shapes are independent.
+
+    Example:
+        >>> result = ss.statistics.compare_disparity(cohort, group=["group"], permutations=99)
+        >>> result.name
+        'disparity'
     """
 
     __test__ = False  # no test class of pytest

@@ -17,7 +17,7 @@
   // Forms -----------------------------------------------------------------------------------------------------------
 
   const quoted = (column) => (/^[A-Za-z_]\w*$/.test(column) ? column : `\`${column}\``);
-  const terms = (formula) => formula.replace(/^\s*~/, "").split("+").map((term) => term.trim()).filter(Boolean);
+  const terms = (formula) => (formula.replace(/^\s*~/, "").match(/(`[^`]*`|[^`+])+/g) || []).map((term) => term.trim()).filter(Boolean);
 
   /** A formula, built from ticked columns and editable. */
   function Formula({ option, value, columns, onvalue }) {

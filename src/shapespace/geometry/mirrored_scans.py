@@ -1,17 +1,19 @@
 """Which scans of a collection are mirror images of the others, decided for the collection as a whole (C30, C31).
 
-A few scans are anchors. Each scan and its mirror image are compared with each anchor by the scores of the pose search.
-The sides of anchors and scans that explain the scores best are those of the collection.
+A few scans are anchors. Each scan and its mirror image are compared with each anchor: raw scans by the scores of the
+pose search, shapes in correspondence by their Procrustes distances. The sides of anchors and scans that explain the
+scores best are those of the collection.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 
+from shapespace.reprs import first_names
 from shapespace.types import BoolArray, FloatArray
 
 _LARGEST_EVIDENCE = 0.3
@@ -25,6 +27,10 @@ and 11 simulated kinds."""
 _ALONE = np.log(0.85)
 """Log ratio of scores of a scan and its mirror image below which one comparison decides: of 60 faces, femora and
 spleens that were not mirrored none had less than log 0.88."""
+_ANCHORS = 3
+"""Shapes in correspondence that all others are compared with, as many as of raw scans."""
+_ROUNDING = 1e-12  # squared Procrustes distance, as a share of the squared size, of equal shapes
+_NAMED = 3  # names in a message
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +78,41 @@ def solve_sides(scores: FloatArray, anchors: Sequence[int], seed: int) -> Sides:
         if decided and i >= 0:
             mirrored[i] = signs[a] < 0
     return Sides(np.asarray(mirrored), np.abs(margin), bool(decided), asymmetry)
+
+
+def mirrored_note(shape: Callable[[int], FloatArray], name: Callable[[int], str], count: int) -> list[str]:
+    """Return a sentence that names the shapes in correspondence that are mirror images of the majority, if any.
+
+    Args:
+        shape: returns the vertices (V, 3) of a shape by its index, in any pose and unit.
+        name: returns the name of a shape by its index.
+        count: number of shapes.
+    """
+    anchors = np.unique(np.linspace(0, count - 1, min(count, _ANCHORS)).round().astype(np.int32)).tolist()
+    references = [_normalised(shape(i)) for i in anchors]
+    scores = np.empty((len(anchors), count, 2))
+    for j in range(count):
+        vertices = _normalised(shape(j))
+        for a, reference in enumerate(references):
+            u, s, vt = np.linalg.svd(reference.T @ vertices)
+            last = s[2] if np.linalg.det(u @ vt) > 0 else -s[2]
+            cosines = np.array([s[0] + s[1] + last, s[0] + s[1] - last])  # of the best rotation and reflection
+            scores[a, j] = np.sqrt(np.maximum(1.0 - cosines**2, _ROUNDING))
+    if (scores[:, :, 0] <= scores[:, :, 1]).all():  # the draws would take a tenth of a second
+        return []
+    mirrored = solve_sides(scores, anchors, 0).mirrored
+    mirrored = ~mirrored if 2 * mirrored.sum() > count else mirrored
+    if not mirrored.any():
+        return []
+    of = "shapes is a mirror image" if mirrored.sum() == 1 else "shapes are mirror images"
+    flagged = first_names([name(int(i)) for i in np.flatnonzero(mirrored)[: _NAMED + 1]], _NAMED)
+    return [f"{mirrored.sum()} of {count} {of} of the others ({flagged}); reflect or remove them."]
+
+
+def _normalised(vertices: FloatArray) -> FloatArray:
+    """Return vertices (V, 3) about their centroid, with centroid size 1."""
+    centred = vertices - vertices.mean(axis=0)
+    return centred / np.linalg.norm(centred)
 
 
 def _best_signs(evidence: FloatArray, anchors: Sequence[int]) -> tuple[FloatArray, float]:
