@@ -37,7 +37,7 @@ from shapespace.statistics.compare_strata import Stratum, is_nested, less, span,
 from shapespace.statistics.compare_unequal import Units, is_between_units, units_of
 from shapespace.statistics.compare_within import ModelStrata, RepeatedMeasures, WithinSubjects, strata_of
 from shapespace.statistics.dispersion import VARIANCES, DispersionTest, Variances
-from shapespace.statistics.effect_size import EFFECT_SIZES, EffectSize, effect_size, permutation_p
+from shapespace.statistics.effect_size import EFFECT_SIZES, EffectSize, UnknownP, effect_size, permutation_p
 from shapespace.statistics.methods import dispersion_record, methods_of, sample_sizes
 from shapespace.statistics.multiple_imputation import Imputations, over_imputations
 from shapespace.statistics.observation_weights import information, weights_of
@@ -235,12 +235,21 @@ class ShapeEffect:
 
 @dataclass(frozen=True)
 class EffectAngle:
-    """The angle between two changes of shape; `p` tests whether they are parallel, None where that is not asked."""
+    """The angle between two changes of shape.
+
+    Args:
+        first: one change.
+        second: the other change.
+        degrees: the angle.
+        p: of the test whether they are parallel; None where that is not tested or not known.
+        unknown_p: why p is not known: neither change is longer than its noise. None where it is, or is not tested.
+    """
 
     first: str
     second: str
     degrees: float
     p: float | None
+    unknown_p: UnknownP | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -959,8 +968,9 @@ def _parallel(
             pairs, _changes_in_pairs(design, strata, one, other, config, owners, unequal=unequal), strict=False
         ):
             angle = float(angles_between(drawn[0][:1], drawn[1][:1])[0])
-            p = permutation_p(off_common_direction(*drawn, *weights))
-            yield EffectAngle(words[first], words[second], angle, p)
+            is_known = any(own * (change[0] ** 2).sum() > 1.0 for change, own in zip(drawn, weights, strict=True))
+            p = permutation_p(off_common_direction(*drawn, *weights)) if is_known else None
+            yield EffectAngle(words[first], words[second], angle, p, None if is_known else "short vectors")
 
 
 def _changes_in_pairs(
@@ -987,12 +997,16 @@ def _changes_in_pairs(
             half, between = within.contrast_stratum((first - second) / 2, both, f"{one.name}:{other.name}")
             middle, parts = within.contrast_stratum((first + second) / 2, frozenset({one.column}), one.name)
             direction = middle.direction(parts.average({}))
-            mean, left = direction @ middle.shapes, middle.residual(middle.terms)
-            common = without_noise(mean, float((direction**2).sum() * (left**2).sum()) / max(middle.df_error, 1))
-            differ = half.direction(between.average({}))
+            mean, differ = direction @ middle.shapes, half.direction(between.average({}))
+            noise, other_noise = (
+                float((own**2).sum() * (stratum.residual(stratum.terms) ** 2).sum()) / max(stratum.df_error, 1)
+                for own, stratum in ((direction, middle), (differ, half))
+            )
+            common = without_noise(mean, noise)
             flipped = half.products(differ[:, None], half.shapes, config.permutations, config.seed, flips=True)[:, 0]
             mean = np.concatenate([mean[None], np.repeat(common[None], len(flipped) - 1, axis=0)])
-            yield (mean + flipped, mean - flipped), (1.0, 1.0)
+            precision = 1.0 / max(noise + other_noise, 1e-300)
+            yield (mean + flipped, mean - flipped), (precision, precision)
         return
     stratum, contrasts = None, list[FloatArray]()
     if within is None or not within.holds(both):

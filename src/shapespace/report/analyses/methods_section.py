@@ -369,9 +369,8 @@ def dispersion_sentence(one: Dispersion, unequal_variances: bool | None, unit: s
     details = f"standard deviations by {one.variable}{where}: {named}; p = {one.p:.3g}"
     if unequal_variances and min(one.counts) < FEWEST_OF_GROUP:
         return (
-            f"Warning: {one.variable}{where} has a class of {min(one.counts)} subjects; below "
-            f"{FEWEST_OF_GROUP} the test with unequal variances has too many false positives, 8 % instead of 5 % for 4 "
-            f"({details})."
+            f"Warning: {one.variable}{where} has a class of {min(one.counts)} subjects; with fewer than "
+            f"{FEWEST_OF_GROUP} the test with unequal variances is cautious and finds few differences ({details})."
         )
     if one.equal:
         return f"No significant difference of dispersion ({details})."

@@ -11,6 +11,7 @@ from shapespace.report.analyses.analysis_report import AnalysisReport, Rows
 from shapespace.report.analyses.methods_section import methods_parts, points_word
 from shapespace.report.analyses.shape_data import add_shape_data, model_hashes
 from shapespace.schemas import Counts, HistogramPart, Part, TablePart
+from shapespace.statistics.effect_size import permutation_p
 from shapespace.statistics.shape_tests.shape_test_result import ShapeTestResult, Statistic
 
 _BINS = 40  # bins of a histogram of thousands of permutations
@@ -19,7 +20,7 @@ _MOST_SENTENCES = 10
 _MOST_HISTOGRAMS = 3
 """Histograms of the first statistics; more of them fill the page."""
 
-_HAS_UNIT = re.compile("Procrustes|^distance|length|difference of disparity")
+_HAS_UNIT = re.compile("Procrustes|^distance|length|difference of (root )?disparity")
 """Names of statistics that have the unit of the cohort, or its square."""
 
 
@@ -67,6 +68,13 @@ def _sentence(one: Statistic, level: float) -> str:
     if one.p is not None:
         figures.append(f"p {one.p:.3g}")
         figures.append("significant" if one.p <= level else "not significant")
+    if one.unknown_p == "short vectors":
+        figures.append("p not known: neither vector is longer than its noise, so that no direction is determined")
+    if one.unknown_p == "raw residuals":
+        figures.append(
+            f"p not known: {permutation_p(one.arrangements):.3g} by raw residuals, as in RRPP, is too small if "
+            "the common change is short; omit --residuals raw"
+        )
     text = ", ".join(figures)
     return f"{one.tested}: {text}" if one.tested else f"{text[:1].upper()}{text[1:]}"
 
@@ -74,6 +82,8 @@ def _sentence(one: Statistic, level: float) -> str:
 def _statistics_table(result: ShapeTestResult) -> TablePart:
     rows = [(one.name, one.tested, one.value, one.z, one.p) for one in result.statistics]
     note = f"{result.test.statistics[:1].upper()}{result.test.statistics[1:]}."
+    unknown = dict.fromkeys(one.name for one in result.statistics if one.unknown_p)
+    note += f" p of {', '.join(unknown)} is not known where it is blank." if unknown else ""
     return TablePart.of("Statistics", ("statistic", "tested", "value", "Z", "p"), rows, note=note, level=2)
 
 
@@ -92,8 +102,8 @@ def _histograms(result: ShapeTestResult) -> Iterator[Part]:
 
 
 def _rows(result: ShapeTestResult) -> Rows:
-    header = ("statistic", "tested", "value", "z", "p", "low", "high")
-    return header, [(s.name, s.tested, s.value, s.z, s.p, s.low, s.high) for s in result.statistics]
+    header = ("statistic", "tested", "value", "z", "p", "low", "high", "p_not_known")
+    return header, [(s.name, s.tested, s.value, s.z, s.p, s.low, s.high, s.unknown_p or "") for s in result.statistics]
 
 
 def _file_name(table: TablePart) -> str:

@@ -5,6 +5,7 @@ Equations Mn are those of docs/morphometrics.md.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
@@ -18,7 +19,7 @@ from shapespace.statistics.compare_shapes import complete_cohort
 from shapespace.statistics.compare_strata import means_of, span
 from shapespace.statistics.dispersion import unequal_variances
 from shapespace.statistics.shape_tests.ordination import discriminant_components, principal_components
-from shapespace.statistics.shape_tests.permutations import Groups, Orders, orders, permuted
+from shapespace.statistics.shape_tests.permutations import Groups, Orders, Residuals, orders, permuted
 from shapespace.statistics.shape_tests.shape_test_result import (
     LEVEL,
     ShapeTestResult,
@@ -37,6 +38,7 @@ _ITERATIONS = 50  # of a spatial median; its error is then far below the standar
 _BISECTIONS = 55  # halvings of an interval until float64 numbers are equal
 _TINY = 1e-7  # smallest score, in roots of the scatter; a smaller one changes no classification
 _SMALLEST = 1e-300  # avoids divisions by zero
+_DIFFERENCE = "difference of disparity"
 
 
 def compare_disparity(
@@ -45,7 +47,7 @@ def compare_disparity(
     group: tuple[str, ...],
     formula: str | None = None,
     partial: bool = False,
-    correct_leverage: bool = False,
+    residuals: Residuals = "scaled",
     permutations: int = 1000,
     seed: int = 0,
     drop_missing: bool = False,
@@ -59,8 +61,8 @@ def compare_disparity(
         formula: linear model about whose predictions disparity is measured (default: ~ 1, the mean of all shapes).
         partial: partial disparities (Foote 1993): sums of squares about the mean of all shapes, divided by the number
             of all shapes - 1, so that those of the groups add up to the total disparity.
-        correct_leverage: divide squared residuals by 1 - leverage. Those of a model with the groups are else smaller in
-            small groups, which geomorph leaves so.
+        residuals: of a formula: `scaled` to the variance of errors, in permutations after the model is fitted again; or
+            `raw`, as geomorph, which are smaller in small groups, so that equal groups differ.
         permutations: number of permutations, including the observed data.
         seed: of the permutations, and of the bootstrap samples of the intervals.
         drop_missing: exclude shapes with missing values in the table (default: an error).
@@ -73,30 +75,54 @@ def compare_disparity(
         raise InputError("Partial disparities are about the mean of all shapes; leave out --formula or --partial.")
     cohort, groups = groups_of(cohort, group, drop_missing, 2, "a variance", formula)
     n, design = len(cohort), design_of(formula, cohort.table) if formula else None
-    columns = np.column_stack([np.ones(n), design.matrix]) if design else np.ones((n, 1))
-    q = span(columns)
+    q = span(np.column_stack([np.ones(n), design.matrix]) if design else np.ones((n, 1)))
+    residual = cohort.coefficients - q @ (q.T @ cohort.coefficients)
+    scaled = design is not None and residuals == "scaled"
+    free = np.maximum(1 - (q**2).sum(axis=1), _TINY) if scaled else np.ones(n)
+    squares = (residual**2).sum(axis=1) / free
+    shares = groups.indicator / (np.full(len(groups.names), n - 1.0) if partial else groups.counts)
+    refit = _refitted(q, residual / np.sqrt(free)[:, None], shares / free[:, None])
     # Rows of residuals are permuted, so their squared norms are.
-    squares = ((cohort.coefficients - q @ (q.T @ cohort.coefficients)) ** 2).sum(axis=1)
-    if correct_leverage:
-        squares = squares / np.maximum(1 - (q**2).sum(axis=1), _TINY)
-    divisor = np.full(len(groups.names), n - 1.0) if partial else groups.counts.astype(np.float64)
-    variances = permuted(n, permutations, seed, lambda rows: groups.sums(squares[:, None], rows)[..., 0], progress)
-    variances /= divisor  # M20
+    variances = permuted(n, permutations, seed, refit if scaled else lambda rows: squares @ shares[rows], progress)
+    variances[0] = squares @ shares  # M20
     name = "partial disparity" if partial else "Procrustes variance"
     limits = [
         Statistic(name=name, tested=one, value=float(value), low=float(low * value), high=float(high * value))
         for one, value, (low, high) in zip(groups.names, variances[0], _intervals(groups, squares, seed), strict=True)
     ]
-    differences = np.abs([variances[:, a] - variances[:, b] for a, b in groups.pairs])
+    compared, label = (np.sqrt(variances), "difference of root disparity") if scaled else (variances, _DIFFERENCE)
+    differences = np.abs([compared[:, a] - compared[:, b] for a, b in groups.pairs])
     rows = [(s.tested, int(count), s.value, s.low, s.high) for s, count in zip(limits, groups.counts, strict=True)]
     return ShapeTestResult(
         name="disparity", cohort=cohort, classes=group,
-        statistics=[*_pairs("difference of disparity", groups, differences), *limits],
-        settings={"group": list(group), "formula": formula, "partial": partial, "correct_leverage": correct_leverage,
+        statistics=[*_pairs(label, groups, differences), *limits],
+        settings={"group": list(group), "formula": formula, "partial": partial, "residuals": residuals,
                   "permutations": permutations, "seed": seed},
         tables=(TablePart.of("Disparity", ("group", "shapes", name, "lower 95 %", "upper 95 %"), rows),),
         reduced_model=tuple(term.label for term in design.terms) if design else (),
     )  # fmt: skip
+
+
+def _refitted(q: FloatArray, rows_of_errors: FloatArray, weights: FloatArray) -> Callable[[Orders], FloatArray]:
+    """Return a function of orders (b, N) that permutes errors, fits the model again and sums its squared residuals.
+
+    The sums have the degrees of freedom of the observed ones, so that variances of small groups vary as they do.
+
+    Args:
+        q: (N, m) orthonormal columns of the model.
+        rows_of_errors: (N, K) residuals scaled to the variance of errors.
+        weights: (N, G) of the squared residuals in the sum of each group.
+    """
+    columns = np.hstack([q, *(q * own[:, None] for own in weights.T)])
+    inner, squares = np.einsum("ng,nm,nk->gmk", weights, q, q), (rows_of_errors**2).sum(axis=1)
+
+    def sums(rows: Orders) -> FloatArray:
+        products = columns[rows].transpose(0, 2, 1).reshape(-1, len(q)) @ rows_of_errors
+        products = products.reshape(len(rows), 1 + weights.shape[1], q.shape[1], -1)
+        fitted, weighted = products[:, :1], products[:, 1:]
+        return squares @ weights[rows] + ((inner @ fitted - 2 * weighted) * fitted).sum(axis=(2, 3))
+
+    return sums
 
 
 def _intervals(groups: Groups, squares: FloatArray, seed: int) -> FloatArray:

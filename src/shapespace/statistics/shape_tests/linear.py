@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any, Literal, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from shapespace.statistics.compare_shapes import (
 )
 from shapespace.statistics.compare_strata import Stratum, independent_stratum, less, means_of, span, without_noise
 from shapespace.statistics.methods import REDUCED_OF_EACH_TERM
-from shapespace.statistics.shape_tests.permutations import Groups, Orders, orders
+from shapespace.statistics.shape_tests.permutations import Groups, Orders, Residuals, orders
 from shapespace.statistics.shape_tests.shape_test_result import (
     LEVEL,
     ShapeTestResult,
@@ -32,9 +32,8 @@ from shapespace.statistics.shape_tests.shape_test_result import (
     pair_statistics,
 )
 from shapespace.step_counter import Progress, StepCounter
-from shapespace.types import FloatArray
+from shapespace.types import BoolArray, FloatArray
 
-Residuals: TypeAlias = Literal["scaled", "raw"]
 _ALIASED = 1e-8  # relative length; columns below it follow from others, and estimates below it are equal
 _MOST_COORDINATES = 20_000_000
 """Size-corrected coordinates that are written; more fill gigabytes, and the coefficients are written alone."""
@@ -95,7 +94,7 @@ def compare_trajectories(
     design, reduced, labels = _models(cohort, formula, null)
     estimator = _mean_estimator(design, np.eye(g * p)[cells])
     steps = estimator.reshape(g, p, -1) - estimator.reshape(g, p, -1).mean(axis=1, keepdims=True)
-    excess = _excess(steps, reduced, cohort)
+    excess, is_long = _excess(steps, reduced, cohort)
     batches: list[FloatArray] = []
     angles: list[float] = []
     observed = np.zeros(0)
@@ -128,7 +127,7 @@ def compare_trajectories(
     return _pairs_result(
         "trajectory", cohort, groups, batches, names, (*group, points), labels,
         {"group": list(group), "points": list(stages), "formula": formula, "null": null, "residuals": residuals,
-         "permutations": permutations, "seed": seed}, (figure,), angles,
+         "permutations": permutations, "seed": seed}, (figure,), angles, is_long,
     )  # fmt: skip
 
 
@@ -153,8 +152,8 @@ def _angle(one: FloatArray, other: FloatArray) -> float:
     return float(angles_between(one[None], other[None])[0])
 
 
-def _excess(estimators: FloatArray, reduced: FloatArray, cohort: Cohort) -> FloatArray:
-    """Return the part (G, r, K) of vectors of the reduced model by which noise makes them longer than they are.
+def _excess(estimators: FloatArray, reduced: FloatArray, cohort: Cohort) -> tuple[FloatArray, BoolArray]:
+    """Return by how much noise makes vectors (G, r, K) of the reduced model longer, and whose own exceed noise (G,).
 
     Args:
         estimators: (G, r, N) of the r vectors of each group, which are shortened together.
@@ -166,7 +165,9 @@ def _excess(estimators: FloatArray, reduced: FloatArray, cohort: Cohort) -> Floa
     variance = float((residual**2).sum()) / (len(residual) - columns.shape[1])
     noise = variance * ((estimators @ columns) ** 2).sum(axis=(1, 2))
     flat = vectors.reshape(len(vectors), -1)
-    return vectors - without_noise(flat, noise).reshape(vectors.shape)
+    own = ((estimators @ cohort.coefficients) ** 2).sum(axis=(1, 2))
+    is_long = own > variance * (estimators**2).sum(axis=(1, 2))
+    return vectors - without_noise(flat, noise).reshape(vectors.shape), is_long
 
 
 def _aligned(centred: FloatArray) -> FloatArray:
@@ -232,7 +233,7 @@ def compare_pairs(
         )
     batches: list[FloatArray] = []
     angles: list[float] = []
-    excess = _excess(estimator[:, None], reduced, cohort)[:, 0]
+    excess, is_long = _excess(estimator[:, None], reduced, cohort)
     one, other = np.array(groups.pairs).T
     for vectors in _permuted(estimator, reduced, cohort, residuals, permutations, seed, progress):
         values = [np.linalg.norm(vectors[:, one] - vectors[:, other], axis=2).T]
@@ -241,13 +242,13 @@ def compare_pairs(
             values.append(np.abs(length[:, one] - length[:, other]).T)
             angles = angles if batches else [_angle(vectors[0, a], vectors[0, b]) for a, b in groups.pairs]
             if residuals == "scaled":
-                vectors[bool(not batches) :] -= excess
+                vectors[bool(not batches) :] -= excess[:, 0]
             values.append(_directions(vectors, 1.0 / (estimator**2).sum(axis=1), groups, residuals))
         batches.append(np.array(values))
     return _pairs_result(
         "pairwise", cohort, groups, batches, names, group, labels,
         {"formula": formula, "group": list(group), "covariate": covariate, "null": null, "residuals": residuals,
-         "permutations": permutations, "seed": seed}, angles=angles,
+         "permutations": permutations, "seed": seed}, angles=angles, is_long=is_long,
     )  # fmt: skip
 
 
@@ -532,23 +533,26 @@ def _permuted(
 def _pairs_result(
     name: str, cohort: Cohort, groups: Groups, batches: Sequence[FloatArray], names: Sequence[str],
     classes: Sequence[str], reduced_model: tuple[str, ...], settings: dict[str, Any], figures: tuple[Part, ...] = (),
-    angles: Sequence[float] = (),
+    angles: Sequence[float] = (), is_long: Sequence[bool] | BoolArray = (),
 ) -> ShapeTestResult:  # fmt: skip
     """Return the result of statistics of pairs of groups, from batches (statistics, pairs, b) of permutations.
 
-    `angles` are the values of angles, whose arrangements are of another statistic unless residuals are raw.
+    `angles` are the values of angles, whose arrangements are of another statistic unless residuals are raw. Their p is
+    not known then, nor if no vector of the pair `is_long`, that is longer than its noise.
     """
     values = np.concatenate(batches, axis=2)
     statistics = [
         one for name_of_one, own in zip(names, values, strict=False)
         for one in pair_statistics(name_of_one, own, groups.pair_names)
     ]  # fmt: skip
-    if settings["residuals"] == "scaled":
-        known = dict(zip(groups.pair_names, angles, strict=False))
-        statistics = [
-            replace(one, value=known[one.tested], arrangements=np.zeros(0)) if one.name.startswith("angle") else one
-            for one in statistics
-        ]
+    raw, known = settings["residuals"] == "raw", dict(zip(groups.pair_names, angles, strict=False))
+    for k, one in enumerate(statistics):
+        if one.name.startswith("angle"):
+            a, b = groups.pairs[groups.pair_names.index(one.tested)]
+            unknown = "raw residuals" if raw else None if is_long[a] or is_long[b] else "short vectors"
+            one = one if raw else replace(one, value=known[one.tested], arrangements=np.zeros(0))
+            short = unknown == "short vectors"
+            statistics[k] = replace(one, p=None if unknown else one.p, z=None if short else one.z, unknown_p=unknown)
     rows = [(one.name, one.tested, one.value,
              float(np.quantile(one.arrangements, 1 - LEVEL)) if len(one.arrangements) else None, one.z, one.p)
             for one in statistics]  # fmt: skip
