@@ -193,6 +193,15 @@ def test_f_of_means_is_that_of_compare_with_equal_and_unequal_variances() -> Non
         assert found.statistic(name).p == pytest.approx(expected.p, abs=0.1)
 
 
+def test_the_form_of_covariance_is_not_compared_in_one_component() -> None:
+    one, two = (
+        compare_means_and_covariances(simulated((6, 6)), group=GROUP, components=k, permutations=20) for k in (1, 2)
+    )
+    assert {item.name for item in two.statistics} - {item.name for item in one.statistics} == {
+        "Riemannian distance of relative covariance"
+    }
+
+
 def test_covariance_that_differs_in_scale_or_in_form_is_found_by_its_statistic() -> None:
     scaled = compare_means_and_covariances(simulated((40, 40), scales=(1.0, 2.0)), group=GROUP, permutations=200)
     assert scaled.statistic("Riemannian distance of covariance").p == pytest.approx(1 / 200)

@@ -378,3 +378,15 @@ def test_p_of_an_angle_is_not_known_unless_a_change_is_longer_than_its_noise(tur
                 assert "p not known: neither vector is longer than its noise" in summary
                 assert "p not known" in repr(result)
     assert unknown[6.0] == 0 and 0 < unknown[0.0] < 20
+
+
+def test_too_few_different_arrangements_for_a_small_p_are_stated() -> None:
+    shapes = np.random.default_rng(0).normal(size=(12, 6, 3))
+    for subjects, is_limited in ((5, True), (6, False)):
+        count = 2 * subjects
+        table = {"subject": [f"s{k // 2}" for k in range(count)], "session": [f"v{k % 2}" for k in range(count)]}
+        given = Cohort.of_shapes(shapes[:count], table, align=False)
+        result = measure_repeatability(given, session="session", permutations=400)
+        [sentence] = [one for one in shape_test_report(result).summary if one.startswith("session: F")]
+        # The sessions of n subjects can be exchanged in 2^n ways, of which pairs have the same F.
+        assert ("no p below 0.0" in sentence) == is_limited

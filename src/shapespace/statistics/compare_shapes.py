@@ -632,9 +632,8 @@ def term_tests(
             f = _error_f(stratum, term, error, config)
         elif units is not None and (config.variances == "unequal" or units.is_comparable):
             # Columns of the reduced model are not tested; each unit has its own variance.
-            other = units.estimate(
-                units.own(term, reduced), [term], reduced, config.permutations, config.seed, term.label
-            ).statistic()
+            flips = units.flips([term], reduced, config.permutations, config.seed, term.label)
+            other = flips.estimate(units.own(term, reduced)).statistic()
         allowing = unequal and other is not None
         if other is not None and allowing:
             f, other = other, f
@@ -925,8 +924,8 @@ def _tested_unequal(
         own = (direction / max(float(np.linalg.norm(direction)), 1e-300))[:, None]
         label = f"{ends.low} to {ends.high}"
         run = (tested, ends.reduced, config.permutations, config.seed, label)
-        estimate = units.estimate(own, *run)
-        weighted = estimate if root is None else replace(units, shapes=units.shapes @ root).estimate(own, *run)
+        estimate = units.flips(*run).estimate(own)
+        weighted = estimate if root is None else replace(units, shapes=units.shapes @ root).flips(*run).estimate(own)
         statistics.append(weighted.statistic())
         changes.append(direction @ stratum.shapes)
         maps += (

@@ -43,7 +43,7 @@ with 16 (five subjects) flips keep the level of 5 %, with 8 not (docs/compare.md
 FULL_LEVERAGE = 1e-8
 """Rows with 1 - leverage below this limit are fitted exactly, so their residual is zero."""
 _BATCH = 50
-"""Number of sign flips drawn from one seed."""
+"""Number of sign flips drawn from one seed, and of vertices tested together."""
 _STREAM = 3  # separates these permutations from those of other tests with the same seed
 _FLOOR = 1e-12  # share of the total; a variance below is rounding
 _LEAST = 1e-6  # degrees of freedom; weights of classes that have no more than one stay above 0
@@ -328,7 +328,6 @@ def unequal_variances(
     permutations: int,
     seed: int,
     where: str,
-    area: FloatArray | float = 1.0,
 ) -> UnequalVariances:
     """Return the sign flips with which a term of a linear model is tested.
 
@@ -340,7 +339,6 @@ def unequal_variances(
         permutations: number of sign flips, the observed data among them.
         seed: of these.
         where: name of the term, for messages.
-        area: (K,) weights of the coordinates in the variances of the classes.
 
     Raises:
         InputError: a row that the model fits exactly, as the only member of a class.
@@ -354,7 +352,7 @@ def unequal_variances(
         )
     weights, rotated = np.ones(len(shapes)), list[Codes]()
     if groups is not None:
-        weights = _class_weights(((shapes - full @ (full.T @ shapes)) ** 2 * area).sum(axis=1), leverage, groups)
+        weights = _class_weights(((shapes - full @ (full.T @ shapes)) ** 2).sum(axis=1), leverage, groups)
         counts = np.bincount(groups)
         rotated = [np.flatnonzero(groups == k) for k in np.flatnonzero(2.0 ** (counts - 1) < FEWEST_PATTERNS)]
     residual, own = weighted_residual(shapes, reduced, weights)
@@ -386,7 +384,7 @@ def weighted_residual(shapes: FloatArray, columns: FloatArray, weights: FloatArr
 def welch_flips(
     maps: FloatArray, second: npt.NDArray[np.bool_], area: FloatArray, permutations: int, seed: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return Welch's t (V,) of two groups, its largest |t| and the whole squared difference in each sign flip.
+    """Return Welch's t (V,) of two groups, its largest |t| and that of the whole difference in each sign flip.
 
     Args:
         maps: (N, V) of the subjects; each group has two or more.
@@ -397,29 +395,23 @@ def welch_flips(
 
     Returns:
         t: (V,) as observed.
-        arrangements: (2, P) the largest |t|, and the squared difference by its variance; the observed ones first.
+        arrangements: (2, P) the largest |t|, and the whole difference by its standard error; the observed ones first.
     """
-    members = np.stack([~second, second]).astype(np.float64)
-    counts = members.sum(axis=1)[:, None]
+    full = np.column_stack([~second, second]) / np.sqrt(np.where(second, second.sum(), (~second).sum()))[:, None]
     mean = np.full((len(maps), 1), len(maps) ** -0.5)
-    full = members.T / np.sqrt(counts.T)
-    flips = unequal_variances(maps, full, mean, second.astype(np.intp), permutations, seed, "groups", area)
-    squares = members @ flips.residual**2
-    scaled = members @ (flips.scale[:, None] * flips.residual) ** 2
-    observed = np.zeros(maps.shape[1])
-    arrangements: list[FloatArray] = []
-    for start, factors in flips.signs():
-        means = [(factors * one) @ flips.residual / count for one, count in zip(members, counts[:, 0], strict=True)]
-        variance = np.zeros_like(means[0])
-        for mean_k, own, first, count in zip(means, scaled, squares, counts[:, 0], strict=True):
-            own_squares = np.repeat(own[None], len(factors), axis=0)
-            if start == 0:
-                own_squares[0] = first
-            within = np.maximum(own_squares - count * mean_k**2, _FLOOR * own_squares)
-            variance += within / (count - 1.0) / count
-        difference = means[1] - means[0]
-        t = np.divide(difference, np.sqrt(variance), out=np.zeros_like(difference), where=variance > 0)
-        statistic = (difference**2 @ area) / np.maximum(variance @ area, 1e-300)
-        observed = t[0] if start == 0 else observed
-        arrangements.append(np.stack([np.abs(t).max(axis=1), statistic]))
-    return observed, np.hstack(arrangements)
+    own = np.linalg.svd(full - mean @ (mean.T @ full), full_matrices=False)[0][:, :1]
+
+    def estimate(values: FloatArray) -> Estimate:
+        groups = second.astype(np.intp)
+        return unequal_variances(values, full, mean, groups, permutations, seed, "groups").estimate(own)
+
+    # The rows span no more dimensions than there are rows.
+    columns, rows = np.linalg.qr(maps.T)
+    at_vertices, squares, largest = estimate(rows.T), np.empty(maps.shape[1]), np.zeros(permutations)
+    for start in range(0, len(columns), _BATCH):
+        found = at_vertices.statistic_of(columns[start : start + _BATCH].T, 1, 0, permutations)
+        squares[start : start + _BATCH] = found[0]
+        largest = np.maximum(largest, found.max(axis=1))
+    whole = estimate(np.linalg.qr((maps * np.sqrt(area)).T)[1].T).statistic()
+    sign = np.sign(maps.T @ own[:, 0]) * np.sign(own[second.argmax(), 0])
+    return sign * np.sqrt(squares), np.sqrt(np.stack([largest, whole]))

@@ -13,6 +13,8 @@ from shapespace.report.analyses.shape_data import add_shape_data, model_hashes
 from shapespace.schemas import Counts, HistogramPart, Part, TablePart
 from shapespace.statistics.effect_size import permutation_p
 from shapespace.statistics.shape_tests.shape_test_result import ShapeTestResult, Statistic
+from shapespace.statistics.tolerances import TIE
+from shapespace.types import FloatArray
 
 _BINS = 40  # bins of a histogram of thousands of permutations
 _MOST_SENTENCES = 10
@@ -68,6 +70,8 @@ def _sentence(one: Statistic, level: float) -> str:
     if one.p is not None:
         figures.append(f"p {one.p:.3g}")
         figures.append("significant" if one.p <= level else "not significant")
+        if len(one.arrangements) and (least := _least_p(one.arrangements)) > level:
+            figures.append(f"no p below {least:.2g} is possible with so few arrangements that differ")
     if one.unknown_p == "short vectors":
         figures.append("p not known: neither vector is longer than its noise, so that no direction is determined")
     if one.unknown_p == "raw residuals":
@@ -77,6 +81,12 @@ def _sentence(one: Statistic, level: float) -> str:
         )
     text = ", ".join(figures)
     return f"{one.tested}: {text}" if one.tested else f"{text[:1].upper()}{text[1:]}"
+
+
+def _least_p(arrangements: FloatArray) -> float:
+    """Return the share of the arrangements that have the most extreme value of all, at the end where it is smaller."""
+    ends = arrangements.min(), arrangements.max()
+    return min(float((np.abs(arrangements - end) <= TIE * abs(end)).mean()) for end in ends)
 
 
 def _statistics_table(result: ShapeTestResult) -> TablePart:

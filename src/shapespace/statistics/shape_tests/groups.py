@@ -208,7 +208,8 @@ def compare_means_and_covariances(
             Statistic.of("F of means", f),
             Statistic.of("F of means, unequal covariances", flips.estimate(along).statistic()),
             *_pairs("Riemannian distance of covariance", groups, values[2::3], weights),
-            *_pairs("Riemannian distance of relative covariance", groups, values[3::3], weights),
+            # One component has no covariances but a scale.
+            *(_pairs("Riemannian distance of relative covariance", groups, values[3::3], weights) if used > 1 else ()),
             *_pairs("Procrustes distance of means", groups, values[1::3]),
         ],
         settings={"group": list(group), "components": used, "permutations": permutations, "seed": seed},
