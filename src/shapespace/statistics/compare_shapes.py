@@ -687,11 +687,10 @@ def _error_f(stratum: Stratum, term: Term, error: Term, config: CompareConfig) -
 
 def _summarise_stratum(stratum: Stratum, tests: Sequence[TermTest], among: Sequence[Stratum]) -> StratumSummary:
     unequal = any(test.unequal_variances for test in tests if test.stratum == stratum.name)
-    residual = stratum.residual(stratum.terms)
     return StratumSummary(
         stratum=stratum.name,
         df=stratum.df_error,
-        squares=float((residual**2).sum()),
+        squares=float((stratum.residual(stratum.terms) ** 2).sum()),
         df_total=len(stratum.matrix) - stratum.removed,
         squares_total=float((stratum.shapes**2).sum()),
         log_arrangements=min(one.fewest_log_arrangements(flips=unequal) for one in (stratum, *among)),

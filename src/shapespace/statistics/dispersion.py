@@ -35,8 +35,8 @@ Variances: TypeAlias = Literal["auto", "equal", "unequal"]
 VARIANCES: tuple[Variances, ...] = ("auto", "equal", "unequal")
 """Of the classes, in tests of means."""
 
-FEWEST_OF_GROUP = 4
-"""Subjects per class below which tests with unequal variances find little: 0 to 4 % false positives at 5 % (normal)."""
+FEWEST_OF_GROUP = 3
+"""Smallest class for which the level of tests with unequal variances was measured (docs/compare.md)."""
 FEWEST_PATTERNS = 10
 """Different sign flips of a class below which its residuals are rotated, as no p below 10 % can come from them alone:
 with 16 (five subjects) flips keep the level of 5 %, with 8 not (docs/compare.md; normal and t4 residuals)."""
@@ -242,8 +242,7 @@ class UnequalVariances:
         """Return the (permutations, m, K) products of `basis` (n, m) with the flipped residuals."""
         out = np.empty((self.permutations, basis.shape[1], self.residual.shape[1]))
         for start, factors in self.signs():
-            for column in range(basis.shape[1]):
-                out[start : start + len(factors), column] = (factors * basis[:, column]) @ self.residual
+            out[start : start + len(factors)] = (factors[:, None] * basis.T) @ self.residual
         return out
 
     @cached_property
@@ -397,7 +396,8 @@ def welch_flips(
         t: (V,) as observed.
         arrangements: (2, P) the largest |t|, and the whole difference by its standard error; the observed ones first.
     """
-    full = np.column_stack([~second, second]) / np.sqrt(np.where(second, second.sum(), (~second).sum()))[:, None]
+    members = np.column_stack([~second, second]).astype(np.float64)
+    full = members / np.sqrt(members.sum(axis=0))
     mean = np.full((len(maps), 1), len(maps) ** -0.5)
     own = np.linalg.svd(full - mean @ (mean.T @ full), full_matrices=False)[0][:, :1]
 

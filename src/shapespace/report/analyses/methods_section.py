@@ -16,7 +16,7 @@ from shapespace.schemas import (
     TestScheme,
     TextPart,
 )
-from shapespace.statistics.dispersion import FEWEST_OF_GROUP
+from shapespace.statistics.dispersion import FEWEST_OF_GROUP, FEWEST_PATTERNS
 from shapespace.statistics.methods import REDUCED_OF_EACH_TERM, SCAN_OF_SUBJECT
 from shapespace.store.review_text import review_summary
 
@@ -310,7 +310,9 @@ def _exchangeability(methods: Methods) -> str:
     if any(test.unequal_variances for test in methods.tests):
         sentences.append(
             "tests with unequal variances flip the signs of residuals of independent subjects, whose covariances may "
-            f"differ between groups; their level was measured for classes of {FEWEST_OF_GROUP} subjects or more"
+            f"differ between groups; residuals of classes with fewer than {FEWEST_PATTERNS} different flips are "
+            "rotated, which assumes that they are normal; the level was measured for classes of "
+            f"{FEWEST_OF_GROUP} subjects or more"
         )
     return "; ".join(sentences) + "."
 

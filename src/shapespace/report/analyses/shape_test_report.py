@@ -22,7 +22,7 @@ _MOST_SENTENCES = 10
 _MOST_HISTOGRAMS = 3
 """Histograms of the first statistics; more of them fill the page."""
 
-_HAS_UNIT = re.compile("Procrustes|^distance|length|difference of (root )?disparity")
+_HAS_UNIT = re.compile("Procrustes|^distance|length|difference of disparity")
 """Names of statistics that have the unit of the cohort, or its square."""
 
 
@@ -36,7 +36,8 @@ def shape_test_report(result: ShapeTestResult) -> AnalysisReport:
         summary=tuple(_sentences(result)),
         parts=(_statistics_table(result), *result.tables, *result.figures, *_histograms(result),
                *methods_parts(methods)),
-        tables={"statistics.csv": _rows(result), **{_file_name(one): _cells(one) for one in result.tables}},
+        tables={"statistics.csv": _rows(result),
+                **{_file_name(one): ([own.name for own in one.columns], one.rows) for one in result.tables}},
         arrays=result.arrays,
         notes=result.cohort.notes,
         settings={**result.settings, "shapes": len(result.cohort)},
@@ -119,7 +120,3 @@ def _rows(result: ShapeTestResult) -> Rows:
 def _file_name(table: TablePart) -> str:
     words = re.sub(r"[^a-z0-9]+", "_", (table.title or "table").lower()).strip("_")
     return f"{words}.csv"
-
-
-def _cells(table: TablePart) -> Rows:
-    return tuple(column.name for column in table.columns), table.rows

@@ -38,7 +38,6 @@ _ITERATIONS = 50  # of a spatial median; its error is then far below the standar
 _BISECTIONS = 55  # halvings of an interval until float64 numbers are equal
 _TINY = 1e-7  # smallest score, in roots of the scatter; a smaller one changes no classification
 _SMALLEST = 1e-300  # avoids divisions by zero
-_DIFFERENCE = "difference of disparity"
 
 
 def compare_disparity(
@@ -90,12 +89,11 @@ def compare_disparity(
         Statistic(name=name, tested=one, value=float(value), low=float(low * value), high=float(high * value))
         for one, value, (low, high) in zip(groups.names, variances[0], _intervals(groups, squares, seed), strict=True)
     ]
-    compared, label = (np.sqrt(variances), "difference of root disparity") if scaled else (variances, _DIFFERENCE)
-    differences = np.abs([compared[:, a] - compared[:, b] for a, b in groups.pairs])
+    differences = np.abs([variances[:, a] - variances[:, b] for a, b in groups.pairs])
     rows = [(s.tested, int(count), s.value, s.low, s.high) for s, count in zip(limits, groups.counts, strict=True)]
     return ShapeTestResult(
         name="disparity", cohort=cohort, classes=group,
-        statistics=[*_pairs(label, groups, differences), *limits],
+        statistics=[*_pairs("difference of disparity", groups, differences), *limits],
         settings={"group": list(group), "formula": formula, "partial": partial, "residuals": residuals,
                   "permutations": permutations, "seed": seed},
         tables=(TablePart.of("Disparity", ("group", "shapes", name, "lower 95 %", "upper 95 %"), rows),),

@@ -96,8 +96,7 @@ def compare_trajectories(
     steps = estimator.reshape(g, p, -1) - estimator.reshape(g, p, -1).mean(axis=1, keepdims=True)
     excess, is_long = _excess(steps, reduced, cohort)
     batches: list[FloatArray] = []
-    angles: list[float] = []
-    observed = np.zeros(0)
+    observed, directions = np.zeros(0), np.zeros((g, 1))
     for means in _permuted(estimator, reduced, cohort, residuals, permutations, seed, progress):
         paths = means.reshape(len(means), g, p, -1)
         observed = observed if observed.size else paths[0]
@@ -109,7 +108,7 @@ def compare_trajectories(
         one, other = np.array(groups.pairs).T
         values = [np.abs(length[:, one] - length[:, other]).T,
                   _directions(axis, 1.0 / (steps**2).sum(axis=(1, 2)), groups, residuals)]  # fmt: skip
-        angles = angles if batches else [_angle(axis[0, a], axis[0, b]) for a, b in groups.pairs]
+        directions = directions if batches else axis[0]
         if p > 2:
             aligned = _aligned(centred)
             values.append(np.linalg.norm(aligned[:, one] - aligned[:, other], axis=(2, 3)).T)
@@ -127,7 +126,7 @@ def compare_trajectories(
     return _pairs_result(
         "trajectory", cohort, groups, batches, names, (*group, points), labels,
         {"group": list(group), "points": list(stages), "formula": formula, "null": null, "residuals": residuals,
-         "permutations": permutations, "seed": seed}, (figure,), angles, is_long,
+         "permutations": permutations, "seed": seed}, (figure,), directions=directions, is_long=is_long,
     )  # fmt: skip
 
 
@@ -146,10 +145,6 @@ def _directions(vectors: FloatArray, weights: FloatArray, groups: Groups, residu
     return np.array(
         [off_common_direction(vectors[:, a], vectors[:, b], weights[a], weights[b]) for a, b in groups.pairs]
     )
-
-
-def _angle(one: FloatArray, other: FloatArray) -> float:
-    return float(angles_between(one[None], other[None])[0])
 
 
 def _excess(estimators: FloatArray, reduced: FloatArray, cohort: Cohort) -> tuple[FloatArray, BoolArray]:
@@ -232,7 +227,7 @@ def compare_pairs(
             f"{'the interaction of the groups with the covariate' if covariate else 'the groups'}."
         )
     batches: list[FloatArray] = []
-    angles: list[float] = []
+    directions = estimator @ cohort.coefficients
     excess, is_long = _excess(estimator[:, None], reduced, cohort)
     one, other = np.array(groups.pairs).T
     for vectors in _permuted(estimator, reduced, cohort, residuals, permutations, seed, progress):
@@ -240,7 +235,6 @@ def compare_pairs(
         if covariate is not None:
             length = np.linalg.norm(vectors, axis=2)
             values.append(np.abs(length[:, one] - length[:, other]).T)
-            angles = angles if batches else [_angle(vectors[0, a], vectors[0, b]) for a, b in groups.pairs]
             if residuals == "scaled":
                 vectors[bool(not batches) :] -= excess[:, 0]
             values.append(_directions(vectors, 1.0 / (estimator**2).sum(axis=1), groups, residuals))
@@ -248,7 +242,7 @@ def compare_pairs(
     return _pairs_result(
         "pairwise", cohort, groups, batches, names, group, labels,
         {"formula": formula, "group": list(group), "covariate": covariate, "null": null, "residuals": residuals,
-         "permutations": permutations, "seed": seed}, angles=angles, is_long=is_long,
+         "permutations": permutations, "seed": seed}, directions=directions, is_long=is_long,
     )  # fmt: skip
 
 
@@ -533,26 +527,27 @@ def _permuted(
 def _pairs_result(
     name: str, cohort: Cohort, groups: Groups, batches: Sequence[FloatArray], names: Sequence[str],
     classes: Sequence[str], reduced_model: tuple[str, ...], settings: dict[str, Any], figures: tuple[Part, ...] = (),
-    angles: Sequence[float] = (), is_long: Sequence[bool] | BoolArray = (),
+    *, directions: FloatArray, is_long: BoolArray,
 ) -> ShapeTestResult:  # fmt: skip
     """Return the result of statistics of pairs of groups, from batches (statistics, pairs, b) of permutations.
 
-    `angles` are the values of angles, whose arrangements are of another statistic unless residuals are raw. Their p is
-    not known then, nor if no vector of the pair `is_long`, that is longer than its noise.
+    Angles are between `directions` (G, K); their arrangements are of another statistic unless residuals are raw. Their
+    p is not known for raw residuals, nor if no vector of the pair `is_long` (G,), that is longer than its noise.
     """
     values = np.concatenate(batches, axis=2)
     statistics = [
         one for name_of_one, own in zip(names, values, strict=False)
         for one in pair_statistics(name_of_one, own, groups.pair_names)
     ]  # fmt: skip
-    raw, known = settings["residuals"] == "raw", dict(zip(groups.pair_names, angles, strict=False))
     for k, one in enumerate(statistics):
         if one.name.startswith("angle"):
-            a, b = groups.pairs[groups.pair_names.index(one.tested)]
-            unknown = "raw residuals" if raw else None if is_long[a] or is_long[b] else "short vectors"
-            one = one if raw else replace(one, value=known[one.tested], arrangements=np.zeros(0))
-            short = unknown == "short vectors"
-            statistics[k] = replace(one, p=None if unknown else one.p, z=None if short else one.z, unknown_p=unknown)
+            pair = list(groups.pairs[groups.pair_names.index(one.tested)])
+            if settings["residuals"] == "raw":
+                statistics[k] = replace(one, p=None, unknown_p="raw residuals")
+                continue
+            angle = float(angles_between(*directions[pair][:, None])[0])
+            one = replace(one, value=angle, arrangements=np.zeros(0))
+            statistics[k] = one if is_long[pair].any() else replace(one, p=None, z=None, unknown_p="short vectors")
     rows = [(one.name, one.tested, one.value,
              float(np.quantile(one.arrangements, 1 - LEVEL)) if len(one.arrangements) else None, one.z, one.p)
             for one in statistics]  # fmt: skip

@@ -47,8 +47,7 @@ SHAPE_TESTS: tuple[ShapeTest, ...] = (
         name="disparity",
         summary="compare the disparity (Procrustes variance) of groups, in total or about a model",
         function="groups.compare_disparity",
-        statistics="Procrustes variance or partial disparity of each group, and the absolute difference of each pair, "
-        "with a formula that of their roots",
+        statistics="Procrustes variance or partial disparity of each group, and the absolute difference of each pair",
         references=(
             "Zelditch, Swiderski and Sheets (2012) Geometric Morphometrics for Biologists, 2nd edition, Academic.",
             "Foote (1993) Paleobiology 19, 403-419.",
