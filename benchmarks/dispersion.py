@@ -20,8 +20,8 @@ import numpy as np
 import shapespace.statistics.compare_shapes as compare_module
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.table import Table
+from shapespace.statistics.compare_formula import Coding, design_of
 from shapespace.statistics.compare_formula import Design as FormulaDesign
-from shapespace.statistics.compare_formula import design_of
 from shapespace.statistics.compare_shapes import CompareConfig, compare, term_tests
 from shapespace.statistics.compare_unequal import units_of
 from shapespace.statistics.compare_within import strata_of
@@ -94,6 +94,8 @@ AUTO = (
     Design("5, 5, 25, 25, 25, SD × 2, 2, 1, 1, 1", (5, 5, 25, 25, 25), (2, 2, 1, 1, 1)),
     Design("10 v 30 subjects, 2 scans each, SD × 1.5", (10, 30), (1.5, 1), scans=2),
     Design("8 v 24 subjects, 3 scans each, SD × 1.2, with age", (8, 24), (1.2, 1), covariate=True, scans=3),
+    Design("4 v 16, equal SD", (4, 16), (1, 1)),
+    Design("3 v 15, smaller group SD × 3", (3, 15), (3, 1)),
     Design("5 v 25, equal SD, a difference", (5, 25), (1, 1), effect=1.5),
     Design("6 v 12, equal SD, a difference", (6, 12), (1, 1), effect=1.6),
     Design("15 v 30, equal SD, with age, a difference", (15, 30), (1, 1), effect=1.0, covariate=True),
@@ -204,10 +206,10 @@ _contrasts: dict[Any, FloatArray] = {}
 _contrast = FormulaDesign.contrast
 
 
-def _design_once(formula: str, cells: Any) -> FormulaDesign:
-    key = (formula, tuple(cells.columns["group"]))
+def _design_once(formula: str, cells: Any, coding: Coding = "deviation") -> FormulaDesign:
+    key = (formula, coding, tuple(cells.columns["group"]))
     if key not in _designs:
-        _designs[key] = design_of(formula, cells)
+        _designs[key] = design_of(formula, cells, coding)
     return _designs[key]
 
 

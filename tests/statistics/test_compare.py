@@ -799,10 +799,10 @@ def test_random_terms_may_stand_in_brackets() -> None:
     assert random_effects_of("(1 + time | subject)", table) == random_effects_of("1 + time | subject", table)
 
 
-def test_unequal_variances_warn_about_a_class_of_fewer_than_five() -> None:
-    shapes = unequal_groups().take(range(2, 24))
+def test_unequal_variances_warn_about_a_class_of_fewer_than_three() -> None:
+    shapes = unequal_groups().take(range(4, 24))
     found = compare(shapes, "~ sex", CompareConfig(permutations=40, maps=False, variances="unequal"))
-    assert compare_warnings(found)[0].startswith("Warning: sex has a class of 4 subjects")
+    assert compare_warnings(found)[0].startswith("Warning: sex has a class of 2 subjects")
 
 
 def test_means_of_subjects_and_their_contrasts_between_groups_allow_unequal_variances() -> None:
@@ -901,3 +901,20 @@ def test_z_by_logarithms_is_an_option() -> None:
         assert test.z == effect_size(test.arrangements, kind)
     with pytest.raises(InputError, match="no effect size 'cube'"):
         CompareConfig(effect_size="cube")  # type: ignore[arg-type]
+
+
+def test_whether_changes_have_one_direction_is_not_known_where_neither_is_longer_than_its_noise() -> None:
+    unknown = {0.0: 0, 6.0: 0}
+    for seed in range(8):
+        for length in unknown:
+            shapes = np.random.default_rng(seed).normal(size=(24, 12, 3))
+            shapes[[k // 2 % 2 == 1 for k in range(24)], 0, 0] += length
+            table = {"group": ["a", "b"] * 12, "time": [f"t{k // 2 % 2}" for k in range(24)]}
+            cohort = Cohort.of_shapes(shapes, table, align=False)
+            found = compare(cohort, "~ group * time", CompareConfig(permutations=20, maps=False))
+            [angle] = [one for one in found.angles if one.first.startswith("time t0 to t1, group")]
+            assert (angle.p is None) == (angle.unknown_p is not None)
+            unknown[length] += angle.p is None
+            warned = [one for one in compare_warnings(found) if one.startswith("Whether the changes time t0 to t1")]
+            assert len(warned) == (angle.p is None)
+    assert unknown[6.0] == 0 and 0 < unknown[0.0] < 8

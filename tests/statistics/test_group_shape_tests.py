@@ -74,7 +74,7 @@ def test_disparities_and_p_are_those_of_geomorph(
         if data == "plethodon"
         else cohort_of(np.array(geomorph_reference["pupfish_coords"]), geomorph_reference["pupfish_table"])
     )
-    found = compare_disparity(cohort, group=group, formula=formula, permutations=permutations)
+    found = compare_disparity(cohort, group=group, formula=formula, residuals="raw", permutations=permutations)
     variances = [found.statistic("Procrustes variance", name).value for name in expected["groups"]]
     assert variances == pytest.approx(expected["var"], rel=1e-6)
     if data == "pupfish":
@@ -97,16 +97,54 @@ def test_partial_disparities_add_up_to_the_total() -> None:
     assert parts[0] == pytest.approx(float((centred[:5] ** 2).sum()) / 27)
 
 
-def test_leverage_is_corrected_on_request_and_repeated_columns_are_harmless() -> None:
+def test_scaled_residuals_have_the_variance_of_errors_and_repeated_columns_are_harmless() -> None:
     pytest.importorskip("formulaic")
     cohort = simulated((5, 20), shift=3.0)
-    plain = compare_disparity(cohort, group=GROUP, formula="~ group", permutations=20)
-    corrected = compare_disparity(cohort, group=GROUP, formula="~ group", correct_leverage=True, permutations=20)
+    raw = compare_disparity(cohort, group=GROUP, formula="~ group", residuals="raw", permutations=20)
+    scaled = compare_disparity(cohort, group=GROUP, formula="~ group", permutations=20)
+    variances: list[float] = []
     for name, n in (("a", 5), ("b", 20)):
-        variance = plain.statistic("Procrustes variance", name).value
-        assert corrected.statistic("Procrustes variance", name).value == pytest.approx(variance * n / (n - 1))
+        variance = raw.statistic("Procrustes variance", name).value
+        variances.append(scaled.statistic("Procrustes variance", name).value)
+        assert variances[-1] == pytest.approx(variance * n / (n - 1))
         rows = cohort.coefficients[codes_of(cohort) == "ab".index(name)]
         assert variance == pytest.approx(float(rows.var(axis=0).sum()))
+    assert scaled.statistic("difference of disparity").value == pytest.approx(abs(variances[0] - variances[1]))
+
+
+def test_each_permutation_of_scaled_residuals_is_that_of_a_plain_loop_over_refitted_models() -> None:
+    pytest.importorskip("formulaic")
+    cohort = simulated((5, 9), shift=1.0)
+    found = compare_disparity(cohort, group=GROUP, formula="~ group + size", permutations=60, seed=3).statistics[0]
+    codes = codes_of(cohort)
+    columns = np.column_stack([codes == 0, codes == 1, cohort.sizes_mm]).astype(float)
+    off = np.eye(14) - columns @ np.linalg.pinv(columns)
+    free = np.diag(off)
+    residual = off @ cohort.coefficients
+    errors = residual / np.sqrt(free)[:, None]
+    for k, rows in enumerate(np.concatenate([rows for _, rows in orders(14, 60, 3)])):
+        # Shape j has the place rows[j].
+        placed = np.empty_like(errors)
+        placed[rows] = errors
+        squares = ((off @ placed if k else residual) ** 2).sum(axis=1) / free
+        first, second = (float(squares[codes == group].mean()) for group in (0, 1))
+        assert found.arrangements[k] == pytest.approx(abs(first - second))
+
+
+def test_variances_about_group_means_rarely_differ_in_small_groups_of_equal_variance() -> None:
+    pytest.importorskip("formulaic")
+    wrong = {"scaled": 0, "raw": 0}
+    groups = {"group": ["a"] * 5 + ["b"] * 25}
+    for seed in range(60):
+        cohort = cohort_of(np.random.default_rng(seed).normal(size=(30, 30)), groups)
+        for residuals in ("scaled", "raw"):
+            found = compare_disparity(
+                cohort, group=GROUP, formula="~ group", residuals=residuals, permutations=60, seed=seed
+            )
+            p = found.statistics[0].p
+            assert p is not None
+            wrong[residuals] += p <= 0.05
+    assert wrong["scaled"] <= 8 and wrong["raw"] > 12  # 8 are 3 standard errors above 5 %
 
 
 def test_intervals_of_disparity_cover_the_variance() -> None:
@@ -152,6 +190,15 @@ def test_f_of_means_is_that_of_compare_with_equal_and_unequal_variances() -> Non
         expected = compare(cohort, "~ group", options).test("group")
         assert found.statistic(name).value == pytest.approx(expected.f, rel=1e-9)
         assert found.statistic(name).p == pytest.approx(expected.p, abs=0.1)
+
+
+def test_the_form_of_covariance_is_not_compared_in_one_component() -> None:
+    one, two = (
+        compare_means_and_covariances(simulated((6, 6)), group=GROUP, components=k, permutations=20) for k in (1, 2)
+    )
+    assert {item.name for item in two.statistics} - {item.name for item in one.statistics} == {
+        "Riemannian distance of relative covariance"
+    }
 
 
 def test_covariance_that_differs_in_scale_or_in_form_is_found_by_its_statistic() -> None:

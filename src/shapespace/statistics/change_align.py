@@ -133,7 +133,9 @@ def align_robustly(moving: FloatArray, fixed: FloatArray, area: FloatArray) -> t
     T = min((_trimmed(p, q, a, end.chosen, _STEPS) for end in ends[:_GO_ON]), key=lambda end: end.squares).T
     residual = np.linalg.norm(T.apply(p) - q, axis=1)
     size_mm = float(np.linalg.norm(np.ptp(fixed, axis=0)))
-    spread_mm = max(_quantile(residual, a, KEPT_SHARE) / float(chi.ppf(KEPT_SHARE, 3)), _SMALLEST * size_mm)
+    order = np.argsort(residual, kind="stable")
+    quantile = float(residual[order][np.searchsorted(np.cumsum(a[order]), KEPT_SHARE)])
+    spread_mm = max(quantile / float(chi.ppf(KEPT_SHARE, 3)), _SMALLEST * size_mm)
     weights = area
     for _ in range(_ROUNDS):
         residual = np.linalg.norm(T.apply(moving) - fixed, axis=1)
@@ -180,8 +182,3 @@ def _trimmed(p: FloatArray, q: FloatArray, area: FloatArray, chosen: IntArray, s
             break
         squares, chosen = now, nearest
     return _End(T, chosen, squares)
-
-
-def _quantile(values: FloatArray, weights: FloatArray, share: float) -> float:
-    order = np.argsort(values, kind="stable")
-    return float(values[order][np.searchsorted(np.cumsum(weights[order]), share)])

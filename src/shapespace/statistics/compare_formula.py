@@ -556,10 +556,8 @@ def _factor(factor: Any, table: Table, where: str) -> _Factor:
         return _Factor(text, _known(text, table, where))
     quoted_names: dict[str, str] = {}
 
-    def stand_in(match: re.Match[str]) -> str:
-        return quoted_names.setdefault(match[1], f"quoted_{len(quoted_names)}_")
-
-    tree = ast.parse(_QUOTED.sub(stand_in, text), mode="eval").body if kind == "python" else None
+    plain = _QUOTED.sub(lambda match: quoted_names.setdefault(match[1], f"quoted_{len(quoted_names)}_"), text)
+    tree = ast.parse(plain, mode="eval").body if kind == "python" else None
     if tree is None or not isinstance(tree, ast.Call) or not isinstance(tree.func, ast.Name):
         raise InputError(f"{where} holds {text[:60]!r}; {_ALLOWED}")
     if tree.func.id == "C" and not (len(tree.args) == 1 and isinstance(tree.args[0], ast.Name) and not tree.keywords):

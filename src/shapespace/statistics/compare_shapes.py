@@ -38,7 +38,7 @@ from shapespace.statistics.compare_strata import Stratum, is_nested, less, span,
 from shapespace.statistics.compare_unequal import Units, is_between_units, units_of
 from shapespace.statistics.compare_within import ModelStrata, RepeatedMeasures, WithinSubjects, strata_of
 from shapespace.statistics.dispersion import VARIANCES, DispersionTest, Variances
-from shapespace.statistics.effect_size import EFFECT_SIZES, EffectSize, effect_size, permutation_p
+from shapespace.statistics.effect_size import EFFECT_SIZES, EffectSize, UnknownP, effect_size, permutation_p
 from shapespace.statistics.methods import dispersion_record, methods_of, sample_sizes
 from shapespace.statistics.multiple_imputation import Imputations, over_imputations
 from shapespace.statistics.observation_weights import information, weights_of
@@ -236,12 +236,21 @@ class ShapeEffect:
 
 @dataclass(frozen=True)
 class EffectAngle:
-    """The angle between two changes of shape; `p` tests whether they are parallel, None where that is not asked."""
+    """The angle between two changes of shape.
+
+    Args:
+        first: one change.
+        second: the other change.
+        degrees: the angle.
+        p: of the test whether they are parallel; None where that is not tested or not known.
+        unknown_p: why p is not known: neither change is longer than its noise. None where it is, or is not tested.
+    """
 
     first: str
     second: str
     degrees: float
     p: float | None
+    unknown_p: UnknownP | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -631,9 +640,8 @@ def term_tests(
             f = _error_f(stratum, term, error, config)
         elif units is not None and (config.variances == "unequal" or units.is_comparable):
             # Columns of the reduced model are not tested; each unit has its own variance.
-            other = units.estimate(
-                units.own(term, reduced), [term], reduced, config.permutations, config.seed, term.label
-            ).statistic()
+            flips = units.flips([term], reduced, config.permutations, config.seed, term.label)
+            other = flips.estimate(units.own(term, reduced)).statistic()
         allowing = unequal and other is not None
         if other is not None and allowing:
             f, other = other, f
@@ -687,11 +695,10 @@ def _error_f(stratum: Stratum, term: Term, error: Term, config: CompareConfig) -
 
 def _summarise_stratum(stratum: Stratum, tests: Sequence[TermTest], among: Sequence[Stratum]) -> StratumSummary:
     unequal = any(test.unequal_variances for test in tests if test.stratum == stratum.name)
-    residual = stratum.residual(stratum.terms)
     return StratumSummary(
         stratum=stratum.name,
         df=stratum.df_error,
-        squares=float((residual**2).sum()),
+        squares=float((stratum.residual(stratum.terms) ** 2).sum()),
         df_total=len(stratum.matrix) - stratum.removed,
         squares_total=float((stratum.shapes**2).sum()),
         log_arrangements=min(one.fewest_log_arrangements(flips=unequal) for one in (stratum, *among)),
@@ -924,8 +931,8 @@ def _tested_unequal(
         own = (direction / max(float(np.linalg.norm(direction)), 1e-300))[:, None]
         label = f"{ends.low} to {ends.high}"
         run = (tested, ends.reduced, config.permutations, config.seed, label)
-        estimate = units.estimate(own, *run)
-        weighted = estimate if root is None else replace(units, shapes=units.shapes @ root).estimate(own, *run)
+        estimate = units.flips(*run).estimate(own)
+        weighted = estimate if root is None else replace(units, shapes=units.shapes @ root).flips(*run).estimate(own)
         statistics.append(weighted.statistic())
         changes.append(direction @ stratum.shapes)
         maps += (
@@ -967,8 +974,9 @@ def _parallel(
             pairs, _changes_in_pairs(design, strata, one, other, config, owners, unequal=unequal), strict=False
         ):
             angle = float(angles_between(drawn[0][:1], drawn[1][:1])[0])
-            p = permutation_p(off_common_direction(*drawn, *weights))
-            yield EffectAngle(words[first], words[second], angle, p)
+            is_known = any(own * (change[0] ** 2).sum() > 1.0 for change, own in zip(drawn, weights, strict=True))
+            p = permutation_p(off_common_direction(*drawn, *weights)) if is_known else None
+            yield EffectAngle(words[first], words[second], angle, p, None if is_known else "short vectors")
 
 
 def _changes_in_pairs(
@@ -995,12 +1003,16 @@ def _changes_in_pairs(
             half, between = within.contrast_stratum((first - second) / 2, both, f"{one.name}:{other.name}")
             middle, parts = within.contrast_stratum((first + second) / 2, frozenset({one.column}), one.name)
             direction = middle.direction(parts.average({}))
-            mean, left = direction @ middle.shapes, middle.residual(middle.terms)
-            common = without_noise(mean, float((direction**2).sum() * (left**2).sum()) / max(middle.df_error, 1))
-            differ = half.direction(between.average({}))
+            mean, differ = direction @ middle.shapes, half.direction(between.average({}))
+            noise, other_noise = (
+                float((own**2).sum() * (stratum.residual(stratum.terms) ** 2).sum()) / max(stratum.df_error, 1)
+                for own, stratum in ((direction, middle), (differ, half))
+            )
+            common = without_noise(mean, noise)
             flipped = half.products(differ[:, None], half.shapes, config.permutations, config.seed, flips=True)[:, 0]
             mean = np.concatenate([mean[None], np.repeat(common[None], len(flipped) - 1, axis=0)])
-            yield (mean + flipped, mean - flipped), (1.0, 1.0)
+            precision = 1.0 / max(noise + other_noise, 1e-300)
+            yield (mean + flipped, mean - flipped), (precision, precision)
         return
     stratum, contrasts = None, list[FloatArray]()
     if within is None or not within.holds(both):

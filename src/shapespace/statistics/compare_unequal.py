@@ -13,7 +13,6 @@ from shapespace.statistics.compare_strata import Rows, Stratum, less, span
 from shapespace.statistics.dispersion import (
     FULL_LEVERAGE,
     DispersionTest,
-    Estimate,
     UnequalVariances,
     dispersion_test,
     unequal_variances,
@@ -75,13 +74,12 @@ class Units:
         named = {column for term in terms for column in term.variables} - self.varying
         return [one for one in self.design.variables if one.column in named and one.groups]
 
-    def estimate(
-        self, own: FloatArray, terms: Sequence[Term], reduced: Sequence[Term], permutations: int, seed: int, name: str
-    ) -> Estimate:
-        """Return the estimate along `own` (s, q) with its variance, in sign flips of the residuals of a reduced model.
+    def flips(
+        self, terms: Sequence[Term], reduced: Sequence[Term], permutations: int, seed: int, name: str
+    ) -> UnequalVariances:
+        """Return the sign flips of the residuals of a reduced model.
 
         Args:
-            own: (s, q) orthonormal columns within the whole model.
             terms: that are tested; the variances of their classes may differ.
             reduced: terms of the reduced model.
             permutations: number of sign flips, the observed data among them.
@@ -91,12 +89,6 @@ class Units:
         Raises:
             InputError: a unit that the model fits exactly.
         """
-        return self.flips(terms, reduced, permutations, seed, name).estimate(own)
-
-    def flips(
-        self, terms: Sequence[Term], reduced: Sequence[Term], permutations: int, seed: int, name: str
-    ) -> UnequalVariances:
-        """Return the sign flips of the residuals of a reduced model, with arguments as `estimate` has them."""
         return unequal_variances(
             shapes=self.shapes,
             full=self.full,

@@ -121,12 +121,12 @@ def difference_test(
     Welch's t is compared with sign flips of residuals instead. Other arguments are those of `mean_test`; each group has
     two subjects or more.
     """
+    n, of_second = len(maps), int(second.sum())
+    of_first = n - of_second
     if unequal_variances:
-        t, arrangements, every = welch_flips(maps, second, area, permutations, seed)
-        largest, total = arrangements
+        t, (largest, total) = welch_flips(maps, second, area, permutations, seed)
         p = (len(largest) - np.searchsorted(np.sort(largest), np.abs(t) * (1 - _TIE))) / len(largest)
         omnibus = float((total >= total[0] * (1 - _TIE)).mean())
-        counts = (int((~second).sum()), int(second.sum()))
         effect = maps[second].mean(axis=0) - maps[~second].mean(axis=0)
         return MapTest(
             effect=effect,
@@ -134,13 +134,11 @@ def difference_test(
             p=p,
             omnibus_p=omnibus,
             permutations=len(largest),
-            every=every,
-            n=counts,
+            every=False,
+            n=(of_first, of_second),
             critical_t=_critical(largest),
             unequal_variances=True,
         )
-    n, of_second = len(maps), int(second.sum())
-    of_first = n - of_second
     every = math.comb(n, of_second) <= permutations
     count = math.comb(n, of_second) if every else permutations
     centred = maps - maps.mean(axis=0)

@@ -194,7 +194,7 @@ def _figures(result: Any, parts: Collection[str], means: Collection[str]) -> _Fi
 
     def collect(owner: Any) -> Mapping[str, Any]:
         intervals = [one for names in _INTERVALS if all(hasattr(owner, name) for name in names) for one in names]
-        names = (*_P_VALUES, *means, *intervals)
+        names = (*_P_VALUES, "unknown_p", *means, *intervals)
         found.append({name: getattr(owner, name) for name in names if getattr(owner, name, None) is not None})
         return {}
 
@@ -209,8 +209,11 @@ def _pooled(result: Any, each: Sequence[_Figures], parts: Collection[str], means
 
     def combine(owner: Any) -> Mapping[str, Any]:
         number, changed = next(numbers), dict[str, Any]()
+        unknown = {name: own[number][name] for own in each for name in ("unknown_p",) if name in own[number]}
+        if unknown:
+            return {"p": None, **unknown}
         values = {name: np.stack([own[number][name] for own in each]) for name in each[0][number]}
-        for name in values.keys() & set(_P_VALUES):
+        for name in (one for one in values.keys() & set(_P_VALUES) if getattr(owner, one) is not None):
             p, fraction = pool_p_values(values[name], 1 / max(tests, default=_LARGEST))
             changed[name] = np.where(getattr(owner, name) == 1, 1.0, p)  # blank vertices keep p = 1
             label = next((str(getattr(owner, one)) for one in _LABELS if hasattr(owner, one)), "")

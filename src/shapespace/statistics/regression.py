@@ -211,7 +211,8 @@ def regress(
     subject = subject or (SUBJECT if SUBJECT in cohort.table.columns else None)
     cohort = cohort.complete([target, *([subject] if subject else [])], drop_missing=drop_missing, numbers=[target])
     y = cohort.table.numbers(target)
-    _check_target(cohort, target, y)
+    if np.ptp(y) == 0:
+        raise InputError(f"{cohort.table.where}: {target} is {y[0]:g} for all shapes, so there is nothing to learn.")
     subjects = subjects_of(cohort, subject)
     names = tuple(dict.fromkeys(subjects))
     number = {name: k for k, name in enumerate(names)}
@@ -332,11 +333,6 @@ def _check_options(folds: int, permutations: int, draws: int, confidence: float,
         raise InputError("The number of permutations and the seed must be 0 or more, and that of draws 1 or more.")
     if not 0.5 <= confidence < 1:
         raise InputError(f"The level of intervals must lie between 0.5 and 1, not at {confidence}.")
-
-
-def _check_target(cohort: Cohort, target: str, y: FloatArray) -> None:
-    if np.ptp(y) == 0:
-        raise InputError(f"{cohort.table.where}: {target} is {y[0]:g} for all shapes, so there is nothing to learn.")
 
 
 def _intervals(

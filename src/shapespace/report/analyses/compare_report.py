@@ -163,6 +163,12 @@ def compare_warnings(result: CompareResult) -> tuple[str, ...]:
         *_repeated_measures_warnings(result),
         *_uncentred_warnings(result),
         *(
+            f"Whether the changes {one.first} and {one.second} have one direction (angle {one.degrees:.0f}°) is not "
+            "known: neither is longer than its noise."
+            for one in result.angles
+            if one.unknown_p
+        ),
+        *(
             f"{one.name} has {len(one.levels)} classes; pairs of the first {MOST_LEVELS} are compared."
             for one in result.design.variables
             if len(one.levels) > MOST_LEVELS and any(effect.name == one.name for effect in result.effects)
@@ -399,7 +405,8 @@ def _angle_parts(result: CompareResult) -> Iterator[Part]:
     if result.angles:
         yield TablePart(
             title="Angles between changes of shape",
-            note="0° is the same change, 90° nothing in common, 180° the opposite; p is that of parallel changes.",
+            note="0° is the same change, 90° nothing in common, 180° the opposite; p is that of parallel changes"
+            f"{', not known where both are no longer than noise' if any(a.unknown_p for a in result.angles) else ''}.",
             columns=(_column("one"), _column("other"), _column("angle, degrees", "number"), _column("p", "p")),
             rows=tuple((a.first, a.second, a.degrees, a.p) for a in result.angles),
         )
@@ -589,8 +596,8 @@ def _tables(result: CompareResult) -> Mapping[str, Rows]:
         ),
     }
     if result.angles:
-        rows = [(a.first, a.second, a.degrees, "" if a.p is None else a.p) for a in result.angles]
-        tables["angles.csv"] = (("first", "second", "degrees", "p"), rows)
+        rows = [(a.first, a.second, a.degrees, a.p, a.unknown_p or "") for a in result.angles]
+        tables["angles.csv"] = (("first", "second", "degrees", "p", "p_not_known"), rows)
     return tables
 
 

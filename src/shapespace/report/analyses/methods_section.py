@@ -16,7 +16,7 @@ from shapespace.schemas import (
     TestScheme,
     TextPart,
 )
-from shapespace.statistics.dispersion import FEWEST_OF_GROUP
+from shapespace.statistics.dispersion import FEWEST_OF_GROUP, FEWEST_PATTERNS
 from shapespace.statistics.methods import REDUCED_OF_EACH_TERM, SCAN_OF_SUBJECT
 from shapespace.store.review_text import review_summary
 
@@ -312,7 +312,9 @@ def _exchangeability(methods: Methods) -> str:
     if any(test.unequal_variances for test in methods.tests):
         sentences.append(
             "tests with unequal variances flip the signs of residuals of independent subjects, whose covariances may "
-            f"differ between groups; their level was measured for classes of {FEWEST_OF_GROUP} subjects or more"
+            f"differ between groups; residuals of classes with fewer than {FEWEST_PATTERNS} different flips are "
+            "rotated, which assumes that they are normal; the level was measured for classes of "
+            f"{FEWEST_OF_GROUP} subjects or more"
         )
     return "; ".join(sentences) + "."
 
@@ -371,9 +373,8 @@ def dispersion_sentence(one: Dispersion, unequal_variances: bool | None, unit: s
     details = f"standard deviations by {one.variable}{where}: {named}; p = {one.p:.3g}"
     if unequal_variances and min(one.counts) < FEWEST_OF_GROUP:
         return (
-            f"Warning: {one.variable}{where} has a class of {min(one.counts)} subjects; below "
-            f"{FEWEST_OF_GROUP} the test with unequal variances has too many false positives, 8 % instead of 5 % for 4 "
-            f"({details})."
+            f"Warning: {one.variable}{where} has a class of {min(one.counts)} subjects; with fewer than "
+            f"{FEWEST_OF_GROUP} the test with unequal variances is cautious and finds few differences ({details})."
         )
     if one.equal:
         return f"No significant difference of dispersion ({details})."

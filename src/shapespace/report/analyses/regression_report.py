@@ -38,7 +38,8 @@ def regression_report(result: RegressionResult, new: tuple[Cohort, Predictions] 
     if new is not None:
         parts.append(_prediction_part(result.predictor, new[1]))
     arrays, pictures = _maps_and_morphs(result)
-    tables = {"predictions.csv": _rows(result), "measures.csv": _measure_rows(result)}
+    measures = ("measure", "value", "low", "high"), [(n, m.value, m.low, m.high) for n, m in result.measures.items()]
+    tables = {"predictions.csv": _rows(result), "measures.csv": measures}
     if new is not None:
         tables["new.csv"] = _prediction_rows(*new)
     faces = result.cohort.faces
@@ -168,10 +169,6 @@ def _measures_part(result: RegressionResult) -> TablePart:
         note=f"Nested cross-validation in {result.folds} folds of subjects, each of whom counts once; {level} "
         "intervals by bootstrap of subjects.",
     )  # fmt: skip
-
-
-def _measure_rows(result: RegressionResult) -> Rows:
-    return ("measure", "value", "low", "high"), [(n, m.value, m.low, m.high) for n, m in result.measures.items()]
 
 
 def _calibration_part(result: RegressionResult) -> CurvePart:

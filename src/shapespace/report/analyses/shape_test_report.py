@@ -11,7 +11,10 @@ from shapespace.report.analyses.analysis_report import AnalysisReport, Rows
 from shapespace.report.analyses.methods_section import methods_parts, points_word
 from shapespace.report.analyses.shape_data import add_shape_data, model_hashes
 from shapespace.schemas import Counts, HistogramPart, Part, TablePart
+from shapespace.statistics.effect_size import permutation_p
 from shapespace.statistics.shape_tests.shape_test_result import ShapeTestResult, Statistic
+from shapespace.statistics.tolerances import TIE
+from shapespace.types import FloatArray
 
 _BINS = 40  # bins of a histogram of thousands of permutations
 _MOST_SENTENCES = 10
@@ -33,7 +36,8 @@ def shape_test_report(result: ShapeTestResult) -> AnalysisReport:
         summary=tuple(_sentences(result)),
         parts=(_statistics_table(result), *result.tables, *result.figures, *_histograms(result),
                *methods_parts(methods)),
-        tables={"statistics.csv": _rows(result), **{_file_name(one): _cells(one) for one in result.tables}},
+        tables={"statistics.csv": _rows(result),
+                **{_file_name(one): ([own.name for own in one.columns], one.rows) for one in result.tables}},
         arrays=result.arrays,
         notes=result.cohort.notes,
         settings={**result.settings, "shapes": len(result.cohort)},
@@ -67,13 +71,30 @@ def _sentence(one: Statistic, level: float) -> str:
     if one.p is not None:
         figures.append(f"p {one.p:.3g}")
         figures.append("significant" if one.p <= level else "not significant")
+        if len(one.arrangements) and (least := _least_p(one.arrangements)) > level:
+            figures.append(f"no p below {least:.2g} is possible with so few arrangements that differ")
+    if one.unknown_p == "short vectors":
+        figures.append("p not known: neither vector is longer than its noise, so that no direction is determined")
+    if one.unknown_p == "raw residuals":
+        figures.append(
+            f"p not known: {permutation_p(one.arrangements):.3g} by raw residuals, as in RRPP, is too small if "
+            "the common change is short; omit --residuals raw"
+        )
     text = ", ".join(figures)
     return f"{one.tested}: {text}" if one.tested else f"{text[:1].upper()}{text[1:]}"
+
+
+def _least_p(arrangements: FloatArray) -> float:
+    """Return the share of the arrangements that have the most extreme value of all, at the end where it is smaller."""
+    ends = arrangements.min(), arrangements.max()
+    return min(float((np.abs(arrangements - end) <= TIE * abs(end)).mean()) for end in ends)
 
 
 def _statistics_table(result: ShapeTestResult) -> TablePart:
     rows = [(one.name, one.tested, one.value, one.z, one.p) for one in result.statistics]
     note = f"{result.test.statistics[:1].upper()}{result.test.statistics[1:]}."
+    unknown = dict.fromkeys(one.name for one in result.statistics if one.unknown_p)
+    note += f" p of {', '.join(unknown)} is not known where it is blank." if unknown else ""
     return TablePart.of("Statistics", ("statistic", "tested", "value", "Z", "p"), rows, note=note, level=2)
 
 
@@ -92,14 +113,10 @@ def _histograms(result: ShapeTestResult) -> Iterator[Part]:
 
 
 def _rows(result: ShapeTestResult) -> Rows:
-    header = ("statistic", "tested", "value", "z", "p", "low", "high")
-    return header, [(s.name, s.tested, s.value, s.z, s.p, s.low, s.high) for s in result.statistics]
+    header = ("statistic", "tested", "value", "z", "p", "low", "high", "p_not_known")
+    return header, [(s.name, s.tested, s.value, s.z, s.p, s.low, s.high, s.unknown_p or "") for s in result.statistics]
 
 
 def _file_name(table: TablePart) -> str:
     words = re.sub(r"[^a-z0-9]+", "_", (table.title or "table").lower()).strip("_")
     return f"{words}.csv"
-
-
-def _cells(table: TablePart) -> Rows:
-    return tuple(column.name for column in table.columns), table.rows

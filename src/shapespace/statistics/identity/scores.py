@@ -20,22 +20,6 @@ Scorer: TypeAlias = Callable[[Samples, Samples], FloatArray]
 """(gallery, probes) -> (G, P) scores, alike if the two change places."""
 
 
-def _plda(training: Samples) -> Scorer:
-    return TwoCovariance.learn(training).score
-
-
-def _cosine(_: Samples) -> Scorer:
-    return lambda gallery, probes: _directions(gallery.x) @ _directions(probes.x).T
-
-
-def _mahalanobis(_: Samples) -> Scorer:
-    return lambda gallery, probes: -cdist(gallery.x, probes.x)
-
-
-def _distance(_: Samples) -> Scorer:
-    return lambda gallery, probes: -cdist(gallery.mm, probes.mm) / np.sqrt(gallery.n_vertices)
-
-
 def _directions(x: FloatArray) -> FloatArray:
     norms = np.linalg.norm(x, axis=1, keepdims=True)
     return x / np.where(norms > 0, norms, 1.0)
@@ -43,10 +27,10 @@ def _directions(x: FloatArray) -> FloatArray:
 
 SCORES: Mapping[str, Callable[[Samples], Scorer]] = MappingProxyType(
     {
-        "plda": _plda,
-        "cosine": _cosine,
-        "mahalanobis": _mahalanobis,
-        "distance": _distance,
+        "plda": lambda training: TwoCovariance.learn(training).score,
+        "cosine": lambda _: lambda gallery, probes: _directions(gallery.x) @ _directions(probes.x).T,
+        "mahalanobis": lambda _: lambda gallery, probes: -cdist(gallery.x, probes.x),
+        "distance": lambda _: lambda gallery, probes: -cdist(gallery.mm, probes.mm) / np.sqrt(gallery.n_vertices),
     }
 )
 """Similarity scores of two scans: by the two-covariance model (PLDA), by the angle and by the distance of whitened

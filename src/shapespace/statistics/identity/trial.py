@@ -14,7 +14,7 @@ from shapespace.cohort.table import Table, list_names
 from shapespace.errors import InputError
 from shapespace.reprs import short_repr
 from shapespace.statistics.identity.rates import Pairs
-from shapespace.statistics.identity.samples import Samples, samples_of
+from shapespace.statistics.identity.samples import samples_of
 from shapespace.statistics.identity.scores import SCORES, refuse_unknown_scores
 from shapespace.types import BoolArray, FloatArray, IntArray
 
@@ -212,11 +212,7 @@ def scores_of(
         samples = samples_of(trial.cohort, trial.subjects, one.training, uncertainty=config.uncertainty)
         samples = samples.leading(modes)
         training, gallery, probes = (samples.take(rows) for rows in (one.training, one.gallery, one.probes))
-        yield one, {name: _scored(name, training, gallery, probes) for name in config.scores}
-
-
-def _scored(name: str, training: Samples, gallery: Samples, probes: Samples) -> FloatArray:
-    return SCORES[name](training)(gallery, probes)
+        yield one, {name: SCORES[name](training)(gallery, probes) for name in config.scores}
 
 
 def _roles(table: Table, role: str | None, config: IdentityConfig) -> tuple[list[int], list[int], list[int]]:

@@ -5,6 +5,7 @@ Equations Mn are those of docs/morphometrics.md.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
@@ -18,7 +19,7 @@ from shapespace.statistics.compare_shapes import complete_cohort
 from shapespace.statistics.compare_strata import means_of, span
 from shapespace.statistics.dispersion import unequal_variances
 from shapespace.statistics.shape_tests.ordination import discriminant_components, principal_components
-from shapespace.statistics.shape_tests.permutations import Groups, Orders, orders, permuted
+from shapespace.statistics.shape_tests.permutations import Groups, Orders, Residuals, orders, permuted
 from shapespace.statistics.shape_tests.shape_test_result import (
     LEVEL,
     ShapeTestResult,
@@ -45,7 +46,7 @@ def compare_disparity(
     group: tuple[str, ...],
     formula: str | None = None,
     partial: bool = False,
-    correct_leverage: bool = False,
+    residuals: Residuals = "scaled",
     permutations: int = 1000,
     seed: int = 0,
     drop_missing: bool = False,
@@ -59,8 +60,8 @@ def compare_disparity(
         formula: linear model about whose predictions disparity is measured (default: ~ 1, the mean of all shapes).
         partial: partial disparities (Foote 1993): sums of squares about the mean of all shapes, divided by the number
             of all shapes - 1, so that those of the groups add up to the total disparity.
-        correct_leverage: divide squared residuals by 1 - leverage. Those of a model with the groups are else smaller in
-            small groups, which geomorph leaves so.
+        residuals: of a formula: `scaled` to the variance of errors, in permutations after the model is fitted again; or
+            `raw`, as geomorph, which are smaller in small groups, so that equal groups differ.
         permutations: number of permutations, including the observed data.
         seed: of the permutations, and of the bootstrap samples of the intervals.
         drop_missing: exclude shapes with missing values in the table (default: an error).
@@ -78,15 +79,16 @@ def compare_disparity(
         raise InputError("Partial disparities are about the mean of all shapes; leave out --formula or --partial.")
     cohort, groups = groups_of(cohort, group, drop_missing, 2, "a variance", formula)
     n, design = len(cohort), design_of(formula, cohort.table) if formula else None
-    columns = np.column_stack([np.ones(n), design.matrix]) if design else np.ones((n, 1))
-    q = span(columns)
+    q = span(np.column_stack([np.ones(n), design.matrix]) if design else np.ones((n, 1)))
+    residual = cohort.coefficients - q @ (q.T @ cohort.coefficients)
+    scaled = design is not None and residuals == "scaled"
+    free = np.maximum(1 - (q**2).sum(axis=1), _TINY) if scaled else np.ones(n)
+    squares = (residual**2).sum(axis=1) / free
+    shares = groups.indicator / (np.full(len(groups.names), n - 1.0) if partial else groups.counts)
+    refit = _refitted(q, residual / np.sqrt(free)[:, None], shares / free[:, None])
     # Rows of residuals are permuted, so their squared norms are.
-    squares = ((cohort.coefficients - q @ (q.T @ cohort.coefficients)) ** 2).sum(axis=1)
-    if correct_leverage:
-        squares = squares / np.maximum(1 - (q**2).sum(axis=1), _TINY)
-    divisor = np.full(len(groups.names), n - 1.0) if partial else groups.counts.astype(np.float64)
-    variances = permuted(n, permutations, seed, lambda rows: groups.sums(squares[:, None], rows)[..., 0], progress)
-    variances /= divisor  # M20
+    variances = permuted(n, permutations, seed, refit if scaled else lambda rows: squares @ shares[rows], progress)
+    variances[0] = squares @ shares  # M20
     name = "partial disparity" if partial else "Procrustes variance"
     limits = [
         Statistic(name=name, tested=one, value=float(value), low=float(low * value), high=float(high * value))
@@ -97,11 +99,33 @@ def compare_disparity(
     return ShapeTestResult(
         name="disparity", cohort=cohort, classes=group,
         statistics=[*_pairs("difference of disparity", groups, differences), *limits],
-        settings={"group": list(group), "formula": formula, "partial": partial, "correct_leverage": correct_leverage,
+        settings={"group": list(group), "formula": formula, "partial": partial, "residuals": residuals,
                   "permutations": permutations, "seed": seed},
         tables=(TablePart.of("Disparity", ("group", "shapes", name, "lower 95 %", "upper 95 %"), rows),),
         reduced_model=tuple(term.label for term in design.terms) if design else (),
     )  # fmt: skip
+
+
+def _refitted(q: FloatArray, rows_of_errors: FloatArray, weights: FloatArray) -> Callable[[Orders], FloatArray]:
+    """Return a function of orders (b, N) that permutes errors, fits the model again and sums its squared residuals.
+
+    The sums have the degrees of freedom of the observed ones, so that variances of small groups vary as they do.
+
+    Args:
+        q: (N, m) orthonormal columns of the model.
+        rows_of_errors: (N, K) residuals scaled to the variance of errors.
+        weights: (N, G) of the squared residuals in the sum of each group.
+    """
+    columns = np.hstack([q, *(q * own[:, None] for own in weights.T)])
+    inner, squares = np.einsum("ng,nm,nk->gmk", weights, q, q), (rows_of_errors**2).sum(axis=1)
+
+    def sums(rows: Orders) -> FloatArray:
+        products = columns[rows].transpose(0, 2, 1).reshape(-1, len(q)) @ rows_of_errors
+        products = products.reshape(len(rows), 1 + weights.shape[1], q.shape[1], -1)
+        fitted, weighted = products[:, :1], products[:, 1:]
+        return squares @ weights[rows] + ((inner @ fitted - 2 * weighted) * fitted).sum(axis=(2, 3))
+
+    return sums
 
 
 def _intervals(groups: Groups, squares: FloatArray, seed: int) -> FloatArray:
@@ -192,7 +216,8 @@ def compare_means_and_covariances(
             Statistic.of("F of means", f),
             Statistic.of("F of means, unequal covariances", flips.estimate(along).statistic()),
             *_pairs("Riemannian distance of covariance", groups, values[2::3], weights),
-            *_pairs("Riemannian distance of relative covariance", groups, values[3::3], weights),
+            # One component has no covariances but a scale.
+            *(_pairs("Riemannian distance of relative covariance", groups, values[3::3], weights) if used > 1 else ()),
             *_pairs("Procrustes distance of means", groups, values[1::3]),
         ],
         settings={"group": list(group), "components": used, "permutations": permutations, "seed": seed},

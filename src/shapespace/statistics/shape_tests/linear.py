@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any, Literal, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from shapespace.statistics.compare_shapes import (
 )
 from shapespace.statistics.compare_strata import Stratum, independent_stratum, less, means_of, span, without_noise
 from shapespace.statistics.methods import REDUCED_OF_EACH_TERM
-from shapespace.statistics.shape_tests.permutations import Groups, Orders, orders
+from shapespace.statistics.shape_tests.permutations import Groups, Orders, Residuals, orders
 from shapespace.statistics.shape_tests.shape_test_result import (
     LEVEL,
     ShapeTestResult,
@@ -32,9 +32,8 @@ from shapespace.statistics.shape_tests.shape_test_result import (
     pair_statistics,
 )
 from shapespace.step_counter import Progress, StepCounter
-from shapespace.types import FloatArray
+from shapespace.types import BoolArray, FloatArray
 
-Residuals: TypeAlias = Literal["scaled", "raw"]
 _ALIASED = 1e-8  # relative length; columns below it follow from others, and estimates below it are equal
 _MOST_COORDINATES = 20_000_000
 """Size-corrected coordinates that are written; more fill gigabytes, and the coefficients are written alone."""
@@ -100,10 +99,9 @@ def compare_trajectories(
     design, reduced, labels = _models(cohort, formula, null)
     estimator = _mean_estimator(design, np.eye(g * p)[cells])
     steps = estimator.reshape(g, p, -1) - estimator.reshape(g, p, -1).mean(axis=1, keepdims=True)
-    excess = _excess(steps, reduced, cohort)
+    excess, is_long = _excess(steps, reduced, cohort)
     batches: list[FloatArray] = []
-    angles: list[float] = []
-    observed = np.zeros(0)
+    observed, directions = np.zeros(0), np.zeros((g, 1))
     for means in _permuted(estimator, reduced, cohort, residuals, permutations, seed, progress):
         paths = means.reshape(len(means), g, p, -1)
         observed = observed if observed.size else paths[0]
@@ -115,7 +113,7 @@ def compare_trajectories(
         one, other = np.array(groups.pairs).T
         values = [np.abs(length[:, one] - length[:, other]).T,
                   _directions(axis, 1.0 / (steps**2).sum(axis=(1, 2)), groups, residuals)]  # fmt: skip
-        angles = angles if batches else [_angle(axis[0, a], axis[0, b]) for a, b in groups.pairs]
+        directions = directions if batches else axis[0]
         if p > 2:
             aligned = _aligned(centred)
             values.append(np.linalg.norm(aligned[:, one] - aligned[:, other], axis=(2, 3)).T)
@@ -133,7 +131,7 @@ def compare_trajectories(
     return _pairs_result(
         "trajectory", cohort, groups, batches, names, (*group, points), labels,
         {"group": list(group), "points": list(stages), "formula": formula, "null": null, "residuals": residuals,
-         "permutations": permutations, "seed": seed}, (figure,), angles,
+         "permutations": permutations, "seed": seed}, (figure,), directions=directions, is_long=is_long,
     )  # fmt: skip
 
 
@@ -154,12 +152,8 @@ def _directions(vectors: FloatArray, weights: FloatArray, groups: Groups, residu
     )
 
 
-def _angle(one: FloatArray, other: FloatArray) -> float:
-    return float(angles_between(one[None], other[None])[0])
-
-
-def _excess(estimators: FloatArray, reduced: FloatArray, cohort: Cohort) -> FloatArray:
-    """Return the part (G, r, K) of vectors of the reduced model by which noise makes them longer than they are.
+def _excess(estimators: FloatArray, reduced: FloatArray, cohort: Cohort) -> tuple[FloatArray, BoolArray]:
+    """Return by how much noise makes vectors (G, r, K) of the reduced model longer, and whose own exceed noise (G,).
 
     Args:
         estimators: (G, r, N) of the r vectors of each group, which are shortened together.
@@ -171,7 +165,9 @@ def _excess(estimators: FloatArray, reduced: FloatArray, cohort: Cohort) -> Floa
     variance = float((residual**2).sum()) / (len(residual) - columns.shape[1])
     noise = variance * ((estimators @ columns) ** 2).sum(axis=(1, 2))
     flat = vectors.reshape(len(vectors), -1)
-    return vectors - without_noise(flat, noise).reshape(vectors.shape)
+    own = ((estimators @ cohort.coefficients) ** 2).sum(axis=(1, 2))
+    is_long = own > variance * (estimators**2).sum(axis=(1, 2))
+    return vectors - without_noise(flat, noise).reshape(vectors.shape), is_long
 
 
 def _aligned(centred: FloatArray) -> FloatArray:
@@ -241,23 +237,22 @@ def compare_pairs(
             f"{'the interaction of the groups with the covariate' if covariate else 'the groups'}."
         )
     batches: list[FloatArray] = []
-    angles: list[float] = []
-    excess = _excess(estimator[:, None], reduced, cohort)[:, 0]
+    directions = estimator @ cohort.coefficients
+    excess, is_long = _excess(estimator[:, None], reduced, cohort)
     one, other = np.array(groups.pairs).T
     for vectors in _permuted(estimator, reduced, cohort, residuals, permutations, seed, progress):
         values = [np.linalg.norm(vectors[:, one] - vectors[:, other], axis=2).T]
         if covariate is not None:
             length = np.linalg.norm(vectors, axis=2)
             values.append(np.abs(length[:, one] - length[:, other]).T)
-            angles = angles if batches else [_angle(vectors[0, a], vectors[0, b]) for a, b in groups.pairs]
             if residuals == "scaled":
-                vectors[bool(not batches) :] -= excess
+                vectors[bool(not batches) :] -= excess[:, 0]
             values.append(_directions(vectors, 1.0 / (estimator**2).sum(axis=1), groups, residuals))
         batches.append(np.array(values))
     return _pairs_result(
         "pairwise", cohort, groups, batches, names, group, labels,
         {"formula": formula, "group": list(group), "covariate": covariate, "null": null, "residuals": residuals,
-         "permutations": permutations, "seed": seed}, angles=angles,
+         "permutations": permutations, "seed": seed}, directions=directions, is_long=is_long,
     )  # fmt: skip
 
 
@@ -552,23 +547,27 @@ def _permuted(
 def _pairs_result(
     name: str, cohort: Cohort, groups: Groups, batches: Sequence[FloatArray], names: Sequence[str],
     classes: Sequence[str], reduced_model: tuple[str, ...], settings: dict[str, Any], figures: tuple[Part, ...] = (),
-    angles: Sequence[float] = (),
+    *, directions: FloatArray, is_long: BoolArray,
 ) -> ShapeTestResult:  # fmt: skip
     """Return the result of statistics of pairs of groups, from batches (statistics, pairs, b) of permutations.
 
-    `angles` are the values of angles, whose arrangements are of another statistic unless residuals are raw.
+    Angles are between `directions` (G, K); their arrangements are of another statistic unless residuals are raw. Their
+    p is not known for raw residuals, nor if no vector of the pair `is_long` (G,), that is longer than its noise.
     """
     values = np.concatenate(batches, axis=2)
     statistics = [
         one for name_of_one, own in zip(names, values, strict=False)
         for one in pair_statistics(name_of_one, own, groups.pair_names)
     ]  # fmt: skip
-    if settings["residuals"] == "scaled":
-        known = dict(zip(groups.pair_names, angles, strict=False))
-        statistics = [
-            replace(one, value=known[one.tested], arrangements=np.zeros(0)) if one.name.startswith("angle") else one
-            for one in statistics
-        ]
+    for k, one in enumerate(statistics):
+        if one.name.startswith("angle"):
+            pair = list(groups.pairs[groups.pair_names.index(one.tested)])
+            if settings["residuals"] == "raw":
+                statistics[k] = replace(one, p=None, unknown_p="raw residuals")
+                continue
+            angle = float(angles_between(*directions[pair][:, None])[0])
+            one = replace(one, value=angle, arrangements=np.zeros(0))
+            statistics[k] = one if is_long[pair].any() else replace(one, p=None, z=None, unknown_p="short vectors")
     rows = [(one.name, one.tested, one.value,
              float(np.quantile(one.arrangements, 1 - LEVEL)) if len(one.arrangements) else None, one.z, one.p)
             for one in statistics]  # fmt: skip

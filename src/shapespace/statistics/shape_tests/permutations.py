@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +20,8 @@ _BATCH = 50
 _STREAM = 22  # separates these permutations from those of other tests with the same seed
 _RESAMPLES = 1  # no multiple of the batch, so that bootstrap samples differ from permutations
 Orders = npt.NDArray[np.intp]
+Residuals: TypeAlias = Literal["scaled", "raw"]
+"""That are permuted: scaled to the variance of errors, or raw, as in RRPP and geomorph."""
 
 
 def orders(n: int, permutations: int, seed: int, stream: int = _STREAM) -> Iterator[tuple[slice, Orders]]:

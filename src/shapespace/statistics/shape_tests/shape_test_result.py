@@ -12,7 +12,7 @@ from shapespace.cohort.cohort import Cohort
 from shapespace.reprs import list_briefly, short_repr
 from shapespace.schemas import Methods, Part, TablePart, TestScheme
 from shapespace.statistics.analysis_result import AnalysisResult
-from shapespace.statistics.effect_size import EffectSize, effect_size, permutation_p
+from shapespace.statistics.effect_size import EffectSize, UnknownP, effect_size, permutation_p
 from shapespace.statistics.methods import methods_of, sample_sizes
 from shapespace.statistics.shape_tests.test_table import ShapeTest, shape_test
 from shapespace.types import FloatArray, read_only
@@ -28,10 +28,11 @@ class Statistic:
         name: such as `CR`, or `difference of disparity`.
         tested: what it compares, such as `female – male`; empty where the name says it.
         value: as observed.
-        p: share of the arrangements that are as extreme; None without a test.
+        p: share of the arrangements that are as extreme; None without a test, or where it is not known.
         z: effect size, the value in standard deviations of its arrangements; None without.
         low, high: confidence interval; None without.
         arrangements: (P,) the statistic of each arrangement, the observed one first; empty without a test.
+        unknown_p: why p is not known; None where it is, or without a test.
 
     Example:
         >>> statistic = ss.statistics.compare_disparity(cohort, group=["group"], permutations=99).statistics[0]
@@ -47,6 +48,7 @@ class Statistic:
     low: float | None = None
     high: float | None = None
     arrangements: FloatArray = field(default_factory=lambda: np.zeros(0))
+    unknown_p: UnknownP | None = None
 
     __repr__ = short_repr
 
@@ -154,7 +156,7 @@ class ShapeTestResult(AnalysisResult):
     @property
     def methods(self) -> Methods:
         """Sample sizes, tests and assumptions."""
-        tested = tuple(dict.fromkeys(one.name for one in self.statistics if one.p is not None))
+        tested = tuple(dict.fromkeys(one.name for one in self.statistics if one.p is not None or one.unknown_p))
         counts = [len(one.arrangements) for one in self.statistics if len(one.arrangements)]
         scheme = TestScheme(
             tested=tested, statistic=self.test.statistics, resampling=self.test.resampling, unit=self.test.permuted,
@@ -169,8 +171,8 @@ class ShapeTestResult(AnalysisResult):
         )  # fmt: skip
 
     def __repr__(self) -> str:
-        rows = [f"{one.label} {one.value:.4g}" + ("" if one.p is None else f", p {one.p:.3g}")
-                for one in self.statistics]  # fmt: skip
+        rows = [f"{one.label} {one.value:.4g}" + (f", p {one.p:.3g}" if one.p is not None else
+                ", p not known" if one.unknown_p else "") for one in self.statistics]  # fmt: skip
         return f"<ShapeTestResult {self.name} of {len(self.cohort)} shapes; {list_briefly(rows)}>"
 
 

@@ -53,7 +53,7 @@ SHAPE_TESTS: tuple[ShapeTest, ...] = (
             "Foote (1993) Paleobiology 19, 403-419.",
         ),
         example="shapespace test disparity people.csv --group species -o disparity",
-        options={"group": "COLUMN", "formula": "FORMULA", "partial": "", "correct_leverage": ""},
+        options={"group": "COLUMN", "formula": "FORMULA", "partial": "", "residuals": ""},
         required=("group",),
     ),
     ShapeTest(
