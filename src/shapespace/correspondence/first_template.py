@@ -52,11 +52,11 @@ def first_template(
 
     Raises:
         InputError: fewer than two scans, scans that are all equal, both a template and a model, or an object without
-            mirror symmetry that `symmetric` asks for.
+            mirror symmetry that `symmetric_template` asks for.
         MeshError: no scan can be a template, or the template or model has no triangles.
     """
-    if config.symmetric and model is not None:
-        raise InputError("The mean of a model is used unchanged, so it cannot be made symmetric; omit --symmetric.")
+    if config.symmetric_template and model is not None:
+        raise InputError("The mean of a model is used unchanged as the template; omit --symmetric-template.")
     if len(scans) < FEWEST:
         raise InputError(f"A correspondence needs at least {FEWEST} scans, not {len(scans)}; give more.")
     if not 0 < config.landmark_uncertainty < np.inf:
@@ -75,7 +75,7 @@ def first_template(
         origin = f"{template.name} was given as the template."
     else:
         mesh, origin = _chosen_scan(repaired, config)
-    if config.symmetric:
+    if config.symmetric_template:
         mesh = symmetrise(mesh).mesh
         origin += " It was made symmetric."
     scale = SIZE / rms_size(mesh.vertices)

@@ -132,8 +132,8 @@ def _check_symmetry(mirror: SurfaceMirror, name: str) -> None:
     if share > SYMMETRIC_SHARE and (share > _LARGEST_SHARE or share > _OTHER_PLANES * other):
         raise InputError(
             f"{name} has no mirror symmetry: it differs from its mirror image by {100 * share:.1f} % of its size, and "
-            f"{100 * SYMMETRIC_SHARE:.0f} % is the limit, or {100 * _LARGEST_SHARE:.0f} % if no other plane is similar; "
-            "use it without symmetry, or give a more symmetric object."
+            f"{100 * SYMMETRIC_SHARE:.0f} % is the limit, or {100 * _LARGEST_SHARE:.0f} % if no other plane is nearly "
+            "as good; use it as it is, or give a more symmetric object."
         )
 
 
@@ -165,10 +165,10 @@ def _average_landmarks(positions: Mapping[str, FloatArray]) -> tuple[dict[str, F
     if not positions:
         return {}, {}
     names, points = list(positions), np.array(list(positions.values()))
-    distance, nearest = cKDTree(points).query(points * FLIP)
+    distance, nearest = map(np.asarray, cKDTree(points).query(points * FLIP))
     paired = (nearest[nearest] == np.arange(len(names))) & (distance <= LARGEST_PAIR_SHARE * SIZE)
     points = np.where(paired[:, None], (points + points[nearest] * FLIP) / 2.0, points)
-    partners = {name: names[nearest[k]] for k, name in enumerate(names) if paired[k]}
+    partners = {name: names[int(nearest[k])] for k, name in enumerate(names) if paired[k]}
     return dict(zip(names, points, strict=True)), partners
 
 
@@ -233,4 +233,4 @@ def _cut(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray, I
     origin = np.concatenate([np.arange(len(x)), ends[np.arange(len(ends)), share.argmin(axis=1)]])
     used, kept = np.unique(triangles, return_inverse=True)
     points = np.concatenate([vertices, points * [0.0, 1.0, 1.0]])[used]
-    return points, kept.reshape(-1, 3), origin[used]
+    return points, kept.reshape(-1, 3).astype(np.int32), origin[used].astype(np.int32)

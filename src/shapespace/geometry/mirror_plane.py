@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from shapespace.geometry.closest import ClosestPointEngine, build_engine, on_boundary
 from shapespace.geometry.normals import boundary_vertices, faces_of, rms_size, vertex_normals
-from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
+from shapespace.types import FloatArray, IntArray, Mesh
 
 SYMMETRIC_SHARE = 0.02
 """A surface has mirror symmetry if the RMS distance to its mirror image is at most this share of its size."""
@@ -21,7 +21,7 @@ FLIP = np.array([-1.0, 1.0, 1.0])
 _POINTS = 1_000  # points of the mesh that planes are fitted to; time grows with them
 _ITERATIONS = 30  # limit of the iterations for one plane
 _STOP = 1e-5
-"""The search for a plane ends when a step turns the plane by less than this (radians) and moves it by less than this share of the size."""
+"""The search for a plane ends at a step below this: of the normal in radians, of the offset as a share of the size."""
 _ALIKE = 0.3  # cosine of normals below which a point and its match are on different parts of the surface
 _SINGULAR = 1e-9  # share of the largest eigenvalue; directions below it, as of spheres, determine no plane
 _OTHER_PLANE = 0.7  # cosine; starts that end less than about 45 degrees apart have found the same plane
@@ -129,7 +129,8 @@ def _best_plane(mesh: Mesh, engine: ClosestPointEngine, normal: FloatArray) -> t
         turned = (x @ tangents.T) * across[:, None] + (x @ normal - offset)[:, None] * (there @ tangents.T)
         change = 2.0 * np.column_stack([-turned, across]) * valid[:, None]
         gram, residual = change.T @ change, np.einsum("md,md->m", there, near.points - image)
-        step = np.linalg.lstsq(gram, change.T @ residual, _SINGULAR)[0]
+        inverse: FloatArray = np.asarray(np.linalg.pinv(gram, _SINGULAR, hermitian=True))  # pyright: ignore
+        step = inverse @ (change.T @ residual)
         normal = normal + step[:2] @ tangents
         normal, offset = normal / np.linalg.norm(normal), offset + float(step[2])
         if np.linalg.norm(step) < _STOP:

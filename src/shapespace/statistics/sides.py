@@ -121,7 +121,8 @@ def find_sides(cohort: Cohort) -> Sides:
         raise InputError("Landmarks and other points without triangles need --pairs, which names those that mirror "
                          "each other, or --side, the column of the sides of separate shapes.")  # fmt: skip
     if (known := pairs_of_triangles(cohort.faces, cohort.n_vertices)) is not None:
-        return given_sides(cohort, list(enumerate(known.tolist())), "The pairs of the symmetric template")
+        rows = list(zip(range(len(known)), known.tolist(), strict=True))
+        return given_sides(cohort, rows, "The pairs of the symmetric template")
     # A model is made of more shapes than most cohorts hold, so its mean is the more symmetric one.
     mean = cohort.reference if cohort.fitted is None else cohort.fitted.model.mean_vertices
     mesh = Mesh(mean, cohort.faces, name="mean")
@@ -129,8 +130,8 @@ def find_sides(cohort: Cohort) -> Sides:
     if symmetry.off_share > SYMMETRIC_SHARE:
         raise InputError(
             f"The mean lies {100 * symmetry.off_share:.1f} % of its size from its own mirror image about the best "
-            f"plane, and over {100 * SYMMETRIC_SHARE:.0f} % an object, such as a femur or a spleen, is taken to have no "
-            "mirror symmetry; leave asymmetry out, or name what mirrors what with --pairs."
+            f"plane, and above {100 * SYMMETRIC_SHARE:.0f} % an object, such as a femur, has no mirror symmetry; name "
+            "partners with --pairs, or use a symmetric template (correspond --symmetric-template)."
         )
     notes: list[str] = []
     rival = min(symmetry.others_share, default=np.inf)
