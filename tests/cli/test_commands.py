@@ -13,7 +13,10 @@ import pytest
 from conftest import Outcome, Run, World, leftovers
 from shapespace import __version__
 from shapespace.cli import parser
+from shapespace.datasets.bones import Bone
 from shapespace.datasets.faces import EXPRESSIONS
+from shapespace.datasets.organs import Organ, raw_surface
+from shapespace.geometry.mirror_plane import pairs_of_triangles
 from shapespace.io.files import sha256_of_file
 from shapespace.io.landmarks.landmark_io import write_landmarks
 from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
@@ -160,6 +163,28 @@ def test_check_writes_repaired_meshes_in_mm_and_their_mirror_images(run: Run, wo
     assert "written" not in reports[1] and not stale.exists()
     assert np.array_equal(written.vertices, wanted.vertices * [-10.0, 10.0, 10.0])
     assert wanted.faces is not None and np.array_equal(written.faces, wanted.faces[:, ::-1])
+
+
+def test_check_writes_symmetric_meshes_and_names_files_without_symmetry(run: Run, tmp_path: Path) -> None:
+    skull, organ = tmp_path / "skull.ply", tmp_path / "organ.ply"
+    write_mesh(skull, raw_surface(Bone.draw(np.random.default_rng(3)), np.random.default_rng(3), 500))
+    write_mesh(organ, raw_surface(Organ.draw(np.random.default_rng(0)), np.random.default_rng(0), 500))
+    outcome = run("check", skull, organ, "-o", tmp_path / "out", "--symmetric", "--unit", "cm", "--json")
+    assert outcome.code == 1
+    report, refused = outcome.facts
+    written = read_mesh(Path(report["written"]))
+    assert written.faces is not None
+    pairs = pairs_of_triangles(written.faces, len(written.vertices))
+    assert pairs is not None
+    assert (pairs == np.arange(len(pairs))).sum() == report["midline_vertices"]
+    assert len(pairs) == report["midline_vertices"] + 2 * report["vertex_pairs"]
+    normal, point = np.array(report["plane_normal"]), np.array(report["plane_point_mm"])
+    assert np.abs((written.vertices[pairs] - written.vertices) @ normal / 2
+                  + (written.vertices - point) @ normal).max() < 1e-9  # fmt: skip
+    assert 0.0 < report["asymmetry_share"] < 0.02
+    assert "organ.ply has no mirror symmetry" in refused["error"]
+    assert not (tmp_path / "out" / "organ.ply").exists()
+    assert "--symmetric" in run("check", skull, "--symmetric").sentence()
 
 
 def test_check_overwrites_no_mesh_that_it_reads(run: Run, world: World, tmp_path: Path) -> None:

@@ -361,12 +361,15 @@ COMMANDS: tuple[Command, ...] = (
     Command(
         "check",
         "check meshes: contents, defects, and their repair before a fit",
-        ("shapespace check scan.obj", "shapespace check left_bones -o mirrored --mirror --unit cm"), run.check,
+        ("shapespace check scan.obj", "shapespace check left_bones -o mirrored --mirror --unit cm",
+         "shapespace check template.ply -o symmetric --symmetric"), run.check,
         (
             basic("files", "FILE", "mesh files, or folders of them", nargs="+", parse=Path),
             basic("-o --output", "DIR", "output folder for the repaired meshes in mm, as NAME.ply", parse=Path),
             basic("--unit", "UNIT", "unit of the files, for -o (default: mm)", choices=_UNITS),
             basic("--mirror", help="write mirror images, such as of left bones among right ones"),
+            basic("--symmetric", help="write symmetric meshes, as templates: the mean of each mesh and its mirror "
+                  "image, with vertices in left and right pairs and on the midline"),
             basic("--recursive", help="also search subfolders of the given folders"),
             basic("--strict", help=_STRICT_HELP),
         ),
@@ -401,6 +404,7 @@ COMMANDS: tuple[Command, ...] = (
                      "initialises the first round", parse=Path),
             advanced("--subjects", "COLUMN", "column of the list of scans that names the subjects: each scan is then "
                      "registered from the subject's other scans, the most usual one first"),
+            advanced("--symmetric-template", source=CORRESPOND),
             advanced("--mirror", source=CORRESPOND),
             advanced("--groups", help="bring each kind of object into correspondence, in folders group_1 (the largest "
                      "group), group_2, ... of the output folder (default: the largest group only)"),

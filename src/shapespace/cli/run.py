@@ -166,7 +166,7 @@ def check(arguments: argparse.Namespace) -> int:
 
     reports = check(
         arguments.files, recursive=arguments.recursive, strict=arguments.strict, output=arguments.output,
-        unit=arguments.unit, mirror=arguments.mirror, say=warn,
+        unit=arguments.unit, mirror=arguments.mirror, symmetric=arguments.symmetric, say=warn,
     )  # fmt: skip
     if arguments.json:
         show_json(reports)

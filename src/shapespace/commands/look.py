@@ -25,7 +25,7 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, read, to_json
 from shapespace.store.corresponding import json_of
 from shapespace.store.results import Results, mesh_at, modes_of, results_at
-from shapespace.types import MM_PER_UNIT
+from shapespace.types import MM_PER_UNIT, Mesh
 
 NOT_CALIBRATED = "its results are not calibrated: statuses, intervals and expected errors come from the model alone"
 
@@ -38,6 +38,7 @@ def check(
     output: Path | None = None,
     unit: str | None = None,
     mirror: bool = False,
+    symmetric: bool = False,
     say: Callable[[str], None],
 ) -> list[dict[str, Any]]:
     """Return what is in each mesh file, what is wrong with it, and what fitting will do about it.
@@ -51,14 +52,15 @@ def check(
         output: folder in which the repaired meshes are written in mm, as NAME.ply (default: none is written).
         unit: of the files, a name of `MM_PER_UNIT` (default: mm).
         mirror: write mirror images, such as of left bones among right ones.
+        symmetric: write symmetric meshes, for templates with left and right pairs of vertices; see `symmetrise`.
         say: called with each message on skipped files.
 
     Raises:
-        InputError: `unit` or `mirror` without `output`, or `output` contains the files.
+        InputError: `unit`, `mirror` or `symmetric` without `output`, or `output` contains the files.
         FileError: `output` cannot be written.
     """
-    if output is None and (unit is not None or mirror):
-        raise InputError("--unit and --mirror change what is written; give the folder for it with -o.")
+    if output is None and (unit is not None or mirror or symmetric):
+        raise InputError("--unit, --mirror and --symmetric change what is written; give the folder for it with -o.")
     reports: list[dict[str, Any]] = []
     listed = mesh_files(paths, recursive=recursive, apart_from=output)
     for sentence in listed.left_out:
@@ -77,6 +79,11 @@ def check(
         try:
             mesh = read_mesh(path)
             report, repaired = examine_and_repair(mesh, strict=strict)
+            facts: dict[str, Any] = {}
+            if repaired is not None and path in targets:
+                repaired = replace(repaired, vertices=MM_PER_UNIT[unit or "mm"] * repaired.vertices, landmarks={})
+                if symmetric:
+                    repaired, facts = _symmetrised(repaired)
         except ShapespaceError as error:
             reports.append({"file": str(path), "usable": False, "error": naming(path, str(error))})
             continue
@@ -86,12 +93,27 @@ def check(
             continue
         findings = [{"level": one.level, "what": one.problem, "action": one.action} for one in report.findings]
         findings += [{"level": "note", "what": note, "action": ""} for note in mesh.notes]
-        reports.append({"file": str(path), "usable": repaired is not None, **asdict(report), "findings": findings})
+        usable = {"usable": repaired is not None}
+        reports.append({"file": str(path), **usable, **asdict(report), **facts, "findings": findings})
         if repaired is not None and path in targets:
-            written = replace(repaired, vertices=MM_PER_UNIT[unit or "mm"] * repaired.vertices, landmarks={})
-            write_mesh(targets[path], mirror_image(written) if mirror else written)
+            write_mesh(targets[path], mirror_image(repaired) if mirror else repaired)
             reports[-1]["written"] = str(targets[path])
     return reports
+
+
+def _symmetrised(mesh: Mesh) -> tuple[Mesh, dict[str, Any]]:
+    """Return the symmetric mesh, and its facts."""
+    from shapespace.correspondence.symmetric_template import symmetrise  # compiled
+
+    symmetric = symmetrise(mesh)
+    return symmetric.mesh, {
+        "asymmetry_mm": symmetric.asymmetry,
+        "asymmetry_share": symmetric.asymmetry_share,
+        "plane_point_mm": symmetric.point.tolist(),
+        "plane_normal": symmetric.normal.tolist(),
+        "midline_vertices": int(symmetric.midline.sum()),
+        "vertex_pairs": int((~symmetric.midline).sum()) // 2,
+    }
 
 
 def info(path: Path) -> dict[str, Any]:

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from shapespace.correspondence.groupwise import correspond
     from shapespace.correspondence.landmark_transfer import LandmarkCheck, MarkedSpecimens, TransferredLandmarks
     from shapespace.correspondence.settings import CorrespondConfig
+    from shapespace.correspondence.symmetric_template import SymmetricMesh, symmetrise
 
 __all__ = [
     "CorrespondConfig",
@@ -19,8 +20,10 @@ __all__ = [
     "Corresponding",
     "LandmarkCheck",
     "MarkedSpecimens",
+    "SymmetricMesh",
     "TransferredLandmarks",
     "correspond",
+    "symmetrise",
 ]
 __getattr__, __dir__ = lazy_names(
     __name__,
@@ -29,5 +32,6 @@ __getattr__, __dir__ = lazy_names(
         "correspondence.groupwise": ("correspond",),
         "correspondence.landmark_transfer": ("LandmarkCheck", "MarkedSpecimens", "TransferredLandmarks"),
         "correspondence.settings": ("CorrespondConfig",),
+        "correspondence.symmetric_template": ("SymmetricMesh", "symmetrise"),
     },
 )

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from shapespace.correspondence.landmark_guide import contradicts_most, with_own_landmarks
 from shapespace.correspondence.scan_set import copies
 from shapespace.correspondence.settings import FEWEST, SIZE, CorrespondConfig
+from shapespace.correspondence.symmetric_template import symmetrise
 from shapespace.correspondence.template import check_template, choose_template, clean_scan, resample
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.doctor import NON_FINITE, repair
@@ -52,9 +53,12 @@ def first_template(
     """Return the input of the first round: `template` as it is, the mean of `model`, or the scan nearest to the others.
 
     Raises:
-        InputError: fewer than two scans, scans that are all equal, or both a template and a model.
+        InputError: fewer than two scans, scans that are all equal, both a template and a model, or an object without
+            mirror symmetry that `symmetric_template` asks for.
         MeshError: no scan can be a template, or the template or model has no triangles.
     """
+    if config.symmetric_template and model is not None:
+        raise InputError("The mean of a model is used unchanged as the template; omit --symmetric-template.")
     if len(scans) < FEWEST:
         raise InputError(f"A correspondence needs at least {FEWEST} scans, not {len(scans)}; give more.")
     if not 0 < config.landmark_uncertainty < np.inf:
@@ -73,6 +77,9 @@ def first_template(
         origin = " ".join([f"{template.name} was given as the template.", *sentences])
     else:
         mesh, origin = _chosen_scan(repaired, config)
+    if config.symmetric_template:
+        mesh = symmetrise(mesh).mesh
+        origin += " It was made symmetric."
     scale = SIZE / rms_size(mesh.vertices)
     T = Similarity(scale, np.eye(3), -scale * mesh.vertices.mean(axis=0))
     mesh = mesh.with_vertices(T.apply(mesh.vertices), {name: T.apply(point) for name, point in mesh.landmarks.items()})

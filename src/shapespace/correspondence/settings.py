@@ -42,6 +42,8 @@ class CorrespondConfig:
             from outside.
         ignore_colours: match points by place and normal alone, also where scans have colours; for colours that are not
             those of the surface.
+        symmetric_template: make the first template symmetric, with vertices in left and right pairs and on the midline;
+            for objects with mirror symmetry, such as faces.
         landmark_uncertainty: standard deviation of the landmarks, as a share of the object's size (RMS distance from
             its centre).
         seed: random seed.
@@ -61,5 +63,6 @@ class CorrespondConfig:
     pose: PoseRange = "search"
     outer: bool = False
     ignore_colours: bool = False
+    symmetric_template: bool = False
     landmark_uncertainty: float = 0.02
     seed: int = 0

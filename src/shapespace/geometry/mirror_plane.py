@@ -9,53 +9,26 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from shapespace.errors import InputError
-from shapespace.geometry.closest import build_engine
-from shapespace.geometry.normals import faces_of, rms_size
-from shapespace.geometry.similarity import fit_similarity
-from shapespace.types import FloatArray, IntArray, Mesh, Similarity
+from shapespace.geometry.closest import ClosestPointEngine, build_engine, on_boundary
+from shapespace.geometry.normals import boundary_vertices, faces_of, rms_size, vertex_normals
+from shapespace.types import FloatArray, IntArray, Mesh
 
-_OFF = 0.01
-"""A surface whose mirror image lies within this share of its size is taken for symmetric."""
+SYMMETRIC_SHARE = 0.02
+"""A surface has mirror symmetry if the RMS distance to its mirror image is at most this share of its size."""
 FLIP = np.array([-1.0, 1.0, 1.0])
 """What turns points (..., 3) into their mirror images about x = 0."""
 
 _POINTS = 1_000  # points of the mesh that planes are fitted to; time grows with them
 _ITERATIONS = 30  # limit of the iterations for one plane
 _STOP = 1e-5
-"""The search for a plane ends when the RMS falls by less than this share of the size."""
+"""The search for a plane ends at a step below this: of the normal in radians, of the offset as a share of the size."""
+_ALIKE = 0.3  # cosine of normals below which a point and its match are on different parts of the surface
+_SINGULAR = 1e-9  # share of the largest eigenvalue; directions below it, as of spheres, determine no plane
+_OTHER_PLANE = 0.7  # cosine; starts that end less than about 45 degrees apart have found the same plane
 _TRIES = 50
 """Triangles from which pairs may fail to spread before the search is given up."""
-_APART = 0.2
-"""Vertices of a pair are no further from one another's mirror image than this share of the size."""
-
-
-def mirror_vertices(vertices: FloatArray) -> IntArray:
-    """Return (V,) the vertex on the other side of the plane x = 0, its own inverse.
-
-    Args:
-        vertices: (V, 3) of a symmetric surface, such as a mean face, that looks along z.
-
-    Raises:
-        InputError: the surface is not its own mirror image, or its vertices do not pair up.
-    """
-    centred = vertices - vertices.mean(axis=0) * [0.0, 1.0, 1.0]
-    neighbours = cKDTree(centred).query(centred * FLIP)
-    distance, other = np.asarray(neighbours[0]), np.asarray(neighbours[1], dtype=np.int32)
-    size = float(np.sqrt((centred**2).sum(axis=1).mean()))
-    if distance.max() > _OFF * size or (other[other] != np.arange(len(other))).any():
-        raise InputError("This surface is not its own mirror image about x = 0; train without mirror images.")
-    return other
-
-
-def mirrored(vertices: FloatArray, other: IntArray) -> FloatArray:
-    """Return the mirror image (..., V, 3) of surfaces (..., V, 3), in correspondence with them.
-
-    Args:
-        vertices: of the surfaces.
-        other: (V,) from `mirror_vertices`.
-    """
-    return vertices[..., other, :] * FLIP
+LARGEST_PAIR_SHARE = 0.2
+"""Points of a pair are no further from each other's mirror image than this share of the size."""
 
 
 def mirror_image(mesh: Mesh) -> Mesh:
@@ -67,59 +40,136 @@ def mirror_image(mesh: Mesh) -> Mesh:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceMirror:
-    """A plane, wherever it lies, and for each vertex of a surface the place on it that is its mirror image.
+    """A mirror plane in any pose, and for each vertex of a surface the place on it that is its mirror image.
 
     Args:
-        corners: (V, 3) of the triangle that the place lies on.
-        weights: (V, 3) barycentric.
-        turn: (3, 3) orthogonal of determinant -1: directions d (column vectors) go to turn d.
+        corners: (V, 3) corners of the triangle on which the place is.
+        weights: (V, 3) barycentric coordinates of the place.
+        normal: (3,) unit normal of the plane.
+        offset: distance of the plane from the origin of the frame, along the normal.
         off_share: RMS distance of the surface's mirror image from it, as a share of its size (RMS distance from its
-            centre).
-        others_share: the same for the other planes that were tried, the nearest first.
+            centre). Points whose match is on the border or on a part that faces another way are missing on the other
+            side; the RMS of the rest is divided by its share of the points.
+        others_share: the same for other planes that were tried, the smallest first; empty if all starts lead to one
+            plane, or the pairs are known.
         image: (V, 3) the mirror image of the surface itself.
+        pairs: (V,) partner of each vertex if the order of the triangles defines it (see `pairs_of_triangles`), else
+            None.
     """
 
     corners: IntArray
     weights: FloatArray
-    turn: FloatArray
+    normal: FloatArray
+    offset: float
     off_share: float
     others_share: tuple[float, ...]
     image: FloatArray
+    pairs: IntArray | None = None
+
+    @property
+    def turn(self) -> FloatArray:
+        """(3, 3) the reflection of directions d (column vectors): turn d."""
+        return np.eye(3) - 2.0 * np.outer(self.normal, self.normal)
 
 
 def find_mirror(mesh: Mesh) -> SurfaceMirror:
-    """Return the plane about which a surface is nearest to its own mirror image.
+    """Return the plane about which a surface is closest to its own mirror image.
 
-    The planes tried are those across the principal axes, each turned and shifted until the image lies best.
+    The planes tried are those across the principal axes, each moved by Gauss-Newton steps that minimise the distances
+    of the mirror image from the tangent planes of the surface. Parts that are missing on one side do not count. If the
+    triangles define pairs of vertices, the plane is that of the pairs.
 
     Args:
         mesh: with triangles, in any frame.
     """
-    x = mesh.vertices
-    engine, size = build_engine(mesh), rms_size(x)
-    centre = x.mean(axis=0)
-    some = x[:: max(1, len(x) // _POINTS)] - centre
-    tried: list[tuple[float, FloatArray, Similarity]] = []
-    for axis in np.linalg.svd(x - centre, full_matrices=False)[2]:
-        flip = np.eye(3) - 2.0 * np.outer(axis, axis)
-        flipped = some @ flip.T + centre
-        T, near, rms = Similarity.identity(), engine.query(flipped), np.inf
-        for _ in range(_ITERATIONS):
-            if rms - near.rms < _STOP * size:
-                break
-            rms = near.rms
-            T = fit_similarity(flipped, near.points, with_scale=False)
-            near = engine.query(T.apply(flipped), near)
-        tried.append((near.rms, flip, T))
-    tried.sort(key=lambda one: one[0])
-    rms, flip, T = tried[0]
-    image = T.apply((x - centre) @ flip.T + centre)
-    nearest = engine.query(image)
+    x, faces = mesh.vertices, faces_of(mesh)
+    centre, size, pairs = x.mean(axis=0), rms_size(x), pairs_of_triangles(faces, len(x))
+    surface = Mesh((x - centre) / size, faces)
+    engine = build_engine(surface)
+    if pairs is None:
+        axes = np.linalg.svd(surface.vertices, full_matrices=False)[2]
+        planes = sorted((_best_plane(surface, engine, axis) for axis in axes), key=lambda plane: plane[0])
+        share, normal, offset = planes[0]
+        others = tuple(plane[0] for plane in planes if abs(plane[1] @ normal) < _OTHER_PLANE)
+    else:
+        normal, offset = plane_of_pairs(surface.vertices, surface.vertices[pairs])
+        share, others = np.nan, ()
+    nearest = engine.query(reflect(surface.vertices, normal, offset))
     assert nearest.triangle is not None and nearest.barycentric is not None
-    others = tuple(one[0] / size for one in tried[1:])
-    return SurfaceMirror(
-        faces_of(mesh)[nearest.triangle], nearest.barycentric, T.rotation @ flip, rms / size, others, image
-    )
+    corners, weights = faces[nearest.triangle], nearest.barycentric
+    if pairs is not None:
+        share, corners, weights = nearest.rms, np.tile(pairs[:, None], 3), np.tile([1.0, 0.0, 0.0], (len(x), 1))
+    offset = size * offset + float(normal @ centre)
+    image = reflect(x, normal, offset)
+    return SurfaceMirror(corners, weights, normal, offset, share, others, image, pairs)
+
+
+def _best_plane(mesh: Mesh, engine: ClosestPointEngine, normal: FloatArray) -> tuple[float, FloatArray, float]:
+    """Return `off_share` of the best plane near a first one, its normal and its offset.
+
+    Args:
+        mesh: of size 1, about the origin.
+        engine: of it.
+        normal: (3,) of the first plane, which contains the origin.
+    """
+    rows, offset, share, near = slice(None, None, max(1, len(mesh.vertices) // _POINTS)), 0.0, np.inf, None
+    faces, rim, normals = faces_of(mesh), boundary_vertices(mesh), vertex_normals(mesh)
+    x, own = mesh.vertices[rows], normals[rows]
+    for _ in range(_ITERATIONS):
+        image = reflect(x, normal, offset)
+        near = engine.query(image, near)
+        assert near.triangle is not None and near.barycentric is not None
+        there = np.einsum("mc,mcd->md", near.barycentric, normals[faces[near.triangle]])
+        valid = np.einsum("md,md->m", reflect(own, normal, 0.0), there) > _ALIKE
+        valid &= ~on_boundary(near, mesh, rim)
+        if not valid.any():
+            break
+        share = float(np.sqrt((near.distance[valid] ** 2).mean()) / valid.mean())
+        tangents, across = np.linalg.svd(normal[None])[2][1:], there @ normal
+        turned = (x @ tangents.T) * across[:, None] + (x @ normal - offset)[:, None] * (there @ tangents.T)
+        change = 2.0 * np.column_stack([-turned, across]) * valid[:, None]
+        gram, residual = change.T @ change, np.einsum("md,md->m", there, near.points - image)
+        inverse: FloatArray = np.asarray(np.linalg.pinv(gram, _SINGULAR, hermitian=True))  # pyright: ignore
+        step = inverse @ (change.T @ residual)
+        normal = normal + step[:2] @ tangents
+        normal, offset = normal / np.linalg.norm(normal), offset + float(step[2])
+        if np.linalg.norm(step) < _STOP:
+            break
+    return share, normal, offset
+
+
+def reflect(points: FloatArray, normal: FloatArray, offset: float) -> FloatArray:
+    """Return the mirror images (..., 3) of points at the plane of the unit `normal` at `offset` from the origin."""
+    return points - 2.0 * (points @ normal - offset)[..., None] * normal
+
+
+def plane_of_pairs(x: FloatArray, y: FloatArray) -> tuple[FloatArray, float]:
+    """Return the unit normal (3,) and the offset of the plane at which points x (N, 3) are mirrored closest to y."""
+    cross = (x - x.mean(axis=0)).T @ (y - y.mean(axis=0))
+    normal = np.linalg.eigh(cross + cross.T)[1][:, 0]
+    return normal, float(normal @ (x.mean(axis=0) + y.mean(axis=0)) / 2.0)
+
+
+def pairs_of_triangles(faces: IntArray, vertices: int) -> IntArray | None:
+    """Return (V,) the partner of each vertex if the second half of the triangles mirrors the first, in its order.
+
+    Templates from `symmetrise` have this order: corner k of a triangle is the partner of corner 2 - k of its mirror
+    image. It remains in all surfaces in correspondence with them.
+
+    Args:
+        faces: (F, 3).
+        vertices: how many there are.
+
+    Returns:
+        The pairs, their own inverse, vertices on the plane with themselves; None for triangles in another order.
+    """
+    half, own = len(faces) // 2, np.arange(vertices, dtype=np.int32)
+    first, second, other = faces[:half], faces[half:], own.copy()
+    if len(second) != half:
+        return None
+    other[first], other[second] = second[:, ::-1], first[:, ::-1]
+    same = (other[first] == second[:, ::-1]).all() and (other[other] == own).all()
+    return other if same and (other != own).any() else None
 
 
 def mirror_pairs(mesh: Mesh, mirror: SurfaceMirror) -> IntArray | None:
@@ -132,6 +182,8 @@ def mirror_pairs(mesh: Mesh, mirror: SurfaceMirror) -> IntArray | None:
         mesh: a surface with triangles.
         mirror: of it.
     """
+    if mirror.pairs is not None:
+        return mirror.pairs
     x, faces = mesh.vertices, faces_of(mesh)
     nearest = np.asarray(cKDTree(x).query(mirror.image)[1], dtype=np.int32)
     if (nearest[nearest] == np.arange(len(x))).all():
@@ -140,7 +192,7 @@ def mirror_pairs(mesh: Mesh, mirror: SurfaceMirror) -> IntArray | None:
     if other is None:
         return None
     far = np.linalg.norm(x[other] - mirror.image, axis=1).max()
-    return other if far <= _APART * rms_size(x) else None
+    return other if far <= LARGEST_PAIR_SHARE * rms_size(x) else None
 
 
 def _by_triangles(x: FloatArray, image: FloatArray, faces: IntArray, nearest: IntArray) -> IntArray | None:

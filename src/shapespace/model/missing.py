@@ -16,6 +16,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from shapespace.errors import InputError
+from shapespace.geometry.mirror_plane import pairs_of_triangles
 from shapespace.geometry.normals import part_of
 from shapespace.geometry.procrustes import Gauge, align_in_place, centroid_size, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
@@ -80,6 +81,9 @@ class ObservedMeshes:
             if not own.any():
                 raise InputError(f"{mesh.name}: all of its vertices are missing; leave it out.")
         used = observed.sum(axis=0) >= max(min_seen * len(meshes) * (1 - 1e-12), _FEWEST)
+        pairs = None if meshes[0].faces is None else pairs_of_triangles(meshes[0].faces, len(used))
+        if pairs is not None:
+            used &= used[pairs]  # a symmetric template stays one
         if not used.any():
             raise InputError(
                 f"No vertex is observed by {100 * min_seen:g} % of the meshes and two of them, so nothing varies that "

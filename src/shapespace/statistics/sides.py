@@ -15,7 +15,7 @@ from shapespace.cohort.cohort import Cohort, padded, subjects_of
 from shapespace.cohort.table import list_names
 from shapespace.errors import FileFormatError, InputError
 from shapespace.geometry.landmark_alignment import AlignConfig, superimpose
-from shapespace.geometry.mirror_plane import FLIP, find_mirror, mirror_pairs
+from shapespace.geometry.mirror_plane import FLIP, SYMMETRIC_SHARE, find_mirror, mirror_pairs, pairs_of_triangles
 from shapespace.geometry.normals import rms_size
 from shapespace.geometry.procrustes import align_in_place, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
@@ -24,8 +24,6 @@ from shapespace.io.tables.table_io import read_rows
 from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks
 
-LARGEST_OFF = 0.02
-"""A mean that lies further (RMS, share of its size) from its mirror image about any plane is not symmetric."""
 LARGEST_PAIRED_OFF = 0.1
 """The same where pairs are given, from vertex to vertex."""
 _LARGEST_BYTES = 2**26  # bytes; a table of pairs of millions of vertices is smaller
@@ -122,19 +120,22 @@ def find_sides(cohort: Cohort) -> Sides:
     if cohort.faces is None:
         raise InputError("Landmarks and other points without triangles need --pairs, which names those that mirror "
                          "each other, or --side, the column of the sides of separate shapes.")  # fmt: skip
+    if (known := pairs_of_triangles(cohort.faces, cohort.n_vertices)) is not None:
+        rows = list(zip(range(len(known)), known.tolist(), strict=True))
+        return given_sides(cohort, rows, "The pairs of the symmetric template")
     # A model is made of more shapes than most cohorts hold, so its mean is the more symmetric one.
     mean = cohort.reference if cohort.fitted is None else cohort.fitted.model.mean_vertices
     mesh = Mesh(mean, cohort.faces, name="mean")
     symmetry = find_mirror(mesh)
-    if symmetry.off_share > LARGEST_OFF:
+    if symmetry.off_share > SYMMETRIC_SHARE:
         raise InputError(
             f"The mean lies {100 * symmetry.off_share:.1f} % of its size from its own mirror image about the best "
-            f"plane, and over {100 * LARGEST_OFF:.0f} % an object, such as a femur or a spleen, is taken to have no "
-            "mirror symmetry; leave asymmetry out, or name what mirrors what with --pairs."
+            f"plane, and above {100 * SYMMETRIC_SHARE:.0f} % an object, such as a femur, has no mirror symmetry; name "
+            "partners with --pairs, or use a symmetric template (correspond --symmetric-template)."
         )
     notes: list[str] = []
-    rival = symmetry.others_share[0]
-    if rival <= LARGEST_OFF:
+    rival = min(symmetry.others_share, default=np.inf)
+    if rival <= SYMMETRIC_SHARE:
         notes.append(
             f"The mean has another plane of symmetry, {100 * rival:.2f} % of its size off beside "
             f"{100 * symmetry.off_share:.2f} %; if that is the one you mean, name the pairs with --pairs."

@@ -9,14 +9,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from shapespace.errors import InputError
-from shapespace.geometry.mirror_plane import find_mirror
+from shapespace.geometry.mirror_plane import SYMMETRIC_SHARE, find_mirror
 from shapespace.geometry.normals import rms_size
 from shapespace.io.memory_cache import cached_with_owner
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, IntArray
 
-_SYMMETRIC_SHARE = 0.02
-"""A mean whose mirror image lies within this share of its size may be completed by its other side."""
 _PATCHES, _PRIOR_PATCHES = 300.0, 10.0
 """Independent patches of a whole surface, as in R20a, and those that the asymmetry of the modes is worth."""
 _SEAM = 0.1  # share of the size over which the mirror image passes into what is observed
@@ -59,7 +57,7 @@ def add_mirror_image(
 @cached_with_owner()
 def _mirror(model: ShapeModel) -> tuple[IntArray, FloatArray, FloatArray]:
     mirror = find_mirror(model.mesh())
-    if mirror.off_share > _SYMMETRIC_SHARE:
+    if mirror.off_share > SYMMETRIC_SHARE:
         raise InputError(
             f"The mean shape differs from its mirror image by {100 * mirror.off_share:.1f} % of its size, so its sides "
             "do not predict each other; leave --mirror out."
