@@ -32,6 +32,7 @@ FUNCTIONS: Mapping[str, str] = {
     "scale": "less its mean, in standard deviations",
     "poly": "orthogonal polynomial, poly(age, 2)",
     "bs": "B-spline, bs(age, df=4)",
+    "cr": "natural cubic spline, cr(age, df=2)",
 }
 """What a formula may call, and what it is."""
 
@@ -383,7 +384,9 @@ class _Factor:
 def _renamed(tree: ast.expr, column: str) -> ast.expr:
     """Return a checked call with `column` for its innermost first argument."""
     if isinstance(tree, ast.Call):
-        return ast.Call(tree.func, [_renamed(tree.args[0], column), *tree.args[1:]], tree.keywords)
+        # Without the constraint the columns of cr() contain the constant.
+        centred = [ast.keyword("constraints", ast.Constant("center"))] if ast.unparse(tree.func) == "cr" else []
+        return ast.Call(tree.func, [_renamed(tree.args[0], column), *tree.args[1:]], [*tree.keywords, *centred])
     return ast.Name(column)
 
 
@@ -536,7 +539,7 @@ class _Bound:
             self.position += 1
         if depth:
             raise self._unreadable()
-        if token in ("poly", "bs"):
+        if token in ("poly", "bs", "cr"):
             columns = max([_SPLINE, *(int(one) for one in inside if one.isdecimal() and len(one) < 3)])
             return _Size(columns, columns)
         return max(

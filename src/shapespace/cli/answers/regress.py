@@ -1,4 +1,4 @@
-"""`shapespace regress`: regression of a number, such as age, on shape."""
+"""`shapespace regress`: regression of a number, such as age, on shape, and of shape on a number."""
 
 from __future__ import annotations
 
@@ -14,9 +14,14 @@ def run(arguments: argparse.Namespace) -> int:
     from shapespace.cohort.read import CohortConfig, read_cohort
     from shapespace.io.files import make_folder
     from shapespace.report.analyses.regression_report import prediction_report, regression_report
+    from shapespace.report.analyses.shape_prediction_report import shape_prediction_report
     from shapespace.statistics.predictor import Predictor, refuse_known
     from shapespace.statistics.regression import regress
+    from shapespace.statistics.shape_prediction import predict_shapes
 
+    shared = {name: getattr(arguments, name) for name in ("subject", "seed", "drop_missing")}
+    chosen = {name: getattr(arguments, name) for name in ("permutations", "confidence")}
+    shared |= {name: value for name, value in chosen.items() if value is not None}
     if arguments.predictor is not None:
         learned = Predictor.load(arguments.predictor)
         if learned.model_hash and arguments.surfaces == "auto":
@@ -24,18 +29,12 @@ def run(arguments: argparse.Namespace) -> int:
         cohort = cohort_of(arguments, learned.gauge, least=1)
         return finish(prediction_report(learned, cohort, learned.predict(cohort)), arguments)
     cohort = cohort_of(arguments)
+    if arguments.along is not None:
+        with steps(None, "flipping signs", "step", quiet=arguments.quiet) as step:
+            shapes = predict_shapes(cohort, **given(arguments, predict_shapes, **shared), progress=step)
+        return finish(shape_prediction_report(shapes), arguments)
     with steps(None, "learning", "fold", quiet=arguments.quiet) as step:
-        result = regress(
-            cohort,
-            arguments.target,
-            subject=arguments.subject,
-            folds=arguments.folds,
-            permutations=arguments.permutations,
-            confidence=arguments.level,
-            seed=arguments.seed,
-            drop_missing=arguments.drop_missing,
-            progress=step,
-        )
+        result = regress(cohort, arguments.target, folds=arguments.folds, **shared, progress=step)
     new = None
     if arguments.predict is not None:
         config = CohortConfig(**given(arguments, CohortConfig, shapes=arguments.new_shapes, least=1))
