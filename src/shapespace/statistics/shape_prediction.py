@@ -210,7 +210,8 @@ def predict_shapes(
         cohort: the shapes.
         along: column of the number along which shapes are predicted, such as age.
         at: values of the number, within those observed (default: five from the 5th to the 95th percentile).
-        curve: how shape depends on the number: `linear`, or `spline`, a natural cubic spline with a knot at the median.
+        curve: how shape depends on the number: `linear`, or `spline`, a natural cubic spline with a knot at the median
+            (default: linear).
         covariates: further terms of the linear model, such as 'sex + site' or 'sex + age:sex'.
         hold: values at which other columns are held (default: numbers at their mean, and classes count alike).
         lengths: pairs of landmarks whose distance is predicted too.

@@ -6,6 +6,7 @@ import argparse
 
 from shapespace.cli.answers.common import cohort_of, finish
 from shapespace.cli.options import given
+from shapespace.errors import InputError
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -19,9 +20,13 @@ def run(arguments: argparse.Namespace) -> int:
     from shapespace.statistics.regression import regress
     from shapespace.statistics.shape_prediction import predict_shapes
 
-    shared = {name: getattr(arguments, name) for name in ("subject", "seed", "drop_missing")}
-    chosen = {name: getattr(arguments, name) for name in ("permutations", "confidence")}
-    shared |= {name: value for name, value in chosen.items() if value is not None}
+    others = ("at", "curve", "covariates", "hold", "length") if arguments.along is None else ("predict", "new_shapes")
+    for name in others:
+        if getattr(arguments, name):
+            needed = "--along" if arguments.along is None else "--target"
+            raise InputError(f"--{name.replace('_', '-')} needs {needed}; name the column of the number with it.")
+    names = ("subject", "seed", "drop_missing", "permutations", "confidence")
+    shared = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
     if arguments.predictor is not None:
         learned = Predictor.load(arguments.predictor)
         if learned.model_hash and arguments.surfaces == "auto":
@@ -30,8 +35,9 @@ def run(arguments: argparse.Namespace) -> int:
         return finish(prediction_report(learned, cohort, learned.predict(cohort)), arguments)
     cohort = cohort_of(arguments)
     if arguments.along is not None:
+        shared |= {name: value for name, value in given(arguments, predict_shapes).items() if value is not None}
         with steps(None, "flipping signs", "step", quiet=arguments.quiet) as step:
-            shapes = predict_shapes(cohort, **given(arguments, predict_shapes, **shared), progress=step)
+            shapes = predict_shapes(cohort, **shared, progress=step)
         return finish(shape_prediction_report(shapes), arguments)
     with steps(None, "learning", "fold", quiet=arguments.quiet) as step:
         result = regress(cohort, arguments.target, folds=arguments.folds, **shared, progress=step)
