@@ -106,7 +106,7 @@ def test_mean_shapes_of_landmarks_have_intervals_along_the_axes(run: Run, folder
     assert outcome.code == 0, outcome.err
     rows = table(folder / "out" / "landmarks.csv")
     assert len(rows) == 5 * 9 and all(float(row["x_low"]) <= float(row["x"]) <= float(row["x_high"]) for row in rows)
-    assert "L0_to_L5_mm" in table(folder / "out" / "shapes.csv")[0]
+    assert "L0_to_L5" in table(folder / "out" / "shapes.csv")[0]
 
 
 @pytest.mark.parametrize(
