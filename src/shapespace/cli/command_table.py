@@ -941,7 +941,8 @@ COMMANDS: tuple[Command, ...] = (
             basic("--at", "VALUES", source=ALONG, parse=values.numbers),
             basic("--curve", source=ALONG, default=None),
             basic("--covariates", "TERMS", source=ALONG),
-            advanced("--hold", "COLUMN=VALUE", source=ALONG, parse=values.held_values),
+            advanced("--hold", "COLUMN=VALUE", "of --along: value of another column, such as sex=female; commas part "
+                     "several (default: numbers at their mean, and classes count alike)", parse=values.words),
             advanced("--length", "A,B", "of --along: two landmarks whose distance is predicted too; can be repeated",
                      source=ALONG, field="lengths", parse=values.words, repeat=True, default=[]),
             basic("--predict", "NEW", "also predict new shapes, of other subjects: a table or a folder", parse=Path),

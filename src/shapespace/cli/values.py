@@ -142,14 +142,6 @@ def numbers(text: str) -> tuple[float, ...]:
     return tuple(number(word) for word in words(text))
 
 
-def held_values(text: str) -> dict[str, str]:
-    """Return the values of COLUMN=VALUE,COLUMN=VALUE by their columns."""
-    pairs = [word.partition("=") for word in words(text)]
-    if not all(column.strip() and value.strip() for column, _, value in pairs):
-        raise argparse.ArgumentTypeError(f"must be COLUMN=VALUE, such as sex=female, not {text!r}")
-    return {column.strip(): value.strip() for column, _, value in pairs}
-
-
 def shares(text: str) -> tuple[float, ...]:
     """Return numbers above 0 and at most 1, separated by commas."""
     return tuple(share(part) for part in text.split(","))

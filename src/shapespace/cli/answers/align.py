@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 
+from shapespace.cli.answers.common import column_value
 from shapespace.cli.options import given
 from shapespace.cli.printing import say, show, show_json
 
@@ -11,17 +12,14 @@ from shapespace.cli.printing import say, show, show_json
 def run(arguments: argparse.Namespace) -> int:
     """Align landmarks, and name the specimens to check."""
     from shapespace.commands.align import align
-    from shapespace.errors import InputError
     from shapespace.geometry.landmark_alignment import AlignConfig
     from shapespace.report.blocks.wording import counted
     from shapespace.schemas import to_json
 
     config = AlignConfig(**given(arguments, AlignConfig))
-    column, equals, value = (arguments.reflect or "").partition("=")
-    if arguments.reflect and not (column and equals and value):
-        raise InputError(f"--reflect is {arguments.reflect!r}; write COLUMN=VALUE, such as side=left.")
+    reflect = column_value(arguments.reflect, "--reflect") if arguments.reflect else None
     files = {"table": arguments.table, "sliders": arguments.sliders, "separate": arguments.separate}
-    _, record = align(arguments.data, arguments.output, config, **files, reflect=(column, value) if column else None)
+    _, record = align(arguments.data, arguments.output, config, **files, reflect=reflect)
     for note in record.notes:
         say(note)
     if arguments.json:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from shapespace.cli.answers.common import cohort_of, finish
+from shapespace.cli.answers.common import cohort_of, column_value, finish
 from shapespace.cli.options import given
 from shapespace.errors import InputError
 
@@ -35,9 +35,11 @@ def run(arguments: argparse.Namespace) -> int:
         return finish(prediction_report(learned, cohort, learned.predict(cohort)), arguments)
     cohort = cohort_of(arguments)
     if arguments.along is not None:
-        shared |= {name: value for name, value in given(arguments, predict_shapes).items() if value is not None}
+        hold = dict(column_value(word, "--hold") for word in arguments.hold or ())
+        options = {**given(arguments, predict_shapes, hold=hold), **shared}
+        options = {name: value for name, value in options.items() if value is not None}
         with steps(None, "flipping signs", "step", quiet=arguments.quiet) as step:
-            shapes = predict_shapes(cohort, **shared, progress=step)
+            shapes = predict_shapes(cohort, **options, progress=step)
         return finish(shape_prediction_report(shapes), arguments)
     with steps(None, "learning", "fold", quiet=arguments.quiet) as step:
         result = regress(cohort, arguments.target, folds=arguments.folds, **shared, progress=step)
