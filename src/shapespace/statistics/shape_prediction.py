@@ -32,7 +32,7 @@ FEWEST = 10
 """Subjects, of each column of the number in the model, below which nothing is learned; with 6 of a column p is below
 0.05 in up to 10 % of studies without an effect (docs/regress.md)."""
 _LEAST_DF = 3.0
-"""Degrees of freedom below which an interval is not known: there it covers up to 99.5 % instead of 95 % (measured in
+"""Degrees of freedom below which an interval is not known: there it covers up to 99 % instead of 95 % (measured in
 docs/regress.md)."""
 _EDGES = (5.0, 95.0)  # percentiles of the number between which the change of shape is measured
 _VALUES, _STEPS = 5, 21
