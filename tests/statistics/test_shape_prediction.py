@@ -146,7 +146,8 @@ def test_intervals_contain_the_true_mean_shape_where_variances_are_unequal(n: in
     inside: list[NDArray[np.bool_]] = []
     for seed in range(40):
         made = study(n, seed, scans, unequal=True)
-        at = np.clip(ages, *(lambda x: (x.min(), x.max()))(made.table.numbers("age")))
+        observed = made.table.numbers("age")
+        at = np.clip(ages, observed.min(), observed.max())
         found = predict_shapes(made, "age", at=tuple(at), curve=curve, permutations=0)  # type: ignore[arg-type]
         inside += [
             np.abs(shape - truth(age)) <= found.half_width_mm(k)
