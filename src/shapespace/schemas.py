@@ -810,14 +810,20 @@ class SurfaceMapPart(Part, frozen=True, kw_only=True, tag="surface_map"):
 class MorphPart(Part, frozen=True, kw_only=True, tag="morph"):
     """Two shapes in correspondence in an .npz file, between which a slider moves.
 
+    The slider moves on a line, or through the shapes low + weights[k] modes, at equal steps of a variable.
+
     Args:
-        arrays: the file; the next three are names of arrays in it.
+        arrays: the file; the next three, `modes` and `weights` are names of arrays in it.
         low: (V, 3) mm.
         high: (V, 3) mm.
         faces: (F, 3).
         low_label: what `low` is.
         high_label: what `high` is.
         times: factor of the difference in both; 1 is the true difference, below 1 it is drawn smaller.
+        modes: (q, V, 3) mm; empty for a line.
+        weights: (B, q), 0 in the first row.
+        variable: name of the variable.
+        range: its values at `low` and `high`.
     """
 
     arrays: str
@@ -827,6 +833,10 @@ class MorphPart(Part, frozen=True, kw_only=True, tag="morph"):
     low_label: str = "low"
     high_label: str = "high"
     times: float = 1.0
+    modes: str = ""
+    weights: str = ""
+    variable: str = ""
+    range: tuple[float, float] = (0.0, 1.0)
 
 
 class DeformationPart(Part, frozen=True, kw_only=True, tag="deformation"):

@@ -58,6 +58,31 @@ def test_a_morph_moves_from_one_shape_to_the_other_and_back(open_tab, report: Pa
     assert tab.complaints == [] and tab.asked == [] and not tab.page.evaluate("window.wicked === true")
 
 
+def test_a_morph_along_a_number_shows_its_value_and_the_shape_there(open_tab, tmp_path: Path) -> None:
+    """The shape bulges in the middle of the way, and is the same at both ends."""
+    d, faces = sphere(500)
+    low, high = (blob(d, np.full(5, side)) for side in (-2.0, 2.0))
+    arrays = {"low": low, "high": low, "faces": faces, "modes": (high - low)[None],
+              "weights": np.array([[0.0], [1.0], [0.0]])}  # fmt: skip
+    part = MorphPart(title="Growth", arrays="a.npz", low_label="age 20", high_label="age 60", modes="modes",
+                     weights="weights", variable="age", range=(20.0, 60.0))  # fmt: skip
+    AnalysisReport("regress", "Shape along age", ("It grows.",), (part,), arrays={"a.npz": arrays}).save(tmp_path)
+    tab = open_tab(write_report(tmp_path).as_uri(), DESKTOP)
+    widget = tab.page.locator("figure.turning .widget")
+    widget.scroll_into_view_if_needed()
+    canvas = widget.locator("canvas").first
+    canvas.wait_for(state="visible")
+    tab.until("!!document.querySelector('.turning.running')")
+    slider, pictures = widget.locator("input[type=range]"), {}
+    for value, label in ((-1, "age 20"), (0, "age 40"), (0.5, "age 50"), (1, "age 60")):
+        slider.evaluate("(e, value) => { e.value = value; e.dispatchEvent(new Event('input')); }", value)
+        tab.page.wait_for_timeout(300)
+        assert slider.get_attribute("aria-valuetext") == label
+        pictures[value] = canvas.screenshot()
+    assert change(pictures[-1], pictures[1]) < 0.002 < 0.005 < change(pictures[-1], pictures[0])
+    assert change(pictures[0], pictures[0.5]) > 0.002 and tab.complaints == []
+
+
 def test_without_a_script_both_shapes_are_stills(open_tab, report: Path) -> None:
     tab = open_tab(report.as_uri(), java_script_enabled=False)
     poster = tab.page.locator("figure.turning .poster img")

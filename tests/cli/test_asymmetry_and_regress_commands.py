@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shapespace.io.meshes.mesh_io import write_mesh
+from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.types import Mesh
 from symmetric_object import posed, symmetric_object
 
@@ -77,6 +77,38 @@ def test_what_is_learned_predicts_new_shapes_now_and_later(run: Run, folder: Pat
     assert float(now[0]["predicted"]) == pytest.approx(known, abs=5)
 
 
+def test_mean_shapes_along_a_number_are_kept_as_meshes_and_tables(run: Run, folder: Path) -> None:
+    outcome = run("regress", "people.csv", "--along", "age", "--at", "45,50,55", "--covariates", "group", "--hold",
+                  "group=control", "-o", "out", "--gauge", "form", "--permutations", "100")  # fmt: skip
+    assert outcome.code == 0, outcome.err
+    first = outcome.out.splitlines()[0]
+    assert first.startswith("Shape changes with age (p 0.01): ") and "between 12 subjects" in first
+    assert "with group control" in outcome.out
+    rows = table(folder / "out" / "shapes.csv")
+    assert [float(row["age"]) for row in rows] == [45, 50, 55]
+    size = [float(row["centroid_size_mm"]) for row in rows]
+    assert size[0] < size[1] < size[2], "they are taller"
+    assert float(rows[1]["centroid_size_low_mm"]) < size[1] < float(rows[1]["centroid_size_high_mm"])
+    tall = [float(np.ptp(read_mesh(folder / "out" / f"age_{age}.ply").vertices[:, 1])) for age in (45, 50, 55)]
+    assert tall[0] < tall[1] < tall[2]
+    with np.load(folder / "out" / "shapes.npz") as arrays:
+        np.testing.assert_allclose(arrays["shapes"][1], read_mesh(folder / "out" / "age_50.ply").vertices, atol=1e-4)
+
+
+def test_mean_shapes_of_landmarks_have_intervals_along_the_axes(run: Run, folder: Path) -> None:
+    meshes = [read_mesh(path) for path in sorted(folder.glob("s*.ply"))]
+    header = "specimen,landmark,x,y,z"
+    lines = [f"s{k:02d},L{m},{x},{y},{z}" for k, mesh in enumerate(meshes)
+             for m, (x, y, z) in enumerate(mesh.vertices[:9])]  # fmt: skip
+    (folder / "marks.csv").write_text("\n".join([header, *lines]) + "\n")
+    outcome = run("regress", "people.csv", "--shapes", "marks.csv", "--along", "age", "--length", "L0,L5", "-o", "out",
+                  "--permutations", "100")  # fmt: skip
+    assert outcome.code == 0, outcome.err
+    rows = table(folder / "out" / "landmarks.csv")
+    assert len(rows) == 5 * 9 and all(float(row["x_low"]) <= float(row["x"]) <= float(row["x_high"]) for row in rows)
+    assert "L0_to_L5" in table(folder / "out" / "shapes.csv")[0]
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -87,6 +119,12 @@ def test_what_is_learned_predicts_new_shapes_now_and_later(run: Run, folder: Pat
         (["regress", "people.csv", "--target", "group"], "'group' is 'case' at s00, which is no number"),
         (["regress", "people.csv", "--target", "age", "--predict", "people.csv"], "were learned from too"),
         (["regress", "people.csv", "--target", "age", "--level", "2"], "level of intervals"),
+        (["regress", "people.csv", "--along", "group"], "holds classes"),
+        (["regress", "people.csv", "--along", "age", "--at", "500"], "shapes are not predicted beyond, at 500"),
+        (["regress", "people.csv", "--along", "age", "--curve", "spline"], "12 subjects are too few"),
+        (["regress", "people.csv", "--along", "age", "--covariates", "group", "--hold", "group=x"], "held at 'x'"),
+        (["regress", "people.csv", "--along", "age", "--predict", "people.csv"], "--predict needs --target"),
+        (["regress", "people.csv", "--target", "age", "--at", "50"], "--at needs --along"),
         (["regress", "people.csv", "--predictor", "people.csv"], "make it again with shapespace regress"),
     ],
 )

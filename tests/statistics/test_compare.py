@@ -590,7 +590,7 @@ def test_settings_that_cannot_be_are_refused() -> None:
 
 def test_what_a_formula_may_call_is_called() -> None:
     table = people()
-    columns = {"C": "C(group)", "poly": "poly(age, 2)", "bs": "bs(age, df=4)"}
+    columns = {"C": "C(group)", "poly": "poly(age, 2)", "bs": "bs(age, df=4)", "cr": "cr(age, df=2)"}
     table["group"] = (np.arange(37) % 10).astype(float).tolist()
     for name in FUNCTIONS:
         found = compare(cohort(table), "~ " + columns.get(name, f"{name}(age)"), QUICK)

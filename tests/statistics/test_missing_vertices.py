@@ -160,7 +160,8 @@ def test_changes_are_grey_where_a_visit_is_not_observed() -> None:
 def test_regression_and_score_take_missing_vertices() -> None:
     made = cohort(age=[float(k) for k in np.random.default_rng(0).permutation(N)])
     found = regress(made, "age", folds=4, permutations=0)
-    assert np.isfinite(found.map).all() and any("estimates" in note for note in analysis_report(found).notes)
+    assert np.isfinite(found.shapes.per_unit_mm).all()
+    assert any("estimates" in note for note in analysis_report(found).notes)
     more = np.where(mask(24)[20:, :, None], shapes(24)[20:], np.nan)
     subjects = Cohort.of_shapes(more, {}, names=["x1", "x2", "x3", "x4"], onto=made)
     scores = score(made, subjects)

@@ -134,9 +134,10 @@ def test_scans_that_all_stand_there_three_times_change_nothing(varies: bool) -> 
         assert [other.value, other.low, other.high] == pytest.approx([measure.value, measure.low, measure.high])
     for name in ("predicted", "low", "high", "baseline"):
         assert np.allclose(getattr(three, name)[::3], getattr(one, name), rtol=1e-9), name
-    assert np.allclose(three.pattern, one.pattern) and np.allclose(three.map, one.map)
+    assert np.allclose(three.shapes.slope, one.shapes.slope)
+    assert np.allclose(three.shapes.per_unit_mm, one.shapes.per_unit_mm)
     assert three.p == one.p and three.choice == one.choice and three.effective == pytest.approx(one.effective)
-    assert [three.low_at, three.high_at] == pytest.approx([one.low_at, one.high_at])
+    assert three.shapes.ends == pytest.approx(one.shapes.ends)
     assert [three.baseline_rmse, three.baseline_mae] == pytest.approx([one.baseline_rmse, one.baseline_mae])
     told, again = (found.predictor.predict(drawn(5, 7)) for found in (one, three))
     for name in ("value", "low", "high"):
@@ -148,7 +149,7 @@ def test_the_shapes_shown_are_at_the_percentiles_of_one_value_for_each_subject()
     cohort = drawn(40, 8)
     found = regress(cohort, "age", folds=5, permutations=0, draws=1)
     low, high = np.percentile(cohort.table.numbers("age"), [5, 95])
-    assert [found.low_at, found.high_at] == pytest.approx([low, high], rel=1e-12)
+    assert found.shapes.ends == pytest.approx((low, high), rel=1e-12)
 
 
 def test_one_subject_with_forty_scans_does_not_make_a_relation() -> None:
@@ -235,9 +236,10 @@ def test_a_number_that_shape_tells_is_claimed_to_be(learned: RegressionResult) -
 def test_the_shape_that_goes_with_the_number_is_what_was_put_in() -> None:
     found = regress(drawn(400, 5), "age", permutations=0, folds=3)
     expected = SLOPES * STDDEV / ((SLOPES**2).sum() + 25.0)
-    assert np.allclose(found.pattern, expected, atol=0.12)
-    moved = found.shape_at(found.high_at) - found.shape_at(found.low_at)
-    assert np.allclose(moved.ravel(), (found.high_at - found.low_at) * (found.pattern @ BASIS))
+    assert np.allclose(found.shapes.slope, expected, atol=0.12)
+    low, high = found.shapes.ends
+    moved = found.cohort.vertices(found.shapes.path[-1]) - found.cohort.vertices(found.shapes.path[0])
+    assert np.allclose(moved.ravel(), (high - low) * (expected @ BASIS), atol=0.12 * (high - low))
 
 
 def test_the_same_seed_gives_the_same_numbers(learned: RegressionResult) -> None:

@@ -64,6 +64,11 @@ def test_every_action_of_the_page_ends_with_a_result_that_is_shown(tmp_path: Pat
         run(client, "change", {"--subject": "person", "--time": "visit"})
         run(client, "asymmetry", {"--subject": "person"})
         run(client, "regress", {"--target": "age"})
+        along = run(client, "regress", {"--along": "age", "--at": "25,30,40", "--covariates": "group"})
+        assert "which were not followed" in along["sentences"][0], along["sentences"]
+        for options in ({}, {"--target": "age", "--along": "age"}):
+            found = client.post("/api/checks", json={"kind": "regress", "options": options, "on": None}).json()
+            assert "Choose one column" in " ".join(one["text"] for one in found if one["level"] == "problem")
         fits = run(client, "fit", {"--dense": True})["number"]
         run(client, "score", {"--reference": "group=a"})
         run(client, "identify", {"--subject": "person", "--doubtful": True}, fits)

@@ -49,6 +49,7 @@ MORPHOSPACE = Source("statistics.shape_tests.ordination", "ordinate")
 CHANGE = Source("statistics.change_result", "ChangeConfig")
 ASYMMETRY = Source("statistics.asymmetry", "measure_asymmetry")
 REGRESS = Source("statistics.regression", "regress")
+ALONG = Source("statistics.shape_prediction", "predict_shapes")
 SCORE = Source("statistics.score_subjects", "ScoreConfig")
 DEMO = Source("demo", "run_demo")
 FACES = Source("commands.data", "write_simulated_faces")
@@ -931,19 +932,30 @@ COMMANDS: tuple[Command, ...] = (
         ),
     ),
     Command(
-        "regress", "predict a number, such as age, from shape, with its cross-validated accuracy",
-        ("shapespace regress people.csv --target age -o age --predict new.csv",), regress.run,
+        "regress", "predict a number, such as age, from shape, or the mean shape along a number, with intervals",
+        ("shapespace regress people.csv --target age -o age --predict new.csv",
+         "shapespace regress people.csv --along age --at 20,40,60 --covariates sex -o growth"), regress.run,
         (
             *_cohort(),
             basic("--target", "COLUMN", source=REGRESS, either=_TARGET, required=True),
             basic("--predictor", "FILE.npz", "predict DATA with the predictor.npz of an earlier run", parse=Path,
                   either=_TARGET, required=True),
+            basic("--along", "COLUMN", source=ALONG, either=_TARGET, required=True),
+            basic("--at", "VALUES", source=ALONG, parse=values.numbers),
+            advanced("--curve", source=ALONG, default=None),
+            advanced("--covariates", "TERMS", source=ALONG),
+            advanced("--hold", "COLUMN=VALUE", "of --along: value of another column, such as sex=female; commas part "
+                     "several (default: numbers at their mean, and classes count alike)", parse=values.words),
+            advanced("--length", "A,B", "of --along: two landmarks whose distance is predicted too; can be repeated",
+                     source=ALONG, field="lengths", parse=values.words, repeat=True, default=[]),
             basic("--predict", "NEW", "also predict new shapes, of other subjects: a table or a folder", parse=Path),
-            basic("--new-shapes", "DIR", "results of fits, or meshes, of NEW (default: its folder)", parse=Path),
-            basic("--subject", "COLUMN", source=REGRESS),
+            advanced("--new-shapes", "DIR", "results of fits, or meshes, of NEW (default: its folder)", parse=Path),
+            advanced("--subject", "COLUMN", source=REGRESS),
             advanced("--folds", "K", source=REGRESS, parse=values.integer),
-            advanced("--permutations", "P", source=REGRESS, parse=values.integer),
-            advanced("--level", "L", source=REGRESS, field="confidence"),
+            advanced("--permutations", "P", "permutations for p, 0 for none (default: 199; with --along 1000)",
+                     parse=values.integer),
+            advanced("--level", "L", "coverage of intervals (default: 0.9; with --along 0.95)", dest="confidence",
+                     parse=values.number),
             advanced("--drop-missing", source=REGRESS),
             advanced("--seed", "S", source=REGRESS, parse=values.integer),
             *_gauge(),

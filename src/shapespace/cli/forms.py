@@ -19,7 +19,7 @@ _FIRST: Mapping[str, tuple[str, ...]] = {
     "compare": ("--formula", "--blocks", "--permutations"),
     "change": ("--subject", "--time", "--order"),
     "asymmetry": ("--subject", "--reference", "--gauge"),
-    "regress": ("--target", "--subject", "--seed"),
+    "regress": ("--target", "--along", "--at", "--curve", "--covariates", "--subject"),
     "score": ("--reference", "--subject", "--nearest"),
     "identify": ("--subject", "--gallery", "--probe"),
     "convert": ("--to",),
@@ -67,7 +67,7 @@ def _described(option: Option, *, visible: bool) -> dict[str, Any]:
     return {
         "flag": option.spellings[-1], "help": option.text.replace("`", ""), "kind": _kind(option),
         "choices": list(option.accepted), "initial": words if known else None, "visible": visible,
-        "required": (option.required and not option.either) or option.spellings[-1] in ("--target", "--to"),
+        "required": (option.required and not option.either) or option.spellings[-1] == "--to",
     }  # fmt: skip
 
 

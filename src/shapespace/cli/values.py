@@ -137,6 +137,11 @@ def words(text: str) -> tuple[str, ...]:
     return tuple(word.strip() for word in text.split(",") if word.strip())
 
 
+def numbers(text: str) -> tuple[float, ...]:
+    """Return numbers separated by commas."""
+    return tuple(number(word) for word in words(text))
+
+
 def shares(text: str) -> tuple[float, ...]:
     """Return numbers above 0 and at most 1, separated by commas."""
     return tuple(share(part) for part in text.split(","))

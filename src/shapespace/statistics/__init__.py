@@ -1,6 +1,6 @@
 """Statistical analyses of cohorts: groups, change, asymmetry, regression, identity, scores against a reference.
 
-Entry points: `compare`, `change`, `measure_asymmetry`, `regress`, `score`, `verify` and `identify`.
+Entry points: `compare`, `change`, `measure_asymmetry`, `regress`, `predict_shapes`, `score`, `verify` and `identify`.
 May be imported by `report`, `viewer`, `study`, `commands` and `cli`; results contain no prose and no HTML.
 """
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from shapespace.statistics.predictor import Predictions, Predictor
     from shapespace.statistics.regression import RegressionResult, regress
     from shapespace.statistics.score_subjects import ScoreConfig, ScoreResult, score
+    from shapespace.statistics.shape_prediction import PredictedMeasure, ShapePrediction, predict_shapes
     from shapespace.statistics.shape_tests.covariation import compare_effect_sizes, estimate_modularity, fit_pls
     from shapespace.statistics.shape_tests.groups import (
         assess_equivalence,
@@ -46,11 +47,13 @@ __all__ = [
     "IdentificationResult",
     "IdentityConfig",
     "Ordination",
+    "PredictedMeasure",
     "Predictions",
     "Predictor",
     "RegressionResult",
     "ScoreConfig",
     "ScoreResult",
+    "ShapePrediction",
     "ShapeTestResult",
     "Statistic",
     "VerificationResult",
@@ -73,6 +76,7 @@ __all__ = [
     "measure_repeatability",
     "ordinate",
     "plan_sample_size",
+    "predict_shapes",
     "regress",
     "score",
     "verify",
@@ -90,6 +94,7 @@ __getattr__, __dir__ = lazy_names(
         "statistics.predictor": ("Predictions", "Predictor"),
         "statistics.regression": ("RegressionResult", "regress"),
         "statistics.score_subjects": ("ScoreConfig", "ScoreResult", "score"),
+        "statistics.shape_prediction": ("PredictedMeasure", "ShapePrediction", "predict_shapes"),
         "statistics.shape_tests.covariation": ("compare_effect_sizes", "estimate_modularity", "fit_pls"),
         "statistics.shape_tests.groups": (
             "assess_equivalence",

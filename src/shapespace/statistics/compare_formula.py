@@ -32,6 +32,7 @@ FUNCTIONS: Mapping[str, str] = {
     "scale": "less its mean, in standard deviations",
     "poly": "orthogonal polynomial, poly(age, 2)",
     "bs": "B-spline, bs(age, df=4)",
+    "cr": "natural cubic spline, cr(age, df=2)",
 }
 """What a formula may call, and what it is."""
 
@@ -172,21 +173,18 @@ class Design:
         values = self.values[one.column]
         return [str(value) for value in values] if one.levels else [_group(float(value)) for value in values]
 
-    def average(self, fixed: Mapping[str, str | float]) -> FloatArray:
+    def average(self, fixed: Mapping[str, str | float], averaged: frozenset[str] | None = None) -> FloatArray:
         """Return the (p,) columns, averaged over the classes of variables in the terms, with numbers at their mean.
 
         Args:
             fixed: values of variables that are not averaged, by their names inside.
+            averaged: variables whose classes are averaged; None for those of all terms.
         """
-        used = {name for term in self.terms for name in term.variables}
+        used = {name for term in self.terms for name in term.variables} if averaged is None else averaged
         choices: list[Sequence[str | float]] = []
         for one in self.variables:
-            if one.column in fixed:
-                choices.append((fixed[one.column],))
-            elif one.levels:
-                choices.append(one.levels if one.column in used else one.levels[:1])
-            else:
-                choices.append((one.middle,))
+            own = one.levels if one.column in used else one.levels[:1]
+            choices.append((fixed[one.column],) if one.column in fixed else own or (one.middle,))
         cells = _cells(choices, self.formula)
         return read_only(
             self.rows({one.column: [cell[k] for cell in cells] for k, one in enumerate(self.variables)}).mean(axis=0)
@@ -205,23 +203,9 @@ class Design:
             high: value.
             fixed: values of other variables, by their names inside.
         """
-        held = dict(fixed or {})
-        interacting = {name for term in self.terms if column in term.variables for name in term.variables}
-        choices: list[Sequence[str | float]] = []
-        for one in self.variables:
-            if one.column == column:
-                choices.append((low, high))
-            elif one.column in held:
-                choices.append((held[one.column],))
-            elif one.levels:
-                choices.append(one.levels if one.column in interacting else one.levels[:1])
-            else:
-                choices.append((one.middle,))
-        cells = _cells(choices, self.formula)
-        values = {one.column: [cell[k] for cell in cells] for k, one in enumerate(self.variables)}
-        rows = self.rows(values)
-        at_high = np.array([value == high for value in values[column]])
-        return read_only(rows[at_high].mean(axis=0) - rows[~at_high].mean(axis=0))
+        interacting = frozenset(name for term in self.terms if column in term.variables for name in term.variables)
+        at_low, at_high = (self.average({**(fixed or {}), column: value}, interacting) for value in (low, high))
+        return read_only(at_high - at_low)
 
 
 def _cells(choices: Sequence[Sequence[str | float]], formula: str) -> list[tuple[str | float, ...]]:
@@ -383,7 +367,9 @@ class _Factor:
 def _renamed(tree: ast.expr, column: str) -> ast.expr:
     """Return a checked call with `column` for its innermost first argument."""
     if isinstance(tree, ast.Call):
-        return ast.Call(tree.func, [_renamed(tree.args[0], column), *tree.args[1:]], tree.keywords)
+        # Without the constraint the columns of cr() contain the constant.
+        centred = [ast.keyword("constraints", ast.Constant("center"))] if ast.unparse(tree.func) == "cr" else []
+        return ast.Call(tree.func, [_renamed(tree.args[0], column), *tree.args[1:]], [*tree.keywords, *centred])
     return ast.Name(column)
 
 
@@ -536,7 +522,7 @@ class _Bound:
             self.position += 1
         if depth:
             raise self._unreadable()
-        if token in ("poly", "bs"):
+        if token in ("poly", "bs", "cr"):
             columns = max([_SPLINE, *(int(one) for one in inside if one.isdecimal() and len(one) < 3)])
             return _Size(columns, columns)
         return max(

@@ -12,7 +12,6 @@ import numpy as np
 from shapespace.cohort.cohort import SUBJECT, Cohort, subjects_of
 from shapespace.cohort.proportions import widen_share
 from shapespace.errors import InputError
-from shapespace.geometry.normals import vertex_normals
 from shapespace.reprs import describe_briefly, list_briefly
 from shapespace.schemas import Methods, TestScheme
 from shapespace.statistics.analysis_result import AnalysisResult
@@ -29,14 +28,14 @@ from shapespace.statistics.linear_regressors import (
 from shapespace.statistics.methods import SCAN_OF_SUBJECT, methods_of
 from shapespace.statistics.multiple_imputation import Imputations, over_imputations
 from shapespace.statistics.predictor import Predictions, Predictor, cv_plus, model_hash_of
+from shapespace.statistics.shape_prediction import FEWEST, ShapePrediction, predict_shapes
 from shapespace.step_counter import StepCounter
-from shapespace.types import FloatArray, Mesh, read_only, require
+from shapespace.types import FloatArray, read_only, require
 
-FEWEST, SMALL = 10, 100
-"""Subjects below which nothing is learned, and below which a sample is said to be small."""
+SMALL = 100
+"""Subjects below which a sample is said to be small."""
 MEASURES = ("r2", "rmse", "mae", "slope", "intercept", "coverage", "width")
 _BLOCK = 500  # permutations at a time; bounds memory
-_EDGES = (5.0, 95.0)  # percentiles of the target that the two predicted shapes stand for
 
 
 @dataclass(frozen=True)
@@ -68,8 +67,7 @@ class RegressionResult(AnalysisResult):
         choice: made on all rows.
         effective: its degrees of freedom.
         predictor: learned from all rows.
-        pattern: (K,) how the coefficients change, mm, with one unit of the target.
-        low_at, high_at: the 5th and 95th percentile of the target.
+        shapes: the mean shapes along the target.
         confidence: level of all intervals.
         folds: of the outer cross-validation.
         permutations: how many.
@@ -99,9 +97,7 @@ class RegressionResult(AnalysisResult):
     choice: Regularisation
     effective: float
     predictor: Predictor
-    pattern: FloatArray
-    low_at: float
-    high_at: float
+    shapes: ShapePrediction
     confidence: float
     folds: int
     permutations: int
@@ -139,21 +135,6 @@ class RegressionResult(AnalysisResult):
                 "mean of the training subjects, not a share of the sum of squares of shapes.",
             ),
         )  # fmt: skip
-
-    def shape_at(self, value: float) -> FloatArray:
-        """Return the mean shape (V, 3), mm, at a value of the target, by regression of shape on the target."""
-        middle = float(weighted_mean(self.observed, self.predictor.share))
-        own = weighted_mean(self.cohort.coefficients, self.predictor.share)
-        return self.cohort.vertices(own + (value - middle) * self.pattern)
-
-    @cached_property
-    def map(self) -> FloatArray:
-        """(V,) mm along the normals of the mean for one unit of the target; lengths, for points."""
-        moved = (self.pattern @ self.cohort.basis).reshape(-1, 3)
-        if self.cohort.faces is None:
-            return np.linalg.norm(moved, axis=1)
-        mean = self.cohort.vertices(weighted_mean(self.cohort.coefficients, self.predictor.share))
-        return np.einsum("vd,vd->v", moved, vertex_normals(Mesh(mean, self.cohort.faces)))
 
     def __repr__(self) -> str:
         figures = [f"{name} {one.value:.3g} ({one.low:.3g} to {one.high:.3g})" for name, one in self.measures.items()]
@@ -268,9 +249,6 @@ def regress(
         choice=CHOICES[int(errors.argmin())],
         confidence=confidence,
     )
-    centred = y - weighted_mean(y, share)
-    pattern = (share * centred) @ X / float((share * centred**2).sum())  # S44
-    low_at, high_at = _percentiles(y, codes, share, _EDGES)
     return RegressionResult(
         cohort=cohort,
         target=target,
@@ -287,9 +265,7 @@ def regress(
         choice=choice,
         effective=effective,
         predictor=predictor,
-        pattern=read_only(pattern),
-        low_at=low_at,
-        high_at=high_at,
+        shapes=predict_shapes(cohort, target, subject=subject, confidence=confidence, permutations=0),
         confidence=confidence,
         folds=folds,
         permutations=permutations,
@@ -515,25 +491,6 @@ def permutation_scheme(subjects: Sequence[str], y: FloatArray) -> str:
         "The target varies within subjects: the permutations exchange the targets of subjects with the same number of "
         f"scans, and the targets within each subject{rest}."
     )
-
-
-def _percentiles(
-    y: FloatArray, codes: IndexArray, share: FloatArray, percent: tuple[float, float]
-) -> tuple[float, float]:
-    """Return percentiles of a target in which each subject counts once, linear between its distinct values.
-
-    With one value for each subject they are those of `np.percentile`.
-    """
-    weights: dict[tuple[float, int], float] = {}
-    for value, subject, one in zip(y.tolist(), codes.tolist(), share.tolist(), strict=True):
-        weights[value, subject] = weights.get((value, subject), 0.0) + one
-    own = sorted(weights)
-    weight = np.array([weights[key] for key in own])
-    midpoint = np.cumsum(weight) - 0.5 * (weight + 1.0)
-    last = float(weight.sum()) - 1.0
-    values = np.array([value for value, _ in own])
-    low, high = (float(np.interp(one / 100.0 * last, midpoint, values)) for one in percent)
-    return low, high
 
 
 def _rms(values: FloatArray, share: FloatArray) -> float:

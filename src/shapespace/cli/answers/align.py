@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 
+from shapespace.cli.answers.common import column_value
 from shapespace.cli.options import given
 from shapespace.cli.printing import say, show, show_json
 
@@ -11,17 +12,13 @@ from shapespace.cli.printing import say, show, show_json
 def run(arguments: argparse.Namespace) -> int:
     """Align landmarks, and name the specimens to check."""
     from shapespace.commands.align import align
-    from shapespace.errors import InputError
     from shapespace.geometry.landmark_alignment import AlignConfig
     from shapespace.report.blocks.wording import counted
     from shapespace.schemas import to_json
 
     config = AlignConfig(**given(arguments, AlignConfig))
-    column, equals, value = (arguments.reflect or "").partition("=")
-    if arguments.reflect and not (column and equals and value):
-        raise InputError(f"--reflect is {arguments.reflect!r}; write COLUMN=VALUE, such as side=left.")
-    options = given(arguments, align, reflect=(column, value) if column else None)
-    _, record = align(arguments.data, arguments.output, config, **options)
+    reflect = column_value(arguments.reflect, "--reflect") if arguments.reflect else None
+    _, record = align(arguments.data, arguments.output, config, **given(arguments, align, reflect=reflect))
     for note in record.notes:
         say(note)
     if arguments.json:

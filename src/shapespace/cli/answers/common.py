@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from shapespace.cli.options import given
 from shapespace.cli.printing import say, show, show_json
+from shapespace.errors import InputError
 
 if TYPE_CHECKING:
     from shapespace.cohort.cohort import Cohort
@@ -15,6 +16,18 @@ if TYPE_CHECKING:
     from shapespace.geometry.procrustes import Gauge
     from shapespace.report.analyses.analysis_report import AnalysisReport
     from shapespace.schemas import Orientation
+
+
+def column_value(text: str, option: str) -> tuple[str, str]:
+    """Return the column and the value of COLUMN=VALUE.
+
+    Raises:
+        InputError: it is something else.
+    """
+    column, _, value = (part.strip() for part in text.partition("="))
+    if not (column and value):
+        raise InputError(f"{option} is {text!r}; write COLUMN=VALUE, such as group=control.")
+    return column, value
 
 
 def cohort_of(

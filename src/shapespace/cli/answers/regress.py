@@ -1,11 +1,12 @@
-"""`shapespace regress`: regression of a number, such as age, on shape."""
+"""`shapespace regress`: regression of a number, such as age, on shape, and of shape on a number."""
 
 from __future__ import annotations
 
 import argparse
 
-from shapespace.cli.answers.common import cohort_of, finish
+from shapespace.cli.answers.common import cohort_of, column_value, finish
 from shapespace.cli.options import given
+from shapespace.errors import InputError
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -14,9 +15,18 @@ def run(arguments: argparse.Namespace) -> int:
     from shapespace.cohort.read import CohortConfig, read_cohort
     from shapespace.io.files import make_folder
     from shapespace.report.analyses.regression_report import prediction_report, regression_report
+    from shapespace.report.analyses.shape_prediction_report import shape_prediction_report
     from shapespace.statistics.predictor import Predictor, refuse_known
     from shapespace.statistics.regression import regress
+    from shapespace.statistics.shape_prediction import predict_shapes
 
+    others = ("at", "curve", "covariates", "hold", "length") if arguments.along is None else ("predict", "new_shapes")
+    for name in others:
+        if getattr(arguments, name):
+            needed = "--along" if arguments.along is None else "--target"
+            raise InputError(f"--{name.replace('_', '-')} needs {needed}; name the column of the number with it.")
+    names = ("subject", "seed", "drop_missing", "permutations", "confidence")
+    shared = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
     if arguments.predictor is not None:
         learned = Predictor.load(arguments.predictor)
         if learned.model_hash and arguments.surfaces == "auto":
@@ -24,18 +34,15 @@ def run(arguments: argparse.Namespace) -> int:
         cohort = cohort_of(arguments, learned.gauge, least=1)
         return finish(prediction_report(learned, cohort, learned.predict(cohort)), arguments)
     cohort = cohort_of(arguments)
+    if arguments.along is not None:
+        hold = dict(column_value(word, "--hold") for word in arguments.hold or ())
+        options = {**given(arguments, predict_shapes, hold=hold), **shared}
+        options = {name: value for name, value in options.items() if value is not None}
+        with steps(None, "flipping signs", "step", quiet=arguments.quiet) as step:
+            shapes = predict_shapes(cohort, **options, progress=step)
+        return finish(shape_prediction_report(shapes), arguments)
     with steps(None, "learning", "fold", quiet=arguments.quiet) as step:
-        result = regress(
-            cohort,
-            arguments.target,
-            subject=arguments.subject,
-            folds=arguments.folds,
-            permutations=arguments.permutations,
-            confidence=arguments.level,
-            seed=arguments.seed,
-            drop_missing=arguments.drop_missing,
-            progress=step,
-        )
+        result = regress(cohort, arguments.target, folds=arguments.folds, **shared, progress=step)
     new = None
     if arguments.predict is not None:
         config = CohortConfig(**given(arguments, CohortConfig, shapes=arguments.new_shapes, least=1))

@@ -68,8 +68,6 @@ _OF_QUESTION = {
                 "Statistical Society B 53, 285-339.",),
     "asymmetry": ("Klingenberg C. P., Barluenga M., Meyer A. (2002) Shape analysis of symmetric structures: "
                   "quantifying variation among individuals and asymmetry. Evolution 56, 1909-1920.",),
-    "regress": ("Barber R. F., Candès E. J., Ramdas A., Tibshirani R. J. (2021) Predictive inference with the "
-                "jackknife+. Annals of Statistics 49, 486-507.",),
     "change": ("Bland J. M., Altman D. G. (1986) Statistical methods for assessing agreement between two methods of "
                "clinical measurement. Lancet 327, 307-310.",),
     "recognise verify": ("Brümmer N., du Preez J. (2006) Application-independent evaluation of speaker detection. "

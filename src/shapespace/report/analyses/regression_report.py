@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from shapespace.cohort.cohort import Cohort, subjects_of
-from shapespace.report.analyses.analysis_report import AnalysisReport, LengthFormat, Rows
+from shapespace.report.analyses.analysis_report import AnalysisReport, Rows
 from shapespace.report.analyses.methods_section import methods_parts
-from shapespace.report.analyses.shape_data import add_shape_data, model_hashes, shape_change_parts
-from shapespace.schemas import CurvePart, Part, Series, SurfaceMapPart, TablePart, TextPart
+from shapespace.report.analyses.shape_data import add_shape_data, model_hashes
+from shapespace.report.analyses.shape_prediction_report import SHAPES_FILE, shape_prediction_parts
+from shapespace.schemas import CurvePart, Part, Series, TablePart, TextPart
 from shapespace.statistics.methods import methods_of
-from shapespace.statistics.observation_weights import blank_where, weights_of
 from shapespace.statistics.predictor import Predictions, Predictor
 from shapespace.statistics.regression import (
     SMALL,
@@ -22,9 +22,11 @@ from shapespace.statistics.regression import (
     permutation_scheme,
     share_of,
 )
-from shapespace.types import Mesh
 
-_FILE = "regression.npz"
+_CITATIONS = (
+    "Barber R. F., Candès E. J., Ramdas A., Tibshirani R. J. (2021) Predictive inference with the jackknife+. Annals "
+    "of Statistics 49, 486-507.",
+)
 _MOST_ROWS = 20  # rows that fit one screen; files have all
 _MEASURE_NAMES = {
     "r2": "R²", "rmse": "RMSE", "mae": "mean absolute error", "slope": "calibration slope",
@@ -37,23 +39,18 @@ def regression_report(result: RegressionResult, new: tuple[Cohort, Predictions] 
     parts: list[Part] = [_measures_part(result), _calibration_part(result)]
     if new is not None:
         parts.append(_prediction_part(result.predictor, new[1]))
-    arrays, pictures = _maps_and_morphs(result)
+    pictures, arrays, meshes = shape_prediction_parts(result.shapes)
     measures = ("measure", "value", "low", "high"), [(n, m.value, m.low, m.high) for n, m in result.measures.items()]
     tables = {"predictions.csv": _rows(result), "measures.csv": measures}
     if new is not None:
         tables["new.csv"] = _prediction_rows(*new)
-    faces = result.cohort.faces
-    meshes = {
-        f"{name}.ply": Mesh(result.shape_at(value), faces, name=f"{result.target} {value:g}")
-        for name, value in (("low", result.low_at), ("high", result.high_at))
-    }
     report = AnalysisReport(
         question="regress",
         title=f"{result.target} from shape",
         summary=_summary(result, new),
         parts=(*parts, *pictures, *methods_parts(result.methods)),
         tables=tables,
-        arrays={_FILE: arrays},
+        arrays={SHAPES_FILE: arrays},
         meshes=meshes,
         notes=(*result.cohort.notes, *(() if new is None else new[0].notes)),
         settings={
@@ -63,6 +60,7 @@ def regression_report(result: RegressionResult, new: tuple[Cohort, Predictions] 
         },
         model_hashes=model_hashes(result.cohort),
         methods=result.methods,
+        citations=_CITATIONS,
     )  # fmt: skip
     return add_shape_data(report, result.cohort, result.imputations)
 
@@ -89,6 +87,7 @@ def prediction_report(predictor: Predictor, cohort: Cohort, predictions: Predict
             ),
         ),
         model_hashes=(predictor.model_hash,) if predictor.model_hash else (),
+        citations=_CITATIONS,
     )  # fmt: skip
     return add_shape_data(report, cohort, predictions.imputations)
 
@@ -182,29 +181,6 @@ def _calibration_part(result: RegressionResult) -> CurvePart:
         title="Calibration", series=(rows, line) if np.isfinite(slope) else (rows,), x=f"{result.target} predicted",
         y=f"{result.target} observed", diagonal=True,
     )  # fmt: skip
-
-
-def _maps_and_morphs(result: RegressionResult) -> tuple[dict[str, Any], list[Part]]:
-    low, high = result.shape_at(result.low_at), result.shape_at(result.high_at)
-    blank = weights_of(result.cohort.observed_share) == 0
-    arrays: dict[str, Any] = {"low": low, "high": high, "vertices": (low + high) / 2.0}
-    arrays["per_unit_mm"] = blank_where(result.map, blank)
-    ends = shape_change_parts(
-        result.cohort, title=f"The shape that goes with {result.target}", arrays=_FILE,
-        low_label=f"{result.target} {result.low_at:.3g}", high_label=f"{result.target} {result.high_at:.3g}",
-        note="The mean shape at the 5th and the 95th percentile, by regression of shape on the number.",
-    )  # fmt: skip
-    if result.cohort.faces is None:
-        return arrays, [*ends]
-    arrays["faces"] = result.cohort.faces
-    return arrays, [
-        *ends,
-        SurfaceMapPart(
-            title=f"Change of shape for one unit of {result.target}", arrays=_FILE, values="per_unit_mm",
-            unit=LengthFormat(result.cohort.unit).of_map,
-            note="Along the normals of the mean; shapespace compare tests where this is more than chance.",
-        ),
-    ]  # fmt: skip
 
 
 def _rows(result: RegressionResult) -> Rows:

@@ -11,6 +11,7 @@ from shapespace.report.analyses.compare_report import compare_report
 from shapespace.report.analyses.identify_report import identify_report
 from shapespace.report.analyses.regression_report import regression_report
 from shapespace.report.analyses.score_report import score_report
+from shapespace.report.analyses.shape_prediction_report import shape_prediction_report
 from shapespace.report.analyses.shape_test_report import shape_test_report
 from shapespace.report.analyses.verify_report import verify_report
 from shapespace.statistics.analysis_result import AnalysisResult
@@ -21,6 +22,7 @@ from shapespace.statistics.identity.identify import IdentificationResult
 from shapespace.statistics.identity.verify import VerificationResult
 from shapespace.statistics.regression import RegressionResult
 from shapespace.statistics.score_subjects import ScoreResult
+from shapespace.statistics.shape_prediction import ShapePrediction
 from shapespace.statistics.shape_tests.shape_test_result import ShapeTestResult
 
 
@@ -43,6 +45,8 @@ def analysis_report(result: AnalysisResult) -> AnalysisReport:
             return regression_report(result)
         case ScoreResult():
             return score_report(result)
+        case ShapePrediction():
+            return shape_prediction_report(result)
         case ShapeTestResult():
             return shape_test_report(result)
         case VerificationResult():

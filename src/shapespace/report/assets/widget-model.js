@@ -94,42 +94,52 @@
   /** A slider that moves one shape to another. */
   Shapespace.widgets.morph = (element, payload) =>
     lazily(element, payload, (unpacked) => {
-      const model = new Shapespace.Model(unpacked), { low, high } = unpacked.facts;
+      const model = new Shapespace.Model(unpacked), { low, high, weights, variable, range } = unpacked.facts;
       const { view, controls } = stage(element, `A shape between ${low} and ${high}, as the slider says`);
-      const at = new Float32Array([-1]), positions = new Float32Array(3 * model.V);
+      const at = new Float32Array(weights[0]), positions = new Float32Array(3 * model.V);
+      let now = -1;
+      /** Sets the shape at a value from -1 to 1. */
+      const move = (value) => {
+        now = value;
+        const place = (value + 1) / 2 * (weights.length - 1), before = Math.min(Math.floor(place), weights.length - 2);
+        for (let k = 0; k < at.length; k++) {
+          at[k] = weights[before][k] + (place - before) * (weights[before + 1][k] - weights[before][k]);
+        }
+        draw();
+      };
       view.setSurface("shape", { positions: model.vertices(at), faces: model.faces, colour: colours().clay });
       view.frame();
       const bar = make("div", { class: "ss-bar", hidden: true });
       const draw = () => view.move("shape", model.vertices(at, positions));
-      const words = (value) => (value <= -1 ? low : value >= 1 ? high : `${Math.round(50 + 50 * value)} % of the way`);
+      const words = (value) => {
+        if (variable) return `${variable} ${Number((range[0] + (value + 1) / 2 * (range[1] - range[0])).toPrecision(3))}`;
+        return value <= -1 ? low : value >= 1 ? high : `${Math.round(50 + 50 * value)} % of the way`;
+      };
       const row = slider({
         label: `${low} to ${high}`, min: -1, max: 1, step: 0.02, value: -1, show: words,
         input: (value) => {
           stop();
-          at[0] = value;
-          draw();
+          move(value);
         },
       });
       row.row.classList.add("ss-wide");
-      const { toggle, stop } = animation(element, 1, () => ({ value: at[0], put: (value) => {
-        at[0] = value;
-        row.put(at[0]);
-        draw();
+      const { toggle, stop } = animation(element, 1, () => ({ value: now, put: (value) => {
+        row.put(value);
+        move(value);
       } }));
       const map = model.faces ? colours().diverging : colours().sequential;
       let change = null, top = 0;
       const put = (value) => {
         stop();
-        at[0] = value;
         row.put(value);
-        draw();
+        move(value);
       };
       controls.append(
         make("div", { class: "ss-sliders", role: "group", "aria-label": "Between the two shapes" }, row.row),
         make("div", { class: "ss-buttons" }, button(low, () => put(-1)), button(high, () => put(1)), toggle),
         tick("Colour by how far it moves", false, (on) => {
           if (on && !change) {
-            change = model.displacement([1]).map((value) => 2 * value);
+            change = model.displacement(weights[weights.length - 1].map((value, k) => value - weights[0][k]));
             top = niceCeiling(quantile(change, 0.98));
             Shapespace.colourBar(bar, {
               map, range: [model.faces ? -top : 0, top], unit: "mm", open: true,

@@ -281,9 +281,15 @@ class StudyParts:
         both = first.with_vertices(first.vertices @ turn.T), last.with_vertices(last.vertices @ turn.T)
         labels = part.low_label or "low", part.high_label or "high"
         alt = f"{title}: {labels[0]}, and {labels[1]}"
+        path = None
+        if part.modes:
+            modes, weights = self._arrays(part.arrays, (part.modes, part.weights))
+            if modes.shape[1:] != low.shape or weights.shape[1:] != modes.shape[:1] or len(weights) < 2:
+                raise self.parts_file.damaged("the modes and weights of a morph do not fit its shapes")
+            path = modes @ turn.T, weights
         still = self.page.still(figures.morph_figure(first, last, labels, title=None), alt)
         turning = self.page.turning(
-            "morph", pack_morph(*both, labels), still,
+            "morph", pack_morph(*both, labels, path=path, variable=part.variable, ends=part.range), still,
             f"{note or f'From {labels[0]} to {labels[1]}.'}{_times_sentence(part.times)}",
             label=alt, still="The still shows both, from the front and from the side.",
         )  # fmt: skip

@@ -176,27 +176,43 @@ def pack_model(model: ShapeModel, modes: int | None = None, *, small: bool = Fal
     return pack(arrays, facts)
 
 
-def pack_morph(low: Mesh, high: Mesh, labels: tuple[str, str], *, largest: int = 20_000) -> bytes:
-    """Return the data of the morph widget: two shapes in correspondence as a mean and one mode, from -1 to 1.
+def pack_morph(
+    low: Mesh,
+    high: Mesh,
+    labels: tuple[str, str],
+    *,
+    path: tuple[FloatArray, FloatArray] | None = None,
+    variable: str = "",
+    ends: tuple[float, float] = (0.0, 1.0),
+    largest: int = 20_000,
+) -> bytes:
+    """Return the data of the morph widget: two shapes in correspondence as a mean and one mode, from -1 to 1, or a path
+    between them.
 
-    Arrays: `mean` (V, 3) mm; `faces`, absent for points; `modes` (1, V, 3) mm, half of the difference.
+    Arrays: `mean` (V, 3) mm; `faces`, absent for points; `modes` (q, V, 3) mm, of a line half of the difference.
 
     Args:
         low: where the slider begins.
         high: in correspondence with it; where the slider ends.
         labels: what they are.
+        path: modes (q, V, 3) mm and weights (B, q) of the shapes low + weights modes; None for a line.
+        variable: that the slider shows; empty for none.
+        ends: its values at `low` and `high`.
         largest: how many triangles (or points) are kept.
     """
-    middle, half = (low.vertices + high.vertices) / 2, (high.vertices - low.vertices) / 2
+    half = (high.vertices - low.vertices) / 2
+    modes, weights = (half[None], np.array([[-1.0], [1.0]])) if path is None else path
+    middle = low.vertices + (half if path is None else 0.0)
     mesh, source_rows = _decimate(low.with_vertices(middle), largest)
     extent = float(np.ptp(middle, axis=0).max())
     arrays: dict[str, npt.NDArray[Any] | Steps] = {
         "mean": quantise(mesh.vertices, step=min(_PLACE_STEP_MM, extent / 4000), coded=True),
-        "modes": quantise(half[None, source_rows], step=min(_MODE_STEP_MM, extent / 8000), by_row=True, coded=True),
+        "modes": quantise(modes[:, source_rows], step=min(_MODE_STEP_MM, extent / 8000), by_row=True, coded=True),
     }
     if mesh.faces is not None:
         arrays["faces"] = _indices(mesh.faces, len(mesh.vertices), coded=True)
-    return pack(arrays, {"kind": "morph", "low": labels[0], "high": labels[1]})
+    facts = {"low": labels[0], "high": labels[1], "weights": weights.tolist(), "variable": variable, "range": ends}
+    return pack(arrays, {"kind": "morph", **facts})
 
 
 def pack_morphospace(space: Morphospace, *, largest: int = 12_000) -> bytes:

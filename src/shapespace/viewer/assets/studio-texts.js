@@ -65,7 +65,7 @@
       kinds: {
         correspond: "Correspondence", redo: "Correct one scan", build: "Build the model", quality: "Measure the quality", morphospace: "Draw the morphospace",
         fit: "Fit the model", complete: "Complete partial scans", compare: "Do groups differ?", change: "Has it changed?", asymmetry: "Is it symmetric?",
-        regress: "Number from shape?", score: "How unusual is it?", identify: "Who is it?", report: "Report", convert: "Convert the model", export: "Export",
+        regress: "Shape and a number?", score: "How unusual is it?", identify: "Who is it?", report: "Report", convert: "Convert the model", export: "Export",
       },
       statuses: { waiting: "waiting", running: "running", done: "done", failed: "failed", cancelled: "cancelled", interrupted: "interrupted" },
       settings: "Settings, and run again", run: "Run", runAgain: "Run again", runOf: { correspond: "Bring into correspondence", build: "Build the model", fit: "Fit the scans" },
@@ -95,7 +95,7 @@
       paper: "Text for the paper", copyPaper: "Copy the text", findings: "Result", figures: "Figures (SVG, PDF, PNG)", none: "Bring the specimens into correspondence first, or fit new scans.",
       hints: {
         compare: "Test whether shape is associated with sex, age, treatment or any other column.", change: "Measure the change between visits of the same subjects in millimetres.",
-        asymmetry: "Compare left with right: a score for each subject, and a map.", regress: "Predict a number, such as age, from shape, with its cross-validated accuracy.",
+        asymmetry: "Compare left with right: a score for each subject, and a map.", regress: "Predict a number, such as age, from shape (target), or the mean shape along it (along).",
         score: "Compare each shape with a class, such as the controls: a percentile, and a map.", identify: "Find the subject of a scan among the enrolled ones.",
       },
       empty: "After the run, the answer in words, the figures and the text for the paper are shown here.",

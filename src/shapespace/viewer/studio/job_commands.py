@@ -155,7 +155,7 @@ def checks(
 ) -> list[dict[str, str]]:
     """Return findings on a question before it is run: a level (`ok`, `warning`, `problem`) and a sentence each."""
     chosen = _specimens_of(project, shapes)
-    formula = str(options.get("--formula", ""))
+    formula = f"{options.get('--formula', '')} {options.get('--covariates', '')}"
     used = {str(value) for value in options.values() if isinstance(value, str)}
     columns = [column for column in project.state.columns if column in used or _in_formula(column, formula)]
     missing = {column: sum(not one.cells.get(column) for one in chosen) for column in columns}
@@ -171,6 +171,9 @@ def checks(
         level = "problem" if members < 2 or not others else "warning" if members < 20 else "ok"
         text = f"{members} in the reference, {others} to score; percentiles have steps of 1 in {members + 1}."
         found.append({"level": level, "text": text})
+    if kind == "regress" and bool(options.get("--target")) == bool(options.get("--along")):
+        text = "Choose one column: a target to predict a number from shape, or along to predict shapes along a number."
+        found.append({"level": "problem", "text": text})
     for column in columns:
         cells = [one.cells.get(column, "") for one in chosen]
         if missing[column]:

@@ -1,0 +1,196 @@
+"""Report of mean shapes along a number: sentences, tables, curves, maps and a morph with a slider."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from shapespace.cohort.cohort import subjects_of
+from shapespace.report.analyses.analysis_report import AnalysisReport, LengthFormat, Rows
+from shapespace.report.analyses.methods_section import methods_parts
+from shapespace.report.analyses.shape_data import add_shape_data, model_hashes, shape_change_parts
+from shapespace.schemas import CurvePart, MorphPart, Part, Series, SurfaceMapPart, TableColumn, TablePart
+from shapespace.statistics.observation_weights import blank_where, weights_of
+from shapespace.statistics.shape_prediction import ShapePrediction
+from shapespace.types import FloatArray, Mesh
+
+SHAPES_FILE = "shapes.npz"
+"""Mean shapes, half widths of their intervals, and maps."""
+_CITATIONS = (
+    "Bell R. M., McCaffrey D. F. (2002) Bias reduction in standard errors for linear regression with multi-stage "
+    "samples. Survey Methodology 28, 169-181.",
+    "Imbens G. W., Kolesár M. (2016) Robust standard errors in small samples: some practical advice. Review of "
+    "Economics and Statistics 98, 701-712.",
+)
+
+
+def shape_prediction_report(result: ShapePrediction) -> AnalysisReport:
+    """Return the report of mean shapes along a number."""
+    parts, arrays, meshes = shape_prediction_parts(result)
+    report = AnalysisReport(
+        question="regress",
+        title=f"Shape along {result.along}",
+        summary=tuple(_summary(result)),
+        parts=(_value_part(result), *_measure_parts(result), *parts, *methods_parts(result.methods)),
+        tables=dict(_tables(result)),
+        arrays={SHAPES_FILE: arrays},
+        meshes=meshes,
+        notes=result.cohort.notes,
+        settings={
+            "along": result.along, "formula": result.formula, "held": dict(result.held) or None,
+            "gauge": result.cohort.gauge, "shapes": len(result.cohort), "subjects": result.n_subjects,
+            "permutations": result.permutations, "level": result.confidence, "seed": result.seed,
+            "subject": result.subject,
+        },
+        model_hashes=model_hashes(result.cohort),
+        methods=result.methods,
+        citations=_CITATIONS,
+    )  # fmt: skip
+    return add_shape_data(report, result.cohort)
+
+
+def shape_prediction_parts(result: ShapePrediction) -> tuple[list[Part], dict[str, Any], dict[str, Mesh]]:
+    """Return the morph and the maps of mean shapes along a number, their arrays, and the meshes."""
+    cohort, unit = result.cohort, LengthFormat(result.cohort.unit).of_map
+    blank = weights_of(cohort.observed_share) == 0
+    low, high = cohort.vertices(result.path[0]), cohort.vertices(result.path[-1])
+    widths = [result.half_width_mm(k) for k in range(len(result.df))]
+    arrays: dict[str, Any] = {
+        "low": low, "high": high, "vertices": cohort.vertices(result.path[len(result.path) // 2]),
+        "values": result.values, "shapes": np.stack([cohort.vertices(own) for own in result.coefficients]),
+        "half_width_mm": np.stack(widths[:-1]), "per_unit_mm": blank_where(result.per_unit_mm, blank),
+        "per_unit_half_width_mm": widths[-1] / (result.ends[1] - result.ends[0]),
+    }  # fmt: skip
+    ends = [f"{result.along} {value:.3g}" for value in result.ends]
+    morph: dict[str, Any] = {
+        "title": f"Mean shape along {result.along}", "arrays": SHAPES_FILE, "low_label": ends[0], "high_label": ends[1]
+    }  # fmt: skip
+    if cohort.faces is None:
+        return list(shape_change_parts(cohort, **morph)), arrays, {}
+    weights, modes = _modes(result)
+    widest = int(np.argmax([np.nan_to_num(np.linalg.norm(width), nan=-1.0) for width in widths[:-1]]))
+    arrays |= {"faces": cohort.faces, "weights": weights, "modes": modes}
+    parts: list[Part] = [
+        MorphPart(**morph, modes="modes", weights="weights", variable=result.along, range=result.ends,
+                  note="The slider moves through the mean shapes."),
+        SurfaceMapPart(
+            title=f"Change of shape for one unit of {result.along}", arrays=SHAPES_FILE, unit=unit,
+            values="per_unit_mm",
+            note="Along the normals, mean of the change between both ends; shapespace compare tests where this is more "
+            "than chance.",
+        ),
+    ]  # fmt: skip
+    if result.is_known[widest]:
+        arrays["widest_mm"] = blank_where(widths[widest], blank)
+        parts.append(
+            SurfaceMapPart(
+                title=f"Half width of the interval at {result.along} {result.values[widest]:.4g}, the widest",
+                arrays=SHAPES_FILE, values="widest_mm", unit=unit, signed=False,
+                note=f"Pointwise {100 * result.confidence:g} % interval of the mean shape along the normals.",
+            )
+        )  # fmt: skip
+    name = re.sub(r"[^\w.-]+", "_", result.along)
+    meshes = {
+        f"{name}_{value:.6g}.ply": cohort.mesh(own, f"{result.along} {value:.6g}")
+        for value, own in zip(result.values.tolist(), result.coefficients, strict=True)
+    }
+    return parts, arrays, meshes
+
+
+def _modes(result: ShapePrediction) -> tuple[FloatArray, FloatArray]:
+    """Return weights (B, q) up to 1 and modes (q, V, 3), mm, of the path less its first shape."""
+    u, s, axes = np.linalg.svd(result.path - result.path[0], full_matrices=False)
+    count = max(int((s > 1e-9 * s[0]).sum()), 1)  # the rest is rounding
+    weights = u[:, :count] * s[:count]
+    largest = np.maximum(np.abs(weights).max(axis=0), 1e-300)
+    modes = (largest[:, None] * axes[:count]) @ result.cohort.basis
+    return weights / largest, modes.reshape(count, -1, 3)
+
+
+def _summary(result: ShapePrediction) -> Iterator[str]:
+    lengths, along = LengthFormat(result.cohort.unit), result.along
+    change, error = map(lengths.text, result.change_mm)
+    ends = f"from {along} {result.ends[0]:.3g} to {result.ends[1]:.3g}"
+    p = "" if result.p is None else f" (p {result.p:.3g})"
+    owners = subjects_of(result.cohort, result.subject)
+    varies = len(set(zip(owners, result.observed.tolist(), strict=True))) > result.n_subjects
+    subjects = f"{'between and within' if varies else 'between'} {result.n_subjects} subjects"
+    limits = f"{subjects}{'' if varies else ', which were not followed'}"
+    known = "" if result.is_known.all() else "; some intervals are not known"
+    found = result.p is None or result.p <= result.methods.level
+    yield (
+        f"{f'Shape changes with {along}' if found else f'No change of shape with {along} is found'}{p}: {change} (RMS "
+        f"over vertices, standard error {error}) {ends}, {limits}{known}."
+    )
+    held = ", ".join(f"{name} {value}" for name, value in result.held.items())
+    yield (
+        f"Mean shapes are predicted at {along} {', '.join(f'{value:.4g}' for value in result.values)} by ~ "
+        f"{result.formula}{f', with {held}' if held else ''}; other numbers are at their mean, and classes count alike."
+    )
+    yield (
+        f"Intervals are pointwise {100 * result.confidence:g} % intervals of the mean shape; single subjects vary more."
+    )
+    if not result.is_known.all():
+        values = [f"{v:.4g}" for v, known in zip(result.values, result.is_known[:-1], strict=True) if not known]
+        yield (
+            f"Too few subjects determine the variance at {along} {', '.join(values) or 'of both ends'}, so the "
+            "interval there is not known."
+        )
+
+
+def _columns(result: ShapePrediction) -> tuple[list[str], list[list[float | None]]]:
+    """Return the columns of lengths, and their values at each value of the number."""
+    names = ["distance_from_first", "standard_error", "half_width"]
+    widths = [np.linalg.norm(result.half_width_mm(k)) for k in range(len(result.values))]
+    columns = [result.distance_mm, result.distance_std_mm, np.array(widths) / result.cohort.n_vertices**0.5]
+    for one in result.measures:
+        name = re.sub(r"\W+", "_", one.name)
+        names += [name, f"{name}_low", f"{name}_high"]
+        columns += [one.value, one.low, one.high]
+    return names, [[float(v) if np.isfinite(v) else None for v in row] for row in zip(*columns, strict=True)]
+
+
+def _value_part(result: ShapePrediction) -> Part:
+    lengths, (names, rows) = LengthFormat(result.cohort.unit), _columns(result)
+    return TablePart(
+        title=f"Mean shapes along {result.along}", level=2,
+        columns=(TableColumn(name=result.along, kind="number"),
+                 *(lengths.column(name.replace("_", " ")) for name in names)),
+        rows=tuple((float(value), *row) for value, row in zip(result.values, rows, strict=True)),
+        note="RMS over vertices: distance from the first shape with its standard error, and half the width of the "
+        f"pointwise {100 * result.confidence:g} % interval. Empty where an interval is not known.",
+    )  # fmt: skip
+
+
+def _measure_parts(result: ShapePrediction) -> Iterator[Part]:
+    for one in result.measures:
+        low, high = ([None if np.isnan(v) else float(v) for v in end] for end in (one.low, one.high))
+        yield CurvePart(
+            title=f"{one.name.capitalize()} along {result.along}", x=result.along,
+            y=LengthFormat(result.cohort.unit).label(one.name),
+            series=(Series(x=_floats(result.observed), y=_floats(one.observed), label="shapes", points=True),
+                    Series(x=_floats(result.values), y=_floats(one.value), label="mean", low=tuple(low),
+                           high=tuple(high))),
+        )  # fmt: skip
+
+
+def _tables(result: ShapePrediction) -> Iterator[tuple[str, Rows]]:
+    field, (names, rows) = LengthFormat(result.cohort.unit).field, _columns(result)
+    values = [(value, *row, df) for value, row, df in zip(result.values, rows, result.df, strict=False)]
+    yield "shapes.csv", ((result.along, *map(field, names), "df"), values)
+    if result.cohort.source.kind == "landmarks" and result.cohort.landmarks is not None:
+        axes = "xyz"[: result.cohort.dimensions]
+        header = (result.along, "landmark", *axes, *(f"{axis}_{end}" for end in ("low", "high") for axis in axes))
+        points: list[tuple[object, ...]] = []
+        for k, value in enumerate(result.values):
+            shape, width = result.cohort.vertices(result.coefficients[k]), result.half_width_mm(k)
+            for name, *ends in zip(result.cohort.landmarks.names, shape, shape - width, shape + width, strict=True):
+                points.append((value, name, *(float(v) for end in ends for v in end[: len(axes)])))
+        yield "landmarks.csv", (header, points)
+
+
+def _floats(values: FloatArray) -> tuple[float, ...]:
+    return tuple(map(float, values))
