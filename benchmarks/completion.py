@@ -45,8 +45,7 @@ from shapespace.datasets.faces import load_faces
 from shapespace.datasets.organs import Organ
 from shapespace.datasets.simulated_scan import Cut, random_similarity, simulate_scan
 from shapespace.errors import FitError
-from shapespace.fit.completion.complete import Completion, CompletionConfig, complete
-from shapespace.fit.completion.mirror import add_mirror_image
+from shapespace.fit.completion.complete import Completion, CompletionConfig, add_mirror_image, complete
 from shapespace.fit.dense.residual_modes import residual_modes
 from shapespace.fit.fit_scan import FitConfig
 from shapespace.fit.robust.posterior import lack_of_new_shapes, variance_of_new_shapes

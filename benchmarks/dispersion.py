@@ -22,8 +22,7 @@ from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.table import Table
 from shapespace.statistics.compare_formula import Coding, design_of
 from shapespace.statistics.compare_formula import Design as FormulaDesign
-from shapespace.statistics.compare_shapes import CompareConfig, compare, term_tests
-from shapespace.statistics.compare_unequal import units_of
+from shapespace.statistics.compare_shapes import CompareConfig, compare, term_tests, units_of
 from shapespace.statistics.compare_within import strata_of
 from shapespace.statistics.dispersion import dispersion_test
 from shapespace.statistics.map_tests import difference_test

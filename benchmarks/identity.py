@@ -26,8 +26,7 @@ from identity_scans import CONDITIONS, fit_harder, people_there, read_harder, st
 from shapespace.model.additive import AdditiveModel
 from shapespace.statistics.identity.identify import Searches, identification_rates, joined, search
 from shapespace.statistics.identity.rates import Pairs, RateEstimate, Sweep, people_drawn
-from shapespace.statistics.identity.samples import Samples
-from shapespace.statistics.identity.scores import SCORES
+from shapespace.statistics.identity.scores import SCORES, Samples
 from shapespace.statistics.identity.verify import VerificationRates, cllr, verification_rates
 from shapespace.types import FloatArray, IntArray
 from simulated import StudyConfig, prepare_folder, run_fits

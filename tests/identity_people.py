@@ -4,7 +4,7 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort, Fitted
 from shapespace.cohort.table import Table
-from shapespace.statistics.identity.samples import Samples
+from shapespace.statistics.identity.scores import Samples
 from shapespace.types import FloatArray
 from synthetic_shapes import blob_model
 

@@ -16,8 +16,8 @@ from PIL import Image, ImageDraw, ImageFont
 import shapespace as ss
 from shapespace.cli import main as shapespace
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.report.render.checkerboard import checker_layer, checker_places
 from shapespace.report.render.renderer import Camera, Layer, render
+from shapespace.report.render.thumbnails import checker_layer, checker_places
 from shapespace.types import FloatArray, Mesh
 
 SHOWN, SIZE, HEIGHT_MM, BAND = 5, (300, 240), 122.0, 34

@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shapespace.correspondence.groupwise import correspond
+from shapespace.correspondence.groupwise import correspond, subject_levels
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.isometry import IntrinsicShape, bent_shapes, common_symmetries
 from shapespace.correspondence.settings import CorrespondConfig
-from shapespace.correspondence.subject_tree import subject_levels
 from shapespace.correspondence.template import resample
 from shapespace.errors import InputError
 from shapespace.geometry.distortion import edge_stretch

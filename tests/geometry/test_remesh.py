@@ -4,7 +4,7 @@ import pytest
 from shapespace.errors import MeshError
 from shapespace.geometry import remesh
 from shapespace.geometry.closest import build_engine
-from shapespace.report.render.decimate import decimate
+from shapespace.report.render.scene import decimate
 from shapespace.types import Mesh
 
 

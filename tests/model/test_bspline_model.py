@@ -12,7 +12,7 @@ from shapespace import cli
 from shapespace.errors import InputError, MeshError, ModelFileError
 from shapespace.io.containers.hdf5 import read_hdf5, write_hdf5
 from shapespace.io.meshes.mesh_io import write_mesh
-from shapespace.model.holes import fill_holes
+from shapespace.model.build_model import fill_holes
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Mesh
 from synthetic_shapes import similarity, training_meshes

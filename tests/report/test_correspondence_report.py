@@ -18,8 +18,8 @@ from shapespace.report.inputs.correspondence_folder import Corresponded, upright
 from shapespace.report.inputs.triage import concerns_of
 from shapespace.report.pages import correspondence_page
 from shapespace.report.pages.write_html import LARGEST_REPORT_BYTES, write_report
-from shapespace.report.render.checkerboard import checker_layer, checker_places
 from shapespace.report.render.renderer import Camera, Layer, render, squares
+from shapespace.report.render.thumbnails import checker_layer, checker_places
 from shapespace.types import Mesh
 from synthetic_shapes import similarity
 

@@ -17,7 +17,7 @@ from shapespace.errors import InputError
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.report.inputs.staged_fit import StagedFit
 from shapespace.report.render import scene
-from shapespace.report.render.scene_scripts import SCENE_SCRIPTS, WIDGET_SCRIPTS
+from shapespace.report.render.scene import SCENE_SCRIPTS, WIDGET_SCRIPTS
 from shapespace.types import Mesh, SurfaceLandmarks
 from synthetic_shapes import blob_model, raw_scan
 

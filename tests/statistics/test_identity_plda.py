@@ -9,8 +9,7 @@ from scipy.stats import multivariate_normal
 from identity_people import MODES, people, spreads
 from shapespace.errors import InputError
 from shapespace.statistics.identity.rates import Sweep
-from shapespace.statistics.identity.samples import Samples
-from shapespace.statistics.identity.scores import SCORES, TwoCovariance
+from shapespace.statistics.identity.scores import SCORES, Samples, TwoCovariance
 
 pytest.importorskip("sklearn", reason="the extra `statistics` is not installed")
 

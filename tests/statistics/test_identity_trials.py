@@ -14,7 +14,7 @@ from shapespace.model.additive import AdditiveModel
 from shapespace.report.analyses.result_tables import analysis_report
 from shapespace.schemas import Analysis
 from shapespace.statistics.identity.identify import identify
-from shapespace.statistics.identity.samples import samples_of
+from shapespace.statistics.identity.scores import samples_of
 from shapespace.statistics.identity.trial import IdentityConfig, rows_of, trial_of
 from shapespace.statistics.identity.verify import verify
 

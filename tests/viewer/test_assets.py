@@ -6,7 +6,7 @@ from importlib.resources import files
 
 import pytest
 
-from shapespace.viewer.responses import ASSETS, PAGES
+from shapespace.viewer.server import ASSETS, PAGES
 
 
 @pytest.mark.parametrize("page", ["viewer.html", "surfaces.html", "studio.html"])

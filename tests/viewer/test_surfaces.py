@@ -16,14 +16,13 @@ from viewer_world import enter, served, unpacked
 
 from same_blobs import ASIDE, FAR, FOLDED, HIDDEN, NAMES, VERTICES, surface, write_same
 from shapespace.errors import FileFormatError, InputError
-from shapespace.report.render.scene_scripts import SCENE_SCRIPTS
+from shapespace.report.render.scene import SCENE_SCRIPTS
 from shapespace.viewer import corresponding_surfaces as module
 from shapespace.viewer.corresponding_surfaces import Surfaces
 from shapespace.viewer.guard import SECURITY_HEADERS, Access
 from shapespace.viewer.model_view import ModelView
-from shapespace.viewer.responses import ASSETS, PAGES
 from shapespace.viewer.serve import serve
-from shapespace.viewer.surfaces_server import make_surfaces_app
+from shapespace.viewer.server import ASSETS, PAGES, make_surfaces_app
 
 
 @contextmanager

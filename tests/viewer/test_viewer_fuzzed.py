@@ -24,8 +24,7 @@ from shapespace.viewer import uploaded_scans as scans_module
 from shapespace.viewer.corresponding_surfaces import Surfaces
 from shapespace.viewer.guard import Access
 from shapespace.viewer.model_view import ModelView
-from shapespace.viewer.server import make_app
-from shapespace.viewer.surfaces_server import make_surfaces_app
+from shapespace.viewer.server import make_app, make_surfaces_app
 from shapespace.viewer.uploaded_scans import Limits, Scans
 from synthetic_shapes import blob_model
 

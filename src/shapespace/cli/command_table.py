@@ -25,7 +25,7 @@ from shapespace.cli.answers import (
     shape_tests,
 )
 from shapespace.cli.options import Option, Source, advanced, basic
-from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS, ShapeTest
+from shapespace.statistics.shape_tests.shape_test_result import SHAPE_TESTS, ShapeTest
 
 # The classes and functions that options are read from.
 COHORT = Source("cohort.read", "CohortConfig")

@@ -45,7 +45,7 @@ def _open(report: Path, arguments: argparse.Namespace) -> None:
 
 def report(arguments: argparse.Namespace) -> int:
     """One HTML file on the results in a folder."""
-    from shapespace.commands.report import write_report
+    from shapespace.commands.answers import write_report
 
     report = write_report(
         arguments.folder, arguments.output, model=arguments.model, labels=arguments.labels, quiet=arguments.quiet

@@ -16,7 +16,7 @@ from shapespace.batch.progress import progress, waiting
 from shapespace.batch.result_folder import RECORD
 from shapespace.cohort.labels import read_labels
 from shapespace.cohort.table import names_of_file
-from shapespace.commands.about import ABOUT, read_about
+from shapespace.commands.data import ABOUT, read_about
 from shapespace.commands.look import training_shapes_note
 from shapespace.errors import InputError, MeshError, ShapespaceError
 from shapespace.geometry.landmark_placement import far_landmarks, landmarks_in_frame_of, place_landmarks

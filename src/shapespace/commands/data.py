@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
 from shapespace.batch.progress import progress, steps
-from shapespace.commands.about import write_about
 from shapespace.errors import InputError
-from shapespace.io.files import make_folder
+from shapespace.io.containers.json_files import read_json
+from shapespace.io.files import make_folder, write_text
 
 
 def data_list() -> list[dict[str, object]]:
@@ -171,3 +172,27 @@ def write_simulated_organs(
 
         write_organs(folder, count=count, seed=seed, volumes=volumes, progress=one_more)
     write_about(folder, f"{count} simulated organs of shapespace, seed {seed}", LICENSE)
+
+
+ABOUT = "about.json"
+
+
+def write_about(folder: Path, provenance: str, licence: str) -> None:
+    """Write what the meshes in `folder` are.
+
+    Raises:
+        FileError: it cannot be written.
+    """
+    write_text(folder / ABOUT, json.dumps({"provenance": provenance, "licence": licence}, indent=1) + "\n")
+
+
+def read_about(folder: Path) -> tuple[str, str] | None:
+    """Return the provenance and licence of the meshes in `folder`, or None where nothing says so."""
+    path = folder / ABOUT
+    if not path.is_file():
+        return None
+    try:
+        stored = read_json(path, "make the faces again")
+        return str(stored["provenance"]), str(stored["licence"])
+    except (ValueError, KeyError, TypeError):
+        return None

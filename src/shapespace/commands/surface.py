@@ -15,7 +15,7 @@ from shapespace.batch.result_folder import names_for
 from shapespace.errors import ShapespaceError
 from shapespace.geometry.volume_surface import SMOOTH, VolumeSurface, surface_of_volume
 from shapespace.io.files import make_folder, remove_file
-from shapespace.io.memory import available_bytes
+from shapespace.io.memory_cache import available_bytes
 from shapespace.io.meshes.mesh_folders import mesh_files
 from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.io.volumes.volume_io import VOLUME_ENDINGS, read_volume, require_volumes_extra, volume_name

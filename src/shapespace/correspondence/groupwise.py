@@ -10,12 +10,13 @@ those of docs/correspondence.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import Protocol
 
 import numpy as np
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
 from shapespace.correspondence.first_template import FirstTemplate, first_template, repaired_scans
@@ -24,13 +25,7 @@ from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.isometry import common_symmetries
 from shapespace.correspondence.kinds import Collection, find_kinds, is_outlier
 from shapespace.correspondence.landmark_guide import ScanLandmarks, consensus_landmarks
-from shapespace.correspondence.pose_consensus import (
-    SAME_POSE_DEG,
-    TEMPLATE,
-    PoseComparison,
-    angle_deg,
-    consensus_poses,
-)
+from shapespace.correspondence.pose_consensus import SAME_POSE_DEG, TEMPLATE, PoseComparison, angle_deg, consensus_poses
 from shapespace.correspondence.registration import (
     CLEARLY_LESS_STRAINED,
     Comparison,
@@ -49,7 +44,6 @@ from shapespace.correspondence.scan_status import (
     judge,
 )
 from shapespace.correspondence.settings import FEWEST, SIZE, CorrespondConfig
-from shapespace.correspondence.subject_tree import subject_levels
 from shapespace.correspondence.template import PoseModel, clean_scan
 from shapespace.correspondence.vertex_confidence import VertexConfidence
 from shapespace.errors import InputError, ShapespaceError
@@ -1020,3 +1014,35 @@ def _measures(template: Mesh, registration: ScanRegistration, moved: Sequence[fl
         area_change=changed.area_factor,
         not_settled=moved[-1] if moved else np.nan,
     )
+
+
+_LEAST = 1e-9  # share of the largest distance, so that equal shapes are connected
+
+
+def subject_levels(shapes: FloatArray, mean: FloatArray, subjects: Sequence[Hashable]) -> list[list[tuple[int, int]]]:
+    """Return pairs of shape and parent; those of a level have parents in the levels before, or roots.
+
+    The shapes of a subject are the nodes of a minimum spanning tree of their RMS distances. Its root is the shape
+    nearest to the mean, such as the neutral face; extreme shapes follow through intermediate ones.
+
+    Args:
+        shapes: (N, V, 3) aligned.
+        mean: (V, 3) of all shapes.
+        subjects: (N,) of the shapes.
+    """
+    members: dict[Hashable, list[int]] = {}
+    for i, subject in enumerate(subjects):
+        members.setdefault(subject, []).append(i)
+    levels: dict[int, list[tuple[int, int]]] = {}
+    for own in members.values():
+        flat = shapes[own].reshape(len(own), -1)
+        distances = np.linalg.norm(flat[:, None] - flat, axis=2)
+        root = int(np.linalg.norm(flat - mean.ravel(), axis=1).argmin())
+        tree = minimum_spanning_tree(distances + _LEAST * max(float(distances.max()), 1.0))
+        order, parents = breadth_first_order(tree, root, directed=False)
+        depth = {root: 0}
+        for child in map(int, order[1:]):
+            parent = int(parents[child])
+            depth[child] = depth[parent] + 1
+            levels.setdefault(depth[child], []).append((own[child], own[parent]))
+    return [levels[depth] for depth in sorted(levels)]

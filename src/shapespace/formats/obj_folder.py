@@ -11,8 +11,7 @@ from typing import Final
 import numpy as np
 
 from shapespace.errors import ModelFileError, ShapespaceError
-from shapespace.formats.facts import KEY, facts_of, json_object, with_facts
-from shapespace.formats.model_folder import write_folder
+from shapespace.formats.facts import KEY, facts_of, json_object, with_facts, write_folder
 from shapespace.formats.model_parts import LinearModel, Modes
 from shapespace.io.containers.json_files import read_json
 from shapespace.io.files import read_bytes

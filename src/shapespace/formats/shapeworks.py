@@ -20,8 +20,7 @@ from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
 from shapespace.errors import InputError, ModelFileError, ShapespaceError
-from shapespace.formats.facts import KEY, facts_of, json_object, with_facts
-from shapespace.formats.model_folder import write_folder
+from shapespace.formats.facts import KEY, facts_of, json_object, with_facts, write_folder
 from shapespace.formats.model_parts import LinearModel, Modes
 from shapespace.geometry.procrustes import align_in_place
 from shapespace.geometry.similarity import fit_similarity

@@ -14,7 +14,7 @@ import numpy as np
 
 from shapespace.errors import InputError
 from shapespace.io.containers.row_spill import Spill
-from shapespace.io.memory import available_bytes
+from shapespace.io.memory_cache import available_bytes
 from shapespace.model.krylov import KeptPasses, Leading, Stop, leading
 from shapespace.model.pca import (
     ALL_EQUAL,

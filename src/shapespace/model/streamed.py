@@ -34,7 +34,7 @@ from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.containers.arrays import read_arrays, write_arrays
 from shapespace.io.containers.row_spill import Spill
 from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_error, write_text
-from shapespace.io.memory import available_bytes
+from shapespace.io.memory_cache import available_bytes
 from shapespace.model.choose_modes import drawn, number_of_modes
 from shapespace.model.krylov import KeptPasses
 from shapespace.model.large_pca import checked_large_modes, large_components

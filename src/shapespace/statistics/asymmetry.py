@@ -25,9 +25,8 @@ from shapespace.geometry.procrustes import centroid_size
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.reprs import list_briefly, short_repr
 from shapespace.schemas import Methods, SampleSize, TestScheme
-from shapespace.statistics.analysis_result import AnalysisResult
 from shapespace.statistics.effect_size import effect_size
-from shapespace.statistics.methods import methods_of
+from shapespace.statistics.methods import AnalysisResult, methods_of
 from shapespace.statistics.multiple_imputation import Imputations, over_imputations
 from shapespace.statistics.observation_weights import weights_of
 from shapespace.statistics.sides import Sides, aligned_shapes, find_sides, given_sides, match_sides

@@ -14,14 +14,13 @@ from scipy.stats import t as student
 from shapespace.cohort.cohort import Cohort
 from shapespace.reprs import list_briefly, short_repr
 from shapespace.schemas import Methods, TestScheme
-from shapespace.statistics.analysis_result import AnalysisResult
 from shapespace.statistics.change_align import stable_vertices
 from shapespace.statistics.change_maps import align_visits
 from shapespace.statistics.change_repeatability import Repeatability
 from shapespace.statistics.change_visits import visits_of
 from shapespace.statistics.dispersion import DispersionTest, Variances
 from shapespace.statistics.map_tests import LEVEL, MapTest
-from shapespace.statistics.methods import dispersion_record, methods_of, sample_sizes
+from shapespace.statistics.methods import AnalysisResult, dispersion_record, methods_of, sample_sizes
 from shapespace.types import BoolArray, FloatArray, Mesh, SurfaceLandmarks
 
 NINETY_FIVE = 1.96

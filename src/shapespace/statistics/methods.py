@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from shapespace.cohort.cohort import Cohort
+from shapespace.lazy import lazy_import
 from shapespace.schemas import Dispersion, Methods, SampleSize
 from shapespace.statistics.dispersion import DispersionTest
 from shapespace.statistics.tolerances import RANK
@@ -86,3 +88,26 @@ def dispersion_record(test: DispersionTest, alpha: float) -> Dispersion:
         f=test.f, p=test.p, arrangements=test.permutations, equal=test.p > alpha,
         smaller_is_more_variable=test.smaller_is_more_variable,
     )  # fmt: skip
+
+
+class AnalysisResult:
+    """The result of an analysis of a cohort."""
+
+    def save(self, folder: Path | str) -> Path:
+        """Write the report, tables, arrays and meshes to a folder.
+
+        `shapespace report FOLDER` draws the report from these files.
+
+        Args:
+            folder: is created if it does not exist.
+
+        Returns:
+            The path of analysis.json.
+
+        Raises:
+            FileError: the folder cannot be written, or the disk is full.
+        """
+        return lazy_import("save_analysis")(self, folder)
+
+    def _repr_html_(self) -> str:
+        return lazy_import("html_of_analysis")(self)

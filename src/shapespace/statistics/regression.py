@@ -14,7 +14,6 @@ from shapespace.cohort.proportions import widen_share
 from shapespace.errors import InputError
 from shapespace.reprs import describe_briefly, list_briefly
 from shapespace.schemas import Methods, TestScheme
-from shapespace.statistics.analysis_result import AnalysisResult
 from shapespace.statistics.linear_regressors import (
     CHOICES,
     IndexArray,
@@ -25,7 +24,7 @@ from shapespace.statistics.linear_regressors import (
     nested,
     weighted_mean,
 )
-from shapespace.statistics.methods import SCAN_OF_SUBJECT, methods_of
+from shapespace.statistics.methods import SCAN_OF_SUBJECT, AnalysisResult, methods_of
 from shapespace.statistics.multiple_imputation import Imputations, over_imputations
 from shapespace.statistics.predictor import Predictions, Predictor, cv_plus, model_hash_of
 from shapespace.statistics.shape_prediction import FEWEST, ShapePrediction, predict_shapes

@@ -22,8 +22,7 @@ from shapespace.geometry.normals import vertex_normals
 from shapespace.geometry.procrustes import centroid_size
 from shapespace.reprs import list_briefly
 from shapespace.schemas import Methods, SampleSize, SurfaceReview, TestScheme
-from shapespace.statistics.analysis_result import AnalysisResult
-from shapespace.statistics.methods import methods_of
+from shapespace.statistics.methods import AnalysisResult, methods_of
 from shapespace.statistics.multiple_imputation import Imputations, over_imputations
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, read_only, require
 

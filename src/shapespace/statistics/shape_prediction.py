@@ -16,13 +16,12 @@ from shapespace.geometry.normals import vertex_normals
 from shapespace.geometry.procrustes import centroid_size
 from shapespace.reprs import list_briefly
 from shapespace.schemas import Methods, TestScheme
-from shapespace.statistics.analysis_result import AnalysisResult
 from shapespace.statistics.compare_formula import Design, design_of, quoted
 from shapespace.statistics.compare_shapes import complete_cohort
 from shapespace.statistics.compare_strata import columns_of_terms, refuse_aliased
 from shapespace.statistics.effect_size import permutation_p
 from shapespace.statistics.linear_regressors import IndexArray
-from shapespace.statistics.methods import methods_of
+from shapespace.statistics.methods import AnalysisResult, methods_of
 from shapespace.statistics.subject_regression import SubjectRegression
 from shapespace.step_counter import Progress
 from shapespace.types import BoolArray, FloatArray, Mesh, read_only, require

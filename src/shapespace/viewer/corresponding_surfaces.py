@@ -19,9 +19,8 @@ from shapespace.report.blocks.wording import without_folders
 from shapespace.report.inputs.correspondence_folder import Corresponded, Population
 from shapespace.report.inputs.triage import Concern, concerns_of, distance_share, scan_status, sentence
 from shapespace.report.render import palette as colours
-from shapespace.report.render.checkerboard import SQUARES, checker_places
-from shapespace.report.render.decimate import decimate
-from shapespace.report.render.scene import pack, quantise
+from shapespace.report.render.scene import decimate, pack, quantise
+from shapespace.report.render.thumbnails import SQUARES, checker_places
 from shapespace.version import __version__
 
 MAX_MARKED = 100

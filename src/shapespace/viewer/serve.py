@@ -88,8 +88,7 @@ def serve(
         start_loading(notify=not quiet)
     from shapespace.viewer.corresponding_surfaces import Surfaces
     from shapespace.viewer.model_view import ModelView
-    from shapespace.viewer.server import make_app
-    from shapespace.viewer.surfaces_server import make_surfaces_app
+    from shapespace.viewer.server import make_app, make_surfaces_app
     from shapespace.viewer.uploaded_scans import FOLDER_PREFIX, Limits, Scans
 
     with _stopped_by_signals(), ExitStack() as stack:

@@ -7,30 +7,33 @@ import secrets
 import shutil
 import tempfile
 import unicodedata
-from collections.abc import AsyncGenerator, Mapping
+from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
 from contextlib import aclosing
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
-from starlette.requests import Request
-from starlette.responses import FileResponse, Response
-from starlette.routing import Route
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.routing import BaseRoute, Route
 from starlette.types import ASGIApp
 
-from shapespace.errors import FileError
+from shapespace.errors import FileError, ShapespaceError
 from shapespace.io.containers.json_files import plain_json
 from shapespace.io.files import read_bytes
 from shapespace.io.landmarks.landmark_io import write_landmarks
 from shapespace.io.meshes.mesh_io import MESH_ENDINGS, read_mesh, write_mesh
 from shapespace.report.render import palette as colours
+from shapespace.report.render.scene import SCENE_SCRIPTS
+from shapespace.schemas import to_json
 from shapespace.types import Mesh
 from shapespace.version import __version__
+from shapespace.viewer.corresponding_surfaces import Surfaces
 from shapespace.viewer.fitting import NAME, PICTURE, PREVIEW
-from shapespace.viewer.guard import Access, Guard
+from shapespace.viewer.guard import Access, Guard, refusal
 from shapespace.viewer.model_view import ModelView, shape_of
-from shapespace.viewer.responses import PAGES, application, asset, binary, json_response
 from shapespace.viewer.uploaded_scans import MIN_LANDMARKS, Scans, UploadedScan
 
 EXPORTS = ("ply", "obj", "stl")
@@ -311,3 +314,159 @@ def _file(path: Path, missing: str, file_name: str | None = None) -> Response:
         return binary(read_bytes(path), file_name)
     except FileError:
         raise HTTPException(404, missing) from None
+
+
+_MAX_QUERY = 2000  # characters; bounds the work of one request
+
+
+def make_surfaces_app(
+    surfaces: Surfaces, access: Access, *, loopback: bool = True, cookie_name: str = "shapespace"
+) -> ASGIApp:
+    """Return the application behind a guard.
+
+    Args:
+        surfaces: the folder.
+        access: the secrets of this viewer.
+        loopback: whether only this machine can reach the server.
+        cookie_name: browsers share cookies between ports, so the name should contain the port.
+    """
+    return Guard(surfaces_app(surfaces), access=access, cookie_name=cookie_name, loopback=loopback)
+
+
+def surfaces_app(surfaces: Surfaces) -> ASGIApp:
+    """Return the application."""
+
+    def page(request: Request) -> Response:
+        return FileResponse(PAGES / "surfaces.html", media_type="text/html")
+
+    def about(request: Request) -> Response:
+        return json_response(surfaces.about())
+
+    def mean(request: Request) -> Response:
+        return binary(surfaces.packed_mean())
+
+    def population(request: Request) -> Response:
+        return binary(surfaces.packed_population())
+
+    def names(request: Request) -> Response:
+        return json_response(surfaces.names())
+
+    def surface_list(request: Request) -> Response:
+        return json_response(surfaces.rows())
+
+    def surface(request: Request) -> Response:
+        try:
+            return binary(surfaces.packed_surface(request.path_params["name"]))
+        except KeyError:
+            raise HTTPException(404, "There is no such scan in correspondence; reload the page.") from None
+
+    def positions(request: Request) -> Response:
+        numbers = request.query_params.get("vertices", "")[:_MAX_QUERY].split(",")
+        if not all(part.isascii() and part.isdigit() for part in numbers):
+            raise HTTPException(400, "Give the numbers of vertices with commas between them.")
+        return binary(surfaces.positions_csv([int(part) for part in numbers]).encode(), "places.csv")
+
+    routes = [
+        Route("/", page),
+        Route("/assets/{name}", asset),
+        Route("/api/about", about),
+        Route("/api/mean", mean),
+        Route("/api/population", population),
+        Route("/api/names", names),
+        Route("/api/surfaces", surface_list),
+        Route("/api/surfaces/{name}", surface),
+        Route("/api/places", positions),
+    ]
+    return application(routes, surfaces.public)
+
+
+PAGES = Path(__file__).parent / "assets"
+_SHARED = Path(__file__).parents[1] / "report" / "assets"
+_VIEWER_SCRIPTS = (
+    "page.js", "charts.js", "coefficients-csv.js", "fit-controls.js", "fit-view.js", "viewer.js", "surfaces.js",
+    *(f"viewer-{part}.js" for part in ("stage", "model", "compare", "fits", "scan", "uploads", "landmarks")),
+)  # fmt: skip
+_STUDIO_SCRIPTS = ("studio.js", *(f"studio-{part}.js" for part in (
+    "texts", "store", "widgets", "start", "table", "specimens", "jobs", "steps", "questions", "results",
+)))  # fmt: skip
+ASSETS: Mapping[str, tuple[Path, str]] = {
+    "viewer.css": (PAGES / "viewer.css", "text/css"),
+    "studio.css": (PAGES / "studio.css", "text/css"),
+    **{name: (PAGES / name, "text/javascript") for name in (*_VIEWER_SCRIPTS, *_STUDIO_SCRIPTS)},
+    "preact-htm.min.js": (PAGES / "vendor" / "preact-htm.min.js", "text/javascript"),
+    "uPlot.iife.min.js": (PAGES / "vendor" / "uPlot.iife.min.js", "text/javascript"),
+    "uPlot.min.css": (PAGES / "vendor" / "uPlot.min.css", "text/css"),
+    "theme.js": (_SHARED / "theme.js", "text/javascript"),
+    "widgets.css": (_SHARED / "widgets.css", "text/css"),
+    **{name: (_SHARED / name, "text/javascript") for name in SCENE_SCRIPTS},
+    "three.min.js": (_SHARED / "vendor" / "three.min.js", "text/javascript"),
+}
+"""Path and media type of each static file, by name."""
+
+_MESSAGES = {"Not Found": "There is nothing at this address.", "Method Not Allowed": "This cannot be done here."}
+_STORAGE_ERROR = "The server could not store a file: {}; free some space there and try again."
+_INTERNAL_ERROR = "The server met an error of its own; look at the terminal where it runs, and reload the page."
+
+
+def asset(request: Request) -> Response:
+    """Return a static file of the page."""
+    name = request.path_params["name"]
+    if name not in ASSETS:
+        raise HTTPException(404, "There is no such file.")
+    path, media_type = ASSETS[name]
+    return FileResponse(path, media_type=media_type)
+
+
+def json_response(content: object, status: int = 200) -> Response:
+    """Return `content` as JSON; numbers that are not finite become null."""
+    return JSONResponse(to_json(content), status)
+
+
+def binary(content: bytes, file_name: str | None = None) -> Response:
+    """Return `content` as bytes, as a download where `file_name` is given."""
+    headers = {} if file_name is None else {"Content-Disposition": f'attachment; filename="{file_name}"'}
+    return Response(content, media_type="application/octet-stream", headers=headers)
+
+
+def application(routes: Sequence[BaseRoute], public: Callable[[str], str]) -> Starlette:
+    """Return an application of `routes`.
+
+    Args:
+        routes: of the application.
+        public: removes the folders of this machine from an error message.
+    """
+
+    async def input_error(_: Request, error: Exception) -> Response:
+        return refusal(422, public(str(error)))
+
+    app = Starlette(
+        routes=routes,
+        exception_handlers={
+            HTTPException: _http_error,
+            ShapespaceError: input_error,
+            ClientDisconnect: _disconnected,
+            OSError: _storage_error,
+            Exception: _internal_error,
+        },
+    )
+    # The redirect would repeat the Host header of the request.
+    app.router.redirect_slashes = False
+    return app
+
+
+async def _http_error(_: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    return refusal(error.status_code, _MESSAGES.get(error.detail, error.detail))
+
+
+async def _disconnected(_: Request, error: Exception) -> Response:
+    return refusal(400, "The upload ended early.")
+
+
+async def _storage_error(_: Request, error: Exception) -> Response:
+    assert isinstance(error, OSError)
+    return refusal(507, _STORAGE_ERROR.format(error.strerror or "its disk failed"))
+
+
+async def _internal_error(_: Request, error: Exception) -> Response:
+    return refusal(500, _INTERNAL_ERROR)

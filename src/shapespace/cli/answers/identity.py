@@ -29,7 +29,7 @@ def run_verify(arguments: argparse.Namespace) -> int:
 def run_identify(arguments: argparse.Namespace) -> int:
     """Identify the subject of a scan among the enrolled ones."""
     from shapespace.batch.progress import steps
-    from shapespace.report.analyses.identify_report import identify_report
+    from shapespace.report.analyses.identity import identify_report
     from shapespace.statistics.identity.identify import identify
 
     cohort, config = _cohort_and_config(arguments)

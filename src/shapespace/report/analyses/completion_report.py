@@ -11,7 +11,7 @@ import numpy.typing as npt
 from shapespace.fit.completion.complete import ESTIMATED, OBSERVED, UNKNOWABLE, Completion, CompletionConfig
 from shapespace.geometry.closest import build_engine
 from shapespace.report.analyses.analysis_report import AnalysisReport, Rows
-from shapespace.report.render.decimate import decimate
+from shapespace.report.render.scene import decimate
 from shapespace.reprs import first_names
 from shapespace.schemas import MorphPart, Part, SurfaceMapPart, TablePart, TextPart
 from shapespace.types import FloatArray, Mesh

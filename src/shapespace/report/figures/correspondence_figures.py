@@ -23,9 +23,9 @@ from shapespace.report.figures.draw import (
     short,
     view,
 )
-from shapespace.report.render.checkerboard import checker_layer, checker_places
 from shapespace.report.render.palette import SEQUENTIAL
 from shapespace.report.render.renderer import Camera, Image, Layer, render
+from shapespace.report.render.thumbnails import checker_layer, checker_places
 from shapespace.types import FloatArray, Mesh
 
 SIDE_DEG = 65.0  # degrees, between three quarters and profile

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from shapespace.correspondence.correspondence_result import Correspondence
     from shapespace.geometry.volume_surface import VolumeSurface
     from shapespace.model.additive import AdditiveModel
-    from shapespace.statistics.analysis_result import AnalysisResult
+    from shapespace.statistics.methods import AnalysisResult
     from shapespace.statistics.predictor import Predictions, Predictor
     from shapespace.store.results import Results
 

@@ -410,7 +410,7 @@ class CorrespondencePage:
         return self.page.image(still, f"{record.name}: {seen}"), note
 
     def _bounded(self, record: CorrespondRecord) -> Mesh:
-        from shapespace.report.render.decimate import decimate
+        from shapespace.report.render.scene import decimate
 
         return decimate(self.result.raw_scan(record), _TRIANGLES_DRAWN)[0]
 

@@ -11,9 +11,9 @@ from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.proportions import widen_share
 from shapespace.errors import InputError
 from shapespace.reprs import list_briefly, short_repr
-from shapespace.statistics.analysis_result import AnalysisResult
 from shapespace.statistics.identity.rates import RateEstimate, people_drawn, rate_estimate
 from shapespace.statistics.identity.trial import IdentityConfig, Trial, scores_of, trial_of
+from shapespace.statistics.methods import AnalysisResult
 from shapespace.types import BoolArray, FloatArray, IntArray, require
 
 FPIR = (1e-1, 1e-2)

@@ -14,8 +14,7 @@ from shapespace.cohort.table import Table, list_names
 from shapespace.errors import InputError
 from shapespace.reprs import short_repr
 from shapespace.statistics.identity.rates import Pairs
-from shapespace.statistics.identity.samples import samples_of
-from shapespace.statistics.identity.scores import SCORES, refuse_unknown_scores
+from shapespace.statistics.identity.scores import SCORES, refuse_unknown_scores, samples_of
 from shapespace.types import BoolArray, FloatArray, IntArray
 
 ROLES = ("gallery", "probe", "train")

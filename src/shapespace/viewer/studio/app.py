@@ -27,8 +27,16 @@ from shapespace.io.meshes.mesh_io import MESH_ENDINGS, MESH_FILE_ENDINGS
 from shapespace.types import MM_PER_UNIT
 from shapespace.version import __version__
 from shapespace.viewer.guard import Access, Guard, refusal
-from shapespace.viewer.responses import PAGES, application, asset, json_response
-from shapespace.viewer.server import body_pieces, display_name, json_body, whole_body
+from shapespace.viewer.server import (
+    PAGES,
+    application,
+    asset,
+    body_pieces,
+    display_name,
+    json_body,
+    json_response,
+    whole_body,
+)
 from shapespace.viewer.studio.job_commands import QUESTIONS, Forms, checks, order, shapes_of
 from shapespace.viewer.studio.jobs import Job, Jobs, Order, history
 from shapespace.viewer.studio.project import (

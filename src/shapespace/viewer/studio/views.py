@@ -19,8 +19,7 @@ from shapespace.schemas import CorrespondenceRecord
 from shapespace.viewer.corresponding_surfaces import Surfaces
 from shapespace.viewer.guard import refusal
 from shapespace.viewer.model_view import ModelView
-from shapespace.viewer.server import model_app
-from shapespace.viewer.surfaces_server import surfaces_app
+from shapespace.viewer.server import model_app, surfaces_app
 from shapespace.viewer.uploaded_scans import FOLDER_PREFIX, Limits, Scans
 
 REPORT, REPORT_PAGE = "report.html", "report"
