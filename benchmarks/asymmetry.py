@@ -23,7 +23,7 @@ from shapespace.cohort.cohort import Cohort, Fitted
 from shapespace.datasets.faces import Warp, load_faces
 from shapespace.datasets.simulated_scan import Hole, random_similarity, simulate_scan
 from shapespace.fit.fit_scan import FitConfig, fit_scan
-from shapespace.geometry.mirror_plane import FLIP, mirrored
+from shapespace.geometry.mirror_plane import FLIP
 from shapespace.geometry.normals import vertex_normals
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.shape_model import ShapeModel
@@ -52,12 +52,12 @@ class Kind:
 
     def symmetric(self, rng: np.random.Generator) -> FloatArray:
         x = self.person(rng)
-        return (x + mirrored(x, self.other)) / 2.0
+        return (x + x[..., self.other, :] * FLIP) / 2.0
 
     def difference(self, x: FloatArray) -> FloatArray:
         """Return (V,) how far a shape stands out of its own mirror image, along the normals of the mean."""
         x = fit_similarity(x, self.mean.vertices, with_scale=False).apply(x)
-        image = mirrored(x, self.other)
+        image = x[..., self.other, :] * FLIP
         image = fit_similarity(image, x, with_scale=False).apply(image)
         return np.einsum("vd,vd->v", x - image, vertex_normals(self.mean))
 
@@ -65,7 +65,7 @@ class Kind:
         """Return a symmetric person to whom asymmetry of `mm` is put in."""
         x = self.symmetric(rng)
         field = _ANTI.draw(x.copy(), self.other, rng)
-        field = (field - mirrored(field, self.other)) / 2.0
+        field = (field - field[..., self.other, :] * FLIP) / 2.0
         for _ in range(4):  # poses and normals make it not quite linear
             field *= mm / np.sqrt((self.difference(x + field) ** 2).mean())
         return x + field
@@ -79,7 +79,7 @@ def faces() -> Kind:
     there = {tuple(np.round(v, 6)): tuple(np.round(w, 6)) for v, w in zip(made.template.vertices, image, strict=True)}
     other = np.array([place[there[tuple(np.round(v, 6))]] for v in face.vertices], dtype=np.int32)
     x = face.vertices
-    return Kind(Mesh((x + mirrored(x, other)) / 2.0, face.faces, name="face"), other)
+    return Kind(Mesh((x + x[..., other, :] * FLIP) / 2.0, face.faces, name="face"), other)
 
 
 def organs() -> Kind:
@@ -147,7 +147,7 @@ def fits(kind: Kind, subjects: int, people: int, seed: int) -> list[tuple[str, s
     assert kind.mean.faces is not None
     rng = np.random.default_rng([seed, 77])
     trained = [Mesh(kind.person(rng), kind.mean.faces, name=f"person {k}") for k in range(people)]
-    images = [m.with_vertices(mirrored(m.vertices, kind.other)) for m in trained]
+    images = [m.with_vertices(m.vertices[..., kind.other, :] * FLIP) for m in trained]
     models = {"plain": ShapeModel.fit(trained), "with mirrored shapes": ShapeModel.fit([*trained, *images])}
     truth, who = [LEVELS_MM[k % 3] for k in range(subjects)], [k for k in range(subjects) for _ in range(2)]
     scans: list[Mesh] = []

@@ -28,7 +28,7 @@ from identity_scans import Condition
 from shapespace.datasets.ict import landmark_vertices
 from shapespace.errors import ShapespaceError
 from shapespace.fit.fit_scan import FitConfig, fit_scan
-from shapespace.geometry.mirror_plane import mirror_vertices, mirrored
+from shapespace.geometry.mirror_plane import FLIP
 from shapespace.io.files import make_folder, read_bytes, write_bytes
 from shapespace.model.additive import AdditiveModel
 from shapespace.statistics.identity.scores import SCORES
@@ -74,14 +74,14 @@ def faces_of(people: StudyPeople, case: HardCase, person: int) -> list[Mesh]:
 def make_model(path: Path, config: StudyConfig, case: HardCase, first: int, count: int) -> None:
     """Write the additive model of `count` people from `first` on, neutral and each expression at its strongest."""
     people = config.people
-    strongest, other = max(people.levels), mirror_vertices(faces_of_ict().mesh().vertices)
+    strongest, other = max(people.levels), faces_of_ict().mirror
     meshes: list[Mesh] = []
     subjects: list[str] = []
     neutral: list[bool] = []
     for person in range(first, first + count):
         for face, (_, level) in zip(faces_of(people, case, person), people.shown, strict=True):
             if level in (0.0, strongest):
-                meshes += [face, face.with_vertices(mirrored(face.vertices, other))]
+                meshes += [face, face.with_vertices(face.vertices[..., other, :] * FLIP)]
                 subjects += [people.subject(person), people.subject(person) + MIRRORED]
                 neutral += 2 * [level == 0.0]
     AdditiveModel.fit(

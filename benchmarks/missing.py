@@ -5,7 +5,7 @@
 
 Connected patches are missing at random places, or always the same side in some of the shapes. The shapes are then
 given to `build` as they are (probabilistic PCA), with the mean filled in, or filled by a smooth surface
-(`model/build_model.py`: sheets alone). Ratios are to the model of the whole shapes: of the variance in all, of the first
+(`build_model`: sheets alone). Ratios are to the model of the whole shapes: of the variance in all, of the first
 five modes and of the next five. Errors are on whole shapes that no model saw, all modes, each shape in its best pose;
 the last measure is the distance of random shapes of the model from the nearest whole training shape. All in mm, vertex
 to vertex; the last column is CPU seconds.

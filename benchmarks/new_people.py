@@ -17,7 +17,7 @@ from scipy.optimize import isotonic_regression
 
 from shapespace.datasets.faces import load_faces
 from shapespace.datasets.ict import load_ict
-from shapespace.geometry.mirror_plane import mirror_vertices, mirrored
+from shapespace.geometry.mirror_plane import FLIP
 from shapespace.model.held_out import held_out_shapes
 from shapespace.model.new_shapes import variances_of_new_shapes
 from shapespace.model.pca import modes_for_variance
@@ -35,9 +35,9 @@ Draw = Callable[[np.random.Generator, int], FloatArray]
 def kinds(femur: Path | None) -> Mapping[str, Draw]:
     """Return what is drawn, by name: every 20th vertex will do, since only inner products count."""
     ict, faces = load_ict(), load_faces()
-    other = mirror_vertices(ict.mesh().vertices)
+    other = ict.mirror
     modes = ict.identity[:, : ict.face_vertices]
-    both = np.stack([modes[:, ::_STRIDE], mirrored(modes, other)[:, ::_STRIDE]])
+    both = np.stack([modes[:, ::_STRIDE], (modes[..., other, :] * FLIP)[:, ::_STRIDE]])
 
     def draw_ict(rng: np.random.Generator, n: int) -> FloatArray:
         return (rng.standard_normal((n, len(modes))) @ both[0].reshape(len(modes), -1))[:, None]

@@ -27,7 +27,7 @@ from shapespace.errors import FileFormatError, FitError, InputError, ShapespaceE
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.robust.robust_method import Robust
 from shapespace.fit.robust.robust_settings import Level
-from shapespace.geometry.mirror_plane import mirror_vertices, mirrored
+from shapespace.geometry.mirror_plane import FLIP
 from shapespace.io.files import make_folder, read_bytes, write_bytes, write_text
 from shapespace.model.additive import AdditiveModel, FitInformation
 from shapespace.model.shape_model import ShapeModel
@@ -258,12 +258,12 @@ def training_meshes(
     meshes: list[Mesh] = []
     subjects: list[str] = []
     neutral: list[bool] = []
-    other = mirror_vertices(ict.mesh().vertices)
+    other = ict.mirror
     for person in people:
         faces = config.people.faces(ict, person)
         for face, (_, level) in zip(faces, config.people.shown, strict=True):
             if level in (0.0, strongest):
-                meshes += [face, face.with_vertices(mirrored(face.vertices, other))]
+                meshes += [face, face.with_vertices(face.vertices[..., other, :] * FLIP)]
                 subjects += [config.people.subject(person), config.people.subject(person) + MIRRORED]
                 neutral += 2 * [level == 0.0]
     return meshes, subjects, neutral

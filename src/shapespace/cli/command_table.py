@@ -13,16 +13,17 @@ from typing import Any
 
 from shapespace.cli import run, values
 from shapespace.cli.answers import (
-    align,
-    asymmetry,
-    change,
-    compare,
-    complete,
-    identity,
-    morphospace,
-    regress,
-    score,
-    shape_tests,
+    answer_align,
+    answer_asymmetry,
+    answer_change,
+    answer_compare,
+    answer_complete,
+    answer_identify,
+    answer_morphospace,
+    answer_regress,
+    answer_score,
+    answer_shape_tests,
+    answer_verify,
 )
 from shapespace.cli.options import Option, Source, advanced, basic
 from shapespace.statistics.shape_tests.shape_test_result import SHAPE_TESTS, ShapeTest
@@ -243,7 +244,7 @@ def _shape_test(test: ShapeTest) -> Command:
         for number, (field, metavar) in enumerate(test.options.items())
     )
     return Command(
-        f"test {test.name}", test.summary, (test.example,), shape_tests.run,
+        f"test {test.name}", test.summary, (test.example,), answer_shape_tests,
         (
             *_cohort(),
             *own,
@@ -562,7 +563,7 @@ COMMANDS: tuple[Command, ...] = (
         "complete", "complete partial scans: the missing part with its uncertainty, and samples of the whole shape",
         ("shapespace complete model.h5 broken.ply -o completed",
          "shapespace complete model.h5 scans -o completed --mirror combined --stl",
-         "shapespace compare completed -o compared --formula '~ group'"), complete.run,
+         "shapespace compare completed -o compared --formula '~ group'"), answer_complete,
         (
             basic("model", "MODEL.h5", "the shape model", parse=Path),
             basic("scans", "SCAN", "scans, folders, patterns, addresses such as s3://bucket/x, or lists of these",
@@ -718,7 +719,7 @@ COMMANDS: tuple[Command, ...] = (
     Command(
         "align", "align landmarks by generalised Procrustes analysis, and name specimens to check",
         ("shapespace align skulls.tps --table skulls.csv -o aligned",
-         "shapespace compare aligned --formula '~ sex' -o sex"), align.run,
+         "shapespace compare aligned --formula '~ sex' -o sex"), answer_align,
         (
             basic("data", "DATA", "a landmark file (TPS, NTS, MorphoJ, CSV, .rda), or a folder of landmark files",
                   parse=Path),
@@ -822,7 +823,7 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command(
         "recognise verify", "test whether two scans are of one subject: error rates, likelihood ratios",
-        ("shapespace recognise verify scans.csv -o verified --gallery session=1",), identity.run_verify,
+        ("shapespace recognise verify scans.csv -o verified --gallery session=1",), answer_verify,
         (
             *_identity(),
             advanced("--curve", "K,K,...", source=IDENTITY, parse=values.mode_counts),
@@ -835,7 +836,7 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command(
         "recognise identify", "identify the subject of a scan among the enrolled ones: ranks and error rates",
-        ("shapespace recognise identify scans.csv -o identified --gallery expression=neutral",), identity.run_identify,
+        ("shapespace recognise identify scans.csv -o identified --gallery expression=neutral",), answer_identify,
         _identity(),
         (
             "Computes ranks (CMC), and the rate of misses if subjects who are not enrolled are searched for too.",
@@ -844,7 +845,7 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command(
         "compare", "test effects of groups and covariates on shape by linear models",
-        ("shapespace compare people.csv --formula '~ sex + age' -o sex-and-age",), compare.run,
+        ("shapespace compare people.csv --formula '~ sex + age' -o sex-and-age",), answer_compare,
         (
             *_cohort(),
             basic("--formula",
@@ -873,7 +874,7 @@ COMMANDS: tuple[Command, ...] = (
     Command(
         "morphospace", "draw shapes on axes of an ordination, and the shape at any place: PCA, CVA, phylogenetic axes",
         ("shapespace morphospace people.csv --group sex -o morphospace",
-         "shapespace morphospace species.tps --tree species.nwk --format pdf -o phylomorphospace"), morphospace.run,
+         "shapespace morphospace species.tps --tree species.nwk --format pdf -o phylomorphospace"), answer_morphospace,
         (
             *_cohort(),
             basic("--method", source=MORPHOSPACE),
@@ -892,7 +893,7 @@ COMMANDS: tuple[Command, ...] = (
     *(_shape_test(test) for test in SHAPE_TESTS),
     Command(
         "change", "measure change between visits of the same subjects, in mm, and its noise",
-        ("shapespace change visits.csv -o change --order before,after",), change.run,
+        ("shapespace change visits.csv -o change --order before,after",), answer_change,
         (
             *_cohort(),
             basic("--subject", "COLUMN", source=CHANGE),
@@ -913,7 +914,7 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command(
         "asymmetry", "measure asymmetry: scores and maps, directional and fluctuating asymmetry",
-        ("shapespace asymmetry skulls.csv --surfaces dense -o asymmetry",), asymmetry.run,
+        ("shapespace asymmetry skulls.csv --surfaces dense -o asymmetry",), answer_asymmetry,
         (
             *_cohort(),
             basic("--subject", "COLUMN", source=ASYMMETRY),
@@ -934,7 +935,7 @@ COMMANDS: tuple[Command, ...] = (
     Command(
         "regress", "predict a number, such as age, from shape, or the mean shape along a number, with intervals",
         ("shapespace regress people.csv --target age -o age --predict new.csv",
-         "shapespace regress people.csv --along age --at 20,40,60 --covariates sex -o growth"), regress.run,
+         "shapespace regress people.csv --along age --at 20,40,60 --covariates sex -o growth"), answer_regress,
         (
             *_cohort(),
             basic("--target", "COLUMN", source=REGRESS, either=_TARGET, required=True),
@@ -963,7 +964,7 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command(
         "score", "score new subjects against a reference population: distance, percentile, z-map",
-        ("shapespace score patients -o scored --reference controls.csv",), score.run,
+        ("shapespace score patients -o scored --reference controls.csv",), answer_score,
         (
             *_cohort("coefficients"),
             basic("--reference", "DATA", "the population: a table, fits or landmarks; its doubtful fits are excluded",

@@ -633,7 +633,7 @@ def export(arguments: argparse.Namespace) -> int:
 
 
 def _export_cohort(arguments: argparse.Namespace) -> int:
-    from shapespace.cli.answers.common import cohort_of
+    from shapespace.cli.answers import cohort_of
     from shapespace.commands.export import export_cohort
 
     if arguments.names or arguments.all or arguments.table is not None:

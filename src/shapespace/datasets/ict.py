@@ -16,10 +16,12 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from shapespace.datasets import fetch, ict_files
 from shapespace.datasets.simulated_scan import plain_scan
 from shapespace.errors import DataError, InputError
+from shapespace.geometry.mirror_plane import FLIP
 from shapespace.io.files import make_folder
 from shapespace.io.landmarks.landmark_io import write_landmark_indices
 from shapespace.io.meshes.mesh_io import write_mesh
@@ -104,6 +106,12 @@ class IctFaces:
     expression_names: tuple[str, ...]
     faces: IntArray
     face_vertices: int = ict_files.FACE_VERTICES
+
+    @property
+    def mirror(self) -> IntArray:
+        """(V,) the vertex on the other side of the plane x = 0, of the vertices of `face`."""
+        vertices = self.mesh().vertices
+        return np.asarray(cKDTree(vertices).query(vertices * FLIP)[1], dtype=np.int32)
 
     def mesh(
         self,

@@ -1,0 +1,319 @@
+"""The commands that answer questions about cohorts: they read the cohort, analyse it, and print and write results."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING
+
+from shapespace.cli.options import given
+from shapespace.cli.printing import say, show, show_json, warn
+from shapespace.errors import InputError
+
+if TYPE_CHECKING:
+    from shapespace.cohort.cohort import Cohort
+    from shapespace.commands.answers import FigureConfig
+    from shapespace.geometry.procrustes import Gauge
+    from shapespace.report.analyses.analysis_report import AnalysisReport
+    from shapespace.schemas import Orientation
+    from shapespace.statistics.identity.trial import IdentityConfig
+    from shapespace.types import SurfaceLandmarks
+
+
+def column_value(text: str, option: str) -> tuple[str, str]:
+    """Return the column and the value of COLUMN=VALUE.
+
+    Raises:
+        InputError: it is something else.
+    """
+    column, _, value = (part.strip() for part in text.partition("="))
+    if not (column and value):
+        raise InputError(f"{option} is {text!r}; write COLUMN=VALUE, such as group=control.")
+    return column, value
+
+
+def cohort_of(
+    arguments: argparse.Namespace,
+    gauge: Gauge | None = None,
+    onto: Cohort | None = None,
+    *,
+    least: int = 2,
+    accept_review: bool | None = None,
+) -> Cohort:
+    """Return the cohort that the arguments name.
+
+    Args:
+        arguments: parsed arguments of a command that reads a cohort.
+        gauge: gauge of a command that has no option for it; None for the value of the option.
+        onto: a cohort that this one is compared with.
+        least: the smallest number of shapes, if `onto` is None.
+        accept_review: see `CohortConfig`; None for the value of --doubtful, or True for a command without the option.
+    """
+    from shapespace.batch.progress import steps
+    from shapespace.cohort.read import CohortConfig, read_cohort
+
+    _figures(arguments)  # files and options that do not fit are refused before the analysis
+    fixed = {} if gauge is None else {"gauge": gauge}
+    accept_review = getattr(arguments, "doubtful", True) if accept_review is None else accept_review
+    config = CohortConfig(**given(arguments, CohortConfig, least=least, accept_review=accept_review, **fixed))
+    with steps(None, "reading", "shape", quiet=arguments.quiet) as step:
+        cohort = read_cohort(arguments.data, config, onto=onto, on_shape=step)
+    return replace(cohort, unit="") if getattr(arguments, "no_unit", False) else cohort
+
+
+def _figures(arguments: argparse.Namespace) -> tuple[FigureConfig, Orientation | None]:
+    """Return the formats of figures, and the named views of the shapes."""
+    from shapespace.commands.answers import FigureConfig
+    from shapespace.report.inputs.orientation import find_orientation
+
+    config = FigureConfig(**given(arguments, FigureConfig))
+    sources = [path for path in (getattr(arguments, "shapes", None), getattr(arguments, "data", None)) if path]
+    folders = [path if path.is_dir() else path.parent for path in sources]
+    return config, find_orientation(config.orientation, folders)
+
+
+def finish(report: AnalysisReport, arguments: argparse.Namespace) -> int:
+    """Write a report to the output folder, and print its summary."""
+    from shapespace.commands.answers import save_report
+    from shapespace.schemas import to_json
+
+    figures, orientation = _figures(arguments)
+    page, notes = save_report(report, arguments.output, quiet=arguments.quiet, figures=figures, orientation=orientation)
+    for note in notes:
+        say(note)
+    if arguments.json:
+        analysis = to_json(report.analysis())
+        show_json({"folder": str(arguments.output), "report": None if page is None else str(page), **analysis})
+        return 0
+    for sentence in report.summary:
+        show(sentence)
+    show(f"The report is {page}" if page is not None else f"All numbers are in {arguments.output}")
+    return 0
+
+
+def answer_align(arguments: argparse.Namespace) -> int:
+    """Align landmarks, and name the specimens to check."""
+    from shapespace.commands.align import align
+    from shapespace.geometry.landmark_alignment import AlignConfig
+    from shapespace.report.blocks.wording import counted
+    from shapespace.schemas import to_json
+
+    config = AlignConfig(**given(arguments, AlignConfig))
+    reflect = column_value(arguments.reflect, "--reflect") if arguments.reflect else None
+    _, record = align(arguments.data, arguments.output, config, **given(arguments, align, reflect=reflect))
+    for note in record.notes:
+        say(note)
+    if arguments.json:
+        show_json({"folder": str(arguments.output), **to_json(record)})
+    else:
+        show(f"{record.specimens} specimens with {record.landmarks} landmarks ({record.dimensions}-D) are aligned.")
+        check = len({finding.specimen for finding in record.findings})
+        show(f"{counted(check, 'specimen')} to check." if check else "No outliers, swaps or mirrored specimens.")
+        show(f"Results are in {arguments.output}")
+    return 0
+
+
+def answer_asymmetry(arguments: argparse.Namespace) -> int:
+    """Measure the asymmetry of a cohort, and write its report."""
+    from shapespace.batch.progress import steps
+    from shapespace.report.analyses.asymmetry_report import asymmetry_report
+    from shapespace.statistics.asymmetry import measure_asymmetry
+    from shapespace.statistics.sides import read_pairs
+
+    reference = column_value(arguments.reference, "--reference") if arguments.reference else None
+    cohort = cohort_of(arguments)
+    pairs = None if arguments.pairs is None else read_pairs(arguments.pairs, cohort)
+    options = given(arguments, measure_asymmetry, pairs=pairs, reference=reference)
+    with steps(None, "permuting", "shape", quiet=arguments.quiet) as step:
+        result = measure_asymmetry(cohort, **options, where=str(arguments.pairs), progress=step)
+    return finish(asymmetry_report(result), arguments)
+
+
+def answer_change(arguments: argparse.Namespace) -> int:
+    """Measure the changes, and write the report."""
+    from shapespace.batch.progress import steps
+    from shapespace.io.meshes.region_files import read_region
+    from shapespace.report.analyses.change_report import change_report
+    from shapespace.statistics.change_result import ChangeConfig
+    from shapespace.statistics.measure_change import change
+
+    cohort = cohort_of(arguments, "form")
+    if arguments.landmarks is not None:
+        cohort = replace(cohort, landmarks=_landmarks(arguments.landmarks, cohort.n_vertices))
+    regions = {name: read_region(path) for name, path in arguments.region} or None
+    config = ChangeConfig(**given(arguments, ChangeConfig, regions=regions))
+    with steps(None, "comparing", "subject", quiet=arguments.quiet) as step:
+        result = change(cohort, config, progress=step)
+    return finish(change_report(result), arguments)
+
+
+def _landmarks(path: Path, n_vertices: int) -> SurfaceLandmarks:
+    from shapespace.errors import InputError
+    from shapespace.io.landmarks.landmark_io import read_surface_landmarks
+
+    found = read_surface_landmarks(path)
+    for name, vertex in zip(found.names, found.corners.max(axis=1).tolist(), strict=True):
+        if vertex >= n_vertices:
+            raise InputError(
+                f"{path}: landmark {name[:40]!r} is at vertex {vertex}, but the surfaces have {n_vertices}; give "
+                "landmarks of these surfaces."
+            )
+    return found
+
+
+def answer_compare(arguments: argparse.Namespace) -> int:
+    """Compare the shapes of a cohort."""
+    from shapespace.batch.progress import steps
+    from shapespace.report.analyses.compare_report import compare_report
+    from shapespace.statistics.compare_shapes import CompareConfig, compare
+
+    config = CompareConfig(**given(arguments, CompareConfig, errors=dict(arguments.error)))
+    cohort = cohort_of(arguments)
+    with steps(None, "permuting", "step", quiet=arguments.quiet) as step:
+        result = compare(cohort, arguments.formula, config, progress=step)
+    return finish(compare_report(result), arguments)
+
+
+def answer_complete(arguments: argparse.Namespace) -> int:
+    """Complete scans; 1 if some failed, 2 if all did."""
+    from shapespace.commands.complete import CompletionFiles, complete_scans
+    from shapespace.fit.completion.complete import CompletionConfig
+    from shapespace.fit.fit_scan import FitConfig
+    from shapespace.io.files import write_text
+    from shapespace.report.analyses.analysis_report import METHODS_FILE
+    from shapespace.report.analyses.completion_report import CompletionReport
+
+    fit = FitConfig(**given(arguments, FitConfig))
+    config = CompletionConfig(**given(arguments, CompletionConfig), fit=fit)
+    files = CompletionFiles(**given(arguments, CompletionFiles))
+    collected = CompletionReport(config)
+    failed = complete_scans(
+        arguments.model, arguments.scans, arguments.output, config, files, quiet=arguments.quiet, say=warn,
+        on_completion=collected.add,
+    )  # fmt: skip
+    if not collected.count:
+        return 2
+    finish(collected.report(len(failed)), arguments)
+    write_text(arguments.output / METHODS_FILE, collected.methods_text())
+    return 1 if failed else 0
+
+
+def answer_verify(arguments: argparse.Namespace) -> int:
+    """Verify whether two scans are of one subject."""
+    from shapespace.batch.progress import steps
+    from shapespace.report.analyses.verify_report import verify_report
+    from shapespace.statistics.identity.verify import verify
+
+    cohort, config = _cohort_and_config(arguments)
+    with steps(None, "comparing", "draw", quiet=arguments.quiet) as step:
+        result = verify(cohort, config, progress=step)
+    return finish(verify_report(result), arguments)
+
+
+def answer_identify(arguments: argparse.Namespace) -> int:
+    """Identify the subject of a scan among the enrolled ones."""
+    from shapespace.batch.progress import steps
+    from shapespace.report.analyses.identity import identify_report
+    from shapespace.statistics.identity.identify import identify
+
+    cohort, config = _cohort_and_config(arguments)
+    with steps(None, "searching", "score", quiet=arguments.quiet) as step:
+        result = identify(cohort, config, progress=step)
+    return finish(identify_report(result), arguments)
+
+
+def _cohort_and_config(arguments: argparse.Namespace) -> tuple[Cohort, IdentityConfig]:
+    from shapespace.statistics.identity.trial import IdentityConfig
+
+    cohort = cohort_of(arguments, "shape")
+    if arguments.surfaces != "coefficients":
+        cohort = replace(cohort, fitted=None)
+    return cohort, IdentityConfig(**given(arguments, IdentityConfig))
+
+
+def answer_morphospace(arguments: argparse.Namespace) -> int:
+    """Compute an ordination of a cohort, and write its report."""
+    from shapespace.report.analyses.morphospace_report import morphospace_report
+    from shapespace.statistics.shape_tests.ordination import ordinate
+
+    result = ordinate(cohort_of(arguments), **given(arguments, ordinate))
+    return finish(morphospace_report(result, arguments.axes), arguments)
+
+
+def answer_regress(arguments: argparse.Namespace) -> int:
+    """Fit a regression on shape, predict with it, and write the report."""
+    from shapespace.batch.progress import steps
+    from shapespace.cohort.read import CohortConfig, read_cohort
+    from shapespace.io.files import make_folder
+    from shapespace.report.analyses.regression_report import prediction_report, regression_report
+    from shapespace.report.analyses.shape_prediction_report import shape_prediction_report
+    from shapespace.statistics.predictor import Predictor, refuse_known
+    from shapespace.statistics.regression import regress
+    from shapespace.statistics.shape_prediction import predict_shapes
+
+    others = ("at", "curve", "covariates", "hold", "length") if arguments.along is None else ("predict", "new_shapes")
+    for name in others:
+        if getattr(arguments, name):
+            needed = "--along" if arguments.along is None else "--target"
+            raise InputError(f"--{name.replace('_', '-')} needs {needed}; name the column of the number with it.")
+    names = ("subject", "seed", "drop_missing", "permutations", "confidence")
+    shared = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
+    if arguments.predictor is not None:
+        learned = Predictor.load(arguments.predictor)
+        if learned.model_hash and arguments.surfaces == "auto":
+            arguments.surfaces = "coefficients"
+        cohort = cohort_of(arguments, learned.gauge, least=1)
+        return finish(prediction_report(learned, cohort, learned.predict(cohort)), arguments)
+    cohort = cohort_of(arguments)
+    if arguments.along is not None:
+        hold = dict(column_value(word, "--hold") for word in arguments.hold or ())
+        options = {**given(arguments, predict_shapes, hold=hold), **shared}
+        options = {name: value for name, value in options.items() if value is not None}
+        with steps(None, "flipping signs", "step", quiet=arguments.quiet) as step:
+            shapes = predict_shapes(cohort, **options, progress=step)
+        return finish(shape_prediction_report(shapes), arguments)
+    with steps(None, "learning", "fold", quiet=arguments.quiet) as step:
+        result = regress(cohort, arguments.target, folds=arguments.folds, **shared, progress=step)
+    new = None
+    if arguments.predict is not None:
+        config = CohortConfig(**given(arguments, CohortConfig, shapes=arguments.new_shapes, least=1))
+        with steps(None, "reading", "shape", quiet=arguments.quiet) as step:
+            fresh = read_cohort(arguments.predict, config, onto=result.cohort, on_shape=step)
+        own = [result.subject] if result.subject is not None and result.subject in fresh.table.columns else []
+        fresh = fresh.complete(own, drop_missing=arguments.drop_missing)
+        refuse_known(result.subjects, fresh.table.texts(own[0]) if own else fresh.names, fresh.table.where)
+        new = (fresh, result.predictor.predict(fresh))
+    make_folder(arguments.output)
+    result.predictor.save(arguments.output / "predictor.npz")
+    return finish(regression_report(result, new), arguments)
+
+
+def answer_score(arguments: argparse.Namespace) -> int:
+    """Score subjects against a reference."""
+    from shapespace.batch.progress import steps
+    from shapespace.report.analyses.score_report import score_report
+    from shapespace.statistics.score_subjects import ScoreConfig, score
+
+    config = ScoreConfig(**given(arguments, ScoreConfig))
+    known = {"data": arguments.reference, "shapes": arguments.reference_shapes, "doubtful": False}
+    reference = cohort_of(argparse.Namespace(**{**vars(arguments), **known}), accept_review=arguments.doubtful)
+    subjects = cohort_of(arguments, onto=reference)
+    with steps(len(subjects), "scoring", "subject", quiet=arguments.quiet) as step:
+        result = score(reference, subjects, config, progress=step)
+    return finish(score_report(result), arguments)
+
+
+def answer_shape_tests(arguments: argparse.Namespace) -> int:
+    """Run a test of shape on a cohort, and write its report."""
+    from shapespace.batch.progress import steps
+    from shapespace.report.analyses.shape_test_report import shape_test_report
+
+    test = arguments.shape_test
+    function = resolve_name(f"shapespace.statistics.shape_tests.{test.function}")
+    cohort = cohort_of(arguments)
+    options = given(arguments, function)
+    with steps(None, "permuting", "permutation", quiet=arguments.quiet) as step:
+        result = function(cohort, **options, progress=step)
+    return finish(shape_test_report(result), arguments)
