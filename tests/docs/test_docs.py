@@ -546,7 +546,7 @@ def test_the_pages_of_commands_are_those_of_the_parser() -> None:
 def test_the_reference_has_every_option_of_the_parser_and_no_other(command: Command) -> None:
     text = (ROOT / "docs" / "cli" / f"{command.name.replace(' ', '-')}.md").read_text("utf-8")
     cells = [line.split(" | ")[0] for line in text.splitlines() if line.startswith("| `-")]
-    shown = [option for option in command.options if not option.hidden and not option.is_positional]
+    shown = [option for option in command.options if not option.is_positional]
     assert [name for cell in cells for name in re.findall(r"`(-[\w-]+)", cell)] == [
         name for option in sorted(shown, key=lambda option: not option.basic) for name in option.spellings
     ]

@@ -54,6 +54,11 @@ class SymmetricMesh:
         normal: (3,) unit normal of the plane, towards the side of the first half.
         asymmetry: RMS distance of the given surface from its mirror image, in the unit of its vertices.
         asymmetry_share: the same as a share of its size (RMS distance from its centre).
+
+    Example:
+        >>> symmetric = ss.correspondence.symmetrise(meshes[0])
+        >>> bool((symmetric.pairs[symmetric.pairs] == np.arange(len(symmetric.pairs))).all())
+        True
     """
 
     mesh: Mesh

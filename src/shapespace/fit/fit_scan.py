@@ -16,7 +16,7 @@ from threadpoolctl import ThreadpoolController
 
 from shapespace.errors import FitError, InputError
 from shapespace.fit.crop import Crop
-from shapespace.fit.diagnostics.failure_model import judge
+from shapespace.fit.diagnostics.verdict import judge
 from shapespace.fit.iteration_state import Fitted, IcpState
 from shapespace.fit.landmark_terms import SHARE, LandmarkConstraint
 from shapespace.fit.method import Ended, Limits, Method

@@ -49,6 +49,11 @@ class PredictedMeasure:
         value: (A,) mm.
         low: (A,) ends of pointwise intervals; NaN where they are not known.
         high: (A,) likewise.
+
+    Example:
+        >>> shapes = ss.statistics.predict_shapes(cohort, "age", permutations=99)
+        >>> shapes.measures[0].name
+        'centroid size'
     """
 
     name: str
@@ -83,6 +88,11 @@ class ShapePrediction(AnalysisResult):
         confidence: coverage of intervals.
         permutations: number of sign flips, including the observed data.
         seed: of these.
+
+    Example:
+        >>> shapes = ss.statistics.predict_shapes(cohort, "age", permutations=99)
+        >>> len(shapes.values) == len(shapes.coefficients)
+        True
     """
 
     cohort: Cohort
