@@ -22,7 +22,7 @@ from shapespace.statistics.asymmetry import measure_asymmetry
 from shapespace.statistics.compare_shapes import CompareConfig, compare
 from shapespace.statistics.shape_tests.linear import compare_pairs, compare_trajectories
 from shapespace.statistics.shape_tests.ordination import ordinate
-from shapespace.statistics.shape_tests.shape_test_result import SHAPE_TESTS
+from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS
 
 SPECIMENS, LANDMARKS, PERMUTATIONS = 400, 500, 1000
 DECAY = 0.98  # ratio of the variances of neighbouring components

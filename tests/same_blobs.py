@@ -4,8 +4,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from msgspec import structs
 
+from shapespace.correspondence.scan_status import SurfaceMeasures, find_review_reasons
 from shapespace.geometry.distortion import Distortion
+from shapespace.geometry.normals import rms_size
 from shapespace.io.files import make_folder, sha256_of_file, write_text
 from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.schemas import CorrespondenceRecord, CorrespondRecord, json_text
@@ -13,6 +16,7 @@ from shapespace.types import Mesh, Similarity
 from synthetic_shapes import blob, similarity, sphere
 
 VERTICES = 600
+SETTLED = 0.002
 HIDDEN = "holed"
 """A scan without its top."""
 FAR = "far"
@@ -44,12 +48,21 @@ def surface(name: str, number: int) -> tuple[Mesh, Similarity]:
     return Mesh(T.apply(vertices), faces, name=name), T
 
 
+def write_records(folder: Path, records: Sequence[CorrespondRecord]) -> None:
+    """Write records with their reasons to review the surfaces."""
+    measures = [SurfaceMeasures.of_record(record, rms_size(mean_blob().vertices)) for record in records]
+    for record, review in zip(records, find_review_reasons(measures, SETTLED), strict=True):
+        text = json_text(structs.replace(record, review=review))
+        write_text(folder / f"{record.name}{CorrespondRecord.ENDING}", text)
+
+
 def write_same(home: Path, names: Sequence[str] = NAMES, *, aside: bool = True) -> Path:
     """Write `home`/same and the scans beside it in `home`/scans; return the former."""
     folder, scans, mean = home / "same", home / "scans", mean_blob()
     make_folder(folder / "template")
     make_folder(scans)
     write_mesh(folder / CorrespondenceRecord.MEAN, mean)
+    records: list[CorrespondRecord] = []
     for number, name in enumerate(names):
         mesh, _ = surface(name, number)
         write_mesh(folder / f"{name}{CorrespondRecord.SURFACE}", mesh)
@@ -66,7 +79,8 @@ def write_same(home: Path, names: Sequence[str] = NAMES, *, aside: bool = True) 
             folded_share=changed.folded_share, area_factor=changed.area_factor, moved_share=[0.05, 0.012],
             cpu_s=[2.0, 1.0 + number],
         )  # fmt: skip
-        write_text(folder / f"{name}{CorrespondRecord.ENDING}", json_text(record))
+        records.append(record)
+    write_records(folder, records)
     if aside:
         write_mesh(scans / f"{ASIDE}.ply", mean.with_vertices(mean.vertices * [1.0, 3.0, 0.3]))
         record = CorrespondRecord(
@@ -76,7 +90,8 @@ def write_same(home: Path, names: Sequence[str] = NAMES, *, aside: bool = True) 
         write_text(folder / f"{ASIDE}{CorrespondRecord.ENDING}", json_text(record))
     summary = CorrespondenceRecord(
         template="able is the first template.", vertices=VERTICES, rounds=[0.05, 0.012], corresponding=list(names),
-        set_aside={ASIDE: "another object"} if aside else {}, settings={"rounds": 2, "settled": 0.002}, version="0.1.0",
+        set_aside={ASIDE: "another object"} if aside else {}, settings={"rounds": 2, "settled": SETTLED},
+        version="0.1.0",
     )  # fmt: skip
     write_text(folder / CorrespondenceRecord.FILE, json_text(summary))
     return folder

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from shapespace.cli.command_table import COMMANDS, Command
 from shapespace.cli.options import Option
-from shapespace.statistics.shape_tests.shape_test_result import SHAPE_TESTS
+from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 GENERATED = "<!-- Written by tools/make_cli_reference.py; edit src/shapespace/cli/command_table.py. -->\n\n"

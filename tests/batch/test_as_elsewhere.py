@@ -21,7 +21,7 @@ from synthetic_shapes import blob_model, raw_scan
 SRC = Path(__file__).resolve().parents[2] / "src" / "shapespace"
 POSIX_ONLY = {
     ("batch/workers.py", "sched_getaffinity"): "on Linux alone; elsewhere cpu_count",
-    ("datasets/download.py", "fcntl"): "elsewhere msvcrt",
+    ("datasets/fetch.py", "fcntl"): "elsewhere msvcrt",
     ("io/sandbox_child.py", "resource"): "elsewhere its parent ends it when it is late",
     ("io/files.py", "kill"): "on Windows nothing is asked, and files are left for an hour",
     ("model/streamed.py", "fcntl"): "Windows refuses to remove open files",

@@ -174,7 +174,7 @@ def test_commands_that_read_aligned_landmarks_have_one_note_on_specimens_to_chec
 
 def test_a_folder_that_align_wrote_is_no_landmark_file(run: Run, folder: Path) -> None:
     assert run("align", "skulls.tps", "-o", "aligned").code == 0
-    landmarks = ("check",), ("plot", "-o", "again.png"), ("convert", "again.tps")
+    landmarks = ("check",), ("plot", "-o", "again.png"), ("convert", "-o", "again.tps")
     for command, *rest in (("align", "-o", "again"), *(("landmarks", *one) for one in landmarks)):
         name = rest.pop(0) if command == "landmarks" else ""
         refused = run(*filter(None, (command, name)), "aligned", *rest)

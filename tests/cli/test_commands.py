@@ -395,6 +395,7 @@ def test_fit_writes_the_files_of_the_contract_and_no_others(fitted: Path, world:
     names = {path.stem for path in world.scans}
     assert {path.name for path in fitted.iterdir()} == {
         "coefficients.csv",
+        "scans.csv",
         *(f"{name}.fit.json" for name in names),
         *(f"{name}.fitted.ply" for name in names),
         *(f"{name}.landmarks.{kind}" for name in names for kind in ("csv", "mrk.json", "fcsv")),

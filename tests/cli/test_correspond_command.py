@@ -11,6 +11,7 @@ from conftest import Run
 from raw_blobs import LANDMARKS, marked, raw_blob
 from shapespace.cli import main
 from shapespace.commands import correspond
+from shapespace.correspondence.first_template import usable_scan
 from shapespace.errors import InputError
 from shapespace.io.landmarks.landmark_io import read_surface_landmarks, write_landmarks
 from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
@@ -218,5 +219,5 @@ def test_scans_that_cannot_be_used_are_named_before_the_first_round(
         named = [line.split()[1] for line in lines if " is excluded: " in line]
         assert sorted(named) == excluded and f"{len(excluded)} of {SCANS + 3} scans are excluded" in outcome.err
         assert lines[-1].endswith("The template is chosen here.") and outcome.code == 2
-    _, notes = correspond._looked_at(Mesh(vertices, scan.faces, name="hole"), strict=False)
+    _, notes = usable_scan(Mesh(vertices, scan.faces, name="hole"))
     assert any("1 vertex with coordinates that are NaN or infinite, used by" in note for note in notes)

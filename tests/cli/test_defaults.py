@@ -23,6 +23,7 @@ JUSTIFIED = {
         "all surfaces give the same answer: fits are compared by them",
     ),
     ("recognise identify", "--surfaces"): ("coefficients", "as for verify"),
+    ("regress", "--curve"): (None, "means that --curve was not given, as --target takes none"),
     ("score", "--surfaces"): ("coefficients", "other surfaces have no covariance of the fit, which the scores contain"),
 }
 """Options whose default differs from that of the field: the default, and the reason."""

@@ -68,9 +68,8 @@ def test_landmarks_are_converted_with_their_sliders_and_what_is_left_out_is_prin
     assert (tmp_path / "newts.curveslide.csv").read_text() == "before,slide,after\n1,2,3\n"
     back = read_configurations(tmp_path / "newts.tps")
     np.testing.assert_array_equal(back.points, read_configurations(table).points)
-    facts = run(
-        "landmarks", "convert", tmp_path / "newts.tps", tmp_path / "newts.txt", "--to", "morphoj", "--json"
-    ).facts
+    arguments = (tmp_path / "newts.tps", "-o", tmp_path / "newts.txt", "--to", "morphoj", "--json")
+    facts = run("landmarks", "convert", *arguments).facts
     assert facts["specimens"] == 24 and facts["dimensions"] == 2
 
 
@@ -186,12 +185,12 @@ def test_bad_input_ends_with_one_sentence(run: Run, table: Path, tmp_path: Path)
     for arguments, words in (
         (("landmarks", "check", none), "no such file"),
         (("landmarks", "check", table, "-o", none), "-o goes with SAME"),
-        (("landmarks", "convert", table, table), "is the file to convert"),
-        (("landmarks", "convert", table, tmp_path / "a.doc"), "has no format"),
-        (("landmarks", "convert", table, tmp_path / "a.csv", "--to", "word"), "there is no format 'word'"),
-        (("landmarks", "convert", table, tmp_path / "a.tps", "--object", "land"), "leave --object out"),
+        (("landmarks", "convert", table, "-o", table), "is the file to convert"),
+        (("landmarks", "convert", table, "-o", tmp_path / "a.doc"), "has no format"),
+        (("landmarks", "convert", table, "-o", tmp_path / "a.csv", "--to", "word"), "there is no format 'word'"),
+        (("landmarks", "convert", table, "-o", tmp_path / "a.tps", "--object", "land"), "leave --object out"),
         (
-            ("landmarks", "convert", table, tmp_path / "a.tps", "--sliders", tmp_path / "bad.csv"),
+            ("landmarks", "convert", table, "-o", tmp_path / "a.tps", "--sliders", tmp_path / "bad.csv"),
             "before, slide, after",
         ),
         (("landmarks", "plot", table, "-o", tmp_path / "a.jpg"), "cannot be written as 'jpg'"),

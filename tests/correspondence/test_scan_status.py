@@ -90,7 +90,7 @@ def test_build_leaves_doubtful_surfaces_out_with_a_note_and_includes_them_on_req
     doubtful = summary["doubtful"]
     assert len(doubtful) == 1 and set(doubtful) <= set(summary["corresponding"])
     assert f"({len(doubtful)} doubtful)" in output.out
-    reviews = Corresponded(tmp_path / "same").reviews()
+    reviews = {record.name: record.review for record in Corresponded(tmp_path / "same").corresponding}
     codes = {
         name: [*(["doubtful"] if name in doubtful else []), *(r.code for r in own)] for name, own in reviews.items()
     }

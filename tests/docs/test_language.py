@@ -20,7 +20,6 @@ RULED_OUT = (
 NAMES_RULED_OUT = {"told", "tell", "tells", "said", "somebody", "nobody"}
 NAMES_KEPT = {
     # Released names: a rename would break programs that use them.
-    "AdditiveModel.told": {"told"},
     "AdditiveModel.tie": {"told"},
     # The callback of a build, an argument with this name since 1.0.
     "ShapeModel.fit": {"tell"},

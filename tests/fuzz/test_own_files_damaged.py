@@ -435,7 +435,7 @@ KINDS: dict[str, tuple[dict[str, Any], Callable[[object], object]]] = {
     ),
     "one.correspond.json": (
         {"format": "shapespace corresponding", "format_version": 1, "name": "one", "path": "../one.ply", "hash": "ab",
-         "status": "corresponding", "seen_share": 0.9, "notes": ["Holes."], "moved_share": [0.1], "cpu_s": [1, 2]},
+         "status": "converged", "seen_share": 0.9, "notes": ["Holes."], "moved_share": [0.1], "cpu_s": [1, 2]},
         lambda content: read(CorrespondRecord, content, "one.correspond.json", CORRESPOND_AGAIN),
     ),
     "correspondence.json": (

@@ -337,7 +337,9 @@ def test_words_of_any_text_come_back_and_what_is_no_text_is_refused_before_it_is
     arrays, attributes = parts
     words = "Gesichter «éà» 顔" + "long " * 20_000
     told = {"landmarks": json.dumps({"näse \udcff": 3}), "provenance": words, "licence": ""}
-    write_hdf5(tmp_path / "m.h5", arrays, attributes | told)
+    first = {name: array[:1] for name, array in arrays.items() if name.startswith("landmark_")}
+    vertex = {"landmark_corners": np.array([[3, 3, 3]], dtype=np.int32)}
+    write_hdf5(tmp_path / "m.h5", arrays | first | vertex, attributes | told)
     model = ShapeModel.load(tmp_path / "m.h5")
     assert (dict(model.landmarks), model.provenance, model.licence) == ({"näse \udcff": 3}, words, "")
     for wrong in ("\udcff", "\0"):

@@ -78,7 +78,7 @@ def test_what_does_not_belong_to_the_model_is_refused():
     other = failed_record(Source("t.ply", "b"), Source("m.h5", "f" * 64), "t.ply is empty.", {})
     with pytest.raises(InputError, match=r"t\.ply was fitted with the model ffffffffffff"):
         space.transform([other])
-    with pytest.raises(FileFormatError, match="number 1 is damaged"):
+    with pytest.raises(FileFormatError, match="record of number 1 is incomplete"):
         space.transform([{"status": "converged"}])
     with pytest.raises(InputError, match="int is no mesh"):
         space.transform([3])

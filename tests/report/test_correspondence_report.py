@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec import structs
 from report_page import Page, edit
 
-from same_blobs import ASIDE, EVIL, FAR, FOLDED, HIDDEN, NAMES, VERTICES, mean_blob, surface, write_same
+from same_blobs import ASIDE, EVIL, FAR, FOLDED, HIDDEN, NAMES, VERTICES, mean_blob, surface, write_records, write_same
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.report.figures import correspondence_figures
@@ -79,8 +80,8 @@ def test_what_stands_out_has_its_reason_and_comes_first(page: str, template: Pat
 
 
 def test_scans_that_are_all_alike_bad_are_told_too(same: Path) -> None:
-    for name in NAMES:
-        edit(same, lambda record: record.update(folded_share=0.05, covered_share=0.6), f"{name}.correspond.json")
+    records = Corresponded(same).corresponding
+    write_records(same, [structs.replace(record, folded_share=0.05, covered_share=0.6) for record in records])
     concerns = concerns_of(Corresponded(same))
     assert all("folded over" in c.text and "only 60 % of its points are reached" in c.text for c in concerns.values())
 
@@ -262,7 +263,7 @@ def test_a_folder_that_is_damaged_as_a_whole_is_one_sentence(same: Path) -> None
 
 def test_a_folder_in_which_all_were_set_aside_is_still_told(same: Path) -> None:
     for name in NAMES:
-        edit(same, lambda record: record.update(status="set aside", reason="half missing"), f"{name}.correspond.json")
+        edit(same, lambda record: record.update(status="excluded", reason="half missing"), f"{name}.correspond.json")
     page = report(same)
     assert "0 of 7 scans are in correspondence" in Page(page).words and "Half missing." in Page(page).words
     assert "could not be made" not in page

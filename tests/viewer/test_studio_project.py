@@ -218,7 +218,7 @@ def test_each_action_is_a_command_line_that_the_parser_takes(project: Project, t
     options = {
         one["flag"]: chosen.get(one["kind"]) or (one["choices"] or ["age"])[0]
         for one in described[kind]["options"]
-        if one["required"] or one["kind"] in ("class", "formula")
+        if one["required"] or one["kind"] in ("class", "formula") or one["flag"] == "--along"
     }
     ordered = order(project, done, described, kind, options, None, 4)
     arguments = parser().parse_args(ordered.arguments)

@@ -26,7 +26,7 @@ from shapespace.cli.answers import (
     answer_verify,
 )
 from shapespace.cli.options import Option, Source, advanced, basic
-from shapespace.statistics.shape_tests.shape_test_result import SHAPE_TESTS, ShapeTest
+from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS, ShapeTest
 
 # The classes and functions that options are read from.
 COHORT = Source("cohort.read", "CohortConfig")
@@ -729,8 +729,8 @@ COMMANDS: tuple[Command, ...] = (
                   "one column for surfaces; can be repeated", source=ALIGN_FILES, parse=Path, repeat=True,
                   default=[]),
             basic("--slide-by", source=ALIGN),
-            basic("--curve-points", "N", source=ALIGN_FILES, parse=values.positive),
-            basic("--dimensions", "D", source=ALIGN_FILES, parse=values.positive),
+            advanced("--curve-points", "N", source=ALIGN_FILES, parse=values.positive),
+            advanced("--dimensions", "D", source=ALIGN_FILES, parse=values.positive),
             basic("--missing", source=ALIGN),
             basic("--separate", "FILE", source=ALIGN_FILES, parse=Path),
             basic("--reflect", "COLUMN=VALUE", "specimens that are reflected before the alignment, such as side=left"),
