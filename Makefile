@@ -15,7 +15,7 @@ QUICK = tests/api tests/contracts tests/formats tests/geometry tests/io/test_mes
 .PHONY: demo test test-all test-oldest test-newest lint types contracts check bench docs dist clean
 
 demo: $(READY_FOR_DEMO)
-	$(BIN)/shapespace demo --out demo-out $(DEMO)
+	$(BIN)/shapespace demo -o demo-out $(DEMO)
 
 test: $(READY)
 	$(RUN_TESTS) -m "not long" $(PYTEST)
