@@ -412,10 +412,14 @@ _WAVES = 96  # random Fourier features of the field
 class Warp:
     """Amplitude and length scales of a random deformation, mm for a head.
 
+    The shape is stretched along its axes, and displaced by Gaussian processes with squared-exponential covariance, each
+    a sum of cosine waves in space (random Fourier features: Rahimi and Recht, NIPS 2007). No triangle turns over while
+    the amplitude of a field is far below its length scale.
+
     Args:
         stretch: standard deviation of the logarithm of the stretch along each axis; the volume stays.
         fields: (length over which a field is smooth, its standard deviation along each axis), from coarse to fine.
-        lopsided: of the part that differs from side to side, beside that of the part both sides share.
+        lopsided: standard deviation of the asymmetric part, relative to that of the symmetric part.
     """
 
     stretch: float = 0.04

@@ -1,7 +1,7 @@
 """Evaluation of classifiers in subjects who were not trained on.
 
-`predictions` has folds by subject and the choice nested inside them, `scores` what answers are worth, `resampling`
-tests against shuffled labels and curves, `decision` where on the face classes differ.
+`predictions` has folds by subject and the nested choice of settings, `classification_scores` the rates, `resampling`
+the tests against shuffled labels and the learning curves. Maps of where classes differ are at the end of this module.
 """
 
 from __future__ import annotations

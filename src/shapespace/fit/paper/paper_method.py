@@ -157,6 +157,43 @@ def _hotelling_bound(k: int, n: int) -> float:
     return float((n**2 - 1) / (n * (n - k)) * fdtri(k, n - k, 1.0 - _IMPLAUSIBLE))
 
 
+# Phase 1 (section 3.1 of the paper): similarity ICP of the mean shape
+
+
+def similarity_icp(
+    model: ShapeModel, scan: ClosestPointEngine, T_scan_model: Similarity, stop: StopRule, *, with_scale: bool = True
+) -> Iterator[IcpState]:
+    """Yield the start and each iteration of phase 1, until the RMS closest distance stops falling.
+
+    Args:
+        model: its mean shape is moved, its modes are not used.
+        scan: search structure of the scan, in the scan's mm frame.
+        T_scan_model: the start.
+        stop: the stopping rule.
+        with_scale: False holds the scale of the start.
+
+    Raises:
+        InputError: the matches determine no similarity, or the pose has diverged.
+    """
+    Q_mean, b = model.mean_vertices, np.zeros(model.n_modes)
+    p = T_scan_model.apply(Q_mean)
+    matched = scan.query(p)
+    rms_model_mm = [matched.rms / T_scan_model.scale]
+    yield IcpState(1, 0, T_scan_model, b, matched.rms, np.inf)
+
+    for iteration in range(1, stop.max_iterations + 1):
+        p_prime = matched.points  # P7: the closest scan point of each model vertex
+        T_scan_model = fit_pose(Q_mean, p_prime, T_scan_model, with_scale)  # P8-P18
+        moved, p = p, T_scan_model.apply(Q_mean)
+        matched = scan.query(p, near=matched)
+        rms_model_mm.append(matched.rms / T_scan_model.scale)
+        motion_mm = largest_motion(p - moved)
+        stopped = stop.why(rms_model_mm, motion_mm / T_scan_model.scale)
+        yield IcpState(1, iteration, T_scan_model, b, matched.rms, motion_mm, stopped)
+        if stopped:
+            return
+
+
 # Phase 2 (section 3.2 of the paper): correspondence, similarity and projection in turn
 
 
@@ -202,60 +239,7 @@ def shape_icp(
         rms_model_mm.append(matched.rms / T_scan_model.scale)
         motion_mm = largest_motion(y - moved)
         stopped = stop.why(rms_model_mm, motion_mm / T_scan_model.scale)  # step 4
-        yield IcpState(
-            phase=2,
-            iteration=iteration,
-            T_scan_model=T_scan_model,
-            b=b,
-            rms_mm=matched.rms,
-            motion_mm=motion_mm,
-            stopped=stopped,
-        )
-        if stopped:
-            return
-
-
-# Phase 1 (section 3.1 of the paper): similarity ICP of the mean shape
-
-
-def similarity_icp(
-    model: ShapeModel, scan: ClosestPointEngine, T_scan_model: Similarity, stop: StopRule, *, with_scale: bool = True
-) -> Iterator[IcpState]:
-    """Yield the start and each iteration of phase 1, until the RMS closest distance stops falling.
-
-    Args:
-        model: its mean shape is moved, its modes are not used.
-        scan: search structure of the scan, in the scan's mm frame.
-        T_scan_model: the start.
-        stop: the stopping rule.
-        with_scale: False holds the scale of the start.
-
-    Raises:
-        InputError: the matches determine no similarity, or the pose has diverged.
-    """
-    Q_mean, b = model.mean_vertices, np.zeros(model.n_modes)
-    p = T_scan_model.apply(Q_mean)
-    matched = scan.query(p)
-    rms_model_mm = [matched.rms / T_scan_model.scale]
-    yield IcpState(1, 0, T_scan_model, b, matched.rms, np.inf)
-
-    for iteration in range(1, stop.max_iterations + 1):
-        p_prime = matched.points  # P7: the closest scan point of each model vertex
-        T_scan_model = fit_pose(Q_mean, p_prime, T_scan_model, with_scale)  # P8-P18
-        moved, p = p, T_scan_model.apply(Q_mean)
-        matched = scan.query(p, near=matched)
-        rms_model_mm.append(matched.rms / T_scan_model.scale)
-        motion_mm = largest_motion(p - moved)
-        stopped = stop.why(rms_model_mm, motion_mm / T_scan_model.scale)
-        yield IcpState(
-            phase=1,
-            iteration=iteration,
-            T_scan_model=T_scan_model,
-            b=b,
-            rms_mm=matched.rms,
-            motion_mm=motion_mm,
-            stopped=stopped,
-        )
+        yield IcpState(2, iteration, T_scan_model, b, matched.rms, motion_mm, stopped)
         if stopped:
             return
 

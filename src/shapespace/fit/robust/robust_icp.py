@@ -609,6 +609,9 @@ def in_span(
 ) -> Estimate:
     """Return the likeliest pose and first `modes` coefficients given the surface `vertices` (R18, R19).
 
+    Ordinary least squares would give weak modes, and modes close to motions of the pose, large coefficients for a
+    negligible gain; the prior keeps them plausible.
+
     Args:
         prepared: the model.
         vertices: (V, 3) in the model's order, in its frame.

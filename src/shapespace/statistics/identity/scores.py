@@ -165,7 +165,12 @@ _MOST_NOISE, _LEAST_BETWEEN = 0.9, 1e-3
 
 @dataclass(frozen=True, eq=False)
 class TwoCovariance:
-    """Between- and within-person covariance, in the coordinates in which both are diagonal.
+    """Between- and within-person covariance, in the coordinates in which both are diagonal: the two-covariance PLDA.
+
+    A scan is x = m + y + w: y ~ N(0, B) is the identity, w ~ N(0, W) the other variation and the error of the fit. W
+    differs between scans with the variances that their fits state. Sources: Brummer and de Villiers, "The speaker
+    partitioning problem", Odyssey 2010; Ioffe, "Probabilistic linear discriminant analysis", ECCV 2006; variances of
+    single samples: Cumani, Plchot and Laface, IEEE/ACM TASLP 22(4), 2014.
 
     Args:
         mean: (K,) of all people.
