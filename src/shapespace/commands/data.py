@@ -187,7 +187,7 @@ def write_about(folder: Path, provenance: str, licence: str) -> None:
 
 
 def read_about(folder: Path) -> tuple[str, str] | None:
-    """Return the provenance and licence of the meshes in `folder`, or None where nothing says so."""
+    """Return the provenance and licence of the meshes in `folder`, or None if no file states them."""
     path = folder / ABOUT
     if not path.is_file():
         return None

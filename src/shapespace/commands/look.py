@@ -60,7 +60,9 @@ def check(
         FileError: `output` cannot be written.
     """
     if output is None and (unit is not None or mirror or symmetric):
-        raise InputError("--unit, --mirror and --symmetric change what is written; give the folder for it with -o.")
+        raise InputError(
+            "--unit, --mirror and --symmetric apply to the meshes that are written; give their folder with -o."
+        )
     reports: list[dict[str, Any]] = []
     listed = mesh_files(paths, recursive=recursive, apart_from=output)
     for sentence in listed.left_out:

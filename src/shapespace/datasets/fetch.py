@@ -378,7 +378,7 @@ def _fetch_obj(file: DataFile, url: str, path: Path, neutral: Any, bar: tqdm[Any
     except Exception as error:
         path.unlink(missing_ok=True)
         raise DataError(
-            f"{url} is not the published file: its content does not match the known hash; what came was deleted, "
+            f"{url} is not the published file: its content does not match the known hash; the download was deleted, "
             "so try again later or set SHAPESPACE_DATA to a local copy."
         ) from error
 
@@ -419,7 +419,7 @@ def download(url: str, path: Path, bar: tqdm[Any], *, sha256: str | None = None,
         raise write_error(path, error) from error
     except ValueError as error:
         raise DataError(
-            f"{url} does not match its published SHA-256; what came was deleted, so try again later or set "
+            f"{url} does not match its published SHA-256; the download was deleted, so try again later or set "
             "SHAPESPACE_DATA to a local copy."
         ) from error
 
@@ -474,7 +474,7 @@ class _ResumingDownload:
         cause = getattr(reason, "reason", None) or reason
         raise DataError(
             f"Cannot download {fname} ({str(cause).strip('.')}), and {self.part.parent} does not hold it yet: "
-            "check the network and run again, which goes on where it stopped, or set SHAPESPACE_DATA to a local copy."
+            "check the network and run again, which resumes the download, or set SHAPESPACE_DATA to a local copy."
         ) from reason
 
     def _get_rest(self, url: str) -> None:

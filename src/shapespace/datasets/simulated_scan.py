@@ -348,7 +348,7 @@ class _Head:
         query_result = cast("tuple[FloatArray, LongArray]", self.directions.query(directions, k=6))
         distance, nearest = query_result
         weights = np.exp(-((distance * self.radius / 12.0) ** 2))
-        # Fading to the sphere away from the face keeps the scalp round where there is no surface at all.
+        # Away from the face the surface blends into a sphere, so that the scalp is round where the mesh ends.
         return self.radius + (weights * self.excess[nearest]).sum(axis=1) / np.maximum(weights.sum(axis=1), 1.0)
 
 
@@ -418,7 +418,7 @@ def _tuft(head: _Head, hair: Hair, rng: np.random.Generator) -> tuple[FloatArray
 
 
 def _shred(head: _Head, hair: Hair, rng: np.random.Generator) -> tuple[FloatArray, LongArray]:
-    """A small crumpled patch that floats above the hair or beside the head."""
+    """A small crumpled patch of triangles, detached from the head, such as scanners make of hair."""
     direction = rng.standard_normal(3)
     direction[1] = abs(direction[1]) * 1.2 - 0.2
     direction /= np.linalg.norm(direction)

@@ -160,10 +160,9 @@ class ShapePrediction(AnalysisResult):
         Returns:
             (V,) along the normals; (V, 3) along the axes for landmarks; NaN where it is not known.
         """
-        from scipy.stats import t  # loads much
-
-        factor = float(t.ppf((1 + self.confidence) / 2, self.df[k])) if self.is_known[k] else np.nan
-        width = factor * np.linalg.norm(self.parts[k] @ self._directions, axis=0)  # S47
+        width = _interval_factor(self.df, self.confidence)[k] * np.linalg.norm(
+            self.parts[k] @ self._directions, axis=0
+        )  # S47
         return width if self.cohort.faces is not None else width.reshape(-1, 3)
 
     @property
@@ -303,6 +302,13 @@ def predict_shapes(
     )
 
 
+def _interval_factor(df: FloatArray, confidence: float) -> FloatArray:
+    """Return half the widths of intervals in standard errors; NaN where they are not known."""
+    from scipy.stats import t  # loads much
+
+    return np.where(df >= _LEAST_DF, t.ppf((1 + confidence) / 2, df), np.nan)
+
+
 def percentiles(y: FloatArray, codes: IndexArray, percent: tuple[float, float]) -> tuple[float, float]:
     """Return percentiles of numbers (N,) in which each subject counts once, linear between distinct values.
 
@@ -368,8 +374,6 @@ def _measures(
     cohort: Cohort, lengths: Sequence[tuple[str, str]], model: SubjectRegression, rows: FloatArray, confidence: float
 ) -> list[PredictedMeasure]:
     """Return the mean centroid size and lengths at each value."""
-    from scipy.stats import t  # loads much
-
     known = () if cohort.landmarks is None else cohort.landmarks.names
     for pair in lengths:
         if len(pair) != 2 or not set(pair) <= set(known):
@@ -391,7 +395,7 @@ def _measures(
     if not named:
         return []
     value, parts, df = model.estimate(rows, np.column_stack(list(named.values())))
-    width = np.where(df >= _LEAST_DF, t.ppf((1 + confidence) / 2, df), np.nan)[:, None] * np.linalg.norm(parts, axis=1)
+    width = _interval_factor(df, confidence)[:, None] * np.linalg.norm(parts, axis=1)  # S47
     return [
         PredictedMeasure(name=name, observed=own, value=value[:, k], low=(value - width)[:, k],
                          high=(value + width)[:, k])
