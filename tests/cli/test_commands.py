@@ -191,7 +191,7 @@ def test_check_overwrites_no_mesh_that_it_reads(run: Run, world: World, tmp_path
     scan = tmp_path / "scan.ply"
     scan.write_bytes(world.scan.read_bytes())
     assert "would be overwritten" in run("check", scan, "-o", tmp_path).sentence()
-    assert "give the folder" in run("check", scan, "--mirror").sentence()
+    assert "give their folder with -o" in run("check", scan, "--mirror").sentence()
     assert scan.read_bytes() == world.scan.read_bytes()
 
 
