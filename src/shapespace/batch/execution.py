@@ -33,9 +33,9 @@ class ExecutionConfig:
         if self.kind not in EXECUTORS:
             raise InputError(f"There is no executor {self.kind!r}; use one of {', '.join(EXECUTORS)}.")
         if self.dask and self.kind != "dask":
-            raise InputError(f"A Dask scheduler is for --executor dask, not {self.kind}; leave out one of them.")
+            raise InputError(f"A Dask scheduler is for executor=dask, not {self.kind}; leave out one of them.")
         if self.kind == "serial" and self.timeout_s is not None:
-            raise InputError("--executor serial cannot stop a scan that hangs; leave out --timeout or --executor.")
+            raise InputError("executor=serial cannot stop a scan that hangs; leave out timeout or executor.")
 
     def executor(self, tasks: int, *, quiet: bool = True) -> Executor:
         """Return the executor for a number of tasks.

@@ -210,7 +210,7 @@ class _Death:
 
     def __str__(self) -> str:
         if self.late_s is not None:
-            return f"it took more than the {self.late_s:g} s of --timeout"
+            return f"it took more than the {self.late_s:g} s of --set timeout"
         cause = f"by signal {-self.code}" if self.code < 0 else f"with exit code {self.code}"
         return (
             f"its worker ended {cause}, {ATTEMPTS} times, most likely for lack of memory; thin it, or use fewer --jobs"

@@ -66,7 +66,7 @@ class OnDask:
             from distributed import Client, LocalCluster
         except ImportError as error:
             raise ShapespaceError(
-                "A cluster needs the extra 'cluster'; run pip install 'shapespace[cluster]', or leave out --executor."
+                "A cluster needs the extra 'cluster'; run pip install 'shapespace[cluster]', or omit executor=dask."
             ) from error
         if isinstance(self.cluster, Client):
             return self.cluster
@@ -82,7 +82,7 @@ class OnDask:
         except (OSError, TimeoutError, ValueError) as error:
             location = f"at {self.cluster}" if self.cluster else "on this machine"
             raise InputError(
-                f"There is no Dask scheduler {location} that answers; start it, or mend --dask."
+                f"There is no Dask scheduler {location} that answers; start it, or mend --set dask=ADDRESS."
             ) from error
 
 

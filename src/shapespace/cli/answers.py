@@ -6,7 +6,7 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from shapespace.cli.options import given
 from shapespace.cli.printing import say, show, show_json, warn
@@ -14,12 +14,9 @@ from shapespace.errors import InputError
 
 if TYPE_CHECKING:
     from shapespace.cohort.cohort import Cohort
-    from shapespace.commands.answers import FigureConfig
-    from shapespace.geometry.procrustes import Gauge
+    from shapespace.cohort.read import Surfaces
     from shapespace.report.analyses.analysis_report import AnalysisReport
-    from shapespace.schemas import Orientation
     from shapespace.statistics.identity.trial import IdentityConfig
-    from shapespace.types import SurfaceLandmarks
 
 
 def column_value(text: str, option: str) -> tuple[str, str]:
@@ -35,43 +32,77 @@ def column_value(text: str, option: str) -> tuple[str, str]:
 
 
 def cohort_of(
-    arguments: argparse.Namespace,
-    gauge: Gauge | None = None,
-    onto: Cohort | None = None,
-    *,
-    least: int = 2,
-    accept_review: bool | None = None,
-) -> Cohort:
-    """Return the cohort that the arguments name.
+    arguments: argparse.Namespace, data: Path | None = None, *, onto: Cohort | None = None, least: int = 2,
+    accept_review: bool | None = None, surfaces: Surfaces | None = None, **fixed: Any,
+) -> Cohort:  # fmt: skip
+    """Return a cohort that the arguments name, with the settings of its file and of --set.
 
     Args:
         arguments: parsed arguments of a command that reads a cohort.
-        gauge: gauge of a command that has no option for it; None for the value of the option.
+        data: its data; None for those of the arguments.
         onto: a cohort that this one is compared with.
         least: the smallest number of shapes, if `onto` is None.
-        accept_review: see `CohortConfig`; None for the value of --doubtful, or True for a command without the option.
+        accept_review: see `CohortConfig`.
+        surfaces: those of the question, where neither the file nor --set chooses them.
+        fixed: settings that the question does not leave open.
     """
     from shapespace.batch.progress import steps
-    from shapespace.cohort.read import CohortConfig, read_cohort
+    from shapespace.cohort.read import CohortConfig, is_cohort_file, read_cohort, read_cohort_file
 
-    _figures(arguments)  # files and options that do not fit are refused before the analysis
-    fixed = {} if gauge is None else {"gauge": gauge}
-    accept_review = getattr(arguments, "doubtful", True) if accept_review is None else accept_review
-    config = CohortConfig(**given(arguments, CohortConfig, least=least, accept_review=accept_review, **fixed))
+    place, stated = (data or arguments.data), dict[str, Any]()
+    if is_cohort_file(place):
+        place, stated = read_cohort_file(place)
+    if surfaces is not None:
+        stated.setdefault("surfaces", surfaces)
+    known = given(arguments, CohortConfig)
+    chosen = {name: known[name] for name in arguments.chosen if name in known}
+    if data is None and arguments.shapes is not None:
+        chosen["shapes"] = arguments.shapes
+    config = CohortConfig(**{**stated, "least": least, "accept_review": accept_review, **chosen, **fixed})
     with steps(None, "reading", "shape", quiet=arguments.quiet) as step:
-        cohort = read_cohort(arguments.data, config, onto=onto, on_shape=step)
-    return replace(cohort, unit="") if getattr(arguments, "no_unit", False) else cohort
+        return read_cohort(place, config, onto=onto, on_shape=step)
 
 
-def _figures(arguments: argparse.Namespace) -> tuple[FigureConfig, Orientation | None]:
-    """Return the formats of figures, and the named views of the shapes."""
-    from shapespace.commands.answers import FigureConfig
-    from shapespace.report.inputs.orientation import find_orientation
+def answer_cohort(arguments: argparse.Namespace) -> int:
+    """Write a cohort file, and say what the cohort is."""
+    from shapespace.batch.progress import steps
+    from shapespace.cohort.read import CohortConfig, read_cohort, write_cohort_file
+
+    settings = {name: value for name, value in given(arguments, CohortConfig).items() if value is not None}
+    config = CohortConfig(**settings)
+    initial = CohortConfig()
+    with steps(None, "reading", "shape", quiet=arguments.quiet) as step:
+        cohort = read_cohort(arguments.data, config, on_shape=step)
+    stated = {name: value for name, value in settings.items() if value != getattr(initial, name)}
+    write_cohort_file(arguments.output, arguments.data, **stated)
+    for note in cohort.notes:
+        say(note)
+    if arguments.json:
+        facts = {"shapes": len(cohort), "vertices": cohort.n_vertices, "gauge": cohort.gauge}
+        columns = list(cohort.table.columns)
+        show_json({"cohort": str(arguments.output), **facts, "source": cohort.source.kind, "columns": columns})
+    else:
+        show(f"{arguments.output}: {repr(cohort)[1:-1]}")
+    return 0
+
+
+def answer_figures(arguments: argparse.Namespace) -> int:
+    """Draw the figures of an answer as files."""
+    from shapespace.batch.progress import waiting
+    from shapespace.report.pages.figure_files import FigureConfig, write_figures
+    from shapespace.report.pages.write_html import require_report_extra
 
     config = FigureConfig(**given(arguments, FigureConfig))
-    sources = [path for path in (getattr(arguments, "shapes", None), getattr(arguments, "data", None)) if path]
-    folders = [path if path.is_dir() else path.parent for path in sources]
-    return config, find_orientation(config.orientation, folders)
+    require_report_extra()
+    with waiting("drawing the figures", quiet=arguments.quiet):
+        paths, notes = write_figures(arguments.folder, config)
+    for note in notes:
+        say(note)
+    if arguments.json:
+        show_json({"folder": str(arguments.folder), "figures": list(map(str, paths)), "notes": notes})
+    else:
+        show(f"{len(paths)} files in {paths[0].parent}" if paths else f"{arguments.folder} has nothing to draw.")
+    return 0
 
 
 def finish(report: AnalysisReport, arguments: argparse.Namespace) -> int:
@@ -79,8 +110,7 @@ def finish(report: AnalysisReport, arguments: argparse.Namespace) -> int:
     from shapespace.commands.answers import save_report
     from shapespace.schemas import to_json
 
-    figures, orientation = _figures(arguments)
-    page, notes = save_report(report, arguments.output, quiet=arguments.quiet, figures=figures, orientation=orientation)
+    page, notes = save_report(report, arguments.output, quiet=arguments.quiet)
     for note in notes:
         say(note)
     if arguments.json:
@@ -139,28 +169,12 @@ def answer_change(arguments: argparse.Namespace) -> int:
     from shapespace.statistics.change_result import ChangeConfig
     from shapespace.statistics.measure_change import change
 
-    cohort = cohort_of(arguments, "form")
-    if arguments.landmarks is not None:
-        cohort = replace(cohort, landmarks=_landmarks(arguments.landmarks, cohort.n_vertices))
+    cohort = cohort_of(arguments, gauge="form")
     regions = {name: read_region(path) for name, path in arguments.region} or None
     config = ChangeConfig(**given(arguments, ChangeConfig, regions=regions))
     with steps(None, "comparing", "subject", quiet=arguments.quiet) as step:
         result = change(cohort, config, progress=step)
     return finish(change_report(result), arguments)
-
-
-def _landmarks(path: Path, n_vertices: int) -> SurfaceLandmarks:
-    from shapespace.errors import InputError
-    from shapespace.io.landmarks.landmark_io import read_surface_landmarks
-
-    found = read_surface_landmarks(path)
-    for name, vertex in zip(found.names, found.corners.max(axis=1).tolist(), strict=True):
-        if vertex >= n_vertices:
-            raise InputError(
-                f"{path}: landmark {name[:40]!r} is at vertex {vertex}, but the surfaces have {n_vertices}; give "
-                "landmarks of these surfaces."
-            )
-    return found
 
 
 def answer_compare(arguments: argparse.Namespace) -> int:
@@ -227,8 +241,8 @@ def answer_identify(arguments: argparse.Namespace) -> int:
 def _cohort_and_config(arguments: argparse.Namespace) -> tuple[Cohort, IdentityConfig]:
     from shapespace.statistics.identity.trial import IdentityConfig
 
-    cohort = cohort_of(arguments, "shape")
-    if arguments.surfaces != "coefficients":
+    cohort = cohort_of(arguments, surfaces="coefficients", gauge="shape")
+    if cohort.source.kind != "coefficients":
         cohort = replace(cohort, fitted=None)
     return cohort, IdentityConfig(**given(arguments, IdentityConfig))
 
@@ -245,7 +259,6 @@ def answer_morphospace(arguments: argparse.Namespace) -> int:
 def answer_regress(arguments: argparse.Namespace) -> int:
     """Fit a regression on shape, predict with it, and write the report."""
     from shapespace.batch.progress import steps
-    from shapespace.cohort.read import CohortConfig, read_cohort
     from shapespace.io.files import make_folder
     from shapespace.report.analyses.regression_report import prediction_report, regression_report
     from shapespace.report.analyses.shape_prediction_report import shape_prediction_report
@@ -253,18 +266,17 @@ def answer_regress(arguments: argparse.Namespace) -> int:
     from shapespace.statistics.regression import regress
     from shapespace.statistics.shape_prediction import predict_shapes
 
-    others = ("at", "curve", "covariates", "hold", "length") if arguments.along is None else ("predict", "new_shapes")
+    others = ("at", "curve", "covariates", "hold", "length") if arguments.along is None else ("predict",)
     for name in others:
         if getattr(arguments, name):
             needed = "--along" if arguments.along is None else "--target"
             raise InputError(f"--{name.replace('_', '-')} needs {needed}; name the column of the number with it.")
-    names = ("subject", "seed", "drop_missing", "permutations", "confidence")
+    names = ("seed", "permutations", "confidence")
     shared = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
     if arguments.predictor is not None:
         learned = Predictor.load(arguments.predictor)
-        if learned.model_hash and arguments.surfaces == "auto":
-            arguments.surfaces = "coefficients"
-        cohort = cohort_of(arguments, learned.gauge, least=1)
+        surfaces: Surfaces | None = "coefficients" if learned.model_hash else None
+        cohort = cohort_of(arguments, least=1, surfaces=surfaces, gauge=learned.gauge)
         return finish(prediction_report(learned, cohort, learned.predict(cohort)), arguments)
     cohort = cohort_of(arguments)
     if arguments.along is not None:
@@ -278,11 +290,9 @@ def answer_regress(arguments: argparse.Namespace) -> int:
         result = regress(cohort, arguments.target, folds=arguments.folds, **shared, progress=step)
     new = None
     if arguments.predict is not None:
-        config = CohortConfig(**given(arguments, CohortConfig, shapes=arguments.new_shapes, least=1))
-        with steps(None, "reading", "shape", quiet=arguments.quiet) as step:
-            fresh = read_cohort(arguments.predict, config, onto=result.cohort, on_shape=step)
+        fresh = cohort_of(arguments, arguments.predict, onto=result.cohort, least=1)
         own = [result.subject] if result.subject is not None and result.subject in fresh.table.columns else []
-        fresh = fresh.complete(own, drop_missing=arguments.drop_missing)
+        fresh = fresh.complete(own)
         refuse_known(result.subjects, fresh.table.texts(own[0]) if own else fresh.names, fresh.table.where)
         new = (fresh, result.predictor.predict(fresh))
     make_folder(arguments.output)
@@ -297,9 +307,11 @@ def answer_score(arguments: argparse.Namespace) -> int:
     from shapespace.statistics.score_subjects import ScoreConfig, score
 
     config = ScoreConfig(**given(arguments, ScoreConfig))
-    known = {"data": arguments.reference, "shapes": arguments.reference_shapes, "doubtful": False}
-    reference = cohort_of(argparse.Namespace(**{**vars(arguments), **known}), accept_review=arguments.doubtful)
-    subjects = cohort_of(arguments, onto=reference)
+    doubtful = arguments.doubtful
+    reference = cohort_of(
+        arguments, arguments.reference, accept_review=doubtful, surfaces="coefficients", doubtful=False
+    )
+    subjects = cohort_of(arguments, onto=reference, surfaces="coefficients")
     with steps(len(subjects), "scoring", "subject", quiet=arguments.quiet) as step:
         result = score(reference, subjects, config, progress=step)
     return finish(score_report(result), arguments)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from shapespace.cli.command_table import COMMANDS, GROUPS, Command
-from shapespace.cli.options import Container, Option
+from shapespace.cli.options import Container, Option, apply_settings
 from shapespace.version import __version__
 
 
@@ -56,10 +56,18 @@ class CommandParser(argparse.ArgumentParser):
             for text in itertools.takewhile(lambda text: text != "--", args):
                 option = text.partition("=")[0]
                 if option.startswith("--") and not any(name.startswith(option) for name in known):
+                    name = option.removeprefix("--").replace("-", "_")
+                    if name in [one.names for one in self._command.settings]:
+                        self.error(f"there is no option {option}; write --set {name}=VALUE")
                     self.error(f"there is no option {option}{_suggestion(option, known)}")
         parsed, unknown = super().parse_known_args(args, namespace)
         if unknown and self._command:
             self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        if self._command and self._command.settings:
+            try:
+                apply_settings(parsed, self._command.settings)
+            except argparse.ArgumentTypeError as error:
+                self.error(str(error))
         return parsed, unknown
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
@@ -90,6 +98,7 @@ class CommandParser(argparse.ArgumentParser):
         self.epilog = "example: " + "\n         ".join(command.examples)
         if help_level == "all":
             self.description += "".join(f"\n\n{textwrap.fill(text, 78)}" for text in command.details)
+            self.epilog += _settings_text(command.settings)
         elif more:
             self.epilog += f"\n\n{more} more options: {self.prog} --help-all"
         self.add_argument("--help-all", action=_HelpAll, help="show all options and exit")
@@ -117,6 +126,13 @@ class _HelpAll(argparse.Action):
         """Print it, and end."""
         print(parser.format_help(everything=True), end="")
         parser.exit()
+
+
+def _settings_text(settings: Sequence[Option]) -> str:
+    """Return the list of settings at the end of the help; empty for none."""
+    texts = [f"{setting.names}={setting.value_name}: {setting.text}".replace("`", "") for setting in settings]
+    rows = [textwrap.fill(text, 78, subsequent_indent="    ") for text in texts]
+    return "".join(["\n\nsettings (--set NAME=VALUE):", *(f"\n  {row}" for row in rows)] if rows else [])
 
 
 def _suggestion(text: str, known: Sequence[str]) -> str:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,10 @@ from shapespace.cli.answers import (
     answer_align,
     answer_asymmetry,
     answer_change,
+    answer_cohort,
     answer_compare,
     answer_complete,
+    answer_figures,
     answer_identify,
     answer_morphospace,
     answer_regress,
@@ -25,7 +27,7 @@ from shapespace.cli.answers import (
     answer_shape_tests,
     answer_verify,
 )
-from shapespace.cli.options import Option, Source, advanced, basic
+from shapespace.cli.options import Option, Source, advanced, basic, setting
 from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS, ShapeTest
 
 # The classes and functions that options are read from.
@@ -44,7 +46,7 @@ COMPLETION = Source("fit.completion.complete", "CompletionConfig")
 COMPLETION_FILES = Source("commands.complete", "CompletionFiles")
 PAPER = Source("fit.paper.paper_method", "Paper")
 IDENTITY = Source("statistics.identity.trial", "IdentityConfig")
-FIGURES = Source("commands.answers", "FigureConfig")
+FIGURES = Source("report.pages.figure_files", "FigureConfig")
 COMPARE = Source("statistics.compare_shapes", "CompareConfig")
 MORPHOSPACE = Source("statistics.shape_tests.ordination", "ordinate")
 CHANGE = Source("statistics.change_result", "ChangeConfig")
@@ -97,6 +99,7 @@ class Command:
         details: paragraphs on what it reads and writes, for `--help-all` and the reference.
         json: whether it prints facts, with `--json`.
         defaults: further attributes of the parsed arguments.
+        settings: values that are rarely changed, given as `--set NAME=VALUE`.
     """
 
     name: str
@@ -107,11 +110,12 @@ class Command:
     details: tuple[str, ...] = ()
     json: bool = True
     defaults: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    settings: tuple[Option, ...] = ()
 
     @property
     def options(self) -> tuple[Option, ...]:
         """All arguments, those included that every command has."""
-        return (*self.arguments, *((_JSON,) if self.json else ()), _QUIET)
+        return (*self.arguments, *((SET,) if self.settings else ()), *((JSON,) if self.json else ()), QUIET)
 
     @property
     def usage(self) -> str:
@@ -130,8 +134,10 @@ class Command:
         return " ".join([*words, "[options]"])
 
 
-_QUIET = basic("--quiet", help="do not show progress")
-_JSON = basic("--json", help="print the results as JSON")
+QUIET = basic("--quiet", help="do not show progress")
+JSON = basic("--json", help="print the results as JSON")
+SET = advanced("--set", "NAME=VALUE", "a value that is rarely changed, from the list of settings; can be repeated",
+               repeat=True, default=())  # fmt: skip
 _OUTPUT = basic("-o --output", "DIR", "output folder", parse=Path, required=True)
 _MARKED = basic("marked", "MARKED", "folder of landmark files with the names of the scans, in any landmark format",
                 parse=Path)  # fmt: skip
@@ -143,7 +149,6 @@ _STRICT_HELP = (
     "refuse scans with coordinates that are NaN or infinite (default: remove the triangles that use them, with a note)"
 )
 _NO_OPEN = advanced("--no-open", help="do not open the report in a browser")
-_SEED = advanced("--seed", "S", "random seed", parse=values.natural, default=0)
 _MODEL_OF_FITS = advanced("--model", "MODEL.h5", "model file of the fits, if it was moved", parse=Path)
 _RESULTS = basic("results", "RESULTS", "a folder that fit wrote, or its coefficients.csv", parse=Path)
 _IDENTITY_RULES = (
@@ -154,74 +159,74 @@ _MODES, _TARGET = "modes", "target"
 _CHANGE = "change"
 
 
-def _execution(what: str) -> tuple[Option, ...]:
-    """Return the options of parallel and distributed runs; `what` is run."""
-    return (
-        basic("--jobs", "N", f"{what} in parallel (default: one per core)", EXECUTION),
-        advanced("--executor",
-                 help="local: processes on this machine; serial: one after the other in this process; dask: "
-                 "a Dask cluster", source=EXECUTION, field="kind", choices=("local", "serial", "dask")),
-        advanced("--dask", "ADDRESS", "address of a Dask scheduler, such as tcp://10.0.0.5:8786, or its scheduler file "
-                 "(.json); without it --executor dask starts a cluster on this machine", EXECUTION),
-        advanced("--timeout", "S", f"skip any of the {what} that takes longer than S seconds (default: no limit)",
-                 EXECUTION, "timeout_s", parse=values.seconds),
-    )  # fmt: skip
+_FIT_OPTIONS = (
+    advanced("--scale", source=FIT),
+    advanced("--crop", "KIND:NUMBERS", source=FIT),
+)
+"""Options of the fit that `fit` and `complete` share."""
+_LANDMARK_STDDEV = setting("landmark_stddev_mm", "MM", source=FIT, parse=values.std_mm)
+_EXECUTION_SETTINGS = (
+    setting("executor", "", "local: processes on this machine; serial: one after the other in this process; dask: "
+            "a Dask cluster", EXECUTION, "kind", choices=("local", "serial", "dask")),
+    setting("dask", "ADDRESS", "address of a Dask scheduler, such as tcp://10.0.0.5:8786, or its scheduler file "
+            "(.json); without it executor=dask starts a cluster on this machine", EXECUTION),
+    setting("timeout", "S", "skip scans, fits or folds that take longer than S seconds (default: no limit)",
+            EXECUTION, "timeout_s", parse=values.seconds),
+)  # fmt: skip
 
 
-def _cohort(surfaces: str = "auto") -> tuple[Option, ...]:
-    """Return the options that name a cohort; `surfaces` is a default."""
-    return (
-        basic("data",
-              "DATA", "a table (CSV or .xlsx) with one row per shape, named in the column file, scan, specimen, "
-              "name or id; a folder of fits, whose metadata are the table; a folder that align wrote; or a landmark "
-              "file", parse=Path),
-        _OUTPUT,
-        basic("--shapes", "DIR|FILE", source=COHORT),
-        advanced("--model", "MODEL.h5", source=COHORT),
-        advanced("--surfaces", source=COHORT, default=surfaces),
-        advanced("--doubtful", source=COHORT),
-        advanced("--geometry", source=COHORT),
-        advanced("--imputations", "M", source=COHORT),
-        *_figures(),
-    )  # fmt: skip
+def _jobs(what: str) -> Option:
+    """Return the option of parallel runs; `what` is run."""
+    return basic("--jobs", "N", f"{what} in parallel (default: one per core)", EXECUTION)
 
 
-def _figures() -> tuple[Option, ...]:
-    """Return the options of the figures of an analysis."""
-    return (
-        basic("--format", "LIST", source=FIGURES, field="formats"),
-        advanced("--dpi", "N", source=FIGURES, parse=values.positive),
-        advanced("--orientation", "FILE", source=FIGURES),
-    )
+_COHORT_SETTINGS = (
+    setting("model", "MODEL.h5", source=COHORT),
+    setting("surfaces", source=COHORT),
+    setting("geometry", source=COHORT),
+    setting("gauge", source=COHORT),
+    setting("unit", source=COHORT),
+    setting("doubtful", source=COHORT),
+    setting("missing", source=COHORT),
+    setting("imputations", "M", source=COHORT),
+    setting("subject", "COLUMN", source=COHORT),
+    setting("landmarks", "FILE", source=COHORT),
+    setting("orientation", "FILE", source=COHORT),
+)
+"""Settings of a cohort, which a cohort file contains."""
+_BASIC_OF_COHORT = ("surfaces", "geometry", "gauge", "doubtful", "missing", "subject")
+"""Settings that `shapespace cohort --help` lists."""
+_SHAPES = basic("--shapes", "DIR|FILE", source=COHORT)
+_DATA = basic(
+    "data", "DATA", "a table (CSV or .xlsx) with one row per shape, named in the column file, scan, specimen, name or "
+    "id; a cohort file (.toml); a folder of fits, whose metadata are the table; a folder that align wrote; or a "
+    "landmark file", parse=Path,
+)  # fmt: skip
+_COHORT = (_DATA, _OUTPUT, _SHAPES)
+"""Arguments of a question: its cohort, and the output folder."""
 
 
-def _gauge() -> tuple[Option, ...]:
-    """Return the options of the gauge and the unit."""
-    return (
-        advanced("--gauge", source=COHORT),
-        advanced("--no-unit",
-                 help="the coordinates have no unit, as those of digitised landmarks: lengths are not written "
-                 "in mm"),
-    )  # fmt: skip
+def _settings(*own: Option, without: tuple[str, ...] = ()) -> tuple[Option, ...]:
+    """Return the settings of a question: its own, and those of its cohort `without` some names."""
+    return (*own, *(one for one in _COHORT_SETTINGS if one.names not in without))
 
 
-def _identity() -> tuple[Option, ...]:
-    """Return the options that verification and identification share."""
-    return (
-        *_cohort("coefficients"),
-        basic("--subject", "COLUMN", source=IDENTITY),
-        basic("--gallery", "EXPR", source=IDENTITY),
-        basic("--probe", "EXPR", source=IDENTITY),
-        advanced("--train", "EXPR", source=IDENTITY),
-        advanced("--role", "COLUMN", source=IDENTITY),
-        advanced("--folds", "N", source=IDENTITY),
-        advanced("--scores", "LIST", source=IDENTITY),
-        advanced("--modes", "K", source=IDENTITY),
-        advanced("--no-uncertainty", help="ignore the uncertainty of the fits", source=IDENTITY),
-        advanced("--draws", "N", source=IDENTITY),
-        advanced("--drop-missing", source=IDENTITY),
-        advanced("--seed", "S", source=IDENTITY),
-    )
+_IDENTITY_OPTIONS = (
+    *_COHORT,
+    basic("--gallery", "EXPR", source=IDENTITY),
+    basic("--probe", "EXPR", source=IDENTITY),
+    advanced("--train", "EXPR", source=IDENTITY),
+    advanced("--scores", "LIST", source=IDENTITY),
+    advanced("--modes", "K", source=IDENTITY),
+)
+_IDENTITY_SETTINGS = _settings(
+    setting("role", "COLUMN", source=IDENTITY),
+    setting("folds", "N", source=IDENTITY),
+    setting("uncertainty", source=IDENTITY),
+    setting("draws", "N", source=IDENTITY),
+    setting("seed", "S", source=IDENTITY),
+    without=("gauge", "unit"),
+)
 
 
 _BASIC_OF_TEST = 4
@@ -246,14 +251,12 @@ def _shape_test(test: ShapeTest) -> Command:
     return Command(
         f"test {test.name}", test.summary, (test.example,), answer_shape_tests,
         (
-            *_cohort(),
+            *_COHORT,
             *own,
             basic("--permutations", "N", source=source, parse=values.positive),
-            advanced("--drop-missing", source=source),
-            advanced("--seed", "S", source=source),
-            *_gauge(),
         ),
         defaults={"shape_test": test},
+        settings=_settings(setting("seed", "S", source=source)),
     )  # fmt: skip
 
 
@@ -408,18 +411,15 @@ COMMANDS: tuple[Command, ...] = (
                      "registered from the subject's other scans, the most usual one first"),
             advanced("--symmetric-template", source=CORRESPOND),
             advanced("--mirror", source=CORRESPOND),
-            advanced("--groups", help="bring each kind of object into correspondence, in folders group_1 (the largest "
-                     "group), group_2, ... of the output folder (default: the largest group only)"),
             advanced("--pose", source=CORRESPOND),
             advanced("--outer", source=CORRESPOND),
-            advanced("--ignore-colours", source=CORRESPOND),
-            advanced("--landmark-std", "SHARE", source=CORRESPOND, field="landmark_uncertainty", parse=values.share),
+            advanced("--groups", help="bring each kind of object into correspondence, in folders group_1 (the largest "
+                     "group), group_2, ... of the output folder (default: the largest group only)"),
             advanced("--rounds", "N", source=CORRESPOND, parse=values.positive),
             _RECURSIVE,
             advanced("--strict", help="exclude scans with coordinates that are NaN or infinite (default: remove the "
                      "triangles that use them, with a note)"),
-            *_execution("scans"),
-            advanced("--seed", "S", source=CORRESPOND),
+            _jobs("scans"),
         ),
         (
             "Writes NAME.corresponding.ply and NAME.correspond.json for each scan, and correspondence.json and "
@@ -428,6 +428,12 @@ COMMANDS: tuple[Command, ...] = (
             "run.",
         ),
         defaults=_GOES_ON,
+        settings=(
+            setting("ignore_colours", source=CORRESPOND),
+            setting("landmark_uncertainty", "SHARE", source=CORRESPOND, parse=values.share),
+            *_EXECUTION_SETTINGS,
+            setting("seed", "S", source=CORRESPOND),
+        ),
     ),
     Command(
         "build", "build a shape model from corresponding meshes: Procrustes and PCA",
@@ -484,19 +490,22 @@ COMMANDS: tuple[Command, ...] = (
             basic("--folds", "N|loo", source=QUALITY, parse=values.folds),
             basic("--modes", "K", source=QUALITY, parse=values.positive),
             basic("--samples", "N", source=QUALITY, parse=values.positive),
-            advanced("--gauge", source=QUALITY),
             advanced("--no-align", help="use the meshes in their pose, without alignment", source=QUALITY),
             advanced("--representation", source=QUALITY_TARGETS, field="representations", nargs="+",
                      choices=_REPRESENTATIONS, default=("vertices",)),
-            advanced("--control-points", "MxN", source=QUALITY, parse=values.control_points),
-            advanced("--seed", "S", source=QUALITY),
-            *_execution("folds"),
+            _jobs("folds"),
         ),
         (
             "Writes quality.json, and quality.png and quality.svg, which need the extra report. Of a folder with "
             "fitted surfaces, those of fit --dense are used; of a folder that correspond wrote, its surfaces with "
             "missing vertices. The numbers do not depend on the executor. Fewer than 200,000 vertices in all are "
             "processed by one process.",
+        ),
+        settings=(
+            setting("gauge", source=QUALITY),
+            setting("control_points", "MxN", source=QUALITY, parse=values.control_points),
+            *_EXECUTION_SETTINGS,
+            setting("seed", "S", source=QUALITY),
         ),
     ),
     Command(
@@ -535,20 +544,13 @@ COMMANDS: tuple[Command, ...] = (
             advanced("--method",
                      "NAME", "robust: pose and shape jointly, from distances in both directions; paper: the "
                      "paper's modified ICP", FIT),
-            advanced("--search", source=PAPER, choices=("auto", "vertices", "surface"), default="auto",
-                     help="closest points of --method paper: vertices of the scan (auto), as in the paper, or points "
-                     "on its triangles; the robust method always uses the triangles"),
-            advanced("--scale", source=FIT),
-            advanced("--max-iterations", "N", source=FIT, parse=values.positive),
-            advanced("--landmark-std", "MM", source=FIT, field="landmark_stddev_mm", parse=values.std_mm),
-            advanced("--crop", "KIND:NUMBERS", source=FIT),
-            *_execution("scans"),
+            *_FIT_OPTIONS,
+            _jobs("scans"),
             advanced("--again", help="fit all scans again, also those with valid results", either="results"),
             advanced("--store",
                      help="write the results to few files (the default from 10,000 scans on, and in a folder "
                      "with such files); then only counts are printed"),
             advanced("--strict", help=f"{_STRICT_HELP}; exit with 1 when a fit is doubtful", source=FIT),
-            advanced("--seed", "S", source=FIT),
         ),
         (
             "Writes coefficients.csv, and for each scan NAME.fitted.ply and NAME.fit.json. A bad scan among several "
@@ -558,12 +560,21 @@ COMMANDS: tuple[Command, ...] = (
             "run at a time writes into a folder.",
         ),
         defaults=_GOES_ON,
+        settings=(
+            _LANDMARK_STDDEV,
+            setting("search", source=PAPER, choices=("auto", "vertices", "surface"), default="auto",
+                    help="closest points of --method paper: vertices of the scan (auto), as in the paper, or points "
+                    "on its triangles; the robust method always uses the triangles"),
+            setting("max_iterations", "N", source=FIT, parse=values.positive),
+            *_EXECUTION_SETTINGS,
+            setting("seed", "S", source=FIT),
+        ),
     ),
     Command(
         "complete", "complete partial scans: the missing part with its uncertainty, and samples of the whole shape",
         ("shapespace complete model.h5 broken.ply -o completed",
          "shapespace complete model.h5 scans -o completed --mirror combined --stl",
-         "shapespace compare completed -o compared --formula '~ group'"), answer_complete,
+         "shapespace compare completed '~ group' -o compared"), answer_complete,
         (
             basic("model", "MODEL.h5", "the shape model", parse=Path),
             basic("scans", "SCAN", "scans, folders, patterns, addresses such as s3://bucket/x, or lists of these",
@@ -577,11 +588,7 @@ COMMANDS: tuple[Command, ...] = (
             basic("--stl", source=COMPLETION_FILES),
             advanced("--with-doubtful", source=COMPLETION),
             advanced("--recursive", source=COMPLETION_FILES),
-            advanced("--scale", source=FIT),
-            advanced("--landmark-std", "MM", source=FIT, field="landmark_stddev_mm", parse=values.std_mm),
-            advanced("--crop", "KIND:NUMBERS", source=FIT),
-            advanced("--seed", "S", source=COMPLETION, parse=values.natural),
-            *_figures(),
+            *_FIT_OPTIONS,
         ),
         (
             "Writes for each scan NAME.ply, the completed surface with the vertices of the model and the property "
@@ -591,6 +598,7 @@ COMMANDS: tuple[Command, ...] = (
             "scan whose fit is doubtful is refused, as its completion would look more certain than it is. The exit "
             "code is 1 if some scans have no completion, 2 if none has.",
         ),
+        settings=(_LANDMARK_STDDEV, setting("seed", "S", source=COMPLETION, parse=values.natural)),
     ),
     Command(
         "report", "write one HTML report of the fits, correspondence or study in a folder",
@@ -719,7 +727,7 @@ COMMANDS: tuple[Command, ...] = (
     Command(
         "align", "align landmarks by generalised Procrustes analysis, and name specimens to check",
         ("shapespace align skulls.tps --table skulls.csv -o aligned",
-         "shapespace compare aligned --formula '~ sex' -o sex"), answer_align,
+         "shapespace compare aligned '~ sex' -o sex"), answer_align,
         (
             basic("data", "DATA", "a landmark file (TPS, NTS, MorphoJ, CSV, .rda), or a folder of landmark files",
                   parse=Path),
@@ -735,17 +743,18 @@ COMMANDS: tuple[Command, ...] = (
             basic("--separate", "FILE", source=ALIGN_FILES, parse=Path),
             basic("--reflect", "COLUMN=VALUE", "specimens that are reflected before the alignment, such as side=left"),
             basic("--gauge", source=ALIGN),
-            advanced("--no-tangent", help="do not project shapes onto the tangent space", source=ALIGN),
-            advanced("--no-match-curves", help="keep the first points of closed curves and the directions of curves",
-                     source=ALIGN),
-            advanced("--tolerance", "T", source=ALIGN),
-            advanced("--iterations", "N", source=ALIGN, parse=values.positive),
         ),
         (
             "Writes aligned.csv (name, covariates, centroid size, coordinates), mean.csv, estimated.csv (the estimated "
             "landmarks) and align.json. The commands about cohorts, such as compare, take the folder. Conventions "
             "are those of gpagen in geomorph, but the set is never reflected. Specimens that are outliers, mirrored or "
             "have swapped landmarks are named.",
+        ),
+        settings=(
+            setting("tangent", source=ALIGN),
+            setting("match_curves", source=ALIGN),
+            setting("tolerance", "T", source=ALIGN),
+            setting("iterations", "N", source=ALIGN, parse=values.positive),
         ),
     ),
     Command(
@@ -811,8 +820,7 @@ COMMANDS: tuple[Command, ...] = (
             basic("--model", "MODEL.h5", "shape model that is fitted to them", parse=Path),
             basic("--folds", "N", "folds of subjects, fewer for fewer subjects", STUDY, default=10,
                   parse=values.positive),
-            _SEED,
-            *_execution("fits"),
+            _jobs("fits"),
             _NO_OPEN,
         ),
         (
@@ -820,12 +828,13 @@ COMMANDS: tuple[Command, ...] = (
             "and recognise.",
         ),
         defaults=_GOES_ON,
+        settings=(*_EXECUTION_SETTINGS, setting("seed", "S", source=STUDY)),
     ),
     Command(
         "recognise verify", "test whether two scans are of one subject: error rates, likelihood ratios",
         ("shapespace recognise verify scans.csv -o verified --gallery session=1",), answer_verify,
         (
-            *_identity(),
+            *_IDENTITY_OPTIONS,
             advanced("--curve", "K,K,...", source=IDENTITY, parse=values.mode_counts),
             advanced("--by", "COLUMN", source=IDENTITY),
         ),
@@ -833,91 +842,115 @@ COMMANDS: tuple[Command, ...] = (
             "Computes ROC and DET curves, the equal error rate, the rates of true accepts at given false accepts with "
             "intervals over subjects, and calibrated likelihood ratios.", _IDENTITY_RULES,
         ),
+        settings=_IDENTITY_SETTINGS,
     ),
     Command(
         "recognise identify", "identify the subject of a scan among the enrolled ones: ranks and error rates",
         ("shapespace recognise identify scans.csv -o identified --gallery expression=neutral",), answer_identify,
-        _identity(),
+        _IDENTITY_OPTIONS,
         (
             "Computes ranks (CMC), and the rate of misses if subjects who are not enrolled are searched for too.",
             _IDENTITY_RULES,
         ),
+        settings=_IDENTITY_SETTINGS,
+    ),
+    Command(
+        "cohort", "write a cohort file: shapes, table and settings, which all questions about shapes read",
+        ("shapespace cohort people.csv --shapes same --gauge form -o bones.toml",
+         "shapespace compare bones.toml '~ sex' -o sex"), answer_cohort,
+        (
+            _DATA,
+            basic("-o --output", "FILE.toml", "the cohort file", parse=Path, required=True),
+            _SHAPES,
+            *(replace(one, names=f"--{one.names}", setting=False, basic=one.names in _BASIC_OF_COHORT)
+              for one in _COHORT_SETTINGS),
+        ),
+        (
+            "The shapes are read once, so that what cannot be used is named now. Paths in the file are relative to it. "
+            "A question takes the file in place of a table, and --set changes one of its settings for one answer.",
+        ),
+    ),
+    Command(
+        "figures", "draw the figures of an answer as files for a paper",
+        ("shapespace figures sex --format svg,pdf", "shapespace figures sex --format png --dpi 600 --views dorsal"),
+        answer_figures,
+        (
+            basic("folder", "OUT", "written by compare or another question about shapes", parse=Path),
+            basic("--format", "LIST", source=FIGURES, field="formats"),
+            basic("--dpi", "N", source=FIGURES, parse=values.positive),
+            basic("--views", "LIST", source=FIGURES),
+            basic("--orientation", "FILE", source=FIGURES),
+        ),
+        ("Writes OUT/figures with captions.txt. Needs the extra report.",),
     ),
     Command(
         "compare", "test effects of groups and covariates on shape by linear models",
-        ("shapespace compare people.csv --formula '~ sex + age' -o sex-and-age",), answer_compare,
+        ("shapespace compare people.csv '~ sex + age' -o sex-and-age",), answer_compare,
         (
-            *_cohort(),
-            basic("--formula",
-                  "FORMULA", "linear model of shape, such as '~ sex + age'; size and log_size are available "
-                  "too", required=True),
+            *_COHORT,
+            basic("formula", "FORMULA", "linear model of shape, such as '~ sex + age'; size and log_size are available "
+                  "too"),
             basic("--blocks", "COLUMN", source=COMPARE),
             basic("--permutations", "N", source=COMPARE, parse=values.integer),
             advanced("--random", "TERMS", source=COMPARE),
             advanced("--error", "TERM=ERROR", "error term of a term, over whose mean square its F is computed, such as "
                      "genus=genus:species; can be repeated (default: the residuals)", parse=values.error_term,
                      repeat=True),
-            advanced("--error-permutation", source=COMPARE),
-            advanced("--coding", source=COMPARE),
             advanced("--type", source=COMPARE, field="anova_type", dest="anova_type"),
             advanced("--level", "P", source=COMPARE, field="alpha"),
             advanced("--variances", source=COMPARE),
-            advanced("--effect-size", source=COMPARE),
-            advanced("--weights", source=COMPARE),
-            advanced("--no-maps", help="skip the tests of each vertex", source=COMPARE),
             advanced("--bumps", "MM", source=COMPARE, field="bump_width_mm"),
-            advanced("--drop-missing", source=COMPARE),
-            advanced("--seed", "S", source=COMPARE, parse=values.integer),
-            *_gauge(),
+        ),
+        settings=_settings(
+            setting("error_permutation", source=COMPARE),
+            setting("coding", source=COMPARE),
+            setting("effect_size", source=COMPARE),
+            setting("weights", source=COMPARE),
+            setting("maps", source=COMPARE),
+            setting("seed", "S", source=COMPARE, parse=values.integer),
         ),
     ),
     Command(
         "morphospace", "draw shapes on axes of an ordination, and the shape at any place: PCA, CVA, phylogenetic axes",
         ("shapespace morphospace people.csv --group sex -o morphospace",
-         "shapespace morphospace species.tps --tree species.nwk --format pdf -o phylomorphospace"), answer_morphospace,
+         "shapespace morphospace species.tps --tree species.nwk -o phylomorphospace"), answer_morphospace,
         (
-            *_cohort(),
+            *_COHORT,
             basic("--method", source=MORPHOSPACE),
             basic("--group", "COLUMN", source=MORPHOSPACE),
             basic("--tree", "FILE", source=MORPHOSPACE),
             basic("--axes", "A,B", "numbers of the axes drawn across and up", parse=values.axes, default=(1, 2)),
             advanced("--components", "N", source=MORPHOSPACE, parse=values.positive),
-            advanced("--drop-missing", source=MORPHOSPACE),
-            *_gauge(),
         ),
         (
             "In the plot of the report a click, or the arrow keys, choose a place; the shape there is drawn next to "
             "the mean. Scores, loadings (change of each coordinate per unit of score) and eigenvalues are CSV tables.",
         ),
+        settings=_settings(),
     ),
     *(_shape_test(test) for test in SHAPE_TESTS),
     Command(
         "change", "measure change between visits of the same subjects, in mm, and its noise",
         ("shapespace change visits.csv -o change --order before,after",), answer_change,
         (
-            *_cohort(),
-            basic("--subject", "COLUMN", source=CHANGE),
+            *_COHORT,
             basic("--time", "COLUMN", source=CHANGE),
             basic("--order", "LIST", source=CHANGE),
             basic("--group", "COLUMN", source=CHANGE),
             basic("--stable", "WHAT", source=CHANGE),
             advanced("--region", "NAME=FILE", "region whose volume is also reported: a CSV file of vertices; can be "
                      "repeated (default: the regions of the model)", parse=values.named_file, repeat=True),
-            advanced("--landmarks", "FILE", "CSV of name,vertex, or landmarks.csv of correspond (default: those of the "
-                     "model)", parse=Path),
             advanced("--variances", source=CHANGE),
             advanced("--rate", source=CHANGE),
             advanced("--permutations", "N", source=CHANGE, parse=values.integer),
-            advanced("--drop-missing", source=CHANGE),
-            advanced("--seed", "S", source=CHANGE, parse=values.integer),
         ),
+        settings=_settings(setting("seed", "S", source=CHANGE, parse=values.integer), without=("gauge", "unit")),
     ),
     Command(
         "asymmetry", "measure asymmetry: scores and maps, directional and fluctuating asymmetry",
-        ("shapespace asymmetry skulls.csv --surfaces dense -o asymmetry",), answer_asymmetry,
+        ("shapespace asymmetry skulls.csv -o asymmetry --set surfaces=dense",), answer_asymmetry,
         (
-            *_cohort(),
-            basic("--subject", "COLUMN", source=ASYMMETRY),
+            *_COHORT,
             basic("--reference", "COLUMN=VALUE", "group that scores are compared with (default: all)"),
             basic("--pairs",
                   "PAIRS.csv", "two columns of landmarks that mirror each other, by name or by number from 1; those in "
@@ -927,57 +960,49 @@ COMMANDS: tuple[Command, ...] = (
             basic("--side", "COLUMN", source=ASYMMETRY),
             advanced("--degrees-of-freedom", source=ASYMMETRY),
             advanced("--permutations", "P", source=ASYMMETRY, parse=values.integer),
-            advanced("--drop-missing", source=ASYMMETRY),
-            advanced("--seed", "S", source=ASYMMETRY, parse=values.integer),
-            *_gauge(),
         ),
+        settings=_settings(setting("seed", "S", source=ASYMMETRY, parse=values.integer)),
     ),
     Command(
         "regress", "predict a number, such as age, from shape, or the mean shape along a number, with intervals",
         ("shapespace regress people.csv --target age -o age --predict new.csv",
          "shapespace regress people.csv --along age --at 20,40,60 --covariates sex -o growth"), answer_regress,
         (
-            *_cohort(),
+            *_COHORT,
             basic("--target", "COLUMN", source=REGRESS, either=_TARGET, required=True),
             basic("--predictor", "FILE.npz", "predict DATA with the predictor.npz of an earlier run", parse=Path,
                   either=_TARGET, required=True),
             basic("--along", "COLUMN", source=ALONG, either=_TARGET, required=True),
             basic("--at", "VALUES", source=ALONG, parse=values.numbers),
-            advanced("--curve", source=ALONG, default=None),
             advanced("--covariates", "TERMS", source=ALONG),
-            advanced("--hold", "COLUMN=VALUE", "of --along: value of another column, such as sex=female; commas part "
-                     "several (default: numbers at their mean, and classes count alike)", parse=values.words),
             advanced("--length", "A,B", "of --along: two landmarks whose distance is predicted too; can be repeated",
                      source=ALONG, field="lengths", parse=values.words, repeat=True, default=[]),
-            basic("--predict", "NEW", "also predict new shapes, of other subjects: a table or a folder", parse=Path),
-            advanced("--new-shapes", "DIR", "results of fits, or meshes, of NEW (default: its folder)", parse=Path),
-            advanced("--subject", "COLUMN", source=REGRESS),
-            advanced("--folds", "K", source=REGRESS, parse=values.integer),
+            basic("--predict", "NEW", "also predict new shapes, of other subjects: a table, a folder or a cohort file",
+                  parse=Path),
             advanced("--permutations", "P", "permutations for p, 0 for none (default: 199; with --along 1000)",
                      parse=values.integer),
-            advanced("--level", "L", "coverage of intervals (default: 0.9; with --along 0.95)", dest="confidence",
-                     parse=values.number),
-            advanced("--drop-missing", source=REGRESS),
-            advanced("--seed", "S", source=REGRESS, parse=values.integer),
-            *_gauge(),
+        ),
+        settings=_settings(
+            setting("curve", source=ALONG, default=None),
+            setting("hold", "COLUMN=VALUE", "of --along: value of another column, such as sex=female; commas part "
+                    "several (default: numbers at their mean, and classes count alike)", parse=values.words),
+            setting("folds", "K", source=REGRESS, parse=values.integer),
+            setting("level", "L", "coverage of intervals (default: 0.9; with --along 0.95)", dest="confidence",
+                    parse=values.number),
+            setting("seed", "S", source=REGRESS, parse=values.integer),
         ),
     ),
     Command(
         "score", "score new subjects against a reference population: distance, percentile, z-map",
         ("shapespace score patients -o scored --reference controls.csv",), answer_score,
         (
-            *_cohort("coefficients"),
-            basic("--reference", "DATA", "the population: a table, fits or landmarks; its doubtful fits are excluded",
-                  parse=Path, required=True),
-            basic("--reference-shapes", "DIR", "its results of fits, or meshes (default: the folder of the reference)",
-                  parse=Path),
-            basic("--subject", "COLUMN", source=SCORE),
+            *_COHORT,
+            basic("--reference", "DATA", "the population: a table, a cohort file, fits or landmarks; its doubtful fits "
+                  "are excluded", parse=Path, required=True),
             basic("--modes", "N", source=SCORE, parse=values.integer),
             basic("--nearest", "N", source=SCORE, parse=values.integer),
-            advanced("--drop-missing", source=SCORE),
-            advanced("--seed", "S", source=SCORE, parse=values.integer),
-            *_gauge(),
         ),
+        settings=_settings(setting("seed", "S", source=SCORE, parse=values.integer)),
     ),
     Command(
         "export", "export fits as single files or one table, or any cohort to geomorph, MorphoJ, TPS or CSV",
@@ -991,9 +1016,7 @@ COMMANDS: tuple[Command, ...] = (
             basic("--table", "FILE", source=EXPORT),
             basic("--to", source=EXPORT_COHORT),
             basic("--formula", "FORMULA", source=EXPORT_COHORT),
-            advanced("--drop-missing", source=EXPORT_COHORT),
-            *(option for option in _cohort() if option.source is COHORT),
-            *_gauge(),
+            _SHAPES,
         ),
         (
             "With --to, the aligned coordinates, the table and the sizes of a cohort are written. For geomorph, "
@@ -1003,6 +1026,7 @@ COMMANDS: tuple[Command, ...] = (
             "the columns of coefficients.csv, the rows of each shard in turn; in MATLAB it is a struct fits with b, "
             "z, b_stddev, scan and so on. The exit code is 1 if some of the fits cannot be read, 2 if none can.",
         ),
+        settings=_settings(),
     ),
     Command(
         "convert", "convert a shape model from or to the format of another tool",
@@ -1028,5 +1052,5 @@ COMMANDS: tuple[Command, ...] = (
 
 
 def summaries_and_options() -> dict[str, tuple[str, tuple[Option, ...]]]:
-    """Return name -> summary and options of all commands."""
-    return {command.name: (command.summary, command.options) for command in COMMANDS}
+    """Return name -> summary, and options and settings of all commands."""
+    return {command.name: (command.summary, (*command.options, *command.settings)) for command in COMMANDS}

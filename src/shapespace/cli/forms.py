@@ -11,6 +11,7 @@ from shapespace.formats.registry import MODEL_FORMATS
 _KINDS: Mapping[str, str] = {"identify": "recognise identify"}
 _FIRST: Mapping[str, tuple[str, ...]] = {
     "correspond": ("--vertices", "--mirror", "--pose"),
+    "figures": ("--format",),
     "build": ("--modes", "--gauge", "--unit"),
     "quality": ("--folds", "--samples", "--modes"),
     "morphospace": ("--method", "--group", "--gauge"),
@@ -29,9 +30,9 @@ _FIRST: Mapping[str, tuple[str, ...]] = {
 """Command -> the options that its form shows; the others are folded."""
 _FILES = frozenset(
     {
-        "--output", "--shapes", "--model", "--reference-shapes", "--table", "--labels", "--template", "--subjects",
-        "--add", "--redo", "--remove", "--update", "--recursive", "--dask", "--executor", "--predictor", "--predict",
-        "--new-shapes", "--no-open", "--json", "--quiet", "--all", "--groups", "--surfaces",
+        "--output", "--shapes", "--model", "--table", "--labels", "--template", "--subjects", "--add", "--redo",
+        "--remove", "--update", "--recursive", "--dask", "--executor", "--predictor", "--predict", "--no-open",
+        "--json", "--quiet", "--all", "--groups", "--surfaces", "--set", "--orientation",
     }
 )  # fmt: skip
 """Options that the studio sets itself, or that name files."""
@@ -53,21 +54,31 @@ def forms(commands: Mapping[str, tuple[str, Sequence[Option]]]) -> dict[str, dic
 
 
 def _form(summary: str, options: Sequence[Option], first: tuple[str, ...]) -> dict[str, Any]:
-    offered = [option for option in options if not option.is_positional and not _FILES & set(option.spellings)]
     order = {flag: place for place, flag in enumerate(first)}
-    described = [_described(option, visible=option.spellings[-1] in order) for option in offered]
+    offered = [option for option in options if not option.is_positional or option.metavar == "FORMULA"]
+    described = [_described(option, visible=_flag(option) in order) for option in offered]
+    described = [option for option in described if option["flag"] not in _FILES]
     described.sort(key=lambda one: order.get(one["flag"], len(order)))
     return {"summary": summary, "options": described}
+
+
+def _flag(option: Option) -> str:
+    """Return the name of an option on the page, also of a setting and of a formula."""
+    return f"--{option.names.replace('_', '-')}" if option.setting or option.is_positional else option.spellings[-1]
 
 
 def _described(option: Option, *, visible: bool) -> dict[str, Any]:
     initial = option.initial
     known = initial is not NO_DEFAULT and initial not in (None, (), [], "") and not option.is_flag
     words = " ".join(map(str, cast(tuple[Any, ...], initial))) if isinstance(initial, tuple) else str(initial)
+    choices = list(option.accepted)
+    if option.setting and isinstance(initial, bool):
+        choices, words = ["yes", "no"], "yes" if initial else "no"
+    way = f"--set {option.names}" if option.setting else "" if option.is_positional else option.spellings[-1]
     return {
-        "flag": option.spellings[-1], "help": option.text.replace("`", ""), "kind": _kind(option),
-        "choices": list(option.accepted), "initial": words if known else None, "visible": visible,
-        "required": (option.required and not option.either) or option.spellings[-1] == "--to",
+        "flag": _flag(option), "way": way, "help": option.text.replace("`", ""),
+        "kind": "choice" if choices else _kind(option), "choices": choices, "initial": words if known else None, "visible": visible,
+        "required": (option.required and not option.either) or option.names in ("formula", "--to"),
     }  # fmt: skip
 
 

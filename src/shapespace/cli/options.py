@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import difflib
 import pkgutil
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -29,6 +30,7 @@ _PARSERS: dict[str, Callable[[str], Any]] = {
     "Path": Path,
     "tuple[str, ...]": values.words,
     "tuple[int, ...]": values.counts,
+    "bool": values.yes_or_no,
 }
 """Annotation -> parser of its values."""
 
@@ -86,6 +88,7 @@ class Option:
         repeat: whether it can be given several times.
         dest: attribute of the parsed arguments; empty for the long spelling.
         either: name of a group of options of which only one can be given; one must, if they are `required`.
+        setting: whether it is given as `--set NAME=VALUE`; its only spelling is NAME.
     """
 
     names: str
@@ -102,6 +105,7 @@ class Option:
     repeat: bool = False
     dest: str = ""
     either: str = ""
+    setting: bool = False
 
     @property
     def spellings(self) -> list[str]:
@@ -111,7 +115,7 @@ class Option:
     @property
     def is_positional(self) -> bool:
         """Whether it is given without a name."""
-        return not self.names.startswith("-")
+        return not (self.setting or self.names.startswith("-"))
 
     @property
     def attribute(self) -> str:
@@ -132,12 +136,17 @@ class Option:
     @property
     def is_flag(self) -> bool:
         """Whether it takes no value."""
-        return not (self.is_positional or self.metavar or self.accepted)
+        return not (self.setting or self.is_positional or self.metavar or self.accepted)
 
     @property
     def accepted(self) -> tuple[str, ...]:
         """The values that it accepts; empty for all that can be parsed."""
         return self.choices or (self._field.choices if self._field and not self.parse and not self.metavar else ())
+
+    @property
+    def value_name(self) -> str:
+        """The name of its value, or the values that it accepts."""
+        return self.metavar or "|".join(self.accepted) or ("yes|no" if self.setting else "")
 
     @property
     def initial(self) -> Any:
@@ -153,7 +162,8 @@ class Option:
         initial = self.initial
         if self.is_flag or initial in (NO_DEFAULT, None, "", (), []) or "(default" in text or self.required:
             return text
-        default_text = " ".join(map(str, cast(Sequence[Any], initial))) if isinstance(initial, tuple) else initial
+        words = cast(Sequence[Any], initial) if isinstance(initial, tuple) else (initial,)
+        default_text = " ".join({True: "yes", False: "no"}[w] if isinstance(w, bool) else str(w) for w in words)
         return f"{text} (default: {default_text})"
 
     @property
@@ -178,6 +188,16 @@ class Option:
         keywords |= {"type": self.parse or self._parser(), "default": self.initial}
         group.add_argument(*self.spellings, metavar=self.metavar or None, **keywords)
 
+    def parse_value(self, text: str) -> Any:
+        """Return the value of a text.
+
+        Raises:
+            ArgumentTypeError: the text is no value of this option.
+        """
+        if self.accepted and text not in self.accepted:
+            raise argparse.ArgumentTypeError(f"is {text!r}; choose from {', '.join(self.accepted)}")
+        return (self.parse or self._parser())(text)
+
     def _parser(self) -> Callable[[str], Any]:
         kinds = self._field.kinds if self._field else ()
         return next((_PARSERS[kind] for kind in kinds if kind in _PARSERS), str)
@@ -187,6 +207,39 @@ basic = Option
 """An option that `--help` lists."""
 advanced = partial(Option, basic=False)
 """An option that only `--help-all` lists."""
+setting = partial(Option, basic=False, setting=True)
+"""A value that is given as `--set NAME=VALUE`."""
+
+
+def apply_settings(arguments: argparse.Namespace, settings: Sequence[Option]) -> None:
+    """Set the attributes of parsed arguments to the values of `--set NAME=VALUE`.
+
+    Args:
+        arguments: parsed arguments; `chosen` becomes the names of the settings that are given.
+        settings: those of the command.
+
+    Raises:
+        ArgumentTypeError: a setting that the command does not have, or a value that it does not accept.
+    """
+    known = {option.names: option for option in settings}
+    for option in settings:
+        if option.initial is not NO_DEFAULT:
+            setattr(arguments, option.attribute, option.initial)
+    chosen: set[str] = set()
+    for text in arguments.set or ():
+        name, equals, value = (part.strip() for part in text.partition("="))
+        if not equals:
+            raise argparse.ArgumentTypeError(f"argument --set: {text!r} is not NAME=VALUE")
+        if name not in known:
+            nearest = ", ".join(difflib.get_close_matches(name, known, 1) or sorted(known))
+            raise argparse.ArgumentTypeError(f"argument --set: there is no setting {name!r}; choose {nearest}")
+        option = known[name]
+        try:
+            setattr(arguments, option.attribute, option.parse_value(value))
+        except argparse.ArgumentTypeError as error:
+            raise argparse.ArgumentTypeError(f"argument --set: {name} {error}") from None
+        chosen.add(name)
+    arguments.chosen = frozenset(chosen)
 
 
 def given(arguments: argparse.Namespace, taker: Callable[..., Any], **instead: Any) -> dict[str, Any]:
@@ -198,7 +251,7 @@ def given(arguments: argparse.Namespace, taker: Callable[..., Any], **instead: A
         instead: values of some fields that the command line computes.
     """
     chosen: dict[str, Any] = {}
-    for option in arguments.command.options:
+    for option in (*arguments.command.options, *arguments.command.settings):
         if option.source is not None and option.source.name == taker.__name__ and hasattr(arguments, option.attribute):
             value = getattr(arguments, option.attribute)
             if option.is_flag and not value:

@@ -87,6 +87,13 @@ def _number(text: str, accepts: Callable[[float], bool], accepted: str) -> float
     return value
 
 
+def yes_or_no(text: str) -> bool:
+    """Return whether a text is `yes` or `true`."""
+    if text.lower() not in ("yes", "true", "no", "false"):
+        raise argparse.ArgumentTypeError(f"must be yes or no, not {text!r}")
+    return text.lower() in ("yes", "true")
+
+
 def memory_bytes(text: str) -> int:
     """Return a size such as 8G as bytes."""
     match = re.fullmatch(r"(\d{1,9}(?:\.\d{1,6})?)([KMGT])(?:i?B)?", text, re.IGNORECASE | re.ASCII)

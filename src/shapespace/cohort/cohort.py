@@ -26,7 +26,7 @@ from shapespace.lazy import lazy_import
 from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import list_briefly, short_repr
-from shapespace.schemas import SurfaceReview
+from shapespace.schemas import Orientation, SurfaceReview
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, SurfaceLandmarks, common_faces, read_only
 
 SUBJECT = "subject"
@@ -138,6 +138,8 @@ class Cohort:
         fitted: of fits; None for other surfaces.
         notes: who was left out and why, a sentence each.
         cautions: sentences on the use of columns that answers begin with.
+        drop_missing: whether all questions exclude shapes with missing values in the table.
+        orientation: named views and links of the figures; None for views that are chosen by the form of the object.
         source: source of the shapes.
         unit: of lengths: `mm`, or empty for coordinates without a unit, such as those of unit centroid size.
         observed: (N, V) bool, False for vertices that are estimates; None if all are observed.
@@ -169,6 +171,8 @@ class Cohort:
     samples: tuple[ShapeSamples | None, ...] = ()
     review: SurfaceReview = field(default_factory=SurfaceReview)
     cautions: tuple[str, ...] = ()
+    drop_missing: bool = False
+    orientation: Orientation | None = None
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -331,10 +335,10 @@ class Cohort:
             return replace(self, notes=(*self.notes, *new)) if new else self
         excluded_names = list_names([self.names[row] for row in missing])
         columns = [column for column in dict.fromkeys(columns) if self.table.missing([column])]
-        if not drop_missing:
+        if not (drop_missing or self.drop_missing):
             raise InputError(
                 f"{self.table.where}: {' or '.join(columns)} of {len(missing)} of {len(self)} shapes is missing "
-                f"({excluded_names}); fill it in, or leave them out with --drop-missing."
+                f"({excluded_names}); fill it in, or leave them out with --set missing=drop."
             )
         if len(missing) == len(self):
             raise InputError(f"{self.table.where}: no shape has all of {', '.join(columns)}; fill them in.")
@@ -550,7 +554,7 @@ class Cohort:
             without_size = [name for name, size in zip(names, sizes_mm, strict=True) if not np.isfinite(size)]
             raise InputError(
                 f"The size of {list_names(without_size)} is not known in mm, so forms cannot be compared; fit with "
-                "--unit, or compare shapes with --gauge shape."
+                "--unit, or compare shapes with --set gauge=shape."
             )
         if gauge == "form" or model.gauge == "form":
             centre = reference.mean(axis=0)
@@ -636,7 +640,7 @@ def subjects_of(cohort: Cohort, column: str | None) -> tuple[str, ...]:
     if not all(cells):
         raise InputError(
             f"{cohort.table.where}: {column or SUBJECT!r} of {cohort.names[cells.index('')]} is missing; fill it in, "
-            "or leave such shapes out with --drop-missing."
+            "or leave such shapes out with --set missing=drop."
         )
     return cells
 

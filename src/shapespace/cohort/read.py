@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
+import os
+import tomllib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, cast, get_args
 
 import numpy as np
 
-from shapespace.cohort.cohort import Cohort, Fitted, ShapeSource
+from shapespace.cohort.cohort import SUBJECT, Cohort, Fitted, ShapeSource
 from shapespace.cohort.landmark_cohort import has_landmarks, landmark_cohort, read_landmark_cohort
+from shapespace.cohort.orientation import find_orientation
 from shapespace.cohort.shape_samples import ENDING, SampleFile, find_samples
 from shapespace.cohort.table import Table, list_names, match_rows, name_key, names_of_file, read_table
-from shapespace.errors import InputError
+from shapespace.errors import FileFormatError, InputError
 from shapespace.geometry.procrustes import Gauge
+from shapespace.io.files import read_bytes, write_text
 from shapespace.io.landmarks.landmark_io import read_surface_landmarks
 from shapespace.model.additive import AdditiveModel, load_model
 from shapespace.model.shape_model import ShapeModel
@@ -24,13 +30,20 @@ from shapespace.store.corresponding import SURFACE, SurfaceFiles, surface_files,
 from shapespace.store.results import Results, modes_of
 from shapespace.store.review_text import review_summary
 from shapespace.store.rows import META
-from shapespace.types import FloatArray, Mesh, read_only
+from shapespace.types import FloatArray, Mesh, SurfaceLandmarks, read_only
 
 Geometry: TypeAlias = Literal["surface", "landmarks"]
 Surfaces: TypeAlias = Literal["auto", "coefficients", "fitted", "dense"]
 SURFACES: tuple[Surfaces, ...] = ("auto", "coefficients", "fitted", "dense")
 """Shapes of fits: the model's coefficients, or a surface stored with the record. `auto` is dense where all have one."""
 
+PATHS = ("shapes", "model", "landmarks", "orientation")
+"""Fields of `CohortConfig` that are paths."""
+COHORT_ENDING = ".toml"
+"""Ending of cohort files."""
+_LONGEST_FILE = 1_000_000  # bytes of a cohort file
+_OF_QUESTIONS = ("least", "accept_review")
+"""Fields of `CohortConfig` that a question sets."""
 _USED = ("converged", "max_iterations")
 _LANDMARKS = "landmarks.csv"
 """Landmarks that all meshes of a folder carry, as `correspond` writes them."""
@@ -54,6 +67,12 @@ class CohortConfig:
         least: shapes that there must be; one will do where it is compared with what is known already.
         imputations: number of samples of each completed shape (NAME.samples.npz next to NAME.ply) that compare,
             regress, asymmetry and score combine by Rubin's rules; 0 or 1 ignores samples.
+        unit: unit of the lengths; `none` for coordinates without a unit, as those of digitised landmarks.
+        missing: `refuse` shapes with missing values in the table, or `drop` them.
+        subject: column that names whose a shape is (default: subject).
+        landmarks: CSV of name,vertex, or landmarks.csv of correspond (default: those of the model or the folder).
+        orientation: JSON file with named views of the object, such as dorsal, and links between landmarks (default:
+            orientation.json and links.csv next to the shapes).
     """
 
     shapes: Path | str | None = None
@@ -65,20 +84,85 @@ class CohortConfig:
     geometry: Geometry = "surface"
     least: int = 2
     imputations: int = 20
+    unit: Literal["mm", "none"] = "mm"
+    missing: Literal["refuse", "drop"] = "refuse"
+    subject: str | None = None
+    landmarks: Path | str | None = None
+    orientation: Path | str | None = None
 
     def __post_init__(self) -> None:
         if self.imputations < 0:
             raise InputError("CohortConfig: the number of imputations must be 0 or more.")
-        for name, path in (("shapes", self.shapes), ("model", self.model)):
+        for name in PATHS:
+            path = getattr(self, name)
             if path is not None and not isinstance(path, str | PathLike):  # pyright: ignore[reportUnnecessaryIsInstance]
                 raise InputError(f"CohortConfig: {name} is a path, not {type(path).__name__}; give a str or a Path.")
         for name, value, choices in (
             ("surfaces", self.surfaces, SURFACES),
             ("gauge", self.gauge, get_args(Gauge)),
             ("geometry", self.geometry, get_args(Geometry)),
+            ("unit", self.unit, ("mm", "none")),
+            ("missing", self.missing, ("refuse", "drop")),
         ):
             if value not in choices:
                 raise InputError(f"CohortConfig: there is no {name} {value!r}; choose one of {', '.join(choices)}.")
+
+
+def is_cohort_file(data: object) -> bool:
+    """Return whether data are a path with the ending of cohort files, .toml."""
+    return isinstance(data, str | PathLike) and Path(cast("str", data)).suffix.lower() == COHORT_ENDING
+
+
+def read_cohort_file(path: Path) -> tuple[Path, dict[str, Any]]:
+    """Return the data of a cohort file, and the fields of `CohortConfig` that it states.
+
+    Raises:
+        FileError: the file cannot be read.
+        FileFormatError: it is not TOML, has no data, or has a setting that there is not.
+        InputError: a value that a setting does not have.
+    """
+    again = "write it again with shapespace cohort"
+    try:
+        stated = tomllib.loads(read_bytes(path, _LONGEST_FILE).decode("utf-8-sig"))
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+        raise FileFormatError(f"{path} is not a TOML file ({str(error)[:100]}); {again}.") from error
+    defaults = {field.name: field.default for field in fields(CohortConfig) if field.name not in _OF_QUESTIONS}
+    for name in ("data", *defaults):
+        kind = str if defaults.get(name) is None else type(defaults[name])
+        if (name in stated or name == "data") and type(stated.get(name)) is not kind:
+            expected = {str: "a text", int: "a whole number", bool: "true or false"}[kind]
+            raise FileFormatError(f"{path} needs {expected} as its {name}; {again}.")
+    if unknown := sorted(stated.keys() - defaults.keys() - {"data"}):
+        raise FileFormatError(f"{path} has a setting {unknown[0][:40]!r}, which cohorts do not have; {again}.")
+    stated |= {name: path.parent / stated[name] for name in ("data", *PATHS) if name in stated}
+    return cast(Path, stated.pop("data")), stated
+
+
+def write_cohort_file(path: Path | str, data: Path | str, **settings: Any) -> None:
+    """Write a cohort file: the data and the settings of a cohort, which all questions about its shapes read.
+
+    Args:
+        path: NAME.toml.
+        data: table, folder or landmark file.
+        settings: fields of `CohortConfig`; those that are not given keep their default.
+
+    Raises:
+        InputError: another ending, or a setting that there is not.
+        FileError: the file cannot be written.
+    """
+    path = Path(path)
+    if not is_cohort_file(path):
+        raise InputError(f"{path} needs the ending {COHORT_ENDING}; give the name of a cohort file.")
+    CohortConfig(**settings)
+    folder = path.absolute().parent
+    stated = {"data": data, **{name: value for name, value in settings.items() if value is not None}}
+    for name in ("data", *PATHS):
+        if name in stated:
+            with contextlib.suppress(ValueError):  # another drive: an absolute path
+                stated[name] = os.path.relpath(stated[name], folder)
+            stated[name] = Path(stated[name]).as_posix()
+    lines = [f"{name} = {json.dumps(value, ensure_ascii=False)}\n" for name, value in stated.items()]
+    write_text(path, "".join(lines))
 
 
 def read_cohort(
@@ -98,18 +182,53 @@ def read_cohort(
     Args:
         data: a table whose column `file`, `scan`, `specimen`, `name` or `id` names a shape in each row
             (coefficients.csv is one), as a file or a DataFrame; a folder of results of fits, whose metadata are the
-            table; or landmarks.
-        config: which shapes; None for the defaults.
+            table; landmarks; or a cohort file (`write_cohort_file`).
+        config: which shapes; None for the defaults, or those of the cohort file.
         onto: a cohort that these shapes, of which there may be one alone, are to be compared with.
         on_shape: called with (done, total) as surfaces are read.
 
     Raises:
         FileError: something cannot be read.
         FileFormatError: something is damaged, or the table is none.
-        InputError: no row has a shape, fits of different models, the same scan twice, or fewer than two shapes.
+        InputError: no row has a shape, fits of different models, the same scan twice, fewer than two shapes, or
+            settings beside those of a cohort file.
         CorrespondenceError: meshes that are not in correspondence.
     """
+    if is_cohort_file(data):
+        if config is not None:
+            raise InputError(f"{data} contains the settings of the cohort; leave the others out, or give its table.")
+        data, stated = read_cohort_file(Path(data))
+        config = CohortConfig(**stated)
     config = config or CohortConfig()
+    cohort = _read(data, config, onto, on_shape)
+    if config.landmarks is not None:
+        cohort = replace(cohort, landmarks=_landmarks_of(Path(config.landmarks), cohort.n_vertices))
+    if config.subject is not None:
+        columns = {**cohort.table.columns, SUBJECT: cohort.table.texts(config.subject)}
+        cohort = replace(cohort, table=replace(cohort.table, columns=columns))
+    places = [Path(place) for place in (config.shapes, data) if isinstance(place, str | PathLike)]
+    orientation = find_orientation(
+        None if config.orientation is None else Path(config.orientation),
+        [place if place.is_dir() else place.parent for place in places],
+    )
+    unit = "" if config.unit == "none" else cohort.unit
+    return replace(cohort, unit=unit, drop_missing=config.missing == "drop", orientation=orientation)
+
+
+def _landmarks_of(path: Path, n_vertices: int) -> SurfaceLandmarks:
+    found = read_surface_landmarks(path)
+    for name, vertex in zip(found.names, found.corners.max(axis=1).tolist(), strict=True):
+        if vertex >= n_vertices:
+            raise InputError(
+                f"{path}: landmark {name[:40]!r} is at vertex {vertex}, but the surfaces have {n_vertices}; give "
+                "landmarks of these surfaces."
+            )
+    return found
+
+
+def _read(
+    data: Path | str | Any, config: CohortConfig, onto: Cohort | None, on_shape: Callable[[int, int], None] | None
+) -> Cohort:
     given: Table | None = None
     if not isinstance(data, str | PathLike):
         given = data if isinstance(data, Table) else Table.of(data)
@@ -124,7 +243,7 @@ def read_cohort(
         return read_landmark_cohort(source, table, config.gauge, onto, config.least)
     if config.geometry == "landmarks":
         least = 1 if onto is not None else config.least
-        surfaces = read_cohort(given or data, replace(config, geometry="surface", least=least), on_shape=on_shape)
+        surfaces = _read(given or data, replace(config, geometry="surface", least=least), None, on_shape)
         if surfaces.samples:
             note = (
                 "The samples of completed shapes are not used for landmarks, so p does not contain their uncertainty."
@@ -257,7 +376,7 @@ def _of_results(
         if unknown and config.gauge == "form":
             raise InputError(
                 f"The size of {list_names(unknown)} is not known in mm, so forms cannot be compared; fit with --unit, "
-                "or compare shapes with --gauge shape."
+                "or compare shapes with --set gauge=shape."
             )
         meshes: list[Mesh] = []
         for index, row in enumerate(fits):
@@ -298,10 +417,10 @@ def _of_surfaces(
     listing = surface_files([folder])
     matched, _ = _match_files(table, listing, folder)
     review = listing.review(
-        [file for file, _ in matched], "--doubtful",
+        [file for file, _ in matched], "--set doubtful=yes",
         accept=config.doubtful if config.accept_review is None else config.accept_review,
     )  # fmt: skip
-    listing = listing if config.doubtful else listing.without_doubtful("--doubtful")
+    listing = listing if config.doubtful else listing.without_doubtful("--set doubtful=yes")
     notes = [*([f"{summary}."] if (summary := review_summary(review)) else []), *listing.notes]
     if config.gauge == "form":
         listing.refuse_mixed_units()
@@ -365,11 +484,15 @@ def _model_of(results: Results, fit: _Row, given: Path | None) -> tuple[ShapeMod
     source = results.fit(fit.name).model
     path = given or results.folder / (source.path or source.name)
     if given is None and not path.is_file():
-        raise InputError(f"{results.folder}: the model {path.name} is no longer at {path}; give it with --model.")
+        raise InputError(
+            f"{results.folder}: the model {path.name} is no longer at {path}; give it with --set model=MODEL.h5."
+        )
     read_model = load_model(path)
     model, additive = (read_model.shape, read_model) if isinstance(read_model, AdditiveModel) else (read_model, None)
     if model.content_hash != fit.model_hash:
-        raise InputError(f"{path} is not the model of the fits in {results.folder}; give the right one with --model.")
+        raise InputError(
+            f"{path} is not the model of the fits in {results.folder}; give the right one with --set model=MODEL.h5."
+        )
     return model, additive
 
 

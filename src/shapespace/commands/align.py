@@ -7,6 +7,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from shapespace.cohort.landmark_cohort import join_table, write_aligned
+from shapespace.cohort.orientation import find_orientation
 from shapespace.cohort.table import Table, list_names, refuse_repeated
 from shapespace.commands.landmark_data import find_other_scales
 from shapespace.errors import FileFormatError, InputError
@@ -23,7 +24,6 @@ from shapespace.io.landmarks.landmark_configurations import LandmarkConfiguratio
 from shapespace.io.tables.table_io import key_column, read_rows
 from shapespace.report.analyses.analysis_report import METHODS_FILE
 from shapespace.report.analyses.methods_section import alignment_text
-from shapespace.report.inputs.orientation import find_orientation
 from shapespace.schemas import AlignFinding, AlignRecord, Orientation, json_text, to_json
 from shapespace.version import __version__
 

@@ -2,59 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 from shapespace.batch.progress import progress, waiting
-from shapespace.errors import InputError, ShapespaceError
+from shapespace.errors import ShapespaceError
 from shapespace.report.analyses.analysis_report import AnalysisReport
-from shapespace.schemas import Orientation
-
-_FORMATS = ("svg", "pdf", "png")
 
 
-@dataclass(frozen=True)
-class FigureConfig:
-    """Figures of an analysis.
-
-    Args:
-        formats: write all figures for a paper to OUT/figures, in these formats: svg, pdf, png (default: none).
-        dpi: resolution of PNG figures, and of surfaces in SVG and PDF.
-        orientation: JSON file with named views of the object, such as dorsal, and links between landmarks (default:
-            orientation.json and links.csv next to the shapes).
-
-    Raises:
-        InputError: another format, or a resolution below 72 or above 1200.
-    """
-
-    formats: tuple[str, ...] = ()
-    dpi: int = 300
-    orientation: Path | None = None
-
-    def __post_init__(self) -> None:
-        unknown = [one for one in self.formats if one not in _FORMATS]
-        if unknown:
-            raise InputError(f"--format is {unknown[0][:40]!r}; choose from {', '.join(_FORMATS)}.")
-        if not 72 <= self.dpi <= 1200:
-            raise InputError(f"--dpi is {self.dpi}; choose a resolution from 72 to 1200.")
-
-
-def save_report(
-    report: AnalysisReport,
-    output: Path,
-    *,
-    quiet: bool,
-    figures: FigureConfig | None = None,
-    orientation: Orientation | None = None,
-) -> tuple[Path | None, list[str]]:
-    """Write a report to a folder, with its HTML page and figures if the extra `report` is installed.
+def save_report(report: AnalysisReport, output: Path, *, quiet: bool) -> tuple[Path | None, list[str]]:
+    """Write a report to a folder, with its HTML page if the extra `report` is installed.
 
     Args:
         report: of the analysis.
         output: the folder.
         quiet: no progress.
-        figures: formats and resolution; None for no figures as files.
-        orientation: of all figures; None for that of the report.
 
     Returns:
         The path of the page, None where it cannot be drawn; and notes for the user.
@@ -65,17 +26,12 @@ def save_report(
     from shapespace.report.pages.write_html import require_report_extra
 
     with waiting("writing the results", quiet=quiet):
-        (replace(report, orientation=orientation) if orientation else report).save(output)
+        report.save(output)
     notes = list(report.notes)
     try:
         require_report_extra()
     except ShapespaceError as error:
         return None, [*notes, str(error)]
-    if figures is not None and figures.formats:
-        from shapespace.report.pages.figure_files import write_figures
-
-        with waiting("drawing the figures", quiet=quiet):
-            notes += write_figures(output, figures.formats, figures.dpi)[1]
     return write_report(output, None, model=None, labels=None, quiet=quiet), notes
 
 

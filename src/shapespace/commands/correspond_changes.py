@@ -57,8 +57,9 @@ from shapespace.store.corresponding import LANDMARKS, MEAN, RECORD, SUMMARY, SUR
 from shapespace.types import Mesh, SurfaceLandmarks
 
 _OPTIONS = {
-    "vertices": "--vertices", "rounds": "--rounds", "outer": "--outer", "ignore_colours": "--ignore-colours",
-    "mirror": "--mirror", "pose": "--pose", "landmark_uncertainty": "--landmark-std", "seed": "--seed",
+    "vertices": "--vertices", "rounds": "--rounds", "outer": "--outer", "ignore_colours": "--set ignore_colours",
+    "mirror": "--mirror", "pose": "--pose", "landmark_uncertainty": "--set landmark_uncertainty",
+    "seed": "--set seed",
 }  # fmt: skip
 """Options of the settings that a change takes from the finished correspondence, by their fields."""
 _LISTED = 5  # names in a message, so that it stays short

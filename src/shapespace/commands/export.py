@@ -184,9 +184,7 @@ def _rows(results: Results, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
             yield dict(zip(asked, values, strict=True))
 
 
-def export_cohort(
-    cohort: Cohort, output: Path, to: Target, formula: str | None = None, *, drop_missing: bool = False
-) -> tuple[list[Path], list[str]]:
+def export_cohort(cohort: Cohort, output: Path, to: Target, formula: str | None = None) -> tuple[list[Path], list[str]]:
     """Write the aligned coordinates of a cohort, its table and sizes; return the files, and sentences on the contents.
 
     `geomorph` is a folder with coordinates, covariates, and a script in R of the linear model `formula`.
@@ -196,7 +194,6 @@ def export_cohort(
         output: the file; a folder for geomorph, or to write landmarks.ENDING into.
         to: geomorph (a folder with a script in R), morphoj, tps or csv (default: fits of DATA as files)
         formula: for geomorph, linear model of shape, such as '~ sex + age' (default: the mean alone)
-        drop_missing: exclude shapes with missing values in the columns of the formula (default: an error).
 
     Raises:
         InputError: a formula that cannot be read, or missing values in its columns.
@@ -204,7 +201,7 @@ def export_cohort(
     """
     notes: list[str] = []
     if formula is not None:
-        cohort = complete_cohort(cohort, (formula,), (), drop_missing=drop_missing)
+        cohort = complete_cohort(cohort, (formula,), (), drop_missing=False)
         notes += cohort.cautions
     if cohort.estimated_share.any():
         notes.append("Missing landmarks or vertices are written at their estimated positions.")
@@ -224,7 +221,7 @@ def export_cohort(
     model = "1" if formula is None else formula.strip().removeprefix("~").strip()
     write_text(output / R_SCRIPT, _R.replace("@FORMULA", model).replace("@K", str(cohort.dimensions)))
     if cohort.position_std is not None:
-        notes.append("The script gives all vertices the same weight, as compare does with --weights none.")
+        notes.append("The script gives all vertices the same weight, as compare does with --set weights=none.")
     return [output / name for name in (COORDINATES, COVARIATES, R_SCRIPT)], notes
 
 

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from msgspec import structs
 
+from shapespace.cohort.orientation import find_orientation, read_links
 from shapespace.errors import InputError
 from shapespace.geometry.landmark_alignment import align_landmarks, find_outliers
 from shapespace.io.files import write_text
 from shapespace.io.landmarks.configuration_io import read_configurations, slider_texts, write_configurations
 from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations
 from shapespace.lazy import require_package
-from shapespace.report.inputs.orientation import find_orientation, read_links
 from shapespace.schemas import Orientation
 
 _OTHER_SCALE = 4.0

@@ -209,7 +209,7 @@ def recognise_study(
     model: Path | None,
     *,
     folds: int,
-    seed: int,
+    seed: int = 0,
     execution: ExecutionConfig,
     quiet: bool,
 ) -> tuple[Path, list[dict[str, Any]], str]:

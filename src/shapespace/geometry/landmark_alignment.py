@@ -378,7 +378,7 @@ def match_curves(configurations: LandmarkConfigurations, mean: FloatArray | None
             names = list_briefly([configurations.names[k] for k in np.flatnonzero(is_reversed[:, c]).tolist()])
             notes.append(f"Curve {c + 1} runs in the other direction in {names}, and is reversed there.")
     if any(closed for _, closed in curves):
-        notes.append("Closed curves start where they fit the mean best; --no-match-curves keeps their first points.")
+        notes.append("Closed curves start where they fit the mean best; match_curves=no keeps their first points.")
     return replace(configurations, points=read_only(moved), notes=(*configurations.notes, *notes))
 
 

@@ -60,7 +60,7 @@ VertexWeights: TypeAlias = Literal["confidence", "none"]
 ErrorPermutation: TypeAlias = Literal["units", "residuals"]
 _WEIGHTED_NOTE = (
     "Vertices have weights in the sums of squares by the standard deviation of their position along the surface; "
-    "--weights none gives all the same weight."
+    "--set weights=none gives all the same weight."
 )
 MOST_LEVELS = 6
 """Largest number of classes of a variable whose pairs are compared."""
@@ -464,10 +464,10 @@ def complete_cohort(
             calls.setdefault(column, set()).update(own_calls)
     named = [*calls, *columns, *numbers]
     unknown = int(np.isnan(cohort.sizes_mm).sum())
-    if unknown and not drop_missing and {"size", "log_size"} & set(named) - own:
+    if unknown and not (drop_missing or cohort.drop_missing) and {"size", "log_size"} & set(named) - own:
         raise InputError(
             f"The size of {unknown} of {len(cohort)} shapes is not known in mm; fit them with --unit, or leave them "
-            "out with --drop-missing."
+            "out with --set missing=drop."
         )
     table = cohort.table
     in_formulas = [column for column in calls if "C" not in calls[column] and table.kind(column) == "number"]

@@ -162,7 +162,7 @@ class Predictor:
             )
         if cohort.gauge != self.gauge:
             raise InputError(f"{self.target} was learned in the gauge {self.gauge}, not {cohort.gauge}; read the new "
-                             f"shapes with --gauge {self.gauge}.")  # fmt: skip
+                             f"shapes with --set gauge={self.gauge}.")  # fmt: skip
 
     def _placed(self, vertices: FloatArray) -> FloatArray:
         """Return a shape (V, 3) in the pose, and in the gauge `shape` the scale, of those learned from."""

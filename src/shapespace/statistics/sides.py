@@ -245,7 +245,7 @@ def match_sides(cohort: Cohort, subject: str | None, side: str) -> tuple[Cohort,
         for both, part in zip(rows, own, strict=True):
             both += part[: min(map(len, own))]
     if not rows[0]:
-        raise InputError(f"{where}: no subject has both sides; name the subjects with --subject.")
+        raise InputError(f"{where}: no subject has both sides; name the subjects with --set subject=COLUMN.")
     left = [cohort.names[k] for k in sorted(set(range(len(cohort))) - {*rows[0], *rows[1]})]
     verb = (
         "s without a counterpart on the other side are"

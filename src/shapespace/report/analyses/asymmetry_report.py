@@ -184,7 +184,7 @@ def _limitation_notes(result: AsymmetryResult) -> list[str]:
     if fitted is not None:
         notes.append(
             "Fits hold asymmetry back where their model has little of it; docs/asymmetry.md says by how much. Dense "
-            "surfaces (--surfaces dense) of a model built with mirrored shapes lose least."
+            "surfaces (--set surfaces=dense) of a model built with mirrored shapes lose least."
         )
     return notes
 

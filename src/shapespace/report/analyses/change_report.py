@@ -577,7 +577,7 @@ def _notes(change: ChangeResult) -> list[str]:
     if change.is_model_only:
         notes.append(
             "The surfaces are the model's own, so what it cannot make of a change is not there; fit with --dense, and "
-            "give --surfaces dense."
+            "give --set surfaces=dense."
         )
     return notes
 

@@ -260,7 +260,9 @@ def add_shape_data(report: AnalysisReport, cohort: Cohort, imputations: Imputati
     if methods is None and len(cohort) > 1:
         methods = methods_of(cohort, _count_subjects(cohort, report.settings.get("subject")))
     summary = (*report.summary[:1], *cohort.cautions, *report.summary[1:])
-    report = replace(report, summary=summary, notes=notes, settings=settings, methods=methods)
+    report = replace(
+        report, summary=summary, notes=notes, settings=settings, methods=methods, orientation=cohort.orientation
+    )
     if sentence and methods is not None:
         methods = structs.replace(methods, assumptions=(*methods.assumptions, sentence))
         report = replace(report, notes=(*notes, sentence), methods=methods)

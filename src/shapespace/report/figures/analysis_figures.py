@@ -11,6 +11,7 @@ import numpy.typing as npt
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from shapespace.cohort.orientation import view_rotation
 from shapespace.errors import InputError
 from shapespace.geometry.normals import face_vectors, faces_of
 from shapespace.report.figures.draw import (
@@ -29,7 +30,6 @@ from shapespace.report.figures.draw import (
     view,
 )
 from shapespace.report.inputs.correspondence_folder import upright
-from shapespace.report.inputs.orientation import view_rotation
 from shapespace.report.inputs.staged_fit import nice_ceiling
 from shapespace.report.render.palette import CATEGORIES, DIVERGING, SEQUENTIAL
 from shapespace.report.render.renderer import Camera, Image, Layer, render, visible_triangles

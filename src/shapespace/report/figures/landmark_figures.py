@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
+from shapespace.cohort.orientation import view_rotation
 from shapespace.errors import InputError
 from shapespace.geometry.landmark_alignment import AlignedLandmarks
 from shapespace.geometry.thin_plate_spline import ThinPlateSpline
@@ -29,7 +30,6 @@ from shapespace.report.figures.draw import (
     short,
     type_size,
 )
-from shapespace.report.inputs.orientation import view_rotation
 from shapespace.report.inputs.staged_fit import nice_ceiling
 from shapespace.report.render.palette import CATEGORIES, DIVERGING, SEQUENTIAL, UNKNOWN_COLOUR
 from shapespace.types import BoolArray, FloatArray

@@ -14,11 +14,12 @@ from shapespace.schemas import FitRecord
 
 _MOST_SCANS = 50  # paths in a command; more do not belong in a line
 _OPTIONS = {
-    "method": "--method", "unit": "--unit", "scale": "--scale", "max_iterations": "--max-iterations", "seed": "--seed",
-    "dense": "--dense", "landmark_stddev_mm": "--landmark-std", "crop": "--crop", "region": "--region",
-    "strict": "--strict",
+    "method": "--method", "unit": "--unit", "scale": "--scale", "dense": "--dense", "crop": "--crop",
+    "region": "--region", "strict": "--strict",
 }  # fmt: skip
 """Setting in a record -> its option."""
+_SETTINGS = ("max_iterations", "seed", "landmark_stddev_mm")
+"""Those that are given by --set."""
 
 
 def command_with_stages(root: Path, records: Mapping[str, FitRecord]) -> str:
@@ -39,11 +40,12 @@ def command_with_stages(root: Path, records: Mapping[str, FitRecord]) -> str:
     elif len(scans) > _MOST_SCANS:
         scans = ["SCANS"]
     usual, options = FitConfig().as_dict(), list[str]()
-    for name, option in _OPTIONS.items():
+    for name in (*_OPTIONS, *_SETTINGS):
         value = first.config.get(name)
         if value in (None, usual.get(name), False) or not isinstance(value, str | int | float):
             continue
-        options += [option] if value is True else [option, str(value)]
+        given = ["--set", f"{name}={value}"] if name in _SETTINGS else [_OPTIONS[name], str(value)]
+        options += given[:1] if value is True else given
     return shlex.join(["shapespace", "fit", first.model.path or "MODEL.h5", *scans, "-o", ".", "--stages", *options])
 
 

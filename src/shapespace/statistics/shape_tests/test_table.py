@@ -144,8 +144,8 @@ SHAPE_TESTS: tuple[ShapeTest, ...] = (
             "Fruciano (2016) Development Genes and Evolution 226, 139-158.",
             "Liljequist, Elfving and Skavberg Roaldsen (2019) PLoS ONE 14, e0219854.",
         ),
-        example="shapespace test repeatability digitised.csv --subject specimen -o repeatability",
-        options={"subject": "COLUMN", "session": "COLUMN"},
+        example="shapespace test repeatability digitised.csv -o repeatability",
+        options={"session": "COLUMN"},
     ),
     ShapeTest(
         name="pls",

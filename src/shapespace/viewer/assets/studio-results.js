@@ -49,7 +49,7 @@
       <div class="fill scroll" data-testid="screen-export">
         <div class="row bar"><div><h2>${T.export.title}</h2><p class="hint">${T.export.intro}</p></div><span class="grow"></span>
           <${Button} edits strong testid="write-report" disabled=${!source || busy} onclick=${() => Studio.runJob("report", {}, source.number)}>${T.export.report}<//></div>
-        <${Jobs} kinds=${["report", "convert", "export"]} />
+        <${Jobs} kinds=${["report", "convert", "export", "figures"]} />
         ${Studio.jobsOf(Studio.QUESTIONS).filter(Studio.isActive).map((job) => html`<${JobPanel} key=${job.number} job=${job} />`)}
         ${Studio.newest("build") && Studio.forms.convert && html`<details class="narrow" data-testid="convert"><summary>${T.export.convert}</summary><${JobForm} kind="convert" sources=${["build"]} /></details>`}
         ${!done.length ? html`<p class="hint">${T.export.none}</p>` : html`

@@ -124,8 +124,8 @@
   const edit = Viewer.guarded((content) => inOrder("/api/edit", content));
   /** An edit by a control, which shows again what it showed before where the edit is refused. */
   const editBy = async (content, restore) => { if (!(await edit(content))) restore(); };
-  /** The figures of a question for print: it is run again with the same shapes and options. */
-  const runFigures = (job) => runJob(job.kind, { ...job.options, "--format": "svg,pdf,png" }, job.on);
+  /** The figures of an answer for print. */
+  const runFigures = (job) => runJob("figures", { "--format": "svg,pdf,png" }, job.number);
   const undo = Viewer.guarded(() => inOrder("/api/undo", {}));
   const redo = Viewer.guarded(() => inOrder("/api/redo", {}));
 

@@ -63,7 +63,7 @@
 
     jobs: {
       kinds: {
-        correspond: "Correspondence", redo: "Correct one scan", build: "Build the model", quality: "Measure the quality", morphospace: "Draw the morphospace",
+        correspond: "Correspondence", redo: "Correct one scan", build: "Build the model", quality: "Measure the quality", morphospace: "Draw the morphospace", figures: "Draw figures for print",
         fit: "Fit the model", complete: "Complete partial scans", compare: "Do groups differ?", change: "Has it changed?", asymmetry: "Is it symmetric?",
         regress: "Shape and a number?", score: "How unusual is it?", identify: "Who is it?", report: "Report", convert: "Convert the model", export: "Export",
       },

@@ -12,7 +12,7 @@
     questions: Studio.Questions, export: Studio.Export, history: Studio.History,
   };
   const NAMES = Object.keys(SCREENS);
-  const KINDS = { correspondence: ["correspond", "redo"], model: ["build", "quality", "morphospace"], fit: ["fit", "complete"], questions: Studio.QUESTIONS, export: ["report", "convert", "export"] };
+  const KINDS = { correspondence: ["correspond", "redo"], model: ["build", "quality", "morphospace"], fit: ["fit", "complete"], questions: Studio.QUESTIONS, export: ["report", "convert", "export", "figures"] };
   const AFTER = { specimens: "correspondence", correspondence: "model", model: "questions", fit: "questions", questions: "export" };
 
   const ofAddress = () => (NAMES.includes(location.hash.slice(1)) ? location.hash.slice(1) : NAMES[0]);

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from shapespace.cohort.read import write_cohort_file
 from shapespace.errors import InputError
 from shapespace.viewer.studio.jobs import Job, Order
 from shapespace.viewer.studio.project import Project, Specimen
 
 Forms = Mapping[str, Mapping[str, Any]]
-"""Kind -> `command` (its words), `summary`, and `options`, each with `flag`, `help`, `kind`, `choices`, `initial`,
-`visible` and `required`."""
+"""Kind -> `command` (its words), `summary`, and `options`, each with `flag`, `way` (of the command line; empty for a
+positional argument), `help`, `kind`, `choices`, `initial`, `visible` and `required`."""
 
 QUESTIONS = ("compare", "change", "asymmetry", "regress", "score", "identify", "morphospace")
 CORRESPONDENCES = ("correspond", "redo")
@@ -76,6 +77,9 @@ def order(
     if kind == "report":
         before = result_of(jobs, (*CORRESPONDENCES, "fit"), on)
         return Order((*words, before.output, "--no-open", *given), f"{before.output}/report.html")
+    if kind == "figures":
+        before = result_of(jobs, QUESTIONS, on)
+        return Order((*words, before.output, *given), before.output)
     if kind == "convert":
         model, to = result_of(jobs, ("build",), on).output, str(options.get("--to", ""))
         output = f"exported-{number}{_model_ending(to)}"
@@ -99,10 +103,12 @@ def _question(
         reference, others = _by_class(chosen, options.get("--reference"))
         project.write_table(project.folder / f"{stem}.csv", _some(others, "to score", 1))
         project.write_table(project.folder / f"{stem}-reference.csv", _some(reference, "in the reference", 2))
-        given = [one for one in given if not one.startswith("--reference=")]
+        population = project.folder / f"{stem}-reference.toml"
+        write_cohort_file(population, population.with_suffix(".csv"), shapes=project.folder / shapes.output)
+        given = [word for word in given if not word.startswith("--reference=")]
         return Order(
-            (*words, f"{stem}.csv", "--shapes", shapes.output, "--reference", f"{stem}-reference.csv",
-             "--reference-shapes", shapes.output, "-o", output, *given),
+            (*words, f"{stem}.csv", "--shapes", shapes.output, "--reference", f"{stem}-reference.toml", "-o", output,
+             *given),
             output, on=shapes.number,
         )  # fmt: skip
     project.write_table(project.folder / f"{stem}.csv", _some(chosen, "to analyse", 2))
@@ -144,10 +150,9 @@ def result_of(jobs: Sequence[Job], kinds: Sequence[str], on: int | None) -> Job:
     for job in reversed(jobs):
         if job.kind in kinds and job.status == "done" and on in (None, job.number):
             return job
-    missing = {"correspond": "a correspondence", "build": "a model", "fit": "fits of new scans"}[
-        next(kind for kind in kinds if kind in ("correspond", "build", "fit"))
-    ]
-    raise InputError(f"This needs {missing}; run that first.")
+    missing = {"correspond": "a correspondence", "build": "a model", "fit": "fits of new scans"}
+    needed = next((missing[kind] for kind in kinds if kind in missing), "an answer")
+    raise InputError(f"This needs {needed}; run that first.")
 
 
 def checks(
@@ -160,7 +165,7 @@ def checks(
     columns = [column for column in project.state.columns if column in used or _in_formula(column, formula)]
     missing = {column: sum(not one.cells.get(column) for one in chosen) for column in columns}
     of_all = len(chosen)
-    drop_missing = bool(options.get("--drop-missing"))
+    drop_missing = options.get("--missing") == "drop"
     if drop_missing:
         chosen = [one for one in chosen if all(one.cells.get(column) for column in columns)]
     enough = len(chosen) >= 2
@@ -177,7 +182,7 @@ def checks(
     for column in columns:
         cells = [one.cells.get(column, "") for one in chosen]
         if missing[column]:
-            what = "these are left out" if drop_missing else "fill it in, or leave these out with --drop-missing"
+            what = "these are left out" if drop_missing else "fill it in, or exclude these with missing: drop"
             text = f"{column} is missing for {missing[column]} of {of_all} specimens; {what}."
             found.append({"level": "warning" if drop_missing else "problem", "text": text})
         classes = {cell: cells.count(cell) for cell in dict.fromkeys(cells) if cell}
@@ -211,11 +216,12 @@ def _given(forms: Forms, kind: str, options: Mapping[str, Any]) -> list[str]:
     for flag, value in options.items():
         if flag not in known:
             raise InputError(f"The action {kind[:30]!r} has no option {str(flag)[:40]!r}; reload the page.")
-        if isinstance(value, bool):
+        if known[flag]["kind"] == "flag":
             arguments += [flag] if value else []
-        elif value is not None and str(value).strip():
+        elif value is not None and (text := str(value).strip()):
             # One argument, so that a value that begins with a dash is not taken for an option.
-            arguments.append(f"{flag}={str(value).strip()}")
+            option, _, setting = str(known[flag]["way"]).partition(" ")
+            arguments += [option, f"{setting}={text}"] if setting else [f"{option}={text}" if option else text]
     return arguments
 
 
