@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from shapespace import statistics as statistics
     from shapespace import store as store
     from shapespace.cohort.cohort import Cohort
-    from shapespace.cohort.read import CohortConfig, read_cohort
+    from shapespace.cohort.read import CohortConfig, read_cohort, write_cohort_file
     from shapespace.correspondence.groupwise import correspond
     from shapespace.correspondence.settings import CorrespondConfig
     from shapespace.datasets.faces import load_faces
@@ -63,6 +63,7 @@ __all__ = [
     "simulate_scan",
     "surface_distances",
     "train_classifier",
+    "write_cohort_file",
     "write_mesh",
 ]
 
@@ -72,7 +73,7 @@ _name, __dir__ = lazy_names(
     __name__,
     {
         "cohort.cohort": ("Cohort",),
-        "cohort.read": ("CohortConfig", "read_cohort"),
+        "cohort.read": ("CohortConfig", "read_cohort", "write_cohort_file"),
         "correspondence.groupwise": ("correspond",),
         "correspondence.settings": ("CorrespondConfig",),
         "datasets.faces": ("load_faces",),

@@ -174,7 +174,7 @@ def test_the_dimensions_of_a_morphoj_table_lead_to_an_analysis(write, capsys: py
     assert main(["landmarks", "convert", str(path), "-o", str(out / "c.csv"), "--dimensions", "2"]) == 0
     assert read_configurations(out / "c.csv").points.shape == (10, 6, 2)
     for data in ("b", "c.csv"):
-        compare = ["compare", str(out / data), "--formula", "~ sex", "-o", str(out / "d"), "--permutations", "99"]
+        compare = ["compare", str(out / data), "~ sex", "-o", str(out / "d"), "--permutations", "99"]
         assert main(compare) == 0
 
 

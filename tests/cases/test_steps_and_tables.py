@@ -45,7 +45,7 @@ def test_p_does_not_depend_on_the_order_of_rows_and_triangles(shapes: Path, run:
     found: list[str] = []
     for name, order in (("a", range(COUNT)), ("b", [*range(7, COUNT), *range(7)])):
         path = table(tmp_path / f"{name}.csv", {"sex": SEX, "age": AGE}, order)
-        run("compare", path, "--formula", "~ sex", "--shapes", shapes, "-o", tmp_path / name, "--permutations", 99)
+        run("compare", path, "~ sex", "--shapes", shapes, "-o", tmp_path / name, "--permutations", 99)
         found.append(rows(tmp_path / name))
     assert found[0] == found[1]
 
@@ -54,14 +54,14 @@ def test_p_does_not_depend_on_the_order_of_rows_and_triangles(shapes: Path, run:
 def test_two_rows_of_one_specimen_are_refused(twice: str, shapes: Path, run: Run, tmp_path: Path) -> None:
     path = table(tmp_path / "a.csv", {"sex": SEX})
     path.write_text(f"{path.read_text()}{twice},m\n")
-    told = run("compare", path, "--formula", "~ sex", "--shapes", shapes, "-o", tmp_path / "out", code=2)
+    told = run("compare", path, "~ sex", "--shapes", shapes, "-o", tmp_path / "out", code=2)
     assert f"'s03') and 21 ('{twice}') are of one specimen" in told
 
 
 def test_rows_and_specimens_without_the_other_are_counted(shapes: Path, run: Run, tmp_path: Path) -> None:
     path = table(tmp_path / "a.csv", {"sex": SEX}, range(2, COUNT))
     path.write_text(f"{path.read_text()}stranger,m\n")
-    told = run("compare", path, "--formula", "~ sex", "--shapes", shapes, "-o", tmp_path / "out", "--permutations", 20)
+    told = run("compare", path, "~ sex", "--shapes", shapes, "-o", tmp_path / "out", "--permutations", 20)
     assert "1 of 19 rows" in told and "stranger" in told and "2 of 20 specimens" in told and "s00, s01" in told
 
 
@@ -70,7 +70,6 @@ def test_codes_used_as_numbers_and_columns_with_signs(shapes: Path, run: Run, tm
     told = run(
         "compare",
         path,
-        "--formula",
         "~ `Group #` + family",
         "--shapes",
         shapes,
@@ -82,7 +81,7 @@ def test_codes_used_as_numbers_and_columns_with_signs(shapes: Path, run: Run, tm
     lines = [line for line in told.splitlines() if line]
     assert any("write C(family), with 3." in line for line in lines[:3]), told
     assert "`Group #` with its backticks" in run(
-        "compare", path, "--formula", "~ Group #", "--shapes", shapes, "-o", tmp_path / "out", code=2
+        "compare", path, "~ Group #", "--shapes", shapes, "-o", tmp_path / "out", code=2
     )
 
 
@@ -90,11 +89,11 @@ def test_codes_used_as_numbers_and_columns_with_signs(shapes: Path, run: Run, tm
 def test_every_formula_counts_missing_cells(formula: str, shapes: Path, run: Run, tmp_path: Path) -> None:
     columns = {"sex": SEX, "age": AGE, "family": [13 + k % 2 for k in range(COUNT)]}
     lacking = {name: ["NA" if k == 4 else cell for k, cell in enumerate(cells)] for name, cells in columns.items()}
-    options = (table(tmp_path / "a.csv", lacking), "--formula", formula, "--shapes", shapes, "-o", tmp_path / "out")
+    options = (table(tmp_path / "a.csv", lacking), formula, "--shapes", shapes, "-o", tmp_path / "out")
     told = run("compare", *options, code=2)
-    assert "s04" in told and "--drop-missing" in told
+    assert "s04" in told and "missing=drop" in told
     if formula == "~ sex * age":
-        assert "19 shapes" in run("compare", *options, "--permutations", 20, "--drop-missing")
+        assert "19 shapes" in run("compare", *options, "--permutations", 20, "--set", "missing=drop")
 
 
 def test_surfaces_of_check_and_others_are_one_cohort(shapes: Path, run: Run, tmp_path: Path) -> None:
@@ -108,6 +107,6 @@ def test_surfaces_of_check_and_others_are_one_cohort(shapes: Path, run: Run, tmp
         write_mesh((mirrored if k % 2 else same) / path.name, mesh.with_vertices(mesh.vertices * sign))
     run("check", mirrored, "-o", same, "--mirror")
     path = table(tmp_path / "a.csv", {"sex": SEX})
-    run("compare", path, "--formula", "~ sex", "--shapes", same, "-o", tmp_path / "out", "--permutations", 20)
-    run("compare", path, "--formula", "~ sex", "--shapes", shapes, "-o", tmp_path / "known", "--permutations", 20)
+    run("compare", path, "~ sex", "--shapes", same, "-o", tmp_path / "out", "--permutations", 20)
+    run("compare", path, "~ sex", "--shapes", shapes, "-o", tmp_path / "known", "--permutations", 20)
     assert rows(tmp_path / "out") == rows(tmp_path / "known")

@@ -72,11 +72,11 @@ def test_a_folder_has_coordinates_mean_settings_and_findings(run: Run, folder: P
 @pytest.mark.parametrize(
     "command",
     [
-        ("compare", "aligned", "--formula", "~ sex + log_size", "--permutations", "20"),
-        ("compare", "skulls.csv", "--shapes", "skulls.tps", "--formula", "~ age", "--permutations", "20"),
+        ("compare", "aligned", "~ sex + log_size", "--permutations", "20"),
+        ("compare", "skulls.csv", "--shapes", "skulls.tps", "~ age", "--permutations", "20"),
         ("regress", "aligned", "--target", "age", "--permutations", "5"),
         ("score", "skulls.csv", "--shapes", "new.tps", "--reference", "aligned", "--modes", "3"),
-        ("asymmetry", "aligned", "--subject", "animal", "--side", "side", "--permutations", "20"),
+        ("asymmetry", "aligned", "--set", "subject=animal", "--side", "side", "--permutations", "20"),
         ("test", "disparity", "aligned", "--group", "sex", "--permutations", "20"),
     ],
 )
@@ -111,10 +111,10 @@ def test_sides_that_are_mirror_images_are_reflected_on_request(run: Run, folder:
     outcome = run("align", "skulls.tps", "--table", "skulls.csv", "--reflect", f"side={side}", "-o", "one")
     assert outcome.code == 0 and f"8 of 16 specimens are reflected, those with side {side}" in outcome.err
     assert (
-        run("asymmetry", "one", "--subject", "animal", "--side", "side", "--permutations", "20", "-o", "out").code == 0
+        run("asymmetry", "one", "--set", "subject=animal", "--side", "side", "--permutations", "20", "-o", "out").code == 0
     )
     assert run("align", "skulls.tps", "--table", "skulls.csv", "-o", "raw").code == 0
-    assert "mirror images" in run("asymmetry", "raw", "--subject", "animal", "--side", "side", "-o", "out").sentence()
+    assert "mirror images" in run("asymmetry", "raw", "--set", "subject=animal", "--side", "side", "-o", "out").sentence()
 
 
 @pytest.mark.parametrize(

@@ -62,8 +62,8 @@ def test_what_is_learned_predicts_new_shapes_now_and_later(run: Run, folder: Pat
     rows = (folder / "people.csv").read_text().splitlines()
     (folder / "new.csv").write_text("\n".join([rows[0], *rows[23:25]]) + "\n")
     (folder / "old.csv").write_text("\n".join(rows[:23]) + "\n")
-    outcome = run("regress", "old.csv", "--target", "age", "-o", "out", "--folds", "5", "--permutations", "9",
-                  "--predict", "new.csv", "--gauge", "form")  # fmt: skip
+    outcome = run("regress", "old.csv", "--target", "age", "-o", "out", "--set", "folds=5", "--permutations", "9",
+                  "--predict", "new.csv", "--set", "gauge=form")  # fmt: skip
     assert outcome.code == 0, outcome.err
     assert "2 new shapes are predicted" in outcome.out and "11 subjects are a small sample" in outcome.out
     now = table(folder / "out" / "new.csv")
@@ -78,8 +78,7 @@ def test_what_is_learned_predicts_new_shapes_now_and_later(run: Run, folder: Pat
 
 
 def test_mean_shapes_along_a_number_are_kept_as_meshes_and_tables(run: Run, folder: Path) -> None:
-    outcome = run("regress", "people.csv", "--along", "age", "--at", "45,50,55", "--covariates", "group", "--hold",
-                  "group=control", "-o", "out", "--gauge", "form", "--permutations", "100")  # fmt: skip
+    outcome = run("regress", "people.csv", "--along", "age", "--at", "45,50,55", "--covariates", "group", "--set", "hold=group=control", "-o", "out", "--set", "gauge=form", "--permutations", "100")  # fmt: skip
     assert outcome.code == 0, outcome.err
     first = outcome.out.splitlines()[0]
     assert first.startswith("Shape changes with age (p 0.01): ") and "between 12 subjects" in first
@@ -114,15 +113,15 @@ def test_mean_shapes_of_landmarks_have_intervals_along_the_axes(run: Run, folder
     [
         (["asymmetry", "people.csv", "--reference", "control"], "write COLUMN=VALUE"),
         (["asymmetry", "people.csv", "--reference", "group=nobody"], "0 subjects have group nobody"),
-        (["asymmetry", "people.csv", "--subject", "who"], "has no column 'who'"),
+        (["asymmetry", "people.csv", "--set", "subject=who"], "has no column 'who'"),
         (["asymmetry", "people.csv", "--pairs", "none.csv"], "none.csv"),
         (["regress", "people.csv", "--target", "group"], "'group' is 'case' at s00, which is no number"),
         (["regress", "people.csv", "--target", "age", "--predict", "people.csv"], "were learned from too"),
-        (["regress", "people.csv", "--target", "age", "--level", "2"], "level of intervals"),
+        (["regress", "people.csv", "--target", "age", "--set", "level=2"], "level of intervals"),
         (["regress", "people.csv", "--along", "group"], "holds classes"),
         (["regress", "people.csv", "--along", "age", "--at", "500"], "shapes are not predicted beyond, at 500"),
-        (["regress", "people.csv", "--along", "age", "--curve", "spline"], "12 subjects are too few"),
-        (["regress", "people.csv", "--along", "age", "--covariates", "group", "--hold", "group=x"], "held at 'x'"),
+        (["regress", "people.csv", "--along", "age", "--set", "curve=spline"], "12 subjects are too few"),
+        (["regress", "people.csv", "--along", "age", "--covariates", "group", "--set", "hold=group=x"], "held at 'x'"),
         (["regress", "people.csv", "--along", "age", "--predict", "people.csv"], "--predict needs --target"),
         (["regress", "people.csv", "--target", "age", "--at", "50"], "--at needs --along"),
         (["regress", "people.csv", "--predictor", "people.csv"], "make it again with shapespace regress"),

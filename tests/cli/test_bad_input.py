@@ -132,7 +132,7 @@ def test_vertices_that_are_not_finite_are_removed_and_named_or_refused(
     bad = tmp_path / f"bad{ending}"
     write_mesh(bad, _with_bad_vertex(scan_mesh, value))
     refused(run("fit", world.model, bad, "-o", tmp_path / "strict", "--strict"), bad)
-    outcome = run("fit", world.model, bad, "-o", tmp_path / "out", "--max-iterations", "3")
+    outcome = run("fit", world.model, bad, "-o", tmp_path / "out", "--set", "max_iterations=3")
     assert outcome.code == 0 and "1 vertex with coordinates that are NaN or infinite, used by" in outcome.out
     assert np.isfinite(read_mesh(tmp_path / "out" / "bad.fitted.ply").vertices).all()
     (facts,) = run("check", bad, "--json").facts
@@ -180,7 +180,7 @@ def test_scans_that_cannot_be_read_are_reported_before_the_first_fit(
 
     monkeypatch.setattr(FitWork, "do", noted)
     outcome = run(
-        "fit", world.model, *world.scans[:2], empty, cut, "-o", tmp_path / "out", "--max-iterations", 2, "--jobs", 1
+        "fit", world.model, *world.scans[:2], empty, cut, "-o", tmp_path / "out", "--set", "max_iterations=2", "--jobs", 1
     )
     assert outcome.code == 1
     assert order == ["y_empty", "z_cut", "scan_0", "scan_1"]
@@ -196,11 +196,11 @@ def test_several_scans_with_vertices_that_are_not_finite_are_named_at_the_end(
 ) -> None:
     bad = tmp_path / "bad.ply"
     write_mesh(bad, _with_bad_vertex(scan_mesh, np.nan))
-    outcome = run("fit", world.model, world.scan, bad, "-o", tmp_path / "out", "--max-iterations", 2, "--jobs", 1)
+    outcome = run("fit", world.model, world.scan, bad, "-o", tmp_path / "out", "--set", "max_iterations=2", "--jobs", 1)
     assert "1 scan has vertices with coordinates that are NaN or infinite" in outcome.err.splitlines()[-1]
     assert "(bad)" in outcome.err and outcome.code == 0
     outcome = run(
-        "fit", world.model, world.scan, bad, "-o", tmp_path / "out", "--max-iterations", 2, "--jobs", 1, "--strict"
+        "fit", world.model, world.scan, bad, "-o", tmp_path / "out", "--set", "max_iterations=2", "--jobs", 1, "--strict"
     )
     assert outcome.code == 1 and "--strict" in outcome.err and str(bad) in outcome.err
 
@@ -223,7 +223,7 @@ def test_a_probe_passes_whole_files_and_refuses_cut_ones(ending: str, scan_mesh:
 def test_the_surface_search_refuses_a_point_cloud(run: Run, world: World, scan_mesh: Mesh, tmp_path: Path) -> None:
     cloud = tmp_path / "cloud.ply"
     write_mesh(cloud, Mesh(scan_mesh.vertices))
-    outcome = run("fit", world.model, cloud, "-o", tmp_path / "out", "--method", "paper", "--search", "surface")
+    outcome = run("fit", world.model, cloud, "-o", tmp_path / "out", "--method", "paper", "--set", "search=surface")
     assert str(cloud) in outcome.sentence() and outcome.code == 2
     assert "triangles" in outcome.err
     assert run("fit", world.model, cloud, "-o", tmp_path / "out").code == 0
@@ -475,7 +475,7 @@ def test_a_disk_that_fills_up_in_a_batch_keeps_what_was_written(
     names: str, run: Run, world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     FullDisk(monkeypatch, names)
-    outcome = run("fit", world.model, *world.scans, "-o", tmp_path, "--max-iterations", 3, "--jobs", 1)
+    outcome = run("fit", world.model, *world.scans, "-o", tmp_path, "--set", "max_iterations=3", "--jobs", 1)
     assert outcome.code == 2
     errors = [line for line in outcome.err.splitlines() if "max_iterations" not in line]
     assert len(errors) == 1
@@ -490,7 +490,7 @@ def test_a_disk_that_fills_up_in_a_batch_keeps_what_was_written(
         assert not (tmp_path / "scan_1.fit.json").exists()
     # With space again, the same command does the rest.
     monkeypatch.undo()
-    outcome = run("fit", world.model, *world.scans, "-o", tmp_path, "--max-iterations", 3, "--json")
+    outcome = run("fit", world.model, *world.scans, "-o", tmp_path, "--set", "max_iterations=3", "--json")
     assert outcome.code == 0 and outcome.facts["max_iterations"] == 3
 
 

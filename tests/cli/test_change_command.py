@@ -52,7 +52,7 @@ def ask(visits: Path, run: Callable[..., object], tmp_path: Path, monkeypatch) -
 
 
 def test_a_table_of_meshes_becomes_an_answer_with_tables_in_millimetres(visits, ask, tmp_path) -> None:
-    outcome = ask("--order", "before,after", "--stable", "all", "--landmarks", visits / "marks.csv",
+    outcome = ask("--order", "before,after", "--stable", "all", "--set", f"landmarks={visits / 'marks.csv'}",
                   "--region", f"part={visits / 'part.csv'}", "--json")  # fmt: skip
     assert outcome.code == 0, outcome.err
     assert "1 of 3 subjects are left out" in outcome.err
@@ -71,9 +71,9 @@ def test_what_cannot_be_used_is_said_in_a_sentence(visits, ask) -> None:
     assert "not in the order before,later" in ask("--order", "before,later").sentence()
     assert "no stable region 'brow'" in ask("--order", "before,after", "--stable", "brow").sentence()
     (visits / "far.csv").write_text("name,vertex\nnose,5000\n")
-    assert f"have {V}" in ask("--order", "before,after", "--landmarks", visits / "far.csv").sentence()
+    assert f"have {V}" in ask("--order", "before,after", "--set", f"landmarks={visits / 'far.csv'}").sentence()
     text = (visits / "visits.csv").read_text()
     (visits / "gap.csv").write_text(text.replace("s0_before_2.ply,s0,before", "s0_before_2.ply,s0,"))
-    assert "--drop-missing" in ask("--order", "before,after", table="gap.csv").sentence()
-    dropped = ask("--order", "before,after", "--stable", "all", "--drop-missing", "--quiet", table="gap.csv")
+    assert "missing=drop" in ask("--order", "before,after", table="gap.csv").sentence()
+    dropped = ask("--order", "before,after", "--stable", "all", "--set", "missing=drop", "--quiet", table="gap.csv")
     assert dropped.code == 0 and "1 of 7 shapes are left out" in dropped.err

@@ -65,7 +65,7 @@ def test_help_names_every_command_and_version_is_told(run: Run) -> None:
         ["fit", "model.h5", "scan.ply"],
         ["fit", "model.h5", "scan.ply", "-o", "out", "--unit", "furlong"],
         ["fit", "model.h5", "scan.ply", "-o", "out", "--jobs", "-1"],
-        ["fit", "model.h5", "scan.ply", "-o", "out", "--max-iterations", "0"],
+        ["fit", "model.h5", "scan.ply", "-o", "out", "--set", "max_iterations=0"],
         ["build", "a.ply", "-o", "m.h5", "--variance", "0"],
         ["build", "a.ply", "-o", "m.h5", "--variance", "nan"],
         ["build", "a.ply", "-o", "m.h5", "--modes", "0"],
@@ -581,14 +581,14 @@ def test_a_folder_of_scans_is_read_in_order_of_names(run: Run, world: World, tmp
         (scans / name).write_bytes(world.scan.read_bytes())
     (scans / "notes.txt").write_text("not a scan")
     (scans / ".hidden.ply").write_text("not a scan either")
-    assert run("fit", world.model, scans, "-o", tmp_path / "o", "--max-iterations", 2).code == 0
+    assert run("fit", world.model, scans, "-o", tmp_path / "o", "--set", "max_iterations=2").code == 0
     assert [row["scan"] for row in rows_of(tmp_path / "o")] == ["a", "b"]
 
 
 def test_results_among_the_scans_are_not_taken_for_scans(run: Run, world: World, tmp_path: Path) -> None:
     (tmp_path / "a.ply").write_bytes(world.scan.read_bytes())
     for _ in range(2):
-        outcome = run("fit", world.model, tmp_path, "-o", tmp_path, "--max-iterations", 2, "--json")
+        outcome = run("fit", world.model, tmp_path, "-o", tmp_path, "--set", "max_iterations=2", "--json")
         assert outcome.facts["scans"] == 1
     (tmp_path / "a.ply").unlink()
     outcome = run("fit", world.model, tmp_path, "-o", tmp_path)
@@ -601,7 +601,7 @@ def test_scans_of_one_name_keep_results_apart(run: Run, world: World, tmp_path: 
         (tmp_path / folder).mkdir()
         paths.append(tmp_path / folder / "face.ply")
         paths[-1].write_bytes(source.read_bytes())
-    assert run("fit", world.model, *paths, "-o", tmp_path / "o", "--max-iterations", 3).code == 0
+    assert run("fit", world.model, *paths, "-o", tmp_path / "o", "--set", "max_iterations=3").code == 0
     records = [record_of(tmp_path / "o", name) for name in ("one_face", "two_face")]
     assert records[0]["scan"]["hash"] == sha256_of_file(paths[0])
     assert records[1]["scan"]["hash"] == sha256_of_file(paths[1])
@@ -619,14 +619,14 @@ def test_strict_turns_a_doubtful_fit_into_exit_code_1(run: Run, world: World, tm
 
 
 def test_a_cap_on_iterations_is_a_status_of_its_own(run: Run, world: World, tmp_path: Path) -> None:
-    outcome = run("fit", world.model, world.scan, "-o", tmp_path, "--max-iterations", 1, "--json")
+    outcome = run("fit", world.model, world.scan, "-o", tmp_path, "--set", "max_iterations=1", "--json")
     assert outcome.code == 0 and outcome.facts["max_iterations"] == 1
     assert "max_iterations" in outcome.err
 
 
 def test_the_surface_search_and_a_held_scale_are_in_the_record(run: Run, world: World, tmp_path: Path) -> None:
     outcome = run(
-        "fit", world.model, world.scan, "-o", tmp_path, "--method", "paper", "--search", "surface", "--scale", "fixed"
+        "fit", world.model, world.scan, "-o", tmp_path, "--method", "paper", "--set", "search=surface", "--scale", "fixed"
     )
     assert outcome.code == 0, outcome.err
     record = record_of(tmp_path)
@@ -641,7 +641,7 @@ def test_an_unknown_method_lists_the_known_ones(run: Run, world: World, tmp_path
 
 
 def test_quiet_never_shows_a_bar(run: Run, world: World, tmp_path: Path) -> None:
-    outcome: Outcome = run("fit", world.model, *world.scans, "-o", tmp_path, "--quiet", "--max-iterations", 1)
+    outcome: Outcome = run("fit", world.model, *world.scans, "-o", tmp_path, "--quiet", "--set", "max_iterations=1")
     assert "%|" not in outcome.err and "\r" not in outcome.err
 
 

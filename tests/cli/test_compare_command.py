@@ -21,7 +21,7 @@ def people(run: Run, folder: Path, *more: str) -> Path:
 
 def test_a_table_becomes_a_report_with_all_its_numbers(run: Run, tmp_path: Path) -> None:
     table = people(run, tmp_path / "people", "--effect", "4")
-    told = run("compare", table, "--formula", "~ sex", "--permutations", "40", "--json", "-o", tmp_path / "answer")
+    told = run("compare", table, "~ sex", "--permutations", "40", "--json", "-o", tmp_path / "answer")
     assert told.code == 0, told.err
     assert told.facts["question"] == "compare"
     assert told.facts["settings"]["permutations"] == 40
@@ -36,18 +36,9 @@ def test_a_table_becomes_a_report_with_all_its_numbers(run: Run, tmp_path: Path)
 
 def test_unequal_variances_effect_size_and_no_unit_are_settings_of_the_answer(run: Run, tmp_path: Path) -> None:
     table = people(run, tmp_path / "people", "--effect", "4")
-    more = (
-        "--permutations",
-        "40",
-        "--no-maps",
-        "--variances",
-        "unequal",
-        "--effect-size",
-        "log",
-        "--no-unit",
-        "--json",
-    )
-    told = run("compare", table, "--formula", "~ sex", *more, "-o", tmp_path / "answer")
+    settings = [word for name in ("maps=no", "effect_size=log", "unit=none") for word in ("--set", name)]
+    more = ("--permutations", "40", "--variances", "unequal", *settings, "--json")
+    told = run("compare", table, "~ sex", *more, "-o", tmp_path / "answer")
     assert told.code == 0, told.err
     settings, methods = told.facts["settings"], told.facts["methods"]
     assert settings["unequal_variances"] is True and settings["effect_size"] == "log"
@@ -59,7 +50,7 @@ def test_unequal_variances_effect_size_and_no_unit_are_settings_of_the_answer(ru
 def test_a_formula_that_cannot_be_ends_in_one_sentence(run: Run, tmp_path: Path) -> None:
     table = people(run, tmp_path / "people")
     for formula, word in (("~ weight", "no column"), ("~ __import__('os')", "__import__"), ("~ expression", "groups")):
-        told = run("compare", table, "--formula", formula, "-o", tmp_path / "answer")
+        told = run("compare", table, formula, "-o", tmp_path / "answer")
         assert told.code != 0
         assert word in told.sentence()
     assert not (tmp_path / "answer").exists()

@@ -17,7 +17,7 @@ from conftest import World, leftovers
 pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
 pytestmark = pytest.mark.long
 SCANS = 60
-FAST = ("--max-iterations", "3", "--quiet")
+FAST = ("--set", "max_iterations=3", "--quiet")
 
 
 @contextmanager
@@ -51,7 +51,7 @@ def cluster(file: Path) -> Iterator[tuple[subprocess.Popen[bytes], list[subproce
 def fit(world: World, scans: Path, out: Path, file: Path) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "shapespace", "fit", world.model, scans, "-o", out, *FAST]
     return subprocess.Popen(
-        [*command, "--executor", "dask", "--dask", file], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [*command, "--set", "executor=dask", "--set", f"dask={file}"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
 
 

@@ -14,23 +14,17 @@ from shapespace.cli.options import NO_DEFAULT, Option, Source, given
 from shapespace.model.build_config import BuildConfig
 
 JUSTIFIED = {
-    ("fit", "--search"): (
+    ("fit", "search"): (
         "auto",
-        "means that --search was not given, as another method than paper has no such setting",
+        "means that search was not given, as another method than paper has no such setting",
     ),
-    ("recognise verify", "--surfaces"): (
-        "coefficients",
-        "all surfaces give the same answer: fits are compared by them",
-    ),
-    ("recognise identify", "--surfaces"): ("coefficients", "as for verify"),
-    ("regress", "--curve"): (None, "means that --curve was not given, as --target takes none"),
-    ("score", "--surfaces"): ("coefficients", "other surfaces have no covariance of the fit, which the scores contain"),
+    ("regress", "curve"): (None, "means that curve was not given, as --target takes none"),
 }
 """Options whose default differs from that of the field: the default, and the reason."""
 OPTIONS = [
     (command.name, option)
     for command in COMMANDS
-    for option in command.options
+    for option in (*command.options, *command.settings)
     if option.source is not None and not option.required
 ]
 

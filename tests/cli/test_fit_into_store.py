@@ -15,7 +15,7 @@ from shapespace.store.results import Results
 
 pytest.importorskip("zarr", reason="the extra 'store' is not installed")
 pytest.importorskip("pyarrow", reason="the extra 'store' is not installed")
-FAST = ("--max-iterations", "3", "--quiet")
+FAST = ("--set", "max_iterations=3", "--quiet")
 
 
 def scans(world: World, folder: Path, count: int) -> Path:

@@ -17,7 +17,7 @@ from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
 from synthetic_shapes import raw_scan, similarity
 
-FAST = ("--max-iterations", 2)
+FAST = ("--set", "max_iterations=2")
 COUNTED = ("converged", "max_iterations", "doubtful", "failed")
 
 

@@ -12,7 +12,7 @@ from stored_fits import MODES, model, write_fit
 pytest.importorskip("sklearn", reason="the extra `statistics` is not installed")
 
 PEOPLE, SHOWN = 9, ("neutral", "smile", "fear")
-FEW = ("--draws", "20", "--quiet")
+FEW = ("--set", "draws=20", "--quiet")
 
 
 @pytest.fixture(scope="module")
@@ -47,13 +47,13 @@ def test_a_table_and_fits_end_in_an_answer_and_a_report(command: str, folder: Pa
     assert "compared by PLDA score, cosine" in methods and "Ioffe S. (2006)" in methods
     assert (tmp_path / "analysis.json").is_file() and (tmp_path / "figures.csv").is_file()
     assert (tmp_path / "report.html").is_file() == (outcome.facts["report"] is not None)
-    assert run(*asked, "--doubtful", "--gallery", "expression=neutral").out.startswith("By PLDA score")
+    assert run(*asked, "--set", "doubtful=yes", "--gallery", "expression=neutral").out.startswith("By PLDA score")
 
 
 def test_the_first_score_is_told_of_first(folder: Path, tmp_path: Path, run: Run) -> None:
     outcome = run("recognise", "verify", folder / "people.csv", "--shapes", folder / "fits", "-o", tmp_path, *FEW,
                   "--scores", "cosine,distance", "--curve", "1,2", "--by", "expression",
-                  "--no-uncertainty")  # fmt: skip
+                  "--set", "uncertainty=no")  # fmt: skip
     assert outcome.code == 0 and outcome.out.startswith("By cosine the equal error rate is")
     figures = (tmp_path / "figures.csv").read_text()
     assert "eer with 2 modes" in figures and "eer of smile" in figures and "likelihood" not in figures
@@ -61,16 +61,16 @@ def test_the_first_score_is_told_of_first(folder: Path, tmp_path: Path, run: Run
 
 def test_surfaces_of_fits_are_compared_where_they_are_asked_for(folder: Path, tmp_path: Path, run: Run) -> None:
     outcome = run("recognise", "verify", folder / "people.csv", "--shapes", folder / "fits", "-o", tmp_path, *FEW,
-                  "--surfaces", "fitted", "--scores", "distance")  # fmt: skip
+                  "--set", "surfaces=fitted", "--scores", "distance")  # fmt: skip
     assert outcome.code == 0 and outcome.out.startswith("By plain distance")
 
 
 BAD = {
     "in both": (("--train", "expression=fear"), "both tested and learned from"),
     "no expression": (("--gallery", "neutral"), "names no scans"),
-    "no column": (("--subject", "who"), "no column 'who'"),
+    "no column": (("--set", "subject=who"), "no column 'who'"),
     "no score": (("--scores", "best"), "not best"),
-    "no role": (("--role", "expression"), "it may be gallery, probe or train"),
+    "no role": (("--set", "role=expression"), "it may be gallery, probe or train"),
 }
 
 

@@ -15,7 +15,7 @@ import pytest
 from conftest import Run, World, leftovers
 from shapespace.io import remote
 
-FAST = ("--max-iterations", "3", "--jobs", "1", "--quiet")
+FAST = ("--set", "max_iterations=3", "--jobs", "1", "--quiet")
 
 
 def rows(folder: Path) -> dict[str, dict[str, str]]:

@@ -17,7 +17,7 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray
 from synthetic_shapes import raw_scan, similarity
 
-FAST = ("--max-iterations", "3", "--quiet")
+FAST = ("--set", "max_iterations=3", "--quiet")
 
 
 def test_all_three_files_hold_the_places_on_the_fitted_surface(run: Run, world: World, tmp_path: Path) -> None:
@@ -123,10 +123,10 @@ def test_landmarks_that_the_fit_would_overwrite_are_refused(run: Run, world: Wor
 def test_the_standard_deviation_is_told_and_infinity_holds_nothing(run: Run, world: World, tmp_path: Path) -> None:
     write_landmarks(tmp_path / "m.csv", marks_of(world, 0))
     command = ("fit", world.model, world.scan, "-o", tmp_path / "o", "--landmarks", tmp_path / "m.csv", "--quiet")
-    assert run(*command, "--landmark-std", "1.5").code == 0
+    assert run(*command, "--set", "landmark_stddev_mm=1.5").code == 0
     record = record_of(tmp_path / "o", "scan_0")
     assert record["config"]["landmark_stddev_mm"] == record["evidence"]["marks_stddev_mm"] == 1.5
-    assert run(*command, "--landmark-std", "inf").code == 0
+    assert run(*command, "--set", "landmark_stddev_mm=inf").code == 0
     assert "marks_stddev_mm" not in record_of(tmp_path / "o", "scan_0")["evidence"]
-    assert "which is reused" in run(*command, "--landmark-std", "inf").err
-    assert run(*command, "--landmark-std", "0").code == 2
+    assert "which is reused" in run(*command, "--set", "landmark_stddev_mm=inf").err
+    assert run(*command, "--set", "landmark_stddev_mm=0").code == 2

@@ -21,7 +21,7 @@ from shapespace.io import disk_cache
 from shapespace.io.meshes.mesh_io import MESH_FORMATS, write_mesh
 from shapespace.types import Mesh
 
-FAST = ("--max-iterations", 2)
+FAST = ("--set", "max_iterations=2")
 NAMES = ["with space", "Grüße 顔 🙂", "-leading dash", "=1+1", "@cmd", "+x", "line\nbreak", "tab\tname", "a'b\"c;$(x)",
          "dots.in.name", "x" * 240, "\udcff not utf-8"]  # fmt: skip
 

@@ -42,7 +42,7 @@ def long_names(options: list[Option]) -> set[str]:
 def test_fields_read_from_source_text_are_those_of_the_imported_class_or_function(source: Source) -> None:
     taker: Any = getattr(importlib.import_module(f"shapespace.{source.module}"), source.name)
     defaults = {name: one.default for name, one in inspect.signature(taker).parameters.items()}
-    used = [o for command in COMMANDS for o in command.options if o.source == source]
+    used = [o for command in COMMANDS for o in (*command.options, *command.settings) if o.source == source]
     assert used, "no option uses this source"
     for option in used:
         field = source.field(option.field_name)
@@ -68,7 +68,7 @@ def test_help_lists_at_most_ten_options_and_help_all_the_others(command: Command
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
 def test_every_option_has_a_help_text(command: Command) -> None:
-    assert all(option.text for option in command.options)
+    assert all(option.text for option in (*command.options, *command.settings))
 
 
 def test_an_option_of_no_command_is_refused_with_the_usage_of_the_command(run: Run) -> None:

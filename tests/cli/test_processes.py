@@ -224,7 +224,7 @@ def undisturbed(world: World, tmp_path_factory: pytest.TempPathFactory) -> tuple
 
 # By hand SHAPESPACE_FAULTS=1 kills a batch of 1,000 at 20 moments.
 BATCH, KILLS = (1000, 20) if os.environ.get("SHAPESPACE_FAULTS") else (90, 5)
-FAST = ("--max-iterations", "3")
+FAST = ("--set", "max_iterations=3")
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 
 

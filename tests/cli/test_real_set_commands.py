@@ -10,7 +10,7 @@ import pytest
 from conftest import Run, World
 from shapespace.io.meshes.mesh_io import read_mesh
 
-FAST = ("--max-iterations", 2)
+FAST = ("--set", "max_iterations=2")
 
 
 def vrml(points: list[list[float]], faces: list[list[int]]) -> str:

@@ -223,7 +223,7 @@ def test_help_shows_an_example(run: Run, command: str) -> None:
 
 def test_real_fits_go_through(run: Run, world: World, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    fitted = run("fit", world.model, world.meshes, "-o", out, "--quiet", "--jobs", 1, "--max-iterations", 3)
+    fitted = run("fit", world.model, world.meshes, "-o", out, "--quiet", "--jobs", 1, "--set", "max_iterations=3")
     assert fitted.code in (0, 1)
     write_rows(tmp_path / "l.csv", ("file", "label"), [(f"blob_{k:02d}.ply", "ab"[k % 2]) for k in range(12)])
     made = run("recognise", "train", out, "--labels", tmp_path / "l.csv", "-o", tmp_path / "c.skops", "--json")

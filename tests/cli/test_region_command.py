@@ -9,7 +9,7 @@ import numpy as np
 from conftest import VERTICES, Run, World
 from shapespace.model.shape_model import ShapeModel
 
-FAST = ("--max-iterations", "3", "--quiet")
+FAST = ("--set", "max_iterations=3", "--quiet")
 
 
 def front(world: World) -> list[int]:

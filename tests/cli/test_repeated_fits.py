@@ -15,7 +15,7 @@ from shapespace.report.inputs.repeated_fit import command_with_stages
 from shapespace.schemas import FitRecord
 from shapespace.store.results import Results
 
-QUICK = ("--max-iterations", 6, "--unit", "mm")
+QUICK = ("--set", "max_iterations=6", "--unit", "mm")
 
 
 @pytest.fixture

@@ -28,6 +28,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     write_same(tmp_path, NAMES, aside=False)
     (tmp_path / "people.csv").write_text(TABLE)
+    ss.write_cohort_file("people.toml", "people.csv", shapes="same")
     (tmp_path / "new").mkdir()
     (tmp_path / "new" / "new.csv").write_text("name\nnew\n")
     write_mesh(tmp_path / "new" / "new.ply", surface("new", 20)[0])
@@ -46,10 +47,10 @@ def majority(home: Path) -> None:
 
 COHORT = ("people.csv", "--shapes", "same", "-o", "out")
 ANALYSES = {
-    "compare": ("compare", *COHORT, "--formula", "~ group", "--permutations", "20"),
-    "regress": ("regress", *COHORT, "--target", "age", "--folds", "3", "--permutations", "9"),
-    "change": ("change", *COHORT, "--subject", "animal", "--order", "v0,v1"),
-    "score": ("score", "new/new.csv", "--reference", "people.csv", "--reference-shapes", "same", "-o", "out"),
+    "compare": ("compare", *COHORT, "~ group", "--permutations", "20"),
+    "regress": ("regress", *COHORT, "--target", "age", "--set", "folds=3", "--permutations", "9"),
+    "change": ("change", *COHORT, "--set", "subject=animal", "--order", "v0,v1"),
+    "score": ("score", "new/new.csv", "--reference", "people.toml", "-o", "out"),
 }  # fmt: skip
 OTHERS = {
     "build": ("build", "same", "-o", "model.h5"),
@@ -72,10 +73,11 @@ def test_a_majority_of_inputs_that_need_review_is_rejected_unless_accepted(
     run: Run, folder: Path, command: str
 ) -> None:
     majority(folder)
-    arguments, option = {**ANALYSES, **OTHERS}[command], "--doubtful" if command in ANALYSES else "--with-doubtful"
+    arguments = {**ANALYSES, **OTHERS}[command]
+    option = "--set doubtful=yes" if command in ANALYSES else "--with-doubtful"
     outcome = run(*arguments)
     assert outcome.code == 2 and MOST in outcome.sentence() and f"or use {option} to continue" in outcome.sentence()
-    outcome = run(*arguments, option)
+    outcome = run(*arguments, *option.split())
     assert outcome.code == 0 and MOST in outcome.err, outcome.err
 
 

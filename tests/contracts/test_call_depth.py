@@ -43,7 +43,7 @@ def test_few_frames_lie_between_the_command_and_the_first_matching_step(
     for k in range(scans):
         (tmp_path / "scans").mkdir(exist_ok=True)
         write_mesh(tmp_path / "scans" / f"{k}.ply", raw_scan(np.full(5, 0.3), seed=k).scan)
-    options = ["--quiet", "--executor", "serial", *(["--store"] if store else [])]
+    options = ["--quiet", "--set", "executor=serial", *(["--store"] if store else [])]
     assert main(["fit", f"{tmp_path}/model.h5", f"{tmp_path}/scans", "-o", f"{tmp_path}/out", *options]) == 0
     assert stacks[0][0].endswith(":main")
     assert len(stacks[0]) <= MAX_FRAMES, "\n".join(stacks[0])

@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
 
-from shapespace.commands.answers import FigureConfig
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.report import figures
 from shapespace.report.analyses.analysis_report import AnalysisReport
@@ -22,7 +21,7 @@ from shapespace.report.analyses.shape_data import scree_part, tangent_part
 from shapespace.report.figures.analysis_figures import views_of
 from shapespace.report.figures.publication import ONE_COLUMN_MM, TWO_COLUMNS_MM
 from shapespace.cohort.orientation import find_orientation, view_rotation
-from shapespace.report.pages.figure_files import write_figures
+from shapespace.report.pages.figure_files import FigureConfig, write_figures
 from shapespace.schemas import CurvePart, DeformationPart, NamedView, Orientation, Series, SurfaceMapPart, TextPart
 from shapespace.types import FloatArray, Mesh
 
@@ -158,14 +157,14 @@ def analysis(folder: Path, mesh: Mesh, **known: object) -> Path:
 def test_all_figures_of_an_analysis_are_files_named_after_their_titles(
     tmp_path: Path, head: Callable[..., Mesh]
 ) -> None:
-    paths, notes = write_figures(analysis(tmp_path, head(6)), ["png", "svg"], 80)
+    paths, notes = write_figures(analysis(tmp_path, head(6)), FigureConfig(formats=("png", "svg"), dpi=80))
     stems = ["where-it-differs", "sex-f-to-m-score", "from-low-to-high", "age-score"]
     assert [path.name for path in paths] == [f"{stem}.{kind}" for stem in stems for kind in ("png", "svg")]
     assert len(notes) == 1 and "'On a line' could not be drawn" in notes[0]
     captions = (tmp_path / "figures" / "captions.txt").read_text()
     assert "from-low-to-high: From low to high. Thin-plate splines" in captions and "3 times as large" in captions
     before = {path: path.read_bytes() for path in paths}
-    write_figures(tmp_path, ["png"], 80)
+    write_figures(tmp_path, FigureConfig(formats=("png",), dpi=80))
     assert before == {path: path.read_bytes() for path in paths}
 
 

@@ -577,7 +577,7 @@ def test_a_visit_twice_is_a_rescan_unless_the_table_marks_others() -> None:
 
 
 def test_missing_cells_groups_and_stable_parts_are_refused_by_name(tmp_path: Path) -> None:
-    assert "--drop-missing" in refusal(cells(subject=["a", None, "b", "b"], visit=[1, 2, 1, 2]))
+    assert "missing=drop" in refusal(cells(subject=["a", None, "b", "b"], visit=[1, 2, 1, 2]))
     assert "two groups by 'arm'" in refusal(cells(**PAIR, arm=[*"xyxx"]), order=ORDER, group="arm")
     assert "two groups of two or more" in refusal(cells(**PAIR, arm=[*"xxyy"]), order=ORDER, group="arm")
     assert "two groups of two or more" in refusal(cells(**PAIR, arm=[*"xxxx"]), order=ORDER, group="arm")

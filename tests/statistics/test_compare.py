@@ -491,7 +491,7 @@ def refused(table: dict[str, Any], formula: str, *words: str, options: CompareCo
         ("~ sex * nested", ("follows from", "empty group")),
         ("~ each", ("columns for 37 shapes, so that no degrees of freedom are left",)),
         ("~ mixed", ("'mixed' holds numbers but 'old'",)),
-        ("~ holes", ("holes of 2 of 37", "--drop-missing")),
+        ("~ holes", ("holes of 2 of 37", "missing=drop")),
     ],
 )
 def test_tables_and_formulas_that_cannot_be_are_refused(formula: str, words: tuple[str, ...]) -> None:

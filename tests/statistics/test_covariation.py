@@ -225,7 +225,7 @@ def test_blocks_that_cannot_covary_are_refused(tmp_path: Path) -> None:
         fit_pls(cohort, columns=("a",))
     with pytest.raises(InputError, match="which is no number"):
         fit_pls(cohort, columns=("sex",))
-    with pytest.raises(InputError, match="--drop-missing"):
+    with pytest.raises(InputError, match="missing=drop"):
         fit_pls(cohort, columns=("b",))
     assert len(fit_pls(cohort, columns=("b",), permutations=2, drop_missing=True).cohort) == 19
     with pytest.raises(InputError, match="no column 'c'"):

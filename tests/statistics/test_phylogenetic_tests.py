@@ -262,7 +262,7 @@ def test_designs_that_cannot_be_tested_are_refused() -> None:
         fit_pgls(cohort, formula="~ id", tree=tree)
     with pytest.raises(InputError, match="follows from the other terms"):
         fit_pgls(cohort, formula="~ age + center(age)", tree=tree)
-    with pytest.raises(InputError, match="--drop-missing"):
+    with pytest.raises(InputError, match="missing=drop"):
         fit_pgls(cohort, formula="~ few", tree=tree)
     assert len(fit_pgls(cohort, formula="~ few", tree=tree, permutations=20, drop_missing=True).cohort) == 7
 

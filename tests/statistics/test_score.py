@@ -280,7 +280,7 @@ def test_the_command_scores_a_new_folder_by_a_folder_of_fits(
     assert {"scores.csv", "nearest.csv", "reference.csv", "score.npz"} <= {path.name for path in out.iterdir()}
     with np.load(out / "score.npz") as arrays:
         assert arrays["z_1"].shape == (VERTICES,) and arrays["shape_1"].shape == (VERTICES, 3)
-    assert main([*command, "--gauge", "form", "--json", "--modes", "2"]) == 0
+    assert main([*command, "--set", "gauge=form", "--json", "--modes", "2"]) == 0
     assert json.loads(capsys.readouterr().out)["settings"]["modes"] == 2
 
 
@@ -291,7 +291,7 @@ def test_the_command_says_what_is_wrong_in_one_sentence(fits: Path, capsys: pyte
         (fits, [], "is in the reference too"),
         (fits.parent / "unsure", [], "0 of its fits can be used, and one is the least"),
         (new, ["--modes", "99"], "has 1 to 4 modes"),
-        (new, ["--subject", "site"], "no column 'site'"),
+        (new, ["--set", "subject=site"], "no column 'site'"),
     ):
         assert main(["score", str(subjects), "-o", str(out), "--reference", str(fits), "--quiet", *more]) == 2
         said = capsys.readouterr().err

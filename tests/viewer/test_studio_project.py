@@ -272,7 +272,11 @@ def test_the_studio_and_the_command_give_the_same_answer(
     studio = answer_of(made.arguments, capsys)
     lines = [f"{name},{','.join(cells)}" for name, cells in reversed(GROUPS.items())]
     Path("table.csv").write_text("\n".join(["specimen,Group #,sex (m/f),age", *lines]))
-    given = [word for item in options.items() for word in item]
+    way = {option["flag"]: option["way"].split() for option in described[kind]["options"]}
+    given: list[str] = []
+    for flag, value in options.items():
+        option, *setting = way[flag] or [""]
+        given += [option, f"{setting[0]}={value}"] if setting else [option, value] if option else [value]
     command = answer_of([kind, "table.csv", "--shapes", "correspondence-1", "-o", "out", *given], capsys)
     assert studio == command
 

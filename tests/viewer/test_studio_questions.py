@@ -71,7 +71,7 @@ def test_every_action_of_the_page_ends_with_a_result_that_is_shown(tmp_path: Pat
             assert "Choose one column" in " ".join(one["text"] for one in found if one["level"] == "problem")
         fits = run(client, "fit", {"--dense": True})["number"]
         run(client, "score", {"--reference": "group=a"})
-        run(client, "identify", {"--subject": "person", "--doubtful": True}, fits)
+        run(client, "identify", {"--subject": "person", "--doubtful": "yes"}, fits)
         run(client, "complete", {"--samples": "10"})
         run(client, "convert", {"--to": "statismo"})
         run(client, "export")
