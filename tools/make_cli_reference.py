@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from shapespace.cli.command_table import COMMANDS, Command
+from shapespace.cli.command_table import COHORT_SETTINGS, COMMANDS, GROUPS, JSON, QUIET, SET, Command
 from shapespace.cli.options import Option
 from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS
 
@@ -48,6 +48,8 @@ PAGES = {
     "align": ["morphometrics.md", "tutorial-landmarks.md"],
     "complete": ["completion.md"],
     "morphospace": ["morphometrics.md", "tutorial-landmarks.md"],
+    "cohort": ["statistics.md"],
+    "figures": ["morphometrics.md"],
     "compare": ["compare.md", "statistics.md"],
     **{f"test {test.name}": ["morphometrics.md", "statistics.md"] for test in SHAPE_TESTS},
     "change": ["change.md", "statistics.md"],
@@ -62,16 +64,13 @@ PAGES = {
 """Command -> pages that explain its topic."""
 INTRODUCTION = """# The command line
 
-Every command has `--help` with an example and its basic options, `--help-all` with all options, `--quiet` (no
-progress) and, where it prints facts, `--json` (on standard output). Progress and messages go to standard error.
-Without a terminal there is no progress bar: a step that takes longer than five seconds writes a line to the log, with
-the number done so far, and further lines at intervals that double up to one minute. One line reports that code is
-being compiled, which happens once on a machine and takes about half a minute.
+Every command has `--help` with an example and its basic options, `--help-all` with all options and settings, `--quiet`
+(no progress) and, where it prints facts, `--json` (on standard output). `--set NAME=VALUE` gives a setting, a value
+that is rarely changed. Messages go to standard error. Without a terminal a step longer than five seconds writes lines
+to the log in place of a progress bar. One line reports that code is being compiled, once on a machine.
 
-Where several meshes are expected, a folder stands for all meshes in it, in the order of their names. With
-`--recursive` it also stands for those in its subfolders, except links to folders and the folder of the results.
-Skipped folders and broken links are named on standard error; names that begin with a dot and files of other kinds are
-not.
+Where several meshes are expected, a folder stands for all meshes in it, in the order of their names, with
+`--recursive` also for those in its subfolders. Skipped folders and broken links are named.
 
 ## Commands
 
@@ -84,36 +83,41 @@ EXIT_CODES = """
 | code | means |
 |---|---|
 | 0 | done |
-| 1 | done, but some of several scans or volumes failed or, under `--strict`, are doubtful |
+| 1 | done, but some of several inputs failed or, under `--strict`, are doubtful; not of `build`, `quality`, `info` |
 | 2 | the arguments are wrong, or no input could be used; one sentence on standard error, no traceback |
-| 130 | stopped by Ctrl-C; files are complete, `coefficients.csv` has every finished fit; the same command continues |
-| 143, 129 | the same by SIGTERM, by SIGHUP |
-
-`build`, `quality` and `info` end with 0 or 2.
+| 130, 143, 129 | stopped by Ctrl-C, SIGTERM or SIGHUP; files are complete, and the same command continues |
 
 ## A session
 
 ```console
 $ shapespace data faces -o faces --subjects 12
 $ shapespace build faces -o model.h5 --modes 5 --provenance "12 simulated people" --licence CC0-1.0
-$ shapespace info model.h5
 $ shapespace data faces -o scans --subjects 1 --seed 7
 $ shapespace check scans
 $ shapespace fit model.h5 scans -o out
-$ shapespace info out/subject_000_neutral.fit.json
-$ shapespace fit model.h5 scans -o out --json
+$ shapespace info out/subject_000_neutral.fit.json --json
 ```
 """
 
 
 def pages() -> dict[str, str]:
     """Return the text of each page by its path in docs."""
-    index = "".join(f"| [`{command.name}`](cli/{file_name(command)}) | {command.summary} |\n" for command in COMMANDS)
+    index = "".join(f"| {links} | {text} |\n" for links, text in index_rows())
     return {
         "cli.md": GENERATED + INTRODUCTION + index + EXIT_CODES,
         **{f"cli/{file_name(command)}": GENERATED + page(command) for command in COMMANDS},
         TESTS_PAGE: with_tests((DOCS / TESTS_PAGE).read_text(encoding="utf-8")),
     }
+
+
+def index_rows() -> list[tuple[str, str]]:
+    """Return links and summary of each command, or of each group of commands."""
+    rows: dict[str, tuple[list[str], str]] = {}
+    for command in COMMANDS:
+        group, _, name = command.name.rpartition(" ")
+        text = f"`{group}`: {GROUPS[group]}" if group else command.summary
+        rows.setdefault(group or name, ([], text))[0].append(f"[`{name}`](cli/{file_name(command)})")
+    return [(", ".join(links), text) for links, text in rows.values()]
 
 
 def with_tests(text: str) -> str:
@@ -138,22 +142,28 @@ def page(command: Command) -> str:
     text += f"```text\n{command.usage}\n```\n\n"
     text += "".join(f"{paragraph}\n\n" for paragraph in command.details)
     text += "Example:\n\n```text\n" + "\n".join(command.examples) + "\n```\n"
-    shown = command.options
+    shown = [option for option in command.options if option not in (JSON, QUIET, SET)]
     for title, some in (
         ("Arguments", [option for option in shown if option.is_positional]),
         ("Options", [option for option in shown if option.basic and not option.is_positional]),
         ("Advanced options", [option for option in shown if not option.basic]),
+        ("Settings", [option for option in command.settings if option not in COHORT_SETTINGS]),
     ):
         if some:
             text += f"\n## {title}\n\n| option | does |\n|---|---|\n" + "".join(map(row, some))
+    if set(command.settings) & set(COHORT_SETTINGS):
+        names = ", ".join(f"`{option.names}`" for option in command.settings if option in COHORT_SETTINGS)
+        text += f"\nSettings of the [cohort](cohort.md): {names}.\n"
     links = ", ".join(f"[{name.removesuffix('.md')}](../{name})" for name in PAGES[command.name])
     return f"{text}\nSee also: {links}, [all commands](../cli.md).\n"
 
 
 def row(option: Option) -> str:
     """Return the row of an option in the table of its command."""
-    value = option.metavar or "|".join(option.accepted)
+    value = option.value_name
     names = [option.metavar] if option.is_positional else [f"{name} {value}".strip() for name in option.spellings]
+    if option.setting:
+        names = [f"--set {option.names}={value}"]
     text = option.text
     cells = [", ".join(f"`{name}`" for name in names), text]
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"

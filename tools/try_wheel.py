@@ -27,11 +27,11 @@ PREPARE = (
     "fit model.h5 scans -o out",
 )
 TRIES = {
-    "cluster": ["fit model.h5 scans -o with-dask --executor dask --jobs 1"],
+    "cluster": ["fit model.h5 scans -o with-dask --set executor=dask --jobs 1"],
     "recognise": ["recognise train out --labels labels.csv -o people.skops"],
     "remote": ["fit model.h5 zip://subject_000_neutral.ply::scans.zip -o from-zip"],
     "report": ["report out"],
-    "statistics": ["compare labels.csv --shapes out --formula '~ label' --no-maps --permutations 20 -o compared"],
+    "statistics": ["compare labels.csv --shapes out '~ label' --set maps=no --permutations 20 -o compared"],
     "store": ["fit model.h5 scans -o with-store --store"],
     "view": ["view model.h5 --port 99999"],
     "volumes": ["data organs -o masks --count 1 --volumes", "surface masks -o surfaces"],

@@ -111,10 +111,13 @@ def test_sides_that_are_mirror_images_are_reflected_on_request(run: Run, folder:
     outcome = run("align", "skulls.tps", "--table", "skulls.csv", "--reflect", f"side={side}", "-o", "one")
     assert outcome.code == 0 and f"8 of 16 specimens are reflected, those with side {side}" in outcome.err
     assert (
-        run("asymmetry", "one", "--set", "subject=animal", "--side", "side", "--permutations", "20", "-o", "out").code == 0
+        run("asymmetry", "one", "--set", "subject=animal", "--side", "side", "--permutations", "20", "-o", "out").code
+        == 0
     )
     assert run("align", "skulls.tps", "--table", "skulls.csv", "-o", "raw").code == 0
-    assert "mirror images" in run("asymmetry", "raw", "--set", "subject=animal", "--side", "side", "-o", "out").sentence()
+    assert (
+        "mirror images" in run("asymmetry", "raw", "--set", "subject=animal", "--side", "side", "-o", "out").sentence()
+    )
 
 
 @pytest.mark.parametrize(

@@ -78,7 +78,9 @@ def test_what_is_learned_predicts_new_shapes_now_and_later(run: Run, folder: Pat
 
 
 def test_mean_shapes_along_a_number_are_kept_as_meshes_and_tables(run: Run, folder: Path) -> None:
-    outcome = run("regress", "people.csv", "--along", "age", "--at", "45,50,55", "--covariates", "group", "--set", "hold=group=control", "-o", "out", "--set", "gauge=form", "--permutations", "100")  # fmt: skip
+    settings = ("--set", "hold=group=control", "--set", "gauge=form", "--permutations", "100")
+    along = ("--along", "age", "--at", "45,50,55", "--covariates", "group")
+    outcome = run("regress", "people.csv", *along, "-o", "out", *settings)
     assert outcome.code == 0, outcome.err
     first = outcome.out.splitlines()[0]
     assert first.startswith("Shape changes with age (p 0.01): ") and "between 12 subjects" in first

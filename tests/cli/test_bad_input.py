@@ -180,7 +180,17 @@ def test_scans_that_cannot_be_read_are_reported_before_the_first_fit(
 
     monkeypatch.setattr(FitWork, "do", noted)
     outcome = run(
-        "fit", world.model, *world.scans[:2], empty, cut, "-o", tmp_path / "out", "--set", "max_iterations=2", "--jobs", 1
+        "fit",
+        world.model,
+        *world.scans[:2],
+        empty,
+        cut,
+        "-o",
+        tmp_path / "out",
+        "--set",
+        "max_iterations=2",
+        "--jobs",
+        1,
     )
     assert outcome.code == 1
     assert order == ["y_empty", "z_cut", "scan_0", "scan_1"]
@@ -200,7 +210,17 @@ def test_several_scans_with_vertices_that_are_not_finite_are_named_at_the_end(
     assert "1 scan has vertices with coordinates that are NaN or infinite" in outcome.err.splitlines()[-1]
     assert "(bad)" in outcome.err and outcome.code == 0
     outcome = run(
-        "fit", world.model, world.scan, bad, "-o", tmp_path / "out", "--set", "max_iterations=2", "--jobs", 1, "--strict"
+        "fit",
+        world.model,
+        world.scan,
+        bad,
+        "-o",
+        tmp_path / "out",
+        "--set",
+        "max_iterations=2",
+        "--jobs",
+        1,
+        "--strict",
     )
     assert outcome.code == 1 and "--strict" in outcome.err and str(bad) in outcome.err
 

@@ -626,7 +626,17 @@ def test_a_cap_on_iterations_is_a_status_of_its_own(run: Run, world: World, tmp_
 
 def test_the_surface_search_and_a_held_scale_are_in_the_record(run: Run, world: World, tmp_path: Path) -> None:
     outcome = run(
-        "fit", world.model, world.scan, "-o", tmp_path, "--method", "paper", "--set", "search=surface", "--scale", "fixed"
+        "fit",
+        world.model,
+        world.scan,
+        "-o",
+        tmp_path,
+        "--method",
+        "paper",
+        "--set",
+        "search=surface",
+        "--scale",
+        "fixed",
     )
     assert outcome.code == 0, outcome.err
     record = record_of(tmp_path)

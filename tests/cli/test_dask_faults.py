@@ -51,7 +51,10 @@ def cluster(file: Path) -> Iterator[tuple[subprocess.Popen[bytes], list[subproce
 def fit(world: World, scans: Path, out: Path, file: Path) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "shapespace", "fit", world.model, scans, "-o", out, *FAST]
     return subprocess.Popen(
-        [*command, "--set", "executor=dask", "--set", f"dask={file}"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [*command, "--set", "executor=dask", "--set", f"dask={file}"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
 
 

@@ -1,4 +1,4 @@
-"""The package only gets lighter: statements and modules of each package, and options of commands, only ever sink.
+"""The package only gets lighter: statements and modules of each package, options and settings, only ever sink.
 
 After a change that makes it lighter, write the lower numbers to size.json and commit them:
 
@@ -13,12 +13,14 @@ from pathlib import Path
 import pytest
 
 import shapespace
-from shapespace.cli.command_table import COMMANDS
+from shapespace.cli.command_table import COMMANDS, JSON, QUIET
 
 ROOT = Path(shapespace.__file__).parent
 LIMITS = Path(__file__).with_name("size.json")
 AGAIN = "python tests/contracts/test_size.py"
 
+OF_ALL = (JSON, QUIET)
+"""Options of all commands, which count once."""
 Sizes = dict[str, dict[str, int]]
 
 
@@ -34,7 +36,7 @@ def statements(code: str) -> int:
 
 
 def measure(root: Path) -> Sizes:
-    """Return statements and modules by package, and the options of all commands."""
+    """Return statements and modules by package, the options of all commands, and the settings that differ."""
     count: Counter[str] = Counter()
     modules: Counter[str] = Counter()
     for path in root.rglob("*.py"):
@@ -42,8 +44,11 @@ def measure(root: Path) -> Sizes:
         package = parts[0] if len(parts) > 1 else "(top)"
         count[package] += statements(path.read_text("utf-8"))
         modules[package] += 1
-    options = sum(not option.is_positional for command in COMMANDS for option in command.options)
-    sizes = {"statements": count, "modules": modules, "options": {"commands": options}}
+    given = [option for command in COMMANDS for option in command.options if option not in OF_ALL]
+    options = len(OF_ALL) + sum(not option.is_positional for option in given)
+    settings = len({option for command in COMMANDS for option in command.settings})
+    kinds = {"options": {"commands": options}, "settings": {"commands": settings}}
+    sizes = {"statements": count, "modules": modules, **kinds}
     return {kind: {package: numbers[package] for package in sorted(numbers)} for kind, numbers in sizes.items()}
 
 

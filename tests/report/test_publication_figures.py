@@ -14,13 +14,13 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
 
+from shapespace.cohort.orientation import find_orientation, view_rotation
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.report import figures
 from shapespace.report.analyses.analysis_report import AnalysisReport
 from shapespace.report.analyses.shape_data import scree_part, tangent_part
 from shapespace.report.figures.analysis_figures import views_of
 from shapespace.report.figures.publication import ONE_COLUMN_MM, TWO_COLUMNS_MM
-from shapespace.cohort.orientation import find_orientation, view_rotation
 from shapespace.report.pages.figure_files import FigureConfig, write_figures
 from shapespace.schemas import CurvePart, DeformationPart, NamedView, Orientation, Series, SurfaceMapPart, TextPart
 from shapespace.types import FloatArray, Mesh

@@ -69,7 +69,7 @@ def answer_cohort(arguments: argparse.Namespace) -> int:
     from shapespace.cohort.read import CohortConfig, read_cohort, write_cohort_file
 
     settings = {name: value for name, value in given(arguments, CohortConfig).items() if value is not None}
-    config = CohortConfig(**settings)
+    config = CohortConfig(**settings, least=1)
     initial = CohortConfig()
     with steps(None, "reading", "shape", quiet=arguments.quiet) as step:
         cohort = read_cohort(arguments.data, config, on_shape=step)

@@ -137,7 +137,7 @@ class Command:
 QUIET = basic("--quiet", help="do not show progress")
 JSON = basic("--json", help="print the results as JSON")
 SET = advanced("--set", "NAME=VALUE", "a value that is rarely changed, from the list of settings; can be repeated",
-               repeat=True, default=())  # fmt: skip
+               repeat=True)  # fmt: skip
 _OUTPUT = basic("-o --output", "DIR", "output folder", parse=Path, required=True)
 _MARKED = basic("marked", "MARKED", "folder of landmark files with the names of the scans, in any landmark format",
                 parse=Path)  # fmt: skip
@@ -180,7 +180,7 @@ def _jobs(what: str) -> Option:
     return basic("--jobs", "N", f"{what} in parallel (default: one per core)", EXECUTION)
 
 
-_COHORT_SETTINGS = (
+COHORT_SETTINGS = (
     setting("model", "MODEL.h5", source=COHORT),
     setting("surfaces", source=COHORT),
     setting("geometry", source=COHORT),
@@ -208,7 +208,7 @@ _COHORT = (_DATA, _OUTPUT, _SHAPES)
 
 def _settings(*own: Option, without: tuple[str, ...] = ()) -> tuple[Option, ...]:
     """Return the settings of a question: its own, and those of its cohort `without` some names."""
-    return (*own, *(one for one in _COHORT_SETTINGS if one.names not in without))
+    return (*own, *(one for one in COHORT_SETTINGS if one.names not in without))
 
 
 _IDENTITY_OPTIONS = (
@@ -863,7 +863,7 @@ COMMANDS: tuple[Command, ...] = (
             basic("-o --output", "FILE.toml", "the cohort file", parse=Path, required=True),
             _SHAPES,
             *(replace(one, names=f"--{one.names}", setting=False, basic=one.names in _BASIC_OF_COHORT)
-              for one in _COHORT_SETTINGS),
+              for one in COHORT_SETTINGS),
         ),
         (
             "The shapes are read once, so that what cannot be used is named now. Paths in the file are relative to it. "
