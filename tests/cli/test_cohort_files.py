@@ -59,7 +59,7 @@ def test_each_setting_of_the_file_reaches_the_cohort(home: Path) -> None:
     (home / "marks.csv").write_text("name,vertex\ntop,5\n")
     views = {"views": [{"name": "dorsal", "toward_viewer": [0, 0, 1], "up": [0, 1, 0]}]}
     (home / "views.json").write_text(json.dumps(views))
-    chosen = {
+    chosen: dict[str, Any] = {
         "subject": "animal",
         "unit": "none",
         "gauge": "form",

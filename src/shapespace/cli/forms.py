@@ -77,7 +77,8 @@ def _described(option: Option, *, visible: bool) -> dict[str, Any]:
     way = f"--set {option.names}" if option.setting else "" if option.is_positional else option.spellings[-1]
     return {
         "flag": _flag(option), "way": way, "help": option.text.replace("`", ""),
-        "kind": "choice" if choices else _kind(option), "choices": choices, "initial": words if known else None, "visible": visible,
+        "kind": "choice" if choices else _kind(option), "choices": choices,
+        "initial": words if known else None, "visible": visible,
         "required": (option.required and not option.either) or option.names in ("formula", "--to"),
     }  # fmt: skip
 
