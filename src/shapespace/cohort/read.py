@@ -149,6 +149,13 @@ def write_cohort_file(path: Path | str, data: Path | str, **settings: Any) -> No
     Raises:
         InputError: another ending, or a setting that there is not.
         FileError: the file cannot be written.
+
+    Example:
+        >>> ss.write_cohort_file("bones.toml", "people.csv", shapes="same", gauge="form")
+        >>> print(open("bones.toml").read(), end="")
+        data = "people.csv"
+        shapes = "same"
+        gauge = "form"
     """
     path = Path(path)
     if not is_cohort_file(path):
