@@ -209,4 +209,4 @@ def test_bad_input_ends_with_one_sentence(run: Run, table: Path, tmp_path: Path)
 
 def test_numbers_that_json_cannot_hold_are_refused_before_any_work(run: Run, table: Path) -> None:
     outcome = run("test", "disparity", table, "--group", "sex", "--set", f"seed={10**20}", "-o", table.parent / "out")
-    assert outcome.code == 2 and "argument --seed: must be below" in outcome.err
+    assert outcome.code == 2 and "argument --set: seed must be below" in outcome.err

@@ -208,7 +208,7 @@ def test_each_action_is_a_command_line_that_the_parser_takes(project: Project, t
     for k, name in enumerate(("dora", "emil")):
         project.add(tetrahedron(project.new_file(f"{name}.ply"), 5.0 + k), "new")
     join_table(project, b"id,group,age\nanna,a,1\nben,a,2\ncarl,b,3\ndora,a,4\nemil,b,5\n")
-    made = (("correspond", "correspondence-1"), ("build", "model-2.h5"), ("fit", "fits-3"))
+    made = (("correspond", "correspondence-1"), ("build", "model-2.h5"), ("fit", "fits-3"), ("compare", "compare-4"))
     done = [
         Job(number=1 + k, kind=one, arguments=(one,), output=output, status="done")
         for k, (one, output) in enumerate(made)
@@ -220,13 +220,13 @@ def test_each_action_is_a_command_line_that_the_parser_takes(project: Project, t
         for one in described[kind]["options"]
         if one["required"] or one["kind"] in ("class", "formula") or one["flag"] == "--along"
     }
-    ordered = order(project, done, described, kind, options, None, 4)
+    ordered = order(project, done, described, kind, options, None, 5)
     arguments = parser().parse_args(ordered.arguments)
     assert callable(arguments.run)
     if kind == "score":
         written = {path.name: path.read_text() for path in (project.folder / "inputs").glob("*.csv")}
-        assert "anna" in written["0004-reference.csv"] and "carl" not in written["0004-reference.csv"]
-        assert "carl" in written["0004.csv"] and "anna" not in written["0004.csv"]
+        assert "anna" in written["0005-reference.csv"] and "carl" not in written["0005-reference.csv"]
+        assert "carl" in written["0005.csv"] and "anna" not in written["0005.csv"]
 
 
 GROUPS = {f"s{k:02}": ("a" if k % 2 else "b", f"g{k % 3}", str(20 + 3 * k)) for k in range(12)}
