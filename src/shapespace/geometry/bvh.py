@@ -16,10 +16,12 @@ from shapespace.compiled import compiled
 from shapespace.errors import InputError
 from shapespace.geometry.kdtree import (
     STACK_SIZE,
-    box_distance,
     checked_guess,
-    cover_children,
+    cover,
+    descend,
+    next_node,
     order_into_leaves,
+    rows_of,
     start_at,
     writable,
 )
@@ -69,15 +71,14 @@ class TriangleTree:
         original = np.arange(len(faces), dtype=np.int32)
         boxes = np.empty((2 ** (depth + 1) - 1, 6))
         vertices, faces = writable(vertices), np.require(faces, dtype=np.int32, requirements=["C", "W"])
-        middles = np.empty((len(faces), 3))
-        _middles(vertices, faces, middles)
+        corners = vertices.take(faces, axis=0)
+        middles = (corners[:, 0] + corners[:, 1] + corners[:, 2]) / 3.0
         if not np.isfinite(middles).all():
             raise InputError("A triangle tree needs finite corners; drop the triangles whose corners are not.")
         order_into_leaves(middles, original, boxes, depth)
-        del middles
-        row_of, corners = np.empty_like(original), np.empty((len(faces), 9))
-        _cover(vertices, faces, original, row_of, corners, boxes, depth)
-        self.arrays = TriangleArrays(corners, original, row_of, boxes, depth)
+        corners = corners.take(original, axis=0).reshape(-1, 9)
+        cover(corners, boxes, depth)
+        self.arrays = TriangleArrays(corners, original, rows_of(original), boxes, depth)
         """The tree as compiled loops take it."""
 
     def closest(
@@ -99,39 +100,6 @@ class TriangleTree:
         barycentric, points = np.empty((len(queries), 3)), np.empty((len(queries), 3))
         closest_into(self.arrays, queries, guess, triangle, barycentric, points, squared)
         return triangle, barycentric, points, squared
-
-
-@compiled
-def _middles(vertices: FloatArray, faces: IntArray, middles: FloatArray) -> None:
-    for f in range(len(faces)):
-        for k in range(3):
-            middles[f, k] = (vertices[faces[f, 0], k] + vertices[faces[f, 1], k] + vertices[faces[f, 2], k]) / 3.0
-
-
-@compiled
-def _cover(
-    vertices: FloatArray,
-    faces: IntArray,
-    original: IntArray,
-    row_of: IntArray,
-    corners: FloatArray,
-    boxes: FloatArray,
-    depth: int,
-) -> None:
-    """Fill `place`, `corners` and `boxes` of triangles in the order `original`, leaves first."""
-    count, first_leaf = len(original), (1 << depth) - 1
-    for leaf in range(1 << depth):
-        box = boxes[first_leaf + leaf]
-        box[:3], box[3:] = np.inf, -np.inf
-        for row in range((leaf * count) >> depth, ((leaf + 1) * count) >> depth):
-            row_of[original[row]] = row
-            for corner in range(3):
-                for k in range(3):
-                    value = vertices[faces[original[row], corner], k]
-                    corners[row, 3 * corner + k] = value
-                    box[k] = value if value < box[k] else box[k]
-                    box[3 + k] = value if value > box[3 + k] else box[3 + k]
-    cover_children(boxes, first_leaf)
 
 
 @compiled
@@ -267,32 +235,16 @@ def closest_one(
         best = tree.row_of[guess]
         squared, weight_b, weight_c = on_triangle(corners, best, x, y, z, np.inf)
         node, top = start_at(boxes, best, count, depth, x, y, z, squared, stack)
-    while True:
-        while node < first_leaf:
-            left = 2 * node + 1
-            near, far = box_distance(boxes, left, x, y, z), box_distance(boxes, left + 1, x, y, z)
-            node = left
-            if far < near:
-                node = left + 1
-                near, far = far, near
-            if near >= squared:
-                node = -1
-                break
-            if far < squared:
-                stack[top], stack[top + 1] = 2 * left + 1 - node, far
-                top += 2
+    while node >= 0:
+        node, top = descend(boxes, node, first_leaf, top, x, y, z, squared, stack)
         if node >= 0:
             leaf = node - first_leaf
             for row in range((leaf * count) >> depth, ((leaf + 1) * count) >> depth):
                 d, b, c = on_triangle(corners, row, x, y, z, squared)
                 if d < squared or best < 0:
                     best, squared, weight_b, weight_c = row, d, b, c
-        while top > 0 and stack[top - 1] >= squared:
-            top -= 2
-        if top == 0:
-            return tree.original[best], squared, weight_b, weight_c
-        top -= 2
-        node = int(stack[top])
+        node, top = next_node(stack, top, squared)
+    return tree.original[best], squared, weight_b, weight_c
 
 
 @compiled

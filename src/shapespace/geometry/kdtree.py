@@ -83,9 +83,7 @@ class KdTree:
         index = np.arange(len(points), dtype=np.int32)
         boxes = np.empty((2 ** (depth + 1) - 1, 6))
         order_into_leaves(ordered, index, boxes, depth)
-        row_of = np.empty_like(index)
-        row_of[index] = np.arange(len(points), dtype=np.int32)
-        self.arrays = KdArrays(ordered, index, row_of, boxes, depth)
+        self.arrays = KdArrays(ordered, index, rows_of(index), boxes, depth)
         """The tree as compiled loops take it."""
 
     def moved(self, points: FloatArray) -> KdTree:
@@ -97,7 +95,7 @@ class KdTree:
         tree, old = object.__new__(KdTree), self.arrays
         boxes = np.empty_like(old.boxes)
         ordered = np.ascontiguousarray(points[old.original], dtype=np.float64)
-        _boxes_of_leaves(ordered, boxes, old.depth)
+        cover(ordered, boxes, old.depth)
         tree.arrays = KdArrays(ordered, old.original, old.row_of, boxes, old.depth)
         return tree
 
@@ -141,6 +139,13 @@ class KdTree:
         nearest, squared, points = np.empty(m, dtype=np.int32), np.empty(m), np.empty((m, 3))
         follow_into(self.arrays, queries, known, nearest, squared, points)
         return nearest, squared, points, known
+
+
+def rows_of(original: IntArray) -> IntArray:
+    """Return the row (N,) int32 at which each of the numbers `original` (N,) stands."""
+    row_of = np.empty_like(original)
+    row_of[original] = np.arange(len(original), dtype=np.int32)
+    return row_of
 
 
 def writable(queries: FloatArray) -> FloatArray:
@@ -250,27 +255,22 @@ def order_into_leaves(points: FloatArray, index: IntArray, boxes: FloatArray, de
 
 
 @compiled
-def cover_children(boxes: FloatArray, first_leaf: int) -> None:
-    """Fill the `boxes` before `first_leaf`, each around its two children, from those of the leaves."""
-    for node in range(first_leaf - 1, -1, -1):
-        for k in range(3):
-            boxes[node, k] = min(boxes[2 * node + 1, k], boxes[2 * node + 2, k])
-            boxes[node, 3 + k] = max(boxes[2 * node + 1, 3 + k], boxes[2 * node + 2, 3 + k])
-
-
-@compiled
-def _boxes_of_leaves(points: FloatArray, boxes: FloatArray, depth: int) -> None:
-    """Fill `boxes` of `points` in leaf order, leaves first."""
+def cover(points: FloatArray, boxes: FloatArray, depth: int) -> None:
+    """Fill `boxes` around rows of one or several points, (N, 3 n) in leaf order, leaves first."""
     count, first_leaf = len(points), (1 << depth) - 1
     for leaf in range(1 << depth):
         box = boxes[first_leaf + leaf]
         box[:3], box[3:] = np.inf, -np.inf
         for row in range((leaf * count) >> depth, ((leaf + 1) * count) >> depth):
-            for k in range(3):
-                value = points[row, k]
-                box[k] = value if value < box[k] else box[k]
-                box[3 + k] = value if value > box[3 + k] else box[3 + k]
-    cover_children(boxes, first_leaf)
+            for start in range(0, points.shape[1], 3):
+                for k in range(3):
+                    value = points[row, start + k]
+                    box[k] = value if value < box[k] else box[k]
+                    box[3 + k] = value if value > box[3 + k] else box[3 + k]
+    for node in range(first_leaf - 1, -1, -1):
+        for k in range(3):
+            boxes[node, k] = min(boxes[2 * node + 1, k], boxes[2 * node + 2, k])
+            boxes[node, 3 + k] = max(boxes[2 * node + 1, 3 + k], boxes[2 * node + 2, 3 + k])
 
 
 @compiled
@@ -312,6 +312,54 @@ def start_at(
 
 
 @compiled
+def descend(
+    boxes: FloatArray,
+    node: int,
+    first_leaf: int,
+    top: int,
+    x: float,
+    y: float,
+    z: float,
+    squared: float,
+    stack: FloatArray,
+) -> tuple[int, int]:
+    """Return the leaf below `node` nearest to (x, y, z), -1 if nothing lies within `squared`, and the top of `stack`.
+
+    Args:
+        boxes: of the tree.
+        node: where to begin.
+        first_leaf: the first node that is a leaf.
+        top: of the stack, which gets what else may lie within `squared`.
+        x: coordinates of the query,
+        y: in the unit
+        z: of the boxes.
+        squared: what lies farther is passed over.
+        stack: (STACK_SIZE,) float64 workspace.
+    """
+    while node < first_leaf:
+        left = 2 * node + 1
+        near, far = box_distance(boxes, left, x, y, z), box_distance(boxes, left + 1, x, y, z)
+        node = left
+        if far < near:
+            node = left + 1
+            near, far = far, near
+        if near > squared:
+            return -1, top
+        if far <= squared:
+            stack[top], stack[top + 1] = 2 * left + 1 - node, far
+            top += 2
+    return node, top
+
+
+@compiled
+def next_node(stack: FloatArray, top: int, squared: float) -> tuple[int, int]:
+    """Return the last node of `stack` that may hold something within `squared`, -1 for none, and the top below it."""
+    while top > 0 and stack[top - 1] > squared:
+        top -= 2
+    return (int(stack[top - 2]), top - 2) if top > 0 else (-1, 0)
+
+
+@compiled
 def nearest_one(tree: KdArrays, x: float, y: float, z: float, guess: int, stack: FloatArray) -> tuple[int, float]:
     """Return the index of the point nearest to (x, y, z) and its squared distance.
 
@@ -332,20 +380,8 @@ def nearest_one(tree: KdArrays, x: float, y: float, z: float, guess: int, stack:
         dx, dy, dz = points[row, 0] - x, points[row, 1] - y, points[row, 2] - z
         best, squared = guess, dx * dx + dy * dy + dz * dz
         node, top = start_at(boxes, row, count, depth, x, y, z, squared, stack)
-    while True:
-        while node < first_leaf:
-            left = 2 * node + 1
-            near, far = box_distance(boxes, left, x, y, z), box_distance(boxes, left + 1, x, y, z)
-            node = left
-            if far < near:
-                node = left + 1
-                near, far = far, near
-            if near > squared:
-                node = -1
-                break
-            if far <= squared:
-                stack[top], stack[top + 1] = 2 * left + 1 - node, far
-                top += 2
+    while node >= 0:
+        node, top = descend(boxes, node, first_leaf, top, x, y, z, squared, stack)
         if node >= 0:
             leaf = node - first_leaf
             for row in range((leaf * count) >> depth, ((leaf + 1) * count) >> depth):
@@ -353,12 +389,8 @@ def nearest_one(tree: KdArrays, x: float, y: float, z: float, guess: int, stack:
                 d = dx * dx + dy * dy + dz * dz
                 if d < squared or (d == squared and (best < 0 or index[row] < best)):
                     best, squared = index[row], d
-        while top > 0 and stack[top - 1] > squared:
-            top -= 2
-        if top == 0:
-            return best, squared
-        top -= 2
-        node = int(stack[top])
+        node, top = next_node(stack, top, squared)
+    return best, squared
 
 
 @compiled
@@ -403,20 +435,8 @@ def nearest_few(
     node, top = 0, 0
     if start >= 0:
         node, top = start_at(boxes, start, count, depth, x, y, z, limit, stack)
-    while True:
-        while node < first_leaf:
-            left = 2 * node + 1
-            near, far = box_distance(boxes, left, x, y, z), box_distance(boxes, left + 1, x, y, z)
-            node = left
-            if far < near:
-                node = left + 1
-                near, far = far, near
-            if near > limit:
-                node = -1
-                break
-            if far <= limit:
-                stack[top], stack[top + 1] = 2 * left + 1 - node, far
-                top += 2
+    while node >= 0:
+        node, top = descend(boxes, node, first_leaf, top, x, y, z, limit, stack)
         if node >= 0:
             leaf = node - first_leaf
             for row in range((leaf * count) >> depth, ((leaf + 1) * count) >> depth):
@@ -435,12 +455,7 @@ def nearest_few(
                     rows[j], squared[j] = rows[j - 1], squared[j - 1]
                 rows[k], squared[k] = row, d
                 limit = min(limit, squared[last])
-        while top > 0 and stack[top - 1] > limit:
-            top -= 2
-        if top == 0:
-            return
-        top -= 2
-        node = int(stack[top])
+        node, top = next_node(stack, top, limit)
 
 
 @compiled
