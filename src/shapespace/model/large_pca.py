@@ -8,7 +8,6 @@ mean, in single precision; all sums are in double precision, in one order.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -67,7 +66,7 @@ def large_components(
     n, d = shapes.rows, shapes.columns
     modes = checked_large_modes(modes, n, d)
     mean, total = _mean_and_total(shapes)
-    covariance = partial(_times_covariance, shapes, mean)
+    covariance = _Covariance(shapes, mean)
     if n <= EXACT:
         variance, rows = _by_gram(shapes, mean, modes, total, seed)
         CV = covariance(rows.T)
@@ -129,17 +128,23 @@ def _mean_and_total(shapes: Spill) -> tuple[FloatArray, float]:
     return mean, total
 
 
-def _times_covariance(shapes: Spill, mean: FloatArray, Q: FloatArray) -> FloatArray:
-    """Return C Q by one pass over the rows, centred by the rank-one term."""
-    from scipy.linalg import blas
+class _Covariance:
+    """C Q by one pass over the rows, centred by the rank-one term."""
 
-    n, onto = shapes.rows, np.zeros(Q.shape, order="F")
-    dgemm = cast(Any, blas).dgemm
-    for _, block in shapes.row_blocks():
-        onto = dgemm(1.0, block.T, block @ Q, beta=1.0, c=onto, overwrite_c=1)
-    onto -= np.outer(mean, n * (mean @ Q))
-    onto /= n - 1
-    return onto
+    def __init__(self, shapes: Spill, mean: FloatArray) -> None:
+        self.shapes, self.mean = shapes, mean
+
+    def __call__(self, Q: FloatArray) -> FloatArray:
+        from scipy.linalg import blas
+
+        n = self.shapes.rows
+        onto = np.zeros(Q.shape, order="F")
+        dgemm = cast(Any, blas).dgemm
+        for _, block in self.shapes.row_blocks():
+            onto = dgemm(1.0, block.T, block @ Q, beta=1.0, c=onto, overwrite_c=1)
+        onto -= np.outer(self.mean, n * (self.mean @ Q))
+        onto /= n - 1
+        return onto
 
 
 def _columns(d: int) -> int:
