@@ -107,6 +107,12 @@ def read_only(array: npt.ArrayLike) -> FloatArray:
     return out
 
 
+def set_fields(instance: object, **fields: object) -> None:
+    """Set fields of a frozen instance while it is made: those that `__post_init__` converts."""
+    for name, value in fields.items():
+        object.__setattr__(instance, name, value)
+
+
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """A surface, or a point cloud when it has no faces.

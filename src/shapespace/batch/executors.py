@@ -160,7 +160,7 @@ class Team:
                         yield number, _value(answer)
                     continue
                 late_s = None if time.monotonic() < assignment.deadline else self._timeout_s
-                death = _Death(worker.stop(), late_s)
+                code = worker.stop()
                 if number is None:
                     self._failed_starts += 1
                     if self._failed_starts >= _STARTS:
@@ -171,7 +171,7 @@ class Team:
                     waiting.append(number)
                     continue
                 left -= 1
-                yield number, self._work.give_up(tasks[number], str(death))
+                yield number, self._work.give_up(tasks[number], _reason_of_death(code, late_s))
 
     def close(self) -> None:
         """Give running tasks a moment to end, then end every worker."""
@@ -201,20 +201,12 @@ class Team:
         return [worker for worker, one in self._assignments.items() if worker.line in lines or now >= one.deadline]
 
 
-@dataclass(frozen=True)
-class _Death:
-    """Why a worker did not answer: its exit code, or the time limit of its task."""
-
-    code: int
-    late_s: float | None
-
-    def __str__(self) -> str:
-        if self.late_s is not None:
-            return f"it took more than the {self.late_s:g} s of --set timeout"
-        cause = f"by signal {-self.code}" if self.code < 0 else f"with exit code {self.code}"
-        return (
-            f"its worker ended {cause}, {ATTEMPTS} times, most likely for lack of memory; thin it, or use fewer --jobs"
-        )
+def _reason_of_death(code: int, late_s: float | None) -> str:
+    """Return why a worker did not answer, by its exit code, or the time limit of its task."""
+    if late_s is not None:
+        return f"it took more than the {late_s:g} s of --set timeout"
+    cause = f"by signal {-code}" if code < 0 else f"with exit code {code}"
+    return f"its worker ended {cause}, {ATTEMPTS} times, most likely for lack of memory; thin it, or use fewer --jobs"
 
 
 def _serve(line: Connection, work: Work[Any, Any]) -> None:

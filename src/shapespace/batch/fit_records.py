@@ -15,8 +15,9 @@ import numpy as np
 
 from shapespace.errors import FileFormatError
 from shapespace.fit.result import FitResult
+from shapespace.fit.result import OverlapDistances as FitOverlap
 from shapespace.fit.stages import stage_arrays
-from shapespace.geometry.distance import DistanceSummary, SurfaceDistances
+from shapespace.geometry.distance import SurfaceDistances
 from shapespace.geometry.normals import face_areas, rms_size
 from shapespace.io.files import atomic_path, sha256_of_file, write_bytes, write_text
 from shapespace.io.meshes.ply import ply_comment, write_ply
@@ -127,9 +128,9 @@ def fit_record(
     """
     T = result.T_scan_model
     marks = landmarks.content_hash if landmarks else ""
-    size = measure_surface(result)
+    settings = {key: value for key, value in result.config.items() if key not in ("version", "scale_in_effect")}
     return FitRecord(
-        id=fit_identity(scan.content_hash, model.content_hash, _settings(result), marks),
+        id=fit_identity(scan.content_hash, model.content_hash, settings, marks),
         scan=scan.to_file(),
         model=model.to_file(),
         landmarks=landmarks.to_file() if landmarks else None,
@@ -145,11 +146,7 @@ def fit_record(
         notes=tuple(result.notes),
         T_scan_model=Pose(scale=T.scale, rotation=T.rotation.tolist(), translation=T.translation.tolist()),
         mm_per_scan_unit=result.mm_per_scan_unit,
-        size_mm=size.rms_mm,
-        n_vertices=size.n_vertices,
-        centroid_size_mm=size.centroid_size_mm,
-        extents_mm=size.extents_mm,
-        area_mm2=size.area_mm2,
+        **_size_of_surface(result),
         b=tuple(result.b.tolist()),
         z=tuple(result.z.tolist()),
         b_stddev=tuple(result.b_stddev.tolist()),
@@ -158,7 +155,7 @@ def fit_record(
         evidence={} if result.evidence is None else result.evidence.to_dict(),
         chirality=result.chirality,
         found_landmarks=_found_landmarks(result),
-        distances_mm={name: _both_ways(stage.distances) for name, stage in result.stages.items()},
+        distances_mm={name: BothWays(**_both_ways(stage.distances)) for name, stage in result.stages.items()},
         history=tuple(
             Iteration(
                 phase=state.phase, iteration=state.iteration, rms_mm=state.rms_mm, motion_mm=state.motion_mm,
@@ -172,27 +169,19 @@ def fit_record(
     )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class SurfaceSize:
-    """Size of a fitted surface in mm of the scan; the fields are explained in `FitRecord`."""
-
-    rms_mm: float
-    n_vertices: int
-    centroid_size_mm: float
-    extents_mm: tuple[float, float, float]
-    area_mm2: float | None
-
-
-def measure_surface(result: FitResult) -> SurfaceSize:
-    """Return the size of the fitted surface."""
+def _size_of_surface(result: FitResult) -> dict[str, Any]:
+    """Return the size of the fitted surface in mm of the scan, by the fields of `FitRecord`."""
     surface = result.surface()
     x = (surface.vertices - surface.vertices.mean(axis=0)) * result.mm_per_scan_unit
     axes = np.linalg.svd(x, full_matrices=False)[2]
     rms_mm = rms_size(surface.vertices) * result.mm_per_scan_unit
     extents_mm: list[float] = np.sort(np.ptp(x @ axes.T, axis=0))[::-1].tolist()
     area_mm2 = None if surface.faces is None else float(face_areas(surface).sum()) * result.mm_per_scan_unit**2
-    long, wide, deep = extents_mm
-    return SurfaceSize(rms_mm, len(x), rms_mm * float(np.sqrt(len(x))), (long, wide, deep), area_mm2)
+    size_mm = rms_mm * float(np.sqrt(len(x)))
+    return {
+        "size_mm": rms_mm, "n_vertices": len(x), "centroid_size_mm": size_mm, "extents_mm": tuple(extents_mm),
+        "area_mm2": area_mm2,
+    }  # fmt: skip
 
 
 def _found_landmarks(result: FitResult) -> dict[str, FoundLandmark]:
@@ -204,19 +193,11 @@ def _found_landmarks(result: FitResult) -> dict[str, FoundLandmark]:
     }
 
 
-def _settings(result: FitResult) -> dict[str, Any]:
-    """Return the settings as in `FitConfig.as_dict`."""
-    return {key: value for key, value in result.config.items() if key not in ("version", "scale_in_effect")}
-
-
-def _distances(summary: DistanceSummary) -> Distances:
-    return Distances(**asdict(summary))
-
-
-def _both_ways(distances: SurfaceDistances) -> BothWays:
-    return BothWays(
-        model_to_scan=_distances(distances.model_to_scan), scan_to_model=_distances(distances.scan_to_model)
-    )
+def _both_ways(distances: SurfaceDistances | FitOverlap) -> dict[str, Distances]:
+    return {
+        direction: Distances(**asdict(getattr(distances, direction)))
+        for direction in ("model_to_scan", "scan_to_model")
+    }
 
 
 def _overlap(result: FitResult, stage: str) -> OverlapDistances | None:
@@ -225,8 +206,7 @@ def _overlap(result: FitResult, stage: str) -> OverlapDistances | None:
         return None
     overlap = result.overlap_distances_at(stage)
     return OverlapDistances(
-        model_to_scan=_distances(overlap.model_to_scan),
-        scan_to_model=_distances(overlap.scan_to_model),
+        **_both_ways(overlap),
         model_seen_share=overlap.model_seen_share,
         scan_covered_share=overlap.scan_covered_share,
     )

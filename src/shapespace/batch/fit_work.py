@@ -37,7 +37,7 @@ from shapespace.io.read_limits import LARGEST_MESH_FILE_BYTES
 from shapespace.io.remote import fetch_copy, is_address, name_of, version_of
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import File, FitRecord, to_json
-from shapespace.store.results import has_written_landmarks
+from shapespace.store.results import ENDINGS, has_written_landmarks
 from shapespace.types import FloatArray
 from shapespace.version import __version__
 
@@ -113,50 +113,40 @@ def publish(result: FitResult, record: FitRecord, name: str, folder: Path, *, st
     Raises:
         FileError: they cannot be written.
     """
-    files, dense = _Files.of(name, folder), "dense" in result.stages
+    files, dense = _files(name, folder), "dense" in result.stages
     writes: dict[Path, Callable[[Path], None]] = {}
-    for surface, stage in ((files.fitted, "final"), *([(files.dense, "dense")] if dense else [])):
+    for surface, stage in ((files["fitted"], "final"), *([(files["dense"], "dense")] if dense else [])):
         writes[surface] = partial(write_fitted_mesh, result=result, model=result.model, stage=stage, identity=record.id)
     if stages:
-        writes[files.stages] = partial(write_stages, result=result, model=result.model)
+        writes[files["stages"]] = partial(write_stages, result=result, model=result.model)
     landmarks: Mapping[str, Any] = to_json(record.found_landmarks)
     texts = fiducial_texts(landmarks) if landmarks else {}
-    writes |= {files.landmarks[ending]: partial(write_text, text=text) for ending, text in texts.items()}
-    writes[files.record] = partial(write_record, record=record)
-    write_together(writes, files.stale(dense=not dense, stages=not stages, landmarks=not texts))
+    writes |= {files[ending]: partial(write_text, text=text) for ending, text in texts.items()}
+    writes[files["record"]] = partial(write_record, record=record)
+    write_together(writes, _stale(files, dense=not dense, stages=not stages, landmarks=not texts))
 
 
 def _write_failed(record: FitRecord, job: Job, folder: Path) -> FitRecord:
-    files = _Files.of(job.name, folder)
+    files = _files(job.name, folder)
     # An earlier run's surface would contradict the record.
-    stale = [files.fitted, *files.stale(dense=True, stages=True, landmarks=True)]
-    write_together({files.record: partial(write_record, record=record)}, stale)
+    stale = [files["fitted"], *_stale(files, dense=True, stages=True, landmarks=True)]
+    write_together({files["record"]: partial(write_record, record=record)}, stale)
     return record
 
 
-@dataclass(frozen=True)
-class _Files:
-    """Where the results of one scan are."""
+def _files(name: str, folder: Path) -> dict[str, Path]:
+    """Return where the results of one scan are: by what they are, and landmarks by their endings."""
+    endings = {"record": RECORD, **ENDINGS, **{ending: ending for ending in FIDUCIAL_ENDINGS}}
+    return {what: folder / f"{name}{ending}" for what, ending in endings.items()}
 
-    record: Path
-    fitted: Path
-    dense: Path
-    stages: Path
-    landmarks: Mapping[str, Path]
 
-    @staticmethod
-    def of(name: str, folder: Path) -> _Files:
-        endings = (RECORD, ".fitted.ply", ".dense.ply", ".stages.npz")
-        landmarks = {ending: folder / f"{name}{ending}" for ending in FIDUCIAL_ENDINGS}
-        record, fitted, dense, stages = (folder / f"{name}{ending}" for ending in endings)
-        return _Files(record, fitted, dense, stages, landmarks)
-
-    def stale(self, *, dense: bool, stages: bool, landmarks: bool) -> list[Path]:
-        """Return what an earlier fit may have left that this one does not write."""
-        # Without a record they are no results of ours, but perhaps a scan and the landmarks that somebody placed.
-        left = [self.dense] if dense and self.record.is_file() else []
-        left += self.landmarks.values() if landmarks and has_written_landmarks(self.record) else ()
-        return [*left, self.stages] if stages else left
+def _stale(files: Mapping[str, Path], *, dense: bool, stages: bool, landmarks: bool) -> list[Path]:
+    """Return what an earlier fit may have left that this one does not write."""
+    # Without a record they are no results of ours, but perhaps a scan and the landmarks that somebody placed.
+    left = [files["dense"]] if dense and files["record"].is_file() else []
+    if landmarks and has_written_landmarks(files["record"]):
+        left += [files[ending] for ending in FIDUCIAL_ENDINGS]
+    return [*left, files["stages"]] if stages else left
 
 
 def naming(source: Path | str, sentence: str) -> str:
@@ -263,8 +253,8 @@ _model = LatestValue[ShapeModel]()
 
 def has_surface(job: Job, folder: Path) -> bool:
     """Return whether `folder` holds the surface of an earlier fit of the scan."""
-    files = _Files.of(job.name, folder)
-    return files.fitted.is_file() and files.record.is_file()
+    files = _files(job.name, folder)
+    return files["fitted"].is_file() and files["record"].is_file()
 
 
 def resumed(task: FitTask, model_hash: str, folder: Path, run: str = "") -> tuple[FitTask, FitRecord | None]:
@@ -273,18 +263,18 @@ def resumed(task: FitTask, model_hash: str, folder: Path, run: str = "") -> tupl
     A fit that has to be done again for the stages, say, keeps the dense surface that it had. A scan that was given up
     is tried again by another run, not by `run` itself.
     """
-    files = _Files.of(task.job.name, folder)
-    if not files.record.is_file():
+    files = _files(task.job.name, folder)
+    if not files["record"].is_file():
         return task, None
     try:
-        record = read_record(files.record)
+        record = read_record(files["record"])
         if not _is_of(record, task, model_hash, folder):
             return task, None
         if run and record.given_up == run:
             return task, record
-        dense = bool(record.config["dense"]) and is_surface_of(files.dense, record)
-        staged = files.stages.is_file()
-        enough = is_surface_of(files.fitted, record) and dense >= task.config.dense and staged >= task.stages
+        dense = bool(record.config["dense"]) and is_surface_of(files["dense"], record)
+        staged = files["stages"].is_file()
+        enough = is_surface_of(files["fitted"], record) and dense >= task.config.dense and staged >= task.stages
         complete = len(record.b) == len(record.z) == len(record.b_stddev)
     except (ShapespaceError, KeyError, TypeError, AttributeError, ValueError):
         return task, None

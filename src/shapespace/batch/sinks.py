@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol
+from typing import TypeAlias
 
 from msgspec import structs
 
@@ -42,18 +42,17 @@ _SCAN = {
 _COLUMNS = ("scan", "id", "status", "stages", *_SCAN.values())
 
 
-class Sink(Protocol):
-    """Takes the results of a batch of fits; used once."""
+@dataclass
+class FolderSink:
+    """Single files, and coefficients.csv with the records of all runs, those of this run last.
 
-    @property
-    def folder(self) -> Path:
-        """The folder that the fits write their files to."""
-        ...
+    Args:
+        folder: of the results.
+        records: of this run by the names of the jobs, also of valid earlier results.
+    """
 
-    @property
-    def records(self) -> Mapping[str, FitRecord]:
-        """The records of this run by the names of the jobs, also of valid earlier results, where the sink has them."""
-        ...
+    folder: Path
+    records: dict[str, FitRecord] = field(default_factory=dict[str, FitRecord], init=False)
 
     def open(self, names: Sequence[str], model: ShapeModel, *, reuse: bool) -> None:
         """Read what is there.
@@ -63,48 +62,12 @@ class Sink(Protocol):
             model: that is fitted.
             reuse: whether valid earlier results are reused.
         """
-        ...
-
-    def find_valid(self, task: FitTask) -> tuple[FitTask, FitRecord | None]:
-        """Return the task that remains, and the record of a valid earlier result, or None."""
-        ...
-
-    def has_result(self, job: Job) -> bool:
-        """Return whether there is a surface of an earlier fit of the scan."""
-        ...
-
-    def start(self, names: Sequence[str]) -> None:
-        """Prepare for the jobs `names`, which are fitted now."""
-        ...
-
-    def add(self, name: str, record: FitRecord) -> None:
-        """Take the record of a job; its files are written."""
-        ...
-
-    def close(self) -> None:
-        """Leave the folder complete, also with results that were written and not added, after an interruption."""
-        ...
-
-
-@dataclass
-class FolderSink:
-    """Single files, and coefficients.csv with the records of all runs, those of this run last.
-
-    Args:
-        folder: of the results.
-    """
-
-    folder: Path
-    records: dict[str, FitRecord] = field(default_factory=dict[str, FitRecord], init=False)
-
-    def open(self, names: Sequence[str], model: ShapeModel, *, reuse: bool) -> None:
-        """As `Sink.open`."""
         self._reuse, self._model_hash, self._started = reuse, model.content_hash, tuple[str, ...]()
         self._table = CoefficientTable(self.folder, names, model.n_modes)
         self._next_save = time.monotonic() + _SAVE_INTERVAL_S
 
     def find_valid(self, task: FitTask) -> tuple[FitTask, FitRecord | None]:
-        """As `Sink.find_valid`."""
+        """Return the task that remains, and the record of a valid earlier result, or None."""
         if not self._reuse:
             return task, None
         remaining, record = resumed(task, self._model_hash, self.folder)
@@ -117,16 +80,16 @@ class FolderSink:
         return task, self.records[task.job.name]
 
     def has_result(self, job: Job) -> bool:
-        """As `Sink.has_result`."""
+        """Return whether there is a surface of an earlier fit of the scan."""
         return has_surface(job, self.folder)
 
     def start(self, names: Sequence[str]) -> None:
-        """As `Sink.start`."""
+        """Prepare for the jobs `names`, which are fitted now."""
         self._started = tuple(names)
         self._table.catch_up(names)
 
     def add(self, name: str, record: FitRecord) -> None:
-        """As `Sink.add`; the table is saved at intervals."""
+        """Take the record of a job, whose files are written; the table is saved at intervals."""
         self._table.add(name, record)
         self.records[name] = record
         if (now := time.monotonic()) > self._next_save:
@@ -134,7 +97,7 @@ class FolderSink:
             self._next_save = time.monotonic() + max(_SAVE_INTERVAL_S, _SAVE_COST_RATIO * (time.monotonic() - now))
 
     def close(self) -> None:
-        """As `Sink.close`."""
+        """Leave the folder complete, also with results that were written and not added, after an interruption."""
         self._table.catch_up([name for name in self._started if name not in self.records])
         self._table.save()
 
@@ -146,12 +109,8 @@ class FolderSink:
         return record
 
 
-@dataclass(frozen=True)
-class _Stored:
-    """A fit in a store: of its record id, status and scan alone."""
-
-    record: FitRecord
-    stages: bool
+_Stored: TypeAlias = tuple[FitRecord, bool]
+"""A fit in a store: of its record id, status and scan alone, and whether its stages are kept."""
 
 
 @dataclass
@@ -166,7 +125,12 @@ class StoreSink:
     records: Mapping[str, FitRecord] = field(default_factory=dict[str, FitRecord], init=False)
 
     def open(self, names: Sequence[str], model: ShapeModel, *, reuse: bool) -> None:
-        """As `Sink.open`.
+        """Read what is there.
+
+        Args:
+            names: of the jobs of this run.
+            model: that is fitted.
+            reuse: whether valid earlier results are reused.
 
         Raises:
             ShapespaceError: the extra `store` is not installed.
@@ -177,46 +141,50 @@ class StoreSink:
         self._stored = dict(self._read_stored()) if reuse else {}
 
     def find_valid(self, task: FitTask) -> tuple[FitTask, FitRecord | None]:
-        """As `Sink.find_valid`."""
+        """Return the task that remains, and the record of a valid earlier result, or None."""
         stored = self._stored.get(task.job.name)
         valid = stored is not None and self._is_valid(stored, task)
-        return task, stored.record if valid and stored is not None else None
+        return task, stored[0] if valid and stored is not None else None
 
     def has_result(self, job: Job) -> bool:
-        """As `Sink.has_result`."""
+        """Return whether there is a surface of an earlier fit of the scan."""
         stored = self._stored.get(job.name)
-        return stored is not None and stored.record.is_fitted
+        return stored is not None and stored[0].is_fitted
 
     def start(self, names: Sequence[str]) -> None:
-        """As `Sink.start`: free the memory of what was stored."""
+        """Prepare for the jobs `names`, which are fitted now: free the memory of what was stored."""
         self._stored.clear()
 
     def add(self, name: str, record: FitRecord) -> None:
-        """As `Sink.add`."""
+        """Take the record of a job, whose files are written."""
         self._finished.append(name)
         if len(self._finished) >= ROWS:
             self._store.compact(self._finished)
             self._finished.clear()
 
     def close(self) -> None:
-        """As `Sink.close`."""
+        """Leave the folder complete, also with results that were written and not added, after an interruption."""
         self._store.compact()
 
     def _read_stored(self) -> Iterator[tuple[str, _Stored]]:
         for rows in Results(self.folder).iter_rows(_COLUMNS):
             for name, identity, status, stages, *scan in zip(*(rows[column] for column in _COLUMNS), strict=True):
                 known = {key: value for key, value in zip(_SCAN, scan, strict=True) if value is not None}
-                yield name, _Stored(FitRecord(id=identity or "", status=status, scan=File(**known)), bool(stages))
+                yield name, (FitRecord(id=identity or "", status=status, scan=File(**known)), bool(stages))
 
     def _is_valid(self, stored: _Stored, task: FitTask) -> bool:
         """Return whether a stored fit has what the task asks for, or more: a dense surface, or stages."""
-        if not stored.record.is_fitted or not stored.record.id or (task.stages and not stored.stages):
+        (record, staged), config, job = stored, task.config, task.job
+        if not record.is_fitted or not record.id or (task.stages and not staged):
             return False
-        config, job = task.config, task.job
         configs = [config] if config.dense else [config, replace(config, dense=True)]
         try:
-            marks, scan_hash = sha256_of_file(job.landmarks) if job.landmarks else "", stored.record.scan.hash
+            marks, scan_hash = sha256_of_file(job.landmarks) if job.landmarks else "", record.scan.hash
             identities = {fit_identity(scan_hash, self._model_hash, one.as_dict(), marks) for one in configs}
-            return stored.record.id in identities and is_same_scan(stored.record.scan, job, self.folder)
+            return record.id in identities and is_same_scan(record.scan, job, self.folder)
         except FileError:
             return False  # the fit reports it
+
+
+Sink: TypeAlias = FolderSink | StoreSink
+"""Takes the results of a batch of fits; used once."""

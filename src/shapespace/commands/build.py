@@ -29,15 +29,15 @@ from shapespace.model.build_config import BuildConfig
 from shapespace.model.build_model import build_model, extend_model
 from shapespace.model.missing import MIN_SEEN, ObservedMeshes
 from shapespace.model.representation import representation_named
-from shapespace.model.shape_model import ShapeModel, region_vertices
-from shapespace.model.streamed import Scratch, bytes_in_memory, too_large
+from shapespace.model.shape_model import ShapeModel, odd_size_notes, region_vertices
+from shapespace.model.streamed import Scratch, streaming_note
 from shapespace.recognise.labelled_scans import NEUTRAL
 from shapespace.reprs import first_names
 from shapespace.schemas import FitRecord
 from shapespace.store.corresponding import SurfaceFiles, surface_files
 from shapespace.store.results import is_result
 from shapespace.store.review_text import provenance_with_review, review_summary
-from shapespace.types import MM_PER_UNIT, Mesh, SurfaceLandmarks, common_faces
+from shapespace.types import MM_PER_UNIT, Mesh, SurfaceLandmarks
 from shapespace.version import __version__
 
 if TYPE_CHECKING:
@@ -47,8 +47,6 @@ if TYPE_CHECKING:
 _IDENTITY_VARIANCE, _EXPRESSION_VARIANCE = 0.995, 0.99
 _SURFACES = (".dense.ply", ".fitted.ply")
 _NAMED = 3  # names in a message, so that it stays short
-_LEAST_MM, _MOST_MM = 1.0, 3000.0
-"""Beyond this the largest extent of an object is more likely given in another unit."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,8 +161,8 @@ def build(
     files, records = _trusted(listed.files, notes, with_doubtful=config.with_doubtful)
     make_folder(output.absolute().parent)
     on_disk = _OnDisk(files, config.unit, listed)
-    streamed = config.streams or (config.of_vertices and _too_large(on_disk, config, notes))
-    loaded = on_disk if streamed else _read(on_disk, quiet=quiet)
+    streamed = config.streams or (config.of_vertices and bool(streaming_note(on_disk, config.model)))
+    loaded = [] if streamed else _read(on_disk, quiet=quiet)
     first = on_disk[0] if streamed else loaded[0]
     if listed.unit_ratios:
         notes.append(listed.unit_note(config.unit))
@@ -173,48 +171,39 @@ def build(
         name: region_vertices(read_region(file), len(first.vertices), name) for name, file in config.regions.items()
     }
     config = _with_origin(files, config, notes)
-    config = _with_words(config, provenance_with_review(config.model.provenance, review), config.model.licence)
-    if not isinstance(loaded, list):
-        model = _streamed(
-            meshes=on_disk,
-            output=output,
-            config=config,
-            gauge=gauge,
-            landmarks=marks,
-            parent=parent,
-            notes=notes,
-            quiet=quiet,
-        )
-        if regions:
-            model = replace(model, regions=regions)
-            model.save(output)
-        return model, notes + _model_notes(model, config)
-    notes += _missing(loaded, marks, config)
-    with waiting(f"aligning {len(files)} meshes and finding their modes", quiet=quiet):
-        if config.labels is not None:
-            additive, unmatched = _additive(files, loaded, config.labels, config, gauge, marks)
-            additive = replace(additive, shape=replace(additive.shape, regions=regions))
-            additive.save(output)
-            notes += unmatched
-            notes.append(
-                f"It parts {additive.n_identity} modes of identity and {additive.n_expression} of expression, by "
-                f"{config.labels}."
-            )
-            return additive.shape, notes + _model_notes(additive.shape, config)
-        chosen = replace(config.model, gauge=gauge, landmarks=marks, min_seen=_min_seen(config), out_of_core=False)
-        model = build_model(loaded, chosen)
-        if regions:
-            observed = (
-                ObservedMeshes.of(loaded, _min_seen(config)) if config.model.representation == "vertices" else None
-            )
-            model = replace(model, regions=regions if observed is None else observed.regions(regions))
-        model.save(output)
-    return model, notes + _model_notes(model, config)
-
-
-def _model_notes(model: ShapeModel, config: BuildFilesConfig) -> list[str]:
-    """Return what the user should know of the model itself."""
-    return [*model.notes, *_odd_size(model, config.unit), training_shapes_note(model)]
+    provenance = provenance_with_review(config.model.provenance, review)
+    chosen = replace(
+        config.model,
+        gauge=gauge,
+        landmarks=marks,
+        provenance=provenance,
+        min_seen=MIN_SEEN if config.min_seen is None else config.min_seen,
+    )
+    config = replace(config, model=chosen)
+    additive = None
+    if streamed:
+        model = _streamed(on_disk, output, config, parent, quiet=quiet)
+    else:
+        with waiting(f"aligning {len(files)} meshes and finding their modes", quiet=quiet):
+            if config.labels is not None:
+                additive, unmatched = _additive(files, loaded, config.labels, config)
+                notes += unmatched
+                notes.append(
+                    f"It parts {additive.n_identity} modes of identity and {additive.n_expression} of expression, by "
+                    f"{config.labels}."
+                )
+                model = additive.shape
+            else:
+                model = build_model(loaded, replace(chosen, out_of_core=False))
+    if regions:
+        used = ~np.isin(np.arange(len(first.vertices)), model.dropped_vertices)
+        model = replace(model, regions=ObservedMeshes(loaded, used).regions(regions))
+    (model if additive is None else replace(additive, shape=model)).save(output)
+    if config.keep_shapes:
+        size = sum(file.stat().st_size for file in shapes_folder(output).iterdir())
+        notes.append(f"The shapes are kept in {shapes_folder(output)} ({size / 1e6:.1f} MB), for --add.")
+    odd = [] if config.unit == "mm" else odd_size_notes(model.mean_vertices)
+    return model, [*notes, *(note for note in model.notes if note not in odd), training_shapes_note(model)]
 
 
 def shapes_folder(model: Path) -> Path:
@@ -237,54 +226,24 @@ def _parent(path: Path, output: Path) -> ShapeModel:
     return model
 
 
-def _too_large(meshes: _OnDisk, config: BuildFilesConfig, notes: list[str]) -> bool:
-    """Return whether the meshes do not fit into memory, and say so."""
-    needed = bytes_in_memory(len(meshes), meshes[0], choose=config.model.modes == "auto")
-    if config.model.out_of_core is not None or not too_large(needed):
-        return False
-    notes.append(
-        f"{len(meshes)} meshes would take {needed / 1e9:.1f} GB of memory, which is more than four fifths of what is "
-        "free, so they are streamed through a file (--out-of-core)."
-    )
-    return True
-
-
 def _streamed(
-    meshes: _OnDisk,
-    output: Path,
-    config: BuildFilesConfig,
-    gauge: Gauge,
-    landmarks: SurfaceLandmarks,
-    parent: ShapeModel | None,
-    notes: list[str],
-    *,
-    quiet: bool,
+    meshes: _OnDisk, output: Path, config: BuildFilesConfig, parent: ShapeModel | None, *, quiet: bool
 ) -> ShapeModel:
-    """Build a model of meshes that are not held in memory, and save it."""
-    folder = output.with_name(f"{output.name}.build")
-    scratch = Scratch(folder, _identity(meshes, config, parent))
+    """Build a model of meshes that are not held in memory."""
+    scratch = Scratch(output.with_name(f"{output.name}.build"), _identity(meshes, config, parent))
     shapes_kept_in = shapes_folder(output) if config.keep_shapes else None
     with progress(None, "streaming", "mesh", quiet=quiet) as bar:
-        if parent is not None and config.add is not None:
-            chosen = replace(
-                config.model,
-                provenance=_joined(parent.provenance, config.model.provenance),
-                licence=_joined(parent.licence, config.model.licence),
-            )
-            shapes = shapes_folder(config.add)
-            model = extend_model(
-                parent, meshes, shapes, chosen, scratch=scratch, keep_shapes=shapes_kept_in, log=bar.set_description_str
-            )
-        else:
-            chosen = replace(config.model, gauge=gauge, landmarks=landmarks, out_of_core=True)
-            model = build_model(
-                meshes, chosen, scratch=scratch, keep_shapes=shapes_kept_in, log=bar.set_description_str
-            )
-        model.save(output)
-    if shapes_kept_in is not None:
-        size = sum(file.stat().st_size for file in shapes_kept_in.iterdir())
-        notes.append(f"The shapes are kept in {shapes_kept_in} ({size / 1e6:.1f} MB), for --add.")
-    return model
+        log = bar.set_description_str
+        if parent is None or config.add is None:
+            chosen = replace(config.model, out_of_core=config.model.out_of_core or config.keep_shapes or None)
+            return build_model(meshes, chosen, scratch=scratch, keep_shapes=shapes_kept_in, log=log)
+        chosen = replace(
+            config.model,
+            provenance=_joined(parent.provenance, config.model.provenance),
+            licence=_joined(parent.licence, config.model.licence),
+        )
+        shapes = shapes_folder(config.add)
+        return extend_model(parent, meshes, shapes, chosen, scratch=scratch, keep_shapes=shapes_kept_in, log=log)
 
 
 def _joined(old: str, new: str) -> str:
@@ -366,15 +325,6 @@ def _read(meshes: _OnDisk, *, quiet: bool) -> list[Mesh]:
     return loaded
 
 
-def _odd_size(model: ShapeModel, unit: str) -> list[str]:
-    """Return that the mean is of a size that tells of another unit, where nobody said which one it is."""
-    extent = np.ptp(model.mean_vertices, axis=0)
-    if unit != "mm" or _LEAST_MM < float(extent.max()) < _MOST_MM:
-        return []
-    size = " x ".join(f"{length:.3g}" for length in extent)
-    return [f"The mean is {size} mm large, which is odd for mm; --unit says in which unit the meshes are."]
-
-
 def _training_mesh(listed: SurfaceFiles, path: Path) -> Mesh:
     try:
         mesh = without_estimates(listed.mesh(path))
@@ -383,47 +333,6 @@ def _training_mesh(listed: SurfaceFiles, path: Path) -> Mesh:
     if not len(mesh.vertices):
         raise MeshError(f"{path}: it has no vertices, so no shape model can be made of it; leave it out.")
     return mesh
-
-
-def _min_seen(config: BuildFilesConfig) -> float:
-    return MIN_SEEN if config.min_seen is None else config.min_seen
-
-
-def _missing(meshes: Sequence[Mesh], landmarks: SurfaceLandmarks, config: BuildFilesConfig) -> list[str]:
-    """Return how many vertices are missing, and which of them and of the landmarks are not in the model for it.
-
-    Raises:
-        CorrespondenceError: the meshes differ in vertices or triangles.
-        InputError: meshes with missing vertices for a model that parts identity and expression.
-    """
-    common_faces(meshes)
-    holed = [int(np.isnan(mesh.vertices).any(axis=1).sum()) for mesh in meshes]
-    if not any(holed):
-        return []
-    if config.labels is not None:
-        raise InputError(
-            f"{meshes[int(np.argmax(holed))].name}: vertices are missing, and a model that parts identity and "
-            "expression needs whole meshes; leave --additive out, or the meshes with holes."
-        )
-    missing, every = sum(holed), len(meshes) * len(meshes[0].vertices)
-    where, share = sum(count > 0 for count in holed), 100 * missing / every
-    sentences = [f"{missing} of {every} vertices are missing ({share:.1f} %), in {where} of {len(meshes)} meshes."]
-    if config.model.representation != "vertices":
-        return sentences
-    observed = ObservedMeshes.of(meshes, _min_seen(config))
-    if out := int((~observed.vertices).sum()):
-        number = "1 vertex is" if out == 1 else f"{out} vertices are"
-        sentences.append(
-            f"{number} taken out of the model, since fewer than {100 * _min_seen(config):g} % of the meshes show "
-            "them; "
-            "--min-seen says how many must."
-        )
-    if lost := sorted(set(landmarks) - set(observed.landmarks(landmarks))):
-        sentences.append(
-            f"The model has no {', '.join(lost)}, since these landmarks lie in triangles with vertices that are taken "
-            "out."
-        )
-    return sentences
 
 
 def _landmarks(
@@ -514,8 +423,6 @@ def _additive(
     meshes: Sequence[Mesh],
     labels: Path,
     config: BuildFilesConfig,
-    gauge: Gauge,
-    landmarks: SurfaceLandmarks,
 ) -> tuple[AdditiveModel, list[str]]:
     from shapespace.model.additive import AdditiveModel
 
@@ -535,8 +442,8 @@ def _additive(
         [label.text == NEUTRAL for label in own],
         identity_modes=_IDENTITY_VARIANCE if config.model.modes == "auto" else config.model.modes,
         expression_modes=_EXPRESSION_VARIANCE if expression_modes is None else expression_modes,
-        gauge=gauge,
-        landmarks=landmarks,
+        gauge=config.model.gauge,
+        landmarks=config.model.landmarks,
         provenance=config.model.provenance,
         licence=config.model.licence,
     )

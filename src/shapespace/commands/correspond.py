@@ -14,7 +14,6 @@ import numpy as np
 from msgspec import structs
 
 from shapespace.batch.execution import ExecutionConfig
-from shapespace.batch.fit_records import Source
 from shapespace.batch.fit_work import Job
 from shapespace.batch.lock import only_writer
 from shapespace.batch.parallel_rounds import RoundRunner
@@ -24,24 +23,22 @@ from shapespace.commands.inputs import given_scans, with_ids
 from shapespace.commands.landmark_files import LandmarkFiles
 from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
 from shapespace.correspondence.first_template import first_template, usable_scan
-from shapespace.correspondence.groupwise import ENOUGH_TO_JUDGE, correspond
+from shapespace.correspondence.groupwise import correspond
 from shapespace.correspondence.registration import RegistrationTask, RoundContext, ScanRegistration
-from shapespace.correspondence.scan_set import copies, unit_ratios
-from shapespace.correspondence.scan_status import SurfaceMeasures, find_review_reasons
 from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.errors import InputError, ShapespaceError
-from shapespace.geometry.landmark_placement import far_landmarks, place_landmarks
+from shapespace.geometry.landmark_placement import place_landmarks
 from shapespace.geometry.mirror_plane import mirror_image
-from shapespace.geometry.normals import face_areas, faces_of, rms_size, without_estimates
+from shapespace.geometry.normals import faces_of, rms_size
 from shapespace.geometry.outer_surface import outer_surface
 from shapespace.io.containers.json_files import read_json
 from shapespace.io.files import make_folder, move_file, remove_file, sha256_of_file, write_text
 from shapespace.io.landmarks.landmark_io import write_surface_landmarks
 from shapespace.io.meshes.mesh_io import ending_of, read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
-from shapespace.reprs import describe_groups, first_names
+from shapespace.reprs import first_names
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, json_text, read
-from shapespace.store.corresponding import LANDMARKS, MEAN, RECORD, SUMMARY, SURFACE
+from shapespace.store.corresponding import LANDMARKS, MEAN, RECORD, SUMMARY, SURFACE, json_of
 from shapespace.types import Mesh
 from shapespace.version import __version__
 
@@ -53,11 +50,6 @@ _UNREADABLE = "unreadable"
 _WITH_OTHER_FILES = (".gltf",)
 """Endings of mesh formats that can store vertices in other files."""
 _LISTED = 10  # names in a message, so that it stays readable
-_ANOTHER_SHAPE = 0.25
-"""The mean change of another object, as a share of its size."""
-_OTHER_SIZE = 2.0  # ratio of sizes: beyond twice the median a scan is probably of another object or unit
-_ENOUGH_TO_COMPARE, _FAR = 4, 3.0
-"""Times the usual distance (95 % of both directions), sizes divided out."""
 Say: TypeAlias = Callable[[str], None]
 
 
@@ -160,51 +152,72 @@ def _corresponding(
     template = None if files.template is None else marks.onto(read_mesh(files.template), files.template)
     model = None if files.model is None else ShapeModel.load(files.model)
     read = read_scans(jobs, marks, strict=files.strict, outer=config.outer, quiet=quiet, say=say)
-    say_excluded(read.unread, len(jobs), say)
-    scans, notes = read.scans, read.notes
-    marks.report_unused(say)
-    settings, config = asdict(config), replace(config, outer=False)  # the scans are without inner surfaces now
-    rounds = RoundsWithProgress(folder / ROUNDS_FOLDER, files.execution, quiet=quiet)
-    with telling_of_compiling(quiet=quiet), waiting("choosing the template", quiet=quiet):
-        first = first_template(list(scans.values()), template, config, model)
-    of_scans = [subjects[name] for name in scans] if subjects else []
-    made = correspond(
-        list(scans.values()), config, template=template, model=model, first=first, subjects=of_scans, run=rounds
-    )
-    note_copies(scans, notes)
-    given = template.name if template is not None else "" if model is None else "The model's mean"
-    if not given or made.moved[0] < _ANOTHER_SHAPE:
-        _note_other_objects(made, notes)
-    records = records_of(made, read, jobs, folder, config.settled)
-    say_notes(records, made, given, say)
-    report_landmarks(records, read, say)
+    without_inner = replace(config, outer=False)  # the scans that are read are without inner surfaces
+
+    def make(rounds: RoundsWithProgress) -> Correspondence:
+        scans = list(read.scans.values())
+        with waiting("choosing the template", quiet=quiet):
+            first = first_template(scans, template, without_inner, model)
+        of_scans = [subjects[name] for name in read.scans] if subjects else []
+        return correspond(
+            scans, without_inner, template=template, model=model, first=first, subjects=of_scans, run=rounds
+        )
+
+    made, records = bring(jobs, read, marks, files, folder, make, quiet=quiet, say=say)
     # Until all is written the folder is none that build takes.
     remove_file(folder / SUMMARY)
+    summary = CorrespondenceRecord(
+        template=made.why, vertices=len(made.template.vertices), rounds=list(made.moved), corresponding=[],
+        set_aside={}, settings=asdict(config), version=__version__, sides_decided=made.sides_decided,
+        groups=[list(group) for group in made.groups], inputs_hash=inputs_hash,
+    )  # fmt: skip
     # Surfaces of an earlier run are on another template.
     if old := _forget_others({record.name for record in records}, folder):
         say(f"Results of {old} scans that are not among those given were removed from {folder}.")
-    write_results(made, records, folder)
-    write_mean(made, folder)
-    summary = CorrespondenceRecord(
-        template=made.why,
-        vertices=len(made.template.vertices),
-        rounds=list(made.moved),
+    return publish(made, records, with_scans(summary, records), folder, with_mean=True), records
+
+
+def bring(
+    jobs: Sequence[Job],
+    read: ScansRead,
+    marks: LandmarkFiles,
+    files: CorrespondFiles,
+    folder: Path,
+    make: Callable[[RoundsWithProgress], Correspondence],
+    *,
+    quiet: bool,
+    say: Say,
+) -> tuple[Correspondence, list[CorrespondRecord]]:
+    """Bring the scans of `jobs` that are read into correspondence by `make`, and say what a user should know of it."""
+    say_excluded(read.unread, len(jobs), say)
+    marks.report_unused(say)
+    rounds = RoundsWithProgress(folder / ROUNDS_FOLDER, files.execution, quiet=quiet)
+    with telling_of_compiling(quiet=quiet):
+        made = make(rounds)
+    came = {scan.name: scan for scan in made.scans}
+    came |= {name: Corresponding(name, reason) for name, reason in read.unread.items()}
+    scans = [came[job.name] for job in jobs]
+    noted = [replace(scan, notes=tuple(read.notes.get(scan.name, ()))).noting(*scan.notes) for scan in scans]
+    made = replace(made, scans=tuple(noted))
+    size = rms_size(made.template.vertices)
+    records = [_record(job, scan, read, folder, size) for job, scan in zip(jobs, made.scans, strict=True)]
+    for sentence in made.notes:
+        say(sentence)
+    report_landmarks(records, read, say)
+    return made, records
+
+
+def with_scans(summary: CorrespondenceRecord, records: Sequence[CorrespondRecord]) -> CorrespondenceRecord:
+    """Return the summary of a correspondence of the scans in `records`."""
+    return structs.replace(
+        summary,
         corresponding=[record.name for record in records if not record.reason],
         set_aside={record.name: record.reason for record in records if record.reason},
-        settings=settings,
-        version=__version__,
         other_units={record.name: record.unit_ratio for record in records if record.unit_ratio != 1.0},
         mirrored=[record.name for record in records if record.mirrored],
-        sides_decided=made.sides_decided,
-        groups=[list(group) for group in made.groups],
-        inputs_hash=inputs_hash,
         doubtful=[record.name for record in records if record.doubt],
         needs_review={record.name: codes for record in records if (codes := record.review_codes)},
     )
-    summary = structs.replace(summary, results_hash=results_hash_of(summary, folder))
-    write_text(folder / SUMMARY, json_text(summary))
-    shutil.rmtree(folder / ROUNDS_FOLDER, ignore_errors=True)
-    return summary, records
 
 
 def _subjects_of(jobs: Sequence[Job], column: str | None) -> dict[str, str]:
@@ -297,15 +310,24 @@ def _finished(
 ) -> tuple[CorrespondenceRecord, list[CorrespondRecord]] | None:
     """Return the summary and records of a finished run with the same inputs whose files are whole; else None."""
     try:
-        summary = CorrespondenceRecord.from_json(read_json(folder / SUMMARY, CORRESPOND_AGAIN))
-        if summary.inputs_hash != inputs_hash or summary.results_hash != results_hash_of(summary, folder):
-            return None
-        files = [folder / f"{job.name}{RECORD}" for job in jobs]
-        return summary, [
-            read(CorrespondRecord, read_json(file, CORRESPOND_AGAIN), file.name, CORRESPOND_AGAIN) for file in files
-        ]
-    except ShapespaceError:
+        summary, records = read_finished(folder)
+        is_same = summary.inputs_hash == inputs_hash and summary.results_hash == results_hash_of(summary, folder)
+        return (summary, [records[job.name] for job in jobs]) if is_same else None
+    except (ShapespaceError, KeyError):
         return None
+
+
+def read_finished(folder: Path) -> tuple[CorrespondenceRecord, dict[str, CorrespondRecord]]:
+    """Return the summary of the correspondence in `folder`, and all records by name, those in correspondence first.
+
+    Raises:
+        FileError, FileFormatError: a file cannot be read, or is damaged.
+    """
+    summary = CorrespondenceRecord.from_json(json_of(folder / SUMMARY), str(folder / SUMMARY))
+    files = {name: folder / f"{name}{RECORD}" for name in (*summary.corresponding, *summary.set_aside)}
+    return summary, {
+        name: read(CorrespondRecord, json_of(file), str(file), CORRESPOND_AGAIN) for name, file in files.items()
+    }
 
 
 class RoundsWithProgress:
@@ -363,11 +385,10 @@ def read_scans(
                 if outer and (visible := outer_surface(own)) is not own:
                     removed.append(1 - len(faces_of(visible)) / len(faces_of(own)))
                     own = visible
-                read.scans[job.name], read.notes[job.name] = scan, notes = usable_scan(own, strict=strict)
+                read.scans[job.name], read.notes[job.name] = scan, _ = usable_scan(own, strict=strict)
                 if scan.landmarks:
                     placed = place_landmarks(scan, scan.landmarks)
                     read.landmark_distances[job.name] = dict(zip(placed, placed.distance_mm.tolist(), strict=True))
-                    notes += far_landmarks(scan, placed)
             except ShapespaceError as error:
                 read.unread[job.name] = f"{_BROKEN}{error}"
             bar.update()
@@ -401,184 +422,57 @@ def report_landmarks(records: Sequence[CorrespondRecord], read: ScansRead, say: 
     say(f"{sentence}{after}.")
 
 
-def note_copies(scans: dict[str, Mesh], notes: dict[str, list[str]]) -> None:
-    """Add a note to each scan that is an earlier one again."""
-    names = list(scans)
-    for copy, first in copies(list(scans.values())).items():
-        notes[names[copy]].append(f"It is {names[first]} again; leave one of them out.")
-
-
-def _note_other_objects(made: Correspondence, notes: dict[str, list[str]]) -> None:
-    """Where too few scans are there to tell an object of another kind, say which one is quite another shape."""
-    there = [scan for scan in made.scans if not scan.reason]
-    if len(there) >= ENOUGH_TO_JUDGE:
-        return
-    for scan in there:
-        if scan.moved and scan.moved[0] > _ANOTHER_SHAPE:
-            notes[scan.name].append(
-                f"It differs from the others by {100 * scan.moved[0]:.0f} % of its size, and there are too "
-                "few scans to decide whether it is another object; inspect it."
-            )
-
-
-def say_notes(records: Sequence[CorrespondRecord], made: Correspondence, given: str, say: Say) -> None:
-    """Say what should be known before the results are used; `given` is what the template given is called, if one is."""
-    if given and made.moved[0] >= _ANOTHER_SHAPE:
-        say(
-            f"{given} had to change by {100 * made.moved[0]:.0f} % of its size to become these scans, so it is "
-            "hardly an object of their kind; look at the surfaces, or leave it out."
-        )
-    if mirrored := [record.name for record in records if record.mirrored]:
-        named = first_names(mirrored, _LISTED)
-        of = "scan is a mirror image" if len(mirrored) == 1 else "scans are mirror images"
-        say(
-            f"{len(mirrored)} {of} of {given or 'the others'} ({named}) and reflected for the correspondence; surfaces "
-            "are in the frames of their scans."
-        )
-    if made.groups:
-        say(describe_groups(made.groups))
-    noted = [record for record in records if record.notes]
-    for record in noted[:_LISTED]:
-        say(f"{record.name}: {' '.join(record.notes)}")
-    if len(noted) > _LISTED:
-        say(f"Notes on {len(noted) - _LISTED} more scans are in their records.")
-    if others := [record for record in records if record.unit_ratio != 1.0]:
-        named = first_names([record.name for record in others], _LISTED)
-        noun = "scans is" if len(others) == 1 else "scans are"
-        say(
-            f"{len(others)} of {len(records)} {noun} in another unit than the majority, judging by size ({named}); "
-            "so are the surfaces, and build converts them to the unit of the majority."
-        )
-
-
-def records_of(
-    made: Correspondence,
-    read: ScansRead,
-    jobs: Sequence[Job],
-    folder: Path,
-    settled: float,
-    kept: Sequence[tuple[float, CorrespondRecord]] = (),
-) -> list[CorrespondRecord]:
-    """Return the records of the scans `jobs`; `kept` are scales and records of the scans that they are added to.
-
-    `settled` is the setting of the correspondence.
-    """
-    came = {scan.name: scan for scan in made.scans}
-    surfaces = {mesh.name: mesh for mesh in made.meshes()}
-    scaled = {scan.name: scan.T_scan_template.scale for scan in made.scans if scan.T_scan_template is not None}
-    sizes = _sizes(scaled, kept)
-    mean_size = rms_size(made.template.vertices)
-    of_kept = [SurfaceMeasures.of_record(record, scale * mean_size) for scale, record in kept]
-    measures = {scan.name: scan.measures for scan in made.scans if scan.measures is not None}
-    reviews = find_review_reasons([*of_kept, *measures.values()], settled)[len(kept) :]
-    review = dict(zip(measures, reviews, strict=True))
-    records: list[CorrespondRecord] = []
-    for job in jobs:
-        name, one = job.name, came.get(job.name)
-        source = replace(job.source(folder), content_hash=read.hashes.get(name, ""))
-        record = _record(name, source, one, read.unread.get(name, ""), read.notes.get(name, []))
-        record = structs.replace(record, metadata=dict(job.metadata))
-        if name in surfaces:
-            scan = read.scans[name]
-            area = float(np.nansum(face_areas(without_estimates(surfaces[name]))))
-            share = None if scan.faces is None else area / float(face_areas(scan).sum())
-            record = structs.replace(record, area_share=share, size=scaled[name] * mean_size, review=review[name])
-        record = structs.replace(record, landmark_distances=read.landmark_distances.get(name, {}))
-        if name in sizes:
-            scale, ratio = map(float, sizes[name])
-            odd = [] if 1 / _OTHER_SIZE < scale < _OTHER_SIZE else [_size_note(scale)]
-            record = structs.replace(record, scale=scale, unit_ratio=ratio, notes=[*record.notes, *odd])
-        records.append(record)
-    before = [record for _, record in kept]
-    return _with_far_ones([*before, *records])[len(before) :]
-
-
-def _sizes(
-    scales: Mapping[str, float], kept: Sequence[tuple[float, CorrespondRecord]]
-) -> dict[str, tuple[np.float64, np.float64]]:
-    """Return size and unit of scans, by name, relative to the others, or to the scans that they are added to."""
-    if not kept:
-        return dict(zip(scales, zip(*unit_ratios(list(scales.values())), strict=True), strict=True))
-    usual = [scale / record.unit_ratio for scale, record in kept]
-    ratios = {name: unit_ratios([*usual, *usual, scale]) for name, scale in scales.items()}  # the others are most
-    return {name: (sizes[-1], units[-1]) for name, (sizes, units) in ratios.items()}
-
-
-def _with_far_ones(records: Sequence[CorrespondRecord]) -> list[CorrespondRecord]:
-    """Return `records` with a note on those whose surface lies much farther from its scan than is usual.
-
-    Point clouds are compared with each other, since their distances are those to points.
-    """
-    far = np.array([(r.distance_p95 or np.nan) / ((r.scale or np.nan) * r.unit_ratio) for r in records])
-    is_cloud = np.array([r.area_share is None for r in records])
-    ratios = np.full(len(records), np.nan)
-    for alike in (is_cloud, ~is_cloud):
-        if np.isfinite(far[alike]).sum() >= _ENOUGH_TO_COMPARE:
-            ratios[alike] = far[alike] / np.nanmedian(far[alike])
-    return [
-        record
-        if not times > _FAR
-        else structs.replace(
-            record,
-            notes=[*record.notes, f"Its surface lies {times:.2g} times as far from it as is usual; look at it."],
-        )
-        for record, times in zip(records, ratios, strict=True)
-    ]
-
-
-def _size_note(scale: float) -> str:
-    return f"It is {scale:.2g} times as large as most; look whether it is the same kind of object."
-
-
-def _record(
-    name: str, source: Source, one: Corresponding | None, unread: str, notes: Sequence[str]
-) -> CorrespondRecord:
-    path = source.path or source.name
-    if one is None or one.vertices is None or one.measures is None:
-        reason = unread if one is None else one.reason
-        return CorrespondRecord(
-            name=name, path=path, hash=source.content_hash, status="excluded", reason=reason, notes=list(notes)
-        )
-    mean, p95, p99, largest = one.distance
-    return CorrespondRecord(
-        name=name, path=path, hash=source.content_hash, status=one.status, doubt=one.doubt,
-        probability=one.probability if np.isfinite(one.probability) else None, seen_share=one.seen,
-        covered_share=one.covered, folded_share=one.measures.folded, area_factor=one.measures.area_change,
-        distance_mean=mean, distance_p95=p95, distance_p99=p99, distance_max=largest,
-        notes=list(notes), moved_share=list(one.moved), cpu_s=list(one.seconds),
-        landmark_rms=one.landmarks if np.isfinite(one.landmarks) else None, mirrored=one.mirrored,
+def _record(job: Job, scan: Corresponding, read: ScansRead, folder: Path, mean_size: float) -> CorrespondRecord:
+    """Return the record of a scan; `mean_size` is the RMS size of the mean shape."""
+    source = job.source(folder)
+    record = CorrespondRecord(
+        name=job.name, path=source.path or source.name, hash=read.hashes.get(job.name, ""), status=scan.status,
+        reason=scan.reason, notes=list(scan.notes), metadata=dict(job.metadata),
+        landmark_distances=read.landmark_distances.get(job.name, {}),
+    )  # fmt: skip
+    if scan.measures is None or scan.T_scan_template is None:
+        return record
+    mean, p95, p99, largest = scan.distance
+    return structs.replace(
+        record, doubt=scan.doubt, probability=scan.probability if np.isfinite(scan.probability) else None,
+        review=list(scan.review), seen_share=scan.seen, covered_share=scan.covered, area_share=scan.area_share,
+        folded_share=scan.measures.folded, area_factor=scan.measures.area_change, distance_mean=mean, distance_p95=p95,
+        distance_p99=p99, distance_max=largest, moved_share=list(scan.moved), cpu_s=list(scan.seconds),
+        landmark_rms=scan.landmarks if np.isfinite(scan.landmarks) else None, mirrored=scan.mirrored,
+        scale=float(scan.scale), size=scan.T_scan_template.scale * mean_size, unit_ratio=float(scan.unit_ratio),
     )  # fmt: skip
 
 
-def write_results(made: Correspondence, records: Sequence[CorrespondRecord], folder: Path) -> None:
-    """Write records and surfaces into `folder`, and remove those surfaces that the records do not have.
+def publish(
+    made: Correspondence,
+    records: Sequence[CorrespondRecord],
+    summary: CorrespondenceRecord,
+    folder: Path,
+    *,
+    with_mean: bool,
+) -> CorrespondenceRecord:
+    """Write results apart, the summary last, then move them into `folder`; return the summary with their hash.
 
     Raises:
         FileError: they cannot be written.
     """
+    change = make_folder(folder / CHANGE_FOLDER)
     surfaces = {mesh.name: replace(mesh, landmarks={}) for mesh in made.meshes()}
     for record in records:
-        file = folder / f"{record.name}{SURFACE}"
-        surface = surfaces.get(record.name)
-        if record.reason or surface is None:
-            remove_file(file)
-        else:
-            write_mesh(file, mirror_image(surface) if record.mirrored else surface)
-        write_text(folder / f"{record.name}{RECORD}", json_text(record))
-
-
-def write_mean(made: Correspondence, folder: Path) -> None:
-    """Write the mean and its landmarks into `folder`.
-
-    Raises:
-        FileError: they cannot be written.
-    """
-    make_folder((folder / MEAN).parent)
-    write_mesh(folder / MEAN, made.template)
-    if made.landmarks:
-        write_surface_landmarks(folder / LANDMARKS, made.landmarks)
-    else:
-        remove_file(folder / LANDMARKS)
+        if not record.reason:
+            surface = surfaces[record.name]
+            write_mesh(change / f"{record.name}{SURFACE}", mirror_image(surface) if record.mirrored else surface)
+        write_text(change / f"{record.name}{RECORD}", json_text(record))
+    if with_mean:
+        make_folder((change / MEAN).parent)
+        write_mesh(change / MEAN, made.template)
+        if made.landmarks:
+            write_surface_landmarks(change / LANDMARKS, made.landmarks)
+    summary = structs.replace(summary, results_hash=results_hash_of(summary, change, folder))
+    write_text(change / SUMMARY, json_text(summary))
+    complete_change(folder)
+    shutil.rmtree(folder / ROUNDS_FOLDER, ignore_errors=True)
+    return summary
 
 
 def complete_change(folder: Path) -> None:
@@ -595,8 +489,10 @@ def complete_change(folder: Path) -> None:
         remove_file(folder / SUMMARY)
         for name in summary.set_aside:
             remove_file(folder / f"{name}{SURFACE}")
-        if (change / MEAN).is_file() and not (change / LANDMARKS).is_file():
-            remove_file(folder / LANDMARKS)
+        if (change / MEAN).is_file():
+            make_folder((folder / MEAN).parent)
+            if not (change / LANDMARKS).is_file():
+                remove_file(folder / LANDMARKS)
         results = (file for pattern in (RECORD, SURFACE) for file in sorted(change.glob(f"*{pattern}")))
         for file in (*results, change / MEAN, change / LANDMARKS):
             if file.is_file():

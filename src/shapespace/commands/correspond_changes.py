@@ -6,7 +6,6 @@ With an update one more round over all scans follows, which computes the mean an
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,44 +15,39 @@ from msgspec import structs
 
 from shapespace.batch.fit_work import Job
 from shapespace.batch.lock import only_writer
-from shapespace.batch.progress import telling_of_compiling
 from shapespace.commands.correspond import (
     CHANGE_FOLDER,
-    ROUNDS_FOLDER,
     CorrespondFiles,
     RoundsWithProgress,
     Say,
     ScansRead,
+    bring,
     complete_change,
     content_hash_of,
     find_jobs,
     inputs_hash_of,
-    note_copies,
+    publish,
+    read_finished,
     read_scans,
-    records_of,
-    report_landmarks,
     results_hash_of,
-    say_excluded,
-    say_notes,
-    write_mean,
-    write_results,
+    with_scans,
 )
 from shapespace.commands.inputs import Given
 from shapespace.commands.landmark_files import LandmarkFiles
-from shapespace.correspondence.correspondence_result import Correspondence
+from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
 from shapespace.correspondence.groupwise import FinishedCorrespondence, add_scans
+from shapespace.correspondence.scan_status import SurfaceMeasures
 from shapespace.correspondence.settings import FEWEST, CorrespondConfig
 from shapespace.errors import InputError
 from shapespace.geometry.mirror_plane import mirror_image
-from shapespace.geometry.normals import faces_of
+from shapespace.geometry.normals import faces_of, rms_size
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.io.files import make_folder, write_text
 from shapespace.io.landmarks.landmark_io import read_surface_landmarks
 from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.io.remote import is_address
 from shapespace.reprs import first_names
-from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, json_text, read
-from shapespace.store.corresponding import LANDMARKS, MEAN, RECORD, SUMMARY, SURFACE, json_of
+from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, read
+from shapespace.store.corresponding import LANDMARKS, MEAN, SUMMARY, SURFACE
 from shapespace.types import Mesh, SurfaceLandmarks
 
 _OPTIONS = {
@@ -116,11 +110,7 @@ class _Finished:
             InputError: its files do not belong together.
             FileError, FileFormatError: a file cannot be read, or is damaged.
         """
-        summary = CorrespondenceRecord.from_json(json_of(folder / SUMMARY), str(folder / SUMMARY))
-        records: dict[str, CorrespondRecord] = {}
-        for name in (*summary.corresponding, *summary.set_aside):
-            file = folder / f"{name}{RECORD}"
-            records[name] = read(CorrespondRecord, json_of(file), str(file), CORRESPOND_AGAIN)
+        summary, records = read_finished(folder)
         mean = read_mesh(folder / MEAN)
         files = {name: read_mesh(folder / f"{name}{SURFACE}") for name in summary.corresponding}
         surfaces = {name: mirror_image(one) if name in summary.mirrored else one for name, one in files.items()}
@@ -221,16 +211,15 @@ def _changed(
         )
     read = read_scans(jobs, marks, strict=files.strict, outer=config.outer, quiet=quiet, say=say)
     _refuse_changed(finished, read, files, kept if change.update else [])
-    say_excluded(read.unread, len(jobs), say)
-    marks.report_unused(say)
-    rounds = RoundsWithProgress(folder / ROUNDS_FOLDER, files.execution, quiet=quiet)
-    with telling_of_compiling(quiet=quiet):
-        made = _registered(finished, kept, read, marks, replace(config, outer=False), rounds, update=change.update)
-    _note_copies(finished, kept, read)
-    before = [] if change.update else [(_scale(finished, name), finished.records[name]) for name in kept]
-    records = records_of(made, read, jobs, folder, config.settled, before)
-    say_notes(records, made, "", say)
-    report_landmarks(records, read, say)
+    first = {finished.records[name].hash: name for name in kept if name not in read.scans}
+    for name, content_hash in read.hashes.items():
+        if name in read.notes and content_hash in first:
+            read.notes[name].append(f"It is {first[content_hash]} again; leave one of them out.")
+
+    def make(rounds: RoundsWithProgress) -> Correspondence:
+        return _registered(finished, kept, read, marks, replace(config, outer=False), rounds, update=change.update)
+
+    made, records = bring(jobs, read, marks, files, folder, make, quiet=quiet, say=say)
     every = {name: record for name, record in finished.records.items() if name not in change.remove}
     every |= {record.name: record for record in records}
     summary = structs.replace(_summary(finished, change, records, every), inputs_hash=inputs_hash)
@@ -241,7 +230,7 @@ def _changed(
         count = len(set(change.remove)) or sum(not record.reason for record in records)
         were = "scan was" if count == 1 else "scans were"
         say(f"{count} {were} {done} {folder}; the other {len(kept)} are unchanged.")
-    _publish(folder, made, records, summary, updated=change.update)
+    summary = publish(made, records, summary, folder, with_mean=change.update)
     return summary, list(every.values())
 
 
@@ -296,15 +285,6 @@ def _refuse_changed(finished: _Finished, read: ScansRead, files: CorrespondFiles
             raise InputError(f"{name} was registered with landmarks; give them again with --landmarks.")
 
 
-def _note_copies(finished: _Finished, kept: Sequence[str], read: ScansRead) -> None:
-    """Note scans that are equal to others of the command, or to one that stays."""
-    note_copies(read.scans, read.notes)
-    first = {finished.records[name].hash: name for name in kept if name not in read.scans}
-    for name, content_hash in read.hashes.items():
-        if name in read.notes and content_hash in first:
-            read.notes[name].append(f"It is {first[content_hash]} again; leave one of them out.")
-
-
 # Their registration
 
 
@@ -330,15 +310,23 @@ def _registered(
         paths = [Path(finished.records[name].path) for name in kept]
         surfaces = [marks.onto(surface, path) for surface, path in zip(surfaces, paths, strict=True)]
     mirrored = [name in finished.summary.mirrored for name in kept]
-    start = FinishedCorrespondence(finished.mean, landmarks, surfaces, raw, mirrored, finished.summary.sides_decided)
+    start = FinishedCorrespondence(
+        finished.mean, landmarks, surfaces, raw, mirrored, finished.summary.sides_decided,
+        judged=[] if update else [_judged(finished, name) for name in kept],
+    )  # fmt: skip
     return add_scans(start, added, config, run=rounds)
 
 
-def _scale(finished: _Finished, name: str) -> float:
-    """Return how many times as large as the mean a surface is."""
-    surface, mean = finished.surfaces[name], finished.mean
-    observed = np.ones(len(mean.vertices), np.bool_) if surface.observed is None else surface.observed
-    return fit_similarity(mean.vertices[observed], surface.vertices[observed]).scale
+def _judged(finished: _Finished, name: str) -> Corresponding:
+    """Return what is known of a scan that stays."""
+    record, surface, mean = finished.records[name], finished.surfaces[name], finished.mean.vertices
+    observed = np.ones(len(mean), np.bool_) if surface.observed is None else surface.observed
+    T = fit_similarity(mean[observed], surface.vertices[observed])
+    return Corresponding(
+        name, "", T_scan_template=T, distance=(np.nan, record.distance_p95 or np.nan, np.nan, np.nan),
+        measures=SurfaceMeasures.of_record(record, T.scale * rms_size(mean)), scale=record.scale or np.nan,
+        unit_ratio=record.unit_ratio, area_share=record.area_share,
+    )  # fmt: skip
 
 
 # The folder
@@ -351,8 +339,8 @@ def _summary(
     every: Mapping[str, CorrespondRecord],
 ) -> CorrespondenceRecord:
     """Return the summary of the scans in `every`, of which `records` are new."""
-    there = [name for name, record in every.items() if not record.reason]
-    aside = {name: record.reason for name, record in every.items() if record.reason}
+    summary = with_scans(finished.summary, list(every.values()))
+    there, aside = summary.corresponding, summary.set_aside
     if len(there) < FEWEST:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in list(aside.items())[:_LISTED])
         raise InputError(f"Only {len(there)} of {len(every)} scans would be in correspondence: {reasons}.")
@@ -360,32 +348,7 @@ def _summary(
     groups = [group for group in other_kinds if group]
     added = dict.fromkeys([*finished.summary.added, *(record.name for record in records)])
     return structs.replace(
-        finished.summary,
-        corresponding=there,
-        set_aside=aside,
-        other_units={name: record.unit_ratio for name, record in every.items() if record.unit_ratio != 1.0},
-        mirrored=[name for name, record in every.items() if record.mirrored],
+        summary,
         groups=[there, *groups] if groups else [],
         added=[] if change.update else [name for name in added if name in there],
-        doubtful=[name for name, record in every.items() if record.doubt],
-        needs_review={name: codes for name, record in every.items() if (codes := record.review_codes)},
     )
-
-
-def _publish(
-    folder: Path,
-    made: Correspondence,
-    records: Sequence[CorrespondRecord],
-    summary: CorrespondenceRecord,
-    *,
-    updated: bool,
-) -> None:
-    """Write what is new apart, the summary last, and then move it into `folder`."""
-    change = make_folder(folder / CHANGE_FOLDER)
-    write_results(made, records, change)
-    if updated:
-        write_mean(made, change)
-    summary = structs.replace(summary, results_hash=results_hash_of(summary, change, folder))
-    write_text(change / SUMMARY, json_text(summary))
-    complete_change(folder)
-    shutil.rmtree(folder / ROUNDS_FOLDER, ignore_errors=True)

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from shapespace.correspondence.scan_status import ScanEvidence, ScanStatus, SurfaceMeasures
 from shapespace.geometry.mirror_plane import FLIP
 from shapespace.lazy import lazy_import
-from shapespace.reprs import short_repr
+from shapespace.reprs import describe_groups, first_names, short_repr
 from shapespace.schemas import ReviewCode, ReviewReason
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity, SurfaceLandmarks
+
+ANOTHER_SHAPE = 0.25
+"""The mean change of another object, as a share of its size."""
+_LISTED = 10  # names or notes in the notes, so that they stay readable
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +46,13 @@ class Corresponding:
             scan's unit: with 90 % probability the position is within 2.15 times it; None if excluded.
         measures: of the quality of the surface; None if excluded.
         review: reasons to review the surface, in addition to `doubt`, by its measures; the most unusual first. Empty
-            for scans that were added to a finished correspondence, since its records have the measures of the others.
-        notes: sentences on the repairs of the scan and on its landmarks, such as that they were turned by a half turn.
+            for scans that were added to a finished correspondence without the results of its scans.
+        notes: sentences on the repairs of the scan and on its landmarks, such as that they were turned by a half turn,
+            on copies of other scans, and on odd sizes and surfaces.
+        scale: size beside the usual one, units distinguished; not-a-number if excluded.
+        unit_ratio: how many times as large as in the unit of most scans its coordinates are, such as 0.001 for metres
+            among millimetres.
+        area_share: area of the surface beside that of the scan; None if excluded, and for points.
 
     Example:
         >>> correspondence = ss.correspond(meshes[:3], ss.CorrespondConfig(vertices=200, rounds=1, mirror="never"))
@@ -71,8 +80,15 @@ class Corresponding:
     measures: SurfaceMeasures | None = None
     review: tuple[ReviewReason, ...] = ()
     notes: Sequence[str] = ()
+    scale: float = np.nan
+    unit_ratio: float = 1.0
+    area_share: float | None = None
 
     __repr__ = short_repr
+
+    def noting(self, *sentences: str) -> Corresponding:
+        """Return it with further notes."""
+        return replace(self, notes=tuple(dict.fromkeys([*self.notes, *sentences])))
 
     @property
     def review_codes(self) -> list[ReviewCode]:
@@ -94,6 +110,7 @@ class Correspondence:
             and where they were not compared.
         groups: names of the scans in correspondence, then of those of each other kind of object; empty where all are of
             one kind.
+        given: the template or model that was given, as a subject of a sentence; empty where there is none.
 
     Example:
         >>> correspondence = ss.correspond(meshes[:3], ss.CorrespondConfig(vertices=200, rounds=1, mirror="never"))
@@ -108,11 +125,46 @@ class Correspondence:
     landmarks: SurfaceLandmarks = field(default_factory=SurfaceLandmarks)
     sides_decided: bool = False
     groups: tuple[tuple[str, ...], ...] = ()
+    given: str = ""
 
     __repr__ = short_repr
 
     def _repr_html_(self) -> str:
         return lazy_import("html_of_correspondence")(self)
+
+    @property
+    def is_of_another_kind(self) -> bool:
+        """Whether the first template, if it was given, is hardly an object of the kind of the scans."""
+        return bool(self.given) and self.moved[0] >= ANOTHER_SHAPE
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences on what should be known before the surfaces are used; all notes on a scan are with it."""
+        notes: list[str] = []
+        if self.is_of_another_kind:
+            notes.append(
+                f"{self.given} had to change by {100 * self.moved[0]:.0f} % of its size to become these scans, so it "
+                "is hardly an object of their kind; look at the surfaces, or leave it out."
+            )
+        if mirrored := [scan.name for scan in self.scans if scan.mirrored]:
+            of = "scan is a mirror image" if len(mirrored) == 1 else "scans are mirror images"
+            notes.append(
+                f"{len(mirrored)} {of} of {self.given or 'the others'} ({first_names(mirrored, _LISTED)}) and "
+                "reflected for the correspondence; surfaces are in the frames of their scans."
+            )
+        notes += [describe_groups(self.groups)] if self.groups else []
+        noted = [f"{scan.name}: {' '.join(scan.notes)}" for scan in self.scans if scan.notes]
+        notes += noted[:_LISTED]
+        if len(noted) > _LISTED:
+            notes.append(f"Notes on {len(noted) - _LISTED} more scans are in their records.")
+        if others := [scan.name for scan in self.scans if scan.unit_ratio != 1.0]:
+            noun = "scans is" if len(others) == 1 else "scans are"
+            notes.append(
+                f"{len(others)} of {len(self.scans)} {noun} in another unit than the majority, judging by size "
+                f"({first_names(others, _LISTED)}); so are the surfaces, and build converts them to the unit of the "
+                "majority."
+            )
+        return tuple(notes)
 
     def meshes(self) -> list[Mesh]:
         """Return the complete surfaces of scans that are not excluded, in their own frames, with `Mesh.observed`.

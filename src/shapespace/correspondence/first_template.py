@@ -15,6 +15,7 @@ from shapespace.correspondence.symmetric_template import symmetrise
 from shapespace.correspondence.template import check_template, choose_template, clean_scan, resample
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.doctor import NON_FINITE, repair
+from shapespace.geometry.landmark_placement import far_landmarks, place_landmarks
 from shapespace.geometry.normals import faces_of, rms_size
 from shapespace.geometry.outer_surface import outer_surface
 from shapespace.model.shape_model import ShapeModel
@@ -98,21 +99,25 @@ def usable_scan(scan: Mesh, *, strict: bool = False) -> tuple[Mesh, list[str]]:
     mesh, findings = repair(scan, strict=strict)
     notes = [f"{one.problem} {one.action}" for one in findings if one.level == "note" or NON_FINITE in one.problem]
     mesh, sentences = with_own_landmarks(mesh)
-    return mesh, [*notes, *sentences]
+    far = far_landmarks(mesh, place_landmarks(mesh, mesh.landmarks)) if mesh.landmarks else []
+    return mesh, [*notes, *sentences, *far]
 
 
 def repaired_scans(
-    scans: Sequence[Mesh], config: CorrespondConfig
+    scans: Sequence[Mesh], config: CorrespondConfig, first: int = 0
 ) -> tuple[dict[int, Mesh], dict[int, str], dict[int, list[str]]]:
-    """Return the scans that can be used, by number, why the others cannot, and sentences on the repairs."""
+    """Return the scans that can be used, by number from `first` on, why the others cannot, and notes on scans."""
     repaired: dict[int, Mesh] = {}
     notes: dict[int, list[str]] = {}
     broken: dict[int, str] = {}
-    for i, scan in enumerate(scans):
+    for i, scan in enumerate(scans, first):
         try:
             repaired[i], notes[i] = usable_scan(outer_surface(scan) if config.outer else scan)
         except MeshError as error:
             broken[i] = f"broken: {error}"
+    numbers = list(repaired)
+    for copy, earlier in copies(list(repaired.values())).items():
+        notes[numbers[copy]].append(f"It is {repaired[numbers[earlier]].name} again; leave one of them out.")
     if config.ignore_colours:
         repaired = {i: replace(scan, colours=None) for i, scan in repaired.items()}
     return repaired, broken, notes

@@ -10,15 +10,16 @@ those of docs/correspondence.md.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
-from typing import Protocol
+from typing import TypeAlias
 
 import numpy as np
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
-from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
+from shapespace.correspondence.collection_notes import judge_collection
+from shapespace.correspondence.correspondence_result import ANOTHER_SHAPE, Correspondence, Corresponding
 from shapespace.correspondence.first_template import FirstTemplate, first_template, repaired_scans
 from shapespace.correspondence.guide import ShapePredictor, predict_leave_one_out
 from shapespace.correspondence.harmonics import Harmonics
@@ -40,7 +41,6 @@ from shapespace.correspondence.scan_status import (
     Judgement,
     ScanEvidence,
     SurfaceMeasures,
-    find_review_reasons,
     judge,
 )
 from shapespace.correspondence.settings import FEWEST, SIZE, CorrespondConfig
@@ -51,7 +51,7 @@ from shapespace.geometry.distortion import Distortion
 from shapespace.geometry.landmark_placement import place_landmarks
 from shapespace.geometry.mirror_plane import FLIP, mirror_image
 from shapespace.geometry.mirrored_scans import ASYMMETRIC, Sides, solve_sides
-from shapespace.geometry.normals import rms_size
+from shapespace.geometry.normals import face_areas, rms_size, without_estimates
 from shapespace.geometry.procrustes import align_to_weighted_mean
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.interop import as_meshes
@@ -77,12 +77,8 @@ _ANCHORS, _MOST_ANCHORS = 2, 6
 """Scans that all others are compared with, in addition to the template; at most, until the sides are decided."""
 
 
-class Runner(Protocol):
-    """Does the tasks of a round, here or elsewhere, and yields them as they end."""
-
-    def __call__(self, context: RoundContext, tasks: Sequence[RegistrationTask]) -> Iterable[ScanRegistration]:
-        """Yield the registration of each of `tasks`, in any order."""
-        ...
+Runner: TypeAlias = Callable[[RoundContext, Sequence[RegistrationTask]], Iterable[ScanRegistration]]
+"""Does the tasks of a round, here or elsewhere, and yields their registrations as they end, in any order."""
 
 
 def run_here(context: RoundContext, tasks: Sequence[RegistrationTask]) -> Iterable[ScanRegistration]:
@@ -133,7 +129,8 @@ def correspond(
             state = _registered_by_subject(problem, previous, state, run)
         if state.rounds[-1].moved < config.settled:  # C17
             break
-    result = _result(problem, state, _evidence(state))
+    given = template.name if template is not None else "" if model is None else "The model's mean"
+    result = _result(problem, state, _evidence(state), given)
     _check_folds(result, config)
     return result
 
@@ -306,8 +303,9 @@ def _with_sides(problem: _Problem, run: Runner, *, may_reflect: bool) -> tuple[_
 
 def _compared_with(problem: _Problem, context: RoundContext, anchor: int, run: Runner) -> tuple[_Problem, FloatArray]:
     """Return the problem with the comparisons of all scans with an anchor, and the scores (N, 2) of both sides."""
+    sides: Comparison = "pose" if problem.config.mirror == "never" else "scores"
     tasks = [
-        RegistrationTask(i, scan, None, None, problem.config.first, sides=_comparison_of_poses(problem))
+        RegistrationTask(i, scan, None, None, problem.config.first, sides=sides)
         for i, scan in problem.first.repaired.items()
     ]
     scores = np.full((len(problem.names), 2), np.nan)
@@ -391,10 +389,6 @@ def _comparison(problem: _Problem, state: RegistrationState, i: int) -> Comparis
         and state.registrations[i].scores.mirrored > _CLEARLY_WORSE * state.registrations[i].scores.pose
     )
     return "one" if is_settled else "both"
-
-
-def _comparison_of_poses(problem: _Problem) -> Comparison:
-    return "pose" if problem.config.mirror == "never" else "scores"
 
 
 def _pose_with_usual_size(state: RegistrationState, i: int) -> Similarity:
@@ -731,6 +725,7 @@ class FinishedCorrespondence:
         scans: the raw scans of the surfaces; empty if the mean and the surfaces stay.
         mirrored: which of the scans are mirrored; empty if none is.
         sides_decided: as of `Correspondence`.
+        judged: results of the scans, which those of added scans are compared with; empty if unknown.
     """
 
     mean: Mesh
@@ -739,6 +734,7 @@ class FinishedCorrespondence:
     scans: Sequence[Mesh] = ()
     mirrored: Sequence[bool] = ()
     sides_decided: bool = False
+    judged: Sequence[Corresponding] = ()
 
 
 def add_scans(
@@ -766,30 +762,28 @@ def add_scans(
         InputError: a scan of `finished` cannot be used, or the round over all scans registers fewer than two.
     """
     config = config or CorrespondConfig()
-    kept = len(finished.surfaces)
-    scans = list(as_meshes(scans, "add_scans"))
-    repaired, broken, notes = repaired_scans(scans, config)
-    raw, unusable, notes_of_raw = repaired_scans(finished.scans, config)
-    if unusable:
-        raise InputError(f"A scan of the finished correspondence is {next(iter(unusable.values()))}")
-    raw |= {kept + i: scan for i, scan in repaired.items()}
-    reasons = {kept + i: reason for i, reason in broken.items()}
+    kept, scans = len(finished.surfaces), list(as_meshes(scans, "add_scans"))
+    given = [*finished.scans, *scans]
+    repaired, broken, notes = repaired_scans(given, config, first=kept + len(scans) - len(given))
+    if unusable := [reason for i, reason in broken.items() if i < kept]:
+        raise InputError(f"A scan of the finished correspondence is {unusable[0]}")
     names = [mesh.name for mesh in (*finished.surfaces, *scans)]
-    notes = notes_of_raw | {kept + i: sentences for i, sentences in notes.items()}
     origin = "The template is the mean of the finished correspondence."
-    first = FirstTemplate(finished.mean, origin, raw, reasons, notes)
+    first = FirstTemplate(finished.mean, origin, repaired, broken, notes)
     problem = _Problem.of(names, first, config)
     start = _finished_state(problem, finished)
-    states = _added_states(problem, start, [i for i in raw if i >= kept], run)
+    states = _added_states(problem, start, [i for i in repaired if i >= kept], run)
     judged = {i: _judged_by_finished(problem, state, i) for i, state in states.items()}
     if finished.scans:
         state = _merged(start, {i: state for i, (state, _) in judged.items()})
         state = replace(_update_template(problem, state, state, {}), rounds=())
-        registrations = run(_context(problem, state), [_task(problem, state, i) for i in raw])
+        registrations = run(_context(problem, state), [_task(problem, state, i) for i in repaired])
         state = _next_state(problem, state, registrations)
         return _result(problem, state, _evidence(state))
     confidence = VertexConfidence.of(finished.mean, problem.harmonics)
     results = [_added_result(problem, *judged.get(i, (start, None)), i, confidence) for i in range(kept, len(names))]
+    if finished.judged:
+        results = judge_collection(results, config.settled, finished.judged)
     return Correspondence(finished.mean, tuple(results), first.origin, (), start.landmarks)
 
 
@@ -921,26 +915,39 @@ def _groups(state: RegistrationState) -> list[list[int]]:
     return [sorted(state.registrations), *sorted(alike, key=len, reverse=True)] if alike else []
 
 
-def _result(problem: _Problem, state: RegistrationState, evidence: Mapping[int, ScanEvidence]) -> Correspondence:
+def _result(
+    problem: _Problem, state: RegistrationState, evidence: Mapping[int, ScanEvidence], given: str | None = None
+) -> Correspondence:
+    """Return the result of all scans; `given` is the template or model of the first round, None for later rounds."""
     complete, groups = _complete_shapes(problem, state), _groups(state)
     # A scan of another kind is tried again in each round, and can end with a reason that names no kind.
     kinds = {i: _another_kind(len(group), len(groups[0])) for group in groups[1:] for i in group}
     state = replace(state, excluded={**state.excluded, **kinds})
     confidence = VertexConfidence.of(state.template, problem.harmonics)
-    scans = [
+    scans = tuple(
         _scan_result(problem, state, i, complete.get(i), evidence.get(i), confidence) for i in range(len(problem.names))
-    ]
-    measured = [scan.measures for scan in scans if scan.measures is not None]
-    reasons = iter(find_review_reasons(measured, problem.config.settled))
-    scans = [scan if scan.measures is None else replace(scan, review=tuple(next(reasons))) for scan in scans]
+    )
     points = state.landmarks.positions(state.template.vertices)
     template = state.template.with_vertices(state.template.vertices, points)
     landmarks = replace(state.landmarks, distance_mm=np.empty(0))  # places on a mean have no given point
     moved = tuple(record.moved for record in state.rounds)
-    return Correspondence(
-        template, tuple(scans), problem.first.origin, moved, landmarks, sides_decided=state.sides.decided,
-        groups=tuple(tuple(problem.names[i] for i in group) for group in groups),
+    made = Correspondence(
+        template, scans, problem.first.origin, moved, landmarks, sides_decided=state.sides.decided,
+        groups=tuple(tuple(problem.names[i] for i in group) for group in groups), given=given or "",
     )  # fmt: skip
+    if given is not None and not made.is_of_another_kind and len(state.registrations) < ENOUGH_TO_JUDGE:
+        scans = [_with_other_shape(scan) for scan in scans]
+    return replace(made, scans=judge_collection(scans, problem.config.settled))
+
+
+def _with_other_shape(scan: Corresponding) -> Corresponding:
+    """Return a scan, of too few to decide what is another object, with a note if its shape is quite another one."""
+    if scan.reason or not scan.moved or scan.moved[0] <= ANOTHER_SHAPE:
+        return scan
+    return scan.noting(
+        f"It differs from the others by {100 * scan.moved[0]:.0f} % of its size, and there are too few scans to decide "
+        "whether it is another object; inspect it."
+    )
 
 
 def _complete_shapes(problem: _Problem, state: RegistrationState) -> dict[int, FloatArray]:
@@ -970,15 +977,18 @@ def _scan_result(
     """Return the result of scan `i`; `complete` are its vertices (V, 3) in the template's frame, None if excluded."""
     moved = tuple(record.scan_moved[i] for record in state.rounds if i in record.scan_moved)
     cpu_s = tuple(record.cpu_s[i] for record in state.rounds if i in record.cpu_s)
+    notes = tuple(problem.first.notes.get(i, ()))
     if complete is None:
-        return Corresponding(problem.names[i], state.excluded[i], moved=moved, seconds=cpu_s)
-    registration = state.registrations[i]
+        return Corresponding(problem.names[i], state.excluded[i], moved=moved, seconds=cpu_s, notes=notes)
+    registration, scan = state.registrations[i], problem.first.repaired[i]
     judgement = Judgement("converged", np.nan, "") if evidence is None else judge(evidence)
     T = registration.T_scan_template
     vertices = T.apply(complete)
     landmarks = problem.landmarks(state.landmarks, problem.scan(i, mirrored=registration.mirrored))
     mean, p95, p99, largest = (T.scale * length for length in registration.distance)
     position_std = confidence.position_std(complete, registration.observed, len(state.registrations))
+    shown = without_estimates(Mesh(vertices, state.template.faces, observed=registration.observed))
+    area = float(np.nansum(face_areas(shown)))
     return Corresponding(
         name=problem.names[i],
         reason="",
@@ -998,7 +1008,8 @@ def _scan_result(
         evidence=evidence,
         position_std=T.scale * position_std,
         measures=_measures(state.template, registration, moved),
-        notes=problem.first.notes[i],
+        notes=notes,
+        area_share=None if scan.faces is None else area / float(face_areas(scan).sum()),
     )
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -174,6 +176,30 @@ class _RepairState:
         """Return the state with one more finding."""
         return self.measured(findings=(*self.report.findings, Finding(level, problem, action)))
 
+    def fixed(
+        self,
+        without: Callable[[], _RepairState],
+        measure: str,
+        count: int,
+        names: tuple[str, str],
+        what: str,
+        action: str,
+    ) -> _RepairState:
+        """Return the state `without` that many things, with a measure and a finding; itself where there are none.
+
+        Args:
+            without: returns the state without them.
+            measure: field of the report that counts them.
+            count: of the things.
+            names: one and many of them, with their verb.
+            what: end of the sentence on them.
+            action: what was done.
+        """
+        if not count:
+            return self
+        problem = f"{_some(count, *names)} {what}"
+        return without().measured(**{measure: count}).reported("fixed", problem, action)
+
     def with_vertices_where(self, keep: BoolArray) -> _RepairState:
         """Return the state with some of the vertices, and the triangles between them."""
         colours = None if self.colours is None else self.colours[keep]
@@ -262,19 +288,15 @@ def _drop_non_finite(state: _RepairState, finite: BoolArray, *, strict: bool) ->
 
 def _merge_vertices(state: _RepairState) -> _RepairState:
     first, index = _equal_rows((state.vertices + 0.0).view(np.int64))  # 0 and -0 have other bits
-    count = len(state.vertices) - len(first)
-    if not count:
-        return state
-    merged = replace(
-        state,
-        vertices=state.vertices[first],
-        faces=None if state.faces is None else index[state.faces],
-        colours=None if state.colours is None else state.colours[first],
-    )
-    return merged.measured(duplicate_vertices=count).reported(
-        "fixed",
-        f"{_some(count, 'vertex lies', 'vertices lie')} exactly on another.",
-        "Equal vertices are merged into one.",
+
+    def merged() -> _RepairState:
+        faces = None if state.faces is None else index[state.faces]
+        colours = None if state.colours is None else state.colours[first]
+        return replace(state, vertices=state.vertices[first], faces=faces, colours=colours)
+
+    count, action = len(state.vertices) - len(first), "Equal vertices are merged into one."
+    return state.fixed(
+        merged, "duplicate_vertices", count, ("vertex lies", "vertices lie"), "exactly on another.", action
     )
 
 
@@ -283,12 +305,10 @@ def _drop_degenerate(state: _RepairState) -> _RepairState:
 
     assert state.faces is not None
     flat = topology.flat_triangles(np.array(state.vertices), state.faces, _DEGENERATE)
-    count = int(flat.sum())
-    if not count:
-        return state
-    problem = f"{_some(count, 'triangle has', 'triangles have')} no area."
-    state = state.with_triangles_where(~flat).measured(degenerate_triangles=count)
-    return state.reported("fixed", problem, "They are dropped.")
+    others, count = partial(state.with_triangles_where, ~flat), int(flat.sum())
+    return state.fixed(
+        others, "degenerate_triangles", count, ("triangle has", "triangles have"), "no area.", "They are dropped."
+    )
 
 
 def _drop_repeated(state: _RepairState) -> _RepairState:
@@ -296,12 +316,9 @@ def _drop_repeated(state: _RepairState) -> _RepairState:
     if not len(state.faces):
         return state
     first, _ = _equal_rows(np.sort(state.faces, axis=1))
-    count = len(state.faces) - len(first)
-    if not count:
-        return state
-    problem = f"{_some(count, 'triangle repeats', 'triangles repeat')} an earlier one."
-    state = state.with_triangles_where(first).measured(duplicate_triangles=count)
-    return state.reported("fixed", problem, "Only the first of each is kept.")
+    others, count = partial(state.with_triangles_where, first), len(state.faces) - len(first)
+    names, action = ("triangle repeats", "triangles repeat"), "Only the first of each is kept."
+    return state.fixed(others, "duplicate_triangles", count, names, "an earlier one.", action)
 
 
 def _drop_unreferenced(state: _RepairState) -> _RepairState:
@@ -310,12 +327,9 @@ def _drop_unreferenced(state: _RepairState) -> _RepairState:
         return state
     used = np.zeros(len(state.vertices), dtype=np.bool_)
     used[state.faces] = True
-    count = int((~used).sum())
-    if not count:
-        return state
-    problem = f"{_some(count, 'vertex belongs', 'vertices belong')} to no triangle."
-    state = state.with_vertices_where(used).measured(unreferenced_vertices=count)
-    return state.reported("fixed", problem, "They are not part of the surface, and are dropped.")
+    others, count = partial(state.with_vertices_where, used), int((~used).sum())
+    names, action = ("vertex belongs", "vertices belong"), "They are not part of the surface, and are dropped."
+    return state.fixed(others, "unreferenced_vertices", count, names, "to no triangle.", action)
 
 
 def _check_spread(state: _RepairState) -> _RepairState:

@@ -104,6 +104,15 @@ def align_in_place(
     return Alignment(shapes.mean(axis=0), iteration, converged=True)
 
 
+def align_shapes(shapes: FloatArray, gauge: Gauge, alignment_vertices: IntArray | None = None) -> FloatArray:
+    """Align training `shapes` (N, V, 3) in place, as `align_in_place` and `scale_to_tangent` do, and return them."""
+    align_in_place(shapes, gauge, alignment_vertices=alignment_vertices)
+    # Where only some vertices carried the alignment, the size of the others is shape.
+    if gauge == "shape" and alignment_vertices is None:
+        scale_to_tangent(shapes)
+    return shapes
+
+
 def align_to_weighted_mean(shapes: FloatArray, weights: FloatArray, frame: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return `shapes` (N, V, 3) in the pose and size of their weighted mean, and the mean (V, 3) in those of `frame`.
 

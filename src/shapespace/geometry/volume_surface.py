@@ -9,9 +9,9 @@ by more than half a voxel (after R. T. Whitaker, "Reducing Aliasing Artifacts in
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
-from functools import reduce
+from functools import partial, reduce
 from itertools import pairwise
 from typing import Any, cast
 
@@ -127,10 +127,10 @@ def surface_of_volume(
         raise InputError(f"The smoothing must be from 0 to {MOST_SMOOTH:g} voxels, not {smooth}.")
     chosen, wanted = _chosen(volume, labels)
     sigma = smooth * np.cbrt(np.prod(volume.voxel_mm)) / volume.voxel_mm
-    memory = _Memory(volume.labels.nbytes, max_memory_bytes, volume.name)
-    mask, corner = _cut_out(volume, wanted, np.ceil(3 * sigma).astype(int) + 3, memory)
+    check_memory = partial(_check_memory, volume, max_memory_bytes)
+    mask, corner = _cut_out(volume, wanted, np.ceil(3 * sigma).astype(int) + 3, check_memory)
     part = _Solid.of(mask, keep_pieces=keep_pieces)
-    memory.check(mask.shape, count_crossings(part.mask))
+    check_memory(mask.shape, count_crossings(part.mask))
     if part.voxels < _FEWEST:
         raise InputError(
             f"{volume.name}: {_named(chosen)} has only {part.voxels} "
@@ -156,34 +156,26 @@ def surface_of_volume(
     )
 
 
-@dataclass(frozen=True)
-class _Memory:
-    """Memory limit of a surface.
+def _check_memory(volume: LabelVolume, limit_bytes: int, box: Sequence[int], vertices: int = 0) -> None:
+    """Check the memory of a surface.
 
     Args:
-        volume_bytes: of the volume.
+        volume: the labels.
         limit_bytes: of the volume and all that is made of it.
-        name: of the volume.
+        box: (3,) voxels along each axis of the box around the labels.
+        vertices: of the border of the labels.
+
+    Raises:
+        InputError: it is over the limit.
     """
-
-    volume_bytes: int
-    limit_bytes: int
-    name: str
-
-    def check(self, box: Sequence[int], vertices: int = 0) -> None:
-        """Check the memory for a box of voxels around the labels and for the vertices of their border.
-
-        Raises:
-            InputError: they do.
-        """
-        needed = self.volume_bytes + estimated_bytes(box, vertices)
-        if needed > self.limit_bytes:
-            size = " x ".join(map(str, box))
-            raise InputError(
-                f"{self.name}: the surface of its labels, in a box of {size} voxels, takes about "
-                f"{needed / 2**30:.2g} GiB of memory, over the limit of {self.limit_bytes / 2**30:.2g} GiB; crop or "
-                "resample it, as by 3D Slicer, or allow more (--max-memory)."
-            )
+    needed = volume.labels.nbytes + estimated_bytes(box, vertices)
+    if needed > limit_bytes:
+        size = " x ".join(map(str, box))
+        raise InputError(
+            f"{volume.name}: the surface of its labels, in a box of {size} voxels, takes about "
+            f"{needed / 2**30:.2g} GiB of memory, over the limit of {limit_bytes / 2**30:.2g} GiB; crop or resample "
+            "it, as by 3D Slicer, or allow more (--max-memory)."
+        )
 
 
 def estimated_bytes(box: Sequence[int], vertices: int) -> int:
@@ -290,7 +282,7 @@ def _named(labels: tuple[int | str, ...]) -> str:
 
 
 def _cut_out(
-    volume: LabelVolume, wanted: _Places, margin: npt.NDArray[np.int_], memory: _Memory
+    volume: LabelVolume, wanted: _Places, margin: npt.NDArray[np.int_], check_memory: Callable[[list[int]], None]
 ) -> tuple[BoolArray, FloatArray]:
     """Return the box around the labels in `wanted` with a margin on each axis, and (3,) where it begins."""
     shape, layers = volume.labels.shape[:3], volume.layers
@@ -306,7 +298,7 @@ def _cut_out(
                 along = np.flatnonzero(found.any(axis=tuple(other for other in range(3) if other != axis)))
                 low[axis] = min(low[axis], block[axis].start + along[0])
                 high[axis] = max(high[axis], block[axis].start + along[-1] + 1)
-    memory.check((high - low + 2 * margin).tolist())
+    check_memory((high - low + 2 * margin).tolist())
     mask = np.zeros(high - low + 2 * margin, dtype=np.bool_)
     corner = low - margin
     for block in _blocks(shape):

@@ -33,7 +33,7 @@ from shapespace.model.held_out import held_out_shapes
 from shapespace.model.local_modes import local_modes
 from shapespace.model.new_shapes import HeldOut, variances_of_new_shapes
 from shapespace.model.pca import modes_for_variance, plain_modes, principal_components
-from shapespace.model.shape_model import ShapeModel
+from shapespace.model.shape_model import ShapeModel, odd_size_notes
 from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks, common_faces, read_only
 
@@ -145,6 +145,12 @@ class AdditiveModel:
         identity_modes, expression_modes = plain_modes(identity_modes), plain_modes(expression_modes)
         meshes = [without_estimates(mesh) for mesh in as_meshes(meshes, "AdditiveModel.fit")]
         faces = common_faces(meshes)
+        for mesh in meshes:
+            if np.isnan(mesh.vertices).any():
+                raise InputError(
+                    f"{mesh.name}: vertices are missing, and a model that parts identity and expression needs whole "
+                    "meshes; leave --additive out, or the meshes with holes."
+                )
         neutrals, shapes, people, expressive = _neutrals_and_expressions(meshes, subjects, neutral, kin)
         row = np.array([people.index(subjects[i]) for i in expressive])
         still = still_vertices(neutrals[row], shapes, still_share) if alignment_vertices is None else alignment_vertices
@@ -175,6 +181,7 @@ class AdditiveModel:
                 *mirrored_note(lambda i: meshes[i].vertices, lambda i: meshes[i].name, len(meshes)),
                 *modes_notes(identity_modes, A.shape[1], len(people), "neutral shapes"),
                 *modes_notes(expression_modes, B.shape[1], len(expressive), "expressions"),
+                *odd_size_notes(mean.reshape(-1, 3)),
             ],
         )
         return cls(model, rotation, A.shape[1])

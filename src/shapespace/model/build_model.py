@@ -16,15 +16,15 @@ from shapespace.geometry.bspline import SplineSquare
 from shapespace.geometry.flatten import disc_map
 from shapespace.geometry.mirrored_scans import mirrored_note
 from shapespace.geometry.normals import without_estimates
-from shapespace.geometry.procrustes import Gauge, align_in_place, centroid_size, scale_to_tangent
+from shapespace.geometry.procrustes import Gauge, align_shapes, centroid_size
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.interop import MeshLike, as_meshes
 from shapespace.model.build_config import BuildConfig
 from shapespace.model.choose_modes import modes_notes, number_of_modes
-from shapespace.model.missing import CompletedShapes, ObservedMeshes, complete
+from shapespace.model.missing import CompletedShapes, ObservedMeshes, complete, missing_notes
 from shapespace.model.pca import Modes, PrincipalComponents, principal_components
 from shapespace.model.representation import Representation, Vertices, representation_named
-from shapespace.model.shape_model import ShapeModel
+from shapespace.model.shape_model import ShapeModel, odd_size_notes
 from shapespace.model.spurious import below_precision, made_by_alignment, rounding_mm
 from shapespace.model.streamed import (
     Aligned,
@@ -33,9 +33,8 @@ from shapespace.model.streamed import (
     Scratch,
     Tell,
     aligned_on_disk,
-    bytes_in_memory,
     refuse_without_extent,
-    too_large,
+    streaming_note,
 )
 from shapespace.model.training_shapes import TrainingShapes
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity, SurfaceLandmarks, common_faces, require
@@ -82,10 +81,8 @@ def build_model(
     kind = representation_named(config.representation, config.control_points)
     if kind is not Vertices and (config.out_of_core or keep_shapes is not None):
         raise InputError("Only models of vertices can be made of streamed meshes; leave --representation out.")
-    out_of_core = config.out_of_core
-    if out_of_core is None and kind is Vertices and len(meshes) > 1:
-        out_of_core = too_large(bytes_in_memory(len(meshes), meshes[0], choose=config.modes == "auto"))
-    if out_of_core or keep_shapes is not None:
+    streaming = streaming_note(meshes, config) if kind is Vertices and keep_shapes is None else ""
+    if config.out_of_core or keep_shapes is not None or streaming:
         stream = aligned_on_disk(
             meshes,
             config.gauge,
@@ -98,12 +95,15 @@ def build_model(
         )
         if len(meshes):
             SurfaceLandmarks.of(landmarks).check(len(meshes[0].vertices))
-        return _of_streamed(stream, meshes, config, landmarks, keep_shapes, log)
+        model = _of_streamed(stream, meshes, config, landmarks, keep_shapes, log)
+        return replace(model, notes=[streaming, *model.notes]) if streaming else model
     meshes = [without_estimates(meshes[index]) for index in range(len(meshes))]
     faces, dropped = common_faces(meshes), np.zeros(0, dtype=np.int32)
+    notes = missing_notes(meshes)
     if not kind.takes_holes and len(meshes) > 1:
-        observed = ObservedMeshes.of(meshes, config.min_seen)
-        meshes, landmarks = observed.meshes, observed.landmarks(landmarks)
+        observed, given = ObservedMeshes.of(meshes, config.min_seen), landmarks
+        meshes, landmarks = observed.meshes, observed.landmarks(given)
+        notes += observed.notes(config.min_seen, given)
         faces, alignment_vertices = meshes[0].faces, observed.indices(alignment_vertices)
         dropped = np.flatnonzero(~observed.vertices).astype(np.int32)
     shapes, names = _training_shapes(meshes, faces, fill=kind.takes_holes), [mesh.name for mesh in meshes]
@@ -137,7 +137,8 @@ def build_model(
         licence=config.licence,
         dropped_vertices=dropped,
     )
-    return _finished(model, aligned.__getitem__, names.__getitem__, sizes, config)
+    model = _finished(model, aligned.__getitem__, names.__getitem__, sizes, config)
+    return replace(model, notes=[*notes, *model.notes])
 
 
 def extend_model(
@@ -253,7 +254,8 @@ def _finished(
         sizes: (N,) before alignment, relative to those after it.
         config: options.
     """
-    model = replace(model, notes=[*mirrored_note(shape, name, len(sizes)), *model.notes])
+    odd = odd_size_notes(model.mean_vertices)
+    model = replace(model, notes=[*mirrored_note(shape, name, len(sizes)), *model.notes, *odd])
     if config.without_training_shapes:
         return model
     sizes = sizes if model.gauge == "shape" else np.ones(len(sizes))
@@ -316,12 +318,7 @@ def _aligned(
     if np.isnan(shapes).any():
         completed = complete(shapes, names, gauge, align=align, alignment_vertices=alignment_vertices)
         return completed.shapes, completed
-    if align:
-        align_in_place(shapes, gauge, alignment_vertices=alignment_vertices)
-        # Where only some vertices carried the alignment, the size of the others is shape.
-        if gauge == "shape" and alignment_vertices is None:
-            scale_to_tangent(shapes)
-    return shapes, None
+    return align_shapes(shapes, gauge, alignment_vertices) if align else shapes, None
 
 
 def _components_of_codes(coder: Representation, shapes: FloatArray, modes: Modes, seed: int) -> PrincipalComponents:

@@ -18,7 +18,7 @@ from scipy.linalg import eigh
 from shapespace.errors import InputError
 from shapespace.geometry.mirror_plane import pairs_of_triangles
 from shapespace.geometry.normals import part_of
-from shapespace.geometry.procrustes import Gauge, align_in_place, centroid_size, scale_to_tangent
+from shapespace.geometry.procrustes import Gauge, align_shapes, centroid_size
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.choose_modes import number_of_modes
 from shapespace.model.pca import (
@@ -42,11 +42,6 @@ _MODES_A_SHAPE, _MOST_MODES = 0.7, 60
 """Modes that probabilistic PCA begins with; those without evidence lose their width."""
 # limit of the iterations of the mean, and the change as a share of the size that ends them
 _MEAN_ROUNDS, _STILL = 50, 1e-8
-
-
-def observed_vertices(meshes: Sequence[Mesh]) -> BoolArray:
-    """Return (N, V) which vertices of corresponding meshes are observed: no coordinate is not-a-number."""
-    return _observed(np.stack([mesh.vertices for mesh in meshes]))
 
 
 def _observed(shapes: FloatArray) -> BoolArray:
@@ -74,7 +69,7 @@ class ObservedMeshes:
         """
         if not 0 < min_seen <= 1:
             raise InputError(f"The share of meshes that show a vertex lies above 0 and at most at 1, not {min_seen:g}.")
-        observed = observed_vertices(meshes)
+        observed = _observed(np.stack([mesh.vertices for mesh in meshes]))
         if observed.all():
             return ObservedMeshes(meshes, observed[0])
         for mesh, own in zip(meshes, observed, strict=True):
@@ -108,6 +103,20 @@ class ObservedMeshes:
         given.check(len(self.vertices))
         return given.renumbered(self.vertices)
 
+    def notes(self, min_seen: float, landmarks: Mapping[str, int]) -> list[str]:
+        """Return which vertices, and which of the `landmarks` of the meshes, are not used since few observe them."""
+        out, lost = int((~self.vertices).sum()), sorted(set(landmarks) - set(self.landmarks(landmarks)))
+        number = "1 vertex is" if out == 1 else f"{out} vertices are"
+        notes = [
+            f"{number} taken out of the model, since fewer than {100 * min_seen:g} % of the meshes show them; "
+            "--min-seen says how many must."
+        ]
+        of_landmarks = (
+            f"The model has no {', '.join(lost)}, since these landmarks lie in triangles with vertices that are taken "
+            "out."
+        )
+        return [*(notes if out else []), *([of_landmarks] if lost else [])]
+
     def indices(self, vertices: IntArray | None) -> IntArray | None:
         """Return those of `vertices` that are used, in their new numbers; None stays None."""
         if vertices is None or self.vertices.all():
@@ -115,6 +124,16 @@ class ObservedMeshes:
         chosen = np.asarray(vertices)
         number = (np.cumsum(self.vertices) - 1).astype(np.int32)
         return number[chosen[self.vertices[chosen]]]
+
+
+def missing_notes(meshes: Sequence[Mesh]) -> list[str]:
+    """Return how many vertices of corresponding meshes are missing, in a sentence, if there are any."""
+    holed = [int(np.isnan(mesh.vertices).any(axis=1).sum()) for mesh in meshes]
+    if not any(holed):
+        return []
+    missing, every, where = sum(holed), len(meshes) * len(meshes[0].vertices), sum(count > 0 for count in holed)
+    share = 100 * missing / every
+    return [f"{missing} of {every} vertices are missing ({share:.1f} %), in {where} of {len(meshes)} meshes."]
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,10 +217,10 @@ def complete(
     )
     if align:
         for modes in _POSES_BY:
-            posed = _aligned(guess, gauge, alignment_vertices)
+            posed = align_shapes(guess.copy(), gauge, alignment_vertices)
             fitted = ppca(posed, observed, min(most, modes))
             guess = _in_own_pose(shapes, observed, posed, fitted)
-        guess = _aligned(guess, gauge, alignment_vertices)
+        guess = align_shapes(guess.copy(), gauge, alignment_vertices)
     fitted = ppca(guess, observed, most)
     for i, hidden in enumerate(fitted.patterns.hidden):
         guess[i, hidden] = fitted.estimate(i)
@@ -252,14 +271,6 @@ def _mean_of(shapes: FloatArray, observed: BoolArray) -> FloatArray:
 
 def _filled(shapes: FloatArray, observed: BoolArray, by: FloatArray) -> FloatArray:
     return np.where(observed[:, :, None], shapes, by)
-
-
-def _aligned(shapes: FloatArray, gauge: Gauge, alignment_vertices: IntArray | None) -> FloatArray:
-    posed = shapes.copy()
-    align_in_place(posed, gauge, alignment_vertices=alignment_vertices)
-    if gauge == "shape" and alignment_vertices is None:
-        scale_to_tangent(posed)
-    return posed
 
 
 def _in_own_pose(shapes: FloatArray, observed: BoolArray, posed: FloatArray, fitted: Ppca) -> FloatArray:

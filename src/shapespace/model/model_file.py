@@ -6,9 +6,9 @@ Landmarks are stored as triangles and barycentric coordinates.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, TypeAlias
 
 import msgspec
 import numpy as np
@@ -20,7 +20,7 @@ from shapespace.geometry.procrustes import Gauge
 from shapespace.io.containers.hdf5 import Attribute, content_hash, read_hdf5, write_hdf5
 from shapespace.io.containers.json_files import plain_json
 from shapespace.model.training_shapes import UNIT_TOLERANCE, TrainingShapes
-from shapespace.types import FloatArray, IntArray, SurfaceLandmarks
+from shapespace.types import IntArray, SurfaceLandmarks
 from shapespace.version import __version__
 
 FORMAT_NAME = "shapespace model"
@@ -56,28 +56,8 @@ class _FileAttributes(Struct, frozen=True):
     notes: str = "[]"
 
 
-class ModelFields(TypedDict):
-    """The fields of a `ShapeModel`, which says what they are."""
-
-    mean: FloatArray
-    basis: FloatArray
-    stddev: FloatArray
-    total_variance: float
-    n_training: int
-    faces: IntArray | None
-    gauge: Gauge
-    landmarks: SurfaceLandmarks
-    representation: str
-    coding: Mapping[str, npt.NDArray[Any]]
-    provenance: str
-    licence: str
-    held_out: bool
-    residuals: FloatArray | None
-    regions: Mapping[str, IntArray]
-    is_n_training_known: bool
-    training: TrainingShapes | None
-    dropped_vertices: IntArray
-    notes: Sequence[str]
+ModelFields: TypeAlias = dict[str, Any]
+"""The fields of a `ShapeModel` by their names."""
 
 
 def hash_of(model: ModelFields) -> str:

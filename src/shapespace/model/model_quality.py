@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -228,24 +228,12 @@ class QualityConfig:
         if self.samples < 2 or (self.modes is not None and self.modes < 1):
             raise InputError("Quality needs at least two samples, and at least one mode.")
 
-    def space(self, meshes: Sequence[Mesh], modes: Modes = "all") -> _Space:
+    def space(self, meshes: Sequence[Mesh], modes: Modes = "all") -> ShapeModel:
         """Return the shape space of `meshes`, of the vertices that at least two of them show."""
-        included = np.ones(len(meshes[0].vertices), dtype=np.bool_)
-        if not representation_named(self.representation, self.control_points).takes_holes:
-            included = ObservedMeshes.of(meshes, _ANY).vertices
-        model = ShapeModel.fit(
+        return ShapeModel.fit(
             meshes, modes=modes, gauge=self.gauge, align=self.align, representation=self.representation,
             control_points=self.control_points, min_seen=_ANY, seed=self.seed,
         )  # fmt: skip
-        return _Space(model, included)
-
-
-@dataclass(frozen=True, eq=False)
-class _Space:
-    """A model, and which vertices (V,) of the shapes it has: those that its training shapes show."""
-
-    model: ShapeModel
-    included: BoolArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,10 +269,11 @@ class _Target:
                 )
         return _Target(shape, seen, surface, engine, scan is not None)
 
-    def cut_to(self, used: BoolArray) -> _Target:
-        """Return the same with the vertices `used` (V,) only."""
-        if used.all():
+    def cut_to(self, space: ShapeModel) -> _Target:
+        """Return the same with those vertices only that the training shapes of `space` show."""
+        if len(self.shape.vertices) == space.n_vertices:
             return self
+        used = ~np.isin(np.arange(len(self.shape.vertices)), space.dropped_vertices)
         shape = part_of(self.shape, used)
         seen = np.flatnonzero(np.isfinite(shape.vertices).all(axis=1)).astype(np.int32)
         if self.is_scan:
@@ -356,7 +345,7 @@ class Shapes:
         return sorted({max(2, round(share * least)) for share in _PARTS})
 
     @cached_property
-    def space(self) -> _Space:
+    def space(self) -> ShapeModel:
         """The shape space of all."""
         return self.config.space(self.meshes)
 
@@ -368,17 +357,17 @@ class Shapes:
     @cached_property
     def trained(self) -> list[_Target]:
         """The same of the vertices that the shape space has."""
-        return [target.cut_to(self.space.included) for target in self.targets]
+        return [target.cut_to(self.space) for target in self.targets]
 
     @cached_property
     def drawn(self) -> FloatArray:
         """(S, K) coefficients of the random shapes."""
-        return self.space.model.sample(self.config.samples, np.random.default_rng(self.config.seed + 2))
+        return self.space.sample(self.config.samples, np.random.default_rng(self.config.seed + 2))
 
     @cached_property
     def nearest(self) -> _Nearest:
         """The training shapes in the pose of the model."""
-        return _Nearest.of(_posed(self.space.model, self.trained, self.config), self.space.model.n_vertices)
+        return _Nearest.of(_posed(self.space, self.trained, self.config), self.space.n_vertices)
 
     def parts(self) -> list[Part]:
         """Return all parts of the work, in the order of the output."""
@@ -405,17 +394,17 @@ class Shapes:
         space = self.config.space([self.meshes[i] for i in sorted(part.order)])
         out = np.zeros((len(held), len(self.counts) + len(self.sizes), 2))
         for row, target in enumerate(held):
-            out[row, : len(self.counts)] = _errors_by_modes(space.model, target.cut_to(space.included), self.counts)
+            out[row, : len(self.counts)] = _errors_by_modes(space, target.cut_to(space), self.counts)
         for column, size in enumerate(self.sizes, len(self.counts)):
             fewer = self.config.space([self.meshes[i] for i in sorted(part.order[:size])])
             only = np.array([min(self.config.modes or size - 1, size - 1)], dtype=np.int32)
             for row, target in enumerate(held):
-                out[row, column] = _errors_by_modes(fewer.model, target.cut_to(fewer.included), only, surface=False)[0]
+                out[row, column] = _errors_by_modes(fewer, target.cut_to(fewer), only, surface=False)[0]
         return out
 
     def _drawn(self, part: Part) -> FloatArray:
         """Return how far random shapes (S, n, 2), mm, lie from the nearest training shape."""
-        model, counts = self.space.model, self.few_counts
+        model, counts = self.space, self.few_counts
         mean, modes = model.mean_vertices, np.ascontiguousarray(model.vertex_basis.T)
         out = np.zeros((len(part.drawn), len(counts), 2))
         for row, b in enumerate(self.drawn[list(part.drawn)]):
@@ -424,12 +413,8 @@ class Shapes:
         return out
 
 
-class Runner(Protocol):
-    """Does the parts of a measurement, here or elsewhere, and yields them as they end."""
-
-    def __call__(self, shapes: Shapes, parts: Sequence[Part]) -> Iterable[tuple[Part, FloatArray]]:
-        """Yield what came of each of `parts`, in any order."""
-        ...
+Runner: TypeAlias = Callable[[Shapes, Sequence[Part]], Iterable[tuple[Part, FloatArray]]]
+"""Does the parts of a measurement, here or elsewhere, and yields each with what came of it, in any order."""
 
 
 def run_here(shapes: Shapes, parts: Sequence[Part]) -> Iterable[tuple[Part, FloatArray]]:
@@ -487,8 +472,7 @@ def _of_model(
 ) -> ModelQuality:
     counts = _counts(min(config.modes or model.n_modes, model.n_modes))
     share = model.cumulative_variance[counts - 1]
-    space = _Space(model, np.ones(model.n_vertices, dtype=np.bool_))
-    of_unseen = _unseen(space, unseen, counts, config, StepCounter(len(unseen), progress))
+    of_unseen = _unseen(model, unseen, counts, config, StepCounter(len(unseen), progress))
     return ModelQuality(
         Curve(counts, share, share, share),
         reconstruction=of_unseen[0],
@@ -514,7 +498,7 @@ def _of_meshes(
     of_unseen = _unseen(space, unseen, counts, config, steps)
     there = np.mean([len(target.seen) for target in shapes.targets]) / len(meshes[0].vertices)
     return ModelQuality(
-        _compactness(space.model, shapes.trained, counts, config),
+        _compactness(space, shapes.trained, counts, config),
         generalisation=general[0],
         generalisation_vertices=general[1],
         specificity=specific[0],
@@ -522,10 +506,10 @@ def _of_meshes(
         reconstruction=of_unseen[0],
         reconstruction_vertices=of_unseen[1],
         by_shapes=Curve.over(errors[:, len(counts) :, 0], shapes.sizes, config.seed),
-        supported_modes=config.space(meshes, "auto").model.n_modes if len(meshes) >= FEWEST_SHAPES else None,
+        supported_modes=config.space(meshes, "auto").n_modes if len(meshes) >= FEWEST_SHAPES else None,
         shapes=len(meshes),
         folds=len(shapes.folds),
-        points=_points(space.model.n_vertices),
+        points=_points(space.n_vertices),
         seed=config.seed,
         missing_share=1.0 - float(there),
         left_out_vertices=left_out,
@@ -558,7 +542,7 @@ def _curves(errors: FloatArray, counts: IntArray, seed: int) -> tuple[Curve, Cur
 
 
 def _unseen(
-    space: _Space, unseen: Sequence[Mesh], counts: IntArray, config: QualityConfig, steps: StepCounter
+    space: ShapeModel, unseen: Sequence[Mesh], counts: IntArray, config: QualityConfig, steps: StepCounter
 ) -> tuple[Curve, Curve] | tuple[None, None]:
     if not unseen:
         return None, None
@@ -586,10 +570,10 @@ def _spread(vertices: int) -> IntArray:
     return np.unique(np.linspace(0, vertices - 1, _points(vertices)).round().astype(np.int32))
 
 
-def _over_shapes(space: _Space, targets: Sequence[_Target], counts: IntArray, steps: StepCounter) -> FloatArray:
+def _over_shapes(space: ShapeModel, targets: Sequence[_Target], counts: IntArray, steps: StepCounter) -> FloatArray:
     out = np.zeros((len(targets), len(counts), 2))
     for row, target in enumerate(targets):
-        out[row] = _errors_by_modes(space.model, target.cut_to(space.included), counts)
+        out[row] = _errors_by_modes(space, target.cut_to(space), counts)
         steps.add()
     return out
 

@@ -9,7 +9,7 @@ from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -37,6 +37,7 @@ from shapespace.types import (
     generator_of,
     read_only,
     require_path,
+    set_fields,
 )  # fmt: skip
 
 if TYPE_CHECKING:
@@ -57,6 +58,9 @@ _VECTOR = "mean"
 _ROUNDING = 64 * float(np.finfo(float).eps)
 _WIDEST = 1e6
 """Standard deviations lie between these shares of the norm of the mean shape's vertices about their middle."""
+
+_LEAST_MM, _MOST_MM = 1.0, 3000.0
+"""Beyond this the largest extent of an object is more likely given in another unit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,18 +159,17 @@ class ShapeModel:
                 raise InputError(
                     f"The residuals of {k} modes must be as many numbers from 0 up, not {residuals.shape}."
                 )
-            object.__setattr__(self, "residuals", residuals)
-        object.__setattr__(self, "basis", basis)
-        object.__setattr__(self, "stddev", stddev)
-        object.__setattr__(self, "landmarks", SurfaceLandmarks.of(self.landmarks))
-        object.__setattr__(self, "total_variance", float(self.total_variance))
-        object.__setattr__(self, "n_training", int(self.n_training))
+            set_fields(self, residuals=residuals)
+        set_fields(
+            self, basis=basis, stddev=stddev, landmarks=SurfaceLandmarks.of(self.landmarks),
+            total_variance=float(self.total_variance), n_training=int(self.n_training),
+        )  # fmt: skip
         arrays = dict(self._coder.arrays())
-        object.__setattr__(self, "coding", MappingProxyType({**arrays, _VECTOR: mean} if arrays else {}))
+        set_fields(self, coding=MappingProxyType({**arrays, _VECTOR: mean} if arrays else {}))
         checked = Mesh(self._coder.decode(mean), self.faces, name="model")
         if given.ndim == 2 and arrays and not np.array_equal(given, checked.vertices):
             raise InputError("The vertices of this mean are not those of its B-spline; give its control points (D,).")
-        object.__setattr__(self, "mean", checked.vertices)
+        set_fields(self, mean=checked.vertices, faces=checked.faces)
         _refuse_impossible(stddev, checked.vertices)
         if self.training is not None:
             rows, rest = self.training.rest.shape
@@ -174,19 +177,16 @@ class ShapeModel:
                 raise InputError(f"The training shapes do not belong to a model of {k} modes.")
             _refuse_impossible(self.training.stddev[k:], checked.vertices, first_mode=k)
             _refuse_impossible(np.maximum(self.training.stddev[:k], stddev), checked.vertices)
-        object.__setattr__(self, "faces", checked.faces)
         source = len(checked.vertices) + len(self.dropped_vertices)
         none = np.zeros(0, dtype=np.int32)
         dropped = region_vertices(self.dropped_vertices, source, "dropped") if len(self.dropped_vertices) else none
         if len(dropped) != len(self.dropped_vertices):
             raise InputError("A dropped vertex of a shape model is named twice.")
-        object.__setattr__(self, "dropped_vertices", dropped)
         self.landmarks.check(len(checked.vertices))
         regions = {
             str(name): region_vertices(vertices, len(checked.vertices), name) for name, vertices in self.regions.items()
         }
-        object.__setattr__(self, "regions", MappingProxyType(regions))
-        object.__setattr__(self, "notes", tuple(self.notes))
+        set_fields(self, dropped_vertices=dropped, regions=MappingProxyType(regions), notes=tuple(self.notes))
 
     def __getstate__(self) -> dict[str, Any]:
         # For copies, other processes and skops, none of which takes read-only mappings.
@@ -467,7 +467,7 @@ class ShapeModel:
         """Return what the model is made of, by the names of its arguments."""
         plain = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         coding = {name: array for name, array in self.coding.items() if name != _VECTOR}
-        return cast(model_file.ModelFields, {**plain, "mean": self._vector, "coding": coding})
+        return {**plain, "mean": self._vector, "coding": coding}
 
     def save(self, path: Path | str) -> None:
         """Write the model to one HDF5 file, whole or not at all.
@@ -571,6 +571,15 @@ def region_vertices(vertices: npt.ArrayLike, n_vertices: int, name: str) -> IntA
     region = unique.astype(np.int32)
     region.setflags(write=False)
     return region
+
+
+def odd_size_notes(mean: FloatArray) -> list[str]:
+    """Return that a mean shape (V, 3), mm, is of a size that tells of another unit, in a sentence, if it is."""
+    extent = np.ptp(mean, axis=0)
+    if _LEAST_MM < float(extent.max()) < _MOST_MM:
+        return []
+    size = " x ".join(f"{length:.3g}" for length in extent)
+    return [f"The mean is {size} mm large, which is odd for mm; --unit says in which unit the meshes are."]
 
 
 def _refuse_impossible(stddev: FloatArray, mean_vertices: FloatArray, first_mode: int = 0) -> None:

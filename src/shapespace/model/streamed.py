@@ -35,6 +35,7 @@ from shapespace.io.containers.arrays import read_arrays, write_arrays
 from shapespace.io.containers.row_spill import Spill
 from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_error, write_text
 from shapespace.io.memory_cache import available_bytes
+from shapespace.model.build_config import BuildConfig
 from shapespace.model.choose_modes import drawn, number_of_modes
 from shapespace.model.krylov import KeptPasses
 from shapespace.model.large_pca import checked_large_modes, large_components
@@ -254,10 +255,17 @@ def bytes_in_memory(count: int, mesh: Mesh, *, choose: bool) -> int:
     return int(count * (vertices + triangles) + 2 * 8 * count**2)
 
 
-def too_large(needed: int) -> bool:
-    """Return whether so many bytes are more than four fifths of the memory that is free."""
-    free = available_bytes()
-    return free is not None and needed > _MOST_OF_MEMORY * free
+def streaming_note(meshes: Meshes, config: BuildConfig) -> str:
+    """Return why meshes that nobody asked to stream must be streamed, in a sentence; empty if they fit into memory."""
+    if config.out_of_core is not None or len(meshes) < 2:
+        return ""
+    needed, free = bytes_in_memory(len(meshes), meshes[0], choose=config.modes == "auto"), available_bytes()
+    if free is None or needed <= _MOST_OF_MEMORY * free:
+        return ""
+    return (
+        f"{len(meshes)} meshes would take {needed / 1e9:.1f} GB of memory, which is more than four fifths of what is "
+        "free, so they are streamed through a file (--out-of-core)."
+    )
 
 
 @contextlib.contextmanager
@@ -442,12 +450,13 @@ class _Work:
             template = self.first.vertices - (self.first.vertices[self.chosen].mean(axis=0) if self.align else 0.0)
         else:
             template = self.onto.template
-        sizes, posed, spread = np.empty(self.count), np.empty(self.count), _Spread()
+        sizes, posed, bounds = np.empty(self.count), np.empty(self.count), list[FloatArray]()
 
         def near(index: int, vertices: FloatArray) -> FloatArray:
             sizes[index] = centroid_size(vertices[self.chosen])
             if index >= self.before:
-                spread.take(vertices)
+                low, high = bounds or (vertices, vertices)
+                bounds[:] = np.minimum(low, vertices), np.maximum(high, vertices)
                 if self.align:
                     with_scale = self.gauge == "shape"
                     T = fit_similarity(vertices[self.chosen], template[self.chosen], with_scale=with_scale)
@@ -456,7 +465,8 @@ class _Work:
             return vertices - template
 
         self._fill(shapes, near)
-        if self.onto is None and spread.is_nothing():
+        largest = max((float(np.abs(bound).max()) for bound in bounds), default=0.0)
+        if self.onto is None and (not bounds or float((bounds[1] - bounds[0]).max()) <= _ROUNDING * largest):
             raise InputError(ALL_EQUAL)
         if self.onto is not None:
             sizes[: self.before] = self.onto.sizes
@@ -516,24 +526,6 @@ class _Work:
         for start, block in shapes.row_blocks():
             vertices = block.reshape(len(block), -1, 3) + template
             shapes.write_rows(start, (poses.apply(start, vertices) - self.template).reshape(len(block), -1))
-
-
-class _Spread:
-    """Whether shapes differ at all, as they are read one by one."""
-
-    def __init__(self) -> None:
-        self.least: FloatArray | None = None
-        self.most = self.least
-
-    def take(self, vertices: FloatArray) -> None:
-        self.least = vertices if self.least is None else np.minimum(self.least, vertices)
-        self.most = vertices if self.most is None else np.maximum(self.most, vertices)
-
-    def is_nothing(self) -> bool:
-        if self.least is None or self.most is None:
-            return True
-        largest = max(float(np.abs(self.least).max()), float(np.abs(self.most).max()))
-        return float((self.most - self.least).max()) <= _ROUNDING * largest
 
 
 def refuse_without_extent(vertices: FloatArray, name: str) -> None:

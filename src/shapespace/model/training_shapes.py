@@ -12,7 +12,7 @@ from scipy.linalg import eigh
 
 from shapespace.errors import InputError
 from shapespace.reprs import short_repr
-from shapespace.types import FloatArray, read_only
+from shapespace.types import FloatArray, read_only, set_fields
 
 MOST_SHAPES = 500  # training shapes of a model file; of larger sets a fixed random subset, to bound size and time
 UNIT_TOLERANCE = 1e-3  # length of a mode off 1; float32 rounding over millions of coordinates is smaller
@@ -56,9 +56,7 @@ class TrainingShapes:
             length = np.einsum("dk,dk->k", rest, rest)
         if not (np.abs(length - 1.0) < UNIT_TOLERANCE).all():
             raise InputError("A further mode of the training shapes is not of length 1.")
-        object.__setattr__(self, "coefficients", coefficients)
-        object.__setattr__(self, "rest", rest)
-        object.__setattr__(self, "log_scale", log_scale)
+        set_fields(self, coefficients=coefficients, rest=rest, log_scale=log_scale)
 
     @staticmethod
     def of(

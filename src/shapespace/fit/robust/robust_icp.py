@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
 
 import numpy as np
@@ -434,7 +435,8 @@ def _summary(
         T_scan_fitted=T,
         vertices_scan_mm=T.apply(surface.vertices),
         outside_mm=T.scale * float(np.linalg.norm(iterate.b[wanted:]) / np.sqrt(len(surface.vertices))),
-        regions=FinalMatches(
+        regions=partial(
+            final_regions,
             target=target,
             T_scan_model=T,
             surface=ModelSurface.of(surface.topology, surface.vertices),
@@ -543,9 +545,11 @@ _FINEST = 0.01
 """Of the model's size: what lies nearer than this is followed, however exact the rest is."""
 
 
-@dataclass(frozen=True, eq=False)
-class FinalMatches:
-    """What decides the regions at the end of a robust fit; called, it finds them.
+def final_regions(
+    *, target: ScanTarget, T_scan_model: Similarity, surface: ModelSurface, winding: float, normal_cosine: float,
+    weight: str, width_mm: float, far_mm: float,
+) -> IntArray:  # fmt: skip
+    """Return the code (V,) of the region of each vertex at the end of a robust fit.
 
     Args:
         target: the scan.
@@ -557,41 +561,27 @@ class FinalMatches:
         width_mm: scale of the residuals at the end.
         far_mm: scale of the distances at the end.
     """
-
-    target: ScanTarget
-    T_scan_model: Similarity
-    surface: ModelSurface
-    winding: float
-    normal_cosine: float
-    weight: str
-    width_mm: float
-    far_mm: float
-
-    def __call__(self) -> IntArray:
-        """Return the code of each vertex, (V,)."""
-        every = np.arange(len(self.surface.vertices), dtype=np.int32)
-        matches = match_vertices(
-            target=self.target,
-            engine=self.target.engine,
-            T_scan_model=self.T_scan_model,
-            surface=self.surface,
-            vertex=every,
-            near=None,
-            winding=self.winding,
-            normal_cosine=self.normal_cosine,
-        )
-        w = match_weights(
-            self.weight, matches.residual, np.zeros(len(every)), matches.allowed, self.width_mm, self.far_mm
-        )
-        near_mm = max(self.width_mm, _FINEST * rms_size(self.surface.vertices))
-        sideways = np.sqrt(np.maximum(matches.distance**2 - matches.residual**2, 0.0))
-        counted = (w > _COUNTS) | (matches.allowed & (np.abs(matches.residual) < near_mm))
-        regions = np.where(counted, FOLLOWED, REJECTED)
-        # Where the nearest point of the scan lies off to the side, the scan has nothing at the vertex itself.
-        regions[sideways > max(self.far_mm, _SPACINGS * float(np.median(sideways)))] = UNSEEN
-        at_rim = on_boundary(matches.near, self.target.mesh, self.target.rim)
-        regions[at_rim] = np.where(sideways[at_rim] > near_mm, UNSEEN, BORDER)
-        return regions.astype(np.int32)
+    every = np.arange(len(surface.vertices), dtype=np.int32)
+    matches = match_vertices(
+        target=target,
+        engine=target.engine,
+        T_scan_model=T_scan_model,
+        surface=surface,
+        vertex=every,
+        near=None,
+        winding=winding,
+        normal_cosine=normal_cosine,
+    )
+    w = match_weights(weight, matches.residual, np.zeros(len(every)), matches.allowed, width_mm, far_mm)
+    near_mm = max(width_mm, _FINEST * rms_size(surface.vertices))
+    sideways = np.sqrt(np.maximum(matches.distance**2 - matches.residual**2, 0.0))
+    counted = (w > _COUNTS) | (matches.allowed & (np.abs(matches.residual) < near_mm))
+    regions = np.where(counted, FOLLOWED, REJECTED)
+    # Where the nearest point of the scan lies off to the side, the scan has nothing at the vertex itself.
+    regions[sideways > max(far_mm, _SPACINGS * float(np.median(sideways)))] = UNSEEN
+    at_rim = on_boundary(matches.near, target.mesh, target.rim)
+    regions[at_rim] = np.where(sideways[at_rim] > near_mm, UNSEEN, BORDER)
+    return regions.astype(np.int32)
 
 
 # Projection of a fitted surface onto the span of the model
