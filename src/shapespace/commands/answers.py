@@ -72,7 +72,7 @@ def save_report(
     except ShapespaceError as error:
         return None, [*notes, str(error)]
     if figures is not None and figures.formats:
-        from shapespace.report.pages.figure_files import write_figures
+        from shapespace.report.pages.study_page import write_figures
 
         with waiting("drawing the figures", quiet=quiet):
             notes += write_figures(output, figures.formats, figures.dpi)[1]

@@ -181,7 +181,7 @@ def correspondence_facts(folder: Path) -> dict[str, Any]:
         FileError: it is none, or it cannot be read.
     """
     from shapespace.report.inputs.correspondence_folder import Corresponded
-    from shapespace.report.inputs.triage import concerns_of, distance_share, known, median
+    from shapespace.report.inputs.correspondence_folder import concerns_of, distance_share, known, median
 
     if not (folder / CorrespondenceRecord.FILE).is_file():
         raise FileError(

@@ -17,7 +17,7 @@ from shapespace.geometry.normals import faces_of
 from shapespace.io.tables.table_io import table_text
 from shapespace.report.blocks.wording import without_folders
 from shapespace.report.inputs.correspondence_folder import Corresponded, Population
-from shapespace.report.inputs.triage import Concern, concerns_of, distance_share, scan_status, sentence
+from shapespace.report.inputs.correspondence_folder import Concern, concerns_of, distance_share, scan_status, sentence
 from shapespace.report.render import palette as colours
 from shapespace.report.render.scene import decimate, pack, quantise
 from shapespace.report.render.thumbnails import SQUARES, checker_places

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-from shapespace.report.blocks.wording import DASH, STATUS_WORDS, isfinite, mm
+from shapespace.report.blocks.wording import DASH, STATUS_WORDS, isfinite, mm, setting, words
 
 
 @dataclass(frozen=True)
@@ -297,6 +297,4 @@ def text_table(heads: Sequence[str], rows: Sequence[Sequence[str]], caption: str
 
 def facts_of(values: Mapping[str, object], caption: str) -> Facts:
     """Return settings or measures by name, those with parts by their plain parts."""
-    from shapespace.report.blocks.wording import setting, words
-
     return Facts([(words(key), setting(value)) for key, value in values.items()], caption)

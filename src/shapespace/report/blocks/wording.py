@@ -19,6 +19,8 @@ STATUS_WORDS: Mapping[str, str] = {
     "unreadable": "unreadable",
 }
 """What each status is called, the best first."""
+ORDER_OF_CONCERN = ("failed", "unreadable", "doubtful", "max_iterations", "converged")
+"""Statuses, those first that somebody must look at."""
 
 DASH = "–"
 _FOLDERS = re.compile(r"""(?<![\w.~/\\])(?:[A-Za-z]:)?[\\/](?:[^\s'",;:()\\/]+[\\/])*(?=[^\s\\/])""")

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
@@ -34,10 +37,6 @@ from shapespace.report.figures.draw import (
 )
 from shapespace.report.render.palette import CATEGORIES, SEQUENTIAL, oklab
 from shapespace.types import FloatArray
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.axis import Axis
 
 CurveScale: TypeAlias = Literal["linear", "log", "probit"]
 """How the numbers of a curve stand along an axis."""
@@ -131,8 +130,6 @@ def _cell(axes: Axes, row: int, column: int, share: float, count: float, n: int)
 
 
 def _map() -> Any:
-    from matplotlib.colors import ListedColormap
-
     return ListedColormap(SEQUENTIAL)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import InputError
-from shapespace.report.blocks.sections import ORDER_OF_CONCERN
+from shapespace.report.blocks.wording import ORDER_OF_CONCERN
 from shapespace.store.results import Results, modes_of
 from shapespace.store.rows import META
 from shapespace.types import FloatArray

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,24 @@ LINKS = "links.csv"
 """Table of pairs of landmarks between which figures have a line."""
 _PARALLEL = 1e-3  # sine of the angle below which two directions determine no rotation
 _AGAIN = 'write {"views": [{"name": "dorsal", "toward_viewer": [0, 0, 1], "up": [0, 1, 0]}]}'
+
+_NO_VIEWS = Orientation()
+_ORIENTATION: ContextVar[Orientation] = ContextVar("orientation", default=_NO_VIEWS)
+
+
+@contextmanager
+def oriented(orientation: Orientation | None) -> Generator[None]:
+    """Return a context in which figures have the named views and links of an orientation; None for none."""
+    token = _ORIENTATION.set(orientation or _NO_VIEWS)
+    try:
+        yield
+    finally:
+        _ORIENTATION.reset(token)
+
+
+def current_orientation() -> Orientation:
+    """Return the named views and links of the figures that are drawn."""
+    return _ORIENTATION.get()
 
 
 def find_orientation(

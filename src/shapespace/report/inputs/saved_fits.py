@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Generator, Sequence
+import shlex
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,9 +17,11 @@ from msgspec import structs
 
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.fit.diagnostics.reason_text import text_of
+from shapespace.fit.fit_scan import FitConfig
 from shapespace.geometry.doctor import repair
-from shapespace.io.files import sha256_of_file
+from shapespace.io.files import read_bytes, sha256_of_file
 from shapespace.io.meshes.mesh_io import read_mesh
+from shapespace.io.tables.table_io import table_rows
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report.blocks.wording import counted, printable
 from shapespace.report.inputs.staged_fit import StagedFit
@@ -346,3 +349,48 @@ def _printable(value: object) -> object:
     if isinstance(value, dict):
         return {printable(str(key)): _printable(item) for key, item in cast(dict[object, object], value).items()}
     return value
+
+
+_MOST_SCANS = 50  # paths in a command; more do not belong in a line
+_OPTIONS = {
+    "method": "--method", "unit": "--unit", "scale": "--scale", "max_iterations": "--max-iterations", "seed": "--seed",
+    "dense": "--dense", "landmark_stddev_mm": "--landmark-std", "crop": "--crop", "region": "--region",
+    "strict": "--strict",
+}  # fmt: skip
+"""Setting in a record -> its option."""
+
+
+def command_with_stages(root: Path, records: Mapping[str, FitRecord]) -> str:
+    """Return the command, to be run in the folder `root`, that fits the scans of `records` again and saves the stages.
+
+    The scans are those of the folder's list, which has landmarks and metadata too, if it contains these and no others;
+    otherwise, and for a scan without both, they are named one by one.
+
+    Args:
+        root: folder of the results.
+        records: NAME -> record of each fit.
+    """
+    first = next(iter(records.values()))
+    scans = [record.scan.path or "SCAN" for record in records.values()]
+    is_plain = len(records) == 1 and first.landmarks is None and not first.metadata
+    if not is_plain and _listed(root / FitRecord.LIST) == set(records):
+        scans = [FitRecord.LIST]
+    elif len(scans) > _MOST_SCANS:
+        scans = ["SCANS"]
+    usual, options = FitConfig().as_dict(), list[str]()
+    for name, option in _OPTIONS.items():
+        value = first.config.get(name)
+        if value in (None, usual.get(name), False) or not isinstance(value, str | int | float):
+            continue
+        options += [option] if value is True else [option, str(value)]
+    return shlex.join(["shapespace", "fit", first.model.path or "MODEL.h5", *scans, "-o", ".", "--stages", *options])
+
+
+def _listed(file: Path) -> set[str]:
+    """Return the names of the results in a list of scans; none if there is no such list."""
+    try:
+        rows = table_rows(read_bytes(file))
+        column = next(rows).index("id")
+        return {row[column] for row in rows}
+    except (ShapespaceError, ValueError):
+        return set()

@@ -11,17 +11,18 @@ from shapespace.errors import InputError, ShapespaceError
 from shapespace.fit.result import FitResult
 from shapespace.model.model_quality import Curve, ModelQuality
 from shapespace.model.shape_model import ShapeModel
+from shapespace.report import figures
 from shapespace.report.blocks.blocks import Block
 from shapespace.report.blocks.wording import listed, mm, percent, training_text
 from shapespace.report.inputs.staged_fit import StagedFit
+from shapespace.report.pages.page import template
 from shapespace.report.pages.write_html import require_report_extra
+from shapespace.report.render.thumbnails import Still, fit_strip
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from shapespace.report.render.thumbnails import Still
-
-Drawn: TypeAlias = "tuple[Still, str]"
+Drawn: TypeAlias = tuple[Still, str]
 """A picture, and what stands below it."""
 _SHARES = (0.9, 0.95, 0.98)  # of the variance; usual choices for the number of modes
 _MODES_SHOWN = 2  # layout: rows
@@ -41,8 +42,6 @@ _CURVES = (
 def plot_model(model: ShapeModel, kind: str, **options: Any) -> Figure:
     """Draw a figure for `ShapeModel.plot`."""
     require_report_extra()
-    from shapespace.report import figures
-
     draw = {"modes": figures.modes_figure, "mean": figures.mean_figure, "spectrum": figures.spectrum_figure}
     return _choose(draw, kind)(model, **options)
 
@@ -50,8 +49,6 @@ def plot_model(model: ShapeModel, kind: str, **options: Any) -> Figure:
 def plot_fit(result: FitResult, kind: str, **options: Any) -> Figure:
     """Draw a figure for `FitResult.plot`."""
     require_report_extra()
-    from shapespace.report import figures
-
     draw = {
         "distances": figures.signed_maps,
         "stages": figures.stages_figure,
@@ -67,8 +64,6 @@ def plot_fit(result: FitResult, kind: str, **options: Any) -> Figure:
 def plot_quality(quality: ModelQuality, **options: Any) -> Figure:
     """Draw a figure for `ModelQuality.plot`."""
     require_report_extra()
-    from shapespace.report import figures
-
     curves = {name: _numbers(curve) for name in _CURVES if (curve := getattr(quality, name)) is not None}
     if quality.by_shapes is not None:
         sizes = _numbers(quality.by_shapes)
@@ -126,8 +121,6 @@ def html_of_fit(result: FitResult) -> str:
     rows += [("Note", note) for note in result.notes]
 
     def draw() -> Drawn:
-        from shapespace.report.render.thumbnails import fit_strip
-
         fit = StagedFit.of(result.model, result)
         colours = "blue inside, red outside" if fit.scan.faces is not None else "dark is far"
         caption = f"The scan; scan and fitted model; distances up to {mm(fit.scale_mm)}: {colours}, grey not shown."
@@ -177,8 +170,6 @@ def notebook_html(
         require_report_extra()
     except ShapespaceError as error:
         return f"<pre>{escape(repr(of))}\n{escape(str(error))}</pre>"
-    from shapespace.report.pages.page import template
-
     picture, size, caption = "", (0, 0), ""
     try:
         if draw is not None:
@@ -193,6 +184,4 @@ def notebook_html(
 
 
 def _still(figure: Figure) -> Still:
-    from shapespace.report.figures import encode_webp
-
-    return encode_webp(figure)
+    return figures.encode_webp(figure)

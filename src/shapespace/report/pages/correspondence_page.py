@@ -33,20 +33,25 @@ from shapespace.report.blocks.blocks import (
     text_table,
 )
 from shapespace.report.blocks.wording import DASH, counted, listed, percent, plain, setting, words
-from shapespace.report.inputs.correspondence_folder import Corresponded, PlacedSurface, drawable, upright
-from shapespace.report.inputs.saved_fits import Folder
-from shapespace.report.inputs.staged_fit import nice_ceiling
-from shapespace.report.inputs.triage import (
+from shapespace.report.inputs.correspondence_folder import (
+    Corresponded,
+    PlacedSurface,
     concerns_of,
     distance_share,
+    drawable,
     known,
     median,
     percent_of,
     scan_status,
     sentence,
+    upright,
 )
+from shapespace.report.inputs.saved_fits import Folder
+from shapespace.report.inputs.staged_fit import nice_ceiling
 from shapespace.report.pages.page import Chapter, Page, Step
+from shapespace.report.render import thumbnails
 from shapespace.report.render.palette import DIVERGING, SEQUENTIAL
+from shapespace.report.render.scene import decimate
 from shapespace.reprs import describe_groups, first_names
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondRecord, Quality, read
 from shapespace.types import FloatArray, Mesh
@@ -344,8 +349,6 @@ class CorrespondencePage:
 
     def gallery(self) -> list[Block]:
         """Return a card for each of the first scans."""
-        from shapespace.report.render import thumbnails
-
         limit = 100 * (median([self.share(record, "p99") for record in self.records]) or nan)
         limit = nice_ceiling(limit)
         bars = [(SEQUENTIAL, "0", f"{limit:g} % of its size, or more"), (DIVERGING, "half the area", "twice the area")]
@@ -390,8 +393,6 @@ class CorrespondencePage:
 
     def _still(self, record: CorrespondRecord, limit: float) -> tuple[Image, str]:
         """Return the picture of a scan, and what it lacks."""
-        from shapespace.report.render import thumbnails
-
         if record in self.out:
             scan = drawable(self._bounded(record))[0]
             if scan.faces is not None:
@@ -410,8 +411,6 @@ class CorrespondencePage:
         return self.page.image(still, f"{record.name}: {seen}"), note
 
     def _bounded(self, record: CorrespondRecord) -> Mesh:
-        from shapespace.report.render.scene import decimate
-
         return decimate(self.result.raw_scan(record), _TRIANGLES_DRAWN)[0]
 
     def _scan_on_mean(self, scan: Mesh, placed: PlacedSurface) -> tuple[Mesh, FloatArray]:

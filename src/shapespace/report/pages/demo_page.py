@@ -5,23 +5,19 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from shapespace.errors import FileFormatError
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report import figures
-from shapespace.report.blocks import fit_tables as tables
 from shapespace.report.blocks import sections
 from shapespace.report.blocks.blocks import Block, Facts, Figure, Folded, Notice, Table, Text, Tiles, text_table
 from shapespace.report.blocks.wording import DASH, STATUS_WORDS, isfinite, mm, moment, plain, setting, words
 from shapespace.report.inputs.saved_fits import Folder, SavedFit, read_fit, staged_fit
+from shapespace.report.inputs.staged_fit import StagedFit
 from shapespace.report.pages.page import Chapter, Make, Page, Step
 from shapespace.schemas import DEMO_AGAIN, Case, Demo, DemoModel, ExpressionsOfOne, FitEntry, read
-
-if TYPE_CHECKING:
-    from shapespace.report.inputs.staged_fit import StagedFit
 
 _RESERVE_BYTES = 1_200_000  # bytes that stay free for the parts after the fits
 _PICTURES = 30  # planned pictures, for the progress bar alone
@@ -242,7 +238,7 @@ class DemoPage:
 
     def numbers(self, fits: Sequence[SavedFit]) -> Table:
         """Return the table of fits."""
-        return tables.fits_table(fits, {}, caption="Distances at the end, in mm. A dash: not known.")
+        return sections.fits_table(fits, {}, caption="Distances at the end, in mm. A dash: not known.")
 
     def training(self, one: ExpressionsOfOne) -> Figure:
         """Return some of the training faces."""
@@ -311,7 +307,7 @@ class DemoPage:
             out.append(sections.lines_through_neutral(self.page, scans, neutral, figures_of=of))
             if all(len(scan.b) >= 3 for scan in scans):
                 out += self.page.tried(lambda: sections.scatter_to_turn(self.page, scans))
-        return out + tables.score_tables(
+        return out + sections.score_tables(
             one.scores, many="Is each expression a line through neutral?", single="Are the expressions disjoint?"
         )
 

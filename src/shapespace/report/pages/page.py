@@ -11,8 +11,10 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from shapespace.errors import ShapespaceError
+from shapespace.report import figures
 from shapespace.report.blocks.blocks import Block, Cell, Figure, Image, Section, Text, Turning
 from shapespace.report.blocks.wording import anchor
+from shapespace.report.render import scene
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing
@@ -112,9 +114,7 @@ class Page:
 
     def still(self, figure: Drawing, alt: str, *, lossless: bool = False) -> Image:
         """Return a drawing as an image of this page, such as the still of something that turns."""
-        from shapespace.report.figures import encode_webp
-
-        return self.image(encode_webp(figure, lossless=lossless), alt)
+        return self.image(figures.encode_webp(figure, lossless=lossless), alt)
 
     def image(self, still: Still, alt: str) -> Image:
         """Return a picture as an image of this page."""
@@ -141,8 +141,6 @@ class Page:
             label: what it is.
             still: what the still shows.
         """
-        from shapespace.report.render import scene
-
         name = f"payload-{len(self._payloads) + 1}"
         if not self._payloads:
             self._spent += len(scene.scripts()) + len(scene.style())

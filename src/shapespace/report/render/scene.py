@@ -22,13 +22,15 @@ import numpy.typing as npt
 
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.remesh import collapse
+from shapespace.report.inputs.orientation import current_orientation
 from shapespace.report.inputs.staged_fit import StagedFit, measured_mm
+from shapespace.report.render import palette as colours
 from shapespace.schemas import FitRecord, to_json
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 
 if TYPE_CHECKING:
     from shapespace.model.shape_model import ShapeModel
-    from shapespace.report.figures.morphospace_figures import Morphospace
+    from shapespace.report.figures.landmark_figures import Morphospace
 
 
 _DTYPES = ("float32", "int32", "uint32", "uint16", "int16", "uint8")
@@ -222,8 +224,6 @@ def pack_morphospace(space: Morphospace, *, largest: int = 12_000) -> bytes:
         space: the plot.
         largest: how many triangles of a surface are kept.
     """
-    from shapespace.report.figures.analysis_figures import current_orientation
-
     part, given, rows = space.part, dict(space.arrays), np.arange(len(space.arrays["mean"]))
     mesh = Mesh(given.pop("mean"), space.faces)
     if space.faces is not None:
@@ -431,8 +431,6 @@ def pack_scatter(
 
 def scripts() -> str:
     """Return the JavaScript for the scenes of a page, for one inline `<script>`."""
-    from shapespace.report.render import palette as colours
-
     folder = files("shapespace.report").joinpath("assets")
     shared = {
         "sequential": colours.as_list(colours.SEQUENTIAL),

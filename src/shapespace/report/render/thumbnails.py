@@ -5,15 +5,15 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
-from PIL import Image as PillowImage
 
 from shapespace.errors import InputError
 from shapespace.geometry.distortion import Distortion
 from shapespace.geometry.normals import faces_of
 from shapespace.report.inputs.correspondence_folder import drawable, observed_mask
+from shapespace.report.inputs.staged_fit import StagedFit
 from shapespace.report.render.palette import CATEGORIES, DIVERGING, MODEL_COLOUR, SCAN_COLOUR, SEQUENTIAL, Colour
 from shapespace.report.render.renderer import (
     SQUARE_COLOURS,
@@ -25,10 +25,6 @@ from shapespace.report.render.renderer import (
     render_series,
 )
 from shapespace.types import FloatArray, IntArray, Mesh
-
-if TYPE_CHECKING:
-    from shapespace.report.inputs.staged_fit import StagedFit
-
 
 PANEL = (176, 232)
 """Width and height of a panel in pixels."""
@@ -125,6 +121,8 @@ def colour_bar(colours: Sequence[Sequence[float]] | np.ndarray = DIVERGING) -> S
 
 def encoded(image: Image, *, lossless: bool = False, quality: int = 84, effort: int = 3) -> Still:
     """Return pixels (H, W, 3) uint8 as WebP."""
+    from PIL import Image as PillowImage  # of the extra `report`
+
     stream = io.BytesIO()
     PillowImage.fromarray(np.ascontiguousarray(image)).save(
         stream, format="WEBP", lossless=lossless, quality=quality, method=effort
