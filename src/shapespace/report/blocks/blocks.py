@@ -5,17 +5,19 @@ from __future__ import annotations
 import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, TypeVar
 
-from shapespace.report.blocks.wording import DASH, STATUS_WORDS, isfinite, mm, setting, words
+from shapespace.report.blocks.wording import DASH, STATUS_WORDS, counted, isfinite, mm, setting, words
 
 
 @dataclass(frozen=True)
 class Text:
-    """A paragraph; its kind is a class of report.css."""
+    """A paragraph, or a sentence of a list, perhaps after a name; its kind is a class of report.css."""
 
     text: str
     kind: Literal["", "soft", "notice", "broken"] = ""
+    name: Cell | None = None
+    """Before the text: a status, or what may lead to a place in the page."""
 
 
 @dataclass(frozen=True)
@@ -98,19 +100,11 @@ class Tiles:
 
 
 @dataclass(frozen=True)
-class Item:
-    """A sentence of a list, perhaps after a name that may lead to a place in the page."""
-
-    text: str
-    name: Cell | None = None
-
-
-@dataclass(frozen=True)
 class Notice:
     """A box with a list of sentences; nothing where there are none."""
 
     heading: str
-    items: Sequence[str | Item]
+    items: Sequence[str | Text]
     kind: Literal["notice", "broken"] = "notice"
 
 
@@ -119,14 +113,6 @@ class Notes:
     """A list of remarks."""
 
     items: Sequence[str]
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """A status and the reason for it."""
-
-    status: Cell
-    reason: str
 
 
 @dataclass(frozen=True)
@@ -206,16 +192,8 @@ class Gallery:
 
 
 @dataclass(frozen=True)
-class ScaleKey:
-    """The key of the strips in a gallery: what they show, and the scale of their maps, which ends at `limit_mm`."""
-
-    limit_mm: float
-    bar: Image
-
-
-@dataclass(frozen=True)
 class StripKey:
-    """The key of other strips: what their panels show in words, and scales, each (bar, its ends in words)."""
+    """The key of strips in a gallery: what their panels show in words, and scales, each (bar, its ends in words)."""
 
     text: str
     bars: Sequence[tuple[Image, str, str]]
@@ -261,11 +239,9 @@ Block: TypeAlias = (
     | Tiles
     | Notice
     | Notes
-    | Verdict
     | Figure
     | Turning
     | Gallery
-    | ScaleKey
     | StripKey
     | Folded
     | Group
@@ -273,11 +249,27 @@ Block: TypeAlias = (
 )
 
 
+_Item = TypeVar("_Item")
+
+
 def status(value: str) -> Cell:
     """Return a cell with a status in words and its colour, sorted from bad to good."""
     known = list(STATUS_WORDS)
     kind = value if value in STATUS_WORDS else "failed"
     return Cell(STATUS_WORDS.get(value, value), float(len(known) - known.index(kind)), kind)
+
+
+def first_items(
+    items: Sequence[_Item], most: int, where: str, word: str = "other", words: str | None = None
+) -> list[_Item | str]:
+    """Return the first items of a list, and a sentence that counts the others and says where they are."""
+    return [*items[:most], *([f"{counted(len(items) - most, word, words)}, {where}."] if len(items) > most else [])]
+
+
+def no_picture(count: int, noun: str) -> Text:
+    """Return a sentence on those of which a gallery has no card."""
+    others = counted(count, f"other {noun}")
+    return Text(f"{others} have no picture here, so that this file stays below 8 MB; the table has them all.")
 
 
 def number(value: float, digits: int = 2) -> Cell:

@@ -30,7 +30,6 @@ from shapespace.report.blocks.blocks import (
     Table,
     Text,
     Turning,
-    Verdict,
     length,
     number,
     status,
@@ -224,11 +223,10 @@ def fit_to_turn(page: Page, fit: StagedFit) -> Turning | Figure:
         if fit.scan.faces is not None
         else f"the distance to the points of the scan, 0 to {limit_mm:g} mm."
     )
-    still = thumbnails.fit_strip(fit, limit_mm, (300, 372))
     return page.turning(
         "fit",
         pack_fit(fit, largest_scan=SCAN_TRIANGLES),
-        page.image(still, strip_alt(fit, limit_mm)),
+        page.image(thumbnails.fit_strip(fit, limit_mm, (300, 372)), strip_alt(fit, limit_mm)),
         f"{fit.label}: the scan, and the {'fitted model' if fit.regions is None else 'model at each stage'}.",
         label=f"Scan and model of {fit.label}, to be turned",
         still=f"The still shows the scan, both over each other, and {scale}",
@@ -244,11 +242,10 @@ def surface_to_turn(page: Page, fit: SavedFit, surfaces: Mapping[str, Mesh], why
         surfaces: `final`, and `dense` where there is one, in the picture frame.
         why: the scan is not shown, as the end of a sentence.
     """
-    still = thumbnails.mesh_still(surfaces["final"], (420, 420))
     return page.turning(
         "fit",
         pack_surfaces(surfaces, fit.record, name=fit.name, label=fit.label, reason=why, largest=SCAN_TRIANGLES),
-        page.image(still, f"The fitted surface of {fit.name}"),
+        page.image(thumbnails.mesh_still(surfaces["final"], (420, 420)), f"The fitted surface of {fit.name}"),
         f"{fit.label}: the fitted surface; {why.removesuffix('.')}.",
         label=f"Fitted surface of {fit.label}, to be turned",
         still="The still shows the fitted surface.",
@@ -298,8 +295,12 @@ def fit_pictures(page: Page, fit: StagedFit, population: FloatArray | None, *, o
     def picture(name: str, alt: str) -> Figure:
         more = {"population": population} if name == "coefficients_figure" else {}
         drawing = getattr(figures, name)(fit, **more)
-        caption = (_OF_PAPER.get(name, "") if of_paper else "") + _CAPTIONS[name]
-        return page.figure(drawing, caption, alt=alt, chart=name in ("history_figure", "coefficients_figure"))
+        return page.figure(
+            drawing,
+            ((_OF_PAPER.get(name, "") if of_paper else "") + _CAPTIONS[name]),
+            alt=alt,
+            chart=name in ("history_figure", "coefficients_figure"),
+        )
 
     return in_columns(
         *(block for name, alt in alts.items() for block in page.tried(lambda name=name, alt=alt: picture(name, alt)))
@@ -340,7 +341,7 @@ def region_shares(fit: StagedFit) -> str:
 
 def fit_facts(fit: SavedFit) -> list[Block]:
     """Return status, reason, distances and notes of one fit, and its evidence folded away."""
-    out: list[Block] = [Verdict(status(fit.status), fit.reason), Text(distances_text(fit))]
+    out: list[Block] = [Text(fit.reason, name=status(fit.status)), Text(distances_text(fit))]
     if fit.record.notes:
         out.append(Notes(fit.record.notes))
     if fit.record.evidence:
@@ -550,14 +551,17 @@ def fits_table(fits: Sequence[SavedFit], places: Mapping[str, str], *, caption: 
     ]
     columns = [(Column(head), make) for head, make in texts]
     columns += [(Column(head, "number"), make) for head, make in _NUMBERS]
-    made = [(column, [make(fit) for fit in fits]) for column, make in columns]
     nonempty = [
         (column, cells)
-        for column, cells in made
+        for column, cells in [(column, [make(fit) for fit in fits]) for column, make in columns]
         if any(cell.text if cell.value is None else isfinite(cell.value) for cell in cells)
     ]
-    rows = [[cells[k] for _, cells in nonempty] for k in range(len(fits))]
-    return Table([column for column, _ in nonempty], rows, caption, sortable=len(fits) > 1)
+    return Table(
+        [column for column, _ in nonempty],
+        [[cells[k] for _, cells in nonempty] for k in range(len(fits))],
+        caption,
+        sortable=len(fits) > 1,
+    )
 
 
 def _error(of: Callable[[SavedFit], VertexErrors | None], measure: str) -> _Make:
@@ -624,24 +628,30 @@ def score_tables(scores: Mapping[str, Any], *, many: str, single: str) -> list[B
     """
 
     def row(key: str, values: Sequence[object]) -> list[Cell]:
-        texts = [f"{value:.3f}" if isinstance(value, float) and abs(value) < 10 else plain(value) for value in values]
-        return [Cell(SCORE_WORDS.get(key, words(key))), *map(Cell, texts)]
+        return [
+            Cell(SCORE_WORDS.get(key, words(key))),
+            *map(
+                Cell,
+                [f"{value:.3f}" if isinstance(value, float) and abs(value) < 10 else plain(value) for value in values],
+            ),
+        ]
 
-    by_thing = {key: _object(value) for key, value in scores.items() if key.startswith("line_")}
+    by_thing = {key: _mapping(value) for key, value in scores.items() if key.startswith("line_")}
     out: list[Block] = []
     if by_thing:
         names = list(dict.fromkeys(name for value in by_thing.values() for name in value))
-        rows = [row(key, [value.get(name) for name in names]) for key, value in by_thing.items()]
-        out.append(Table([Column("Score"), *(Column(name, "number") for name in names)], rows, many))
-    singles = {key: _object(value) or {key: value} for key, value in scores.items() if key not in by_thing}
+        out.append(
+            Table(
+                [Column("Score"), *(Column(name, "number") for name in names)],
+                [row(key, [value.get(name) for name in names]) for key, value in by_thing.items()],
+                many,
+            )
+        )
+    singles = {key: _mapping(value) or {key: value} for key, value in scores.items() if key not in by_thing}
     rest = [row(key, [value]) for values in singles.values() for key, value in values.items()]
     if rest:
         out.append(Table([Column("Score"), Column("Value", "number")], rest, single))
     return out or [Text("There are no scores.")]
-
-
-def _object(value: object) -> Mapping[str, object]:
-    return cast(Mapping[str, object], value) if isinstance(value, Mapping) else {}
 
 
 _NOTHING: Mapping[str, Any] = {}
@@ -730,12 +740,6 @@ def _list(value: object) -> list[object]:
     return cast(list[object], value) if isinstance(value, list) else []
 
 
-def _method(config: Mapping[str, Any]) -> str:
-    return {"robust": "robust: what does not match the model is left out", "paper": "the paper's"}.get(
-        str(config.get("method")), plain(config.get("method"))
-    )
-
-
 def _modes(config: Mapping[str, Any]) -> str:
     modes = config.get("modes")
     return "all of the model" if modes is None else f"the first {plain(modes)}"
@@ -754,24 +758,14 @@ def _scale(config: Mapping[str, Any]) -> str:
     return f"{text}, as the model is made" if config.get("scale") == "auto" else text
 
 
-def _dense(config: Mapping[str, Any]) -> str:
-    return "made: the surface goes the rest of the way to the scan" if config.get("dense") is True else "not made"
-
-
-def _iterations(config: Mapping[str, Any]) -> str:
-    return f"at most {plain(config.get('max_iterations'))} in each phase"
-
-
-def _seed(config: Mapping[str, Any]) -> str:
-    return f"from seed {plain(config.get('seed'))}"
-
-
-_CHOICES = (
-    ("Method", _method),
+_METHODS = {"robust": "robust: what does not match the model is left out", "paper": "the paper's"}
+_DENSE = {True: "made: the surface goes the rest of the way to the scan"}
+_CHOICES: tuple[tuple[str, Callable[[Mapping[str, Any]], str]], ...] = (
+    ("Method", lambda config: _METHODS.get(str(config.get("method")), plain(config.get("method")))),
     ("Modes", _modes),
     ("Unit of the scans", _unit),
     ("Size", _scale),
-    ("Dense stage", _dense),
-    ("Iterations", _iterations),
-    ("Random numbers", _seed),
+    ("Dense stage", lambda config: _DENSE.get(config.get("dense") is True, "not made")),
+    ("Iterations", lambda config: f"at most {plain(config.get('max_iterations'))} in each phase"),
+    ("Random numbers", lambda config: f"from seed {plain(config.get('seed'))}"),
 )

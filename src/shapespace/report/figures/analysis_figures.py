@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -19,6 +19,7 @@ from shapespace.report.figures.draw import (
     Scale,
     axis_label,
     chart,
+    equal_views,
     escaped,
     finish,
     grid,
@@ -26,6 +27,7 @@ from shapespace.report.figures.draw import (
     legend,
     number_axis,
     plain,
+    plain_decades,
     short,
     view,
 )
@@ -84,22 +86,6 @@ def upright_views(mesh: Mesh) -> tuple[FloatArray, Sequence[tuple[str, float]]]:
     return np.eye(3) if is_standing else upright(mesh), _OPEN if is_open else _CLOSED
 
 
-def _views(
-    points: FloatArray, sides: Sequence[tuple[str, FloatArray, float]], columns: int
-) -> tuple[list[Camera], tuple[int, int]]:
-    """Return cameras with one scale for all views (`views_of`) of `points`, and the size of their images."""
-    views = [view(points @ turn.T, columns, yaw_deg=yaw) for _, turn, yaw in sides]
-    width, height = views[0].size
-    tall = max(item.camera.height_mm for item in views)
-    across = max(item.camera.height_mm * item.size[0] / item.size[1] for item in views)
-    height = min(max(round(width * tall / across), round(width / 3)), round(width * 1.5))
-    width_mm = max(tall, across * height / width)
-    cameras = [
-        Camera(item.camera.centre, width_mm, item.camera.yaw_deg, 0.0, item.camera.distance_mm) for item in views
-    ]
-    return cameras, (width, height)
-
-
 def surface_map_figure(
     mesh: Mesh,
     values: FloatArray,
@@ -137,29 +123,27 @@ def surface_map_figure(
     sides = views_of(mesh)
     scalars = np.clip(values, -4 * end, 4 * end)
     low, colours = (-end, DIVERGING) if signed else (0.0, SEQUENTIAL)
-    faint_colours = _PALE + (1 - _PALE) * colours
-    cameras, size = _views(mesh.vertices, sides, min(len(sides), _MOST_COLUMNS))
+    cameras, size = equal_views(
+        [(mesh.vertices @ turn.T, yaw) for _, turn, yaw in sides], min(len(sides), _MOST_COLUMNS)
+    )
     panels: list[Image] = []
     for camera, (_, turn, _) in zip(cameras, sides, strict=True):
         turned_mesh = mesh.with_vertices(mesh.vertices @ turn.T)
         full = Layer(turned_mesh, scalars=scalars, colormap=colours, vmin=low, vmax=end)
         image = render(full, camera=camera, size=size)
         if mask is not None and not mask.all():
-            faint = Layer(turned_mesh, scalars=scalars, colormap=faint_colours, vmin=low, vmax=end)
-            image = _blend(image, render(faint, camera=camera, size=size), _inside(turned_mesh, mask, camera, size))
+            pale = render(replace(full, colormap=_PALE + (1 - _PALE) * colours), camera=camera, size=size)
+            inside = _inside(turned_mesh, mask, camera, size)[:, :, None]
+            image = np.rint(pale + (image.astype(float) - pale) * inside).astype(np.uint8)
         panels.append(image)
     extend_words = {(True, True): "both", (True, False): "low", (False, True): "high"}
     extend = extend_words.get((bool(values[known].min() < low), bool(values[known].max() > end)), "neither")
-    notes = ["Grey: no value."] if not known.all() else []
-    notes += ["Pale: outside of what is marked."] if mask is not None and not mask.all() else []
+    pale_note = "Pale: outside of what is marked." if mask is not None and not mask.all() else ""
     return grid(
-        [
-            Row([panel for panel, _ in row], [name for _, (name, _, _) in row])
-            for row in in_rows(list(zip(panels, sides, strict=True)), _MOST_COLUMNS)
-        ],
+        in_rows(panels, [name for name, _, _ in sides], _MOST_COLUMNS),
         title=None if title is None else title or f"{plain(unit)} on the surface",
         scale=Scale(short(unit, 70), colours, low, end, extend),
-        note=" ".join(notes),
+        note=f"{'' if known.all() else 'Grey: no value.'} {pale_note}".strip(),
     )
 
 
@@ -173,10 +157,6 @@ def _inside(mesh: Mesh, mask: BoolArray, camera: Camera, size: tuple[int, int]) 
     triangle, _ = visible_triangles(mesh, camera=camera, size=(2 * width, 2 * height))
     inside = np.append(mask[mesh.faces].sum(axis=1) >= 2, [True])[triangle]
     return inside.reshape(height, 2, width, 2).mean(axis=(1, 3))
-
-
-def _blend(first: Image, second: Image, share: FloatArray) -> Image:
-    return np.rint(second + (first.astype(float) - second) * share[:, :, None]).astype(np.uint8)
 
 
 def morph_figure(low: Mesh, high: Mesh, labels: tuple[str, str], *, title: str | None = "") -> Figure:
@@ -196,7 +176,8 @@ def morph_figure(low: Mesh, high: Mesh, labels: tuple[str, str], *, title: str |
     sides = views_of(low)[:2] if current_orientation().views else [
         ("", turn, 0.0), ("", turn, 40.0 if yaws is _OPEN else 90.0)
     ]  # fmt: skip
-    cameras, size = _views(np.concatenate([low.vertices, high.vertices]), sides, 2 * len(sides))
+    points = np.concatenate([low.vertices, high.vertices])
+    cameras, size = equal_views([(points @ side.T, yaw) for _, side, yaw in sides], 2 * len(sides))
     panels = [
         render(Layer(mesh.with_vertices(mesh.vertices @ side[1].T)), camera=camera, size=size)
         for mesh in (low, high)
@@ -288,13 +269,17 @@ def checkerboard_figure(
     shapes = (mean.vertices, *surfaces)
     drawn = np.concatenate([shape[np.isfinite(shape).all(axis=1)] for shape in shapes])
     panel = view(drawn, columns, yaw_deg=yaw_deg)
-    images = [
-        render(checker_layer(mean.with_vertices(shape), places), camera=panel.camera, size=panel.size)
-        for shape in shapes
-    ]
-    names = ["mean shape", *_distinct_labels(labels)]
-    rows = [Row(i, t) for i, t in zip(in_rows(images, columns), in_rows(names, columns), strict=True)]
-    return grid(rows, title=title or "The same squares on every scan")
+    return grid(
+        in_rows(
+            [
+                render(checker_layer(mean.with_vertices(shape), places), camera=panel.camera, size=panel.size)
+                for shape in shapes
+            ],
+            ["mean shape", *_distinct_labels(labels)],
+            columns,
+        ),
+        title=title or "The same squares on every scan",
+    )
 
 
 def _distinct_labels(labels: Sequence[str]) -> list[str]:
@@ -316,8 +301,12 @@ def missing_figure(mean: Mesh, missing_share: FloatArray, *, title: str = "") ->
     """
     largest_share = float(missing_share.max(initial=0.0))
     top = next(limit for limit in (0.05, 0.1, 0.25, 0.5, 1.0) if largest_share <= limit)
-    scale = Scale("scans that do not show the vertex (%)", SEQUENTIAL, 0.0, 100 * top)
-    return _from_four_sides(mean, 100 * missing_share, scale, title or "Where vertices are missing")
+    return _from_four_sides(
+        mean,
+        100 * missing_share,
+        Scale("scans that do not show the vertex (%)", SEQUENTIAL, 0.0, 100 * top),
+        title or "Where vertices are missing",
+    )
 
 
 def position_std_figure(mean: Mesh, position_std: FloatArray, limit: float, *, title: str = "") -> Figure:
@@ -329,22 +318,23 @@ def position_std_figure(mean: Mesh, position_std: FloatArray, limit: float, *, t
         limit: end of the scale, percent.
         title: above the figure.
     """
-    scale = Scale("standard deviation along the surface (% of the size)", SEQUENTIAL, 0.0, limit, "high")
-    return _from_four_sides(mean, 100 * position_std, scale, title or "How sure the position of each vertex is")
+    return _from_four_sides(
+        mean,
+        100 * position_std,
+        Scale("standard deviation along the surface (% of the size)", SEQUENTIAL, 0.0, limit, "high"),
+        title or "How sure the position of each vertex is",
+    )
 
 
 def _from_four_sides(mean: Mesh, values: FloatArray, scale: Scale, title: str) -> Figure:
     """Draw `values` (V,) on the mean shape from four sides."""
-    sides = (("front", 0.0), ("one side", 90.0), ("back", 180.0), ("other side", 270.0))
     layer = Layer(mean, scalars=values, colormap=SEQUENTIAL, vmax=scale.high)
-    front = view(mean.vertices, len(sides))
-    height = max(view(mean.vertices, len(sides), yaw_deg=yaw).camera.height_mm for _, yaw in sides)
-    panels: list[Image] = []
-    for _, yaw in sides:
-        view_camera = view(mean.vertices, len(sides), yaw_deg=yaw).camera
-        camera = Camera(view_camera.centre, height, yaw, 0.0, view_camera.distance_mm)
-        panels.append(render(layer, camera=camera, size=front.size))
-    return grid([Row(panels, [name for name, _ in sides])], title=title, scale=scale)
+    cameras, size = equal_views([(mean.vertices, yaw) for _, yaw in _CLOSED], len(_CLOSED))
+    return grid(
+        [Row([render(layer, camera=camera, size=size) for camera in cameras], [name for name, _ in _CLOSED])],
+        title=title,
+        scale=scale,
+    )
 
 
 def nearness_figure(distances: FloatArray, *, title: str = "") -> Figure:
@@ -363,17 +353,17 @@ def nearness_figure(distances: FloatArray, *, title: str = "") -> Figure:
     figure, axes = chart(title or "How near the surfaces lie to their scans", height=3.0)
     known = np.maximum(known, 1e-4)
     low, high = 0.7 * float(known.min()), 1.4 * float(known.max())
-    names = ("mean", "95 % of the points", "99 %", "farthest point")
-    for column, (name, colour) in enumerate(zip(names, _LINES, strict=True)):
+    for column, (name, colour) in enumerate(
+        zip(("mean", "95 % of the points", "99 %", "farthest point"), _LINES, strict=True)
+    ):
         sorted_values = np.sort(known[:, column])
         share = 100 * np.arange(len(sorted_values) + 1) / len(sorted_values)
         axes.plot(
             [low, *sorted_values, high], [*share, 100.0], drawstyle="steps-post", color=colour, lw=2.0, label=name
         )
-    axes.set_xscale("log")
-    _plain_decades(axes.xaxis)
     axes.set(xlabel="distance, % of the object's size", ylabel="scans up to there (%)")
-    axes.set(xlim=(low, high), ylim=(0, 102))
+    axes.set(xscale="log", xlim=(low, high), ylim=(0, 102))
+    plain_decades(axes.xaxis)
     legend(axes, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncol=4)
     return finish(figure)
 
@@ -397,22 +387,22 @@ def movement_figure(
     figure, axes = chart(title or "How far vertices moved in each round", height=3.0)
     round_numbers = np.arange(1, len(rounds) + 1)
     for k, series in enumerate([series for series in scans if len(series) == len(rounds)]):
-        values = np.maximum(100 * np.array(series), 1e-3)
-        axes.plot(round_numbers, values, color=_LINES[0], lw=1.0, alpha=float(np.clip(20 / len(scans), 0.15, 0.8)),
-                  marker="o", ms=2.5, label="a scan" if k == 0 else None)  # fmt: skip
+        axes.plot(
+            round_numbers,
+            np.maximum(100 * np.array(series), 1e-3),
+            color=_LINES[0],
+            lw=1.0,
+            alpha=float(np.clip(20 / len(scans), 0.15, 0.8)),
+            marker="o",
+            ms=2.5,
+            label="a scan" if k == 0 else None,
+        )
     axes.plot(
         round_numbers, np.maximum(100 * np.array(rounds), 1e-3), color=INK, lw=2.6, marker="o", label="all together"
     )
     axes.axhline(100 * settled_mm, color=_LINES[2], lw=1.2, ls="--", label="settled below")
-    axes.set_yscale("log")
-    _plain_decades(axes.yaxis)
-    axes.set(xlabel="round", ylabel="moved (RMS), % of the size")
+    axes.set(xlabel="round", ylabel="moved (RMS), % of the size", yscale="log")
+    plain_decades(axes.yaxis)
     number_axis(axes, len(rounds), room=0.3)
     legend(axes, loc="upper right")
     return finish(figure)
-
-
-def _plain_decades(axis: Axis) -> None:
-    """Label 1, 2 and 5 of each decade of a logarithmic axis in plain notation."""
-    axis.set_major_formatter(lambda value, _: f"{value:g}")
-    axis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in "25" else "")

@@ -14,17 +14,18 @@ from bisect import bisect_left
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from html import unescape
 from importlib import import_module
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import matplotlib
 import numpy as np
 from matplotlib import font_manager
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg, RendererAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize
@@ -57,7 +58,7 @@ NOT_SHOWN = "not shown by the scan"
 """What all figures call the signs of distances, distances to a point cloud, and vertices without a distance."""
 
 INK, GREY, RULE = "#1d1f22", "#5c6068", "#e4e5e8"
-FORWARD, BACKWARD = "#0072B2", "#D55E00"
+FORWARD, BACKWARD, BARS = "#0072B2", "#D55E00", "#a9c9e2"
 WIDTH, DPI = 960, 160  # layout: pixels of the column, dots per inch
 TITLE, TEXT, SMALL = 12.0, 11.0, 9.5  # layout: type sizes, points
 MOST_PANELS = 48  # limit on the size of a figure
@@ -67,7 +68,6 @@ _GAP, _EDGE = 8, 4  # layout: pixels
 _MOST_LINES = 4  # layout: lines of a caption
 # steps between tick labels, and how many labels fit beside each other
 _STEPS, _MOST_NUMBERS = (1, 5, 10, 20, 50, 100, 200, 500), 22
-_Item = TypeVar("_Item")
 
 
 @dataclass(frozen=True)
@@ -165,6 +165,22 @@ def view(points: FloatArray, columns: int, *, yaw_deg: float = 0.0, width: int =
     aspect = min(max(1e-3 * flat.height_mm / tall.height_mm, 0.68), 1.5)
     size = (across, round(across / aspect))
     return View(Camera.framing(points, yaw_deg=yaw_deg, aspect=size[0] / size[1], margin=margin), size)
+
+
+def equal_views(sides: Sequence[tuple[FloatArray, float]], columns: int) -> tuple[list[Camera], tuple[int, int]]:
+    """Return cameras of one scale that contain points (N, 3) turned by a yaw in degrees, and the size of their panels.
+
+    Args:
+        sides: points and yaw of each view.
+        columns: number of panels that fill the figure.
+    """
+    views = [view(points, columns, yaw_deg=yaw) for points, yaw in sides]
+    width, height = views[0].size
+    tall = max(item.camera.height_mm for item in views)
+    across = max(item.camera.height_mm * item.size[0] / item.size[1] for item in views)
+    height = min(max(round(width * tall / across), round(width / 3)), round(width * 1.5))
+    height_mm = max(tall, across * height / width)
+    return [replace(item.camera, height_mm=height_mm) for item in views], (width, height)
 
 
 def surroundings(fit: StagedFit) -> FloatArray:
@@ -394,8 +410,14 @@ def style(axes: Axes) -> None:
 def legend(axes: Axes, **options: Any) -> None:
     """Add the legend of a plot."""
     style = {"fontsize": type_size(SMALL), "labelcolor": INK, "framealpha": 0.9, "handlelength": 1.5}
-    box = cast(Any, axes).legend(**{**style, **options})
-    box.get_frame().set_linewidth(0.0)
+    cast(Any, axes).legend(**{**style, **options}).get_frame().set_linewidth(0.0)
+
+
+def legend_above(axes: Axes, room: float, **options: Any) -> None:
+    """Add the legend of a plot above its curves, in a share `room` of their height that is added there."""
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + room * (high - low))
+    legend(axes, **options)
 
 
 @contextmanager
@@ -492,9 +514,24 @@ def short(text: str, max_length: int = 28) -> str:
     return line if len(line) <= max_length else line[: max_length - 1] + "…"
 
 
-def in_rows(items: Sequence[_Item], columns: int) -> list[list[_Item]]:
-    """Split `items` into rows of at most `columns`."""
-    return [list(items[k : k + columns]) for k in range(0, len(items), columns)]
+def in_rows(panels: Sequence[Image], captions: Sequence[str], columns: int) -> list[Row]:
+    """Return rows of at most `columns` panels with their captions."""
+    return [Row(panels[k : k + columns], captions[k : k + columns]) for k in range(0, len(panels), columns)]
+
+
+def plain_decades(axis: Axis) -> None:
+    """Label 1, 2 and 5 of each decade of a logarithmic axis in plain notation."""
+    axis.set_major_formatter(lambda value, _: f"{value:g}")
+    axis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in "25" else "")
+
+
+def empty_chart(title: str, text: str) -> Figure:
+    """Return a chart that says why there is nothing in it."""
+    figure, axes = chart(title, height=1.2)
+    style = {"ha": "center", "va": "center", "fontsize": type_size(TEXT), "color": GREY}
+    axes.text(0.5, 0.5, text, transform=axes.transAxes, **cast(Any, style))
+    axes.set_axis_off()
+    return finish(figure)
 
 
 def scan_over(mesh: Mesh) -> Layer:
@@ -603,8 +640,9 @@ def save_figure(
 def _with_fonts(svg: bytes) -> bytes:
     """Return an SVG with the letters that it uses as embedded fonts."""
     text = svg.decode("utf-8")
-    runs = re.findall(r"<text[^>]*>(.*?)</text>", text, re.DOTALL)
-    letters = "".join(sorted(set(unescape(re.sub("<[^>]*>", "", "".join(runs))))))
+    letters = "".join(
+        sorted(set(unescape(re.sub("<[^>]*>", "", "".join(re.findall(r"<text[^>]*>(.*?)</text>", text, re.DOTALL))))))
+    )
     rules = [
         f"@font-face{{font-family:'DejaVu Sans';font-weight:{weight};src:url(data:font/woff;base64,"
         f"{base64.b64encode(_subset(weight, letters)).decode()}) format('woff')}}"
@@ -618,8 +656,9 @@ def _subset(weight: int, letters: str) -> bytes:
     subset: Any = import_module("fontTools.subset")
     options = subset.Options(flavor="woff", recalc_timestamp=False, layout_features=[], notdef_outline=True)
     options.drop_tables += ["FFTM"]
-    path = font_manager.findfont(font_manager.FontProperties(family="DejaVu Sans", weight=weight))
-    font: Any = subset.load_font(path, options)
+    font: Any = subset.load_font(
+        font_manager.findfont(font_manager.FontProperties(family="DejaVu Sans", weight=weight)), options
+    )
     subsetter: Any = subset.Subsetter(options)
     subsetter.populate(text=letters)
     subsetter.subset(font)

@@ -26,6 +26,8 @@ from shapespace.report.figures.draw import (
     charts,
     counted,
     distance_scale,
+    empty_chart,
+    equal_views,
     finish,
     grid,
     in_rows,
@@ -36,6 +38,7 @@ from shapespace.report.figures.draw import (
     number_axis,
     percent,
     plain,
+    plain_decades,
     scan_over,
     short,
     surroundings,
@@ -88,8 +91,10 @@ def stages_figure(fit: StagedFit, *, title: str = "") -> Figure:
         result = ss.fit_scan(model, scan)
         figures.stages_figure(StagedFit.of(model, result))
     """
-    stages = [Layer(mesh, _colour(stage)) for stage, mesh in fit.surfaces.items()]
-    layers = [[Layer(fit.scan, SCAN_COLOUR)], *([layer] for layer in stages)]
+    layers = [
+        [Layer(fit.scan, SCAN_COLOUR)],
+        *([layer] for layer in [Layer(mesh, _colour(stage)) for stage, mesh in fit.surfaces.items()]),
+    ]
     captions = ["scan", *(f"{_SHORT_STAGES.get(stage, stage)}\n{mm(mean_mm(fit, stage))}" for stage in fit.surfaces)]
     dense = ", and taken the rest of the way" if "dense" in fit.surfaces else ""
     return grid(
@@ -142,12 +147,8 @@ def signed_maps(fit: StagedFit, stage: str = "final", *, limit_mm: float | None 
         distance_layer(mesh, values, limit_mm, signed=signed)
         for mesh, values in ((surface, forward), (fit.scan, backward))
     )
-    panels: tuple[list[Image], list[Image]] = ([], [])
-    for _, yaw in _SIDES:
-        camera_view = view(surroundings(fit), len(_SIDES), yaw_deg=yaw)
-        front_view = view(surroundings(fit), len(_SIDES))
-        for row, layer in zip(panels, (on_model, on_scan), strict=True):
-            row.append(render(layer, camera=camera_view.camera, size=front_view.size))
+    cameras, size = equal_views([(surroundings(fit), yaw) for _, yaw in _SIDES], len(_SIDES))
+    panels = [[render(layer, camera=camera, size=size) for camera in cameras] for layer in (on_model, on_scan)]
     unseen, uncovered = unknown(forward), unknown(backward)
     keys: list[tuple[str, Colour]] = []
     if unseen:
@@ -182,15 +183,23 @@ def threshold_figure(fits: StagedFit | Sequence[StagedFit], *, title: str = "") 
     for fit in all_fits:
         distances = np.abs(fit.model_to_scan_mm["final"])
         camera_view = view(fit.surfaces["final"].vertices, len(THRESHOLDS_MM))
-        maps = [
-            [Layer(fit.surfaces["final"], scalars=distances, colormap=table, vmin=limit - 1e-3, vmax=limit + 1e-3)]
-            for limit in THRESHOLDS_MM
-        ]
-        panels = render_series(maps, camera=camera_view.camera, size=camera_view.size)
+        panels = render_series(
+            [
+                [Layer(fit.surfaces["final"], scalars=distances, colormap=table, vmin=limit - 1e-3, vmax=limit + 1e-3)]
+                for limit in THRESHOLDS_MM
+            ],
+            camera=camera_view.camera,
+            size=camera_view.size,
+        )
         known = measured_mm(distances)
         within = [percent(float((known <= limit).mean())) if len(known) else "–" for limit in THRESHOLDS_MM]
-        captions = [f"{limit:g} mm\n{share}" for limit, share in zip(THRESHOLDS_MM, within, strict=True)]
-        rows.append(Row(panels, captions, short(fit.label, 60) if len(all_fits) > 1 else ""))
+        rows.append(
+            Row(
+                panels,
+                [f"{limit:g} mm\n{share}" for limit, share in zip(THRESHOLDS_MM, within, strict=True)],
+                short(fit.label, 60) if len(all_fits) > 1 else "",
+            )
+        )
     unseen = [(NOT_SHOWN, UNKNOWN_COLOUR)] if any(unknown(fit.model_to_scan_mm["final"]) for fit in all_fits) else []
     whose = f"{short(all_fits[0].label)}: where" if len(all_fits) == 1 else "Where"
     return grid(
@@ -265,15 +274,13 @@ def distance_histograms(fit: StagedFit, *, title: str = "", bins: int = 60) -> F
 
 def history_figure(fit: StagedFit, *, title: str = "") -> Figure:
     """Draw the RMS distance by iteration and phase."""
-    figure, axes = chart(title or f"{short(fit.label)}: the RMS distance from iteration to iteration", height=3.0)
+    title = title or f"{short(fit.label)}: the RMS distance from iteration to iteration"
     rms = np.array([moment.rms_mm for moment in fit.history], dtype=np.float64)
     phase = np.array([moment.phase for moment in fit.history], dtype=np.int64)
     usable = np.isfinite(rms)
     if not usable.any():
-        axes.text(0.5, 0.5, "No iteration was saved.", transform=axes.transAxes, ha="center", fontsize=TEXT, color=GREY)
-        axes.set_xticks([])
-        axes.set_yticks([])
-        return finish(figure)
+        return empty_chart(title, "No iteration was saved.")
+    figure, axes = chart(title, height=3.0)
     for number, colour, name in ((1, BACKWARD, "phase 1: pose"), (2, FORWARD, "phase 2: pose and shape")):
         iterations = np.flatnonzero((phase == number) & usable)
         if len(iterations):
@@ -293,8 +300,7 @@ def history_figure(fit: StagedFit, *, title: str = "") -> Figure:
     log = bool(rms[usable].min() > 0 and rms[usable].max() > 4 * rms[usable].min())
     if log:
         axes.set_yscale("log")
-        axes.yaxis.set_major_formatter("{x:g}")
-        axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:.1e}"[0] in "25" else "")
+        plain_decades(axes.yaxis)
     else:
         axes.set_ylim(0, 1.1 * float(rms[usable].max()) or 1.0)
     axes.set(xlabel="iteration", ylabel=f"RMS distance (mm, {'log' if log else 'linear'} scale)")
@@ -376,28 +382,26 @@ def regions_figure(fit: StagedFit, *, title: str = "") -> Figure:
     """
     if fit.regions is None:
         raise InputError(f"{short(fit.label)} has no saved regions; fit the scan again with --stages.")
-    table = np.array([REGION_COLOURS[name] for name in REGIONS])
     layer = Layer(
-        fit.surfaces["final"], scalars=fit.regions.astype(np.float64), colormap=table, vmin=-0.5,
-        vmax=len(REGIONS) - 0.5, categories=True,
-    )  # fmt: skip
+        fit.surfaces["final"],
+        scalars=fit.regions.astype(np.float64),
+        colormap=np.array([REGION_COLOURS[name] for name in REGIONS]),
+        vmin=-0.5,
+        vmax=len(REGIONS) - 0.5,
+        categories=True,
+    )
     scan = Layer(fit.scan, SCAN_COLOUR)
-    panels: list[Image] = []
-    captions: list[str] = []
-    for _, yaw in (_SIDES[0], _SIDES[2]):
-        camera_view = view(surroundings(fit), 4, yaw_deg=yaw)
-        panels += render_series([[scan], [layer]], camera=camera_view.camera, size=view(surroundings(fit), 4).size)
-        captions += ["scan", "model"]
+    cameras, size = equal_views([(surroundings(fit), yaw) for _, yaw in (_SIDES[0], _SIDES[2])], 4)
+    panels = [panel for camera in cameras for panel in render_series([[scan], [layer]], camera=camera, size=size)]
     share = np.bincount(fit.regions, minlength=len(REGIONS)) / max(len(fit.regions), 1)
-    keys = [
-        (f"{_REGION_WORDS[name]} ({percent(float(share[k]))})", REGION_COLOURS[name])
-        for k, name in enumerate(REGIONS)
-        if share[k] > 0
-    ]
     return grid(
-        [Row(panels, captions)],
+        [Row(panels, ["scan", "model"] * 2)],
         title=title or f"{short(fit.label)}: which parts of the model the scan decided",
-        keys=keys,
+        keys=[
+            (f"{_REGION_WORDS[name]} ({percent(float(share[k]))})", REGION_COLOURS[name])
+            for k, name in enumerate(REGIONS)
+            if share[k] > 0
+        ],
         note="In %: share of the model's vertices. What is not blue has only the model, and its neighbours, to go by.",
     )
 
@@ -409,12 +413,9 @@ def _from_two_sides(fit: StagedFit, layers: Sequence[Sequence[Layer]], captions:
     # Of a start that was near, all is shown; one that was far away would make the rest small.
     if np.abs(before.mean(axis=0) - final.mean(axis=0)).max() < _NEAR_START * np.ptp(final, axis=0).max():
         points = np.concatenate([points, before])
-    size = view(points, len(layers)).size
-    rows: list[Row] = []
-    for k, yaw in enumerate(_FRONT_AND_SIDE):
-        camera = view(points, len(layers), yaw_deg=yaw).camera
-        rows.append(Row(render_series(layers, camera=camera, size=size), captions if k == 0 else ()))
-    return rows
+    cameras, size = equal_views([(points, yaw) for yaw in _FRONT_AND_SIDE], len(layers))
+    rows = [render_series(layers, camera=camera, size=size) for camera in cameras]
+    return [Row(rows[0], captions), Row(rows[1])]
 
 
 def _colour(stage: str) -> Colour:
@@ -473,7 +474,9 @@ def error_curves(fits: Sequence[StagedFit], *, stage: str = "final", title: str 
     fits = [fit for fit, values in zip(fits, sorted_distances, strict=True) if len(values)]
     sorted_distances = [values for values in sorted_distances if len(values)]
     if not sorted_distances:
-        return _empty_figure(title)
+        return empty_chart(
+            title or "How close the model comes to the scan", "No vertex of a model is shown by its scan."
+        )
     pooled = np.sort(np.concatenate(sorted_distances))
     figure, axes = chart(
         title or f"How close the model comes to the scan, over {counted(len(fits), 'fit')}", height=3.5
@@ -501,16 +504,6 @@ def error_curves(fits: Sequence[StagedFit], *, stage: str = "final", title: str 
     return finish(figure)
 
 
-def _empty_figure(title: str) -> Figure:
-    figure, axes = chart(title or "How close the model comes to the scan", height=1.2)
-    axes.text(
-        0.5, 0.5, "No vertex of a model is shown by its scan.", transform=axes.transAxes, ha="center", va="center",
-        fontsize=TEXT, color=GREY,
-    )  # fmt: skip
-    axes.set_axis_off()
-    return finish(figure)
-
-
 def _curve(axes: Any, values: FloatArray, **style: Any) -> None:
     """Draw the share of sorted `values` up to each of them, in at most 400 steps."""
     share = np.linspace(0, 1, min(len(values), 400) + 1)
@@ -535,9 +528,13 @@ def faces_grid(
         raise InputError(f"{title}: {len(meshes)} meshes do not go with {len(labels)} labels.")
     columns = min(columns, max(len(meshes), 3))
     camera_view = view(np.concatenate([m.vertices for m in meshes]), columns)
-    images = [render(Layer(mesh, colour), camera=camera_view.camera, size=camera_view.size) for mesh in meshes]
     return grid(
-        [Row(i, t) for i, t in zip(in_rows(images, columns), in_rows(list(labels), columns), strict=True)], title=title
+        in_rows(
+            [render(Layer(mesh, colour), camera=camera_view.camera, size=camera_view.size) for mesh in meshes],
+            list(labels),
+            columns,
+        ),
+        title=title,
     )
 
 
@@ -580,9 +577,12 @@ def aligned_grid(
     fits: Sequence[StagedFit], *, title: str = "Scan and fitted model over each other", columns: int = 4
 ) -> Figure:
     """Draw scan and fitted model superimposed for many fits, in the order given."""
-    images = _equal_views(fits, columns, lambda fit: [scan_over(fit.scan), Layer(fit.surfaces["final"], MODEL_COLOUR)])
     return grid(
-        _caption_rows(images, fits, columns),
+        _caption_rows(
+            _equal_views(fits, columns, lambda fit: [scan_over(fit.scan), Layer(fit.surfaces["final"], MODEL_COLOUR)]),
+            fits,
+            columns,
+        ),
         title=title,
         keys=[("scan", SCAN_COLOUR), ("model", MODEL_COLOUR)],
         note=mean_words(fits),
@@ -597,15 +597,23 @@ def distance_maps(
         raise InputError(f"{plain(title)}: there is no fit to draw.")
     known = np.concatenate([measured_mm(f.model_to_scan_mm["final"]) for f in fits])
     top = nice_ceiling(float(np.percentile(known, 99)) if len(known) else 1.0)
-    images = _equal_views(
-        fits,
-        columns,
-        lambda fit: [
-            Layer(fit.surfaces["final"], scalars=np.abs(fit.model_to_scan_mm["final"]), colormap=SEQUENTIAL, vmax=top)
-        ],
-    )
     return grid(
-        _caption_rows(images, fits, columns),
+        _caption_rows(
+            _equal_views(
+                fits,
+                columns,
+                lambda fit: [
+                    Layer(
+                        fit.surfaces["final"],
+                        scalars=np.abs(fit.model_to_scan_mm["final"]),
+                        colormap=SEQUENTIAL,
+                        vmax=top,
+                    )
+                ],
+            ),
+            fits,
+            columns,
+        ),
         title=title,
         scale=_unsigned(fits, top),
         keys=_grey(fits),
@@ -643,5 +651,4 @@ def _equal_views(fits: Sequence[StagedFit], columns: int, layers: Callable[[Stag
 
 def _caption_rows(images: Sequence[Image], fits: Sequence[StagedFit], columns: int) -> list[Row]:
     columns = min(columns, max(len(fits), 3))
-    names = [f"{short(f.label, 30)}\n{mm(mean_mm(f))}" for f in fits]
-    return [Row(i, t) for i, t in zip(in_rows(images, columns), in_rows(names, columns), strict=True)]
+    return in_rows(images, [f"{short(f.label, 30)}\n{mm(mean_mm(f))}" for f in fits], columns)

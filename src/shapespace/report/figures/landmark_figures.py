@@ -157,8 +157,11 @@ def superimposed_landmarks(aligned: AlignedLandmarks) -> Figure:
     """Draw all specimens around their mean with numbered landmarks, in the views of `landmark_vectors_figure`."""
     shapes = np.pad(np.concatenate([aligned.mean[None], aligned.coords]), ((0, 0), (0, 0), (0, 3 - aligned.dimensions)))
     estimated = aligned.estimated
-    note = "blue: specimens; black: their mean" + "; orange: missing landmarks, estimated" * int(estimated.any())
-    figure, plots, placed = _in_views(shapes, "", note=note)
+    figure, plots, placed = _in_views(
+        shapes,
+        "",
+        note=("blue: specimens; black: their mean" + "; orange: missing landmarks, estimated" * int(estimated.any())),
+    )
     for axes, place in zip(plots, placed, strict=True):
         mean, specimens = place[0], place[1:]
         draw_links(axes, mean, INK, 1.0)

@@ -31,6 +31,7 @@ from shapespace.report.figures.draw import (
     escaped,
     finish,
     legend,
+    legend_above,
     line_height,
     measured,
     short,
@@ -75,8 +76,7 @@ def distributions_figure(values: Mapping[str, FloatArray], trusted: Any, *, titl
         else:
             axes.hist(parts, edges.tolist(), stacked=True, color=[FORWARD, BACKWARD], label=["converged", "others"])
             axes.set_ylabel("fits")
-        axes.set_xlabel(_wrapped(name))
-        axes.set_xlim(edges[0], edges[-1])
+        axes.set(xlabel=_wrapped(name), xlim=(edges[0], edges[-1]))
         middle = float(np.median(distances[known & trusted])) if (known & trusted).any() else np.nan
         if np.isfinite(middle):
             axes.axvline(middle, color=INK, lw=1.2, ls="--")
@@ -120,9 +120,7 @@ def coefficients_spread(z: npt.NDArray[np.floating[Any]], *, title: str) -> Figu
     for value in (-1.645, 1.645):
         axes.axhline(value, color=GREY, lw=1, ls="--", label="5 and 95 % of the model" if value > 0 else None)
     axes.set(xlabel="coefficient", ylabel="z", xlim=(0.5, z.shape[1] + 0.5))
-    legend(axes, loc="upper right", ncols=3)
-    low, high = axes.get_ylim()
-    axes.set_ylim(low, high + 0.4 * (high - low))
+    legend_above(axes, 0.4, loc="upper right", ncols=3)
     return finish(figure)
 
 
@@ -143,7 +141,6 @@ def density_figure(z: npt.NDArray[np.floating[Any]], distances: FloatArray, *, t
     z, distances = z[known], distances[known]
     pairs = [(0, 1), (0, 2) if z.shape[1] > 2 else None]
     figure, plots = charts(title, [2.6], columns=3)
-    colours = ListedColormap(SEQUENTIAL)
     for axes, pair in zip(plots, pairs, strict=False):
         if pair is None:
             axes.set_axis_off()
@@ -151,17 +148,20 @@ def density_figure(z: npt.NDArray[np.floating[Any]], distances: FloatArray, *, t
         first, second = (z[:, k] for k in pair)
         limits = [max(3.2, 1.1 * float(np.quantile(np.abs(values), 0.9995))) for values in (first, second)]
         counts, x, y = np.histogram2d(first, second, 90, [[-limits[0], limits[0]], [-limits[1], limits[1]]])
-        masked_counts = np.ma.masked_equal(counts.T, 0)
         axes.pcolormesh(
-            x, y, masked_counts, cmap=colours, norm=LogNorm(1, max(2.0, float(counts.max()))), rasterized=True
+            x,
+            y,
+            np.ma.masked_equal(counts.T, 0),
+            cmap=ListedColormap(SEQUENTIAL),
+            norm=LogNorm(1, max(2.0, float(counts.max()))),
+            rasterized=True,
         )
         turn = np.linspace(0, 2 * np.pi, 200)
         axes.plot(3 * np.cos(turn), 3 * np.sin(turn), color=GREY, lw=1, ls="--")
         axes.set(xlabel=f"z{pair[0] + 1}", ylabel=f"z{pair[1] + 1}")
     axes = plots[2]
     axes.hist(distances, np.linspace(0, float(distances.max()) * 1.02 + 1e-9, _BINS + 1).tolist(), color=FORWARD)
-    axes.set_yscale("log")
-    axes.set(xlabel="RMS of all z", ylabel="fits")
+    axes.set(yscale="log", xlabel="RMS of all z", ylabel="fits")
     return finish(figure, w_pad=1.0)
 
 
@@ -200,15 +200,12 @@ def over_time_figure(
                 group_quantiles = _quantiles(np.where(inside, places, -1), values, len(middles))[1]
                 colour = CATEGORIES[k % len(CATEGORIES)]
                 axes.plot(middles, group_quantiles, color=colour, lw=1.3, label=escaped(short(line_name, 18)))
-            legend(axes, loc="upper left", ncols=4)
-            low, high = axes.get_ylim()
-            axes.set_ylim(low, high + 0.3 * (high - low))
+            legend_above(axes, 0.3, loc="upper left", ncols=4)
         axes.set_ylabel(_wrapped(words, 16))
     axes = plots[len(finite)]
     share = [100 * float(untrusted[places == k].mean()) if (places == k).any() else np.nan for k in range(len(middles))]
     axes.bar(middles, share, width=0.9 * (edges[1] - edges[0]), color=BACKWARD)
-    axes.set_ylabel("not trusted (%)")
-    axes.set_xlabel(escaped(short(name, 60)))
+    axes.set(xlabel=escaped(short(name, 60)), ylabel="not trusted (%)")
     for axes in plots:
         axes.set_xlim(edges[0], edges[-1])
         if is_time:
@@ -233,8 +230,9 @@ def _quantiles(places: Any, values: FloatArray, count: int) -> FloatArray:
 def _name_times(axes: Axes, first: float, last: float) -> None:
     ticks = np.linspace(first, last, _TIMES)
     is_long = last - first > 5 * 365 * 86400
-    tick_names = [datetime.fromtimestamp(tick, UTC).strftime("%Y-%m" if is_long else "%Y-%m-%d") for tick in ticks]
-    axes.set_xticks(ticks, tick_names)
+    axes.set_xticks(
+        ticks, [datetime.fromtimestamp(tick, UTC).strftime("%Y-%m" if is_long else "%Y-%m-%d") for tick in ticks]
+    )
     for label, side in zip(axes.get_xticklabels(), ("left", *["center"] * (_TIMES - 2), "right"), strict=True):
         label.set_horizontalalignment(cast(Any, side))
 
@@ -264,8 +262,7 @@ def levels_figure(groups: Sequence[tuple[str, Any]], values: FloatArray, *, word
         axes.plot([middle], [k], "o", color=INK, ms=5)
     axes.axvline(float(np.median(values[known])), color=GREY, lw=1, ls="--")
     axes.set_yticks(range(len(parts)), [f"{escaped(short(name, 24))} ({counted(len(m), 'fit')})" for name, m in parts])
-    axes.set_ylim(len(parts) - 0.5, -0.5)
-    axes.set_xlabel(words)
+    axes.set(xlabel=words, ylim=(len(parts) - 0.5, -0.5))
     return finish(figure)
 
 

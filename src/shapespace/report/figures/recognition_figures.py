@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,7 @@ from matplotlib.ticker import MaxNLocator
 
 from shapespace.errors import InputError
 from shapespace.report.figures.draw import (
+    BARS,
     DPI,
     FORWARD,
     GREY,
@@ -33,6 +34,7 @@ from shapespace.report.figures.draw import (
     measured,
     percent,
     plain,
+    plain_decades,
     short,
 )
 from shapespace.report.render.palette import CATEGORIES, SEQUENTIAL, oklab
@@ -41,7 +43,6 @@ from shapespace.types import FloatArray
 CurveScale: TypeAlias = Literal["linear", "log", "probit"]
 """How the numbers of a curve stand along an axis."""
 
-_BARS = "#a9c9e2"
 _MOST_CLASSES_IN_FULL, _MOST_CLASSES = 12, 40  # classes with numbers, and without: legible at the figure's size
 _MARKERS = "os^Dvp"  # of groups, so that print without colour can be read
 _MOST_SERIES, _MOST_TICKS = 60, 9  # curves and tick labels: legible at the figure's size
@@ -84,7 +85,7 @@ def confusion_figure(counts: npt.ArrayLike, classes: Sequence[str], *, title: st
     figure, axes = chart(
         title or _confused(table, shares, classes), height=(n * high + (longest if upright else 20) + 60) / DPI
     )
-    axes.imshow(shares, cmap=_map(), vmin=0, vmax=1, aspect="auto", interpolation="nearest")
+    axes.imshow(shares, cmap=ListedColormap(SEQUENTIAL), vmin=0, vmax=1, aspect="auto", interpolation="nearest")
     for k in range(1, n):
         axes.axhline(k - 0.5, color="white", lw=1.5)
         axes.axvline(k - 0.5, color="white", lw=1.5)
@@ -129,10 +130,6 @@ def _cell(axes: Axes, row: int, column: int, share: float, count: float, n: int)
         axes.text(column, row, f"{100 * share:.0f}", ha="center", va="center", fontsize=SMALL - 3, color=ink)
 
 
-def _map() -> Any:
-    return ListedColormap(SEQUENTIAL)
-
-
 def calibration_figure(
     bins: npt.ArrayLike, *, ece: float | None = None, brier: float | None = None, title: str = ""
 ) -> Figure:
@@ -161,8 +158,9 @@ def calibration_figure(
     headline = "How often answers are right, against the probability stated for them"
     if ece is not None:
         headline = f"Stated probabilities are off by {100 * ece:.1f} points on average"
-    note = "" if brier is None else f"Brier score {brier:.3f} (0 is best)."
-    figure, (curve_axes, count_axes) = charts(title or headline, [2.9, 1.25], note=note)
+    figure, (curve_axes, count_axes) = charts(
+        title or headline, [2.9, 1.25], note=("" if brier is None else f"Brier score {brier:.3f} (0 is best).")
+    )
     floor = min(float(start.min()), 100 - 1e-3)
     curve_axes.plot([0, 100], [0, 100], color=GREY, ls=(0, (4, 3)), lw=1.4, label="right as often as stated")
     size = 26 + 190 * counts / counts.max()
@@ -181,7 +179,7 @@ def calibration_figure(
         xlim=(floor, 101.5), ylim=(min(floor, float(right.min()) - 5, 100.0), 104), ylabel="right answers (%)"
     )
     legend(curve_axes, loc="lower right" if right[-1] > 60 else "upper left")
-    count_axes.bar(start, counts, width=end - start, align="edge", color=_BARS, edgecolor="white")
+    count_axes.bar(start, counts, width=end - start, align="edge", color=BARS, edgecolor="white")
     count_axes.set(xlim=(floor, 101.5), xlabel="probability stated (%)", ylabel="answers")
     count_axes.locator_params(axis="y", nbins=3, integer=True)
     return finish(figure, h_pad=0.8)
@@ -217,22 +215,24 @@ def learning_curve_figure(
         raise InputError(f"A learning curve of {len(x)} numbers of subjects cannot have {len(y)} accuracies.")
     order = np.argsort(x, kind="stable")
     x, y = x[order], y[order]
-    headline = f"{_share(y[0])} right with {counted(round(x[0]), 'subject')} to learn from"
+    headline = f"{y[0]:.1f} % right with {counted(round(x[0]), 'subject')} to learn from"
     if len(x) > 1:
         headline = (
             f"Learning from {x[-1]:g} subjects instead of {x[0]:g} takes the share of right answers from "
-            f"{_share(y[0])} "
-            f"to {_share(y[-1])}"
+            f"{y[0]:.1f} % "
+            f"to {y[-1]:.1f} %"
         )
     figure, axes = chart(title or headline, height=3.3)
     bottom = float(y.min())
     if low is not None and high is not None:
-        interval = [100 * _numbers(values, "the interval of a learning curve")[order] for values in _like(x, low, high)]
-        axes.fill_between(x, interval[0], interval[1], color=_BARS, alpha=0.5, lw=0, label=escaped(short(band, 40)))
+        if not np.shape(low) == np.shape(high) == x.shape:
+            raise InputError(f"The interval of a learning curve must have {len(x)} lower and {len(x)} upper ends.")
+        interval = [100 * _numbers(values, "the interval of a learning curve")[order] for values in (low, high)]
+        axes.fill_between(x, interval[0], interval[1], color=BARS, alpha=0.5, lw=0, label=escaped(short(band, 40)))
         bottom = min(bottom, float(interval[0].min()))
     axes.plot(x, y, color=FORWARD, lw=2, marker="o", ms=5, label="right answers")
     if ceiling is not None:
-        axes.axhline(100 * ceiling, color=INK, ls=(0, (4, 3)), lw=1.4, label=f"ceiling: {_share(100 * ceiling)}")
+        axes.axhline(100 * ceiling, color=INK, ls=(0, (4, 3)), lw=1.4, label=f"ceiling: {100 * ceiling:.1f} %")
         bottom = min(bottom, 100 * ceiling)
     axes.set(xlabel="subjects learned from", ylabel="right answers, unseen subjects (%)", xlim=(0, 1.04 * float(x[-1])))
     axes.set_ylim(max(0.0, 10 * np.floor((bottom - 4) / 10)), 101)
@@ -324,8 +324,7 @@ def curve_figure(
             label=label,
         )
     axes.margins(y=0.12)
-    axes.set_xscale("log" if scales[0] == "log" else "linear")
-    axes.set_yscale("log" if scales[1] == "log" else "linear")
+    axes.set(xscale="log" if scales[0] == "log" else "linear", yscale="log" if scales[1] == "log" else "linear")
     for axis, kind, band_limits in zip((axes.xaxis, axes.yaxis), scales, limits, strict=True):
         _scaled(axis, kind, band_limits)
     if diagonal:
@@ -384,10 +383,8 @@ def _to_scale(values: FloatArray, kind: CurveScale, limits: tuple[float, float])
 def _scaled(axis: Axis, kind: CurveScale, limits: tuple[float, float]) -> None:
     """Give an axis its scale and ticks that people read."""
     if kind == "log":
-        axis.set_major_formatter(lambda value, _: f"{value:g}")
-        if limits[1] < 30 * limits[0]:
-            axis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in "25" else "")
-        else:
+        plain_decades(axis)
+        if limits[1] >= 30 * limits[0]:
             axis.set_minor_formatter(lambda value, _: "")
     if kind == "probit":
         from scipy.special import ndtri
@@ -399,16 +396,6 @@ def _scaled(axis: Axis, kind: CurveScale, limits: tuple[float, float]) -> None:
             ticks = ticks[::2]
         axis.set_ticks(ndtri(ticks).tolist(), [f"{100 * share:.4g} %" for share in ticks])
         axis.set_view_interval(low - 0.02, high + 0.02, ignore=True)
-
-
-def _like(x: FloatArray, *values: npt.ArrayLike) -> list[npt.ArrayLike]:
-    if any(np.shape(item) != x.shape for item in values):
-        raise InputError(f"The interval of a learning curve must have {len(x)} lower and {len(x)} upper ends.")
-    return list(values)
-
-
-def _share(value_percent: float) -> str:
-    return f"{value_percent:.1f} %"
 
 
 def _numbers(values: npt.ArrayLike, name: str, *, ndim: int = 1, finite: bool = True) -> FloatArray:

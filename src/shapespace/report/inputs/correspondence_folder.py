@@ -6,7 +6,6 @@ import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import isfinite, nan
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +25,7 @@ from shapespace.geometry.normals import (
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.files import read_error, sha256_of_file
 from shapespace.io.meshes.mesh_io import read_mesh
-from shapespace.report.blocks.wording import DASH, plain, printable, without_folders
+from shapespace.report.blocks.wording import known, printable, sentence, without_folders
 from shapespace.report.inputs.saved_fits import Folder
 from shapespace.report.inputs.staged_fit import nice_ceiling
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, read
@@ -362,27 +361,6 @@ def concerns_of(folder: Corresponded) -> dict[str, Concern]:
 def distance_share(record: CorrespondRecord, statistic: str, size: float) -> float:
     """Return the distance `mean`, `p95`, `p99` or `max` of a record as a share of `size`, which is in its unit."""
     return known(getattr(record, f"distance_{statistic}")) / size
-
-
-def known(value: float | None) -> float:
-    """Return a number that may be absent, NaN for None."""
-    return nan if value is None else value
-
-
-def median(values: Sequence[float]) -> float:
-    """Return the median of the finite numbers, NaN if there are none."""
-    numbers = [value for value in values if isfinite(value)]
-    return float(np.median(numbers)) if numbers else nan
-
-
-def percent_of(share: float) -> str:
-    """Return a small share in percent with two digits or so."""
-    return f"{plain(float(f'{100 * share:.2g}'))} %" if isfinite(share) else DASH
-
-
-def sentence(text: str) -> str:
-    """Return `text` from a capital letter to a full stop."""
-    return f"{text[:1].upper()}{text[1:]}" + ("" if text.endswith(".") else ".") if text else ""
 
 
 def scan_status(record: CorrespondRecord, concerns: Mapping[str, Concern]) -> str:

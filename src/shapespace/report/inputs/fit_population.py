@@ -132,8 +132,7 @@ class Population:
     """
 
     def __init__(self, results: Results) -> None:
-        columns = sorted(results.column_names())
-        metas = [column for column in columns if column.startswith(META)]
+        metas = [column for column in sorted(results.column_names()) if column.startswith(META)]
         n_modes = modes_of(results)
         self.names: list[str] = []
         self.n_reasons: Counter[tuple[str, str]] = Counter()

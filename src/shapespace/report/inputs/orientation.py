@@ -80,8 +80,9 @@ def find_orientation(
 
 def read_links(path: Path, landmarks: Sequence[str] | None) -> tuple[tuple[int, int], ...]:
     """Return the numbers of landmarks, from 1, in a table of pairs; errors are those of `read_landmark_numbers`."""
-    rows = read_landmark_numbers(path, landmarks, (2,), "two landmarks").tolist()
-    return tuple((first, second) for first, second in rows)
+    return tuple(
+        (first, second) for first, second in read_landmark_numbers(path, landmarks, (2,), "two landmarks").tolist()
+    )
 
 
 def view_rotation(view: NamedView) -> FloatArray:

@@ -23,7 +23,7 @@ from shapespace.io.files import read_bytes, sha256_of_file
 from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.io.tables.table_io import table_rows
 from shapespace.model.shape_model import ShapeModel
-from shapespace.report.blocks.wording import counted, printable
+from shapespace.report.blocks.wording import counted, known, printable
 from shapespace.report.inputs.staged_fit import StagedFit
 from shapespace.schemas import FitEntry, FitRecord
 from shapespace.store.results import ENDING, ENDINGS, Results, arrays_at, json_at, mesh_at, results_at
@@ -166,12 +166,12 @@ class SavedFit:
     def summary_mm(self, stage: str, direction: Direction, measure: Measure) -> float:
         """Return a distance over the whole model, or the whole scan, in mm; NaN if there is none."""
         summary = self.record.distances_mm.get(stage)
-        return _known(getattr(getattr(summary, direction), measure)) if summary else math.nan
+        return known(getattr(getattr(summary, direction), measure)) if summary else math.nan
 
     def distance_mm(self, direction: Direction, measure: Measure = "mean") -> float:
         """Return a distance of the final stage over the overlap, in mm; NaN if there is none."""
         overlap = self.record.shown
-        return _known(getattr(getattr(overlap, direction), measure)) if overlap else math.nan
+        return known(getattr(getattr(overlap, direction), measure)) if overlap else math.nan
 
     @property
     def expected_error_mm(self) -> float:
@@ -193,10 +193,6 @@ class SavedFit:
         if not len(values) or len(values) != len(self.record.b):
             raise FileFormatError(f"The record of {self.name} holds no list of numbers {key!r}; {_AGAIN}.")
         return values
-
-
-def _known(value: float | None) -> float:
-    return math.nan if value is None else value
 
 
 def read_fit(folder: Folder, entry: FitEntry) -> SavedFit:
@@ -271,8 +267,11 @@ def saved_surfaces(folder: Folder, fit: SavedFit) -> dict[str, Mesh]:
         FileError: a file cannot be read.
         FileFormatError: one is damaged, or the record has no pose.
     """
-    files = {"final": fit.entry.fitted, "dense": fit.entry.dense}
-    surfaces = {stage: folder.mesh(file) for stage, file in files.items() if file or stage == "final"}
+    surfaces = {
+        stage: folder.mesh(file)
+        for stage, file in {"final": fit.entry.fitted, "dense": fit.entry.dense}.items()
+        if file or stage == "final"
+    }
     if len({len(mesh.vertices) for mesh in surfaces.values()}) > 1:
         raise FileFormatError(f"{fit.name}: its fitted and its dense surface differ in their vertices; {_AGAIN}.")
     return {stage: _in_picture_frame(mesh, fit) for stage, mesh in surfaces.items()}

@@ -42,8 +42,9 @@ _CURVES = (
 def plot_model(model: ShapeModel, kind: str, **options: Any) -> Figure:
     """Draw a figure for `ShapeModel.plot`."""
     require_report_extra()
-    draw = {"modes": figures.modes_figure, "mean": figures.mean_figure, "spectrum": figures.spectrum_figure}
-    return _choose(draw, kind)(model, **options)
+    return _choose(
+        {"modes": figures.modes_figure, "mean": figures.mean_figure, "spectrum": figures.spectrum_figure}, kind
+    )(model, **options)
 
 
 def plot_fit(result: FitResult, kind: str, **options: Any) -> Figure:
@@ -84,14 +85,17 @@ def _choose(draw: Mapping[str, Callable[..., Figure]], kind: str) -> Callable[..
 
 def html_of_model(model: ShapeModel) -> str:
     """Return a model for a notebook: its first modes, training data, and licence."""
-    modes_needed = [
-        f"{percent(share)} in {n}" for share in _SHARES if (n := model.modes_for_variance(share)) is not None
-    ]
     rows = [
         ("Made of", training_text(model)),
         ("Surface", f"{model.n_vertices:,} vertices, {0 if model.faces is None else len(model.faces):,} triangles"),
         ("Modes", f"{model.n_modes}, with {100 * float(model.cumulative_variance[-1]):.1f} % of the variance"),
-        ("Variance", listed(modes_needed) or "below 90 % in the modes kept"),
+        (
+            "Variance",
+            listed(
+                [f"{percent(share)} in {n}" for share in _SHARES if (n := model.modes_for_variance(share)) is not None]
+            )
+            or "below 90 % in the modes kept",
+        ),
         ("Size", "divided out (gauge shape)" if model.gauge == "shape" else "kept in the modes (gauge form)"),
         ("Landmarks", listed(list(model.landmarks)) or "none"),
         ("Provenance", model.provenance or "not stated"),
@@ -123,8 +127,9 @@ def html_of_fit(result: FitResult) -> str:
     def draw() -> Drawn:
         fit = StagedFit.of(result.model, result)
         colours = "blue inside, red outside" if fit.scan.faces is not None else "dark is far"
-        caption = f"The scan; scan and fitted model; distances up to {mm(fit.scale_mm)}: {colours}, grey not shown."
-        return fit_strip(fit, fit.scale_mm, _PANEL), caption
+        return fit_strip(
+            fit, fit.scale_mm, _PANEL
+        ), f"The scan; scan and fitted model; distances up to {mm(fit.scale_mm)}: {colours}, grey not shown."
 
     return notebook_html(result, result.scan_name, [f"{result.status}: {result.reason}"], rows, draw)
 

@@ -23,27 +23,36 @@ from shapespace.report.blocks.blocks import (
     Folded,
     Gallery,
     Image,
-    Item,
     Notice,
     StripKey,
     Table,
     Text,
     Tiles,
+    first_items,
+    no_picture,
     number,
     text_table,
 )
-from shapespace.report.blocks.wording import DASH, counted, listed, percent, plain, setting, words
+from shapespace.report.blocks.wording import (
+    DASH,
+    counted,
+    known,
+    listed,
+    median,
+    percent,
+    percent_of,
+    plain,
+    sentence,
+    setting,
+    words,
+)
 from shapespace.report.inputs.correspondence_folder import (
     Corresponded,
     PlacedSurface,
     concerns_of,
     distance_share,
     drawable,
-    known,
-    median,
-    percent_of,
     scan_status,
-    sentence,
     upright,
 )
 from shapespace.report.inputs.saved_fits import Folder
@@ -109,9 +118,8 @@ class CorrespondencePage:
 
     def status(self, record: CorrespondRecord) -> Cell:
         """Return what came of a scan, sorted from bad to good."""
-        cell = scan_status(record, self.concerns)
-        words, colour = _STATUS[cell]
-        return Cell(words, float(list(_STATUS).index(cell)), colour)
+        kind = scan_status(record, self.concerns)
+        return Cell(_STATUS[kind][0], float(list(_STATUS).index(kind)), _STATUS[kind][1])
 
     @property
     def looked_at(self) -> list[CorrespondRecord]:
@@ -133,13 +141,16 @@ class CorrespondencePage:
         ]
         if (self.result.root / "quality.json").is_file():
             chapters.insert(4, Chapter("Quality of the shape space", self.quality, "Quality"))
-        lead = (
-            "Raw scans brought to one surface: the same vertex is meant to be the same place on all of them. The size "
-            "of an object is the RMS distance of its surface from its middle."
-        )
-        made = f"Made by shapespace {__version__} from the files in {name}."
         return self.page.html(
-            f"Correspondence of {counted(self.total, 'scan')} in {name}", [Text(lead)], made, chapters
+            f"Correspondence of {counted(self.total, 'scan')} in {name}",
+            [
+                Text(
+                    "Raw scans brought to one surface: the same vertex is meant to be the same place on all of them. "
+                    "The size of an object is the RMS distance of its surface from its middle."
+                )
+            ],
+            f"Made by shapespace {__version__} from the files in {name}.",
+            chapters,
         )
 
     @property
@@ -168,9 +179,20 @@ class CorrespondencePage:
         return [
             Text(self.verdict()),
             Tiles(tiles),
-            self._set_aside(),
-            self._to_look_at(),
-            Notice("Cannot be read", [Item(text, Cell(name)) for name, text in self._damaged().items()], "broken"),
+            Notice(
+                "Excluded scans: they are not in a model built from this folder",
+                self._items({record.name: sentence(record.reason) for record in self.result.set_aside}),
+                "broken",
+            ),
+            Notice(
+                "In correspondence; needs review",
+                self._items({record.name: self.concerns[record.name].text for record in self.looked_at}),
+            ),
+            Notice(
+                "Cannot be read",
+                [Text(text, name=Cell(name)) for name, text in {**self.result.unread, **self.all.unread}.items()],
+                "broken",
+            ),
             Text("To look at single vertices on all scans, and to go on to a shape space:"),
             Command(f"shapespace view {self.result.root.name}\nshapespace build {self.result.root.name} -o model.h5"),
         ]
@@ -208,24 +230,13 @@ class CorrespondencePage:
             f"size, and {percent_of(self.result.settled)} counts as settled; more --rounds may still better it."
         )
 
-    def _set_aside(self) -> Notice:
-        items = [Item(sentence(r.reason), Cell(r.name, anchor=self._cards.get(r.name))) for r in self.result.set_aside]
-        if len(items) > _MOST_NAMED:
-            items = [*items[:_MOST_NAMED], Item(f"{counted(len(items) - _MOST_NAMED, 'other')}, in the table of all.")]
-        return Notice("Excluded scans: they are not in a model built from this folder", items, "broken")
-
-    def _to_look_at(self) -> Notice:
-        some = self.looked_at
-        items = [
-            Item(self.concerns[record.name].text, Cell(record.name, anchor=self._cards.get(record.name)))
-            for record in some[:_MOST_NAMED]
-        ]
-        if len(some) > _MOST_NAMED:
-            items.append(Item(f"{counted(len(some) - _MOST_NAMED, 'other')}, in the table of all."))
-        return Notice("In correspondence; needs review", items)
-
-    def _damaged(self) -> Mapping[str, str]:
-        return {**self.result.unread, **self.all.unread}
+    def _items(self, texts: Mapping[str, str]) -> list[str | Text]:
+        """Return a sentence for each of the first scans, by name, and the number of the others."""
+        return first_items(
+            [Text(text, name=Cell(name, anchor=self._cards.get(name))) for name, text in texts.items()],
+            _MOST_NAMED,
+            "in the table of all",
+        )
 
     # The pictures
 
@@ -242,12 +253,20 @@ class CorrespondencePage:
         surfaces, labels = [placed[r.name].vertices for r in pictured], [record.name for record in pictured]
         pictures: list[Block] = []
         for yaw, side in ((0.0, "from the front"), (figures.SIDE_DEG, "from one side")):
-            title = f"The same squares on every scan, {side}"
-            drawn = figures.checkerboard_figure(self.mean, surfaces, labels, yaw_deg=yaw, title=title)
-            caption = f"{which} A checkerboard is laid onto the mean shape and carried to each scan by its vertices."
-            alt = f"The same checkerboard {side} on the mean shape and on {listed(labels)}"
+            drawn = figures.checkerboard_figure(
+                self.mean, surfaces, labels, yaw_deg=yaw, title=f"The same squares on every scan, {side}"
+            )
             # As wide as the page: small squares tell nothing.
-            pictures.append(replace(self.page.figure(drawn, caption, alt=alt), kind="plain"))
+            pictures.append(
+                replace(
+                    self.page.figure(
+                        drawn,
+                        f"{which} A checkerboard is laid onto the mean shape and carried to each scan by its vertices.",
+                        alt=f"The same checkerboard {side} on the mean shape and on {listed(labels)}",
+                    ),
+                    kind="plain",
+                )
+            )
         return [
             Text(
                 "Compare them place by place: an edge or a corner that you know, such as the corner of an eye or a "
@@ -327,18 +346,25 @@ class CorrespondencePage:
             "within 2.15 times it. It is large where the surface is flat or of constant curvature, so that no feature "
             "determines the position. Single surfaces are in the viewer."
         )
-        alt = "Standard deviation of the position of each vertex along the surface, on the mean shape from four sides"
-        figure = figures.position_std_figure(self.mean, std, self.all.position_std_limit)
-        return [self.page.figure(figure, caption, alt=alt)]
+        return [
+            self.page.figure(
+                figures.position_std_figure(self.mean, std, self.all.position_std_limit),
+                caption,
+                alt="Standard deviation of the position of each vertex along the surface, on the mean shape from four "
+                "sides",
+            )
+        ]
 
     # The scans
 
     def scans(self) -> list[Block]:
         """Return the gallery, the worst first, and the table of all."""
         all_shown = len(self._cards) == len(self.records) + len(self.out)
-        heading = "All scans, the worst first" if all_shown else f"The {len(self._cards)} scans to look at first"
         return [
-            self.page.section(heading, self.gallery),
+            self.page.section(
+                ("All scans, the worst first" if all_shown else f"The {len(self._cards)} scans to look at first"),
+                self.gallery,
+            ),
             self.page.section("Every scan in numbers", self.numbers),
         ]
 
@@ -351,21 +377,23 @@ class CorrespondencePage:
         """Return a card for each of the first scans."""
         limit = 100 * (median([self.share(record, "p99") for record in self.records]) or nan)
         limit = nice_ceiling(limit)
-        bars = [(SEQUENTIAL, "0", f"{limit:g} % of its size, or more"), (DIVERGING, "half the area", "twice the area")]
         key = StripKey(
             "Each strip, from the left: the scan; the checkerboard of the front view; how far each vertex lies from "
             "the scan (pale to dark); how much each triangle has shrunk (blue) or grown (red) beside the mean shape, "
             "with the change of size divided out and folded triangles in black.",
-            [(self.page.image(thumbnails.colour_bar(c), f"from {low} to {high}"), low, high) for c, low, high in bars],
+            [
+                (self.page.image(thumbnails.colour_bar(c), f"from {low} to {high}"), low, high)
+                for c, low, high in [
+                    (SEQUENTIAL, "0", f"{limit:g} % of its size, or more"),
+                    (DIVERGING, "half the area", "twice the area"),
+                ]
+            ],
             "Where areas change, shapes may differ; where they change suddenly, squares have slid.",
         )
         carded = self._carded()
         out: list[Block] = [Text("Sorted: excluded scans first, then by how much they stand out.")]
         if len(carded) < len(self.records) + len(self.out):
-            others = counted(len(self.records) + len(self.out) - len(carded), "other scan")
-            out.append(
-                Text(f"{others} have no picture here, so that this file stays below 8 MB; the table has them all.")
-            )
+            out.append(no_picture(len(self.records) + len(self.out) - len(carded), "scan"))
         return [*out, key, Gallery([self.card(record, limit) for record in carded])]
 
     def card(self, record: CorrespondRecord, limit: float) -> Card:
@@ -402,8 +430,7 @@ class CorrespondencePage:
         scan, note = None, ""
         far = np.full(len(placed.vertices), nan)
         try:
-            own = drawable(self._bounded(record))[0]
-            scan, far = self._scan_on_mean(own, placed)
+            scan, far = self._scan_on_mean(drawable(self._bounded(record))[0], placed)
         except FileFormatError as error:
             note = f"Without the scan beside it: {error}"
         still = thumbnails.correspondence_strip(self.mean, placed.vertices, scan, far, limit)
@@ -457,8 +484,10 @@ class CorrespondencePage:
         notes: list[Block] = [Text(caption, "soft")]
         why = [[record.name, self._reason(record)] for record in records if self._reason(record)]
         if why:
-            heading = f"The reasons of {counted(len(why), 'scan')}"
-            notes = [*notes, Folded(heading, [text_table(("Scan", "Why"), why, "Reasons")])]
+            notes = [
+                *notes,
+                Folded(f"The reasons of {counted(len(why), 'scan')}", [text_table(("Scan", "Why"), why, "Reasons")]),
+            ]
         return [*out, table, *notes]
 
     def _reason(self, record: CorrespondRecord) -> str:
@@ -484,17 +513,35 @@ class CorrespondencePage:
             cpu = [record.cpu_s[k] for record in self.records if len(record.cpu_s) > k]
             row = [Cell(f"Round {k + 1}", float(k + 1)), _cell(100 * moved)]
             rows.append([*row, number(sum(cpu), 1), number(median(cpu), 1), number(max(cpu, default=nan), 1)])
-        heads = ["Moved (RMS), % of size", "CPU seconds, all scans", "a scan, median", "a scan, most"]
-        table = Table(
-            [Column("Round"), *(Column(head, "number") for head in heads)], rows, "Movement and time by round"
-        )
-        note = "CPU seconds are those of the scans in correspondence; choosing the template is not counted."
-        return [Text(run.template), figure, table, Text(note, "soft")]
+        return [
+            Text(run.template),
+            figure,
+            Table(
+                [
+                    Column("Round"),
+                    *(
+                        Column(head, "number")
+                        for head in [
+                            "Moved (RMS), % of size",
+                            "CPU seconds, all scans",
+                            "a scan, median",
+                            "a scan, most",
+                        ]
+                    ),
+                ],
+                rows,
+                "Movement and time by round",
+            ),
+            Text("CPU seconds are those of the scans in correspondence; choosing the template is not counted.", "soft"),
+        ]
 
     def quality(self) -> list[Block]:
         """Return what quality.json says."""
-        measured = read(Quality, self.result.folder.json("quality.json"), "quality.json", "measure it again")
-        return [sections.quality_part(self.page, measured)]
+        return [
+            sections.quality_part(
+                self.page, read(Quality, self.result.folder.json("quality.json"), "quality.json", "measure it again")
+            )
+        ]
 
     def settings(self) -> list[Block]:
         """Return settings, versions and hashes."""
@@ -502,9 +549,22 @@ class CorrespondencePage:
         rows = [("Report", f"shapespace {__version__}"), ("Correspondence", f"shapespace {run.version}")]
         rows += [("First template", run.template), ("Vertices made", f"{run.vertices:,}")]
         rows += [(words(key), setting(value)) for key, value in run.settings.items() if key != "vertices"]
-        files = [[r.name, r.path or DASH, r.hash or DASH] for r in list(self.result.records.values())[:MOST_ROWS]]
-        hashes = text_table(("Scan", "File", "Hash"), files, "Content hashes of the scans")
-        return [Facts(rows, "Settings and versions"), Folded("Content hashes (SHA-256)", [hashes])]
+        return [
+            Facts(rows, "Settings and versions"),
+            Folded(
+                "Content hashes (SHA-256)",
+                [
+                    text_table(
+                        ("Scan", "File", "Hash"),
+                        [
+                            [r.name, r.path or DASH, r.hash or DASH]
+                            for r in list(self.result.records.values())[:MOST_ROWS]
+                        ],
+                        "Content hashes of the scans",
+                    )
+                ],
+            ),
+        ]
 
 
 def _cell(value: float) -> Cell:

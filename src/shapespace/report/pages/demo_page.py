@@ -61,14 +61,17 @@ class DemoPage:
                 "soft",
             ),
         ]
-        chapters = [
-            Chapter("Summary", self.summary),
-            Chapter("Experiment 1", self.experiment_1),
-            Chapter("Experiment 2", self.experiment_2),
-            Chapter("Settings, versions and hashes", self.settings, "Settings"),
-        ]
-        title = "Low-dimensional surface parameterisation: the paper, run again"
-        return self.page.html(title, lead, f"Made by {self.provenance} from the files in its own folder.", chapters)
+        return self.page.html(
+            "Low-dimensional surface parameterisation: the paper, run again",
+            lead,
+            f"Made by {self.provenance} from the files in its own folder.",
+            [
+                Chapter("Summary", self.summary),
+                Chapter("Experiment 1", self.experiment_1),
+                Chapter("Experiment 2", self.experiment_2),
+                Chapter("Settings, versions and hashes", self.settings, "Settings"),
+            ],
+        )
 
     def with_headings(self, parts: Mapping[str, Make], level: int = 3) -> list[Block]:
         """Return sections with their headings."""
@@ -244,9 +247,10 @@ class DemoPage:
         """Return some of the training faces."""
         examples = one.training_examples[: 8 if self.demo.quick else 12]
         meshes = [self.folder.mesh(example.file) for example in examples]
-        labels = [example.label for example in examples]
         return self.page.figure(
-            figures.faces_grid(meshes, labels, title="Training faces: one person, mixed expressions"),
+            figures.faces_grid(
+                meshes, [example.label for example in examples], title="Training faces: one person, mixed expressions"
+            ),
             f"Paper, figure 1. {len(meshes)} of the {_count(one.n_training)} faces that the model is made of.",
             alt=f"{len(meshes)} faces of one person with different expressions, in a grid",
         )
@@ -261,10 +265,13 @@ class DemoPage:
         if not pictured:
             return [absent if absent.items else Text("No test face was fitted.", "broken")]
         labels = [staged.label for _, staged in pictured]
-        title = "Test faces: raw surfaces, none of them in the training set"
         return [
             self.page.figure(
-                figures.faces_grid([staged.scan for _, staged in pictured], labels, title=title),
+                figures.faces_grid(
+                    [staged.scan for _, staged in pictured],
+                    labels,
+                    title="Test faces: raw surfaces, none of them in the training set",
+                ),
                 "Paper, figure 8. The scans, turned back to the front by the fitted pose; simulated.",
                 alt="Grid of test faces: " + ", ".join(labels),
             ),
@@ -387,14 +394,27 @@ class DemoPage:
         fits, unread = self.readable(self.entries)
         if fits:
             rows += [(f"Fit, {words(key)}", setting(value)) for key, value in fits[0].record.config.items()]
-        files = [
-            [fit.name, *(f"{file.name} {file.hash or 'not recorded'}" for file in (fit.record.scan, fit.record.model))]
-            for fit in fits
-        ]
-        hashes = text_table(("Fit", "Scan", "Model"), files, "Content hashes of the files that took part")
         return [
             Facts(rows, "Settings and versions"),
-            Folded("Content hashes (SHA-256)", [hashes]),
+            Folded(
+                "Content hashes (SHA-256)",
+                [
+                    text_table(
+                        ("Fit", "Scan", "Model"),
+                        [
+                            [
+                                fit.name,
+                                *(
+                                    f"{file.name} {file.hash or 'not recorded'}"
+                                    for file in (fit.record.scan, fit.record.model)
+                                ),
+                            ]
+                            for fit in fits
+                        ],
+                        "Content hashes of the files that took part",
+                    )
+                ],
+            ),
             Notice("Cannot be read", unread),
         ]
 

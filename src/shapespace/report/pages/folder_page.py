@@ -27,12 +27,13 @@ from shapespace.report.blocks.blocks import (
     Folded,
     Gallery,
     Image,
-    Item,
     Notice,
-    ScaleKey,
+    StripKey,
     Table,
     Text,
     Tiles,
+    first_items,
+    no_picture,
     number,
     status,
     text_table,
@@ -45,12 +46,14 @@ from shapespace.report.blocks.wording import (
     counted,
     isfinite,
     listed,
+    median,
     mm,
     percent,
     printable,
+    sentence,
     without_folders,
 )
-from shapespace.report.inputs.fit_population import FEWEST, MEASURES, Group, ListedColumn, Population
+from shapespace.report.inputs.fit_population import FEWEST, MEASURES, ListedColumn, Population
 from shapespace.report.inputs.saved_fits import (
     Folder,
     SavedFit,
@@ -118,8 +121,9 @@ class FolderPage:
             self.label_note = f"There are no labels: {error}"
         self.fits = sorted(map(with_label, fits, found_labels), key=sections.concern)
         self.main = _main_fits(self.fits)
-        planned = sections.MODEL_PICTURES + min(len(fits), MOST_CARDS) + 4 + len(self.main) * sections.FIT_PICTURES
-        self.page = Page(planned, on_step)
+        self.page = Page(
+            (sections.MODEL_PICTURES + min(len(fits), MOST_CARDS) + 4 + len(self.main) * sections.FIT_PICTURES), on_step
+        )
         self.model_path = model
         self._model: ShapeModel | None = None
         if model is not None:
@@ -148,7 +152,22 @@ class FolderPage:
 
     def html(self) -> str:
         """Return the page."""
+        lead = "What a statistical shape model made of raw surfaces. Lengths are in millimetres of the scan."
         name = self.folder.root.resolve().name
+        return self.page.html(
+            f"{counted(self.total, 'fit')} in {name}",
+            [Text(lead)],
+            f"Made by shapespace {__version__} from the files in {name}.",
+            self.chapters(),
+        )
+
+    @property
+    def total(self) -> int:
+        """Number of fits in the folder."""
+        return len(self.fits)
+
+    def chapters(self) -> list[Chapter]:
+        """Return the parts of the page."""
         chapters = [
             Chapter("Summary", self.summary),
             Chapter("The fits", self.fits_part, "Fits"),
@@ -159,16 +178,13 @@ class FolderPage:
         if sum(fit.fitted for fit in self.fits) < 2:
             del chapters[2]
         if self.recognised:
-            recognition_chapter = Chapter("Recognition", lambda: study_page.study_section(self.page, self.folder))
-            chapters.insert(-2, recognition_chapter)
+            chapters.insert(-2, Chapter("Recognition", lambda: study_page.study_section(self.page, self.folder)))
         chapters[-2:-2] = study_page.analysis_chapters(self.page, self.folder.root, self.analyses)
-        lead = "What a statistical shape model made of raw surfaces. Lengths are in millimetres of the scan."
-        made = f"Made by shapespace {__version__} from the files in {name}."
-        return self.page.html(f"{counted(len(self.fits), 'fit')} in {name}", [Text(lead)], made, chapters)
+        return chapters
 
     @property
     def places(self) -> Mapping[str, str]:
-        """Where in the page a fit is shown, by its name."""
+        """Where in the page a fit is shown in full, or else on its card, by its name."""
         return self._cards | self._details
 
     def place_of(self, name: str) -> str | None:
@@ -184,34 +200,43 @@ class FolderPage:
 
     def quality(self) -> Block:
         """Return what quality.json says."""
-        measured = read(Quality, self.folder.json("quality.json"), "quality.json", "measure it again")
-        return sections.quality_part(self.page, measured)
+        return sections.quality_part(
+            self.page, read(Quality, self.folder.json("quality.json"), "quality.json", "measure it again")
+        )
 
     def summary(self) -> list[Block]:
         """Return what was fitted and how much of it is to be trusted."""
         counts = Counter(fit.status for fit in self.fits)
         trusted = [fit for fit in self.fits if fit.status == "converged"]
-        tiles = [
-            (str(len(trusted)), f"of {len(self.fits)}", "with nothing found against them"),
-            (str(counts["doubtful"] + counts["max_iterations"]), "", "to be looked at before use"),
-            (str(counts["failed"] + counts["unreadable"]), "", "without a result"),
-        ]
-        to_scan = "from model to scan, over what the scan shows"
-        for value, label in (
-            (_median([fit.expected_error_mm for fit in trusted]), "vertex error that such a fit expects of itself"),
-            (_median([fit.distance_mm("model_to_scan") for fit in trusted]), f"mean distance {to_scan}"),
-            (_median([fit.distance_mm("scan_to_model") for fit in trusted]), "mean distance from scan to model"),
-        ):
-            if isfinite(value):
-                tiles.append((mm(value).removesuffix(" mm"), "mm", f"{label}, median of those"))
+        medians = {
+            "vertex error that such a fit expects of itself": median([fit.expected_error_mm for fit in trusted]),
+            "mean distance from model to scan, over what the scan shows": median(
+                [fit.distance_mm("model_to_scan") for fit in trusted]
+            ),
+            "mean distance from scan to model": median([fit.distance_mm("scan_to_model") for fit in trusted]),
+        }
         return [
             Text(self.overview(counts)),
-            Tiles(tiles),
+            self.tiles(counts, medians),
             *self.other_models(),
             self.doubts(),
             *self.worst(),
             *self.without_stages(),
         ]
+
+    def tiles(self, counts: Mapping[str, int], medians_mm: Mapping[str, float]) -> Tiles:
+        """Return how many fits have which status, and medians of the trusted ones by what they are."""
+        number_and_unit = {
+            label: mm(value).removesuffix(" mm") for label, value in medians_mm.items() if isfinite(value)
+        }
+        return Tiles(
+            [
+                (f"{counts['converged']:,}", f"of {self.total:,}", "with nothing found against them"),
+                (f"{counts['doubtful'] + counts['max_iterations']:,}", "", "to be looked at before use"),
+                (f"{counts['failed'] + counts['unreadable']:,}", "", "without a result"),
+                *((value, "mm", f"{label}, median of those") for label, value in number_and_unit.items()),
+            ]
+        )
 
     def overview(self, counts: Mapping[str, int]) -> str:
         """Return in a sentence or two what was fitted, and how many fits have which status."""
@@ -222,37 +247,44 @@ class FolderPage:
         trusted = counts["converged"]
         text += counted(trusted, "fit") if trusted else "None"
         text += f" converged with nothing {'found against them' if trusted != 1 else 'against it'}"
-        rest = {
-            "max_iterations": "stopped at the limit of steps",
-            "doubtful": "doubtful",
-            "failed": "could not be fitted",
-            "unreadable": "cannot be read",
-        }
-        others = listed([f"{counts[key]} {word}" for key, word in rest.items() if counts[key]])
+        others = listed(
+            [
+                f"{counts[key]} {word}"
+                for key, word in {
+                    "max_iterations": "stopped at the limit of steps",
+                    "doubtful": "doubtful",
+                    "failed": "could not be fitted",
+                    "unreadable": "cannot be read",
+                }.items()
+                if counts[key]
+            ]
+        )
         return f"{text}; {others}." if others else f"{text}."
 
     def other_models(self) -> list[Block]:
         """Return which fits are by another model than the one shown, where one was given."""
         if self.model_path is None:
             return []
-        model_hash = self.model_hash()
-        others = [fit.name for fit in self.fits if fit.fitted and fit.record.model.hash != model_hash]
+        others = [fit.name for fit in self.fits if fit.fitted and fit.record.model.hash != self.model_hash()]
         return [Notice(f"Fitted with another model than {self.model_path.name}", others)]
 
     def doubts(self) -> Notice:
         """Return the fits that need a look, by name and reason."""
-        bad = [fit for fit in self.fits if fit.status != "converged"]
-        places = self._details | self._cards
-        items: list[str | Item] = [
-            Item(
-                f"{STATUS_WORDS[fit.status]}. {_all_reasons(fit)}",
-                Cell(fit.name, anchor=places.get(fit.name)),
-            )
-            for fit in bad[:_MOST_NAMED]
-        ]
-        if len(bad) > _MOST_NAMED:
-            items.append(f"{counted(len(bad) - _MOST_NAMED, 'other')}, in the table of all fits.")
-        return Notice("Not to be trusted without a look", items)
+        return Notice(
+            "Not to be trusted without a look",
+            first_items(
+                [
+                    Text(
+                        f"{STATUS_WORDS[fit.status]}. {_all_reasons(fit)}",
+                        name=Cell(fit.name, anchor=self.place_of(fit.name)),
+                    )
+                    for fit in self.fits
+                    if fit.status != "converged"
+                ],
+                _MOST_NAMED,
+                "in the table of all fits",
+            ),
+        )
 
     def worst(self) -> list[Block]:
         """Return in a sentence which fits lie farthest from their scans, of those with nothing else against them."""
@@ -301,19 +333,15 @@ class FolderPage:
 
     def not_drawn(self) -> list[str]:
         """Return one sentence for each of the main fits that cannot be drawn, or not with its scan."""
-        return [
-            f"{fit.name}: {_of_scan(error)}" if isinstance(error, ScanNotFoundError) else str(error)
-            for fit in self.main
-            if (error := self.problem(fit)) is not None
-        ]
-
-    def problem(self, fit: SavedFit) -> ShapespaceError | None:
-        """Return why `fit` cannot be drawn with its scan, or None."""
-        try:
-            self.staged(fit)
-        except ShapespaceError as error:
-            return error
-        return None
+        out: list[str] = []
+        for fit in self.main:
+            try:
+                self.staged(fit)
+            except ScanNotFoundError as error:
+                out.append(f"{fit.name}: {str(error).removesuffix('.')}; the fitted surface is shown alone.")
+            except ShapespaceError as error:
+                out.append(str(error))
+        return out
 
     # Fits
 
@@ -322,8 +350,12 @@ class FolderPage:
         page = self.page
         parts: list[Block] = []
         if self._cards:
-            heading = "All fits" if len(self.fits) <= MOST_CARDS else f"The {MOST_CARDS} fits to look at first"
-            parts.append(page.section(heading, self.gallery))
+            parts.append(
+                page.section(
+                    ("All fits" if len(self.fits) <= MOST_CARDS else f"The {MOST_CARDS} fits to look at first"),
+                    self.gallery,
+                )
+            )
         parts.append(page.section("Every fit in numbers", self.numbers))
         several = len(self.fits) > 1
         for fit in self.main:
@@ -340,21 +372,26 @@ class FolderPage:
         curves: Sequence[Block] = self.page.tried(self.curves) if any(fit.pictured for fit in self.fits) else ()
         coefficients = self.page.tried(self.together)
         drawn = [block for block in coefficients if isinstance(block, Figure)]
-        rest = [block for block in coefficients if not isinstance(block, Figure)]
-        return [sections.in_columns(*curves, *drawn), *rest]
+        return [sections.in_columns(*curves, *drawn), *(block for block in coefficients if block not in drawn)]
 
     def gallery(self) -> list[Block]:
         """Return a card for each of the first fits: failed and doubtful first, then by their error."""
         sample, _ = sections.usable([fit for fit in self.carded if fit.pictured], self.staged)
-        good = [fit for fit in sample if fit.status == "converged"]
-        limit = sections.common_limit_mm(good or sample)
+        limit = sections.common_limit_mm([fit for fit in sample if fit.status == "converged"] or sample)
         out: list[Block] = [Text("Sorted by status (failed, doubtful, converged), then by expected error.")]
         if len(self.fits) > len(self.carded):
-            others = counted(len(self.fits) - len(self.carded), "other fit")
-            more = f"{others} have no picture here, so that this file stays below 8 MB; the table has them all."
-            out.append(Text(more))
+            out.append(no_picture(len(self.fits) - len(self.carded), "fit"))
         if sample:
-            out.append(ScaleKey(limit, self.page.image(thumbnails.colour_bar(), "from blue over pale to red")))
+            bar = self.page.image(thumbnails.colour_bar(), "from blue over pale to red")
+            out.append(
+                StripKey(
+                    "Each strip, from the left: the scan; scan (orange) and model (blue) over each other, the nearer "
+                    "one shown; the distance from the model to the scan, one scale for all:",
+                    [(bar, f"−{limit:g} mm, scan inside", f"+{limit:g} mm, scan outside")],
+                    "Grey is what the scan does not show. Distances to a scan of points only have no sign: their map "
+                    f"runs from 0 to {limit:g} mm.",
+                )
+            )
         cards = [self.card(fit, limit) for fit in self.carded]
         out.append(Gallery(cards[:MOST_OPEN_CARDS]))
         if len(cards) > MOST_OPEN_CARDS:
@@ -386,28 +423,27 @@ class FolderPage:
 
     def still(self, fit: SavedFit, limit_mm: float) -> Image:
         """Return the best picture of a fit that there is: with its stages, its fitted surface, or its scan."""
-        if fit.pictured:
-            try:
-                staged = self.staged(fit)
-            except ScanNotFoundError:
-                surfaces = saved_surfaces(self.folder, fit)
-                still, alt = thumbnails.mesh_still(surfaces["final"]), f"The fitted surface of {fit.name}"
-            else:
-                still, alt = thumbnails.fit_strip(staged, limit_mm), sections.strip_alt(staged, limit_mm)
-        else:
-            still, alt = (
-                thumbnails.mesh_still(raw_scan(self.folder, fit)),
-                f"The raw scan {fit.name}, as its axes stand",
-            )
-        return self.page.image(still, alt)
+        if not fit.pictured:
+            scan = thumbnails.mesh_still(raw_scan(self.folder, fit))
+            return self.page.image(scan, f"The raw scan {fit.name}, as its axes stand")
+        try:
+            staged = self.staged(fit)
+        except ScanNotFoundError:
+            surface = thumbnails.mesh_still(saved_surfaces(self.folder, fit)["final"])
+            return self.page.image(surface, f"The fitted surface of {fit.name}")
+        return self.page.image(thumbnails.fit_strip(staged, limit_mm), sections.strip_alt(staged, limit_mm))
 
     def numbers(self) -> list[Block]:
         """Return the table of all fits."""
-        rows = self.fits[:MOST_ROWS]
-        caption = "Every fit: distances and errors at the end in mm. A dash: not known."
-        out: list[Block] = [sections.fits_table(rows, self.places, caption=caption)]
-        if len(self.fits) > len(rows):
-            left = counted(len(self.fits) - len(rows), "other fit")
+        out: list[Block] = [
+            sections.fits_table(
+                self.fits[:MOST_ROWS],
+                self.places,
+                caption="Every fit: distances and errors at the end in mm. A dash: not known.",
+            )
+        ]
+        if len(self.fits) > MOST_ROWS:
+            left = counted(len(self.fits) - MOST_ROWS, "other fit")
             out.append(Text(f"{left} are left out here; coefficients.csv has all."))
         return [*out, *([Text(self.label_note, "soft")] if self.label_note else [])]
 
@@ -443,8 +479,13 @@ class FolderPage:
         points = [sections.coefficients_of(fit) for fit in expressive]
         if any(len(point.b) < 2 for point in points):
             return out
-        own = (fit for fit in compared if fit.entry.intensity == 0 and fit.entry.subject in subjects)
-        neutral = next(map(sections.coefficients_of, own), None)
+        neutral = next(
+            map(
+                sections.coefficients_of,
+                (fit for fit in compared if fit.entry.intensity == 0 and fit.entry.subject in subjects),
+            ),
+            None,
+        )
         return [*out, *self.page.tried(lambda: sections.lines_through_neutral(self.page, points, neutral))]
 
     def detail(self, fit: SavedFit) -> list[Block]:
@@ -453,36 +494,42 @@ class FolderPage:
             staged = self.staged(fit)
         except ScanNotFoundError as error:
             why, surfaces = str(error), saved_surfaces(self.folder, fit)
-            turning = self.page.tried(lambda: sections.surface_to_turn(self.page, fit, surfaces, why))
-            return [*sections.fit_facts(fit), *turning]
-        population = self.others(fit)
+            return [
+                *sections.fit_facts(fit),
+                *self.page.tried(lambda: sections.surface_to_turn(self.page, fit, surfaces, why)),
+            ]
         reserve = _RESERVE_BYTES + study_page.SECTION_BYTES * min(self.recognised + len(self.analyses), _MOST_RESERVED)
-        alone = len(self.fits) == 1
-        pictures = sections.fit_in_full(self.page, staged, population, reserve=reserve, folded=alone)
-        return [*sections.fit_facts(fit), *pictures]
+        return [
+            *sections.fit_facts(fit),
+            *sections.fit_in_full(self.page, staged, self.others(fit), reserve=reserve, folded=len(self.fits) == 1),
+        ]
 
     def others(self, fit: SavedFit) -> FloatArray | None:
         """Return coefficients (N, K) of the other fits by the model of `fit`; None where there are too few."""
-        same = self.of_one_model(fit.record.model.hash)
-        others = [other.numbers("z") for other in same if other.name != fit.name]
+        others = [o.numbers("z") for o in self.of_one_model(fit.record.model.hash) if o.name != fit.name]
         return np.stack(others) if len(others) > 2 and len({len(z) for z in others}) == 1 else None
 
     # The rest
 
     def settings(self) -> list[Block]:
         """Return settings that the fits share, versions and hashes."""
-        known = [fit for fit in self.fits if fit.fitted] or self.fits
-        configs = [fit.record.config for fit in known if fit.record.config]
+        fitted = [fit for fit in self.fits if fit.fitted] or self.fits
+        configs = [fit.record.config for fit in fitted if fit.record.config]
         rows = [("Report", f"shapespace {__version__}")]
         versions = sorted({fit.record.version for fit in self.fits} - {""})
         if versions:
             rows.append(("Fits", f"shapespace {listed(versions)}"))
-        files = [
-            [fit.name, *(part or DASH for part in (fit.record.scan.name, fit.record.scan.hash, fit.record.model.hash))]
-            for fit in self.fits[:MOST_ROWS]
-        ]
-        heads = ("Fit", "Scan", "Hash of the scan", "Hash of the model")
-        hashes = text_table(heads, files, "Content hashes of the files that took part")
+        hashes = text_table(
+            ("Fit", "Scan", "Hash of the scan", "Hash of the model"),
+            [
+                [
+                    fit.name,
+                    *(part or DASH for part in (fit.record.scan.name, fit.record.scan.hash, fit.record.model.hash)),
+                ]
+                for fit in self.fits[:MOST_ROWS]
+            ],
+            "Content hashes of the files that took part",
+        )
         return [*settings_blocks(configs, rows), Folded("Content hashes (SHA-256)", [hashes])]
 
 
@@ -507,13 +554,9 @@ def _carded(fits: Sequence[SavedFit]) -> list[SavedFit]:
     return [*first, *rest[: MOST_CARDS - len(first)]]
 
 
-def _of_scan(error: ScanNotFoundError) -> str:
-    return f"{str(error).removesuffix('.')}; the fitted surface is shown alone."
-
-
 def _all_reasons(fit: SavedFit) -> str:
     """Return the reasons of a fit without its status; the whole reason if the record has no codes."""
-    return _sentence("; ".join(fit.reason_texts)) if fit.reason_texts else fit.reason
+    return sentence("; ".join(fit.reason_texts)) if fit.reason_texts else fit.reason
 
 
 def _first_reason(fit: SavedFit) -> str:
@@ -521,16 +564,7 @@ def _first_reason(fit: SavedFit) -> str:
     if not fit.reason_texts:
         return fit.reason
     first, *others = fit.reason_texts
-    return _sentence(f"{first}, and {counted(len(others), 'more reason')}" if others else first)
-
-
-def _sentence(text: str) -> str:
-    return f"{text[:1].upper()}{text[1:].removesuffix('.')}."
-
-
-def _median(values: Sequence[float]) -> float:
-    known = [value for value in values if isfinite(value)]
-    return float(np.median(known)) if known else np.nan
+    return sentence(f"{first}, and {counted(len(others), 'more reason')}" if others else first)
 
 
 # Labels of the fits in a folder, and the location of their table
@@ -623,10 +657,14 @@ class ManyPage(FolderPage):
         fits = [saved_fit(folder, results, name) for name in sorted(set(names))]
         super().__init__(folder, fits, model=model, labels=labels, on_step=on_step)
 
-    def html(self) -> str:
-        """Return the page."""
-        name = self.folder.root.resolve().name
-        chapters = [
+    @property
+    def total(self) -> int:
+        """Number of fits in the folder."""
+        return len(self.population)
+
+    def chapters(self) -> list[Chapter]:
+        """Return the parts of the page."""
+        return [
             Chapter("Summary", self.summary),
             Chapter("Fits to look at", self.fits_part, "Fits"),
             Chapter("Distributions", self.distributions),
@@ -635,23 +673,14 @@ class ManyPage(FolderPage):
             Chapter("The model", self.model_part, "Model"),
             Chapter("Settings and versions", self.settings, "Settings"),
         ]
-        lead = "What a statistical shape model made of raw surfaces. Lengths are in millimetres of the scan."
-        made = f"Made by shapespace {__version__} from the files in {name}."
-        return self.page.html(f"{counted(len(self.population), 'fit')} in {name}", [Text(lead)], made, chapters)
 
     def summary(self) -> list[Block]:
         """Return how many fits have which status and why, what stands out, and what could not be read."""
-        counts = self.population.counts
-        tiles = [
-            (f"{counts['converged']:,}", f"of {len(self.population):,}", "with nothing found against them"),
-            (f"{counts['doubtful'] + counts['max_iterations']:,}", "", "to be looked at before use"),
-            (f"{counts['failed'] + counts['unreadable']:,}", "", "without a result"),
-        ]
-        for measure, words in tuple(MEASURES.items())[:3]:
-            if isfinite(value := self.population.median(measure)):
-                tiles.append((mm(value).removesuffix(" mm"), "mm", f"{words.removesuffix(' (mm)')}, median of those"))
         return [
-            Tiles(tiles),
+            self.tiles(
+                self.population.counts,
+                {words.removesuffix(" (mm)"): self.population.median(key) for key, words in [*MEASURES.items()][:3]},
+            ),
             *self.other_models(),
             Notice(
                 "Cannot be read",
@@ -664,32 +693,41 @@ class ManyPage(FolderPage):
         ]
 
     def _of_models(self) -> str:
-        most = self.population.models.most_common(1)[0][1]
         return (
-            f"The fits are by {len(self.population.models)} models; coefficients are compared of the {most:,} fits by "
-            "the one with most."
+            f"The fits are by {len(self.population.models)} models; coefficients are compared of the "
+            f"{self.population.models.most_common(1)[0][1]:,} fits by the one with most."
         )
 
     def stands_out(self) -> Notice:
         """Return which times and sites differ from the rest by more than chance."""
-        items: list[str | Item] = []
-        for column in self.population.listed:
-            for group in self.population.compared(column):
-                if group.stands_out:
-                    text = "; ".join(group.stands_out)
-                    items.append(Item(f"{text[:1].upper()}{text[1:]}.", Cell(f"{column.name} {printable(group.name)}")))
-        if len(items) > _MOST_NOTED:
-            items = [*items[:_MOST_NOTED], f"{len(items) - _MOST_NOTED} more, in the tables of Time and site."]
-        return Notice("Differ from all the others", items)
+        return Notice(
+            "Differ from all the others",
+            first_items(
+                [
+                    Text(sentence("; ".join(group.stands_out)), name=Cell(f"{column.name} {printable(group.name)}"))
+                    for column in self.population.listed
+                    for group in self.population.compared(column)
+                    if group.stands_out
+                ],
+                _MOST_NOTED,
+                "in the tables of Time and site",
+                "more",
+                "more",
+            ),
+        )
 
     def reasons(self) -> list[Block]:
         """Return why fits are not trusted, and how often."""
         most = self.population.n_reasons.most_common(_MOST_REASONS)
         if not most:
             return []
-        rows = [[status(kind), Cell(printable(reason)), number(count, 0)] for (kind, reason), count in most]
-        heads = [Column("Status"), Column("Reason, without its names and numbers"), Column("Fits", "number")]
-        out: list[Block] = [Table(heads, rows, "Why fits are not trusted, the most frequent reasons first")]
+        out: list[Block] = [
+            Table(
+                [Column("Status"), Column("Reason, without its names and numbers"), Column("Fits", "number")],
+                [[status(kind), Cell(printable(reason)), number(count, 0)] for (kind, reason), count in most],
+                "Why fits are not trusted, the most frequent reasons first",
+            )
+        ]
         rest = sum(self.population.n_reasons.values()) - sum(count for _, count in most)
         return [*out, Text(f"{counted(rest, 'other')} with rarer reasons.", "soft")] if rest else out
 
@@ -765,8 +803,14 @@ class ManyPage(FolderPage):
             Column("Scan"), Column("Status"), Column("RMS of z", "number"), Column("Largest", "number"),
             Column("Expected vertex error", "number"), *(Column(column.name) for column in listed_in),
         ]  # fmt: skip
-        caption = "The fits whose coefficients are largest: rare shapes, or fits that went astray"
-        return [Table(heads, rows, caption, sortable=True)]
+        return [
+            Table(
+                heads,
+                rows,
+                "The fits whose coefficients are largest: rare shapes, or fits that went astray",
+                sortable=True,
+            )
+        ]
 
     # Time and site
 
@@ -815,26 +859,29 @@ class ManyPage(FolderPage):
         return [picture, table if column.kind == "level" else Folded(f"By {column.name}, in numbers", [table])]
 
     def _compared(self, column: ListedColumn) -> Table:
-        def row(group: Group) -> list[Cell]:
-            shift = f"z{group.mode} {group.shift:+.2f}".replace("-", "−") if group.mode else DASH
-            return [
-                Cell(printable(group.name)),
-                number(group.count, 0),
-                number(100 * group.untrusted, 1),
-                number(group.error_mm, 2),
-                number(group.error_off_mm, 2),
-                Cell(shift, abs(group.shift)),
-                Cell("yes" if group.stands_out else ""),
-            ]
-
         heads = [
             Column(column.name), Column("Fits", "number"), Column("Not trusted, %", "number"),
             Column("Expected error, median", "number"), Column("Beside all", "number"),
             Column("Coefficient that differs most", "number"), Column("Stands out"),
         ]  # fmt: skip
-        rows = [row(group) for group in self.population.compared(column)]
-        caption = f"Fits by {column.name}; errors of the trusted ones in mm, coefficients in standard deviations"
-        return Table(heads, rows, caption, sortable=len(rows) > 1)
+        rows = [
+            [
+                Cell(printable(group.name)),
+                number(group.count, 0),
+                number(100 * group.untrusted, 1),
+                number(group.error_mm, 2),
+                number(group.error_off_mm, 2),
+                Cell(f"z{group.mode} {group.shift:+.2f}".replace("-", "−") if group.mode else DASH, abs(group.shift)),
+                Cell("yes" if group.stands_out else ""),
+            ]
+            for group in self.population.compared(column)
+        ]
+        return Table(
+            heads,
+            rows,
+            f"Fits by {column.name}; errors of the trusted ones in mm, coefficients in standard deviations",
+            sortable=len(rows) > 1,
+        )
 
     # Fits to look at
 
@@ -845,15 +892,16 @@ class ManyPage(FolderPage):
             f"Of {counted(len(self.population), 'fit')} these {len(self.fits)}: the worst of each status ({wanted}), "
             f"and the {_FARTHEST} farthest from the mean. shapespace export gives the table of all, and fits as files."
         )
-        table = sections.fits_table(self.fits, self.places, caption="Fits to look at: distances and errors in mm")
-        return [Text(text), table, *([Text(self.label_note, "soft")] if self.label_note else [])]
+        return [
+            Text(text),
+            sections.fits_table(self.fits, self.places, caption="Fits to look at: distances and errors in mm"),
+            *([Text(self.label_note, "soft")] if self.label_note else []),
+        ]
 
     def together(self) -> list[Block]:
         """Return the first coefficients of the fits that are looked at, to be turned."""
-        compared = self.of_one_model(self.model_hash())
-        return list(
-            self.page.tried(lambda: sections.scatter_to_turn(self.page, [*map(sections.coefficients_of, compared)]))
-        )
+        points = [*map(sections.coefficients_of, self.of_one_model(self.model_hash()))]
+        return [*self.page.tried(lambda: sections.scatter_to_turn(self.page, points))]
 
     def others(self, fit: SavedFit) -> FloatArray | None:
         """Return coefficients of other fits, evenly from all."""
@@ -868,9 +916,13 @@ class ManyPage(FolderPage):
         words = {"method": "Methods", "version": "Versions of shapespace", "model_name": "Models"}
         for key, heading in words.items():
             counts = self.population.origins[key].most_common(_MOST_NOTED)
-            rows.append((heading, listed([f"{printable(value)} ({count:,})" for value, count in counts]) or DASH))
-        hashes = [f"{value} ({count:,})" for value, count in self.population.models.most_common(_MOST_NOTED)]
-        rows.append(("Hashes of the models", listed(hashes) or DASH))
-        rows.append(("Not trusted", percent(1 - float(self.population.trusted.mean()))))
-        known: Sequence[tuple[str, str]] = rows
-        return [Facts(known, "Settings and versions")]
+            rows += [(heading, listed([f"{printable(value)} ({count:,})" for value, count in counts]) or DASH)]
+        rows += [
+            (
+                "Hashes of the models",
+                listed([f"{value} ({count:,})" for value, count in self.population.models.most_common(_MOST_NOTED)])
+                or DASH,
+            )
+        ]
+        rows += [("Not trusted", percent(1 - float(self.population.trusted.mean())))]
+        return [Facts(rows, "Settings and versions")]

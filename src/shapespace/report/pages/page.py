@@ -181,18 +181,21 @@ class Page:
             f"style-src {_hash(style)}; script-src {' '.join(_hash(text) for text in (early, *scripts))}; "
             "base-uri 'none'; form-action 'none'"
         )
-        template = _environment().get_template("page.html")
-        return template.render(
-            title=title,
-            lead=lead,
-            made=made,
-            sections=sections,
-            # Ours, and hashed by the policy above: these alone are not escaped.
-            policy=Markup(policy),
-            style=Markup(style),
-            early=Markup(early),
-            scripts=[Markup(text) for text in scripts],
-            payloads=[Markup(text) for text in self._payloads],
+        return (
+            _environment()
+            .get_template("page.html")
+            .render(
+                title=title,
+                lead=lead,
+                made=made,
+                sections=sections,
+                # Ours, and hashed by the policy above: these alone are not escaped.
+                policy=Markup(policy),
+                style=Markup(style),
+                early=Markup(early),
+                scripts=[Markup(text) for text in scripts],
+                payloads=[Markup(text) for text in self._payloads],
+            )
         )
 
 

@@ -34,10 +34,21 @@ from shapespace.report.blocks.blocks import (
     Table,
     Text,
     facts_of,
+    first_items,
     length,
     text_table,
 )
-from shapespace.report.blocks.wording import DASH, anchor, counted, listed, moment, percent, printable, without_folders
+from shapespace.report.blocks.wording import (
+    DASH,
+    anchor,
+    counted,
+    known,
+    listed,
+    moment,
+    percent,
+    printable,
+    without_folders,
+)
 from shapespace.report.inputs.saved_fits import Folder, has_fits
 from shapespace.report.pages.page import Chapter, Make, Page, Step, rendered
 from shapespace.report.render.scene import pack_morph, pack_morphospace
@@ -208,12 +219,17 @@ class StudyParts:
             "cell is none. Framed: right answers."
         )
         alt = f"Confusion matrix of {counted(len(classes), 'class', 'classes')}; right answers: {listed(right, 40)}"
-        rows = [
-            [name, *(f"{value:g} ({percent(value / total)})" if total else DASH for value in row)]
-            for name, row, total in zip(classes, part.counts, totals, strict=True)
-        ]
-        heads = [Column("True class"), *(Column(f"predicted {name}", "number") for name in classes)]
-        table = Table(heads, [list(map(Cell, row)) for row in rows], f"Confusion matrix: {title}")
+        table = Table(
+            [Column("True class"), *(Column(f"predicted {name}", "number") for name in classes)],
+            [
+                list(map(Cell, row))
+                for row in [
+                    [name, *(f"{value:g} ({percent(value / total)})" if total else DASH for value in row)]
+                    for name, row, total in zip(classes, part.counts, totals, strict=True)
+                ]
+            ],
+            f"Confusion matrix: {title}",
+        )
         picture = self.page.figure(figure, f"{note} {about}".strip(), alt=alt, chart=True)
         return [picture, Folded("The same as a table", [table])]
 
@@ -227,8 +243,11 @@ class StudyParts:
             "How often answers are right, against the probability stated for them: under the dashed line they are "
             "right less often than stated. Larger dots stand for more answers, which the bars count."
         )
-        alt = f"Calibration: {listed(points, 20)}{error}"
-        return [self.page.figure(figure, f"{note} {about}".strip(), alt=alt, chart=True)]
+        return [
+            self.page.figure(
+                figure, f"{note} {about}".strip(), alt=f"Calibration: {listed(points, 20)}{error}", chart=True
+            )
+        ]
 
     def learning_curve(self, part: LearningCurvePart, title: str, note: str) -> list[Block]:
         """Return the accuracy against the number of training people."""
@@ -248,11 +267,17 @@ class StudyParts:
         x, y = part.x or "x", part.y or "y"
         ends = [(one.low, one.high) for one in part.series]
         figure = figures.curve_figure(
-            [(one.label, one.x, one.y) for one in part.series], x=x, y=y,
-            bands=[None if low is None or high is None else (_known(low), _known(high)) for low, high in ends],
-            dots=[one.points for one in part.series], scales=(part.x_scale, part.y_scale), diagonal=part.diagonal,
+            [(one.label, one.x, one.y) for one in part.series],
+            x=x,
+            y=y,
+            bands=[
+                None if low is None or high is None else ([*map(known, low)], [*map(known, high)]) for low, high in ends
+            ],
+            dots=[one.points for one in part.series],
+            scales=(part.x_scale, part.y_scale),
+            diagonal=part.diagonal,
             groups=[one.group for one in part.series],
-        )  # fmt: skip
+        )
         ranges = [
             f"{one.label or y} from {one.y[0]:.3g} at {one.x[0]:g} to {one.y[-1]:.3g} at {one.x[-1]:g}"
             for one in part.series
@@ -266,8 +291,9 @@ class StudyParts:
 
     def surface_map(self, part: SurfaceMapPart, title: str, note: str) -> list[Block]:
         """Return a number for each vertex on a surface, seen from several sides."""
-        names = (part.vertices, part.faces, part.values, *([part.mask] if part.mask else []))
-        vertices, faces, values, *masks = self._arrays(part.arrays, names)
+        vertices, faces, values, *masks = self._arrays(
+            part.arrays, (part.vertices, part.faces, part.values, *([part.mask] if part.mask else []))
+        )
         mesh = self._mesh(vertices, faces)
         mask = masks[0].astype(bool) if masks else None
         if values.dtype.kind not in "iuf" or (mask is not None and masks[0].dtype.kind not in "biu"):
@@ -280,12 +306,19 @@ class StudyParts:
             figure = figures.surface_map_figure(mesh, values, title=None, **style)
         known = values[np.isfinite(values)]
         inside = "" if mask is None else f"; {percent(float(mask.mean()))} of the vertices are marked"
-        alt = (
-            f"{title}: the surface from several sides, coloured by {part.unit}, {known.min():.3g} to {known.max():.3g}"
-            f"{inside}"
-        )
         return [
-            self.drawn((figure, f"Seen from several sides{part.unit and '; '}{part.unit}.", alt), note, chart=False)
+            self.drawn(
+                (
+                    figure,
+                    f"Seen from several sides{part.unit and '; '}{part.unit}.",
+                    (
+                        f"{title}: the surface from several sides, coloured by {part.unit}, {known.min():.3g} to "
+                        f"{known.max():.3g}{inside}"
+                    ),
+                ),
+                note,
+                chart=False,
+            )
         ]
 
     def morph(self, part: MorphPart, title: str, note: str) -> list[Block]:
@@ -304,12 +337,14 @@ class StudyParts:
             if modes.shape[1:] != low.shape or weights.shape[1:] != modes.shape[:1] or len(weights) < 2:
                 raise self.parts_file.damaged("the modes and weights of a morph do not fit its shapes")
             path = modes @ turn.T, weights
-        still = self.page.still(figures.morph_figure(first, last, labels, title=None), alt)
         turning = self.page.turning(
-            "morph", pack_morph(*both, labels, path=path, variable=part.variable, ends=part.range), still,
+            "morph",
+            pack_morph(*both, labels, path=path, variable=part.variable, ends=part.range),
+            self.page.still(figures.morph_figure(first, last, labels, title=None), alt),
             f"{note or f'From {labels[0]} to {labels[1]}.'}{_times_sentence(part.times)}",
-            label=alt, still="The still shows both, from the front and from the side.",
-        )  # fmt: skip
+            label=alt,
+            still="The still shows both, from the front and from the side.",
+        )
         return [turning]
 
     def deformation(self, part: DeformationPart, title: str, note: str) -> list[Block]:
@@ -327,8 +362,9 @@ class StudyParts:
         else:
             figure = figures.landmark_vectors_figure(low, high, labels)
             about = f"Each line leads from a landmark of {labels[0]}, a dot, to its place in {labels[1]}."
-        caption = f"{note} {about}{_times_sentence(part.times)}".strip()
-        return [self.page.figure(figure, caption, alt=f"{title}: {about}")]
+        return [
+            self.page.figure(figure, f"{note} {about}{_times_sentence(part.times)}".strip(), alt=f"{title}: {about}")
+        ]
 
     def histogram(self, part: HistogramPart, title: str, note: str) -> list[Block]:
         """Return a histogram."""
@@ -340,8 +376,12 @@ class StudyParts:
         about = f"Counts: {listed(many)}." if part.y == "count" else ""
         if part.observed is not None:
             about += f" Dashed line: {part.observed_label or 'observed'}, {part.observed:.3g}."
-        alt = f"Histogram of {part.x} from {part.edges[0]:.3g} to {part.edges[-1]:.3g}. {about}"
-        return [self.drawn((figure, about, alt), note)]
+        return [
+            self.drawn(
+                (figure, about, f"Histogram of {part.x} from {part.edges[0]:.3g} to {part.edges[-1]:.3g}. {about}"),
+                note,
+            )
+        ]
 
     def morphospace(self, part: MorphospacePart, title: str, note: str) -> list[Block]:
         """Return the plane of two axes of an ordination, in which a click draws the shape at that place."""
@@ -349,12 +389,14 @@ class StudyParts:
         across, up = (space.labels[k] for k in part.first)
         groups = f" in {counted(len(part.groups), 'group')} of {part.variable}" if part.groups else ""
         alt = f"{title}: {counted(len(part.names), 'shape')}{groups} on {across} and {up}"
-        still = self.page.still(figures.morphospace_figure(space), alt, lossless=True)
         turning = self.page.turning(
-            "morphospace", pack_morphospace(space), still,
+            "morphospace",
+            pack_morphospace(space),
+            self.page.still(figures.morphospace_figure(space), alt, lossless=True),
             note or "Shapes in the plane of two axes; choose a place to draw the shape there next to the mean.",
-            label=alt, still="The still shows the mean and the shapes at the ends of both axes.",
-        )  # fmt: skip
+            label=alt,
+            still="The still shows the mean and the shapes at the ends of both axes.",
+        )
         return [turning]
 
     def _arrays(self, name: str, names: Sequence[str]) -> list[npt.NDArray[Any]]:
@@ -388,10 +430,6 @@ def _times_sentence(times: float) -> str:
     return "" if times == 1 else f" The difference is drawn {times:g} times as large as it is."
 
 
-def _known(values: Sequence[float | None]) -> list[float]:
-    return [float("nan") if value is None else value for value in values]
-
-
 def _cell(value: object, column: TableColumn, parts_file: PartsFile) -> Cell:
     """Return a cell of a table by the kind of its column."""
     where = f"{parts_file.file}: the column {column.name!r}"
@@ -405,13 +443,15 @@ def _cell(value: object, column: TableColumn, parts_file: PartsFile) -> Cell:
     number = read(float, value, where, parts_file.again)
     if column.kind == "mm":
         return length(number)
-    texts = {
-        "percent": f"{100 * number:.1f} %",
-        "p": "< 0.001" if number < 0.001 else f"{number:.3f}",
-        "count": f"{number:,.0f}",
-        "number": f"{number:,.0f}" if abs(number) >= 1000 else f"{number:.3g}",
-    }
-    return Cell(texts[column.kind], number)
+    return Cell(
+        {
+            "percent": f"{100 * number:.1f} %",
+            "p": "< 0.001" if number < 0.001 else f"{number:.3f}",
+            "count": f"{number:,.0f}",
+            "number": f"{number:,.0f}" if abs(number) >= 1000 else f"{number:.3g}",
+        }[column.kind],
+        number,
+    )
 
 
 SECTION_BYTES = 1_500_000
@@ -468,8 +508,12 @@ def study_page(folder: Folder, parts_file: PartsFile, on_step: Step | None = Non
     for heading, make in study.chapters("Results", 3):
         chapters.append(Chapter(heading, make, heading if len(heading) <= 36 else f"{heading[:35]}…"))
     chapters.append(Chapter("Settings, versions and hashes", study.settings, "Settings"))
-    title = study.head["title"] or f"{parts_file.title} in {name}"
-    return page.html(title, lead, f"Made by shapespace {__version__} from the files in {name}.", chapters)
+    return page.html(
+        (study.head["title"] or f"{parts_file.title} in {name}"),
+        lead,
+        f"Made by shapespace {__version__} from the files in {name}.",
+        chapters,
+    )
 
 
 def study_section(page: Page, folder: Folder, parts_file: PartsFile = STUDY) -> list[Block]:
@@ -572,28 +616,31 @@ class _Study:
         self.folder = Folder(folder.root, parts_file.again)
         self.kinds = StudyParts(page, self.folder, parts_file)
         self.content = content
-        texts = {key: content.get(key) for key in ("title", "version", "created")}
-        self.head = {key: text if isinstance(text, str) else "" for key, text in texts.items()}
+        self.head = {
+            key: text if isinstance(text, str) else ""
+            for key, text in {key: content.get(key) for key in ("title", "version", "created")}.items()
+        }
 
     def _read(self, key: str, kind: type[_T]) -> _T:
         return read(kind, self.content.get(key), f"{self.parts_file.file}: {key}", self.parts_file.again)
 
     def summary(self) -> list[Block]:
         """Return its sentences, what it aimed at beside what it reached, and who was left out."""
-        out: list[Block] = []
-        if self.content.get("summary"):
-            out += self.page.tried(self.sentences)
-        if self.content.get("targets"):
-            out += self.page.tried(self.targets)
-        if self.content.get("notes"):
-            out += self.page.tried(self.notes)
-        return out
+        makers: Mapping[str, Make] = {"summary": self.sentences, "targets": self.targets, "notes": self.notes}
+        return [block for key, make in makers.items() if self.content.get(key) for block in self.page.tried(make)]
 
     def notes(self) -> Notice:
         """Return what should be known of it, such as who was left out."""
-        notes = self._read("notes", tuple[str, ...])
-        rest = [f"{len(notes) - _MOST_NOTES} more, in {self.parts_file.file}."] if len(notes) > _MOST_NOTES else []
-        return Notice("To be known", [*map(without_folders, notes[:_MOST_NOTES]), *rest])
+        return Notice(
+            "To be known",
+            first_items(
+                [*map(without_folders, self._read("notes", tuple[str, ...]))],
+                _MOST_NOTES,
+                f"in {self.parts_file.file}",
+                "more",
+                "more",
+            ),
+        )
 
     def sentences(self) -> list[Block]:
         """Return its sentences."""
@@ -716,9 +763,16 @@ class _Study:
     def hashes(self) -> Folded:
         """Return the hashes of the models that took part."""
         hashes = self._read("model_hashes", tuple[str, ...])
-        rows = [[str(k), one] for k, one in enumerate(hashes[:MOST_ROWS], 1)]
-        table = text_table(("Model", "Hash"), rows, "Content hashes of the models")
-        return Folded(f"Content hashes (SHA-256) of {counted(len(hashes), 'model')}", [table])
+        return Folded(
+            f"Content hashes (SHA-256) of {counted(len(hashes), 'model')}",
+            [
+                text_table(
+                    ("Model", "Hash"),
+                    [[str(k), one] for k, one in enumerate(hashes[:MOST_ROWS], 1)],
+                    "Content hashes of the models",
+                )
+            ],
+        )
 
 
 def _title(part: object) -> str:

@@ -92,8 +92,9 @@ def correspondence_strip(
         area.insert(0, Layer(Mesh(np.nan_to_num(vertices), faces[around]), FOLD_COLOUR))
     framed = np.concatenate([mean.vertices, drawn_surface.vertices])
     camera = Camera.framing(framed, aspect=panel[0] / panel[1], margin=0.02)
-    pictures = [render(*layer_group, camera=camera, size=panel) for layer_group in (*layers, area)]
-    return encoded(np.concatenate(pictures, axis=1))
+    return encoded(
+        np.concatenate([render(*layer_group, camera=camera, size=panel) for layer_group in (*layers, area)], axis=1)
+    )
 
 
 def _at_vertices(values: FloatArray, faces: IntArray, vertices: int) -> FloatArray:
