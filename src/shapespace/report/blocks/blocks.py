@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias, TypeVar
 
@@ -12,7 +12,10 @@ from shapespace.report.blocks.wording import DASH, STATUS_WORDS, counted, isfini
 
 @dataclass(frozen=True)
 class Text:
-    """A paragraph, or a sentence of a list, perhaps after a name; its kind is a class of report.css."""
+    """A paragraph, or a sentence of a list, perhaps after a name; its kind is a class of report.css.
+
+    Nothing is shown of an empty text, and of notes, a notice and a folded part without content.
+    """
 
     text: str
     kind: Literal["", "soft", "notice", "broken"] = ""
@@ -254,9 +257,8 @@ _Item = TypeVar("_Item")
 
 def status(value: str) -> Cell:
     """Return a cell with a status in words and its colour, sorted from bad to good."""
-    known = list(STATUS_WORDS)
     kind = value if value in STATUS_WORDS else "failed"
-    return Cell(STATUS_WORDS.get(value, value), float(len(known) - known.index(kind)), kind)
+    return Cell(STATUS_WORDS.get(value, value), float(len(STATUS_WORDS) - [*STATUS_WORDS].index(kind)), kind)
 
 
 def first_items(
@@ -268,8 +270,8 @@ def first_items(
 
 def no_picture(count: int, noun: str) -> Text:
     """Return a sentence on those of which a gallery has no card."""
-    others = counted(count, f"other {noun}")
-    return Text(f"{others} have no picture here, so that this file stays below 8 MB; the table has them all.")
+    others = f"{counted(count, f'other {noun}')} have no picture here"
+    return Text(f"{others}, so that this file stays below 8 MB; the table has them all." if count else "")
 
 
 def number(value: float, digits: int = 2) -> Cell:
@@ -280,6 +282,12 @@ def number(value: float, digits: int = 2) -> Cell:
 def length(value: float) -> Cell:
     """Return a cell with a length in mm, without the unit, which the column's head gives."""
     return Cell(mm(value).removesuffix(" mm"), value)
+
+
+def table_of(items: Sequence[_Item], columns: Sequence[tuple[Column, Callable[[_Item], Cell]]], caption: str) -> Table:
+    """Return a table that sorts, with a row for each item and cells that the columns make of it."""
+    rows = [[make(item) for _, make in columns] for item in items]
+    return Table([column for column, _ in columns], rows, caption, sortable=len(rows) > 1)
 
 
 def text_table(heads: Sequence[str], rows: Sequence[Sequence[str]], caption: str) -> Table:

@@ -49,7 +49,7 @@ from shapespace.report.blocks.wording import (
     words,
 )
 from shapespace.report.inputs.saved_fits import Direction, Measure, SavedFit
-from shapespace.report.inputs.staged_fit import REGIONS, StagedFit, measured_mm, nice_ceiling
+from shapespace.report.inputs.staged_fit import REGIONS, StagedFit, measured_mm
 from shapespace.report.pages.page import Page
 from shapespace.report.render import thumbnails
 from shapespace.report.render.scene import pack_fit, pack_model, pack_scatter, pack_surfaces
@@ -86,7 +86,7 @@ def in_columns(*pictures: Block) -> Block:
     tall = np.array([_height(picture) for picture in pictures])
     right = np.array([(0, *rest) for rest in product((0, 1), repeat=len(pictures) - 1)], dtype=bool)
     best = right[np.abs(right @ tall - (~right) @ tall).argmin()]
-    sides = [[picture for picture, there in zip(pictures, best, strict=True) if there == side] for side in (0, 1)]
+    sides = [[picture for picture, is_right in zip(pictures, best, strict=True) if is_right == k] for k in (0, 1)]
     return Group("columns", [Group("column", side) for side in sides])
 
 
@@ -209,9 +209,10 @@ def fit_in_full(
         return [Text("Its pictures would make this file larger than 8 MB, so they are left out.", "soft")]
     turning = page.tried(lambda: fit_to_turn(page, fit))
     pictures = fit_pictures(page, fit, population, of_paper=of_paper)
-    heading = "More pictures: stages, both ways of distance, regions, thresholds, iterations, coefficients"
-    if fit.regions is None:
-        heading = "More pictures: both ways of distance, thresholds, coefficients"
+    stages, iterations = ("", "") if fit.regions is None else ("stages, ", "iterations, ")
+    heading = (
+        f"More pictures: {stages}both ways of distance, {stages and 'regions, '}thresholds, {iterations}coefficients"
+    )
     return [*turning, Folded(heading, [pictures]) if folded else pictures]
 
 
@@ -289,21 +290,21 @@ def fit_pictures(page: Page, fit: StagedFit, population: FloatArray | None, *, o
         "coefficients_figure": f"Coefficients of {fit.label}: " + ", ".join(f"{value:.1f}" for value in fit.z[:10]),
     }
 
-    if fit.regions is None:
-        alts = {name: alt for name, alt in alts.items() if name not in _OF_STAGES}
-
     def picture(name: str, alt: str) -> Figure:
-        more = {"population": population} if name == "coefficients_figure" else {}
-        drawing = getattr(figures, name)(fit, **more)
         return page.figure(
-            drawing,
+            getattr(figures, name)(fit, **({"population": population} if name == "coefficients_figure" else {})),
             ((_OF_PAPER.get(name, "") if of_paper else "") + _CAPTIONS[name]),
             alt=alt,
             chart=name in ("history_figure", "coefficients_figure"),
         )
 
     return in_columns(
-        *(block for name, alt in alts.items() for block in page.tried(lambda name=name, alt=alt: picture(name, alt)))
+        *(
+            block
+            for name, alt in alts.items()
+            if fit.regions is not None or name not in _OF_STAGES
+            for block in page.tried(lambda name=name, alt=alt: picture(name, alt))
+        )
     )
 
 
@@ -335,18 +336,25 @@ def region_shares(fit: StagedFit) -> str:
     """Return the share of each region in words, or that they are unknown if the stages were not saved."""
     if fit.regions is None:
         return "not saved"
-    counts = np.bincount(fit.regions, minlength=len(REGIONS)) / max(len(fit.regions), 1)
-    return listed([f"{name} {percent(float(share))}" for name, share in zip(REGIONS, counts, strict=True)])
+    return listed(
+        [
+            f"{name} {percent(float(share))}"
+            for name, share in zip(
+                REGIONS, (np.bincount(fit.regions, minlength=len(REGIONS)) / max(len(fit.regions), 1)), strict=True
+            )
+        ]
+    )
 
 
 def fit_facts(fit: SavedFit) -> list[Block]:
     """Return status, reason, distances and notes of one fit, and its evidence folded away."""
-    out: list[Block] = [Text(fit.reason, name=status(fit.status)), Text(distances_text(fit))]
-    if fit.record.notes:
-        out.append(Notes(fit.record.notes))
-    if fit.record.evidence:
-        out.append(Folded("Evidence for the verdict", [evidence_facts(fit.record.evidence, f"Evidence of {fit.name}")]))
-    return out
+    evidence = fit.record.evidence
+    return [
+        Text(fit.reason, name=status(fit.status)),
+        Text(distances_text(fit)),
+        Notes(fit.record.notes),
+        Folded("Evidence for the verdict", [evidence_facts(evidence, f"Evidence of {fit.name}")] if evidence else []),
+    ]
 
 
 def distances_text(fit: SavedFit) -> str:
@@ -367,11 +375,6 @@ def _over(share: float | None, of: str) -> str:
 # Many fits
 
 
-def common_limit_mm(fits: Sequence[StagedFit]) -> float:
-    """Return the end of the scale that strips of these fits share: that of the usual fit."""
-    return nice_ceiling(float(np.median([fit.scale_mm for fit in fits]))) if fits else 1.0
-
-
 def usable(items: Sequence[_From], load: Callable[[_From], _To]) -> tuple[list[_To], list[str]]:
     """Return what `load` gives, and one sentence for each of the items that it refuses."""
     usable_fits: list[_To] = []
@@ -384,7 +387,7 @@ def usable(items: Sequence[_From], load: Callable[[_From], _To]) -> tuple[list[_
     return usable_fits, problems
 
 
-# figures.Coefficients
+# Coefficients
 
 
 def coefficients_of(fit: SavedFit) -> figures.Coefficients:
@@ -544,13 +547,12 @@ def fits_table(fits: Sequence[SavedFit], places: Mapping[str, str], *, caption: 
         places: where in the page a fit is shown, by its name.
         caption: of the table.
     """
-    texts: list[tuple[str, _Make]] = [
-        ("Scan", lambda fit: Cell(fit.name, anchor=places.get(fit.name))),
-        ("Label", lambda fit: Cell(fit.label if fit.label != fit.name else "")),
-        ("Status", lambda fit: status(fit.status)),
+    columns: list[tuple[Column, _Make]] = [
+        (Column("Scan"), lambda fit: Cell(fit.name, anchor=places.get(fit.name))),
+        (Column("Label"), lambda fit: Cell(fit.label if fit.label != fit.name else "")),
+        (Column("Status"), lambda fit: status(fit.status)),
+        *((Column(head, "number"), make) for head, make in _NUMBERS),
     ]
-    columns = [(Column(head), make) for head, make in texts]
-    columns += [(Column(head, "number"), make) for head, make in _NUMBERS]
     nonempty = [
         (column, cells)
         for column, cells in [(column, [make(fit) for fit in fits]) for column, make in columns]
@@ -647,8 +649,12 @@ def score_tables(scores: Mapping[str, Any], *, many: str, single: str) -> list[B
                 many,
             )
         )
-    singles = {key: _mapping(value) or {key: value} for key, value in scores.items() if key not in by_thing}
-    rest = [row(key, [value]) for values in singles.values() for key, value in values.items()]
+    rest = [
+        row(name, [single_value])
+        for key, value in scores.items()
+        if key not in by_thing
+        for name, single_value in (_mapping(value) or {key: value}).items()
+    ]
     if rest:
         out.append(Table([Column("Score"), Column("Value", "number")], rest, single))
     return out or [Text("There are no scores.")]
@@ -678,8 +684,10 @@ def settings_blocks(configs: Sequence[Mapping[str, Any]], first: Sequence[tuple[
         if any(texts):
             rows.append((name, "; of others: ".join(texts[:4])))
     out: list[Block] = [Facts(rows, _CAPTION)]
-    parts = dict.fromkeys(str(config.get("method")) for config in configs)
-    wanted = [*parts, *(["dense_settings"] if any(config.get("dense") is True for config in configs) else [])]
+    wanted = [
+        *dict.fromkeys(str(config.get("method")) for config in configs),
+        *(["dense_settings"] if any(config.get("dense") is True for config in configs) else []),
+    ]
     for key in wanted:
         mappings = [_mapping(config.get(key)) for config in configs]
         values = next((value for value in mappings if value), _NOTHING)
@@ -693,25 +701,27 @@ def settings_blocks(configs: Sequence[Mapping[str, Any]], first: Sequence[tuple[
 
 def described(cls: type) -> dict[str, str]:
     """Return what each argument of a class is, from its docstring."""
-    args = (inspect.getdoc(cls) or "").partition("Args:\n")[2].partition("\n\n")[0]
-    entries = re.findall(r"^    (\w+): (.*(?:\n        .*)*)", args, re.MULTILINE)
+    entries = re.findall(
+        r"^    (\w+): (.*(?:\n        .*)*)",
+        (inspect.getdoc(cls) or "").partition("Args:\n")[2].partition("\n\n")[0],
+        re.MULTILINE,
+    )
     return {name: " ".join(text.split()).strip(" ,;") for name, text in entries}
 
 
 def _numbers(key: str, values: Mapping[str, Any], part_name: str) -> list[Block]:
     """Return the settings of one part of the fit as tables of words."""
     out: list[Block] = []
-    steps = [_mapping(step) for step in _list(values.get("levels"))]
     rows: list[list[str]] = [
-        ["all" if step.get(name) is None else _level(name, step[name]) for name in _LEVEL] for step in steps
+        ["all" if step.get(name) is None else _level(name, step[name]) for name in _LEVEL]
+        for step in map(_mapping, _list(values.get("levels")))
     ]
     if rows:
         out.append(text_table(_LEVEL_HEADS, rows, "The steps from coarse to fine"))
     cells: list[list[str]] = []
     for name, value in _flat(key, values):
         owner, _, own = name.rpartition(".")
-        meaning = described(_OF[owner]).get(own, "") if owner in _OF else ""
-        cells.append([words(own), plain(value), meaning or DASH])
+        cells.append([words(own), plain(value), (described(_OF[owner]).get(own, "") if owner in _OF else "") or DASH])
     return [*out, text_table(("Setting", "Value", "What it is"), cells, f"Settings of {part_name}")]
 
 

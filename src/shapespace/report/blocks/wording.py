@@ -96,8 +96,9 @@ def plain(value: object) -> str:
 def setting(value: object) -> str:
     """Return a setting as text; of a setting with parts, the plain ones."""
     if isinstance(value, Mapping):
-        inner = cast(Mapping[str, Any], value)
-        return plain({key: item for key, item in inner.items() if not isinstance(item, dict | list)})
+        return plain(
+            {key: item for key, item in cast(Mapping[str, Any], value).items() if not isinstance(item, dict | list)}
+        )
     return plain(value)
 
 

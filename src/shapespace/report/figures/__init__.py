@@ -18,8 +18,12 @@ from shapespace.lazy import lazy_names
 if TYPE_CHECKING:
     from shapespace.report.figures.analysis_figures import (
         SIDE_DEG,
+        calibration_figure,
         checkerboard_figure,
+        confusion_figure,
+        curve_figure,
         histogram_figure,
+        learning_curve_figure,
         missing_figure,
         morph_figure,
         movement_figure,
@@ -70,12 +74,6 @@ if TYPE_CHECKING:
         levels_figure,
         over_time_figure,
         scatter_matrix,
-    )
-    from shapespace.report.figures.recognition_figures import (
-        calibration_figure,
-        confusion_figure,
-        curve_figure,
-        learning_curve_figure,
     )
     from shapespace.report.inputs.orientation import oriented
     from shapespace.report.inputs.staged_fit import StagedFit
@@ -142,8 +140,12 @@ __getattr__, __dir__ = lazy_names(
     {
         "report.figures.analysis_figures": (
             "SIDE_DEG",
+            "calibration_figure",
             "checkerboard_figure",
+            "confusion_figure",
+            "curve_figure",
             "histogram_figure",
+            "learning_curve_figure",
             "missing_figure",
             "morph_figure",
             "movement_figure",
@@ -194,12 +196,6 @@ __getattr__, __dir__ = lazy_names(
             "levels_figure",
             "over_time_figure",
             "scatter_matrix",
-        ),
-        "report.figures.recognition_figures": (
-            "calibration_figure",
-            "confusion_figure",
-            "curve_figure",
-            "learning_curve_figure",
         ),
         "report.inputs.orientation": ("oriented",),
         "report.inputs.staged_fit": ("StagedFit",),

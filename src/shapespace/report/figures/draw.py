@@ -222,8 +222,10 @@ def grid(
         raise InputError(f"{plain(title or 'The figure')}: there is nothing to draw.")
     layout = LAYOUT.get()
     columns = max(len(row.panels) for row in rows)
-    widest = max(row.panels[0].shape[1] for row in rows) / layout.panel_scale
-    total_w = max(layout.row_width, int(columns * widest + (columns - 1) * _GAP))
+    total_w = max(
+        layout.row_width,
+        int(columns * (max(row.panels[0].shape[1] for row in rows) / layout.panel_scale) + (columns - 1) * _GAP),
+    )
     texts: list[tuple[float, float, str, dict[str, Any]]] = []
     pictures: list[tuple[float, float, Image]] = []
     y = 6.0
@@ -316,10 +318,9 @@ def bar_height() -> float:
 
 def colour_bar(figure: Figure, scale: Scale, top: float, total_h: float) -> None:
     """Draw a colour bar at a height in pixels from the top of a figure that is `total_h` pixels high."""
-    axes = figure.add_axes((0.18, 1 - (top + 18) / total_h, 0.64, 18 / total_h))
     bar = figure.colorbar(
         ScalarMappable(Normalize(scale.low, scale.high), ListedColormap(scale.colours)),
-        cax=axes,
+        cax=figure.add_axes((0.18, 1 - (top + 18) / total_h, 0.64, 18 / total_h)),
         orientation="horizontal",
         extend={"low": "min", "high": "max", "both": "both"}.get(scale.open_ends, "neither"),
         extendfrac=0.04,
@@ -333,10 +334,7 @@ def colour_bar(figure: Figure, scale: Scale, top: float, total_h: float) -> None
 
 def without_empty_rows(panels: Sequence[Image]) -> list[Image]:
     """Return images of one row without the white rows of pixels at the top and bottom of all of them."""
-    used = np.zeros(panels[0].shape[0], dtype=bool)
-    for panel in panels:
-        used |= (panel < 255).any(axis=(1, 2))
-    used_rows = np.flatnonzero(used)
+    used_rows = np.flatnonzero(np.any([(panel < 255).any(axis=(1, 2)) for panel in panels], axis=0))
     if not len(used_rows):
         return list(panels)
     return [panel[max(used_rows[0] - _EDGE, 0) : used_rows[-1] + 1 + _EDGE] for panel in panels]
@@ -360,14 +358,19 @@ def charts(title: str, heights: Sequence[float], *, note: str = "", columns: int
     figure = DisplayedFigure(figsize=(width / DPI, total), dpi=DPI, facecolor="white")
     places = figure.add_gridspec(len(heights), columns, height_ratios=list(heights))
     axes = [figure.add_subplot(places[r, c]) for r in range(len(heights)) for c in range(columns)]
-    start = total * DPI - height_of(note_lines, small) - 2
     for text, first, size, text_style in (
         (wrapped, 6.0, TITLE, {"color": INK, "fontweight": "bold"}),
-        (note_lines, start, small, {"color": GREY}),
+        (note_lines, (total * DPI - height_of(note_lines, small) - 2), small, {"color": GREY}),
     ):
         for k, line in enumerate(text.split("\n")):
-            up = 1 - (first + baseline(k, size)) / DPI / total
-            figure.text(_EDGE / width, up, escaped(line), in_layout=False, fontsize=size, **cast(Any, text_style))
+            figure.text(
+                _EDGE / width,
+                (1 - (first + baseline(k, size)) / DPI / total),
+                escaped(line),
+                in_layout=False,
+                fontsize=size,
+                **cast(Any, text_style),
+            )
     # Where the plots may stand, for `finish`.
     cast(Any, figure).plots_within = (0.0, bottom / total, 1.0, 1 - top / total)
     return figure, axes
@@ -409,8 +412,9 @@ def style(axes: Axes) -> None:
 
 def legend(axes: Axes, **options: Any) -> None:
     """Add the legend of a plot."""
-    style = {"fontsize": type_size(SMALL), "labelcolor": INK, "framealpha": 0.9, "handlelength": 1.5}
-    cast(Any, axes).legend(**{**style, **options}).get_frame().set_linewidth(0.0)
+    cast(Any, axes).legend(
+        **{"fontsize": type_size(SMALL), "labelcolor": INK, "framealpha": 0.9, "handlelength": 1.5, **options}
+    ).get_frame().set_linewidth(0.0)
 
 
 def legend_above(axes: Axes, room: float, **options: Any) -> None:
@@ -433,8 +437,12 @@ def encode_webp(figure: Figure, *, lossless: bool = False) -> Still:
     with without_glyph_warnings():
         canvas = FigureCanvasAgg(figure)
         canvas.draw()
-    pixels = np.asarray(canvas.buffer_rgba())[:, :, :3]
-    return encoded(pixels, lossless=lossless, quality=20 if lossless else 78, effort=1 if lossless else 3)
+    return encoded(
+        np.asarray(canvas.buffer_rgba())[:, :, :3],
+        lossless=lossless,
+        quality=20 if lossless else 78,
+        effort=1 if lossless else 3,
+    )
 
 
 @lru_cache(maxsize=1)
@@ -528,8 +536,13 @@ def plain_decades(axis: Axis) -> None:
 def empty_chart(title: str, text: str) -> Figure:
     """Return a chart that says why there is nothing in it."""
     figure, axes = chart(title, height=1.2)
-    style = {"ha": "center", "va": "center", "fontsize": type_size(TEXT), "color": GREY}
-    axes.text(0.5, 0.5, text, transform=axes.transAxes, **cast(Any, style))
+    axes.text(
+        0.5,
+        0.5,
+        text,
+        transform=axes.transAxes,
+        **cast(Any, {"ha": "center", "va": "center", "fontsize": type_size(TEXT), "color": GREY}),
+    )
     axes.set_axis_off()
     return finish(figure)
 

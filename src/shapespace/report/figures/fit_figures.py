@@ -284,7 +284,6 @@ def history_figure(fit: StagedFit, *, title: str = "") -> Figure:
     for number, colour, name in ((1, BACKWARD, "phase 1: pose"), (2, FORWARD, "phase 2: pose and shape")):
         iterations = np.flatnonzero((phase == number) & usable)
         if len(iterations):
-            end_label = f"{name}, ends at {mm(float(rms[iterations[-1]]))}"
             axes.plot(
                 iterations,
                 rms[iterations],
@@ -292,7 +291,7 @@ def history_figure(fit: StagedFit, *, title: str = "") -> Figure:
                 lw=2,
                 marker="o",
                 ms=4 if len(rms) < 80 else 2,
-                label=end_label,
+                label=f"{name}, ends at {mm(float(rms[iterations[-1]]))}",
             )
     change = np.flatnonzero(np.diff(phase) > 0)
     if len(change):
@@ -357,8 +356,7 @@ def coefficients_figure(fit: StagedFit, population: FloatArray | None = None, *,
             zorder=3, label="95 % interval",
         )  # fmt: skip
     axes.axhline(0, color=INK, lw=0.8)
-    extent = np.abs(z) + np.where(known, 1.96 * np.nan_to_num(deviation), 0)
-    limit = max(3.0, 1.1 * float(extent.max()))
+    limit = max(3.0, 1.1 * float((np.abs(z) + np.where(known, 1.96 * np.nan_to_num(deviation), 0)).max()))
     axes.set(ylim=(-limit, 1.45 * limit), ylabel="z = b / sd")
     axes.set_xlabel("mode" if n_shown == count else f"mode (first {n_shown} of {count})")
     number_axis(axes, n_shown)
@@ -557,9 +555,10 @@ def portrait_figure(
         camera_view = view(surroundings(fit), 4, yaw_deg=yaw_deg)
         final, distances = fit.surfaces["final"], fit.model_to_scan_mm["final"]
         scan, over, model = Layer(fit.scan, SCAN_COLOUR), scan_over(fit.scan), Layer(final, MODEL_COLOUR)
-        mapped = distance_layer(final, distances, top, signed=signed)
         panels = render_series(
-            [[scan], [model], [over, model], [mapped]], camera=camera_view.camera, size=camera_view.size
+            [[scan], [model], [over, model], [distance_layer(final, distances, top, signed=signed)]],
+            camera=camera_view.camera,
+            size=camera_view.size,
         )
         captions = ["scan", "model, fitted", "both", "distance"] if k == 0 else []
         name = short(labels[k] if labels else fit.label, 60)

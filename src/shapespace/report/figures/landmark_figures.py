@@ -140,13 +140,15 @@ def landmark_map_figure(
     figure, plots, placed = _in_views(points[None], "", bar_height() / DPI)
     inside: BoolArray = np.ones(len(points), np.bool_) if mask is None else mask
     shades = np.tile(np.array(UNKNOWN_COLOUR), (len(points), 1))
-    place_in_scale = np.clip((values[known] - start) / (end - start), 0, 1) * (len(colours) - 1)
-    shades[known] = colours[place_in_scale.round().astype(int)]
+    shades[known] = colours[
+        (np.clip((values[known] - start) / (end - start), 0, 1) * (len(colours) - 1)).round().astype(int)
+    ]
     shades[~inside] = _PALE + (1 - _PALE) * shades[~inside]
     for axes, (place,) in zip(plots, placed, strict=True):
         draw_links(axes, place, _GRID)
-        sizes = np.where(inside, 70.0, 22.0)
-        axes.scatter(*place.T, s=sizes, facecolors=shades, edgecolors=INK, linewidths=0.8, zorder=3)
+        axes.scatter(
+            *place.T, s=np.where(inside, 70.0, 22.0), facecolors=shades, edgecolors=INK, linewidths=0.8, zorder=3
+        )
     finish(figure, w_pad=0.6)
     height = float(figure.get_figheight()) * DPI
     colour_bar(figure, Scale(short(unit, 60), colours, start, end), height - bar_height(), height)
@@ -182,9 +184,11 @@ def _in_views(
 
     Planar landmarks have one view, with a label. There are `below` free inches under the panels.
     """
-    named = [(one.name, view_rotation(one)) for one in current_orientation().views]
-    is_planar = np.ptp(shapes[:, :, 2]) == 0
-    views = [(label, _first_rotation())] if is_planar else named[:4] or list(_THREE_SIDES)
+    views = (
+        [(label, _first_rotation())]
+        if (np.ptp(shapes[:, :, 2]) == 0)
+        else [(one.name, view_rotation(one)) for one in current_orientation().views][:4] or list(_THREE_SIDES)
+    )
     placed = [(shapes @ turn.T)[:, :, :2] for _, turn in views]
     placed = [one - (one.max(axis=(0, 1)) + one.min(axis=(0, 1))) / 2 for one in placed]
     figure, plots = _panels([name for name, _ in views], np.concatenate(placed).reshape(-1, 2), below, note)
@@ -219,8 +223,12 @@ def _panels(names: list[str], points: FloatArray, below: float = 0.0, note: str 
     width = (layout.chart_width if columns == 1 else layout.row_width) / columns / DPI
     aspect = float(high[1] - low[1] + 2 * room) / float(high[0] - low[0] + 2 * room)
     room_of_titles = 1.6 * type_size(TEXT) / 72 * any(names)
-    height = min(width * aspect, _MOST_INCHES * layout.scale) + room_of_titles
-    figure, plots = charts("", [(height + below) / layout.scale], note=note, columns=columns)
+    figure, plots = charts(
+        "",
+        [((min(width * aspect, _MOST_INCHES * layout.scale) + room_of_titles) + below) / layout.scale],
+        note=note,
+        columns=columns,
+    )
     left, bottom, right, top = cast(Any, figure).plots_within
     # Titles have their own room: `tight_layout` counts them only where equal scales leave none above a panel.
     inches = figure.get_figheight()
@@ -336,8 +344,12 @@ def _with_grid(space: Morphospace) -> Morphospace:
     mean, axes = space.arrays["mean"], space.arrays["shape_axes"]
     lines = grid_lines(mean[:, :2])[:, ::_SPARSE]
     points = np.pad(lines.reshape(-1, 2), ((0, 0), (0, 1)))
-    moved = [ThinPlateSpline.fit(mean[:, :2], axis).apply(points[:, :2]) for axis in axes]
-    with_lines = {"mean": np.vstack([mean, points]), "shape_axes": np.concatenate([axes, np.stack(moved)], axis=1)}
+    with_lines = {
+        "mean": np.vstack([mean, points]),
+        "shape_axes": np.concatenate(
+            [axes, np.stack([ThinPlateSpline.fit(mean[:, :2], axis).apply(points[:, :2]) for axis in axes])], axis=1
+        ),
+    }
     return replace(space, arrays={**space.arrays, **with_lines}, grid=lines.shape[:2])
 
 
@@ -353,8 +365,10 @@ def ellipse(points: FloatArray, radius: float) -> FloatArray:
     """Return points (m, 2) of the ellipse of this Mahalanobis radius about the mean of points (n, 2)."""
     turns = np.linspace(0, 2 * np.pi, 73)
     values, vectors = np.linalg.eigh(np.cov(points.T))
-    spread = vectors * np.sqrt(np.maximum(values, 0))
-    return points.mean(axis=0) + radius * np.stack([np.cos(turns), np.sin(turns)], axis=1) @ spread.T
+    return (
+        points.mean(axis=0)
+        + radius * np.stack([np.cos(turns), np.sin(turns)], axis=1) @ (vectors * np.sqrt(np.maximum(values, 0))).T
+    )
 
 
 def morphospace_figure(space: Morphospace) -> Figure:
@@ -362,8 +376,14 @@ def morphospace_figure(space: Morphospace) -> Figure:
     across, up = space.part.first
     figure, (axes, row) = charts("", [4.3, 1.3])
     plane, nodes = (space.arrays[name][:, [across, up]] for name in ("scores", "nodes"))
-    tree = np.vstack([plane, nodes])[space.arrays["edges"].astype(np.intp)]
-    axes.add_collection(LineCollection(list(tree), colors=GREY, linewidths=0.8, zorder=1.5))
+    axes.add_collection(
+        LineCollection(
+            list(np.vstack([plane, nodes])[space.arrays["edges"].astype(np.intp)]),
+            colors=GREY,
+            linewidths=0.8,
+            zorder=1.5,
+        )
+    )
     axes.axhline(0, color=RULE, lw=1.6, zorder=1.0)
     axes.axvline(0, color=RULE, lw=1.6, zorder=1.0)
     for g, radius in enumerate(space.radii):
@@ -411,8 +431,14 @@ def _draw_shapes(row: Axes, space: Morphospace) -> None:
             panel.imshow(render(Layer(Mesh(vertices, space.faces)), camera=seen.camera, size=seen.size))
             continue
         landmarks = vertices[: space.n_landmarks, :2]
-        lines = vertices[space.n_landmarks :, :2].reshape(*space.grid, 2)
-        panel.add_collection(LineCollection(list(lines), colors=GREY, alpha=0.5, linewidths=type_size(0.5)))
+        panel.add_collection(
+            LineCollection(
+                list(vertices[space.n_landmarks :, :2].reshape(*space.grid, 2)),
+                colors=GREY,
+                alpha=0.5,
+                linewidths=type_size(0.5),
+            )
+        )
         draw_links(panel, landmarks, INK, type_size(0.9))
         panel.scatter(*landmarks.T, s=type_size(6), color=INK, linewidths=0, zorder=3)
         panel.set(xlim=(low[0] - room, high[0] + room), ylim=(low[1] - room, high[1] + room), aspect="equal")

@@ -114,8 +114,9 @@ def modes_figure(model: ShapeModel, modes: int = 5, deviations: float = 3.0, *, 
             )
             for sign in (-1, 1)
         )
-        mapped = Layer(mean, scalars=length, colormap=SEQUENTIAL, vmax=top)
-        displacement = render(mapped, camera=camera_view.camera, size=camera_view.size)
+        displacement = render(
+            Layer(mean, scalars=length, colormap=SEQUENTIAL, vmax=top), camera=camera_view.camera, size=camera_view.size
+        )
         share = float(model.stddev[k] ** 2 / model.total_variance)
         rows.append(
             Row(
@@ -183,10 +184,9 @@ def mode_animation(
         raise InputError(f"An animation needs 4 frames or more that stand for a while, not {frames}.")
     move = mode_displacement(model, mode, 1.0)
     mean = model.mesh()
-    extremes = np.concatenate([mean.vertices + sign * deviations * move for sign in (-1, 1)])
-    camera_view = view(extremes, 1, yaw_deg=yaw_deg, width=width)
-    half = frames // 2
-    swings = deviations * np.sin(np.linspace(-np.pi / 2, np.pi / 2, half + 1))
+    camera_view = view(
+        np.concatenate([mean.vertices + sign * deviations * move for sign in (-1, 1)]), 1, yaw_deg=yaw_deg, width=width
+    )
     forth = [
         _labelled(
             render(
@@ -196,7 +196,7 @@ def mode_animation(
             float(z),
             deviations,
         )
-        for z in swings
+        for z in (deviations * np.sin(np.linspace(-np.pi / 2, np.pi / 2, (frames // 2) + 1)))
     ]
     cycle = forth + forth[-2:0:-1]
     stream = io.BytesIO()
@@ -341,10 +341,16 @@ def _of(key: str, quality: Quality) -> dict[str, _Line]:
 def _draw_lines(axes: Axes, key: str, name: str, lines: Mapping[str, _Line], colour: str, band: str) -> None:
     scale = 100.0 if key == "compactness" else 1.0
     for kind, (modes, mean, low, high) in lines.items():
-        label = ", ".join(part for part in (name, kind) if part)
-        style = "--" if kind == "vertices" else "-"
-        dots = "o" if len(modes) < 40 else ""
-        axes.plot(modes, scale * mean, color=colour, lw=2, ls=style, marker=dots, ms=4, label=label or None)
+        axes.plot(
+            modes,
+            scale * mean,
+            color=colour,
+            lw=2,
+            ls=("--" if kind == "vertices" else "-"),
+            marker=("o" if len(modes) < 40 else ""),
+            ms=4,
+            label=", ".join(part for part in (name, kind) if part) or None,
+        )
         if low is not None and high is not None:
             axes.fill_between(modes, scale * low, scale * high, color=band, alpha=0.5, lw=0)
 

@@ -64,8 +64,16 @@ def distributions_figure(values: Mapping[str, FloatArray], trusted: Any, *, titl
         axes.set_axis_off()
     for axes, (name, distances) in zip(plots, finite.items(), strict=False):
         known = np.isfinite(distances)
-        usual = distances[known & trusted] if (known & trusted).any() else distances[known]
-        low, high = float(distances[known].min()), float(min(1.3 * np.quantile(usual, 0.99), distances[known].max()))
+        low, high = (
+            float(distances[known].min()),
+            float(
+                min(
+                    1.3
+                    * np.quantile((distances[known & trusted] if (known & trusted).any() else distances[known]), 0.99),
+                    distances[known].max(),
+                )
+            ),
+        )
         low = 0.0 if low < 0.5 * high else low
         edges = np.linspace(low if high > low else high - 1.0, high, _BINS + 1)
         parts = [np.clip(distances[known & is_group], edges[0], edges[-1]) for is_group in (trusted, ~trusted)]
@@ -197,14 +205,22 @@ def over_time_figure(
         axes.plot(middles, quantiles[1], color=INK, lw=1.8, label="median of all")
         if number == 0:
             for k, (line_name, inside) in enumerate(lines):
-                group_quantiles = _quantiles(np.where(inside, places, -1), values, len(middles))[1]
-                colour = CATEGORIES[k % len(CATEGORIES)]
-                axes.plot(middles, group_quantiles, color=colour, lw=1.3, label=escaped(short(line_name, 18)))
+                axes.plot(
+                    middles,
+                    _quantiles(np.where(inside, places, -1), values, len(middles))[1],
+                    color=CATEGORIES[k % len(CATEGORIES)],
+                    lw=1.3,
+                    label=escaped(short(line_name, 18)),
+                )
             legend_above(axes, 0.3, loc="upper left", ncols=4)
         axes.set_ylabel(_wrapped(words, 16))
     axes = plots[len(finite)]
-    share = [100 * float(untrusted[places == k].mean()) if (places == k).any() else np.nan for k in range(len(middles))]
-    axes.bar(middles, share, width=0.9 * (edges[1] - edges[0]), color=BACKWARD)
+    axes.bar(
+        middles,
+        [100 * float(untrusted[places == k].mean()) if (places == k).any() else np.nan for k in range(len(middles))],
+        width=0.9 * (edges[1] - edges[0]),
+        color=BACKWARD,
+    )
     axes.set(xlabel=escaped(short(name, 60)), ylabel="not trusted (%)")
     for axes in plots:
         axes.set_xlim(edges[0], edges[-1])
@@ -305,9 +321,8 @@ def scatter_matrix(points: Sequence[Coefficients], modes: int = 4, *, title: str
     """
     b = _stack_coefficients(points)
     n_shown = min(modes, b.shape[1])
-    heading = title or f"The first {counted(n_shown, 'coefficient')} of {counted(len(points), 'scan')}, in mm"
-    if n_shown == 1:
-        heading = title or f"The one coefficient of {counted(len(points), 'scan')}, in mm"
+    which = f"first {n_shown} coefficients" if n_shown > 1 else "one coefficient"
+    heading = title or f"The {which} of {counted(len(points), 'scan')}, in mm"
     groups = _groups(points)
     handles = _handles(groups)
     if n_shown == 1:
@@ -317,8 +332,7 @@ def scatter_matrix(points: Sequence[Coefficients], modes: int = 4, *, title: str
         if handles:
             legend(axes, handles=handles, loc="upper right", handlelength=1.0)
         return finish(figure)
-    side = 5.6 / n_shown
-    figure, plots = charts(heading, [side] * n_shown, columns=n_shown)
+    figure, plots = charts(heading, [(5.6 / n_shown)] * n_shown, columns=n_shown)
     dots = _dot_size(len(points)) * (0.8 if n_shown > 3 else 1.0)
     limits = [_limits(b[:, k]) for k in range(n_shown)]
     for r in range(n_shown):
@@ -417,9 +431,8 @@ def b_space(
     groups = _groups(scans)
     handles = _handles(groups, neutral)
     columns = _legend_columns([str(handle.get_label()) for handle in handles])
-    lines = int(np.ceil(len(handles) / columns))
     # Panels are placed by hand, since matplotlib leaves half of a 3-D plot empty.
-    foot_px = lines * _LEGEND_LINE * line_height(SMALL)
+    foot_px = int(np.ceil(len(handles) / columns)) * _LEGEND_LINE * line_height(SMALL)
     of = f"of {counted(len(scans), 'scan')}" if neutral is None else "and the lines of the expressions"
     figure, plots = charts(
         title or f"The first three coefficients {of}, from two sides", [_SPACE_INCHES + foot_px / DPI]
@@ -435,9 +448,13 @@ def b_space(
         axes = cast(Any, figure.add_axes(axes_box, projection="3d"))
         for _, marker_style, scores in groups:
             group_scans = [scans[i] for i in scores]
-            sizes = _sizes(group_scans) if neutral is not None or any(scan.intensity for scan in group_scans) else size
             axes.scatter(
-                *b[scores, :3].T, s=sizes, **marker_style, edgecolors="white", linewidths=0.5, depthshade=False
+                *b[scores, :3].T,
+                s=(_sizes(group_scans) if neutral is not None or any(scan.intensity for scan in group_scans) else size),
+                **marker_style,
+                edgecolors="white",
+                linewidths=0.5,
+                depthshade=False,
             )
             line = _line(group_scans, neutral)
             if line is not None:
@@ -482,15 +499,23 @@ def _wider_than_three(axis: Any) -> float:
     formatter = axis.get_major_formatter()
     low, high = axis.get_view_interval()
     tick_labels = formatter.format_ticks([location for location in axis.get_majorticklocs() if low <= location <= high])
-    widest = max((measured(text, SMALL - 2) for text in tick_labels), default=0.0)
-    return max(0.0, widest - measured("000", SMALL - 2)) * 72 / DPI
+    return (
+        max(0.0, max((measured(text, SMALL - 2) for text in tick_labels), default=0.0) - measured("000", SMALL - 2))
+        * 72
+        / DPI
+    )
 
 
 def _legend_columns(names: Sequence[str]) -> int:
     """Return the number of columns that a legend below a figure needs so that no entry is cut."""
     for columns in range(min(len(names), 5), 1, -1):
-        parts = np.array_split(np.array([measured(name, SMALL) for name in names]), columns)
-        if sum(float(part.max()) + _LEGEND_MARK for part in parts) < WIDTH:
+        if (
+            sum(
+                float(part.max()) + _LEGEND_MARK
+                for part in np.array_split(np.array([measured(name, SMALL) for name in names]), columns)
+            )
+            < WIDTH
+        ):
             return columns
     return 1
 
@@ -578,6 +603,6 @@ def _line(scans: Sequence[Coefficients], neutral: Coefficients | None) -> FloatA
         direction, along = -direction, -along
     # Every scan of a model has b = z * sd, so their sizes give the sd of each mode.
     size_b, size_z = (np.abs(np.stack(rows)).sum(axis=0) for rows in ([s.b for s in scans], [s.z for s in scans]))
-    stddev = np.divide(size_b, size_z, out=np.zeros_like(size_b), where=size_z > 0)
-    end_positions = np.array([min(0.0, along.min()), 1.08 * max(0.0, along.max())])
-    return neutral.b + end_positions[:, None] * (direction * stddev)
+    return neutral.b + np.array([min(0.0, along.min()), 1.08 * max(0.0, along.max())])[:, None] * (
+        direction * np.divide(size_b, size_z, out=np.zeros_like(size_b), where=size_z > 0)
+    )

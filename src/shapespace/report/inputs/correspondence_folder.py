@@ -103,8 +103,7 @@ class Corresponded:
         if self._mean.faces is None or not np.isfinite(self._mean.vertices).all():
             raise FileFormatError(f"{CorrespondenceRecord.MEAN} is no whole surface; {CORRESPOND_AGAIN}.")
         self.unread: dict[str, str] = {}
-        records = [record for file in self._record_files() if (record := self._record(file)) is not None]
-        self.records = {record.name: record for record in records}
+        self.records = {record.name: record for record in map(self._record, self._record_files()) if record is not None}
         self.turn = np.eye(3)
         self._is_upright = False
         self._population: Population | None = None
@@ -177,8 +176,11 @@ class Corresponded:
             raise FileFormatError(
                 f"{name}{CorrespondRecord.SURFACE} cannot be laid onto the mean shape; {CORRESPOND_AGAIN}."
             ) from error
-        share = None if std is None else std / (T.scale * rms_size(self._mean.vertices))
-        return PlacedSurface(np.where(is_observed[:, None], T.inverse().apply(vertices), np.nan), T, share)
+        return PlacedSurface(
+            np.where(is_observed[:, None], T.inverse().apply(vertices), np.nan),
+            T,
+            (None if std is None else std / (T.scale * rms_size(self._mean.vertices))),
+        )
 
     def raw_scan(self, record: CorrespondRecord) -> Mesh:
         """Return the scan of a record, reflected if it is mirrored, if it is in the same place with the same content.
@@ -245,8 +247,13 @@ class Corresponded:
                     turns.append(placed.T_scan_mean.rotation)
             if not self._is_upright:
                 self._turn_by(turns)
-            std = np.sqrt(squares / np.maximum(counts, 1)) if names and np.isfinite(squares).all() else None
-            self._population = Population(tuple(names), counts, np.array(sizes), unread, std)
+            self._population = Population(
+                tuple(names),
+                counts,
+                np.array(sizes),
+                unread,
+                (np.sqrt(squares / np.maximum(counts, 1)) if names and np.isfinite(squares).all() else None),
+            )
         return self._population
 
     @property
@@ -353,8 +360,10 @@ def concerns_of(folder: Corresponded) -> dict[str, Concern]:
     concerns: dict[str, Concern] = {}
     for name in folder.population().names:
         record = folder.records[name]
-        weight = _DOUBTFUL_WEIGHT if record.doubt else max((reason.excess for reason in record.review), default=0.0)
-        concerns[name] = Concern(weight, describe_review(record))
+        concerns[name] = Concern(
+            (_DOUBTFUL_WEIGHT if record.doubt else max((reason.excess for reason in record.review), default=0.0)),
+            describe_review(record),
+        )
     return concerns
 
 

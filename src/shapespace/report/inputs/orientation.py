@@ -73,8 +73,9 @@ def find_orientation(
         if any(number < 1 for link in orientation.links for number in link):
             raise FileFormatError(f"{path}: a link has a landmark below 1; number landmarks from 1.")
     if not orientation.links:
-        pairs = curve_links if links is None else read_links(links, landmarks)
-        orientation = structs.replace(orientation, links=pairs)
+        orientation = structs.replace(
+            orientation, links=(curve_links if links is None else read_links(links, landmarks))
+        )
     return orientation if orientation.views or orientation.links else None
 
 

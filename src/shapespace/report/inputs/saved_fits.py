@@ -255,9 +255,13 @@ def staged_fit(folder: Folder, fit: SavedFit) -> StagedFit:
     """
     if fit.entry.stages:
         return StagedFit.from_arrays(folder.arrays(fit.entry.stages), fit.record, name=fit.name, label=fit.label)
-    surfaces = saved_surfaces(folder, fit)
-    scan = _in_picture_frame(repair(raw_scan(folder, fit))[0], fit)
-    return StagedFit.from_surfaces(surfaces, scan, fit.record, name=fit.name, label=fit.label)
+    return StagedFit.from_surfaces(
+        saved_surfaces(folder, fit),
+        _in_picture_frame(repair(raw_scan(folder, fit))[0], fit),
+        fit.record,
+        name=fit.name,
+        label=fit.label,
+    )
 
 
 def saved_surfaces(folder: Folder, fit: SavedFit) -> dict[str, Mesh]:
@@ -371,8 +375,9 @@ def command_with_stages(root: Path, records: Mapping[str, FitRecord]) -> str:
     """
     first = next(iter(records.values()))
     scans = [record.scan.path or "SCAN" for record in records.values()]
-    is_plain = len(records) == 1 and first.landmarks is None and not first.metadata
-    if not is_plain and _listed(root / FitRecord.LIST) == set(records):
+    if not (len(records) == 1 and first.landmarks is None and not first.metadata) and _listed(
+        root / FitRecord.LIST
+    ) == set(records):
         scans = [FitRecord.LIST]
     elif len(scans) > _MOST_SCANS:
         scans = ["SCANS"]

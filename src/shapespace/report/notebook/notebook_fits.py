@@ -28,6 +28,15 @@ _SHARES = (0.9, 0.95, 0.98)  # of the variance; usual choices for the number of 
 _MODES_SHOWN = 2  # layout: rows
 _PANEL = (220, 290)  # layout: pixels
 _MOST_COEFFICIENTS = 5  # layout: entries
+_FIT_FIGURES = {
+    "distances": "signed_maps",
+    "stages": "stages_figure",
+    "overlay": "overlay_figure",
+    "histograms": "distance_histograms",
+    "coefficients": "coefficients_figure",
+    "history": "history_figure",
+    "regions": "regions_figure",
+}
 _CURVES = (
     "compactness",
     "generalisation",
@@ -41,25 +50,12 @@ _CURVES = (
 
 def plot_model(model: ShapeModel, kind: str, **options: Any) -> Figure:
     """Draw a figure for `ShapeModel.plot`."""
-    require_report_extra()
-    return _choose(
-        {"modes": figures.modes_figure, "mean": figures.mean_figure, "spectrum": figures.spectrum_figure}, kind
-    )(model, **options)
+    return _draw({"modes": "modes_figure", "mean": "mean_figure", "spectrum": "spectrum_figure"}, kind, model, options)
 
 
 def plot_fit(result: FitResult, kind: str, **options: Any) -> Figure:
     """Draw a figure for `FitResult.plot`."""
-    require_report_extra()
-    draw = {
-        "distances": figures.signed_maps,
-        "stages": figures.stages_figure,
-        "overlay": figures.overlay_figure,
-        "histograms": figures.distance_histograms,
-        "coefficients": figures.coefficients_figure,
-        "history": figures.history_figure,
-        "regions": figures.regions_figure,
-    }
-    return _choose(draw, kind)(StagedFit.of(result.model, result), **options)
+    return _draw(_FIT_FIGURES, kind, StagedFit.of(result.model, result), options)
 
 
 def plot_quality(quality: ModelQuality, **options: Any) -> Figure:
@@ -73,14 +69,18 @@ def plot_quality(quality: ModelQuality, **options: Any) -> Figure:
 
 
 def _numbers(curve: Curve) -> dict[str, list[float]]:
-    of = {"modes": curve.counts, "mean": curve.mean, "low": curve.low, "high": curve.high}
-    return {name: values.tolist() for name, values in of.items()}
+    return {
+        name: values.tolist()
+        for name, values in {"modes": curve.counts, "mean": curve.mean, "low": curve.low, "high": curve.high}.items()
+    }
 
 
-def _choose(draw: Mapping[str, Callable[..., Figure]], kind: str) -> Callable[..., Figure]:
-    if kind not in draw:
-        raise InputError(f"There is no plot {kind!r}; choose one of {', '.join(draw)}.")
-    return draw[kind]
+def _draw(names: Mapping[str, str], kind: str, shown: object, options: Mapping[str, Any]) -> Figure:
+    """Return the figure of a kind, by its name in `shapespace.report.figures`."""
+    require_report_extra()
+    if kind not in names:
+        raise InputError(f"There is no plot {kind!r}; choose one of {', '.join(names)}.")
+    return getattr(figures, names[kind])(shown, **options)
 
 
 def html_of_model(model: ShapeModel) -> str:
@@ -103,7 +103,9 @@ def html_of_model(model: ShapeModel) -> str:
     ]
 
     def draw() -> Drawn:
-        return _still(plot_model(model, "modes", modes=_MODES_SHOWN)), "The first modes; model.plot() draws more."
+        return figures.encode_webp(
+            plot_model(model, "modes", modes=_MODES_SHOWN)
+        ), "The first modes; model.plot() draws more."
 
     return notebook_html(model, "Shape model", [], rows, draw)
 
@@ -147,7 +149,7 @@ def html_of_quality(quality: ModelQuality) -> str:
             )
 
     def draw() -> Drawn:
-        return _still(plot_quality(quality)), "Bands are 95 % intervals."
+        return figures.encode_webp(plot_quality(quality)), "Bands are 95 % intervals."
 
     return notebook_html(quality, "Quality of a shape space", quality.sentences(), rows, draw)
 
@@ -186,7 +188,3 @@ def notebook_html(
         title=title, sentences=sentences, rows=rows, picture=picture, size=size, caption=caption,
         body=blocks,
     )  # fmt: skip
-
-
-def _still(figure: Figure) -> Still:
-    return figures.encode_webp(figure)

@@ -31,6 +31,7 @@ from shapespace.report.blocks.blocks import (
     first_items,
     no_picture,
     number,
+    table_of,
     text_table,
 )
 from shapespace.report.blocks.wording import (
@@ -99,8 +100,7 @@ class CorrespondencePage:
         self.result = Corresponded(folder.root)
         if not self.result.records:
             raise FileFormatError(f"{folder.root} holds no record of a scan; {CORRESPOND_AGAIN}.")
-        together = len(self.result.corresponding)
-        self.page = Page(together + min(len(self.result.records), MOST_CARDS) + 5, on_step)
+        self.page = Page(len(self.result.corresponding) + min(len(self.result.records), MOST_CARDS) + 5, on_step)
         self.all = self.result.population(self.page.step)
         self.mean = self.result.mean
         self.size = dict(zip(self.all.names, self.all.sizes, strict=True))
@@ -161,7 +161,6 @@ class CorrespondencePage:
     def summary(self) -> list[Block]:
         """Return what came of the scans, in a sentence, in figures, and those that need a look."""
         mean, far = (median([self.share(r, which) for r in self.records]) for which in ("mean", "p99"))
-        seen = median([known(record.seen_share) for record in self.records])
         tiles = [
             (str(len(self.records)), f"of {self.total}", "scans in correspondence"),
             (f"{self.result.run.vertices:,}", "", "vertices, the same on all"),
@@ -171,11 +170,20 @@ class CorrespondencePage:
                 "of its size: mean distance between scan and surface, median scan",
             ),
             (percent_of(far).removesuffix(" %"), "%", "of its size: 99 % of the points lie nearer, median scan"),
-            (percent(seen).removesuffix(" %"), "%", "of the vertices are shown by the median scan"),
+            (
+                percent(median([known(record.seen_share) for record in self.records])).removesuffix(" %"),
+                "%",
+                "of the vertices are shown by the median scan",
+            ),
         ]
         if self.result.run.rounds:
-            last = percent_of(self.result.run.rounds[-1])
-            tiles.append((last.removesuffix(" %"), "%", "of the size: movement of vertices in the last round (RMS)"))
+            tiles.append(
+                (
+                    percent_of(self.result.run.rounds[-1]).removesuffix(" %"),
+                    "%",
+                    "of the size: movement of vertices in the last round (RMS)",
+                )
+            )
         return [
             Text(self.verdict()),
             Tiles(tiles),
@@ -200,24 +208,28 @@ class CorrespondencePage:
     def verdict(self) -> str:
         """Return in a few sentences whether to go on, and what to look at first."""
         n, aside = len(self.records), len(self.out) + len(self.result.unread)
-        text = f"{n} of {counted(self.total, 'scan')} {'is' if n == 1 else 'are'} in correspondence"
         some = self.looked_at
-        text += f"; {counted(len(some), 'of them needs', 'of them need')} review" if some else (
-            " and none of them needs review"
-        )  # fmt: skip
-        text += f"; {aside} {'is' if aside == 1 else 'are'} excluded." if aside else "."
+        excluded = f"; {aside} {'is' if aside == 1 else 'are'} excluded"
+        review = f"; {counted(len(some), 'of them needs', 'of them need')} review"
         folded = [record.folded_share for record in self.records if record.folded_share]
-        text += " No triangle is folded over." if not folded else (
-            f" {counted(len(folded), 'scan has', 'scans have')} folded triangles, {percent_of(max(folded))} at most."
-        )  # fmt: skip
+        most_folded = (
+            f"{counted(len(folded), 'scan has', 'scans have')} folded triangles, "
+            f"{percent_of(max(folded, default=nan))} at most."
+        )
         mirrored = [record.name for record in self.records if record.mirrored]
-        if mirrored:
-            named = first_names(mirrored, _MOST_NAMED)
-            of = counted(len(mirrored), "scan is a mirror image", "scans are mirror images")
-            text += f" {of} of the others and shown reflected ({named})."
-        if self.result.run.groups:
-            text += f" {describe_groups(self.result.run.groups)}"
-        return f"{text} {self._settling()}"
+        reflected = (
+            f"{counted(len(mirrored), 'scan is a mirror image', 'scans are mirror images')} of the others and shown "
+            f"reflected ({first_names(mirrored, _MOST_NAMED)})."
+        )
+        sentences = [
+            f"{n} of {counted(self.total, 'scan')} {'is' if n == 1 else 'are'} in correspondence"
+            f"{review if some else ' and none of them needs review'}"
+            f"{excluded if aside else ''}.",
+            most_folded if folded else "No triangle is folded over.",
+            reflected if mirrored else "",
+            describe_groups(self.result.run.groups) if self.result.run.groups else "",
+        ]
+        return f"{' '.join(filter(None, sentences))} {self._settling()}"
 
     def _settling(self) -> str:
         moved = self.result.run.rounds
@@ -282,8 +294,7 @@ class CorrespondencePage:
         first = self.looked_at[: MOST_BOARDS // 2 + 1] if len(self.records) > MOST_BOARDS else list(self.ordered)
         rest = [record for record in self.ordered if record not in first]
         room = MOST_BOARDS - len(first)
-        picked = [len(rest) * k // room for k in range(min(room, len(rest)))]
-        return [*first, *(rest[k] for k in picked)]
+        return [*first, *(rest[k] for k in [len(rest) * k // room for k in range(min(room, len(rest)))])]
 
     def nearness(self) -> list[Block]:
         """Return the distances of all scans, and where vertices are missing."""
@@ -292,33 +303,25 @@ class CorrespondencePage:
         shares = np.array([[self.share(r, w) for w in ("mean", "p95", "p99", "max")] for r in self.records])
         share = 1 - self.all.seen_count / len(self.records)
         hardly = float((share > 1 - _HARDLY_SEEN).mean())
-        text = "Every scan shows every vertex."
-        if share.any():
-            most = (
-                f"{percent(hardly)} on more than half, which build leaves out" if hardly else "none on more than half"
-            )
-            text = f"{percent(float((share > 0).mean()))} of the vertices are missing on at least one scan, and {most}."
+        most = f"{percent(hardly)} on more than half, which build leaves out" if hardly else "none on more than half"
+        missing = f"{percent(float((share > 0).mean()))} of the vertices are missing on at least one scan, and {most}."
         there = median([known(record.area_share) for record in self.records])
-        lacking: list[Block] = []
-        if there < _WHOLE_SHARE:
-            caption = (
-                f"The mean shape lacks parts that the scans show: its surface is {percent(there)} of the median "
-                "scan's, mostly because the first template lacked them. Give a whole one with --template."
-            )
-            lacking.append(Text(caption, "notice"))
-        if self.result.holes:
-            caption = (
-                f"The mean shape has {counted(self.result.holes, 'hole')} beside its border. Where the object has no "
-                "opening, the first template had a hole, and no scan can show anything there; give a whole one with "
-                "--template."
-            )
-            lacking.append(Text(caption, "notice"))
+        lacking = (
+            f"The mean shape lacks parts that the scans show: its surface is {percent(there)} of the median scan's, "
+            "mostly because the first template lacked them. Give a whole one with --template."
+        )
+        holes = (
+            f"The mean shape has {counted(self.result.holes, 'hole')} beside its border. Where the object has no "
+            "opening, the first template had a hole, and no scan can show anything there; give a whole one with "
+            "--template."
+        )
         return [
             Text(
                 "Distances are measured both ways: from the vertices that a scan shows to the scan, and from its "
                 "points to the surface, leaving out what lies beyond the surface's rim."
             ),
-            *lacking,
+            Text(lacking if there < _WHOLE_SHARE else "", "notice"),
+            Text(holes if self.result.holes else "", "notice"),
             sections.in_columns(
                 self.page.figure(
                     figures.nearness_figure(shares),
@@ -328,7 +331,7 @@ class CorrespondencePage:
                 ),
                 self.page.figure(
                     figures.missing_figure(self.mean, share),
-                    f"{text} The mean shape from four sides.",
+                    f"{missing if share.any() else 'Every scan shows every vertex.'} The mean shape from four sides.",
                     alt="Share of scans that do not show each vertex, on the mean shape from four sides",
                 ),
             ),
@@ -359,18 +362,20 @@ class CorrespondencePage:
 
     def scans(self) -> list[Block]:
         """Return the gallery, the worst first, and the table of all."""
-        all_shown = len(self._cards) == len(self.records) + len(self.out)
         return [
             self.page.section(
-                ("All scans, the worst first" if all_shown else f"The {len(self._cards)} scans to look at first"),
+                (
+                    "All scans, the worst first"
+                    if (len(self._cards) == len(self.records) + len(self.out))
+                    else f"The {len(self._cards)} scans to look at first"
+                ),
                 self.gallery,
             ),
             self.page.section("Every scan in numbers", self.numbers),
         ]
 
     def _carded(self) -> list[CorrespondRecord]:
-        room = max(MOST_EMPTY_CARDS, MOST_CARDS - len(self.records))
-        first = self.out[:room]
+        first = self.out[: max(MOST_EMPTY_CARDS, MOST_CARDS - len(self.records))]
         return [*first, *self.ordered[: MOST_CARDS - len(first)]]
 
     def gallery(self) -> list[Block]:
@@ -391,10 +396,12 @@ class CorrespondencePage:
             "Where areas change, shapes may differ; where they change suddenly, squares have slid.",
         )
         carded = self._carded()
-        out: list[Block] = [Text("Sorted: excluded scans first, then by how much they stand out.")]
-        if len(carded) < len(self.records) + len(self.out):
-            out.append(no_picture(len(self.records) + len(self.out) - len(carded), "scan"))
-        return [*out, key, Gallery([self.card(record, limit) for record in carded])]
+        return [
+            Text("Sorted: excluded scans first, then by how much they stand out."),
+            no_picture(len(self.records) + len(self.out) - len(carded), "scan"),
+            key,
+            Gallery([self.card(record, limit) for record in carded]),
+        ]
 
     def card(self, record: CorrespondRecord, limit: float) -> Card:
         """Return one scan of the gallery, its distances on a scale that ends at `limit` percent of its size."""
@@ -445,14 +452,10 @@ class CorrespondencePage:
         moved = scan.with_vertices(placed.T_scan_mean.inverse().apply(scan.vertices))
         far = np.full(len(placed.vertices), nan)
         far[placed.seen] = build_engine(moved).query(placed.vertices[placed.seen]).distance
-        size = float(np.sqrt((self.mean.vertices**2).sum(axis=1).mean()))
-        return moved, 100 * far / size
+        return moved, 100 * far / float(np.sqrt((self.mean.vertices**2).sum(axis=1).mean()))
 
     def numbers(self) -> list[Block]:
         """Return the table of all scans."""
-        out: list[Block] = []
-        if self.result.units_mixed:
-            out.append(Text("The scans are in different units: compare distances in % of the size.", "notice"))
         columns: list[tuple[Column, _Make]] = [
             (Column("Scan"), lambda r: Cell(r.name, anchor=self._cards.get(r.name))),
             (Column("Status"), lambda r: self.status(r)),
@@ -472,23 +475,24 @@ class CorrespondencePage:
             (Column("CPU seconds", "number"), lambda r: number(sum(r.cpu_s) if r.cpu_s else nan, 1)),
         ]
         records = [*self.out, *self.ordered]
-        rows = [[make(record) for _, make in columns] for record in records[:MOST_ROWS]]
-        if len(records) > MOST_ROWS:
-            out.append(Text(f"The first {MOST_ROWS:,} of {len(records):,} scans; their records have all."))
-        table = Table([column for column, _ in columns], rows, "All scans", sortable=len(rows) > 1)
+        units = "The scans are in different units: compare distances in % of the size."
+        first = f"The first {MOST_ROWS:,} of {len(records):,} scans; their records have all."
         caption = (
             "Distances are both ways; those without % are in the unit of the scan's file. Area covered: that of the "
             "surface beside that of the scan. Folded: triangles that turn back over their neighbours. Area change: "
             "95 % of the triangles grow or shrink by less than so many times beside the mean shape, size divided out."
         )
-        notes: list[Block] = [Text(caption, "soft")]
         why = [[record.name, self._reason(record)] for record in records if self._reason(record)]
-        if why:
-            notes = [
-                *notes,
-                Folded(f"The reasons of {counted(len(why), 'scan')}", [text_table(("Scan", "Why"), why, "Reasons")]),
-            ]
-        return [*out, table, *notes]
+        return [
+            Text(units if self.result.units_mixed else "", "notice"),
+            Text(first if len(records) > MOST_ROWS else ""),
+            table_of(records[:MOST_ROWS], columns, "All scans"),
+            Text(caption, "soft"),
+            Folded(
+                f"The reasons of {counted(len(why), 'scan')}",
+                ([text_table(("Scan", "Why"), why, "Reasons")] if why else []),
+            ),
+        ]
 
     def _reason(self, record: CorrespondRecord) -> str:
         if record in self.out:
@@ -511,8 +515,14 @@ class CorrespondencePage:
         rows: list[list[Cell]] = []
         for k, moved in enumerate(run.rounds):
             cpu = [record.cpu_s[k] for record in self.records if len(record.cpu_s) > k]
-            row = [Cell(f"Round {k + 1}", float(k + 1)), _cell(100 * moved)]
-            rows.append([*row, number(sum(cpu), 1), number(median(cpu), 1), number(max(cpu, default=nan), 1)])
+            rows.append(
+                [
+                    *[Cell(f"Round {k + 1}", float(k + 1)), _cell(100 * moved)],
+                    number(sum(cpu), 1),
+                    number(median(cpu), 1),
+                    number(max(cpu, default=nan), 1),
+                ]
+            )
         return [
             Text(run.template),
             figure,

@@ -65,7 +65,7 @@ from shapespace.report.inputs.saved_fits import (
     saved_surfaces,
     staged_fit,
 )
-from shapespace.report.inputs.staged_fit import StagedFit
+from shapespace.report.inputs.staged_fit import StagedFit, nice_ceiling
 from shapespace.report.pages import study_page
 from shapespace.report.pages.page import Chapter, Page, Step
 from shapespace.report.render import thumbnails
@@ -125,10 +125,8 @@ class FolderPage:
             (sections.MODEL_PICTURES + min(len(fits), MOST_CARDS) + 4 + len(self.main) * sections.FIT_PICTURES), on_step
         )
         self.model_path = model
-        self._model: ShapeModel | None = None
         if model is not None:
             self.model()
-        self._staged: dict[str, StagedFit] = {}
         self._details = {fit.name: self.page.anchor(f"pictures-of-{fit.name}") for fit in self.main}
         carded = _carded(self.fits) if len(fits) > 1 or not self.main else []
         self._cards = {fit.name: self.page.anchor(f"fit-{fit.name}") for fit in carded}
@@ -138,15 +136,11 @@ class FolderPage:
 
     def model(self) -> ShapeModel:
         """Return the model of the fits."""
-        if self._model is None:
-            self._model = model_of(self.folder, self.fits, self.model_path)
-        return self._model
+        return self.page.once("model", lambda: model_of(self.folder, self.fits, self.model_path))
 
     def staged(self, fit: SavedFit) -> StagedFit:
         """Return what pictures of `fit` need, called by its name."""
-        if fit.name not in self._staged:
-            self._staged[fit.name] = replace(staged_fit(self.folder, fit), label=fit.name)
-        return self._staged[fit.name]
+        return self.page.once(fit, lambda: replace(staged_fit(self.folder, fit), label=fit.name))
 
     # The page
 
@@ -242,11 +236,13 @@ class FolderPage:
         """Return in a sentence or two what was fitted, and how many fits have which status."""
         models = sorted({fit.record.model.name or "an unknown model" for fit in self.fits})
         methods = sorted({fit.record.method for fit in self.fits} - {""})
-        text = f"{counted(len(self.fits), 'scan was', 'scans were')} fitted with {listed(models)}"
-        text += f" by the {listed(methods)} method{'s' if len(methods) > 1 else ''}. " if methods else ". "
+        by = f" by the {listed(methods)} method{'s' if len(methods) > 1 else ''}" if methods else ""
         trusted = counts["converged"]
-        text += counted(trusted, "fit") if trusted else "None"
-        text += f" converged with nothing {'found against them' if trusted != 1 else 'against it'}"
+        text = (
+            f"{counted(len(self.fits), 'scan was', 'scans were')} fitted with {listed(models)}{by}. "
+            f"{counted(trusted, 'fit') if trusted else 'None'} converged with nothing "
+            f"{'found against them' if trusted != 1 else 'against it'}"
+        )
         others = listed(
             [
                 f"{counts[key]} {word}"
@@ -265,8 +261,12 @@ class FolderPage:
         """Return which fits are by another model than the one shown, where one was given."""
         if self.model_path is None:
             return []
-        others = [fit.name for fit in self.fits if fit.fitted and fit.record.model.hash != self.model_hash()]
-        return [Notice(f"Fitted with another model than {self.model_path.name}", others)]
+        return [
+            Notice(
+                f"Fitted with another model than {self.model_path.name}",
+                [fit.name for fit in self.fits if fit.fitted and fit.record.model.hash != self.model_hash()],
+            )
+        ]
 
     def doubts(self) -> Notice:
         """Return the fits that need a look, by name and reason."""
@@ -377,26 +377,35 @@ class FolderPage:
     def gallery(self) -> list[Block]:
         """Return a card for each of the first fits: failed and doubtful first, then by their error."""
         sample, _ = sections.usable([fit for fit in self.carded if fit.pictured], self.staged)
-        limit = sections.common_limit_mm([fit for fit in sample if fit.status == "converged"] or sample)
+        usual = [fit.scale_mm for fit in sample if fit.status == "converged"] or [fit.scale_mm for fit in sample]
+        limit = nice_ceiling(median(usual))  # of strips that share it
         out: list[Block] = [Text("Sorted by status (failed, doubtful, converged), then by expected error.")]
-        if len(self.fits) > len(self.carded):
-            out.append(no_picture(len(self.fits) - len(self.carded), "fit"))
+        out.append(no_picture(len(self.fits) - len(self.carded), "fit"))
         if sample:
-            bar = self.page.image(thumbnails.colour_bar(), "from blue over pale to red")
             out.append(
                 StripKey(
                     "Each strip, from the left: the scan; scan (orange) and model (blue) over each other, the nearer "
                     "one shown; the distance from the model to the scan, one scale for all:",
-                    [(bar, f"−{limit:g} mm, scan inside", f"+{limit:g} mm, scan outside")],
+                    [
+                        (
+                            self.page.image(thumbnails.colour_bar(), "from blue over pale to red"),
+                            f"−{limit:g} mm, scan inside",
+                            f"+{limit:g} mm, scan outside",
+                        )
+                    ],
                     "Grey is what the scan does not show. Distances to a scan of points only have no sign: their map "
                     f"runs from 0 to {limit:g} mm.",
                 )
             )
         cards = [self.card(fit, limit) for fit in self.carded]
-        out.append(Gallery(cards[:MOST_OPEN_CARDS]))
-        if len(cards) > MOST_OPEN_CARDS:
-            out.append(Folded(f"{len(cards) - MOST_OPEN_CARDS} more", [Gallery(cards[MOST_OPEN_CARDS:])]))
-        return out
+        return [
+            *out,
+            Gallery(cards[:MOST_OPEN_CARDS]),
+            Folded(
+                f"{len(cards) - MOST_OPEN_CARDS} more",
+                ([Gallery(cards[MOST_OPEN_CARDS:])] if len(cards) > MOST_OPEN_CARDS else []),
+            ),
+        ]
 
     def card(self, fit: SavedFit, limit_mm: float) -> Card:
         """Return one fit of the gallery, its map on a scale that ends at `limit_mm`."""
@@ -424,13 +433,15 @@ class FolderPage:
     def still(self, fit: SavedFit, limit_mm: float) -> Image:
         """Return the best picture of a fit that there is: with its stages, its fitted surface, or its scan."""
         if not fit.pictured:
-            scan = thumbnails.mesh_still(raw_scan(self.folder, fit))
-            return self.page.image(scan, f"The raw scan {fit.name}, as its axes stand")
+            return self.page.image(
+                thumbnails.mesh_still(raw_scan(self.folder, fit)), f"The raw scan {fit.name}, as its axes stand"
+            )
         try:
             staged = self.staged(fit)
         except ScanNotFoundError:
-            surface = thumbnails.mesh_still(saved_surfaces(self.folder, fit)["final"])
-            return self.page.image(surface, f"The fitted surface of {fit.name}")
+            return self.page.image(
+                thumbnails.mesh_still(saved_surfaces(self.folder, fit)["final"]), f"The fitted surface of {fit.name}"
+            )
         return self.page.image(thumbnails.fit_strip(staged, limit_mm), sections.strip_alt(staged, limit_mm))
 
     def numbers(self) -> list[Block]:
@@ -445,7 +456,7 @@ class FolderPage:
         if len(self.fits) > MOST_ROWS:
             left = counted(len(self.fits) - MOST_ROWS, "other fit")
             out.append(Text(f"{left} are left out here; coefficients.csv has all."))
-        return [*out, *([Text(self.label_note, "soft")] if self.label_note else [])]
+        return [*out, Text(self.label_note, "soft")]
 
     def of_one_model(self, model_hash: str) -> list[SavedFit]:
         """Return the fits by one model that have coefficients: only these can be compared."""
@@ -473,8 +484,11 @@ class FolderPage:
         out = sections.scatter(self.page, [sections.coefficients_of(fit) for fit in compared])
         expressive = [fit for fit in compared if fit.entry.intensity]
         subjects = {fit.entry.subject for fit in expressive}
-        levels = Counter(fit.entry.expression for fit in expressive)
-        if len(subjects) != 1 or "" in subjects or max(levels.values(), default=0) < _FEWEST_LEVELS:
+        if (
+            len(subjects) != 1
+            or "" in subjects
+            or max(Counter(fit.entry.expression for fit in expressive).values(), default=0) < _FEWEST_LEVELS
+        ):
             return out
         points = [sections.coefficients_of(fit) for fit in expressive]
         if any(len(point.b) < 2 for point in points):
@@ -513,8 +527,9 @@ class FolderPage:
 
     def settings(self) -> list[Block]:
         """Return settings that the fits share, versions and hashes."""
-        fitted = [fit for fit in self.fits if fit.fitted] or self.fits
-        configs = [fit.record.config for fit in fitted if fit.record.config]
+        configs = [
+            fit.record.config for fit in ([fit for fit in self.fits if fit.fitted] or self.fits) if fit.record.config
+        ]
         rows = [("Report", f"shapespace {__version__}")]
         versions = sorted({fit.record.version for fit in self.fits} - {""})
         if versions:
@@ -585,8 +600,11 @@ def find_labels(folder: Folder, fits: Sequence[SavedFit], labels_path: Path | No
     places = [folder.root / LABELS_FILE] if labels_path is None else [labels_path]
     source = f"{LABELS_FILE} in the folder" if labels_path is None else labels_path.name
     if labels_path is None and not places[0].is_file():
-        paths = (fit.record.scan.path for fit in fits)
-        beside = dict.fromkeys((folder.root / path).parent / LABELS_FILE for path in paths if path and "\0" not in path)
+        beside = dict.fromkeys(
+            (folder.root / path).parent / LABELS_FILE
+            for path in (fit.record.scan.path for fit in fits)
+            if path and "\0" not in path
+        )
         places = [file for file in beside if file.is_file()]
         source = f"{listed([f'{file.parent.name}/{LABELS_FILE}' for file in places])}, beside the scans"
     names = [(fit.name, *names_of_file(fit.record.scan.name or fit.name)) for fit in fits]
@@ -650,12 +668,20 @@ class ManyPage(FolderPage):
         self.population = Population(results)
         self.problems = results.problems
         self._far = self.population.far()
-        farthest = np.argsort(np.where(np.isfinite(self._far), -self._far, np.inf), kind="stable")[:_FARTHEST]
-        self.farthest = [int(k) for k in farthest if isfinite(self._far[k])]
+        self.farthest = [
+            int(k)
+            for k in np.argsort(np.where(np.isfinite(self._far), -self._far, np.inf), kind="stable")[:_FARTHEST]
+            if isfinite(self._far[k])
+        ]
         names = [name for kind, most in WORST.items() for name in self.population.worst(kind, most)]
         names += [self.population.names[k] for k in self.farthest]
-        fits = [saved_fit(folder, results, name) for name in sorted(set(names))]
-        super().__init__(folder, fits, model=model, labels=labels, on_step=on_step)
+        super().__init__(
+            folder,
+            [saved_fit(folder, results, name) for name in sorted(set(names))],
+            model=model,
+            labels=labels,
+            on_step=on_step,
+        )
 
     @property
     def total(self) -> int:
@@ -768,9 +794,10 @@ class ManyPage(FolderPage):
         )
 
     def _density(self) -> Block:
-        trusted = self.population.trusted
         return self.page.figure(
-            figures.density_figure(self._trusted_z(), self._far[trusted], title="Where in the shape space"),
+            figures.density_figure(
+                self._trusted_z(), self._far[self.population.trusted], title="Where in the shape space"
+            ),
             "How many trusted fits lie where, darker for more, by the logarithm; the farthest are left out. Dashed: "
             "three standard deviations. Right: how far each fit is from the mean in all coefficients.",
             alt="Density of z1 against z2 and z3, and a histogram of the root mean square of all coefficients",
@@ -829,9 +856,7 @@ class ManyPage(FolderPage):
             self.page.section(column.name, lambda column=column: self.by(column)) for column in columns
         ]
         left = [*self.population.left_out, *(column.name for column in self.population.listed[_MOST_COLUMNS:])]
-        if left:
-            parts.append(Text(f"Not shown: {listed(left)}.", "soft"))
-        return parts
+        return [*parts, Text(f"Not shown: {listed(left)}." if left else "", "soft")]
 
     def by(self, column: ListedColumn) -> list[Block]:
         """Return how the fits go with one column."""
@@ -840,8 +865,12 @@ class ManyPage(FolderPage):
         measures = {words: np.where(trusted, people.measures[key], np.nan) for key, words in MEASURES.items()}
         error = next(iter(MEASURES.values()))
         if column.kind == "level":
-            groups = [(name, inside) for name, inside, _ in column.groups()]
-            drawing = figures.levels_figure(groups, measures[error], words=error, title=f"By {column.name}")
+            drawing = figures.levels_figure(
+                [(name, inside) for name, inside, _ in column.groups()],
+                measures[error],
+                words=error,
+                title=f"By {column.name}",
+            )
             caption = "Of each: the median of the trusted fits, the middle half and the middle 90 %. Dashed: of all."
         else:
             levels = next((other for other in people.listed if 1 < len(other.levels) <= _MOST_LINES), None)
@@ -895,7 +924,7 @@ class ManyPage(FolderPage):
         return [
             Text(text),
             sections.fits_table(self.fits, self.places, caption="Fits to look at: distances and errors in mm"),
-            *([Text(self.label_note, "soft")] if self.label_note else []),
+            Text(self.label_note, "soft"),
         ]
 
     def together(self) -> list[Block]:
@@ -907,16 +936,28 @@ class ManyPage(FolderPage):
         """Return coefficients of other fits, evenly from all."""
         z = self._trusted_z()
         z = z[np.isfinite(z).all(axis=1)]
-        few = z[:: max(1, len(z) // _IN_PICTURE)].astype(np.float64)
-        return few if z.shape[1] == len(fit.record.z) and len(z) > 2 else None
+        return (
+            z[:: max(1, len(z) // _IN_PICTURE)].astype(np.float64)
+            if z.shape[1] == len(fit.record.z) and len(z) > 2
+            else None
+        )
 
     def settings(self) -> list[Block]:
         """Return methods, versions and models, and of how many fits they are."""
         rows = [("Report", f"shapespace {__version__}")]
-        words = {"method": "Methods", "version": "Versions of shapespace", "model_name": "Models"}
-        for key, heading in words.items():
-            counts = self.population.origins[key].most_common(_MOST_NOTED)
-            rows += [(heading, listed([f"{printable(value)} ({count:,})" for value, count in counts]) or DASH)]
+        for key, heading in {"method": "Methods", "version": "Versions of shapespace", "model_name": "Models"}.items():
+            rows += [
+                (
+                    heading,
+                    listed(
+                        [
+                            f"{printable(value)} ({count:,})"
+                            for value, count in self.population.origins[key].most_common(_MOST_NOTED)
+                        ]
+                    )
+                    or DASH,
+                )
+            ]
         rows += [
             (
                 "Hashes of the models",

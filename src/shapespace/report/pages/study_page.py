@@ -6,7 +6,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, groupby
 from itertools import count as count_from
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
@@ -178,7 +178,7 @@ class StudyParts:
 
     def text(self, part: TextPart, title: str, note: str) -> list[Block]:
         """Return paragraphs."""
-        return [*paragraphs(part.text), *([Text(note, "soft")] if note else [])]
+        return [*paragraphs(part.text), Text(note, "soft")]
 
     def table(self, part: TablePart, title: str, note: str) -> list[Block]:
         """Return a table that sorts."""
@@ -230,8 +230,10 @@ class StudyParts:
             ],
             f"Confusion matrix: {title}",
         )
-        picture = self.page.figure(figure, f"{note} {about}".strip(), alt=alt, chart=True)
-        return [picture, Folded("The same as a table", [table])]
+        return [
+            self.page.figure(figure, f"{note} {about}".strip(), alt=alt, chart=True),
+            Folded("The same as a table", [table]),
+        ]
 
     def calibration(self, part: CalibrationPart, title: str, note: str) -> list[Block]:
         """Return the reliability diagram."""
@@ -259,8 +261,16 @@ class StudyParts:
             f"{100 * mean:.1f} % from {count:g} subjects" for count, mean in zip(part.subjects, part.mean, strict=True)
         ]
         ceiling = "" if part.ceiling is None else f"; ceiling {100 * part.ceiling:.1f} %"
-        about = "Accuracy on subjects who were not in the training set, by the number of training subjects."
-        return [self.drawn((figure, about, f"Learning curve: {listed(points, 20)}{ceiling}"), note)]
+        return [
+            self.drawn(
+                (
+                    figure,
+                    "Accuracy on subjects who were not in the training set, by the number of training subjects.",
+                    f"Learning curve: {listed(points, 20)}{ceiling}",
+                ),
+                note,
+            )
+        ]
 
     def curve(self, part: CurvePart, title: str, note: str) -> list[Block]:
         """Return one measure against another."""
@@ -284,9 +294,9 @@ class StudyParts:
             if one.x and one.y
         ]
         about = f"{y[:1].upper()}{y[1:]} against {x}."
-        bands = " Bands: its interval." if any(low is not None for low, _ in ends) else ""
-        dashes = " Dashed: where both are the same." if part.diagonal else ""
-        about += bands + dashes
+        about += (" Bands: its interval." if any(low is not None for low, _ in ends) else "") + (
+            " Dashed: where both are the same." if part.diagonal else ""
+        )
         return [self.drawn((figure, about, f"{about} {listed(ranges)}"), note)]
 
     def surface_map(self, part: SurfaceMapPart, title: str, note: str) -> list[Block]:
@@ -494,25 +504,32 @@ def study_page(folder: Folder, parts_file: PartsFile, on_step: Step | None = Non
         FileFormatError: it is damaged, or no file of this format.
     """
     content = _content(folder, parts_file)
-    pictured = [part for part in _raw_parts(content) if _raw(part, "kind") not in ("table", "text")]
-    page = Page(max(len(pictured), 1), on_step)
+    page = Page(
+        max(len([part for part in _raw_parts(content) if _raw(part, "kind") not in ("table", "text")]), 1), on_step
+    )
     study = _Study(page, folder, parts_file, content)
     name = folder.root.resolve().name
-    provenance = f"shapespace {study.head['version']}".strip()
-    if study.head["created"]:
-        provenance += f", {moment(study.head['created'])}"
+    created = f", {moment(study.head['created'])}" if study.head["created"] else ""
     targets_text = ", beside the targets that were set for it" if content.get("targets") else ""
-    lead = [Text(f"{parts_file.lead}{targets_text}."), Text(f"{provenance}.", "soft")]
-    has_summary = any(content.get(key) for key in ("summary", "targets", "notes"))
-    chapters = [Chapter("Summary", study.summary)] if has_summary else []
-    for heading, make in study.chapters("Results", 3):
-        chapters.append(Chapter(heading, make, heading if len(heading) <= 36 else f"{heading[:35]}…"))
-    chapters.append(Chapter("Settings, versions and hashes", study.settings, "Settings"))
     return page.html(
-        (study.head["title"] or f"{parts_file.title} in {name}"),
-        lead,
+        study.head["title"] or f"{parts_file.title} in {name}",
+        [
+            Text(f"{parts_file.lead}{targets_text}."),
+            Text(f"{' '.join(filter(None, ('shapespace', study.head['version'])))}{created}.", "soft"),
+        ],
         f"Made by shapespace {__version__} from the files in {name}.",
-        chapters,
+        [
+            *(
+                [Chapter("Summary", study.summary)]
+                if any(content.get(key) for key in ("summary", "targets", "notes"))
+                else []
+            ),
+            *(
+                Chapter(heading, make, heading if len(heading) <= 36 else f"{heading[:35]}…")
+                for heading, make in study.chapters("Results", 3)
+            ),
+            Chapter("Settings, versions and hashes", study.settings, "Settings"),
+        ],
     )
 
 
@@ -532,8 +549,7 @@ def study_section(page: Page, folder: Folder, parts_file: PartsFile = STUDY) -> 
     if parts_file is STUDY and "format" not in content:
         return sections.score_tables(content, many="Scores by class", single="Scores")
     study = _Study(page, folder, parts_file, content)
-    out: list[Block] = [Text(study.head["title"])] if study.head["title"] else []
-    out += page.tried(study.summary)
+    out: list[Block] = [Text(study.head["title"]), *page.tried(study.summary)]
     for heading, make in study.chapters("", 4):
         out += [page.section(heading, make)] if heading else page.tried(make)
     return [*out, Folded(f"Settings and versions of this {parts_file.word}", page.tried(study.settings))]
@@ -707,20 +723,9 @@ class _Study:
     def parts(self, parts: Sequence[object], level: int) -> list[Block]:
         """Return parts under their headings, charts that follow each other side by side."""
         out: list[Block] = []
-        blocks: list[Block] = []
-
-        def flush() -> None:
-            out.extend([Group("beside", blocks.copy())] if len(blocks) > 1 else blocks)
-            blocks.clear()
-
-        for part in parts:
-            section = self.page.section(_title(part), lambda part=part: self.body(part), level)
-            if _raw(part, "kind") not in _BESIDE:
-                flush()
-            blocks.append(section)
-            if _raw(part, "kind") not in _BESIDE:
-                flush()
-        flush()
+        for is_chart, run in groupby(parts, lambda part: _raw(part, "kind") in _BESIDE):
+            made = [self.page.section(_title(part), lambda part=part: self.body(part), level) for part in run]
+            out += [Group("beside", made)] if is_chart and len(made) > 1 else made
         return out
 
     def body(self, part: object) -> Sequence[Block]:
@@ -733,7 +738,7 @@ class _Study:
         text = len(rendered(blocks).encode()) - (before - self.page.left)
         if text > self.page.left - _PART_BYTES // 2:
             return too_large
-        self.page.spend(text)
+        self.page.spent += text
         return blocks
 
     def part(self, part: object) -> list[Block]:
@@ -745,33 +750,31 @@ class _Study:
 
     def settings(self) -> list[Block]:
         """Return with what the study was made."""
-        rows = [("Report", f"shapespace {__version__}")]
+        rows = {"Report": f"shapespace {__version__}"}
         if self.head["version"]:
-            rows.append((self.parts_file.word.capitalize(), f"shapespace {self.head['version']}"))
+            rows[self.parts_file.word.capitalize()] = f"shapespace {self.head['version']}"
         if self.head["created"]:
-            rows.append(("Made", moment(self.head["created"])))
-        out: list[Block] = [Facts(rows, "Made with")]
-        for key, caption in (("settings", "Settings"), ("versions", "Versions")):
-            if self.content.get(key) is not None:
-                out += self.page.tried(
-                    lambda key=key, caption=caption: facts_of(self._read(key, dict[str, object]), caption)
-                )
-        if self.content.get("model_hashes"):
-            out += self.page.tried(self.hashes)
-        return out
+            rows["Made"] = moment(self.head["created"])
+        makers: Mapping[str, Make] = {
+            "settings": lambda: facts_of(self._read("settings", dict[str, object]), "Settings"),
+            "versions": lambda: facts_of(self._read("versions", dict[str, object]), "Versions"),
+            "model_hashes": self.hashes,
+        }
+        made = [
+            block
+            for key, make in makers.items()
+            if self.content.get(key) is not None
+            for block in self.page.tried(make)
+        ]
+        return [Facts([*rows.items()], "Made with"), *made]
 
     def hashes(self) -> Folded:
         """Return the hashes of the models that took part."""
         hashes = self._read("model_hashes", tuple[str, ...])
+        rows = [[str(k), one] for k, one in enumerate(hashes[:MOST_ROWS], 1)]
         return Folded(
             f"Content hashes (SHA-256) of {counted(len(hashes), 'model')}",
-            [
-                text_table(
-                    ("Model", "Hash"),
-                    [[str(k), one] for k, one in enumerate(hashes[:MOST_ROWS], 1)],
-                    "Content hashes of the models",
-                )
-            ],
+            [text_table(("Model", "Hash"), rows, "Content hashes of the models")] if rows else [],
         )
 
 
