@@ -11,7 +11,7 @@ from conftest import Run, World
 from shapespace.io.landmarks.landmark_io import write_landmarks
 from shapespace.io.tables.table_io import table_rows
 from shapespace.model.shape_model import ShapeModel
-from shapespace.report.inputs.repeated_fit import command_with_stages
+from shapespace.report.inputs.saved_fits import command_with_stages
 from shapespace.schemas import FitRecord
 from shapespace.store.results import Results
 

@@ -17,7 +17,7 @@ from shapespace.errors import FileFormatError, InputError
 from shapespace.geometry.normals import vertex_normals
 from shapespace.report import figures
 from shapespace.report.analyses.analysis_report import AnalysisReport
-from shapespace.report.pages.recognition_page import MOST_ANALYSES
+from shapespace.report.pages.study_page import MOST_ANALYSES
 from shapespace.report.pages.write_html import LARGEST_REPORT_BYTES, write_report
 from shapespace.report.render.scene import pack_morph
 from shapespace.schemas import (

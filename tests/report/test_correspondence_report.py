@@ -14,9 +14,8 @@ from report_page import Page, edit
 from same_blobs import ASIDE, EVIL, FAR, FOLDED, HIDDEN, NAMES, VERTICES, mean_blob, surface, write_records, write_same
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
-from shapespace.report.figures import correspondence_figures
-from shapespace.report.inputs.correspondence_folder import Corresponded, upright
-from shapespace.report.inputs.triage import concerns_of
+from shapespace.report.figures import analysis_figures as correspondence_figures
+from shapespace.report.inputs.correspondence_folder import Corresponded, concerns_of, upright
 from shapespace.report.pages import correspondence_page
 from shapespace.report.pages.write_html import LARGEST_REPORT_BYTES, write_report
 from shapespace.report.render.renderer import Camera, Layer, render, squares

@@ -14,7 +14,7 @@ from shapespace.errors import InputError
 from shapespace.report import figures
 from shapespace.report.inputs import fit_population as population
 from shapespace.report.inputs.fit_population import ListedColumn, Population
-from shapespace.report.pages import many_page
+from shapespace.report.pages import folder_page as many_page
 from shapespace.report.pages.write_html import LARGEST_REPORT_BYTES, write_report
 from shapespace.store.results import Results
 from shapespace.viewer import model_view

@@ -15,7 +15,7 @@ from shapespace.errors import FileFormatError, InputError
 from shapespace.io.tables.table_io import write_rows
 from shapespace.report import figures
 from shapespace.report.analyses.morphospace_report import morphospace_part, morphospace_report
-from shapespace.report.figures.morphospace_figures import ellipse, hull, morphospace_figure
+from shapespace.report.figures.landmark_figures import ellipse, hull, morphospace_figure
 from shapespace.report.pages.write_html import write_report
 from shapespace.report.render.scene import pack_morphospace
 from shapespace.schemas import MorphospacePart, TablePart

@@ -20,8 +20,8 @@ from shapespace.report import figures
 from shapespace.report.analyses.analysis_report import AnalysisReport
 from shapespace.report.analyses.shape_data import scree_part, tangent_part
 from shapespace.report.figures.analysis_figures import views_of
-from shapespace.report.figures.publication import ONE_COLUMN_MM, TWO_COLUMNS_MM
-from shapespace.report.pages.figure_files import FigureConfig, write_figures
+from shapespace.report.figures.draw import ONE_COLUMN_MM, TWO_COLUMNS_MM
+from shapespace.report.pages.study_page import FigureConfig, write_figures
 from shapespace.schemas import CurvePart, DeformationPart, NamedView, Orientation, Series, SurfaceMapPart, TextPart
 from shapespace.types import FloatArray, Mesh
 

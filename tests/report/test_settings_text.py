@@ -13,8 +13,7 @@ from shapespace.fit.fit_scan import FitConfig
 from shapespace.fit.paper.paper_method import Paper
 from shapespace.fit.robust.robust_settings import DenseSettings, ResidualSettings, RobustSettings
 from shapespace.report.blocks.blocks import Block, Facts, Folded, Table
-from shapespace.report.blocks.sections import EVIDENCE, evidence_facts
-from shapespace.report.blocks.settings_text import described, settings_blocks
+from shapespace.report.blocks.sections import EVIDENCE, described, evidence_facts, settings_blocks
 from synthetic_shapes import blob_model, raw_scan
 
 

@@ -89,7 +89,7 @@ def answer_cohort(arguments: argparse.Namespace) -> int:
 def answer_figures(arguments: argparse.Namespace) -> int:
     """Draw the figures of an answer as files."""
     from shapespace.batch.progress import waiting
-    from shapespace.report.pages.figure_files import FigureConfig, write_figures
+    from shapespace.report.pages.study_page import FigureConfig, write_figures
     from shapespace.report.pages.write_html import require_report_extra
 
     config = FigureConfig(**given(arguments, FigureConfig))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,24 @@ LINKS = "links.csv"
 """Table of pairs of landmarks between which figures have a line."""
 _PARALLEL = 1e-3  # sine of the angle below which two directions determine no rotation
 _AGAIN = 'write {"views": [{"name": "dorsal", "toward_viewer": [0, 0, 1], "up": [0, 1, 0]}]}'
+
+_NO_VIEWS = Orientation()
+_ORIENTATION: ContextVar[Orientation] = ContextVar("orientation", default=_NO_VIEWS)
+
+
+@contextmanager
+def oriented(orientation: Orientation | None) -> Generator[None]:
+    """Return a context in which figures have the named views and links of an orientation; None for none."""
+    token = _ORIENTATION.set(orientation or _NO_VIEWS)
+    try:
+        yield
+    finally:
+        _ORIENTATION.reset(token)
+
+
+def current_orientation() -> Orientation:
+    """Return the named views and links of the figures that are drawn."""
+    return _ORIENTATION.get()
 
 
 def find_orientation(
@@ -53,15 +73,17 @@ def find_orientation(
         if any(number < 1 for link in orientation.links for number in link):
             raise FileFormatError(f"{path}: a link has a landmark below 1; number landmarks from 1.")
     if not orientation.links:
-        pairs = curve_links if links is None else read_links(links, landmarks)
-        orientation = structs.replace(orientation, links=pairs)
+        orientation = structs.replace(
+            orientation, links=(curve_links if links is None else read_links(links, landmarks))
+        )
     return orientation if orientation.views or orientation.links else None
 
 
 def read_links(path: Path, landmarks: Sequence[str] | None) -> tuple[tuple[int, int], ...]:
     """Return the numbers of landmarks, from 1, in a table of pairs; errors are those of `read_landmark_numbers`."""
-    rows = read_landmark_numbers(path, landmarks, (2,), "two landmarks").tolist()
-    return tuple((first, second) for first, second in rows)
+    return tuple(
+        (first, second) for first, second in read_landmark_numbers(path, landmarks, (2,), "two landmarks").tolist()
+    )
 
 
 def view_rotation(view: NamedView) -> FloatArray:

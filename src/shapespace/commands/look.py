@@ -180,8 +180,8 @@ def correspondence_facts(folder: Path) -> dict[str, Any]:
     Raises:
         FileError: it is none, or it cannot be read.
     """
-    from shapespace.report.inputs.correspondence_folder import Corresponded
-    from shapespace.report.inputs.triage import concerns_of, distance_share, known, median
+    from shapespace.report.blocks.wording import known, median
+    from shapespace.report.inputs.correspondence_folder import Corresponded, concerns_of, distance_share
 
     if not (folder / CorrespondenceRecord.FILE).is_file():
         raise FileError(

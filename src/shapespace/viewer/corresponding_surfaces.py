@@ -15,9 +15,15 @@ from shapespace.errors import InputError, ShapespaceError
 from shapespace.geometry.mirror_plane import FLIP
 from shapespace.geometry.normals import faces_of
 from shapespace.io.tables.table_io import table_text
-from shapespace.report.blocks.wording import without_folders
-from shapespace.report.inputs.correspondence_folder import Corresponded, Population
-from shapespace.report.inputs.triage import Concern, concerns_of, distance_share, scan_status, sentence
+from shapespace.report.blocks.wording import sentence, without_folders
+from shapespace.report.inputs.correspondence_folder import (
+    Concern,
+    Corresponded,
+    Population,
+    concerns_of,
+    distance_share,
+    scan_status,
+)
 from shapespace.report.render import palette as colours
 from shapespace.report.render.scene import decimate, pack, quantise
 from shapespace.report.render.thumbnails import SQUARES, checker_places

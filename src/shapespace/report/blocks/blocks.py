@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, TypeVar
 
-from shapespace.report.blocks.wording import DASH, STATUS_WORDS, isfinite, mm
+from shapespace.report.blocks.wording import DASH, STATUS_WORDS, counted, isfinite, mm, setting, words
 
 
 @dataclass(frozen=True)
 class Text:
-    """A paragraph; its kind is a class of report.css."""
+    """A paragraph, or a sentence of a list, perhaps after a name; its kind is a class of report.css.
+
+    Nothing is shown of an empty text, and of notes, a notice and a folded part without content.
+    """
 
     text: str
     kind: Literal["", "soft", "notice", "broken"] = ""
+    name: Cell | None = None
+    """Before the text: a status, or what may lead to a place in the page."""
 
 
 @dataclass(frozen=True)
@@ -98,19 +103,11 @@ class Tiles:
 
 
 @dataclass(frozen=True)
-class Item:
-    """A sentence of a list, perhaps after a name that may lead to a place in the page."""
-
-    text: str
-    name: Cell | None = None
-
-
-@dataclass(frozen=True)
 class Notice:
     """A box with a list of sentences; nothing where there are none."""
 
     heading: str
-    items: Sequence[str | Item]
+    items: Sequence[str | Text]
     kind: Literal["notice", "broken"] = "notice"
 
 
@@ -119,14 +116,6 @@ class Notes:
     """A list of remarks."""
 
     items: Sequence[str]
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """A status and the reason for it."""
-
-    status: Cell
-    reason: str
 
 
 @dataclass(frozen=True)
@@ -206,16 +195,8 @@ class Gallery:
 
 
 @dataclass(frozen=True)
-class ScaleKey:
-    """The key of the strips in a gallery: what they show, and the scale of their maps, which ends at `limit_mm`."""
-
-    limit_mm: float
-    bar: Image
-
-
-@dataclass(frozen=True)
 class StripKey:
-    """The key of other strips: what their panels show in words, and scales, each (bar, its ends in words)."""
+    """The key of strips in a gallery: what their panels show in words, and scales, each (bar, its ends in words)."""
 
     text: str
     bars: Sequence[tuple[Image, str, str]]
@@ -261,11 +242,9 @@ Block: TypeAlias = (
     | Tiles
     | Notice
     | Notes
-    | Verdict
     | Figure
     | Turning
     | Gallery
-    | ScaleKey
     | StripKey
     | Folded
     | Group
@@ -273,11 +252,26 @@ Block: TypeAlias = (
 )
 
 
+_Item = TypeVar("_Item")
+
+
 def status(value: str) -> Cell:
     """Return a cell with a status in words and its colour, sorted from bad to good."""
-    known = list(STATUS_WORDS)
     kind = value if value in STATUS_WORDS else "failed"
-    return Cell(STATUS_WORDS.get(value, value), float(len(known) - known.index(kind)), kind)
+    return Cell(STATUS_WORDS.get(value, value), float(len(STATUS_WORDS) - [*STATUS_WORDS].index(kind)), kind)
+
+
+def first_items(
+    items: Sequence[_Item], most: int, where: str, word: str = "other", words: str | None = None
+) -> list[_Item | str]:
+    """Return the first items of a list, and a sentence that counts the others and says where they are."""
+    return [*items[:most], *([f"{counted(len(items) - most, word, words)}, {where}."] if len(items) > most else [])]
+
+
+def no_picture(count: int, noun: str) -> Text:
+    """Return a sentence on those of which a gallery has no card."""
+    others = f"{counted(count, f'other {noun}')} have no picture here"
+    return Text(f"{others}, so that this file stays below 8 MB; the table has them all." if count else "")
 
 
 def number(value: float, digits: int = 2) -> Cell:
@@ -290,6 +284,12 @@ def length(value: float) -> Cell:
     return Cell(mm(value).removesuffix(" mm"), value)
 
 
+def table_of(items: Sequence[_Item], columns: Sequence[tuple[Column, Callable[[_Item], Cell]]], caption: str) -> Table:
+    """Return a table that sorts, with a row for each item and cells that the columns make of it."""
+    rows = [[make(item) for _, make in columns] for item in items]
+    return Table([column for column, _ in columns], rows, caption, sortable=len(rows) > 1)
+
+
 def text_table(heads: Sequence[str], rows: Sequence[Sequence[str]], caption: str) -> Table:
     """Return a table of texts that may be long."""
     return Table([Column(head) for head in heads], [[Cell(text) for text in row] for row in rows], caption, stack=True)
@@ -297,6 +297,4 @@ def text_table(heads: Sequence[str], rows: Sequence[Sequence[str]], caption: str
 
 def facts_of(values: Mapping[str, object], caption: str) -> Facts:
     """Return settings or measures by name, those with parts by their plain parts."""
-    from shapespace.report.blocks.wording import setting, words
-
     return Facts([(words(key), setting(value)) for key, value in values.items()], caption)

@@ -2,40 +2,59 @@
 
 from __future__ import annotations
 
+import inspect
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from itertools import product
+from math import nan
 from types import MappingProxyType
-from typing import TYPE_CHECKING, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
 from shapespace.errors import ShapespaceError
+from shapespace.fit.paper.paper_method import Paper
+from shapespace.fit.robust.robust_settings import DenseSettings, ResidualSettings, RobustSettings
+from shapespace.model.shape_model import ShapeModel
+from shapespace.report import figures
 from shapespace.report.blocks.blocks import (
     Block,
+    Cell,
+    Column,
     Facts,
     Figure,
     Folded,
     Group,
     Notes,
+    Table,
     Text,
     Turning,
-    Verdict,
+    length,
+    number,
     status,
+    text_table,
 )
-from shapespace.report.blocks.wording import counted, isfinite, listed, mm, percent, setting, training_text, words
-from shapespace.report.inputs.saved_fits import SavedFit
-from shapespace.report.inputs.staged_fit import REGIONS, StagedFit, measured_mm, nice_ceiling
+from shapespace.report.blocks.wording import (
+    DASH,
+    ORDER_OF_CONCERN,
+    counted,
+    isfinite,
+    listed,
+    mm,
+    percent,
+    plain,
+    setting,
+    training_text,
+    words,
+)
+from shapespace.report.inputs.saved_fits import Direction, Measure, SavedFit
+from shapespace.report.inputs.staged_fit import REGIONS, StagedFit, measured_mm
 from shapespace.report.pages.page import Page
+from shapespace.report.render import thumbnails
+from shapespace.report.render.scene import pack_fit, pack_model, pack_scatter, pack_surfaces
+from shapespace.schemas import Quality, VertexErrors
 from shapespace.types import FloatArray, Mesh
-
-if TYPE_CHECKING:
-    from shapespace.model.shape_model import ShapeModel
-    from shapespace.report.figures import Coefficients
-    from shapespace.schemas import Quality
-
-ORDER_OF_CONCERN = ("failed", "unreadable", "doubtful", "max_iterations", "converged")
-"""Statuses, those first that somebody must look at."""
 
 MODEL_PICTURES, FIT_PICTURES = 4, 9
 """How many pictures `model_part` and `fit_in_full` make."""
@@ -67,7 +86,7 @@ def in_columns(*pictures: Block) -> Block:
     tall = np.array([_height(picture) for picture in pictures])
     right = np.array([(0, *rest) for rest in product((0, 1), repeat=len(pictures) - 1)], dtype=bool)
     best = right[np.abs(right @ tall - (~right) @ tall).argmin()]
-    sides = [[picture for picture, there in zip(pictures, best, strict=True) if there == side] for side in (0, 1)]
+    sides = [[picture for picture, is_right in zip(pictures, best, strict=True) if is_right == k] for k in (0, 1)]
     return Group("columns", [Group("column", side) for side in sides])
 
 
@@ -88,8 +107,6 @@ def model_part(page: Page, model: ShapeModel, *, figure_of: str = "", to_move: i
         figure_of: said before the caption of the modes.
         to_move: how many modes can be moved by hand.
     """
-    from shapespace.report import figures
-
     needed = [
         f"{100 * share:g} % in {counted(count, 'mode')}"
         for share in _VARIANCE_SHARES
@@ -139,8 +156,6 @@ def model_part(page: Page, model: ShapeModel, *, figure_of: str = "", to_move: i
 
 def quality_part(page: Page, quality: Quality) -> Figure:
     """Return how good the shape space is by its number of modes, from the measures of it that are there."""
-    from shapespace.report import figures
-
     return page.figure(
         figures.quality_figure(quality),
         "Compactness: share of the variance. Generalisation: error on shapes left out. Specificity: distance of random "
@@ -153,9 +168,6 @@ def quality_part(page: Page, quality: Quality) -> Figure:
 
 def modes_to_move(page: Page, model: ShapeModel, most: int) -> Turning | Figure:
     """Return the model's modes with sliders, as stills of the mean where nothing turns."""
-    from shapespace.report.render import thumbnails
-    from shapespace.report.render.scene import pack_model
-
     count = min(most, model.n_modes)
     still = thumbnails.mesh_still(model.mesh(), (420, 420))
     which = f"The first {counted(count, 'mode')} of {model.n_modes}"
@@ -197,28 +209,25 @@ def fit_in_full(
         return [Text("Its pictures would make this file larger than 8 MB, so they are left out.", "soft")]
     turning = page.tried(lambda: fit_to_turn(page, fit))
     pictures = fit_pictures(page, fit, population, of_paper=of_paper)
-    heading = "More pictures: stages, both ways of distance, regions, thresholds, iterations, coefficients"
-    if fit.regions is None:
-        heading = "More pictures: both ways of distance, thresholds, coefficients"
+    stages, iterations = ("", "") if fit.regions is None else ("stages, ", "iterations, ")
+    heading = (
+        f"More pictures: {stages}both ways of distance, {stages and 'regions, '}thresholds, {iterations}coefficients"
+    )
     return [*turning, Folded(heading, [pictures]) if folded else pictures]
 
 
 def fit_to_turn(page: Page, fit: StagedFit) -> Turning | Figure:
     """Return scan and model of one fit, as a strip of stills where nothing turns."""
-    from shapespace.report.render import thumbnails
-    from shapespace.report.render.scene import pack_fit
-
     limit_mm = fit.scale_mm
     scale = (
         f"the signed distance to the scan, −{limit_mm:g} (blue) to +{limit_mm:g} mm (red)."
         if fit.scan.faces is not None
         else f"the distance to the points of the scan, 0 to {limit_mm:g} mm."
     )
-    still = thumbnails.fit_strip(fit, limit_mm, (300, 372))
     return page.turning(
         "fit",
         pack_fit(fit, largest_scan=SCAN_TRIANGLES),
-        page.image(still, strip_alt(fit, limit_mm)),
+        page.image(thumbnails.fit_strip(fit, limit_mm, (300, 372)), strip_alt(fit, limit_mm)),
         f"{fit.label}: the scan, and the {'fitted model' if fit.regions is None else 'model at each stage'}.",
         label=f"Scan and model of {fit.label}, to be turned",
         still=f"The still shows the scan, both over each other, and {scale}",
@@ -234,14 +243,10 @@ def surface_to_turn(page: Page, fit: SavedFit, surfaces: Mapping[str, Mesh], why
         surfaces: `final`, and `dense` where there is one, in the picture frame.
         why: the scan is not shown, as the end of a sentence.
     """
-    from shapespace.report.render import thumbnails
-    from shapespace.report.render.scene import pack_surfaces
-
-    still = thumbnails.mesh_still(surfaces["final"], (420, 420))
     return page.turning(
         "fit",
         pack_surfaces(surfaces, fit.record, name=fit.name, label=fit.label, reason=why, largest=SCAN_TRIANGLES),
-        page.image(still, f"The fitted surface of {fit.name}"),
+        page.image(thumbnails.mesh_still(surfaces["final"], (420, 420)), f"The fitted surface of {fit.name}"),
         f"{fit.label}: the fitted surface; {why.removesuffix('.')}.",
         label=f"Fitted surface of {fit.label}, to be turned",
         still="The still shows the fitted surface.",
@@ -264,8 +269,6 @@ def share_within(fit: StagedFit, limit_mm: float) -> str:
 
 def fit_pictures(page: Page, fit: StagedFit, population: FloatArray | None, *, of_paper: bool) -> Block:
     """Return every picture of one fit, as `fit_in_full` has them."""
-    from shapespace.report import figures
-
     stages = {"before": "before", "initial": "after phase 1", "final": "after phase 2", "dense": "dense"}
     largest = "largest distance from model to scan " + listed(
         [
@@ -287,17 +290,21 @@ def fit_pictures(page: Page, fit: StagedFit, population: FloatArray | None, *, o
         "coefficients_figure": f"Coefficients of {fit.label}: " + ", ".join(f"{value:.1f}" for value in fit.z[:10]),
     }
 
-    if fit.regions is None:
-        alts = {name: alt for name, alt in alts.items() if name not in _OF_STAGES}
-
     def picture(name: str, alt: str) -> Figure:
-        more = {"population": population} if name == "coefficients_figure" else {}
-        drawing = getattr(figures, name)(fit, **more)
-        caption = (_OF_PAPER.get(name, "") if of_paper else "") + _CAPTIONS[name]
-        return page.figure(drawing, caption, alt=alt, chart=name in ("history_figure", "coefficients_figure"))
+        return page.figure(
+            getattr(figures, name)(fit, **({"population": population} if name == "coefficients_figure" else {})),
+            ((_OF_PAPER.get(name, "") if of_paper else "") + _CAPTIONS[name]),
+            alt=alt,
+            chart=name in ("history_figure", "coefficients_figure"),
+        )
 
     return in_columns(
-        *(block for name, alt in alts.items() for block in page.tried(lambda name=name, alt=alt: picture(name, alt)))
+        *(
+            block
+            for name, alt in alts.items()
+            if fit.regions is not None or name not in _OF_STAGES
+            for block in page.tried(lambda name=name, alt=alt: picture(name, alt))
+        )
     )
 
 
@@ -329,18 +336,25 @@ def region_shares(fit: StagedFit) -> str:
     """Return the share of each region in words, or that they are unknown if the stages were not saved."""
     if fit.regions is None:
         return "not saved"
-    counts = np.bincount(fit.regions, minlength=len(REGIONS)) / max(len(fit.regions), 1)
-    return listed([f"{name} {percent(float(share))}" for name, share in zip(REGIONS, counts, strict=True)])
+    return listed(
+        [
+            f"{name} {percent(float(share))}"
+            for name, share in zip(
+                REGIONS, (np.bincount(fit.regions, minlength=len(REGIONS)) / max(len(fit.regions), 1)), strict=True
+            )
+        ]
+    )
 
 
 def fit_facts(fit: SavedFit) -> list[Block]:
     """Return status, reason, distances and notes of one fit, and its evidence folded away."""
-    out: list[Block] = [Verdict(status(fit.status), fit.reason), Text(distances_text(fit))]
-    if fit.record.notes:
-        out.append(Notes(fit.record.notes))
-    if fit.record.evidence:
-        out.append(Folded("Evidence for the verdict", [evidence_facts(fit.record.evidence, f"Evidence of {fit.name}")]))
-    return out
+    evidence = fit.record.evidence
+    return [
+        Text(fit.reason, name=status(fit.status)),
+        Text(distances_text(fit)),
+        Notes(fit.record.notes),
+        Folded("Evidence for the verdict", [evidence_facts(evidence, f"Evidence of {fit.name}")] if evidence else []),
+    ]
 
 
 def distances_text(fit: SavedFit) -> str:
@@ -361,11 +375,6 @@ def _over(share: float | None, of: str) -> str:
 # Many fits
 
 
-def common_limit_mm(fits: Sequence[StagedFit]) -> float:
-    """Return the end of the scale that strips of these fits share: that of the usual fit."""
-    return nice_ceiling(float(np.median([fit.scale_mm for fit in fits]))) if fits else 1.0
-
-
 def usable(items: Sequence[_From], load: Callable[[_From], _To]) -> tuple[list[_To], list[str]]:
     """Return what `load` gives, and one sentence for each of the items that it refuses."""
     usable_fits: list[_To] = []
@@ -381,18 +390,14 @@ def usable(items: Sequence[_From], load: Callable[[_From], _To]) -> tuple[list[_
 # Coefficients
 
 
-def coefficients_of(fit: SavedFit) -> Coefficients:
+def coefficients_of(fit: SavedFit) -> figures.Coefficients:
     """Return the coefficients of one fit with its label."""
-    from shapespace.report.figures import Coefficients
-
     entry = fit.entry
-    return Coefficients(fit.name, entry.expression, entry.intensity or 0.0, fit.numbers("b"), fit.numbers("z"))
+    return figures.Coefficients(fit.name, entry.expression, entry.intensity or 0.0, fit.numbers("b"), fit.numbers("z"))
 
 
-def scatter(page: Page, points: Sequence[Coefficients]) -> list[Block]:
+def scatter(page: Page, points: Sequence[figures.Coefficients]) -> list[Block]:
     """Return the first coefficients of many fits against each other, coloured by label."""
-    from shapespace.report import figures
-
     labels = list(dict.fromkeys(point.expression for point in points if point.expression))
     coloured = f", coloured by label: {listed(labels)}" if len(labels) > 1 else ""
     matrix = page.figure(
@@ -406,7 +411,11 @@ def scatter(page: Page, points: Sequence[Coefficients]) -> list[Block]:
 
 
 def lines_through_neutral(
-    page: Page, points: Sequence[Coefficients], neutral: Coefficients | None, *, figures_of: Sequence[str] = ("", "")
+    page: Page,
+    points: Sequence[figures.Coefficients],
+    neutral: figures.Coefficients | None,
+    *,
+    figures_of: Sequence[str] = ("", ""),
 ) -> Block:
     """Return the line structure of one subject's expressions in two and in three coefficients (figures 9 and 10).
 
@@ -416,8 +425,6 @@ def lines_through_neutral(
         neutral: the fit of the neutral face, through which the lines pass; None draws none.
         figures_of: said before the two captions.
     """
-    from shapespace.report import figures
-
     about = (
         "Larger marks are stronger expressions. Lines pass through the fitted neutral face and fit best in all "
         "coefficients, each in its standard deviations."
@@ -444,11 +451,8 @@ def lines_through_neutral(
     return in_columns(*pictures)
 
 
-def scatter_to_turn(page: Page, points: Sequence[Coefficients]) -> Turning | Figure:
+def scatter_to_turn(page: Page, points: Sequence[figures.Coefficients]) -> Turning | Figure:
     """Return b1, b2 and b3 in space, as a still where nothing turns."""
-    from shapespace.report import figures
-    from shapespace.report.render.scene import pack_scatter
-
     still = figures.encode_webp(figures.b_space(points), lossless=True)
     first = np.stack([point.b[:MODES_IN_WIDGET] for point in points])
     return page.turning(
@@ -530,3 +534,248 @@ def evidence_facts(values: Mapping[str, object], caption: str) -> Facts:
     rows = [(EVIDENCE[key][0], EVIDENCE[key][1](float(known[key]))) for key in EVIDENCE if key in known]
     rows += [(words(key), setting(value)) for key, value in values.items() if key not in known]
     return Facts(rows, caption)
+
+
+_Make = Callable[[SavedFit], Cell]
+
+
+def fits_table(fits: Sequence[SavedFit], places: Mapping[str, str], *, caption: str) -> Table:
+    """Return a table of all fits that sorts, without the columns that would be empty.
+
+    Args:
+        fits: in the order wanted.
+        places: where in the page a fit is shown, by its name.
+        caption: of the table.
+    """
+    columns: list[tuple[Column, _Make]] = [
+        (Column("Scan"), lambda fit: Cell(fit.name, anchor=places.get(fit.name))),
+        (Column("Label"), lambda fit: Cell(fit.label if fit.label != fit.name else "")),
+        (Column("Status"), lambda fit: status(fit.status)),
+        *((Column(head, "number"), make) for head, make in _NUMBERS),
+    ]
+    nonempty = [
+        (column, cells)
+        for column, cells in [(column, [make(fit) for fit in fits]) for column, make in columns]
+        if any(cell.text if cell.value is None else isfinite(cell.value) for cell in cells)
+    ]
+    return Table(
+        [column for column, _ in nonempty],
+        [[cells[k] for _, cells in nonempty] for k in range(len(fits))],
+        caption,
+        sortable=len(fits) > 1,
+    )
+
+
+def _error(of: Callable[[SavedFit], VertexErrors | None], measure: str) -> _Make:
+    return lambda fit: length(getattr(of(fit), measure, nan))
+
+
+def _distance(direction: Direction, measure: Measure) -> _Make:
+    return lambda fit: length(fit.distance_mm(direction, measure))
+
+
+def _share(key: str) -> _Make:
+    def cell(fit: SavedFit) -> Cell:
+        share = getattr(fit.record.shown, key, None)
+        return number(nan if share is None else 100 * share, 0)
+
+    return cell
+
+
+def _total(values: Mapping[str, float], digits: int) -> Cell:
+    return number(sum(values.values()) if values else nan, digits)
+
+
+_NUMBERS: list[tuple[str, _Make]] = [
+    ("True vertex error, mean", _error(lambda fit: fit.entry.vertex_error_mm, "mean")),
+    ("True vertex error, max", _error(lambda fit: fit.entry.vertex_error_mm, "max")),
+    ("Floor of that, mean", _error(lambda fit: fit.entry.floor_mm, "mean")),
+    ("Expected vertex error", lambda fit: length(fit.expected_error_mm)),
+    ("Model to scan where shown, mean", _distance("model_to_scan", "mean")),
+    ("Model to scan where shown, 95 %", _distance("model_to_scan", "p95")),
+    ("Scan to model where covered, mean", _distance("scan_to_model", "mean")),
+    ("Scan to model where covered, 95 %", _distance("scan_to_model", "p95")),
+    ("Model shown, %", _share("model_seen_share")),
+    ("Scan covered, %", _share("scan_covered_share")),
+    ("RMS of z", lambda fit: number(float(np.sqrt(np.mean(np.square(fit.record.z)))) if fit.record.z else nan, 1)),
+    ("Steps", lambda fit: _total(fit.record.iterations, 0)),
+    ("Seconds", lambda fit: _total(fit.record.seconds, 1)),
+]
+
+
+SCORE_WORDS: Mapping[str, str] = {
+    "line_r2_through_neutral": "Share of the deviation on the line through neutral (R²)",
+    "line_r2_free": "R² of the best line anywhere, of the scatter about the mean (a smaller whole, so it may be lower)",
+    "line_sign_consistency": "Share of faces on the same side of neutral",
+    "line_spearman": "Rank correlation of position on the line with intensity",
+    "line_permutation_p": "Its permutation p-value",
+    "disjointness": "All expressions",
+    "leave_one_out_accuracy": "Leave-one-out accuracy of the nearest mean direction",
+    "chance": "Accuracy of guessing",
+    "cosine_silhouette": "Silhouette of the directions (−1 to 1)",
+    "separability": "Between-class over within-class scatter",
+    "accuracy_p": "Permutation p-value of the accuracy",
+    "silhouette_p": "Permutation p-value of the silhouette",
+    "left_out": "Faces left out because their fit is not trusted",
+}
+
+
+def score_tables(scores: Mapping[str, Any], *, many: str, single: str) -> list[Block]:
+    """Return scores as tables: those given for each of several things as one, single values as another.
+
+    Args:
+        scores: name -> value, or name -> {thing: value}.
+        many: caption of the first.
+        single: caption of the second.
+    """
+
+    def row(key: str, values: Sequence[object]) -> list[Cell]:
+        return [
+            Cell(SCORE_WORDS.get(key, words(key))),
+            *map(
+                Cell,
+                [f"{value:.3f}" if isinstance(value, float) and abs(value) < 10 else plain(value) for value in values],
+            ),
+        ]
+
+    by_thing = {key: _mapping(value) for key, value in scores.items() if key.startswith("line_")}
+    out: list[Block] = []
+    if by_thing:
+        names = list(dict.fromkeys(name for value in by_thing.values() for name in value))
+        out.append(
+            Table(
+                [Column("Score"), *(Column(name, "number") for name in names)],
+                [row(key, [value.get(name) for name in names]) for key, value in by_thing.items()],
+                many,
+            )
+        )
+    rest = [
+        row(name, [single_value])
+        for key, value in scores.items()
+        if key not in by_thing
+        for name, single_value in (_mapping(value) or {key: value}).items()
+    ]
+    if rest:
+        out.append(Table([Column("Score"), Column("Value", "number")], rest, single))
+    return out or [Text("There are no scores.")]
+
+
+_NOTHING: Mapping[str, Any] = {}
+_CAPTION = "Settings and versions"
+_OF: Mapping[str, type] = {
+    "robust": RobustSettings, "paper": Paper, "dense_settings": DenseSettings, "residual": ResidualSettings,
+}  # fmt: skip
+_LEVEL = ("modes", "scan_points", "vertices", "triangles", "iterations", "stop_motion_mm")
+_LEVEL_HEADS = (
+    "Modes", "Points of the scan", "Vertices of the model", "Matched to", "Steps at most", "Stops below, mm",
+)  # fmt: skip
+
+
+def settings_blocks(configs: Sequence[Mapping[str, Any]], first: Sequence[tuple[str, str]]) -> list[Block]:
+    """Return what fits ran with: choices as sentences, and the numbers of the method folded away.
+
+    Args:
+        configs: settings of each fit, from its record; they may be damaged.
+        first: names and values that stand before them.
+    """
+    rows = list(first)
+    for name, tell in _CHOICES:
+        texts = list(dict.fromkeys(tell(config) for config in configs))
+        if any(texts):
+            rows.append((name, "; of others: ".join(texts[:4])))
+    out: list[Block] = [Facts(rows, _CAPTION)]
+    wanted = [
+        *dict.fromkeys(str(config.get("method")) for config in configs),
+        *(["dense_settings"] if any(config.get("dense") is True for config in configs) else []),
+    ]
+    for key in wanted:
+        mappings = [_mapping(config.get(key)) for config in configs]
+        values = next((value for value in mappings if value), _NOTHING)
+        if not values:
+            continue
+        part_name = "the dense stage" if key == "dense_settings" else f"the {key} method"
+        differs = " of the first fit; others differ" if any(value and value != values for value in mappings) else ""
+        out.append(Folded(f"All numbers of {part_name}{differs}", _numbers(key, values, part_name)))
+    return out
+
+
+def described(cls: type) -> dict[str, str]:
+    """Return what each argument of a class is, from its docstring."""
+    entries = re.findall(
+        r"^    (\w+): (.*(?:\n        .*)*)",
+        (inspect.getdoc(cls) or "").partition("Args:\n")[2].partition("\n\n")[0],
+        re.MULTILINE,
+    )
+    return {name: " ".join(text.split()).strip(" ,;") for name, text in entries}
+
+
+def _numbers(key: str, values: Mapping[str, Any], part_name: str) -> list[Block]:
+    """Return the settings of one part of the fit as tables of words."""
+    out: list[Block] = []
+    rows: list[list[str]] = [
+        ["all" if step.get(name) is None else _level(name, step[name]) for name in _LEVEL]
+        for step in map(_mapping, _list(values.get("levels")))
+    ]
+    if rows:
+        out.append(text_table(_LEVEL_HEADS, rows, "The steps from coarse to fine"))
+    cells: list[list[str]] = []
+    for name, value in _flat(key, values):
+        owner, _, own = name.rpartition(".")
+        cells.append([words(own), plain(value), (described(_OF[owner]).get(own, "") if owner in _OF else "") or DASH])
+    return [*out, text_table(("Setting", "Value", "What it is"), cells, f"Settings of {part_name}")]
+
+
+def _level(name: str, value: object) -> str:
+    if name == "triangles":
+        return "triangles" if value else "vertices"
+    return f"{value:,}" if isinstance(value, int) else plain(value)
+
+
+def _flat(key: str, values: Mapping[str, Any]) -> list[tuple[str, object]]:
+    """Return settings by `owner.name`, those of a part in its place; the steps have a table of their own."""
+    out: list[tuple[str, object]] = []
+    for name, value in values.items():
+        if name == "levels":
+            continue
+        inner = _mapping(value)
+        out += _flat(name, inner) if inner else [(f"{key}.{name}", value)]
+    return out
+
+
+def _mapping(value: object) -> Mapping[str, Any]:
+    return cast(Mapping[str, Any], value) if isinstance(value, Mapping) else _NOTHING
+
+
+def _list(value: object) -> list[object]:
+    return cast(list[object], value) if isinstance(value, list) else []
+
+
+def _modes(config: Mapping[str, Any]) -> str:
+    modes = config.get("modes")
+    return "all of the model" if modes is None else f"the first {plain(modes)}"
+
+
+def _unit(config: Mapping[str, Any]) -> str:
+    unit = plain(config.get("unit"))
+    return "found from the size of each scan" if unit == "auto" else f"{unit}, as given"
+
+
+def _scale(config: Mapping[str, Any]) -> str:
+    effect = str(config.get("scale_in_effect", config.get("scale")))
+    text = {"free": "free: each fit finds its own", "fixed": "fixed: scans and model are of one size"}.get(
+        effect, plain(effect)
+    )
+    return f"{text}, as the model is made" if config.get("scale") == "auto" else text
+
+
+_METHODS = {"robust": "robust: what does not match the model is left out", "paper": "the paper's"}
+_DENSE = {True: "made: the surface goes the rest of the way to the scan"}
+_CHOICES: tuple[tuple[str, Callable[[Mapping[str, Any]], str]], ...] = (
+    ("Method", lambda config: _METHODS.get(str(config.get("method")), plain(config.get("method")))),
+    ("Modes", _modes),
+    ("Unit of the scans", _unit),
+    ("Size", _scale),
+    ("Dense stage", lambda config: _DENSE.get(config.get("dense") is True, "not made")),
+    ("Iterations", lambda config: f"at most {plain(config.get('max_iterations'))} in each phase"),
+    ("Random numbers", lambda config: f"from seed {plain(config.get('seed'))}"),
+)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
+import statistics
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-from math import isfinite
+from math import isfinite, nan
 from typing import TYPE_CHECKING, Any, cast
 
 if TYPE_CHECKING:
@@ -19,6 +20,8 @@ STATUS_WORDS: Mapping[str, str] = {
     "unreadable": "unreadable",
 }
 """What each status is called, the best first."""
+ORDER_OF_CONCERN = ("failed", "unreadable", "doubtful", "max_iterations", "converged")
+"""Statuses, those first that somebody must look at."""
 
 DASH = "–"
 _FOLDERS = re.compile(r"""(?<![\w.~/\\])(?:[A-Za-z]:)?[\\/](?:[^\s'",;:()\\/]+[\\/])*(?=[^\s\\/])""")
@@ -93,8 +96,9 @@ def plain(value: object) -> str:
 def setting(value: object) -> str:
     """Return a setting as text; of a setting with parts, the plain ones."""
     if isinstance(value, Mapping):
-        inner = cast(Mapping[str, Any], value)
-        return plain({key: item for key, item in inner.items() if not isinstance(item, dict | list)})
+        return plain(
+            {key: item for key, item in cast(Mapping[str, Any], value).items() if not isinstance(item, dict | list)}
+        )
     return plain(value)
 
 
@@ -109,3 +113,24 @@ def moment(value: str) -> str:
 def words(key: str) -> str:
     """Return the name of a setting as words."""
     return key.replace("_", " ")
+
+
+def known(value: float | None) -> float:
+    """Return a number that may be absent, NaN for None."""
+    return nan if value is None else value
+
+
+def median(values: Sequence[float]) -> float:
+    """Return the median of the finite numbers, NaN if there are none."""
+    numbers = [value for value in values if isfinite(value)]
+    return statistics.median(numbers) if numbers else nan
+
+
+def percent_of(share: float) -> str:
+    """Return a small share in percent with two digits or so."""
+    return f"{plain(float(f'{100 * share:.2g}'))} %" if isfinite(share) else DASH
+
+
+def sentence(text: str) -> str:
+    """Return `text` from a capital letter to a full stop."""
+    return f"{text[:1].upper()}{text[1:]}" + ("" if text.endswith(".") else ".") if text else ""

@@ -8,73 +8,75 @@
     figures.signed_maps(StagedFit.of(model, result)).savefig("distances.png")
 
 Pictures of one row share camera and light, one figure has one scale, and the maps are distinguishable for colour-blind
-readers. Importing this package needs the extra `report`.
+readers. A name is imported on first use, which needs the extra `report`.
 """
 
-from shapespace.report.figures.analysis_figures import (
-    histogram_figure,
-    morph_figure,
-    oriented,
-    surface_map_figure,
-    upright_views,
-)
-from shapespace.report.figures.coefficient_figures import Coefficients, b_plane, b_space, scatter_matrix
-from shapespace.report.figures.correspondence_figures import (
-    SIDE_DEG,
-    checkerboard_figure,
-    missing_figure,
-    movement_figure,
-    nearness_figure,
-    position_std_figure,
-)
-from shapespace.report.figures.draw import STAGE_WORDS, encode_webp
-from shapespace.report.figures.fit_figures import (
-    THRESHOLDS_MM,
-    coefficients_figure,
-    distance_histograms,
-    history_figure,
-    overlay_figure,
-    regions_figure,
-    signed_maps,
-    stages_figure,
-    threshold_figure,
-)
-from shapespace.report.figures.landmark_figures import (
-    deformation_grid_figure,
-    landmark_map_figure,
-    landmark_vectors_figure,
-    superimposed_landmarks,
-)
-from shapespace.report.figures.many_fit_figures import (
-    aligned_grid,
-    distance_maps,
-    error_curves,
-    faces_grid,
-    portrait_figure,
-)
-from shapespace.report.figures.model_figures import (
-    mean_figure,
-    mode_animation,
-    modes_figure,
-    quality_figure,
-    spectrum_figure,
-)
-from shapespace.report.figures.morphospace_figures import Morphospace, morphospace_figure
-from shapespace.report.figures.population_figures import (
-    coefficients_spread,
-    density_figure,
-    distributions_figure,
-    levels_figure,
-    over_time_figure,
-)
-from shapespace.report.figures.publication import publication_style, save_figure
-from shapespace.report.figures.recognition_figures import (
-    calibration_figure,
-    confusion_figure,
-    curve_figure,
-    learning_curve_figure,
-)
-from shapespace.report.inputs.staged_fit import StagedFit
+from typing import TYPE_CHECKING
+
+from shapespace.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from shapespace.cohort.orientation import oriented
+    from shapespace.report.figures.analysis_figures import (
+        SIDE_DEG,
+        calibration_figure,
+        checkerboard_figure,
+        confusion_figure,
+        curve_figure,
+        histogram_figure,
+        learning_curve_figure,
+        missing_figure,
+        morph_figure,
+        movement_figure,
+        nearness_figure,
+        position_std_figure,
+        surface_map_figure,
+        upright_views,
+    )
+    from shapespace.report.figures.draw import STAGE_WORDS, encode_webp, publication_style, save_figure
+    from shapespace.report.figures.fit_figures import (
+        THRESHOLDS_MM,
+        aligned_grid,
+        coefficients_figure,
+        distance_histograms,
+        distance_maps,
+        error_curves,
+        faces_grid,
+        history_figure,
+        overlay_figure,
+        portrait_figure,
+        regions_figure,
+        signed_maps,
+        stages_figure,
+        threshold_figure,
+    )
+    from shapespace.report.figures.landmark_figures import (
+        Morphospace,
+        deformation_grid_figure,
+        landmark_map_figure,
+        landmark_vectors_figure,
+        morphospace_figure,
+        superimposed_landmarks,
+    )
+    from shapespace.report.figures.model_figures import (
+        mean_figure,
+        mode_animation,
+        modes_figure,
+        quality_figure,
+        spectrum_figure,
+    )
+    from shapespace.report.figures.population_figures import (
+        Coefficients,
+        b_plane,
+        b_space,
+        coefficients_spread,
+        density_figure,
+        distributions_figure,
+        levels_figure,
+        over_time_figure,
+        scatter_matrix,
+    )
+    from shapespace.report.inputs.staged_fit import StagedFit
 
 __all__ = [
     "SIDE_DEG",
@@ -132,3 +134,70 @@ __all__ = [
     "threshold_figure",
     "upright_views",
 ]
+
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "report.figures.analysis_figures": (
+            "SIDE_DEG",
+            "calibration_figure",
+            "checkerboard_figure",
+            "confusion_figure",
+            "curve_figure",
+            "histogram_figure",
+            "learning_curve_figure",
+            "missing_figure",
+            "morph_figure",
+            "movement_figure",
+            "nearness_figure",
+            "position_std_figure",
+            "surface_map_figure",
+            "upright_views",
+        ),
+        "report.figures.draw": ("STAGE_WORDS", "encode_webp", "publication_style", "save_figure"),
+        "report.figures.fit_figures": (
+            "THRESHOLDS_MM",
+            "aligned_grid",
+            "coefficients_figure",
+            "distance_histograms",
+            "distance_maps",
+            "error_curves",
+            "faces_grid",
+            "history_figure",
+            "overlay_figure",
+            "portrait_figure",
+            "regions_figure",
+            "signed_maps",
+            "stages_figure",
+            "threshold_figure",
+        ),
+        "report.figures.landmark_figures": (
+            "Morphospace",
+            "deformation_grid_figure",
+            "landmark_map_figure",
+            "landmark_vectors_figure",
+            "morphospace_figure",
+            "superimposed_landmarks",
+        ),
+        "report.figures.model_figures": (
+            "mean_figure",
+            "mode_animation",
+            "modes_figure",
+            "quality_figure",
+            "spectrum_figure",
+        ),
+        "report.figures.population_figures": (
+            "Coefficients",
+            "b_plane",
+            "b_space",
+            "coefficients_spread",
+            "density_figure",
+            "distributions_figure",
+            "levels_figure",
+            "over_time_figure",
+            "scatter_matrix",
+        ),
+        "cohort.orientation": ("oriented",),
+        "report.inputs.staged_fit": ("StagedFit",),
+    },
+)

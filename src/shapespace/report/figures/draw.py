@@ -5,6 +5,7 @@ A figure is 960 pixels wide, and its smallest type stays legible when a phone sh
 
 from __future__ import annotations
 
+import base64
 import io
 import re
 import textwrap
@@ -13,11 +14,18 @@ from bisect import bisect_left
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from html import unescape
+from importlib import import_module
+from pathlib import Path
+from typing import Any, cast
 
+import matplotlib
 import numpy as np
+from matplotlib import font_manager
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg, RendererAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize
@@ -25,6 +33,7 @@ from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 
 from shapespace.errors import InputError
+from shapespace.io.files import write_bytes
 from shapespace.report.blocks.wording import counted as counted
 from shapespace.report.blocks.wording import mm as mm
 from shapespace.report.blocks.wording import percent as percent
@@ -34,9 +43,6 @@ from shapespace.report.render.palette import DIVERGING, SCAN_COLOUR, SEQUENTIAL,
 from shapespace.report.render.renderer import Camera, Image, Layer, point_spacing
 from shapespace.report.render.thumbnails import Still, encoded
 from shapespace.types import FloatArray, Mesh
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 STAGE_WORDS = {
     "before": "before",
@@ -52,7 +58,7 @@ NOT_SHOWN = "not shown by the scan"
 """What all figures call the signs of distances, distances to a point cloud, and vertices without a distance."""
 
 INK, GREY, RULE = "#1d1f22", "#5c6068", "#e4e5e8"
-FORWARD, BACKWARD = "#0072B2", "#D55E00"
+FORWARD, BACKWARD, BARS = "#0072B2", "#D55E00", "#a9c9e2"
 WIDTH, DPI = 960, 160  # layout: pixels of the column, dots per inch
 TITLE, TEXT, SMALL = 12.0, 11.0, 9.5  # layout: type sizes, points
 MOST_PANELS = 48  # limit on the size of a figure
@@ -62,7 +68,6 @@ _GAP, _EDGE = 8, 4  # layout: pixels
 _MOST_LINES = 4  # layout: lines of a caption
 # steps between tick labels, and how many labels fit beside each other
 _STEPS, _MOST_NUMBERS = (1, 5, 10, 20, 50, 100, 200, 500), 22
-_Item = TypeVar("_Item")
 
 
 @dataclass(frozen=True)
@@ -162,6 +167,22 @@ def view(points: FloatArray, columns: int, *, yaw_deg: float = 0.0, width: int =
     return View(Camera.framing(points, yaw_deg=yaw_deg, aspect=size[0] / size[1], margin=margin), size)
 
 
+def equal_views(sides: Sequence[tuple[FloatArray, float]], columns: int) -> tuple[list[Camera], tuple[int, int]]:
+    """Return cameras of one scale that contain points (N, 3) turned by a yaw in degrees, and the size of their panels.
+
+    Args:
+        sides: points and yaw of each view.
+        columns: number of panels that fill the figure.
+    """
+    views = [view(points, columns, yaw_deg=yaw) for points, yaw in sides]
+    width, height = views[0].size
+    tall = max(item.camera.height_mm for item in views)
+    across = max(item.camera.height_mm * item.size[0] / item.size[1] for item in views)
+    height = min(max(round(width * tall / across), round(width / 3)), round(width * 1.5))
+    height_mm = max(tall, across * height / width)
+    return [replace(item.camera, height_mm=height_mm) for item in views], (width, height)
+
+
 def surroundings(fit: StagedFit) -> FloatArray:
     """Return the points (N, 3) that a picture of `fit` frames: its surface, and the scan near it."""
     surface = fit.surfaces["final"].vertices
@@ -201,8 +222,10 @@ def grid(
         raise InputError(f"{plain(title or 'The figure')}: there is nothing to draw.")
     layout = LAYOUT.get()
     columns = max(len(row.panels) for row in rows)
-    widest = max(row.panels[0].shape[1] for row in rows) / layout.panel_scale
-    total_w = max(layout.row_width, int(columns * widest + (columns - 1) * _GAP))
+    total_w = max(
+        layout.row_width,
+        int(columns * (max(row.panels[0].shape[1] for row in rows) / layout.panel_scale) + (columns - 1) * _GAP),
+    )
     texts: list[tuple[float, float, str, dict[str, Any]]] = []
     pictures: list[tuple[float, float, Image]] = []
     y = 6.0
@@ -295,10 +318,9 @@ def bar_height() -> float:
 
 def colour_bar(figure: Figure, scale: Scale, top: float, total_h: float) -> None:
     """Draw a colour bar at a height in pixels from the top of a figure that is `total_h` pixels high."""
-    axes = figure.add_axes((0.18, 1 - (top + 18) / total_h, 0.64, 18 / total_h))
     bar = figure.colorbar(
         ScalarMappable(Normalize(scale.low, scale.high), ListedColormap(scale.colours)),
-        cax=axes,
+        cax=figure.add_axes((0.18, 1 - (top + 18) / total_h, 0.64, 18 / total_h)),
         orientation="horizontal",
         extend={"low": "min", "high": "max", "both": "both"}.get(scale.open_ends, "neither"),
         extendfrac=0.04,
@@ -312,10 +334,7 @@ def colour_bar(figure: Figure, scale: Scale, top: float, total_h: float) -> None
 
 def without_empty_rows(panels: Sequence[Image]) -> list[Image]:
     """Return images of one row without the white rows of pixels at the top and bottom of all of them."""
-    used = np.zeros(panels[0].shape[0], dtype=bool)
-    for panel in panels:
-        used |= (panel < 255).any(axis=(1, 2))
-    used_rows = np.flatnonzero(used)
+    used_rows = np.flatnonzero(np.any([(panel < 255).any(axis=(1, 2)) for panel in panels], axis=0))
     if not len(used_rows):
         return list(panels)
     return [panel[max(used_rows[0] - _EDGE, 0) : used_rows[-1] + 1 + _EDGE] for panel in panels]
@@ -339,14 +358,19 @@ def charts(title: str, heights: Sequence[float], *, note: str = "", columns: int
     figure = DisplayedFigure(figsize=(width / DPI, total), dpi=DPI, facecolor="white")
     places = figure.add_gridspec(len(heights), columns, height_ratios=list(heights))
     axes = [figure.add_subplot(places[r, c]) for r in range(len(heights)) for c in range(columns)]
-    start = total * DPI - height_of(note_lines, small) - 2
     for text, first, size, text_style in (
         (wrapped, 6.0, TITLE, {"color": INK, "fontweight": "bold"}),
-        (note_lines, start, small, {"color": GREY}),
+        (note_lines, (total * DPI - height_of(note_lines, small) - 2), small, {"color": GREY}),
     ):
         for k, line in enumerate(text.split("\n")):
-            up = 1 - (first + baseline(k, size)) / DPI / total
-            figure.text(_EDGE / width, up, escaped(line), in_layout=False, fontsize=size, **cast(Any, text_style))
+            figure.text(
+                _EDGE / width,
+                (1 - (first + baseline(k, size)) / DPI / total),
+                escaped(line),
+                in_layout=False,
+                fontsize=size,
+                **cast(Any, text_style),
+            )
     # Where the plots may stand, for `finish`.
     cast(Any, figure).plots_within = (0.0, bottom / total, 1.0, 1 - top / total)
     return figure, axes
@@ -388,9 +412,16 @@ def style(axes: Axes) -> None:
 
 def legend(axes: Axes, **options: Any) -> None:
     """Add the legend of a plot."""
-    style = {"fontsize": type_size(SMALL), "labelcolor": INK, "framealpha": 0.9, "handlelength": 1.5}
-    box = cast(Any, axes).legend(**{**style, **options})
-    box.get_frame().set_linewidth(0.0)
+    cast(Any, axes).legend(
+        **{"fontsize": type_size(SMALL), "labelcolor": INK, "framealpha": 0.9, "handlelength": 1.5, **options}
+    ).get_frame().set_linewidth(0.0)
+
+
+def legend_above(axes: Axes, room: float, **options: Any) -> None:
+    """Add the legend of a plot above its curves, in a share `room` of their height that is added there."""
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + room * (high - low))
+    legend(axes, **options)
 
 
 @contextmanager
@@ -406,8 +437,12 @@ def encode_webp(figure: Figure, *, lossless: bool = False) -> Still:
     with without_glyph_warnings():
         canvas = FigureCanvasAgg(figure)
         canvas.draw()
-    pixels = np.asarray(canvas.buffer_rgba())[:, :, :3]
-    return encoded(pixels, lossless=lossless, quality=20 if lossless else 78, effort=1 if lossless else 3)
+    return encoded(
+        np.asarray(canvas.buffer_rgba())[:, :, :3],
+        lossless=lossless,
+        quality=20 if lossless else 78,
+        effort=1 if lossless else 3,
+    )
 
 
 @lru_cache(maxsize=1)
@@ -487,9 +522,29 @@ def short(text: str, max_length: int = 28) -> str:
     return line if len(line) <= max_length else line[: max_length - 1] + "…"
 
 
-def in_rows(items: Sequence[_Item], columns: int) -> list[list[_Item]]:
-    """Split `items` into rows of at most `columns`."""
-    return [list(items[k : k + columns]) for k in range(0, len(items), columns)]
+def in_rows(panels: Sequence[Image], captions: Sequence[str], columns: int) -> list[Row]:
+    """Return rows of at most `columns` panels with their captions."""
+    return [Row(panels[k : k + columns], captions[k : k + columns]) for k in range(0, len(panels), columns)]
+
+
+def plain_decades(axis: Axis) -> None:
+    """Label 1, 2 and 5 of each decade of a logarithmic axis in plain notation."""
+    axis.set_major_formatter(lambda value, _: f"{value:g}")
+    axis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in "25" else "")
+
+
+def empty_chart(title: str, text: str) -> Figure:
+    """Return a chart that says why there is nothing in it."""
+    figure, axes = chart(title, height=1.2)
+    axes.text(
+        0.5,
+        0.5,
+        text,
+        transform=axes.transAxes,
+        **cast(Any, {"ha": "center", "va": "center", "fontsize": type_size(TEXT), "color": GREY}),
+    )
+    axes.set_axis_off()
+    return finish(figure)
 
 
 def scan_over(mesh: Mesh) -> Layer:
@@ -528,3 +583,99 @@ def number_axis(axes: Axes, count: int, *, room: float = 0.7) -> None:
     axes.set_xlim(1 - aside, count + aside)
     step = next((step for step in _STEPS if count <= _MOST_NUMBERS * step), count)
     axes.set_xticks([1, *range(max(step, 2), count + 1, step)])
+
+
+FORMATS = ("svg", "pdf", "png")
+"""Formats of figures for papers."""
+ONE_COLUMN_MM, TWO_COLUMNS_MM = 85.0, 174.0
+"""Widths of charts, and of rows of pictures, mm: the columns of most journals (Elsevier 90 and 190, Nature 89 and 183,
+PLOS 83 and 173)."""
+_PRINT_SCALE = 0.72  # type of 6.8 to 8 points instead of 9.5 to 11, above the 6 that journals ask for
+_LEAST_DPI, _MOST_DPI = 72, 1200  # legible, and what a rendered panel holds in memory
+
+
+@contextmanager
+def publication_style(dpi: int = 300) -> Generator[None]:
+    """Return a context in which figures have the size and type of print, and no title.
+
+    Args:
+        dpi: resolution of rendered surfaces, pixels per inch.
+
+    Raises:
+        InputError: a resolution below 72 or above 1200.
+    """
+    if not _LEAST_DPI <= dpi <= _MOST_DPI:
+        raise InputError(f"The resolution of a figure is {_LEAST_DPI} to {_MOST_DPI} dpi, not {dpi}.")
+    one, two = (round(width / 25.4 * DPI) for width in (ONE_COLUMN_MM, TWO_COLUMNS_MM))
+    token = LAYOUT.set(Layout(one, two, _PRINT_SCALE, dpi / DPI, has_titles=False))
+    try:
+        yield
+    finally:
+        LAYOUT.reset(token)
+
+
+def save_figure(
+    figure: Figure, path: Path, formats: Sequence[str] = ("pdf",), dpi: float | None = None
+) -> tuple[Path, ...]:
+    """Write a figure in one or more formats, each file whole or not at all, and return their paths.
+
+    Fonts are embedded: as TrueType in PDF, as a subset in SVG, whose text can be searched and edited.
+
+    Args:
+        figure: to write.
+        path: of the files, without an ending.
+        formats: of `FORMATS`.
+        dpi: resolution of PNG and of pictures inside the others; None for that of the figure.
+
+    Raises:
+        FileError: the folder cannot be written, or the disk is full.
+        InputError: another format.
+    """
+    unknown = [kind for kind in formats if kind not in FORMATS]
+    if unknown:
+        raise InputError(f"Figures cannot be written as {unknown[0]!r}; choose from {', '.join(FORMATS)}.")
+    paths: list[Path] = []
+    # Neither date nor random names: the same figure is the same file.
+    undated: dict[str, dict[str, None]] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
+    for kind in formats:
+        stream = io.BytesIO()
+        with (
+            matplotlib.rc_context({"svg.hashsalt": "shapespace", "svg.fonttype": "none", "pdf.fonttype": 42}),
+            without_glyph_warnings(),
+        ):
+            figure.savefig(stream, format=kind, metadata=undated.get(kind, {}), dpi=dpi or "figure")
+        data = stream.getvalue()
+        paths.append(path.with_name(f"{path.name}.{kind}"))
+        write_bytes(paths[-1], _with_fonts(data) if kind == "svg" else data)
+    return tuple(paths)
+
+
+def _with_fonts(svg: bytes) -> bytes:
+    """Return an SVG with the letters that it uses as embedded fonts."""
+    text = svg.decode("utf-8")
+    letters = "".join(
+        sorted(set(unescape(re.sub("<[^>]*>", "", "".join(re.findall(r"<text[^>]*>(.*?)</text>", text, re.DOTALL))))))
+    )
+    rules = [
+        f"@font-face{{font-family:'DejaVu Sans';font-weight:{weight};src:url(data:font/woff;base64,"
+        f"{base64.b64encode(_subset(weight, letters)).decode()}) format('woff')}}"
+        for weight in ((400, 700) if re.search(r"<text[^>]*\b(700|bold)\b", text) else (400,))
+    ]
+    return text.replace("<defs>", f"<defs>\n  <style>{''.join(rules)}</style>", 1).encode()
+
+
+def _subset(weight: int, letters: str) -> bytes:
+    """Return the font of all figures, WOFF, with some letters alone."""
+    subset: Any = import_module("fontTools.subset")
+    options = subset.Options(flavor="woff", recalc_timestamp=False, layout_features=[], notdef_outline=True)
+    options.drop_tables += ["FFTM"]
+    font: Any = subset.load_font(
+        font_manager.findfont(font_manager.FontProperties(family="DejaVu Sans", weight=weight)), options
+    )
+    subsetter: Any = subset.Subsetter(options)
+    subsetter.populate(text=letters)
+    subsetter.subset(font)
+    stream = io.BytesIO()
+    subset.save_font(font, stream, options)
+    font.close()
+    return stream.getvalue()

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -20,35 +21,45 @@ from shapespace.report.figures.draw import (
     STAGE_WORDS,
     TEXT,
     Row,
+    Scale,
     chart,
     charts,
+    counted,
     distance_scale,
+    empty_chart,
+    equal_views,
     finish,
     grid,
+    in_rows,
     legend,
     mean_mm,
     mean_words,
     mm,
     number_axis,
     percent,
+    plain,
+    plain_decades,
     scan_over,
     short,
     surroundings,
     unknown,
     view,
 )
-from shapespace.report.inputs.staged_fit import StagedFit, measured_mm, scale_end
+from shapespace.report.inputs.staged_fit import StagedFit, measured_mm, nice_ceiling, scale_end
 from shapespace.report.render.palette import (
     BEYOND_COLOUR,
+    CLAY,
     DENSE_COLOUR,
     MODEL_COLOUR,
     REGION_COLOURS,
     SCAN_COLOUR,
+    SEQUENTIAL,
     UNKNOWN_COLOUR,
     WITHIN_COLOUR,
     Colour,
+    as_hex,
 )
-from shapespace.report.render.renderer import Image, Layer, distance_layer, render, render_series
+from shapespace.report.render.renderer import Camera, Image, Layer, distance_layer, render, render_series
 from shapespace.types import FloatArray, Mesh
 
 THRESHOLDS_MM = (2.0, 4.0, 6.0, 8.0, 10.0)
@@ -80,8 +91,10 @@ def stages_figure(fit: StagedFit, *, title: str = "") -> Figure:
         result = ss.fit_scan(model, scan)
         figures.stages_figure(StagedFit.of(model, result))
     """
-    stages = [Layer(mesh, _colour(stage)) for stage, mesh in fit.surfaces.items()]
-    layers = [[Layer(fit.scan, SCAN_COLOUR)], *([layer] for layer in stages)]
+    layers = [
+        [Layer(fit.scan, SCAN_COLOUR)],
+        *([layer] for layer in [Layer(mesh, _colour(stage)) for stage, mesh in fit.surfaces.items()]),
+    ]
     captions = ["scan", *(f"{_SHORT_STAGES.get(stage, stage)}\n{mm(mean_mm(fit, stage))}" for stage in fit.surfaces)]
     dense = ", and taken the rest of the way" if "dense" in fit.surfaces else ""
     return grid(
@@ -134,12 +147,8 @@ def signed_maps(fit: StagedFit, stage: str = "final", *, limit_mm: float | None 
         distance_layer(mesh, values, limit_mm, signed=signed)
         for mesh, values in ((surface, forward), (fit.scan, backward))
     )
-    panels: tuple[list[Image], list[Image]] = ([], [])
-    for _, yaw in _SIDES:
-        camera_view = view(surroundings(fit), len(_SIDES), yaw_deg=yaw)
-        front_view = view(surroundings(fit), len(_SIDES))
-        for row, layer in zip(panels, (on_model, on_scan), strict=True):
-            row.append(render(layer, camera=camera_view.camera, size=front_view.size))
+    cameras, size = equal_views([(surroundings(fit), yaw) for _, yaw in _SIDES], len(_SIDES))
+    panels = [[render(layer, camera=camera, size=size) for camera in cameras] for layer in (on_model, on_scan)]
     unseen, uncovered = unknown(forward), unknown(backward)
     keys: list[tuple[str, Colour]] = []
     if unseen:
@@ -174,15 +183,23 @@ def threshold_figure(fits: StagedFit | Sequence[StagedFit], *, title: str = "") 
     for fit in all_fits:
         distances = np.abs(fit.model_to_scan_mm["final"])
         camera_view = view(fit.surfaces["final"].vertices, len(THRESHOLDS_MM))
-        maps = [
-            [Layer(fit.surfaces["final"], scalars=distances, colormap=table, vmin=limit - 1e-3, vmax=limit + 1e-3)]
-            for limit in THRESHOLDS_MM
-        ]
-        panels = render_series(maps, camera=camera_view.camera, size=camera_view.size)
+        panels = render_series(
+            [
+                [Layer(fit.surfaces["final"], scalars=distances, colormap=table, vmin=limit - 1e-3, vmax=limit + 1e-3)]
+                for limit in THRESHOLDS_MM
+            ],
+            camera=camera_view.camera,
+            size=camera_view.size,
+        )
         known = measured_mm(distances)
         within = [percent(float((known <= limit).mean())) if len(known) else "–" for limit in THRESHOLDS_MM]
-        captions = [f"{limit:g} mm\n{share}" for limit, share in zip(THRESHOLDS_MM, within, strict=True)]
-        rows.append(Row(panels, captions, short(fit.label, 60) if len(all_fits) > 1 else ""))
+        rows.append(
+            Row(
+                panels,
+                [f"{limit:g} mm\n{share}" for limit, share in zip(THRESHOLDS_MM, within, strict=True)],
+                short(fit.label, 60) if len(all_fits) > 1 else "",
+            )
+        )
     unseen = [(NOT_SHOWN, UNKNOWN_COLOUR)] if any(unknown(fit.model_to_scan_mm["final"]) for fit in all_fits) else []
     whose = f"{short(all_fits[0].label)}: where" if len(all_fits) == 1 else "Where"
     return grid(
@@ -257,19 +274,16 @@ def distance_histograms(fit: StagedFit, *, title: str = "", bins: int = 60) -> F
 
 def history_figure(fit: StagedFit, *, title: str = "") -> Figure:
     """Draw the RMS distance by iteration and phase."""
-    figure, axes = chart(title or f"{short(fit.label)}: the RMS distance from iteration to iteration", height=3.0)
+    title = title or f"{short(fit.label)}: the RMS distance from iteration to iteration"
     rms = np.array([moment.rms_mm for moment in fit.history], dtype=np.float64)
     phase = np.array([moment.phase for moment in fit.history], dtype=np.int64)
     usable = np.isfinite(rms)
     if not usable.any():
-        axes.text(0.5, 0.5, "No iteration was saved.", transform=axes.transAxes, ha="center", fontsize=TEXT, color=GREY)
-        axes.set_xticks([])
-        axes.set_yticks([])
-        return finish(figure)
+        return empty_chart(title, "No iteration was saved.")
+    figure, axes = chart(title, height=3.0)
     for number, colour, name in ((1, BACKWARD, "phase 1: pose"), (2, FORWARD, "phase 2: pose and shape")):
         iterations = np.flatnonzero((phase == number) & usable)
         if len(iterations):
-            end_label = f"{name}, ends at {mm(float(rms[iterations[-1]]))}"
             axes.plot(
                 iterations,
                 rms[iterations],
@@ -277,7 +291,7 @@ def history_figure(fit: StagedFit, *, title: str = "") -> Figure:
                 lw=2,
                 marker="o",
                 ms=4 if len(rms) < 80 else 2,
-                label=end_label,
+                label=f"{name}, ends at {mm(float(rms[iterations[-1]]))}",
             )
     change = np.flatnonzero(np.diff(phase) > 0)
     if len(change):
@@ -285,8 +299,7 @@ def history_figure(fit: StagedFit, *, title: str = "") -> Figure:
     log = bool(rms[usable].min() > 0 and rms[usable].max() > 4 * rms[usable].min())
     if log:
         axes.set_yscale("log")
-        axes.yaxis.set_major_formatter("{x:g}")
-        axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:.1e}"[0] in "25" else "")
+        plain_decades(axes.yaxis)
     else:
         axes.set_ylim(0, 1.1 * float(rms[usable].max()) or 1.0)
     axes.set(xlabel="iteration", ylabel=f"RMS distance (mm, {'log' if log else 'linear'} scale)")
@@ -343,8 +356,7 @@ def coefficients_figure(fit: StagedFit, population: FloatArray | None = None, *,
             zorder=3, label="95 % interval",
         )  # fmt: skip
     axes.axhline(0, color=INK, lw=0.8)
-    extent = np.abs(z) + np.where(known, 1.96 * np.nan_to_num(deviation), 0)
-    limit = max(3.0, 1.1 * float(extent.max()))
+    limit = max(3.0, 1.1 * float((np.abs(z) + np.where(known, 1.96 * np.nan_to_num(deviation), 0)).max()))
     axes.set(ylim=(-limit, 1.45 * limit), ylabel="z = b / sd")
     axes.set_xlabel("mode" if n_shown == count else f"mode (first {n_shown} of {count})")
     number_axis(axes, n_shown)
@@ -368,28 +380,26 @@ def regions_figure(fit: StagedFit, *, title: str = "") -> Figure:
     """
     if fit.regions is None:
         raise InputError(f"{short(fit.label)} has no saved regions; fit the scan again with --stages.")
-    table = np.array([REGION_COLOURS[name] for name in REGIONS])
     layer = Layer(
-        fit.surfaces["final"], scalars=fit.regions.astype(np.float64), colormap=table, vmin=-0.5,
-        vmax=len(REGIONS) - 0.5, categories=True,
-    )  # fmt: skip
+        fit.surfaces["final"],
+        scalars=fit.regions.astype(np.float64),
+        colormap=np.array([REGION_COLOURS[name] for name in REGIONS]),
+        vmin=-0.5,
+        vmax=len(REGIONS) - 0.5,
+        categories=True,
+    )
     scan = Layer(fit.scan, SCAN_COLOUR)
-    panels: list[Image] = []
-    captions: list[str] = []
-    for _, yaw in (_SIDES[0], _SIDES[2]):
-        camera_view = view(surroundings(fit), 4, yaw_deg=yaw)
-        panels += render_series([[scan], [layer]], camera=camera_view.camera, size=view(surroundings(fit), 4).size)
-        captions += ["scan", "model"]
+    cameras, size = equal_views([(surroundings(fit), yaw) for _, yaw in (_SIDES[0], _SIDES[2])], 4)
+    panels = [panel for camera in cameras for panel in render_series([[scan], [layer]], camera=camera, size=size)]
     share = np.bincount(fit.regions, minlength=len(REGIONS)) / max(len(fit.regions), 1)
-    keys = [
-        (f"{_REGION_WORDS[name]} ({percent(float(share[k]))})", REGION_COLOURS[name])
-        for k, name in enumerate(REGIONS)
-        if share[k] > 0
-    ]
     return grid(
-        [Row(panels, captions)],
+        [Row(panels, ["scan", "model"] * 2)],
         title=title or f"{short(fit.label)}: which parts of the model the scan decided",
-        keys=keys,
+        keys=[
+            (f"{_REGION_WORDS[name]} ({percent(float(share[k]))})", REGION_COLOURS[name])
+            for k, name in enumerate(REGIONS)
+            if share[k] > 0
+        ],
         note="In %: share of the model's vertices. What is not blue has only the model, and its neighbours, to go by.",
     )
 
@@ -401,12 +411,9 @@ def _from_two_sides(fit: StagedFit, layers: Sequence[Sequence[Layer]], captions:
     # Of a start that was near, all is shown; one that was far away would make the rest small.
     if np.abs(before.mean(axis=0) - final.mean(axis=0)).max() < _NEAR_START * np.ptp(final, axis=0).max():
         points = np.concatenate([points, before])
-    size = view(points, len(layers)).size
-    rows: list[Row] = []
-    for k, yaw in enumerate(_FRONT_AND_SIDE):
-        camera = view(points, len(layers), yaw_deg=yaw).camera
-        rows.append(Row(render_series(layers, camera=camera, size=size), captions if k == 0 else ()))
-    return rows
+    cameras, size = equal_views([(points, yaw) for yaw in _FRONT_AND_SIDE], len(layers))
+    rows = [render_series(layers, camera=camera, size=size) for camera in cameras]
+    return [Row(rows[0], captions), Row(rows[1])]
 
 
 def _colour(stage: str) -> Colour:
@@ -441,3 +448,206 @@ def _histogram(values: FloatArray, edges: FloatArray) -> FloatArray:
     if not len(values):
         return np.zeros(len(edges) - 1)
     return np.histogram(np.clip(values, edges[0], edges[-1]), edges)[0] / len(values)
+
+
+_DOUBTFUL = as_hex((0.90, 0.55, 0.05))
+
+
+def error_curves(fits: Sequence[StagedFit], *, stage: str = "final", title: str = "") -> Figure:
+    """Draw cumulative curves of the share of points within each distance.
+
+    Args:
+        fits: for a thin curve each and a thick one of all together, over the vertices that their scans show.
+        stage: of the fits.
+        title: above the figure.
+
+    Raises:
+        InputError: there is nothing to draw, or a fit lacks the stage.
+    """
+    if not fits:
+        raise InputError("There is nothing to draw of cumulative errors without fits.")
+    if any(stage not in fit.surfaces for fit in fits):
+        raise InputError(f"Not every fit has the stage {stage!r}, so their errors cannot be compared there.")
+    sorted_distances = [np.sort(measured_mm(fit.model_to_scan_mm[stage])) for fit in fits]
+    fits = [fit for fit, values in zip(fits, sorted_distances, strict=True) if len(values)]
+    sorted_distances = [values for values in sorted_distances if len(values)]
+    if not sorted_distances:
+        return empty_chart(
+            title or "How close the model comes to the scan", "No vertex of a model is shown by its scan."
+        )
+    pooled = np.sort(np.concatenate(sorted_distances))
+    figure, axes = chart(
+        title or f"How close the model comes to the scan, over {counted(len(fits), 'fit')}", height=3.5
+    )
+    thin = {"lw": 1.1, "alpha": float(np.clip(12 / len(fits), 0.12, 0.8))}
+    labelled_stages: set[str] = set()
+    for fit, values in sorted(zip(fits, sorted_distances, strict=True), key=lambda pair: pair[0].status != "converged"):
+        doubtful = fit.status in ("doubtful", "failed")
+        name = "a doubtful fit" if doubtful else "a fit"
+        colour = _DOUBTFUL if doubtful else "#7fa8c9"
+        _curve(axes, values, color=colour, label=None if name in labelled_stages else name, **thin)
+        labelled_stages.add(name)
+    if len(fits) > 1:
+        _curve(axes, pooled, color=INK, lw=2.6, label="all together")
+    for share in (0.5, 0.95):
+        distance = float(np.quantile(pooled, share))
+        axes.plot([distance], [100 * share], "o", color=INK, ms=6, zorder=5)
+        axes.annotate(
+            f"{100 * share:.0f} % within {mm(distance)}", (distance, 100 * share), xytext=(10, -5),
+            textcoords="offset points", fontsize=SMALL, color=INK, va="top",
+        )  # fmt: skip
+    axes.set(xlabel="distance from the model to the scan (mm)", ylabel="vertices that the scan shows (%)")
+    axes.set(xlim=(0, nice_ceiling(1.15 * float(np.quantile(pooled, 0.985)))), ylim=(0, 102))
+    legend(axes, loc="lower right")
+    return finish(figure)
+
+
+def _curve(axes: Any, values: FloatArray, **style: Any) -> None:
+    """Draw the share of sorted `values` up to each of them, in at most 400 steps."""
+    share = np.linspace(0, 1, min(len(values), 400) + 1)
+    sample = np.quantile(values, share, method="inverted_cdf") if len(values) > 400 else np.concatenate([[0.0], values])
+    axes.plot(
+        np.concatenate([sample, [10 * values[-1] + 1]]),
+        100 * np.concatenate([share, [1.0]]),
+        drawstyle="steps-post",
+        **style,
+    )
+
+
+def faces_grid(
+    meshes: Sequence[Mesh], labels: Sequence[str], *, title: str, columns: int = 4, colour: Colour = CLAY
+) -> Figure:
+    """Draw `meshes` with one light and one scale, each under its label (figures 1 and 8).
+
+    Raises:
+        InputError: no meshes, or another number of labels.
+    """
+    if not meshes or len(meshes) != len(labels):
+        raise InputError(f"{title}: {len(meshes)} meshes do not go with {len(labels)} labels.")
+    columns = min(columns, max(len(meshes), 3))
+    camera_view = view(np.concatenate([m.vertices for m in meshes]), columns)
+    return grid(
+        in_rows(
+            [render(Layer(mesh, colour), camera=camera_view.camera, size=camera_view.size) for mesh in meshes],
+            list(labels),
+            columns,
+        ),
+        title=title,
+    )
+
+
+def portrait_figure(
+    fits: Sequence[StagedFit], labels: Sequence[str] = (), *, title: str = "Raw scans and the models fitted to them",
+    yaw_deg: float = 25.0,
+) -> Figure:  # fmt: skip
+    """Draw for each fit the scan, the fitted model, both superimposed, and the distances from model to scan.
+
+    Raises:
+        InputError: no fit is given.
+    """
+    if not fits:
+        raise InputError(f"{plain(title)}: there is no fit to draw.")
+    top = scale_end(np.concatenate([f.model_to_scan_mm["final"] for f in fits]))
+    # One scale for all rows: where one has no sign, none is shown.
+    signed = all(fit.scan.faces is not None for fit in fits)
+    rows: list[Row] = []
+    for k, fit in enumerate(fits):
+        camera_view = view(surroundings(fit), 4, yaw_deg=yaw_deg)
+        final, distances = fit.surfaces["final"], fit.model_to_scan_mm["final"]
+        scan, over, model = Layer(fit.scan, SCAN_COLOUR), scan_over(fit.scan), Layer(final, MODEL_COLOUR)
+        panels = render_series(
+            [[scan], [model], [over, model], [distance_layer(final, distances, top, signed=signed)]],
+            camera=camera_view.camera,
+            size=camera_view.size,
+        )
+        captions = ["scan", "model, fitted", "both", "distance"] if k == 0 else []
+        name = short(labels[k] if labels else fit.label, 60)
+        rows.append(Row(panels, captions, f"{name}: mean {mm(mean_mm(fit))}"))
+    return grid(
+        rows,
+        title=title,
+        scale=distance_scale(top, signed=signed) if signed else _unsigned(fits, top),
+        keys=_grey(fits),
+        note=mean_words(fits),
+    )
+
+
+def aligned_grid(
+    fits: Sequence[StagedFit], *, title: str = "Scan and fitted model over each other", columns: int = 4
+) -> Figure:
+    """Draw scan and fitted model superimposed for many fits, in the order given."""
+    return grid(
+        _caption_rows(
+            _equal_views(fits, columns, lambda fit: [scan_over(fit.scan), Layer(fit.surfaces["final"], MODEL_COLOUR)]),
+            fits,
+            columns,
+        ),
+        title=title,
+        keys=[("scan", SCAN_COLOUR), ("model", MODEL_COLOUR)],
+        note=mean_words(fits),
+    )
+
+
+def distance_maps(
+    fits: Sequence[StagedFit], *, title: str = "Distance from each fitted model to its scan", columns: int = 4
+) -> Figure:
+    """Draw the distance from each fitted model to its scan, on one scale up to the 99th percentile of all."""
+    if not fits:
+        raise InputError(f"{plain(title)}: there is no fit to draw.")
+    known = np.concatenate([measured_mm(f.model_to_scan_mm["final"]) for f in fits])
+    top = nice_ceiling(float(np.percentile(known, 99)) if len(known) else 1.0)
+    return grid(
+        _caption_rows(
+            _equal_views(
+                fits,
+                columns,
+                lambda fit: [
+                    Layer(
+                        fit.surfaces["final"],
+                        scalars=np.abs(fit.model_to_scan_mm["final"]),
+                        colormap=SEQUENTIAL,
+                        vmax=top,
+                    )
+                ],
+            ),
+            fits,
+            columns,
+        ),
+        title=title,
+        scale=_unsigned(fits, top),
+        keys=_grey(fits),
+        note=mean_words(fits),
+    )
+
+
+def _unsigned(fits: Sequence[StagedFit], top: float) -> Scale:
+    if all(fit.scan.faces is None for fit in fits):
+        return distance_scale(top, signed=False)
+    return Scale("distance from the model to the scan (mm)", SEQUENTIAL, 0.0, top, "high")
+
+
+def _grey(fits: Sequence[StagedFit]) -> list[tuple[str, Colour]]:
+    """Return the legend text for grey areas in the maps."""
+    return [(NOT_SHOWN, UNKNOWN_COLOUR)] if any(unknown(fit.model_to_scan_mm["final"]) for fit in fits) else []
+
+
+def _equal_views(fits: Sequence[StagedFit], columns: int, layers: Callable[[StagedFit], list[Layer]]) -> list[Image]:
+    """Return one view per fit, each from its own front, all of one size."""
+    if not fits:
+        raise InputError("There is nothing to draw without fits.")
+    columns = min(columns, max(len(fits), 3))
+    views = [view(fit.surfaces["final"].vertices, columns, margin=0.07) for fit in fits]
+    size = (views[0].size[0], int(np.median([item.size[1] for item in views])))
+    return [
+        render(
+            *layers(fit),
+            camera=Camera.framing(fit.surfaces["final"].vertices, aspect=size[0] / size[1], margin=0.07),
+            size=size,
+        )
+        for fit in fits
+    ]
+
+
+def _caption_rows(images: Sequence[Image], fits: Sequence[StagedFit], columns: int) -> list[Row]:
+    columns = min(columns, max(len(fits), 3))
+    return in_rows(images, [f"{short(f.label, 30)}\n{mm(mean_mm(f))}" for f in fits], columns)

@@ -19,6 +19,7 @@ from shapespace.errors import FileFormatError, InputError
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report.figures.draw import (
     BACKWARD,
+    BARS,
     FORWARD,
     INK,
     TEXT,
@@ -27,9 +28,11 @@ from shapespace.report.figures.draw import (
     chart,
     charts,
     counted,
+    equal_views,
     finish,
     grid,
     legend,
+    legend_above,
     mm,
     number_axis,
     percent,
@@ -37,7 +40,7 @@ from shapespace.report.figures.draw import (
 )
 from shapespace.report.inputs.staged_fit import nice_ceiling
 from shapespace.report.render.palette import SEQUENTIAL
-from shapespace.report.render.renderer import Camera, Image, Layer, render
+from shapespace.report.render.renderer import Image, Layer, render
 from shapespace.schemas import BySize, Measured, Quality, read
 from shapespace.types import FloatArray, Mesh
 
@@ -45,7 +48,6 @@ SHARES = (0.90, 0.95, 0.98, 0.99)
 """Shares of the variance for which the number of modes is labelled."""
 
 _LANDMARK = (0.78, 0.20, 0.14)  # red, sRGB from 0 to 1
-_BARS = "#a9c9e2"
 _QUALITY = {
     "compactness": ("Compactness: share of the variance held", "share of the variance (%)"),
     "generalisation": ("Generalisation: error on shapes left out", "mean error (mm)"),
@@ -54,7 +56,7 @@ _QUALITY = {
 }
 _LONGEST_NAME = 26  # layout: characters
 _BY_SHAPES = "Generalisation with all modes, by the number of training shapes"
-_COLOURS, _BANDS = (FORWARD, BACKWARD), (_BARS, "#f2c6a5")
+_COLOURS, _BANDS = (FORWARD, BACKWARD), (BARS, "#f2c6a5")
 
 
 def mean_figure(model: ShapeModel, *, title: str = "") -> Figure:
@@ -70,15 +72,9 @@ def mean_figure(model: ShapeModel, *, title: str = "") -> Figure:
         landmark_positions = model.landmarks.interpolate(mean.vertices)
         size = 0.008 * float(np.ptp(mean.vertices, axis=0).max())
         layers.append(Layer(Mesh(landmark_positions), _LANDMARK, point_radius_mm=size))
-    panels: list[Image] = []
     sides = (("front", 0.0), ("three-quarter", 40.0), ("side", 90.0))
-    # One height in mm for all three, so that they can be compared.
-    front = view(mean.vertices, len(sides))
-    for _, yaw in sides:
-        camera = view(mean.vertices, len(sides), yaw_deg=yaw).camera
-        height = max(camera.height_mm, front.camera.height_mm)
-        turned_camera = Camera(camera.centre, height, yaw, 0.0, camera.distance_mm)
-        panels.append(render(*layers, camera=turned_camera, size=front.size))
+    cameras, size = equal_views([(mean.vertices, yaw) for _, yaw in sides], len(sides))
+    panels = [render(*layers, camera=camera, size=size) for camera in cameras]
     marks = f", with {counted(len(model.landmarks), 'landmark')}" if model.landmarks else ""
     return grid(
         [Row(panels, [name for name, _ in sides])],
@@ -118,8 +114,9 @@ def modes_figure(model: ShapeModel, modes: int = 5, deviations: float = 3.0, *, 
             )
             for sign in (-1, 1)
         )
-        mapped = Layer(mean, scalars=length, colormap=SEQUENTIAL, vmax=top)
-        displacement = render(mapped, camera=camera_view.camera, size=camera_view.size)
+        displacement = render(
+            Layer(mean, scalars=length, colormap=SEQUENTIAL, vmax=top), camera=camera_view.camera, size=camera_view.size
+        )
         share = float(model.stddev[k] ** 2 / model.total_variance)
         rows.append(
             Row(
@@ -187,10 +184,9 @@ def mode_animation(
         raise InputError(f"An animation needs 4 frames or more that stand for a while, not {frames}.")
     move = mode_displacement(model, mode, 1.0)
     mean = model.mesh()
-    extremes = np.concatenate([mean.vertices + sign * deviations * move for sign in (-1, 1)])
-    camera_view = view(extremes, 1, yaw_deg=yaw_deg, width=width)
-    half = frames // 2
-    swings = deviations * np.sin(np.linspace(-np.pi / 2, np.pi / 2, half + 1))
+    camera_view = view(
+        np.concatenate([mean.vertices + sign * deviations * move for sign in (-1, 1)]), 1, yaw_deg=yaw_deg, width=width
+    )
     forth = [
         _labelled(
             render(
@@ -200,7 +196,7 @@ def mode_animation(
             float(z),
             deviations,
         )
-        for z in swings
+        for z in (deviations * np.sin(np.linspace(-np.pi / 2, np.pi / 2, (frames // 2) + 1)))
     ]
     cycle = forth + forth[-2:0:-1]
     stream = io.BytesIO()
@@ -257,7 +253,7 @@ def spectrum_figure(model: ShapeModel, *, shares: Sequence[float] = SHARES, titl
         ),
         height=3.3,
     )
-    axes.bar(count, 100 * np.diff(cumulative[:n_shown], prepend=0.0), color=_BARS, label="each mode")
+    axes.bar(count, 100 * np.diff(cumulative[:n_shown], prepend=0.0), color=BARS, label="each mode")
     axes.plot(
         count,
         100 * cumulative[:n_shown],
@@ -319,8 +315,7 @@ def quality_figure(quality: Quality | Mapping[str, object], *, title: str = "") 
             _draw_lines(axes, key, name, lines, colour, band)
         heading, unit = _QUALITY[key]
         axes.set_title(heading, fontsize=TEXT, color=INK, loc="left")
-        axes.set_ylabel(unit)
-        axes.set_ylim(0, 104 if key == "compactness" else None)
+        axes.set(ylabel=unit, ylim=(0, 104 if key == "compactness" else None))
         number_axis(axes, largest_mode_count)
         _legend_above(axes)
     plots[len(measures) - 1].set_xlabel("number of modes")
@@ -346,10 +341,16 @@ def _of(key: str, quality: Quality) -> dict[str, _Line]:
 def _draw_lines(axes: Axes, key: str, name: str, lines: Mapping[str, _Line], colour: str, band: str) -> None:
     scale = 100.0 if key == "compactness" else 1.0
     for kind, (modes, mean, low, high) in lines.items():
-        label = ", ".join(part for part in (name, kind) if part)
-        style = "--" if kind == "vertices" else "-"
-        dots = "o" if len(modes) < 40 else ""
-        axes.plot(modes, scale * mean, color=colour, lw=2, ls=style, marker=dots, ms=4, label=label or None)
+        axes.plot(
+            modes,
+            scale * mean,
+            color=colour,
+            lw=2,
+            ls=("--" if kind == "vertices" else "-"),
+            marker=("o" if len(modes) < 40 else ""),
+            ms=4,
+            label=", ".join(part for part in (name, kind) if part) or None,
+        )
         if low is not None and high is not None:
             axes.fill_between(modes, scale * low, scale * high, color=band, alpha=0.5, lw=0)
 
@@ -373,9 +374,7 @@ def _legend_above(axes: Axes) -> None:
     """Add a legend, if there are entries, above the curves, with enough room for it."""
     count = len(axes.get_legend_handles_labels()[1])
     if count:
-        low, high = axes.get_ylim()
-        axes.set_ylim(low, high + (high - low) * (0.2 * -(-count // 2)))
-        legend(axes, loc="upper right", ncols=2)
+        legend_above(axes, 0.2 * -(-count // 2), loc="upper right", ncols=2)
 
 
 def _measured(key: str, value: Measured | tuple[float, ...]) -> _Line:

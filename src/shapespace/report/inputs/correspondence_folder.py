@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -25,10 +25,11 @@ from shapespace.geometry.normals import (
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.files import read_error, sha256_of_file
 from shapespace.io.meshes.mesh_io import read_mesh
-from shapespace.report.blocks.wording import printable, without_folders
+from shapespace.report.blocks.wording import known, printable, sentence, without_folders
 from shapespace.report.inputs.saved_fits import Folder
 from shapespace.report.inputs.staged_fit import nice_ceiling
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, read
+from shapespace.store.review_text import describe_review
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity, are_same_triangles
 
 _FEWEST_VERTICES = 3  # a triangle
@@ -102,8 +103,7 @@ class Corresponded:
         if self._mean.faces is None or not np.isfinite(self._mean.vertices).all():
             raise FileFormatError(f"{CorrespondenceRecord.MEAN} is no whole surface; {CORRESPOND_AGAIN}.")
         self.unread: dict[str, str] = {}
-        records = [record for file in self._record_files() if (record := self._record(file)) is not None]
-        self.records = {record.name: record for record in records}
+        self.records = {record.name: record for record in map(self._record, self._record_files()) if record is not None}
         self.turn = np.eye(3)
         self._is_upright = False
         self._population: Population | None = None
@@ -176,8 +176,11 @@ class Corresponded:
             raise FileFormatError(
                 f"{name}{CorrespondRecord.SURFACE} cannot be laid onto the mean shape; {CORRESPOND_AGAIN}."
             ) from error
-        share = None if std is None else std / (T.scale * rms_size(self._mean.vertices))
-        return PlacedSurface(np.where(is_observed[:, None], T.inverse().apply(vertices), np.nan), T, share)
+        return PlacedSurface(
+            np.where(is_observed[:, None], T.inverse().apply(vertices), np.nan),
+            T,
+            (None if std is None else std / (T.scale * rms_size(self._mean.vertices))),
+        )
 
     def raw_scan(self, record: CorrespondRecord) -> Mesh:
         """Return the scan of a record, reflected if it is mirrored, if it is in the same place with the same content.
@@ -244,8 +247,13 @@ class Corresponded:
                     turns.append(placed.T_scan_mean.rotation)
             if not self._is_upright:
                 self._turn_by(turns)
-            std = np.sqrt(squares / np.maximum(counts, 1)) if names and np.isfinite(squares).all() else None
-            self._population = Population(tuple(names), counts, np.array(sizes), unread, std)
+            self._population = Population(
+                tuple(names),
+                counts,
+                np.array(sizes),
+                unread,
+                (np.sqrt(squares / np.maximum(counts, 1)) if names and np.isfinite(squares).all() else None),
+            )
         return self._population
 
     @property
@@ -324,3 +332,51 @@ def upright(mean: Mesh, turns: Sequence[FloatArray] = ()) -> FloatArray:
     if ((centred @ up) * (centred @ np.cross(up, front)) ** 2).mean() < 0:
         up = -up
     return np.stack([np.cross(up, front), up, front])
+
+
+_DOUBTFUL_WEIGHT = 1e6  # before all other reasons
+
+
+@dataclass(frozen=True)
+class Concern:
+    """Reasons to review a scan in correspondence.
+
+    Args:
+        weight: how much it stands out, 0 for not at all.
+        reasons: in words, the weightiest first.
+    """
+
+    weight: float = 0.0
+    reasons: tuple[str, ...] = ()
+
+    @property
+    def text(self) -> str:
+        """Reasons as a sentence."""
+        return sentence("; ".join(self.reasons)) if self.reasons else "Nothing about it stands out."
+
+
+def concerns_of(folder: Corresponded) -> dict[str, Concern]:
+    """Return the concerns about each readable scan in correspondence, by name."""
+    concerns: dict[str, Concern] = {}
+    for name in folder.population().names:
+        record = folder.records[name]
+        concerns[name] = Concern(
+            (_DOUBTFUL_WEIGHT if record.doubt else max((reason.excess for reason in record.review), default=0.0)),
+            describe_review(record),
+        )
+    return concerns
+
+
+def distance_share(record: CorrespondRecord, statistic: str, size: float) -> float:
+    """Return the distance `mean`, `p95`, `p99` or `max` of a record as a share of `size`, which is in its unit."""
+    return known(getattr(record, f"distance_{statistic}")) / size
+
+
+def scan_status(record: CorrespondRecord, concerns: Mapping[str, Concern]) -> str:
+    """Return `converged`, `look` for an unusual scan, `doubtful`, `excluded`, or `unreadable`."""
+    if record.is_excluded:
+        return "excluded"
+    concern = concerns.get(record.name)
+    if concern is None:
+        return "unreadable"
+    return "doubtful" if record.status == "doubtful" else "look" if concern.reasons else "converged"

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import InputError
-from shapespace.report.blocks.sections import ORDER_OF_CONCERN
+from shapespace.report.blocks.wording import ORDER_OF_CONCERN
 from shapespace.store.results import Results, modes_of
 from shapespace.store.rows import META
 from shapespace.types import FloatArray
@@ -68,8 +68,11 @@ class ListedColumn:
         """
         if self.kind == "level":
             counts = np.bincount(self.codes[self.codes >= 0], minlength=len(self.levels))
-            most_frequent = sorted(np.argsort(-counts, kind="stable")[:MOST_LEVELS].tolist())
-            return [(self.levels[k], self.codes == k, float(k)) for k in most_frequent if counts[k]]
+            return [
+                (self.levels[k], self.codes == k, float(k))
+                for k in sorted(np.argsort(-counts, kind="stable")[:MOST_LEVELS].tolist())
+                if counts[k]
+            ]
         edges = self.edges()
         bin_index = np.clip(np.searchsorted(edges, self.values, side="right") - 1, 0, len(edges) - 2)
         bin_index[~np.isfinite(self.values)] = -1
@@ -132,8 +135,7 @@ class Population:
     """
 
     def __init__(self, results: Results) -> None:
-        columns = sorted(results.column_names())
-        metas = [column for column in columns if column.startswith(META)]
+        metas = [column for column in sorted(results.column_names()) if column.startswith(META)]
         n_modes = modes_of(results)
         self.names: list[str] = []
         self.n_reasons: Counter[tuple[str, str]] = Counter()
@@ -146,8 +148,12 @@ class Population:
         coded_columns: dict[str, tuple[dict[str, int], list[npt.NDArray[np.int32]]]] = {
             column: ({}, []) for column in metas
         }
-        requested = ("scan", "status", "reason", "model_hash", *self.origins, *_READ, *metas)
-        for rows in results.iter_rows((*requested, *(f"z{k}" for k in range(1, n_modes + 1)))):
+        for rows in results.iter_rows(
+            (
+                *("scan", "status", "reason", "model_hash", *self.origins, *_READ, *metas),
+                *(f"z{k}" for k in range(1, n_modes + 1)),
+            )
+        ):
             self.names += rows["scan"]
             statuses += bytes(_code(status) for status in rows["status"])
             self._count_reasons(rows["status"], rows["reason"])
@@ -187,8 +193,15 @@ class Population:
     @property
     def counts(self) -> Counter[str]:
         """Number of fits per status."""
-        counts = np.bincount(self.status, minlength=len(ORDER_OF_CONCERN))
-        return Counter({status: int(count) for status, count in zip(ORDER_OF_CONCERN, counts, strict=True) if count})
+        return Counter(
+            {
+                status: int(count)
+                for status, count in zip(
+                    ORDER_OF_CONCERN, np.bincount(self.status, minlength=len(ORDER_OF_CONCERN)), strict=True
+                )
+                if count
+            }
+        )
 
     @property
     def trusted(self) -> npt.NDArray[np.bool_]:
@@ -213,8 +226,10 @@ class Population:
         rows = np.flatnonzero(self.status == _code(status))
         error = self.measures["expected_error_mm"][rows]
         error = np.where(np.isfinite(error), error, self.measures["to_model_mm"][rows])
-        order = np.argsort(np.where(np.isfinite(error), -error, 0.0), kind="stable")
-        return [self.names[k] for k in rows[order[:max_count]]]
+        return [
+            self.names[k]
+            for k in rows[np.argsort(np.where(np.isfinite(error), -error, 0.0), kind="stable")[:max_count]]
+        ]
 
     def compared(self, column: ListedColumn) -> list[Group]:
         """Return how the fits of each level, or stretch, of a column differ from all."""
@@ -279,16 +294,21 @@ class Population:
         for kind, parse in (("number", _number), ("time", _seconds)):
             values = np.array([parse(text) for text in texts])
             if np.isfinite(values).mean() > 0.95 and len(np.unique(values)) > _FEWEST_NUMBERS:
-                values_by_row = np.where(codes >= 0, values[codes], np.nan)
-                return ListedColumn(name, "number" if kind == "number" else "time", values_by_row, codes)
+                return ListedColumn(
+                    name, "number" if kind == "number" else "time", np.where(codes >= 0, values[codes], np.nan), codes
+                )
         if not 1 < len(texts) <= min(_MOST_VALUES, len(codes) // 2):
             if len(texts) > 1:
                 self.left_out.append(name)
             return None
         order = sorted(range(len(texts)), key=lambda k: texts[k])
-        rank = np.argsort(np.array(order))
-        own_codes = np.where(codes >= 0, rank[codes], -1).astype(np.int32)
-        return ListedColumn(name, "level", np.zeros(0), own_codes, tuple(texts[k] for k in order))
+        return ListedColumn(
+            name,
+            "level",
+            np.zeros(0),
+            np.where(codes >= 0, np.argsort(np.array(order))[codes], -1).astype(np.int32),
+            tuple(texts[k] for k in order),
+        )
 
 
 def most_concerning(results: Results, max_count: int) -> list[str]:
@@ -327,8 +347,7 @@ def _mean(z: npt.NDArray[np.float32]) -> FloatArray:
     """Return (K,) means, not-a-number where there is nothing."""
     known = np.isfinite(z)
     count = known.sum(axis=0)
-    total = np.where(known, z, 0).sum(axis=0, dtype=np.float64)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    return np.where(count > 0, np.where(known, z, 0).sum(axis=0, dtype=np.float64) / np.maximum(count, 1), np.nan)
 
 
 def _number(text: str) -> float:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Generator, Sequence
+import shlex
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,11 +17,13 @@ from msgspec import structs
 
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.fit.diagnostics.reason_text import text_of
+from shapespace.fit.fit_scan import FitConfig
 from shapespace.geometry.doctor import repair
-from shapespace.io.files import sha256_of_file
+from shapespace.io.files import read_bytes, sha256_of_file
 from shapespace.io.meshes.mesh_io import read_mesh
+from shapespace.io.tables.table_io import table_rows
 from shapespace.model.shape_model import ShapeModel
-from shapespace.report.blocks.wording import counted, printable
+from shapespace.report.blocks.wording import counted, known, printable
 from shapespace.report.inputs.staged_fit import StagedFit
 from shapespace.schemas import FitEntry, FitRecord
 from shapespace.store.results import ENDING, ENDINGS, Results, arrays_at, json_at, mesh_at, results_at
@@ -163,12 +166,12 @@ class SavedFit:
     def summary_mm(self, stage: str, direction: Direction, measure: Measure) -> float:
         """Return a distance over the whole model, or the whole scan, in mm; NaN if there is none."""
         summary = self.record.distances_mm.get(stage)
-        return _known(getattr(getattr(summary, direction), measure)) if summary else math.nan
+        return known(getattr(getattr(summary, direction), measure)) if summary else math.nan
 
     def distance_mm(self, direction: Direction, measure: Measure = "mean") -> float:
         """Return a distance of the final stage over the overlap, in mm; NaN if there is none."""
         overlap = self.record.shown
-        return _known(getattr(getattr(overlap, direction), measure)) if overlap else math.nan
+        return known(getattr(getattr(overlap, direction), measure)) if overlap else math.nan
 
     @property
     def expected_error_mm(self) -> float:
@@ -190,10 +193,6 @@ class SavedFit:
         if not len(values) or len(values) != len(self.record.b):
             raise FileFormatError(f"The record of {self.name} holds no list of numbers {key!r}; {_AGAIN}.")
         return values
-
-
-def _known(value: float | None) -> float:
-    return math.nan if value is None else value
 
 
 def read_fit(folder: Folder, entry: FitEntry) -> SavedFit:
@@ -256,9 +255,13 @@ def staged_fit(folder: Folder, fit: SavedFit) -> StagedFit:
     """
     if fit.entry.stages:
         return StagedFit.from_arrays(folder.arrays(fit.entry.stages), fit.record, name=fit.name, label=fit.label)
-    surfaces = saved_surfaces(folder, fit)
-    scan = _in_picture_frame(repair(raw_scan(folder, fit))[0], fit)
-    return StagedFit.from_surfaces(surfaces, scan, fit.record, name=fit.name, label=fit.label)
+    return StagedFit.from_surfaces(
+        saved_surfaces(folder, fit),
+        _in_picture_frame(repair(raw_scan(folder, fit))[0], fit),
+        fit.record,
+        name=fit.name,
+        label=fit.label,
+    )
 
 
 def saved_surfaces(folder: Folder, fit: SavedFit) -> dict[str, Mesh]:
@@ -268,8 +271,11 @@ def saved_surfaces(folder: Folder, fit: SavedFit) -> dict[str, Mesh]:
         FileError: a file cannot be read.
         FileFormatError: one is damaged, or the record has no pose.
     """
-    files = {"final": fit.entry.fitted, "dense": fit.entry.dense}
-    surfaces = {stage: folder.mesh(file) for stage, file in files.items() if file or stage == "final"}
+    surfaces = {
+        stage: folder.mesh(file)
+        for stage, file in {"final": fit.entry.fitted, "dense": fit.entry.dense}.items()
+        if file or stage == "final"
+    }
     if len({len(mesh.vertices) for mesh in surfaces.values()}) > 1:
         raise FileFormatError(f"{fit.name}: its fitted and its dense surface differ in their vertices; {_AGAIN}.")
     return {stage: _in_picture_frame(mesh, fit) for stage, mesh in surfaces.items()}
@@ -346,3 +352,51 @@ def _printable(value: object) -> object:
     if isinstance(value, dict):
         return {printable(str(key)): _printable(item) for key, item in cast(dict[object, object], value).items()}
     return value
+
+
+_MOST_SCANS = 50  # paths in a command; more do not belong in a line
+_OPTIONS = {
+    "method": "--method", "unit": "--unit", "scale": "--scale", "dense": "--dense", "crop": "--crop",
+    "region": "--region", "strict": "--strict",
+}  # fmt: skip
+"""Setting in a record -> its option."""
+_SETTINGS = ("max_iterations", "seed", "landmark_stddev_mm")
+"""Those that are given by --set."""
+
+
+def command_with_stages(root: Path, records: Mapping[str, FitRecord]) -> str:
+    """Return the command, to be run in the folder `root`, that fits the scans of `records` again and saves the stages.
+
+    The scans are those of the folder's list, which has landmarks and metadata too, if it contains these and no others;
+    otherwise, and for a scan without both, they are named one by one.
+
+    Args:
+        root: folder of the results.
+        records: NAME -> record of each fit.
+    """
+    first = next(iter(records.values()))
+    scans = [record.scan.path or "SCAN" for record in records.values()]
+    if not (len(records) == 1 and first.landmarks is None and not first.metadata) and _listed(
+        root / FitRecord.LIST
+    ) == set(records):
+        scans = [FitRecord.LIST]
+    elif len(scans) > _MOST_SCANS:
+        scans = ["SCANS"]
+    usual, options = FitConfig().as_dict(), list[str]()
+    for name in (*_OPTIONS, *_SETTINGS):
+        value = first.config.get(name)
+        if value in (None, usual.get(name), False) or not isinstance(value, str | int | float):
+            continue
+        given = ["--set", f"{name}={value}"] if name in _SETTINGS else [_OPTIONS[name], str(value)]
+        options += given[:1] if value is True else given
+    return shlex.join(["shapespace", "fit", first.model.path or "MODEL.h5", *scans, "-o", ".", "--stages", *options])
+
+
+def _listed(file: Path) -> set[str]:
+    """Return the names of the results in a list of scans; none if there is no such list."""
+    try:
+        rows = table_rows(read_bytes(file))
+        column = next(rows).index("id")
+        return {row[column] for row in rows}
+    except (ShapespaceError, ValueError):
+        return set()

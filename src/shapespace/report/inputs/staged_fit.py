@@ -91,8 +91,9 @@ class StagedFit:
     @staticmethod
     def of(model: ShapeModel, result: FitResult, label: str = "") -> StagedFit:
         """Return the staged fit of `result`, which was fitted by `model`."""
-        arrays = stage_arrays(result, model)
-        return StagedFit.from_arrays(arrays, result, name=result.scan_name, label=label or result.scan_name)
+        return StagedFit.from_arrays(
+            stage_arrays(result, model), result, name=result.scan_name, label=label or result.scan_name
+        )
 
     @staticmethod
     def from_surfaces(
@@ -178,8 +179,9 @@ class StagedFit:
             forward: dict[str, FloatArray] = {}
             backward: dict[str, FloatArray] = {}
             for stage in (*STAGES, *(("dense",) if "dense" in arrays else ())):
-                colours = arrays.get(f"colours_{stage}")
-                surfaces[stage] = Mesh(arrays[stage].astype(np.float64), faces, name=name, colours=colours)
+                surfaces[stage] = Mesh(
+                    arrays[stage].astype(np.float64), faces, name=name, colours=arrays.get(f"colours_{stage}")
+                )
                 forward[stage] = arrays[f"model_to_scan_{stage}"].astype(np.float64)
                 backward[stage] = arrays[f"scan_to_model_{stage}"].astype(np.float64)
             regions = np.clip(arrays["regions"], 0, len(REGIONS)).astype(np.int32)
@@ -192,16 +194,17 @@ class StagedFit:
         except (KeyError, ValueError, TypeError, IndexError, OverflowError, ShapespaceError) as error:
             raise FileFormatError(f"{name}: its saved stages are damaged ({error}); {remedy}.") from error
         V, S = len(surfaces["final"].vertices), len(scan.vertices)
-        is_finite = all(np.isfinite(mesh.vertices).all() for mesh in (scan, *surfaces.values()))
-        is_finite &= all(len(surface.vertices) == V for surface in surfaces.values())
-        is_finite &= all(d.shape == (V,) and np.isfinite(d).all() for d in forward.values())
-        is_finite &= all(d.shape == (S,) and not np.isinf(d).any() for d in backward.values())
-        is_finite &= regions.shape == (V,) and int(regions.max(initial=0)) < len(REGIONS)
-        is_finite &= all(values.shape == b.shape for values in (z, b_stddev, shrinkage))
-        is_finite &= all(moment.b.shape == b.shape and np.isfinite(moment.b).all() for moment in history)
-        if not is_finite:
+        checks = (
+            all(np.isfinite(mesh.vertices).all() for mesh in (scan, *surfaces.values())),
+            all(len(surface.vertices) == V for surface in surfaces.values()),
+            all(d.shape == (V,) and np.isfinite(d).all() for d in forward.values()),
+            all(d.shape == (S,) and not np.isinf(d).any() for d in backward.values()),
+            regions.shape == (V,) and int(regions.max(initial=0)) < len(REGIONS),
+            all(values.shape == b.shape for values in (z, b_stddev, shrinkage)),
+            all(moment.b.shape == b.shape and np.isfinite(moment.b).all() for moment in history),
+        )
+        if not all(checks):
             raise FileFormatError(f"{name}: its saved stages do not fit together; {remedy}.")
-        overlap_mm = {stage: np.where(np.isin(regions, SHOWN), d, np.nan) for stage, d in forward.items()}
         return StagedFit(
             name=name,
             label=label,
@@ -209,7 +212,7 @@ class StagedFit:
             reason=record.reason,
             scan=scan,
             surfaces=surfaces,
-            model_to_scan_mm=overlap_mm,
+            model_to_scan_mm={stage: np.where(np.isin(regions, SHOWN), d, np.nan) for stage, d in forward.items()},
             scan_to_model_mm=backward,
             regions=regions,
             b=b,

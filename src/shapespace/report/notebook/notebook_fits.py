@@ -11,22 +11,32 @@ from shapespace.errors import InputError, ShapespaceError
 from shapespace.fit.result import FitResult
 from shapespace.model.model_quality import Curve, ModelQuality
 from shapespace.model.shape_model import ShapeModel
+from shapespace.report import figures
 from shapespace.report.blocks.blocks import Block
 from shapespace.report.blocks.wording import listed, mm, percent, training_text
 from shapespace.report.inputs.staged_fit import StagedFit
+from shapespace.report.pages.page import template
 from shapespace.report.pages.write_html import require_report_extra
+from shapespace.report.render.thumbnails import Still, fit_strip
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from shapespace.report.render.thumbnails import Still
-
-Drawn: TypeAlias = "tuple[Still, str]"
+Drawn: TypeAlias = tuple[Still, str]
 """A picture, and what stands below it."""
 _SHARES = (0.9, 0.95, 0.98)  # of the variance; usual choices for the number of modes
 _MODES_SHOWN = 2  # layout: rows
 _PANEL = (220, 290)  # layout: pixels
 _MOST_COEFFICIENTS = 5  # layout: entries
+_FIT_FIGURES = {
+    "distances": "signed_maps",
+    "stages": "stages_figure",
+    "overlay": "overlay_figure",
+    "histograms": "distance_histograms",
+    "coefficients": "coefficients_figure",
+    "history": "history_figure",
+    "regions": "regions_figure",
+}
 _CURVES = (
     "compactness",
     "generalisation",
@@ -40,35 +50,17 @@ _CURVES = (
 
 def plot_model(model: ShapeModel, kind: str, **options: Any) -> Figure:
     """Draw a figure for `ShapeModel.plot`."""
-    require_report_extra()
-    from shapespace.report import figures
-
-    draw = {"modes": figures.modes_figure, "mean": figures.mean_figure, "spectrum": figures.spectrum_figure}
-    return _choose(draw, kind)(model, **options)
+    return _draw({"modes": "modes_figure", "mean": "mean_figure", "spectrum": "spectrum_figure"}, kind, model, options)
 
 
 def plot_fit(result: FitResult, kind: str, **options: Any) -> Figure:
     """Draw a figure for `FitResult.plot`."""
-    require_report_extra()
-    from shapespace.report import figures
-
-    draw = {
-        "distances": figures.signed_maps,
-        "stages": figures.stages_figure,
-        "overlay": figures.overlay_figure,
-        "histograms": figures.distance_histograms,
-        "coefficients": figures.coefficients_figure,
-        "history": figures.history_figure,
-        "regions": figures.regions_figure,
-    }
-    return _choose(draw, kind)(StagedFit.of(result.model, result), **options)
+    return _draw(_FIT_FIGURES, kind, StagedFit.of(result.model, result), options)
 
 
 def plot_quality(quality: ModelQuality, **options: Any) -> Figure:
     """Draw a figure for `ModelQuality.plot`."""
     require_report_extra()
-    from shapespace.report import figures
-
     curves = {name: _numbers(curve) for name in _CURVES if (curve := getattr(quality, name)) is not None}
     if quality.by_shapes is not None:
         sizes = _numbers(quality.by_shapes)
@@ -77,26 +69,33 @@ def plot_quality(quality: ModelQuality, **options: Any) -> Figure:
 
 
 def _numbers(curve: Curve) -> dict[str, list[float]]:
-    of = {"modes": curve.counts, "mean": curve.mean, "low": curve.low, "high": curve.high}
-    return {name: values.tolist() for name, values in of.items()}
+    return {
+        name: values.tolist()
+        for name, values in {"modes": curve.counts, "mean": curve.mean, "low": curve.low, "high": curve.high}.items()
+    }
 
 
-def _choose(draw: Mapping[str, Callable[..., Figure]], kind: str) -> Callable[..., Figure]:
-    if kind not in draw:
-        raise InputError(f"There is no plot {kind!r}; choose one of {', '.join(draw)}.")
-    return draw[kind]
+def _draw(names: Mapping[str, str], kind: str, shown: object, options: Mapping[str, Any]) -> Figure:
+    """Return the figure of a kind, by its name in `shapespace.report.figures`."""
+    require_report_extra()
+    if kind not in names:
+        raise InputError(f"There is no plot {kind!r}; choose one of {', '.join(names)}.")
+    return getattr(figures, names[kind])(shown, **options)
 
 
 def html_of_model(model: ShapeModel) -> str:
     """Return a model for a notebook: its first modes, training data, and licence."""
-    modes_needed = [
-        f"{percent(share)} in {n}" for share in _SHARES if (n := model.modes_for_variance(share)) is not None
-    ]
     rows = [
         ("Made of", training_text(model)),
         ("Surface", f"{model.n_vertices:,} vertices, {0 if model.faces is None else len(model.faces):,} triangles"),
         ("Modes", f"{model.n_modes}, with {100 * float(model.cumulative_variance[-1]):.1f} % of the variance"),
-        ("Variance", listed(modes_needed) or "below 90 % in the modes kept"),
+        (
+            "Variance",
+            listed(
+                [f"{percent(share)} in {n}" for share in _SHARES if (n := model.modes_for_variance(share)) is not None]
+            )
+            or "below 90 % in the modes kept",
+        ),
         ("Size", "divided out (gauge shape)" if model.gauge == "shape" else "kept in the modes (gauge form)"),
         ("Landmarks", listed(list(model.landmarks)) or "none"),
         ("Provenance", model.provenance or "not stated"),
@@ -104,7 +103,9 @@ def html_of_model(model: ShapeModel) -> str:
     ]
 
     def draw() -> Drawn:
-        return _still(plot_model(model, "modes", modes=_MODES_SHOWN)), "The first modes; model.plot() draws more."
+        return figures.encode_webp(
+            plot_model(model, "modes", modes=_MODES_SHOWN)
+        ), "The first modes; model.plot() draws more."
 
     return notebook_html(model, "Shape model", [], rows, draw)
 
@@ -126,12 +127,11 @@ def html_of_fit(result: FitResult) -> str:
     rows += [("Note", note) for note in result.notes]
 
     def draw() -> Drawn:
-        from shapespace.report.render.thumbnails import fit_strip
-
         fit = StagedFit.of(result.model, result)
         colours = "blue inside, red outside" if fit.scan.faces is not None else "dark is far"
-        caption = f"The scan; scan and fitted model; distances up to {mm(fit.scale_mm)}: {colours}, grey not shown."
-        return fit_strip(fit, fit.scale_mm, _PANEL), caption
+        return fit_strip(
+            fit, fit.scale_mm, _PANEL
+        ), f"The scan; scan and fitted model; distances up to {mm(fit.scale_mm)}: {colours}, grey not shown."
 
     return notebook_html(result, result.scan_name, [f"{result.status}: {result.reason}"], rows, draw)
 
@@ -149,7 +149,7 @@ def html_of_quality(quality: ModelQuality) -> str:
             )
 
     def draw() -> Drawn:
-        return _still(plot_quality(quality)), "Bands are 95 % intervals."
+        return figures.encode_webp(plot_quality(quality)), "Bands are 95 % intervals."
 
     return notebook_html(quality, "Quality of a shape space", quality.sentences(), rows, draw)
 
@@ -177,8 +177,6 @@ def notebook_html(
         require_report_extra()
     except ShapespaceError as error:
         return f"<pre>{escape(repr(of))}\n{escape(str(error))}</pre>"
-    from shapespace.report.pages.page import template
-
     picture, size, caption = "", (0, 0), ""
     try:
         if draw is not None:
@@ -190,9 +188,3 @@ def notebook_html(
         title=title, sentences=sentences, rows=rows, picture=picture, size=size, caption=caption,
         body=blocks,
     )  # fmt: skip
-
-
-def _still(figure: Figure) -> Still:
-    from shapespace.report.figures import encode_webp
-
-    return encode_webp(figure)

@@ -23,30 +23,45 @@ from shapespace.report.blocks.blocks import (
     Folded,
     Gallery,
     Image,
-    Item,
     Notice,
     StripKey,
     Table,
     Text,
     Tiles,
+    first_items,
+    no_picture,
     number,
+    table_of,
     text_table,
 )
-from shapespace.report.blocks.wording import DASH, counted, listed, percent, plain, setting, words
-from shapespace.report.inputs.correspondence_folder import Corresponded, PlacedSurface, drawable, upright
-from shapespace.report.inputs.saved_fits import Folder
-from shapespace.report.inputs.staged_fit import nice_ceiling
-from shapespace.report.inputs.triage import (
+from shapespace.report.blocks.wording import (
+    DASH,
+    counted,
+    known,
+    listed,
+    median,
+    percent,
+    percent_of,
+    plain,
+    sentence,
+    setting,
+    words,
+)
+from shapespace.report.inputs.correspondence_folder import (
+    Corresponded,
+    PlacedSurface,
     concerns_of,
     distance_share,
-    known,
-    median,
-    percent_of,
+    drawable,
     scan_status,
-    sentence,
+    upright,
 )
+from shapespace.report.inputs.saved_fits import Folder
+from shapespace.report.inputs.staged_fit import nice_ceiling
 from shapespace.report.pages.page import Chapter, Page, Step
+from shapespace.report.render import thumbnails
 from shapespace.report.render.palette import DIVERGING, SEQUENTIAL
+from shapespace.report.render.scene import decimate
 from shapespace.reprs import describe_groups, first_names
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondRecord, Quality, read
 from shapespace.types import FloatArray, Mesh
@@ -85,8 +100,7 @@ class CorrespondencePage:
         self.result = Corresponded(folder.root)
         if not self.result.records:
             raise FileFormatError(f"{folder.root} holds no record of a scan; {CORRESPOND_AGAIN}.")
-        together = len(self.result.corresponding)
-        self.page = Page(together + min(len(self.result.records), MOST_CARDS) + 5, on_step)
+        self.page = Page(len(self.result.corresponding) + min(len(self.result.records), MOST_CARDS) + 5, on_step)
         self.all = self.result.population(self.page.step)
         self.mean = self.result.mean
         self.size = dict(zip(self.all.names, self.all.sizes, strict=True))
@@ -104,9 +118,8 @@ class CorrespondencePage:
 
     def status(self, record: CorrespondRecord) -> Cell:
         """Return what came of a scan, sorted from bad to good."""
-        cell = scan_status(record, self.concerns)
-        words, colour = _STATUS[cell]
-        return Cell(words, float(list(_STATUS).index(cell)), colour)
+        kind = scan_status(record, self.concerns)
+        return Cell(_STATUS[kind][0], float(list(_STATUS).index(kind)), _STATUS[kind][1])
 
     @property
     def looked_at(self) -> list[CorrespondRecord]:
@@ -128,13 +141,16 @@ class CorrespondencePage:
         ]
         if (self.result.root / "quality.json").is_file():
             chapters.insert(4, Chapter("Quality of the shape space", self.quality, "Quality"))
-        lead = (
-            "Raw scans brought to one surface: the same vertex is meant to be the same place on all of them. The size "
-            "of an object is the RMS distance of its surface from its middle."
-        )
-        made = f"Made by shapespace {__version__} from the files in {name}."
         return self.page.html(
-            f"Correspondence of {counted(self.total, 'scan')} in {name}", [Text(lead)], made, chapters
+            f"Correspondence of {counted(self.total, 'scan')} in {name}",
+            [
+                Text(
+                    "Raw scans brought to one surface: the same vertex is meant to be the same place on all of them. "
+                    "The size of an object is the RMS distance of its surface from its middle."
+                )
+            ],
+            f"Made by shapespace {__version__} from the files in {name}.",
+            chapters,
         )
 
     @property
@@ -145,7 +161,6 @@ class CorrespondencePage:
     def summary(self) -> list[Block]:
         """Return what came of the scans, in a sentence, in figures, and those that need a look."""
         mean, far = (median([self.share(r, which) for r in self.records]) for which in ("mean", "p99"))
-        seen = median([known(record.seen_share) for record in self.records])
         tiles = [
             (str(len(self.records)), f"of {self.total}", "scans in correspondence"),
             (f"{self.result.run.vertices:,}", "", "vertices, the same on all"),
@@ -155,17 +170,37 @@ class CorrespondencePage:
                 "of its size: mean distance between scan and surface, median scan",
             ),
             (percent_of(far).removesuffix(" %"), "%", "of its size: 99 % of the points lie nearer, median scan"),
-            (percent(seen).removesuffix(" %"), "%", "of the vertices are shown by the median scan"),
+            (
+                percent(median([known(record.seen_share) for record in self.records])).removesuffix(" %"),
+                "%",
+                "of the vertices are shown by the median scan",
+            ),
         ]
         if self.result.run.rounds:
-            last = percent_of(self.result.run.rounds[-1])
-            tiles.append((last.removesuffix(" %"), "%", "of the size: movement of vertices in the last round (RMS)"))
+            tiles.append(
+                (
+                    percent_of(self.result.run.rounds[-1]).removesuffix(" %"),
+                    "%",
+                    "of the size: movement of vertices in the last round (RMS)",
+                )
+            )
         return [
             Text(self.verdict()),
             Tiles(tiles),
-            self._set_aside(),
-            self._to_look_at(),
-            Notice("Cannot be read", [Item(text, Cell(name)) for name, text in self._damaged().items()], "broken"),
+            Notice(
+                "Excluded scans: they are not in a model built from this folder",
+                self._items({record.name: sentence(record.reason) for record in self.result.set_aside}),
+                "broken",
+            ),
+            Notice(
+                "In correspondence; needs review",
+                self._items({record.name: self.concerns[record.name].text for record in self.looked_at}),
+            ),
+            Notice(
+                "Cannot be read",
+                [Text(text, name=Cell(name)) for name, text in {**self.result.unread, **self.all.unread}.items()],
+                "broken",
+            ),
             Text("To look at single vertices on all scans, and to go on to a shape space:"),
             Command(f"shapespace view {self.result.root.name}\nshapespace build {self.result.root.name} -o model.h5"),
         ]
@@ -173,24 +208,28 @@ class CorrespondencePage:
     def verdict(self) -> str:
         """Return in a few sentences whether to go on, and what to look at first."""
         n, aside = len(self.records), len(self.out) + len(self.result.unread)
-        text = f"{n} of {counted(self.total, 'scan')} {'is' if n == 1 else 'are'} in correspondence"
         some = self.looked_at
-        text += f"; {counted(len(some), 'of them needs', 'of them need')} review" if some else (
-            " and none of them needs review"
-        )  # fmt: skip
-        text += f"; {aside} {'is' if aside == 1 else 'are'} excluded." if aside else "."
+        excluded = f"; {aside} {'is' if aside == 1 else 'are'} excluded"
+        review = f"; {counted(len(some), 'of them needs', 'of them need')} review"
         folded = [record.folded_share for record in self.records if record.folded_share]
-        text += " No triangle is folded over." if not folded else (
-            f" {counted(len(folded), 'scan has', 'scans have')} folded triangles, {percent_of(max(folded))} at most."
-        )  # fmt: skip
+        most_folded = (
+            f"{counted(len(folded), 'scan has', 'scans have')} folded triangles, "
+            f"{percent_of(max(folded, default=nan))} at most."
+        )
         mirrored = [record.name for record in self.records if record.mirrored]
-        if mirrored:
-            named = first_names(mirrored, _MOST_NAMED)
-            of = counted(len(mirrored), "scan is a mirror image", "scans are mirror images")
-            text += f" {of} of the others and shown reflected ({named})."
-        if self.result.run.groups:
-            text += f" {describe_groups(self.result.run.groups)}"
-        return f"{text} {self._settling()}"
+        reflected = (
+            f"{counted(len(mirrored), 'scan is a mirror image', 'scans are mirror images')} of the others and shown "
+            f"reflected ({first_names(mirrored, _MOST_NAMED)})."
+        )
+        sentences = [
+            f"{n} of {counted(self.total, 'scan')} {'is' if n == 1 else 'are'} in correspondence"
+            f"{review if some else ' and none of them needs review'}"
+            f"{excluded if aside else ''}.",
+            most_folded if folded else "No triangle is folded over.",
+            reflected if mirrored else "",
+            describe_groups(self.result.run.groups) if self.result.run.groups else "",
+        ]
+        return f"{' '.join(filter(None, sentences))} {self._settling()}"
 
     def _settling(self) -> str:
         moved = self.result.run.rounds
@@ -203,24 +242,13 @@ class CorrespondencePage:
             f"size, and {percent_of(self.result.settled)} counts as settled; more --rounds may still better it."
         )
 
-    def _set_aside(self) -> Notice:
-        items = [Item(sentence(r.reason), Cell(r.name, anchor=self._cards.get(r.name))) for r in self.result.set_aside]
-        if len(items) > _MOST_NAMED:
-            items = [*items[:_MOST_NAMED], Item(f"{counted(len(items) - _MOST_NAMED, 'other')}, in the table of all.")]
-        return Notice("Excluded scans: they are not in a model built from this folder", items, "broken")
-
-    def _to_look_at(self) -> Notice:
-        some = self.looked_at
-        items = [
-            Item(self.concerns[record.name].text, Cell(record.name, anchor=self._cards.get(record.name)))
-            for record in some[:_MOST_NAMED]
-        ]
-        if len(some) > _MOST_NAMED:
-            items.append(Item(f"{counted(len(some) - _MOST_NAMED, 'other')}, in the table of all."))
-        return Notice("In correspondence; needs review", items)
-
-    def _damaged(self) -> Mapping[str, str]:
-        return {**self.result.unread, **self.all.unread}
+    def _items(self, texts: Mapping[str, str]) -> list[str | Text]:
+        """Return a sentence for each of the first scans, by name, and the number of the others."""
+        return first_items(
+            [Text(text, name=Cell(name, anchor=self._cards.get(name))) for name, text in texts.items()],
+            _MOST_NAMED,
+            "in the table of all",
+        )
 
     # The pictures
 
@@ -237,12 +265,20 @@ class CorrespondencePage:
         surfaces, labels = [placed[r.name].vertices for r in pictured], [record.name for record in pictured]
         pictures: list[Block] = []
         for yaw, side in ((0.0, "from the front"), (figures.SIDE_DEG, "from one side")):
-            title = f"The same squares on every scan, {side}"
-            drawn = figures.checkerboard_figure(self.mean, surfaces, labels, yaw_deg=yaw, title=title)
-            caption = f"{which} A checkerboard is laid onto the mean shape and carried to each scan by its vertices."
-            alt = f"The same checkerboard {side} on the mean shape and on {listed(labels)}"
+            drawn = figures.checkerboard_figure(
+                self.mean, surfaces, labels, yaw_deg=yaw, title=f"The same squares on every scan, {side}"
+            )
             # As wide as the page: small squares tell nothing.
-            pictures.append(replace(self.page.figure(drawn, caption, alt=alt), kind="plain"))
+            pictures.append(
+                replace(
+                    self.page.figure(
+                        drawn,
+                        f"{which} A checkerboard is laid onto the mean shape and carried to each scan by its vertices.",
+                        alt=f"The same checkerboard {side} on the mean shape and on {listed(labels)}",
+                    ),
+                    kind="plain",
+                )
+            )
         return [
             Text(
                 "Compare them place by place: an edge or a corner that you know, such as the corner of an eye or a "
@@ -258,8 +294,7 @@ class CorrespondencePage:
         first = self.looked_at[: MOST_BOARDS // 2 + 1] if len(self.records) > MOST_BOARDS else list(self.ordered)
         rest = [record for record in self.ordered if record not in first]
         room = MOST_BOARDS - len(first)
-        picked = [len(rest) * k // room for k in range(min(room, len(rest)))]
-        return [*first, *(rest[k] for k in picked)]
+        return [*first, *(rest[k] for k in [len(rest) * k // room for k in range(min(room, len(rest)))])]
 
     def nearness(self) -> list[Block]:
         """Return the distances of all scans, and where vertices are missing."""
@@ -268,33 +303,25 @@ class CorrespondencePage:
         shares = np.array([[self.share(r, w) for w in ("mean", "p95", "p99", "max")] for r in self.records])
         share = 1 - self.all.seen_count / len(self.records)
         hardly = float((share > 1 - _HARDLY_SEEN).mean())
-        text = "Every scan shows every vertex."
-        if share.any():
-            most = (
-                f"{percent(hardly)} on more than half, which build leaves out" if hardly else "none on more than half"
-            )
-            text = f"{percent(float((share > 0).mean()))} of the vertices are missing on at least one scan, and {most}."
+        most = f"{percent(hardly)} on more than half, which build leaves out" if hardly else "none on more than half"
+        missing = f"{percent(float((share > 0).mean()))} of the vertices are missing on at least one scan, and {most}."
         there = median([known(record.area_share) for record in self.records])
-        lacking: list[Block] = []
-        if there < _WHOLE_SHARE:
-            caption = (
-                f"The mean shape lacks parts that the scans show: its surface is {percent(there)} of the median "
-                "scan's, mostly because the first template lacked them. Give a whole one with --template."
-            )
-            lacking.append(Text(caption, "notice"))
-        if self.result.holes:
-            caption = (
-                f"The mean shape has {counted(self.result.holes, 'hole')} beside its border. Where the object has no "
-                "opening, the first template had a hole, and no scan can show anything there; give a whole one with "
-                "--template."
-            )
-            lacking.append(Text(caption, "notice"))
+        lacking = (
+            f"The mean shape lacks parts that the scans show: its surface is {percent(there)} of the median scan's, "
+            "mostly because the first template lacked them. Give a whole one with --template."
+        )
+        holes = (
+            f"The mean shape has {counted(self.result.holes, 'hole')} beside its border. Where the object has no "
+            "opening, the first template had a hole, and no scan can show anything there; give a whole one with "
+            "--template."
+        )
         return [
             Text(
                 "Distances are measured both ways: from the vertices that a scan shows to the scan, and from its "
                 "points to the surface, leaving out what lies beyond the surface's rim."
             ),
-            *lacking,
+            Text(lacking if there < _WHOLE_SHARE else "", "notice"),
+            Text(holes if self.result.holes else "", "notice"),
             sections.in_columns(
                 self.page.figure(
                     figures.nearness_figure(shares),
@@ -304,7 +331,7 @@ class CorrespondencePage:
                 ),
                 self.page.figure(
                     figures.missing_figure(self.mean, share),
-                    f"{text} The mean shape from four sides.",
+                    f"{missing if share.any() else 'Every scan shows every vertex.'} The mean shape from four sides.",
                     alt="Share of scans that do not show each vertex, on the mean shape from four sides",
                 ),
             ),
@@ -322,48 +349,59 @@ class CorrespondencePage:
             "within 2.15 times it. It is large where the surface is flat or of constant curvature, so that no feature "
             "determines the position. Single surfaces are in the viewer."
         )
-        alt = "Standard deviation of the position of each vertex along the surface, on the mean shape from four sides"
-        figure = figures.position_std_figure(self.mean, std, self.all.position_std_limit)
-        return [self.page.figure(figure, caption, alt=alt)]
+        return [
+            self.page.figure(
+                figures.position_std_figure(self.mean, std, self.all.position_std_limit),
+                caption,
+                alt="Standard deviation of the position of each vertex along the surface, on the mean shape from four "
+                "sides",
+            )
+        ]
 
     # The scans
 
     def scans(self) -> list[Block]:
         """Return the gallery, the worst first, and the table of all."""
-        all_shown = len(self._cards) == len(self.records) + len(self.out)
-        heading = "All scans, the worst first" if all_shown else f"The {len(self._cards)} scans to look at first"
         return [
-            self.page.section(heading, self.gallery),
+            self.page.section(
+                (
+                    "All scans, the worst first"
+                    if (len(self._cards) == len(self.records) + len(self.out))
+                    else f"The {len(self._cards)} scans to look at first"
+                ),
+                self.gallery,
+            ),
             self.page.section("Every scan in numbers", self.numbers),
         ]
 
     def _carded(self) -> list[CorrespondRecord]:
-        room = max(MOST_EMPTY_CARDS, MOST_CARDS - len(self.records))
-        first = self.out[:room]
+        first = self.out[: max(MOST_EMPTY_CARDS, MOST_CARDS - len(self.records))]
         return [*first, *self.ordered[: MOST_CARDS - len(first)]]
 
     def gallery(self) -> list[Block]:
         """Return a card for each of the first scans."""
-        from shapespace.report.render import thumbnails
-
         limit = 100 * (median([self.share(record, "p99") for record in self.records]) or nan)
         limit = nice_ceiling(limit)
-        bars = [(SEQUENTIAL, "0", f"{limit:g} % of its size, or more"), (DIVERGING, "half the area", "twice the area")]
         key = StripKey(
             "Each strip, from the left: the scan; the checkerboard of the front view; how far each vertex lies from "
             "the scan (pale to dark); how much each triangle has shrunk (blue) or grown (red) beside the mean shape, "
             "with the change of size divided out and folded triangles in black.",
-            [(self.page.image(thumbnails.colour_bar(c), f"from {low} to {high}"), low, high) for c, low, high in bars],
+            [
+                (self.page.image(thumbnails.colour_bar(c), f"from {low} to {high}"), low, high)
+                for c, low, high in [
+                    (SEQUENTIAL, "0", f"{limit:g} % of its size, or more"),
+                    (DIVERGING, "half the area", "twice the area"),
+                ]
+            ],
             "Where areas change, shapes may differ; where they change suddenly, squares have slid.",
         )
         carded = self._carded()
-        out: list[Block] = [Text("Sorted: excluded scans first, then by how much they stand out.")]
-        if len(carded) < len(self.records) + len(self.out):
-            others = counted(len(self.records) + len(self.out) - len(carded), "other scan")
-            out.append(
-                Text(f"{others} have no picture here, so that this file stays below 8 MB; the table has them all.")
-            )
-        return [*out, key, Gallery([self.card(record, limit) for record in carded])]
+        return [
+            Text("Sorted: excluded scans first, then by how much they stand out."),
+            no_picture(len(self.records) + len(self.out) - len(carded), "scan"),
+            key,
+            Gallery([self.card(record, limit) for record in carded]),
+        ]
 
     def card(self, record: CorrespondRecord, limit: float) -> Card:
         """Return one scan of the gallery, its distances on a scale that ends at `limit` percent of its size."""
@@ -390,8 +428,6 @@ class CorrespondencePage:
 
     def _still(self, record: CorrespondRecord, limit: float) -> tuple[Image, str]:
         """Return the picture of a scan, and what it lacks."""
-        from shapespace.report.render import thumbnails
-
         if record in self.out:
             scan = drawable(self._bounded(record))[0]
             if scan.faces is not None:
@@ -401,8 +437,7 @@ class CorrespondencePage:
         scan, note = None, ""
         far = np.full(len(placed.vertices), nan)
         try:
-            own = drawable(self._bounded(record))[0]
-            scan, far = self._scan_on_mean(own, placed)
+            scan, far = self._scan_on_mean(drawable(self._bounded(record))[0], placed)
         except FileFormatError as error:
             note = f"Without the scan beside it: {error}"
         still = thumbnails.correspondence_strip(self.mean, placed.vertices, scan, far, limit)
@@ -410,8 +445,6 @@ class CorrespondencePage:
         return self.page.image(still, f"{record.name}: {seen}"), note
 
     def _bounded(self, record: CorrespondRecord) -> Mesh:
-        from shapespace.report.render.scene import decimate
-
         return decimate(self.result.raw_scan(record), _TRIANGLES_DRAWN)[0]
 
     def _scan_on_mean(self, scan: Mesh, placed: PlacedSurface) -> tuple[Mesh, FloatArray]:
@@ -419,14 +452,10 @@ class CorrespondencePage:
         moved = scan.with_vertices(placed.T_scan_mean.inverse().apply(scan.vertices))
         far = np.full(len(placed.vertices), nan)
         far[placed.seen] = build_engine(moved).query(placed.vertices[placed.seen]).distance
-        size = float(np.sqrt((self.mean.vertices**2).sum(axis=1).mean()))
-        return moved, 100 * far / size
+        return moved, 100 * far / float(np.sqrt((self.mean.vertices**2).sum(axis=1).mean()))
 
     def numbers(self) -> list[Block]:
         """Return the table of all scans."""
-        out: list[Block] = []
-        if self.result.units_mixed:
-            out.append(Text("The scans are in different units: compare distances in % of the size.", "notice"))
         columns: list[tuple[Column, _Make]] = [
             (Column("Scan"), lambda r: Cell(r.name, anchor=self._cards.get(r.name))),
             (Column("Status"), lambda r: self.status(r)),
@@ -446,21 +475,24 @@ class CorrespondencePage:
             (Column("CPU seconds", "number"), lambda r: number(sum(r.cpu_s) if r.cpu_s else nan, 1)),
         ]
         records = [*self.out, *self.ordered]
-        rows = [[make(record) for _, make in columns] for record in records[:MOST_ROWS]]
-        if len(records) > MOST_ROWS:
-            out.append(Text(f"The first {MOST_ROWS:,} of {len(records):,} scans; their records have all."))
-        table = Table([column for column, _ in columns], rows, "All scans", sortable=len(rows) > 1)
+        units = "The scans are in different units: compare distances in % of the size."
+        first = f"The first {MOST_ROWS:,} of {len(records):,} scans; their records have all."
         caption = (
             "Distances are both ways; those without % are in the unit of the scan's file. Area covered: that of the "
             "surface beside that of the scan. Folded: triangles that turn back over their neighbours. Area change: "
             "95 % of the triangles grow or shrink by less than so many times beside the mean shape, size divided out."
         )
-        notes: list[Block] = [Text(caption, "soft")]
         why = [[record.name, self._reason(record)] for record in records if self._reason(record)]
-        if why:
-            heading = f"The reasons of {counted(len(why), 'scan')}"
-            notes = [*notes, Folded(heading, [text_table(("Scan", "Why"), why, "Reasons")])]
-        return [*out, table, *notes]
+        return [
+            Text(units if self.result.units_mixed else "", "notice"),
+            Text(first if len(records) > MOST_ROWS else ""),
+            table_of(records[:MOST_ROWS], columns, "All scans"),
+            Text(caption, "soft"),
+            Folded(
+                f"The reasons of {counted(len(why), 'scan')}",
+                ([text_table(("Scan", "Why"), why, "Reasons")] if why else []),
+            ),
+        ]
 
     def _reason(self, record: CorrespondRecord) -> str:
         if record in self.out:
@@ -483,19 +515,43 @@ class CorrespondencePage:
         rows: list[list[Cell]] = []
         for k, moved in enumerate(run.rounds):
             cpu = [record.cpu_s[k] for record in self.records if len(record.cpu_s) > k]
-            row = [Cell(f"Round {k + 1}", float(k + 1)), _cell(100 * moved)]
-            rows.append([*row, number(sum(cpu), 1), number(median(cpu), 1), number(max(cpu, default=nan), 1)])
-        heads = ["Moved (RMS), % of size", "CPU seconds, all scans", "a scan, median", "a scan, most"]
-        table = Table(
-            [Column("Round"), *(Column(head, "number") for head in heads)], rows, "Movement and time by round"
-        )
-        note = "CPU seconds are those of the scans in correspondence; choosing the template is not counted."
-        return [Text(run.template), figure, table, Text(note, "soft")]
+            rows.append(
+                [
+                    *[Cell(f"Round {k + 1}", float(k + 1)), _cell(100 * moved)],
+                    number(sum(cpu), 1),
+                    number(median(cpu), 1),
+                    number(max(cpu, default=nan), 1),
+                ]
+            )
+        return [
+            Text(run.template),
+            figure,
+            Table(
+                [
+                    Column("Round"),
+                    *(
+                        Column(head, "number")
+                        for head in [
+                            "Moved (RMS), % of size",
+                            "CPU seconds, all scans",
+                            "a scan, median",
+                            "a scan, most",
+                        ]
+                    ),
+                ],
+                rows,
+                "Movement and time by round",
+            ),
+            Text("CPU seconds are those of the scans in correspondence; choosing the template is not counted.", "soft"),
+        ]
 
     def quality(self) -> list[Block]:
         """Return what quality.json says."""
-        measured = read(Quality, self.result.folder.json("quality.json"), "quality.json", "measure it again")
-        return [sections.quality_part(self.page, measured)]
+        return [
+            sections.quality_part(
+                self.page, read(Quality, self.result.folder.json("quality.json"), "quality.json", "measure it again")
+            )
+        ]
 
     def settings(self) -> list[Block]:
         """Return settings, versions and hashes."""
@@ -503,9 +559,22 @@ class CorrespondencePage:
         rows = [("Report", f"shapespace {__version__}"), ("Correspondence", f"shapespace {run.version}")]
         rows += [("First template", run.template), ("Vertices made", f"{run.vertices:,}")]
         rows += [(words(key), setting(value)) for key, value in run.settings.items() if key != "vertices"]
-        files = [[r.name, r.path or DASH, r.hash or DASH] for r in list(self.result.records.values())[:MOST_ROWS]]
-        hashes = text_table(("Scan", "File", "Hash"), files, "Content hashes of the scans")
-        return [Facts(rows, "Settings and versions"), Folded("Content hashes (SHA-256)", [hashes])]
+        return [
+            Facts(rows, "Settings and versions"),
+            Folded(
+                "Content hashes (SHA-256)",
+                [
+                    text_table(
+                        ("Scan", "File", "Hash"),
+                        [
+                            [r.name, r.path or DASH, r.hash or DASH]
+                            for r in list(self.result.records.values())[:MOST_ROWS]
+                        ],
+                        "Content hashes of the scans",
+                    )
+                ],
+            ),
+        ]
 
 
 def _cell(value: float) -> Cell:

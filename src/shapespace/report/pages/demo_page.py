@@ -5,23 +5,19 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from shapespace.errors import FileFormatError
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report import figures
-from shapespace.report.blocks import fit_tables as tables
 from shapespace.report.blocks import sections
 from shapespace.report.blocks.blocks import Block, Facts, Figure, Folded, Notice, Table, Text, Tiles, text_table
 from shapespace.report.blocks.wording import DASH, STATUS_WORDS, isfinite, mm, moment, plain, setting, words
 from shapespace.report.inputs.saved_fits import Folder, SavedFit, read_fit, staged_fit
+from shapespace.report.inputs.staged_fit import StagedFit
 from shapespace.report.pages.page import Chapter, Make, Page, Step
 from shapespace.schemas import DEMO_AGAIN, Case, Demo, DemoModel, ExpressionsOfOne, FitEntry, read
-
-if TYPE_CHECKING:
-    from shapespace.report.inputs.staged_fit import StagedFit
 
 _RESERVE_BYTES = 1_200_000  # bytes that stay free for the parts after the fits
 _PICTURES = 30  # planned pictures, for the progress bar alone
@@ -48,9 +44,6 @@ class DemoPage:
         self.provenance = f"shapespace {self.demo.version}, {moment(self.demo.created)}"
         self.cases = self.demo.experiment2.cases
         self.entries = [*self.demo.experiment1.fits, *(case.fit for case in self.cases)]
-        self._fits: dict[str, SavedFit] = {}
-        self._staged: dict[str, StagedFit] = {}
-        self._models: dict[str, ShapeModel] = {}
 
     def html(self) -> str:
         """Return the page."""
@@ -65,14 +58,17 @@ class DemoPage:
                 "soft",
             ),
         ]
-        chapters = [
-            Chapter("Summary", self.summary),
-            Chapter("Experiment 1", self.experiment_1),
-            Chapter("Experiment 2", self.experiment_2),
-            Chapter("Settings, versions and hashes", self.settings, "Settings"),
-        ]
-        title = "Low-dimensional surface parameterisation: the paper, run again"
-        return self.page.html(title, lead, f"Made by {self.provenance} from the files in its own folder.", chapters)
+        return self.page.html(
+            "Low-dimensional surface parameterisation: the paper, run again",
+            lead,
+            f"Made by {self.provenance} from the files in its own folder.",
+            [
+                Chapter("Summary", self.summary),
+                Chapter("Experiment 1", self.experiment_1),
+                Chapter("Experiment 2", self.experiment_2),
+                Chapter("Settings, versions and hashes", self.settings, "Settings"),
+            ],
+        )
 
     def with_headings(self, parts: Mapping[str, Make], level: int = 3) -> list[Block]:
         """Return sections with their headings."""
@@ -82,23 +78,16 @@ class DemoPage:
 
     def fit(self, entry: FitEntry) -> SavedFit:
         """Return the fit of an entry of demo.json."""
-        key = str(entry.json)
-        if key not in self._fits:
-            self._fits[key] = read_fit(self.folder, entry)
-        return self._fits[key]
+        return self.page.once(("fit", str(entry.json)), lambda: read_fit(self.folder, entry))
 
     def staged(self, fit: SavedFit, label: str = "") -> StagedFit:
         """Return the surfaces of `fit` for its pictures, with the name `label`."""
-        key = str(fit.entry.stages)
-        if key not in self._staged:
-            self._staged[key] = staged_fit(self.folder, fit)
-        return replace(self._staged[key], label=label or fit.label)
+        staged = self.page.once(("stages", str(fit.entry.stages)), lambda: staged_fit(self.folder, fit))
+        return replace(staged, label=label or fit.label)
 
     def model(self, owner: DemoModel) -> ShapeModel:
         """Return the model of an experiment or a case."""
-        if owner.model not in self._models:
-            self._models[owner.model] = ShapeModel.load(self.folder.path(owner.model))
-        return self._models[owner.model]
+        return self.page.once(("model", owner.model), lambda: ShapeModel.load(self.folder.path(owner.model)))
 
     def readable(self, entries: Sequence[FitEntry]) -> tuple[list[SavedFit], list[str]]:
         """Return the fits whose records can be read, and one sentence for each that cannot."""
@@ -119,8 +108,10 @@ class DemoPage:
 
     def summary(self) -> list[Block]:
         """Return the key numbers, the main figure, and the comparison with the paper."""
-        parts = {"Main figure": self.main_figure, "The paper beside this run": self.paper_table}
-        return [*self.tiles(), *self.with_headings(parts)]
+        return [
+            *self.tiles(),
+            *self.with_headings({"Main figure": self.main_figure, "The paper beside this run": self.paper_table}),
+        ]
 
     def tiles(self) -> list[Block]:
         """Return the number of fits by status, and their mean errors."""
@@ -132,10 +123,13 @@ class DemoPage:
         errors = _mean([entry.vertex_error_mm.mean for entry in tests if entry.vertex_error_mm])
         floors = _mean([entry.floor_mm.mean for entry in tests if entry.floor_mm])
         blind = "fits converged with nothing found against them; the plain method is blind to some errors"
-        modes = plain(self.demo.experiment1.modes_for_98_5)
         tiles = [
             (str(counts["converged"]), f"of {total}", blind),
-            (modes, "", "modes hold 98.5 % of the variance of one person's expressions"),
+            (
+                plain(self.demo.experiment1.modes_for_98_5),
+                "",
+                "modes hold 98.5 % of the variance of one person's expressions",
+            ),
             (*_number_and_unit(_mean(distances)), "mean closest distance, test faces to scans, over what these show"),
             (*_number_and_unit(errors), f"their true vertex error; the model's best possible is {mm(floors)}"),
         ]
@@ -146,11 +140,13 @@ class DemoPage:
             f"{total} fits are reported: {first} to simulated scans of one person's expressions, {total - first} to "
             f"scans of other people.{f' Besides those that converged: {rest}.' if rest else ''}"
         )
-        doubts = [f"{fit.name}: {STATUS_WORDS[fit.status]}. {fit.reason}" for fit in fits if fit.status != "converged"]
         return [
             Text(text),
             Tiles(tiles),
-            Notice("Not to be trusted without a look", doubts),
+            Notice(
+                "Not to be trusted without a look",
+                [f"{fit.name}: {STATUS_WORDS[fit.status]}. {fit.reason}" for fit in fits if fit.status != "converged"],
+            ),
             Notice("Cannot be read", problems),
         ]
 
@@ -161,8 +157,11 @@ class DemoPage:
         usable.sort(key=lambda fit: fit.summary_mm("final", "model_to_scan", "mean"))
         wanted = [(fit.entry, f"{fit.label} (simulated)") for fit in usable[len(usable) // 2 :][:1]]
         for case in self.cases:
-            both = ((case.fit, "paper"), (case.robust, "robust"))
-            wanted += [(fit, f"{_short(case)}, {method}") for fit, method in both if fit and fit.stages]
+            wanted += [
+                (fit, f"{_short(case)}, {method}")
+                for fit, method in ((case.fit, "paper"), (case.robust, "robust"))
+                if fit and fit.stages
+            ]
         staged_fits, unread = sections.usable(wanted, lambda pair: self.staged(self.fit(pair[0]), pair[1]))
         if not staged_fits:
             raise FileFormatError("No fit kept a surface to show; run the demo again.")
@@ -242,15 +241,16 @@ class DemoPage:
 
     def numbers(self, fits: Sequence[SavedFit]) -> Table:
         """Return the table of fits."""
-        return tables.fits_table(fits, {}, caption="Distances at the end, in mm. A dash: not known.")
+        return sections.fits_table(fits, {}, caption="Distances at the end, in mm. A dash: not known.")
 
     def training(self, one: ExpressionsOfOne) -> Figure:
         """Return some of the training faces."""
         examples = one.training_examples[: 8 if self.demo.quick else 12]
         meshes = [self.folder.mesh(example.file) for example in examples]
-        labels = [example.label for example in examples]
         return self.page.figure(
-            figures.faces_grid(meshes, labels, title="Training faces: one person, mixed expressions"),
+            figures.faces_grid(
+                meshes, [example.label for example in examples], title="Training faces: one person, mixed expressions"
+            ),
             f"Paper, figure 1. {len(meshes)} of the {_count(one.n_training)} faces that the model is made of.",
             alt=f"{len(meshes)} faces of one person with different expressions, in a grid",
         )
@@ -265,10 +265,13 @@ class DemoPage:
         if not pictured:
             return [absent if absent.items else Text("No test face was fitted.", "broken")]
         labels = [staged.label for _, staged in pictured]
-        title = "Test faces: raw surfaces, none of them in the training set"
         return [
             self.page.figure(
-                figures.faces_grid([staged.scan for _, staged in pictured], labels, title=title),
+                figures.faces_grid(
+                    [staged.scan for _, staged in pictured],
+                    labels,
+                    title="Test faces: raw surfaces, none of them in the training set",
+                ),
                 "Paper, figure 8. The scans, turned back to the front by the fitted pose; simulated.",
                 alt="Grid of test faces: " + ", ".join(labels),
             ),
@@ -279,9 +282,13 @@ class DemoPage:
         """Return one fit with all its pictures, and its coefficients beside those of the population (N, K)."""
         if len({len(z) for z in population_z}) > 1:
             raise FileFormatError("population_z in demo.json has rows of different lengths; run the demo again.")
-        staged = self.staged(fit, label)
-        spread = np.array(population_z, dtype=np.float64) if population_z else None
-        return sections.fit_in_full(self.page, staged, spread, reserve=_RESERVE_BYTES, of_paper=True)
+        return sections.fit_in_full(
+            self.page,
+            self.staged(fit, label),
+            (np.array(population_z, dtype=np.float64) if population_z else None),
+            reserve=_RESERVE_BYTES,
+            of_paper=True,
+        )
 
     def all_fitted(self, tests: Sequence[SavedFit]) -> list[Block]:
         """Return every test face with its fitted model."""
@@ -307,11 +314,14 @@ class DemoPage:
         neutral = next((sections.coefficients_of(fit) for fit in usable if not fit.entry.intensity), None)
         out: list[Block] = []
         if scans and all(len(scan.b) >= 2 for scan in scans):
-            of = ("Paper, figure 9. ", "Paper, figure 10. ")
-            out.append(sections.lines_through_neutral(self.page, scans, neutral, figures_of=of))
+            out.append(
+                sections.lines_through_neutral(
+                    self.page, scans, neutral, figures_of=("Paper, figure 9. ", "Paper, figure 10. ")
+                )
+            )
             if all(len(scan.b) >= 3 for scan in scans):
                 out += self.page.tried(lambda: sections.scatter_to_turn(self.page, scans))
-        return out + tables.score_tables(
+        return out + sections.score_tables(
             one.scores, many="Is each expression a line through neutral?", single="Are the expressions disjoint?"
         )
 
@@ -363,15 +373,16 @@ class DemoPage:
         """Return one scan of experiment 2."""
         fit = self.fit(case.fit)
         kind = "Simulated scan. " if case.simulated else "Real scan. "
-        if case.note.lower().startswith(("simulated", "real", "a real")):
-            kind = ""
-        text = f"The model is made of {_count(case.n_training)} people"
+        kind = "" if case.note.lower().startswith(("simulated", "real", "a real")) else kind
+        used = f", and {case.n_modes} are used" if case.n_modes else ""
+        modes = f"its {_count(case.n_modes)} modes hold less than 98.5 % of the variance."
         if case.modes_for_98_5:
-            text += f"; {case.modes_for_98_5} modes hold 98.5 % of the variance"
-            text += f", and {case.n_modes} are used." if case.n_modes else "."
-        else:
-            text += f"; its {_count(case.n_modes)} modes hold less than 98.5 % of the variance."
-        out: list[Block] = [Text(kind + case.note, "notice" if case.simulated else ""), Text(text), self.numbers([fit])]
+            modes = f"{case.modes_for_98_5} modes hold 98.5 % of the variance{used}."
+        out: list[Block] = [
+            Text(kind + case.note, "notice" if case.simulated else ""),
+            Text(f"The model is made of {_count(case.n_training)} people; {modes}"),
+            self.numbers([fit]),
+        ]
         if not fit.pictured:
             return out
         parts: dict[str, Make] = {"Step by step": lambda: self.one_fit(fit, _short(case))}
@@ -391,14 +402,27 @@ class DemoPage:
         fits, unread = self.readable(self.entries)
         if fits:
             rows += [(f"Fit, {words(key)}", setting(value)) for key, value in fits[0].record.config.items()]
-        files = [
-            [fit.name, *(f"{file.name} {file.hash or 'not recorded'}" for file in (fit.record.scan, fit.record.model))]
-            for fit in fits
-        ]
-        hashes = text_table(("Fit", "Scan", "Model"), files, "Content hashes of the files that took part")
         return [
             Facts(rows, "Settings and versions"),
-            Folded("Content hashes (SHA-256)", [hashes]),
+            Folded(
+                "Content hashes (SHA-256)",
+                [
+                    text_table(
+                        ("Fit", "Scan", "Model"),
+                        [
+                            [
+                                fit.name,
+                                *(
+                                    f"{file.name} {file.hash or 'not recorded'}"
+                                    for file in (fit.record.scan, fit.record.model)
+                                ),
+                            ]
+                            for fit in fits
+                        ],
+                        "Content hashes of the files that took part",
+                    )
+                ],
+            ),
             Notice("Cannot be read", unread),
         ]
 
@@ -409,8 +433,12 @@ def _tests(fits: Sequence[SavedFit]) -> list[SavedFit]:
 
 def _strongest(pictured: Sequence[tuple[SavedFit, StagedFit]]) -> list[StagedFit]:
     """Return the fit of the highest intensity of each expression."""
-    ranked = sorted(pictured, key=lambda pair: pair[0].entry.intensity or 0)
-    return list({fit.entry.expression: staged for fit, staged in ranked}.values())
+    return list(
+        {
+            fit.entry.expression: staged
+            for fit, staged in sorted(pictured, key=lambda pair: pair[0].entry.intensity or 0)
+        }.values()
+    )
 
 
 def _short(case: Case) -> str:

@@ -6,53 +6,73 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
 from shapespace.cohort.labels import LABELS_FILE, Label, read_labels
 from shapespace.cohort.table import names_of_file
 from shapespace.errors import InputError, ShapespaceError
-from shapespace.report.blocks import fit_tables as tables
+from shapespace.model.shape_model import ShapeModel
+from shapespace.report import figures
 from shapespace.report.blocks import sections
 from shapespace.report.blocks.blocks import (
     Block,
     Card,
     Cell,
+    Column,
     Command,
+    Facts,
     Figure,
     Folded,
     Gallery,
     Image,
-    Item,
     Notice,
-    ScaleKey,
+    StripKey,
+    Table,
     Text,
     Tiles,
+    first_items,
+    no_picture,
+    number,
     status,
     text_table,
 )
-from shapespace.report.blocks.settings_text import settings_blocks
-from shapespace.report.blocks.wording import DASH, STATUS_WORDS, counted, isfinite, listed, mm, printable
-from shapespace.report.inputs.repeated_fit import command_with_stages
+from shapespace.report.blocks.sections import settings_blocks
+from shapespace.report.blocks.wording import (
+    DASH,
+    ORDER_OF_CONCERN,
+    STATUS_WORDS,
+    counted,
+    isfinite,
+    listed,
+    median,
+    mm,
+    percent,
+    printable,
+    sentence,
+    without_folders,
+)
+from shapespace.report.inputs.fit_population import FEWEST, MEASURES, ListedColumn, Population
 from shapespace.report.inputs.saved_fits import (
     Folder,
     SavedFit,
     ScanNotFoundError,
+    command_with_stages,
     model_of,
     raw_scan,
+    saved_fit,
     saved_surfaces,
     staged_fit,
 )
-from shapespace.report.pages import recognition_page as recognition
+from shapespace.report.inputs.staged_fit import StagedFit, nice_ceiling
+from shapespace.report.pages import study_page
 from shapespace.report.pages.page import Chapter, Page, Step
+from shapespace.report.render import thumbnails
 from shapespace.schemas import Quality, read
+from shapespace.store.results import Results
 from shapespace.types import FloatArray
 from shapespace.version import __version__
-
-if TYPE_CHECKING:
-    from shapespace.model.shape_model import ShapeModel
-    from shapespace.report.inputs.staged_fit import StagedFit
 
 # Items on a page: what can be looked through without paging, and a page that stays within its bytes.
 MOST_CARDS = 24
@@ -89,8 +109,8 @@ class FolderPage:
         on_step: Step | None = None,
     ) -> None:
         self.folder = folder
-        self.recognised = (folder.root / recognition.STUDY.file).is_file()
-        self.analyses = recognition.find_analyses(folder.root)
+        self.recognised = (folder.root / study_page.STUDY.file).is_file()
+        self.analyses = study_page.find_analyses(folder.root)
         self.label_note = ""
         found_labels: Sequence[Label | None] = [None] * len(fits)
         try:
@@ -101,13 +121,12 @@ class FolderPage:
             self.label_note = f"There are no labels: {error}"
         self.fits = sorted(map(with_label, fits, found_labels), key=sections.concern)
         self.main = _main_fits(self.fits)
-        planned = sections.MODEL_PICTURES + min(len(fits), MOST_CARDS) + 4 + len(self.main) * sections.FIT_PICTURES
-        self.page = Page(planned, on_step)
+        self.page = Page(
+            (sections.MODEL_PICTURES + min(len(fits), MOST_CARDS) + 4 + len(self.main) * sections.FIT_PICTURES), on_step
+        )
         self.model_path = model
-        self._model: ShapeModel | None = None
         if model is not None:
             self.model()
-        self._staged: dict[str, StagedFit] = {}
         self._details = {fit.name: self.page.anchor(f"pictures-of-{fit.name}") for fit in self.main}
         carded = _carded(self.fits) if len(fits) > 1 or not self.main else []
         self._cards = {fit.name: self.page.anchor(f"fit-{fit.name}") for fit in carded}
@@ -117,21 +136,32 @@ class FolderPage:
 
     def model(self) -> ShapeModel:
         """Return the model of the fits."""
-        if self._model is None:
-            self._model = model_of(self.folder, self.fits, self.model_path)
-        return self._model
+        return self.page.once("model", lambda: model_of(self.folder, self.fits, self.model_path))
 
     def staged(self, fit: SavedFit) -> StagedFit:
         """Return what pictures of `fit` need, called by its name."""
-        if fit.name not in self._staged:
-            self._staged[fit.name] = replace(staged_fit(self.folder, fit), label=fit.name)
-        return self._staged[fit.name]
+        return self.page.once(fit, lambda: replace(staged_fit(self.folder, fit), label=fit.name))
 
     # The page
 
     def html(self) -> str:
         """Return the page."""
+        lead = "What a statistical shape model made of raw surfaces. Lengths are in millimetres of the scan."
         name = self.folder.root.resolve().name
+        return self.page.html(
+            f"{counted(self.total, 'fit')} in {name}",
+            [Text(lead)],
+            f"Made by shapespace {__version__} from the files in {name}.",
+            self.chapters(),
+        )
+
+    @property
+    def total(self) -> int:
+        """Number of fits in the folder."""
+        return len(self.fits)
+
+    def chapters(self) -> list[Chapter]:
+        """Return the parts of the page."""
         chapters = [
             Chapter("Summary", self.summary),
             Chapter("The fits", self.fits_part, "Fits"),
@@ -142,16 +172,13 @@ class FolderPage:
         if sum(fit.fitted for fit in self.fits) < 2:
             del chapters[2]
         if self.recognised:
-            recognition_chapter = Chapter("Recognition", lambda: recognition.study_section(self.page, self.folder))
-            chapters.insert(-2, recognition_chapter)
-        chapters[-2:-2] = recognition.analysis_chapters(self.page, self.folder.root, self.analyses)
-        lead = "What a statistical shape model made of raw surfaces. Lengths are in millimetres of the scan."
-        made = f"Made by shapespace {__version__} from the files in {name}."
-        return self.page.html(f"{counted(len(self.fits), 'fit')} in {name}", [Text(lead)], made, chapters)
+            chapters.insert(-2, Chapter("Recognition", lambda: study_page.study_section(self.page, self.folder)))
+        chapters[-2:-2] = study_page.analysis_chapters(self.page, self.folder.root, self.analyses)
+        return chapters
 
     @property
     def places(self) -> Mapping[str, str]:
-        """Where in the page a fit is shown, by its name."""
+        """Where in the page a fit is shown in full, or else on its card, by its name."""
         return self._cards | self._details
 
     def place_of(self, name: str) -> str | None:
@@ -167,75 +194,97 @@ class FolderPage:
 
     def quality(self) -> Block:
         """Return what quality.json says."""
-        measured = read(Quality, self.folder.json("quality.json"), "quality.json", "measure it again")
-        return sections.quality_part(self.page, measured)
+        return sections.quality_part(
+            self.page, read(Quality, self.folder.json("quality.json"), "quality.json", "measure it again")
+        )
 
     def summary(self) -> list[Block]:
         """Return what was fitted and how much of it is to be trusted."""
         counts = Counter(fit.status for fit in self.fits)
         trusted = [fit for fit in self.fits if fit.status == "converged"]
-        tiles = [
-            (str(len(trusted)), f"of {len(self.fits)}", "with nothing found against them"),
-            (str(counts["doubtful"] + counts["max_iterations"]), "", "to be looked at before use"),
-            (str(counts["failed"] + counts["unreadable"]), "", "without a result"),
-        ]
-        to_scan = "from model to scan, over what the scan shows"
-        for value, label in (
-            (_median([fit.expected_error_mm for fit in trusted]), "vertex error that such a fit expects of itself"),
-            (_median([fit.distance_mm("model_to_scan") for fit in trusted]), f"mean distance {to_scan}"),
-            (_median([fit.distance_mm("scan_to_model") for fit in trusted]), "mean distance from scan to model"),
-        ):
-            if isfinite(value):
-                tiles.append((mm(value).removesuffix(" mm"), "mm", f"{label}, median of those"))
+        medians = {
+            "vertex error that such a fit expects of itself": median([fit.expected_error_mm for fit in trusted]),
+            "mean distance from model to scan, over what the scan shows": median(
+                [fit.distance_mm("model_to_scan") for fit in trusted]
+            ),
+            "mean distance from scan to model": median([fit.distance_mm("scan_to_model") for fit in trusted]),
+        }
         return [
             Text(self.overview(counts)),
-            Tiles(tiles),
+            self.tiles(counts, medians),
             *self.other_models(),
             self.doubts(),
             *self.worst(),
             *self.without_stages(),
         ]
 
+    def tiles(self, counts: Mapping[str, int], medians_mm: Mapping[str, float]) -> Tiles:
+        """Return how many fits have which status, and medians of the trusted ones by what they are."""
+        number_and_unit = {
+            label: mm(value).removesuffix(" mm") for label, value in medians_mm.items() if isfinite(value)
+        }
+        return Tiles(
+            [
+                (f"{counts['converged']:,}", f"of {self.total:,}", "with nothing found against them"),
+                (f"{counts['doubtful'] + counts['max_iterations']:,}", "", "to be looked at before use"),
+                (f"{counts['failed'] + counts['unreadable']:,}", "", "without a result"),
+                *((value, "mm", f"{label}, median of those") for label, value in number_and_unit.items()),
+            ]
+        )
+
     def overview(self, counts: Mapping[str, int]) -> str:
         """Return in a sentence or two what was fitted, and how many fits have which status."""
         models = sorted({fit.record.model.name or "an unknown model" for fit in self.fits})
         methods = sorted({fit.record.method for fit in self.fits} - {""})
-        text = f"{counted(len(self.fits), 'scan was', 'scans were')} fitted with {listed(models)}"
-        text += f" by the {listed(methods)} method{'s' if len(methods) > 1 else ''}. " if methods else ". "
+        by = f" by the {listed(methods)} method{'s' if len(methods) > 1 else ''}" if methods else ""
         trusted = counts["converged"]
-        text += counted(trusted, "fit") if trusted else "None"
-        text += f" converged with nothing {'found against them' if trusted != 1 else 'against it'}"
-        rest = {
-            "max_iterations": "stopped at the limit of steps",
-            "doubtful": "doubtful",
-            "failed": "could not be fitted",
-            "unreadable": "cannot be read",
-        }
-        others = listed([f"{counts[key]} {word}" for key, word in rest.items() if counts[key]])
+        text = (
+            f"{counted(len(self.fits), 'scan was', 'scans were')} fitted with {listed(models)}{by}. "
+            f"{counted(trusted, 'fit') if trusted else 'None'} converged with nothing "
+            f"{'found against them' if trusted != 1 else 'against it'}"
+        )
+        others = listed(
+            [
+                f"{counts[key]} {word}"
+                for key, word in {
+                    "max_iterations": "stopped at the limit of steps",
+                    "doubtful": "doubtful",
+                    "failed": "could not be fitted",
+                    "unreadable": "cannot be read",
+                }.items()
+                if counts[key]
+            ]
+        )
         return f"{text}; {others}." if others else f"{text}."
 
     def other_models(self) -> list[Block]:
         """Return which fits are by another model than the one shown, where one was given."""
         if self.model_path is None:
             return []
-        model_hash = self.model_hash()
-        others = [fit.name for fit in self.fits if fit.fitted and fit.record.model.hash != model_hash]
-        return [Notice(f"Fitted with another model than {self.model_path.name}", others)]
+        return [
+            Notice(
+                f"Fitted with another model than {self.model_path.name}",
+                [fit.name for fit in self.fits if fit.fitted and fit.record.model.hash != self.model_hash()],
+            )
+        ]
 
     def doubts(self) -> Notice:
         """Return the fits that need a look, by name and reason."""
-        bad = [fit for fit in self.fits if fit.status != "converged"]
-        places = self._details | self._cards
-        items: list[str | Item] = [
-            Item(
-                f"{STATUS_WORDS[fit.status]}. {_all_reasons(fit)}",
-                Cell(fit.name, anchor=places.get(fit.name)),
-            )
-            for fit in bad[:_MOST_NAMED]
-        ]
-        if len(bad) > _MOST_NAMED:
-            items.append(f"{counted(len(bad) - _MOST_NAMED, 'other')}, in the table of all fits.")
-        return Notice("Not to be trusted without a look", items)
+        return Notice(
+            "Not to be trusted without a look",
+            first_items(
+                [
+                    Text(
+                        f"{STATUS_WORDS[fit.status]}. {_all_reasons(fit)}",
+                        name=Cell(fit.name, anchor=self.place_of(fit.name)),
+                    )
+                    for fit in self.fits
+                    if fit.status != "converged"
+                ],
+                _MOST_NAMED,
+                "in the table of all fits",
+            ),
+        )
 
     def worst(self) -> list[Block]:
         """Return in a sentence which fits lie farthest from their scans, of those with nothing else against them."""
@@ -249,8 +298,6 @@ class FolderPage:
 
     def curves(self) -> Figure:
         """Return which share of the surface lies within each distance."""
-        from shapespace.report import figures
-
         # Without stages, each curve needs the scan to be read and the distances to be measured.
         pictured = [fit for fit in self.fits if fit.pictured and (fit.entry.stages or fit.name in self.places)]
         fits, problems = sections.usable(pictured[:MOST_CURVES], self.staged)
@@ -286,19 +333,15 @@ class FolderPage:
 
     def not_drawn(self) -> list[str]:
         """Return one sentence for each of the main fits that cannot be drawn, or not with its scan."""
-        return [
-            f"{fit.name}: {_of_scan(error)}" if isinstance(error, ScanNotFoundError) else str(error)
-            for fit in self.main
-            if (error := self.problem(fit)) is not None
-        ]
-
-    def problem(self, fit: SavedFit) -> ShapespaceError | None:
-        """Return why `fit` cannot be drawn with its scan, or None."""
-        try:
-            self.staged(fit)
-        except ShapespaceError as error:
-            return error
-        return None
+        out: list[str] = []
+        for fit in self.main:
+            try:
+                self.staged(fit)
+            except ScanNotFoundError as error:
+                out.append(f"{fit.name}: {str(error).removesuffix('.')}; the fitted surface is shown alone.")
+            except ShapespaceError as error:
+                out.append(str(error))
+        return out
 
     # Fits
 
@@ -307,8 +350,12 @@ class FolderPage:
         page = self.page
         parts: list[Block] = []
         if self._cards:
-            heading = "All fits" if len(self.fits) <= MOST_CARDS else f"The {MOST_CARDS} fits to look at first"
-            parts.append(page.section(heading, self.gallery))
+            parts.append(
+                page.section(
+                    ("All fits" if len(self.fits) <= MOST_CARDS else f"The {MOST_CARDS} fits to look at first"),
+                    self.gallery,
+                )
+            )
         parts.append(page.section("Every fit in numbers", self.numbers))
         several = len(self.fits) > 1
         for fit in self.main:
@@ -325,28 +372,40 @@ class FolderPage:
         curves: Sequence[Block] = self.page.tried(self.curves) if any(fit.pictured for fit in self.fits) else ()
         coefficients = self.page.tried(self.together)
         drawn = [block for block in coefficients if isinstance(block, Figure)]
-        rest = [block for block in coefficients if not isinstance(block, Figure)]
-        return [sections.in_columns(*curves, *drawn), *rest]
+        return [sections.in_columns(*curves, *drawn), *(block for block in coefficients if block not in drawn)]
 
     def gallery(self) -> list[Block]:
         """Return a card for each of the first fits: failed and doubtful first, then by their error."""
-        from shapespace.report.render import thumbnails
-
         sample, _ = sections.usable([fit for fit in self.carded if fit.pictured], self.staged)
-        good = [fit for fit in sample if fit.status == "converged"]
-        limit = sections.common_limit_mm(good or sample)
+        usual = [fit.scale_mm for fit in sample if fit.status == "converged"] or [fit.scale_mm for fit in sample]
+        limit = nice_ceiling(median(usual))  # of strips that share it
         out: list[Block] = [Text("Sorted by status (failed, doubtful, converged), then by expected error.")]
-        if len(self.fits) > len(self.carded):
-            others = counted(len(self.fits) - len(self.carded), "other fit")
-            more = f"{others} have no picture here, so that this file stays below 8 MB; the table has them all."
-            out.append(Text(more))
+        out.append(no_picture(len(self.fits) - len(self.carded), "fit"))
         if sample:
-            out.append(ScaleKey(limit, self.page.image(thumbnails.colour_bar(), "from blue over pale to red")))
+            out.append(
+                StripKey(
+                    "Each strip, from the left: the scan; scan (orange) and model (blue) over each other, the nearer "
+                    "one shown; the distance from the model to the scan, one scale for all:",
+                    [
+                        (
+                            self.page.image(thumbnails.colour_bar(), "from blue over pale to red"),
+                            f"−{limit:g} mm, scan inside",
+                            f"+{limit:g} mm, scan outside",
+                        )
+                    ],
+                    "Grey is what the scan does not show. Distances to a scan of points only have no sign: their map "
+                    f"runs from 0 to {limit:g} mm.",
+                )
+            )
         cards = [self.card(fit, limit) for fit in self.carded]
-        out.append(Gallery(cards[:MOST_OPEN_CARDS]))
-        if len(cards) > MOST_OPEN_CARDS:
-            out.append(Folded(f"{len(cards) - MOST_OPEN_CARDS} more", [Gallery(cards[MOST_OPEN_CARDS:])]))
-        return out
+        return [
+            *out,
+            Gallery(cards[:MOST_OPEN_CARDS]),
+            Folded(
+                f"{len(cards) - MOST_OPEN_CARDS} more",
+                ([Gallery(cards[MOST_OPEN_CARDS:])] if len(cards) > MOST_OPEN_CARDS else []),
+            ),
+        ]
 
     def card(self, fit: SavedFit, limit_mm: float) -> Card:
         """Return one fit of the gallery, its map on a scale that ends at `limit_mm`."""
@@ -373,32 +432,31 @@ class FolderPage:
 
     def still(self, fit: SavedFit, limit_mm: float) -> Image:
         """Return the best picture of a fit that there is: with its stages, its fitted surface, or its scan."""
-        from shapespace.report.render import thumbnails
-
-        if fit.pictured:
-            try:
-                staged = self.staged(fit)
-            except ScanNotFoundError:
-                surfaces = saved_surfaces(self.folder, fit)
-                still, alt = thumbnails.mesh_still(surfaces["final"]), f"The fitted surface of {fit.name}"
-            else:
-                still, alt = thumbnails.fit_strip(staged, limit_mm), sections.strip_alt(staged, limit_mm)
-        else:
-            still, alt = (
-                thumbnails.mesh_still(raw_scan(self.folder, fit)),
-                f"The raw scan {fit.name}, as its axes stand",
+        if not fit.pictured:
+            return self.page.image(
+                thumbnails.mesh_still(raw_scan(self.folder, fit)), f"The raw scan {fit.name}, as its axes stand"
             )
-        return self.page.image(still, alt)
+        try:
+            staged = self.staged(fit)
+        except ScanNotFoundError:
+            return self.page.image(
+                thumbnails.mesh_still(saved_surfaces(self.folder, fit)["final"]), f"The fitted surface of {fit.name}"
+            )
+        return self.page.image(thumbnails.fit_strip(staged, limit_mm), sections.strip_alt(staged, limit_mm))
 
     def numbers(self) -> list[Block]:
         """Return the table of all fits."""
-        rows = self.fits[:MOST_ROWS]
-        caption = "Every fit: distances and errors at the end in mm. A dash: not known."
-        out: list[Block] = [tables.fits_table(rows, self.places, caption=caption)]
-        if len(self.fits) > len(rows):
-            left = counted(len(self.fits) - len(rows), "other fit")
+        out: list[Block] = [
+            sections.fits_table(
+                self.fits[:MOST_ROWS],
+                self.places,
+                caption="Every fit: distances and errors at the end in mm. A dash: not known.",
+            )
+        ]
+        if len(self.fits) > MOST_ROWS:
+            left = counted(len(self.fits) - MOST_ROWS, "other fit")
             out.append(Text(f"{left} are left out here; coefficients.csv has all."))
-        return [*out, *([Text(self.label_note, "soft")] if self.label_note else [])]
+        return [*out, Text(self.label_note, "soft")]
 
     def of_one_model(self, model_hash: str) -> list[SavedFit]:
         """Return the fits by one model that have coefficients: only these can be compared."""
@@ -426,14 +484,22 @@ class FolderPage:
         out = sections.scatter(self.page, [sections.coefficients_of(fit) for fit in compared])
         expressive = [fit for fit in compared if fit.entry.intensity]
         subjects = {fit.entry.subject for fit in expressive}
-        levels = Counter(fit.entry.expression for fit in expressive)
-        if len(subjects) != 1 or "" in subjects or max(levels.values(), default=0) < _FEWEST_LEVELS:
+        if (
+            len(subjects) != 1
+            or "" in subjects
+            or max(Counter(fit.entry.expression for fit in expressive).values(), default=0) < _FEWEST_LEVELS
+        ):
             return out
         points = [sections.coefficients_of(fit) for fit in expressive]
         if any(len(point.b) < 2 for point in points):
             return out
-        own = (fit for fit in compared if fit.entry.intensity == 0 and fit.entry.subject in subjects)
-        neutral = next(map(sections.coefficients_of, own), None)
+        neutral = next(
+            map(
+                sections.coefficients_of,
+                (fit for fit in compared if fit.entry.intensity == 0 and fit.entry.subject in subjects),
+            ),
+            None,
+        )
         return [*out, *self.page.tried(lambda: sections.lines_through_neutral(self.page, points, neutral))]
 
     def detail(self, fit: SavedFit) -> list[Block]:
@@ -442,36 +508,43 @@ class FolderPage:
             staged = self.staged(fit)
         except ScanNotFoundError as error:
             why, surfaces = str(error), saved_surfaces(self.folder, fit)
-            turning = self.page.tried(lambda: sections.surface_to_turn(self.page, fit, surfaces, why))
-            return [*sections.fit_facts(fit), *turning]
-        population = self.others(fit)
-        reserve = _RESERVE_BYTES + recognition.SECTION_BYTES * min(self.recognised + len(self.analyses), _MOST_RESERVED)
-        alone = len(self.fits) == 1
-        pictures = sections.fit_in_full(self.page, staged, population, reserve=reserve, folded=alone)
-        return [*sections.fit_facts(fit), *pictures]
+            return [
+                *sections.fit_facts(fit),
+                *self.page.tried(lambda: sections.surface_to_turn(self.page, fit, surfaces, why)),
+            ]
+        reserve = _RESERVE_BYTES + study_page.SECTION_BYTES * min(self.recognised + len(self.analyses), _MOST_RESERVED)
+        return [
+            *sections.fit_facts(fit),
+            *sections.fit_in_full(self.page, staged, self.others(fit), reserve=reserve, folded=len(self.fits) == 1),
+        ]
 
     def others(self, fit: SavedFit) -> FloatArray | None:
         """Return coefficients (N, K) of the other fits by the model of `fit`; None where there are too few."""
-        same = self.of_one_model(fit.record.model.hash)
-        others = [other.numbers("z") for other in same if other.name != fit.name]
+        others = [o.numbers("z") for o in self.of_one_model(fit.record.model.hash) if o.name != fit.name]
         return np.stack(others) if len(others) > 2 and len({len(z) for z in others}) == 1 else None
 
     # The rest
 
     def settings(self) -> list[Block]:
         """Return settings that the fits share, versions and hashes."""
-        known = [fit for fit in self.fits if fit.fitted] or self.fits
-        configs = [fit.record.config for fit in known if fit.record.config]
+        configs = [
+            fit.record.config for fit in ([fit for fit in self.fits if fit.fitted] or self.fits) if fit.record.config
+        ]
         rows = [("Report", f"shapespace {__version__}")]
         versions = sorted({fit.record.version for fit in self.fits} - {""})
         if versions:
             rows.append(("Fits", f"shapespace {listed(versions)}"))
-        files = [
-            [fit.name, *(part or DASH for part in (fit.record.scan.name, fit.record.scan.hash, fit.record.model.hash))]
-            for fit in self.fits[:MOST_ROWS]
-        ]
-        heads = ("Fit", "Scan", "Hash of the scan", "Hash of the model")
-        hashes = text_table(heads, files, "Content hashes of the files that took part")
+        hashes = text_table(
+            ("Fit", "Scan", "Hash of the scan", "Hash of the model"),
+            [
+                [
+                    fit.name,
+                    *(part or DASH for part in (fit.record.scan.name, fit.record.scan.hash, fit.record.model.hash)),
+                ]
+                for fit in self.fits[:MOST_ROWS]
+            ],
+            "Content hashes of the files that took part",
+        )
         return [*settings_blocks(configs, rows), Folded("Content hashes (SHA-256)", [hashes])]
 
 
@@ -496,13 +569,9 @@ def _carded(fits: Sequence[SavedFit]) -> list[SavedFit]:
     return [*first, *rest[: MOST_CARDS - len(first)]]
 
 
-def _of_scan(error: ScanNotFoundError) -> str:
-    return f"{str(error).removesuffix('.')}; the fitted surface is shown alone."
-
-
 def _all_reasons(fit: SavedFit) -> str:
     """Return the reasons of a fit without its status; the whole reason if the record has no codes."""
-    return _sentence("; ".join(fit.reason_texts)) if fit.reason_texts else fit.reason
+    return sentence("; ".join(fit.reason_texts)) if fit.reason_texts else fit.reason
 
 
 def _first_reason(fit: SavedFit) -> str:
@@ -510,16 +579,7 @@ def _first_reason(fit: SavedFit) -> str:
     if not fit.reason_texts:
         return fit.reason
     first, *others = fit.reason_texts
-    return _sentence(f"{first}, and {counted(len(others), 'more reason')}" if others else first)
-
-
-def _sentence(text: str) -> str:
-    return f"{text[:1].upper()}{text[1:].removesuffix('.')}."
-
-
-def _median(values: Sequence[float]) -> float:
-    known = [value for value in values if isfinite(value)]
-    return float(np.median(known)) if known else np.nan
+    return sentence(f"{first}, and {counted(len(others), 'more reason')}" if others else first)
 
 
 # Labels of the fits in a folder, and the location of their table
@@ -540,8 +600,11 @@ def find_labels(folder: Folder, fits: Sequence[SavedFit], labels_path: Path | No
     places = [folder.root / LABELS_FILE] if labels_path is None else [labels_path]
     source = f"{LABELS_FILE} in the folder" if labels_path is None else labels_path.name
     if labels_path is None and not places[0].is_file():
-        paths = (fit.record.scan.path for fit in fits)
-        beside = dict.fromkeys((folder.root / path).parent / LABELS_FILE for path in paths if path and "\0" not in path)
+        beside = dict.fromkeys(
+            (folder.root / path).parent / LABELS_FILE
+            for path in (fit.record.scan.path for fit in fits)
+            if path and "\0" not in path
+        )
         places = [file for file in beside if file.is_file()]
         source = f"{listed([f'{file.parent.name}/{LABELS_FILE}' for file in places])}, beside the scans"
     names = [(fit.name, *names_of_file(fit.record.scan.name or fit.name)) for fit in fits]
@@ -561,3 +624,346 @@ def with_label(fit: SavedFit, label: Label | None) -> SavedFit:
     if label is None or not label.text:
         return fit
     return fit.with_entry(expression=label.text, subject=label.subject, intensity=label.intensity)
+
+
+WORST = {"failed": 12, "doubtful": 60, "max_iterations": 20, "converged": 60}
+"""How many fits of each status are looked at, the worst first."""
+
+MOST_SINGLE, MOST_STORED = 10_000, 2_000
+"""Fits of which a folder of single files, and a store, are reported with one row for each."""
+
+# Items on a page, and points in a picture: what can be looked through without paging.
+_FARTHEST, _MOST_REASONS, _MOST_NOTED, _MOST_LINES, _IN_PICTURE = 20, 20, 24, 6, 400
+_MOST_COLUMNS = 12  # columns of metadata; each has a figure
+
+
+def is_many(results: Results) -> bool:
+    """Return whether a folder has too many fits to report each one."""
+    return len(results) > (MOST_SINGLE if results.store is None else MOST_STORED)
+
+
+class ManyPage(FolderPage):
+    """The report of very many fits in the making; the page of a folder, whose fits are those to look at.
+
+    Args:
+        folder: that the fits lie in.
+        results: of it.
+        model: the model's file, or None to go by the records.
+        labels: a table of labels, or None to look for one.
+        on_step: called after each picture.
+
+    Raises:
+        InputError: none of the fits can be read.
+    """
+
+    def __init__(
+        self,
+        folder: Folder,
+        results: Results,
+        *,
+        model: Path | None = None,
+        labels: Path | None = None,
+        on_step: Step | None = None,
+    ) -> None:
+        self.population = Population(results)
+        self.problems = results.problems
+        self._far = self.population.far()
+        self.farthest = [
+            int(k)
+            for k in np.argsort(np.where(np.isfinite(self._far), -self._far, np.inf), kind="stable")[:_FARTHEST]
+            if isfinite(self._far[k])
+        ]
+        names = [name for kind, most in WORST.items() for name in self.population.worst(kind, most)]
+        names += [self.population.names[k] for k in self.farthest]
+        super().__init__(
+            folder,
+            [saved_fit(folder, results, name) for name in sorted(set(names))],
+            model=model,
+            labels=labels,
+            on_step=on_step,
+        )
+
+    @property
+    def total(self) -> int:
+        """Number of fits in the folder."""
+        return len(self.population)
+
+    def chapters(self) -> list[Chapter]:
+        """Return the parts of the page."""
+        return [
+            Chapter("Summary", self.summary),
+            Chapter("Fits to look at", self.fits_part, "Fits"),
+            Chapter("Distributions", self.distributions),
+            Chapter("Time and site", self.drift),
+            *study_page.analysis_chapters(self.page, self.folder.root, self.analyses),
+            Chapter("The model", self.model_part, "Model"),
+            Chapter("Settings and versions", self.settings, "Settings"),
+        ]
+
+    def summary(self) -> list[Block]:
+        """Return how many fits have which status and why, what stands out, and what could not be read."""
+        return [
+            self.tiles(
+                self.population.counts,
+                {words.removesuffix(" (mm)"): self.population.median(key) for key, words in [*MEASURES.items()][:3]},
+            ),
+            *self.other_models(),
+            Notice(
+                "Cannot be read",
+                [without_folders(printable(text)) for text in self.problems[:_MOST_NOTED]],
+                "broken",
+            ),
+            *([] if len(self.population.models) < 2 else [Text(self._of_models())]),
+            *self.page.tried(self.stands_out),
+            *self.page.tried(self.reasons),
+        ]
+
+    def _of_models(self) -> str:
+        return (
+            f"The fits are by {len(self.population.models)} models; coefficients are compared of the "
+            f"{self.population.models.most_common(1)[0][1]:,} fits by the one with most."
+        )
+
+    def stands_out(self) -> Notice:
+        """Return which times and sites differ from the rest by more than chance."""
+        return Notice(
+            "Differ from all the others",
+            first_items(
+                [
+                    Text(sentence("; ".join(group.stands_out)), name=Cell(f"{column.name} {printable(group.name)}"))
+                    for column in self.population.listed
+                    for group in self.population.compared(column)
+                    if group.stands_out
+                ],
+                _MOST_NOTED,
+                "in the tables of Time and site",
+                "more",
+                "more",
+            ),
+        )
+
+    def reasons(self) -> list[Block]:
+        """Return why fits are not trusted, and how often."""
+        most = self.population.n_reasons.most_common(_MOST_REASONS)
+        if not most:
+            return []
+        out: list[Block] = [
+            Table(
+                [Column("Status"), Column("Reason, without its names and numbers"), Column("Fits", "number")],
+                [[status(kind), Cell(printable(reason)), number(count, 0)] for (kind, reason), count in most],
+                "Why fits are not trusted, the most frequent reasons first",
+            )
+        ]
+        rest = sum(self.population.n_reasons.values()) - sum(count for _, count in most)
+        return [*out, Text(f"{counted(rest, 'other')} with rarer reasons.", "soft")] if rest else out
+
+    # Distributions
+
+    def distributions(self) -> list[Block]:
+        """Return histograms of distances and coefficients, and the fits that lie farthest from the mean."""
+        page = self.page
+        return [
+            sections.in_columns(
+                *page.tried(self._histograms), *page.tried(self._coefficients), *page.tried(self._density)
+            ),
+            page.section("Farthest from the mean", self.outliers),
+            Folded("The fits to look at in space, to be turned", self.page.tried(self.together)),
+        ]
+
+    def _histograms(self) -> Block:
+        every = counted(len(self.population), "fit")
+        measures = {words: self.population.measures[key] for key, words in MEASURES.items()}
+        return self.page.figure(
+            figures.distributions_figure(measures, self.population.trusted, title=f"How near {every} come"),
+            "Distances over what the scan shows, and the error that a fit expects of itself. The last bar holds all "
+            "that lies beyond.",
+            alt=f"Histograms of {listed(list(measures))} of {every}",
+            chart=True,
+        )
+
+    def _trusted_z(self) -> npt.NDArray[np.float32]:
+        return self.population.z[self.population.trusted]
+
+    def _coefficients(self) -> Block:
+        return self.page.figure(
+            figures.coefficients_spread(self._trusted_z(), title="How widely each coefficient spreads"),
+            "Percentiles of each coefficient over the trusted fits, in standard deviations of the model. Where the "
+            "scans vary as the training shapes did, the band of 5 to 95 % ends at the dashed lines.",
+            alt="Bands of the percentiles of each coefficient",
+            chart=True,
+        )
+
+    def _density(self) -> Block:
+        return self.page.figure(
+            figures.density_figure(
+                self._trusted_z(), self._far[self.population.trusted], title="Where in the shape space"
+            ),
+            "How many trusted fits lie where, darker for more, by the logarithm; the farthest are left out. Dashed: "
+            "three standard deviations. Right: how far each fit is from the mean in all coefficients.",
+            alt="Density of z1 against z2 and z3, and a histogram of the root mean square of all coefficients",
+            chart=True,
+        )
+
+    def outliers(self) -> list[Block]:
+        """Return a table of the fits whose coefficients are the largest."""
+        rows: list[list[Cell]] = []
+        listed_in = [column for column in self.population.listed if column.kind == "level"][:2]
+        for k in self.farthest:
+            z = self.population.z[k]
+            most = int(np.nanargmax(np.abs(z)))
+            levels: list[Cell] = [
+                Cell(printable(column.levels[int(column.codes[k])])) if column.codes[k] >= 0 else Cell(DASH)
+                for column in listed_in
+            ]
+            name = self.population.names[k]
+            rows.append([
+                Cell(printable(name), anchor=self.place_of(name)),
+                status(ORDER_OF_CONCERN[int(self.population.status[k])]),
+                number(float(self._far[k]), 2),
+                Cell(f"z{most + 1} = {float(z[most]):+.1f}".replace("-", "−"), float(np.abs(z[most]))),
+                number(float(self.population.measures["expected_error_mm"][k]), 2),
+                *levels,
+            ])  # fmt: skip
+        if not rows:
+            return [Text("No fit has coefficients.", "soft")]
+        heads = [
+            Column("Scan"), Column("Status"), Column("RMS of z", "number"), Column("Largest", "number"),
+            Column("Expected vertex error", "number"), *(Column(column.name) for column in listed_in),
+        ]  # fmt: skip
+        return [
+            Table(
+                heads,
+                rows,
+                "The fits whose coefficients are largest: rare shapes, or fits that went astray",
+                sortable=True,
+            )
+        ]
+
+    # Time and site
+
+    def drift(self) -> list[Block]:
+        """Return how errors and coefficients go with what the scans were listed with."""
+        columns = self.population.listed[:_MOST_COLUMNS]
+        if not columns:
+            return [
+                Text(
+                    "The scans were listed without columns such as a date or a site; give them in the list of scans to "
+                    "see how the fits go with them.",
+                    "soft",
+                )
+            ]
+        parts: list[Block] = [
+            self.page.section(column.name, lambda column=column: self.by(column)) for column in columns
+        ]
+        left = [*self.population.left_out, *(column.name for column in self.population.listed[_MOST_COLUMNS:])]
+        return [*parts, Text(f"Not shown: {listed(left)}." if left else "", "soft")]
+
+    def by(self, column: ListedColumn) -> list[Block]:
+        """Return how the fits go with one column."""
+        people, trusted = self.population, self.population.trusted
+        # Errors are of trusted fits; the number of the others is given beside them.
+        measures = {words: np.where(trusted, people.measures[key], np.nan) for key, words in MEASURES.items()}
+        error = next(iter(MEASURES.values()))
+        if column.kind == "level":
+            drawing = figures.levels_figure(
+                [(name, inside) for name, inside, _ in column.groups()],
+                measures[error],
+                words=error,
+                title=f"By {column.name}",
+            )
+            caption = "Of each: the median of the trusted fits, the middle half and the middle 90 %. Dashed: of all."
+        else:
+            levels = next((other for other in people.listed if 1 < len(other.levels) <= _MOST_LINES), None)
+            lines = [] if levels is None else [(name, inside) for name, inside, _ in levels.groups()]
+            drawing = figures.over_time_figure(
+                column.values, column.edges(), dict(list(measures.items())[:2]), ~trusted,
+                is_time=column.kind == "time", name=column.name, title=f"Along {column.name}", lines=lines,
+            )  # fmt: skip
+            caption = (
+                f"Medians of the trusted fits, of at least {FEWEST} each, and the share of all that is not trusted."
+            )
+            caption += f" Thin lines: by {levels.name}." if levels is not None and lines else ""
+        picture = self.page.figure(drawing, caption, alt=f"Errors by {column.name}", chart=True)
+        table = self._compared(column)
+        return [picture, table if column.kind == "level" else Folded(f"By {column.name}, in numbers", [table])]
+
+    def _compared(self, column: ListedColumn) -> Table:
+        heads = [
+            Column(column.name), Column("Fits", "number"), Column("Not trusted, %", "number"),
+            Column("Expected error, median", "number"), Column("Beside all", "number"),
+            Column("Coefficient that differs most", "number"), Column("Stands out"),
+        ]  # fmt: skip
+        rows = [
+            [
+                Cell(printable(group.name)),
+                number(group.count, 0),
+                number(100 * group.untrusted, 1),
+                number(group.error_mm, 2),
+                number(group.error_off_mm, 2),
+                Cell(f"z{group.mode} {group.shift:+.2f}".replace("-", "−") if group.mode else DASH, abs(group.shift)),
+                Cell("yes" if group.stands_out else ""),
+            ]
+            for group in self.population.compared(column)
+        ]
+        return Table(
+            heads,
+            rows,
+            f"Fits by {column.name}; errors of the trusted ones in mm, coefficients in standard deviations",
+            sortable=len(rows) > 1,
+        )
+
+    # Fits to look at
+
+    def numbers(self) -> list[Block]:
+        """Return the table of the fits that are looked at."""
+        wanted = listed([f"{most} {STATUS_WORDS[kind]}" for kind, most in WORST.items()])
+        text = (
+            f"Of {counted(len(self.population), 'fit')} these {len(self.fits)}: the worst of each status ({wanted}), "
+            f"and the {_FARTHEST} farthest from the mean. shapespace export gives the table of all, and fits as files."
+        )
+        return [
+            Text(text),
+            sections.fits_table(self.fits, self.places, caption="Fits to look at: distances and errors in mm"),
+            Text(self.label_note, "soft"),
+        ]
+
+    def together(self) -> list[Block]:
+        """Return the first coefficients of the fits that are looked at, to be turned."""
+        points = [*map(sections.coefficients_of, self.of_one_model(self.model_hash()))]
+        return [*self.page.tried(lambda: sections.scatter_to_turn(self.page, points))]
+
+    def others(self, fit: SavedFit) -> FloatArray | None:
+        """Return coefficients of other fits, evenly from all."""
+        z = self._trusted_z()
+        z = z[np.isfinite(z).all(axis=1)]
+        return (
+            z[:: max(1, len(z) // _IN_PICTURE)].astype(np.float64)
+            if z.shape[1] == len(fit.record.z) and len(z) > 2
+            else None
+        )
+
+    def settings(self) -> list[Block]:
+        """Return methods, versions and models, and of how many fits they are."""
+        rows = [("Report", f"shapespace {__version__}")]
+        for key, heading in {"method": "Methods", "version": "Versions of shapespace", "model_name": "Models"}.items():
+            rows += [
+                (
+                    heading,
+                    listed(
+                        [
+                            f"{printable(value)} ({count:,})"
+                            for value, count in self.population.origins[key].most_common(_MOST_NOTED)
+                        ]
+                    )
+                    or DASH,
+                )
+            ]
+        rows += [
+            (
+                "Hashes of the models",
+                listed([f"{value} ({count:,})" for value, count in self.population.models.most_common(_MOST_NOTED)])
+                or DASH,
+            )
+        ]
+        rows += [("Not trusted", percent(1 - float(self.population.trusted.mean())))]
+        return [Facts(rows, "Settings and versions")]

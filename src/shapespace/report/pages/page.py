@@ -8,11 +8,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar
 
 from shapespace.errors import ShapespaceError
+from shapespace.report import figures
 from shapespace.report.blocks.blocks import Block, Cell, Figure, Image, Section, Text, Turning
 from shapespace.report.blocks.wording import anchor
+from shapespace.report.render import scene
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing
@@ -28,6 +30,7 @@ _RESERVE_BYTES = 700_000  # bytes that stay free for tables and text after the l
 Step = Callable[[str, int], None]
 """Called with what was just made and about how many such things there will be, for a progress bar."""
 
+_T = TypeVar("_T")
 Make: TypeAlias = Callable[[], Block | Sequence[Block]]
 """Makes a part of a page."""
 
@@ -42,7 +45,7 @@ class Chapter:
 
 
 class Page:
-    """A page in the making: what it embeds, how large it is so far, and where its sections failed.
+    """A page in the making: what it embeds, how many bytes are spent so far, and where its sections failed.
 
     Args:
         planned: about how many pictures there will be.
@@ -54,16 +57,19 @@ class Page:
         self._on_step = on_step
         self._payloads: list[str] = []
         self._anchors: set[str] = set()
-        self._spent = _SHELL_BYTES
+        self._loaded: dict[object, Any] = {}
+        self.spent = _SHELL_BYTES
 
     @property
     def left(self) -> int:
         """How many bytes may still be embedded."""
-        return LARGEST_REPORT_BYTES - self._spent
+        return LARGEST_REPORT_BYTES - self.spent
 
-    def spend(self, n_bytes: int) -> None:
-        """Count bytes that are embedded by other means than this page's."""
-        self._spent += n_bytes
+    def once(self, key: object, load: Callable[[], _T]) -> _T:
+        """Return what `load` returned when it was first called for `key`."""
+        if key not in self._loaded:
+            self._loaded[key] = load()
+        return self._loaded[key]
 
     def step(self, name: str) -> None:
         """Tell the progress bar what was just made."""
@@ -112,13 +118,11 @@ class Page:
 
     def still(self, figure: Drawing, alt: str, *, lossless: bool = False) -> Image:
         """Return a drawing as an image of this page, such as the still of something that turns."""
-        from shapespace.report.figures import encode_webp
-
-        return self.image(encode_webp(figure, lossless=lossless), alt)
+        return self.image(figures.encode_webp(figure, lossless=lossless), alt)
 
     def image(self, still: Still, alt: str) -> Image:
         """Return a picture as an image of this page."""
-        self._spent += 4 * -(-len(still[0]) // 3)
+        self.spent += 4 * -(-len(still[0]) // 3)
         return Image(*still, alt)
 
     def turning(
@@ -141,17 +145,15 @@ class Page:
             label: what it is.
             still: what the still shows.
         """
-        from shapespace.report.render import scene
-
         name = f"payload-{len(self._payloads) + 1}"
         if not self._payloads:
-            self._spent += len(scene.scripts()) + len(scene.style())
+            self.spent += len(scene.scripts()) + len(scene.style())
         text = scene.payload_html(name, payload)
         self.step(caption)
         if len(text) > self.left - _RESERVE_BYTES:
             why = f"It does not turn, so that this file stays below {LARGEST_REPORT_BYTES // 1_000_000} MB."
             return Figure(poster, f"{caption} {still} {why}")
-        self._spent += len(text)
+        self.spent += len(text)
         self._payloads.append(text)
         return Turning(widget, name, poster, caption, label, still)
 
@@ -183,18 +185,21 @@ class Page:
             f"style-src {_hash(style)}; script-src {' '.join(_hash(text) for text in (early, *scripts))}; "
             "base-uri 'none'; form-action 'none'"
         )
-        template = _environment().get_template("page.html")
-        return template.render(
-            title=title,
-            lead=lead,
-            made=made,
-            sections=sections,
-            # Ours, and hashed by the policy above: these alone are not escaped.
-            policy=Markup(policy),
-            style=Markup(style),
-            early=Markup(early),
-            scripts=[Markup(text) for text in scripts],
-            payloads=[Markup(text) for text in self._payloads],
+        return (
+            _environment()
+            .get_template("page.html")
+            .render(
+                title=title,
+                lead=lead,
+                made=made,
+                sections=sections,
+                # Ours, and hashed by the policy above: these alone are not escaped.
+                policy=Markup(policy),
+                style=Markup(style),
+                early=Markup(early),
+                scripts=[Markup(text) for text in scripts],
+                payloads=[Markup(text) for text in self._payloads],
+            )
         )
 
 

@@ -8,8 +8,11 @@ from pathlib import Path
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.io.files import write_text
 from shapespace.report.inputs.saved_fits import Folder, find_fits
+from shapespace.report.pages.correspondence_page import CorrespondencePage
+from shapespace.report.pages.demo_page import DemoPage
+from shapespace.report.pages.folder_page import FolderPage, ManyPage, is_many
 from shapespace.report.pages.page import LARGEST_REPORT_BYTES, Step
-from shapespace.report.pages.recognition_page import standalone_file, study_page
+from shapespace.report.pages.study_page import standalone_file, study_page
 from shapespace.schemas import CorrespondenceRecord
 from shapespace.store.results import Results
 
@@ -60,38 +63,31 @@ def write_report(
         ShapespaceError: the extra `report` is not installed.
     """
     require_report_extra()
-    folder = Path(folder)
-    results = Folder(folder)
-    path = Path(output) if output is not None else folder / "report.html"
-    if (folder / "demo.json").is_file():
-        from shapespace.report.pages.demo_page import DemoPage
-
-        if model is not None or labels is not None:
-            raise InputError(
-                f"{folder} is a demo, which names its models and labels itself; leave out --model and --labels."
-            )
-        page = DemoPage(results, on_step).html()
-    elif (folder / CorrespondenceRecord.FILE).is_file():
-        from shapespace.report.pages.correspondence_page import CorrespondencePage
-
-        if model is not None or labels is not None:
-            raise InputError(f"{folder} is a correspondence without fits; leave out --model and --labels.")
-        page = CorrespondencePage(results, on_step).html()
-    elif (standalone := standalone_file(results)) is not None:
-        if model is not None or labels is not None:
-            raise InputError(f"{folder} holds {standalone.article} without fits; leave out --model and --labels.")
-        page = study_page(results, standalone, on_step)
-    else:
-        from shapespace.report.pages.folder_page import FolderPage
-        from shapespace.report.pages.many_page import ManyPage, is_many
-
-        standalone = Results(folder)
-        if is_many(standalone):
-            write_text(path, ManyPage(results, standalone, model=model, labels=labels, on_step=on_step).html())
-            return path
-        fits = find_fits(results)
-        if all(fit.status == "unreadable" for fit in fits):
-            raise InputError(f"{folder}: none of its {len(fits)} records can be read; {fits[0].reason}")
-        page = FolderPage(results, fits, model=model, labels=labels, on_step=on_step).html()
-    write_text(path, page)
+    path = Path(output) if output is not None else Path(folder) / "report.html"
+    write_text(path, _page(Folder(Path(folder)), model, labels, on_step))
     return path
+
+
+def _page(folder: Folder, model: Path | None, labels: Path | None, on_step: Step | None) -> str:
+    """Return the page on the results in `folder`."""
+    root, given = folder.root, model is not None or labels is not None
+    if (root / "demo.json").is_file():
+        if given:
+            raise InputError(
+                f"{root} is a demo, which names its models and labels itself; leave out --model and --labels."
+            )
+        return DemoPage(folder, on_step).html()
+    if (root / CorrespondenceRecord.FILE).is_file():
+        if given:
+            raise InputError(f"{root} is a correspondence without fits; leave out --model and --labels.")
+        return CorrespondencePage(folder, on_step).html()
+    if (standalone := standalone_file(folder)) is not None:
+        if given:
+            raise InputError(f"{root} holds {standalone.article} without fits; leave out --model and --labels.")
+        return study_page(folder, standalone, on_step)
+    if is_many(results := Results(root)):
+        return ManyPage(folder, results, model=model, labels=labels, on_step=on_step).html()
+    fits = find_fits(folder)
+    if all(fit.status == "unreadable" for fit in fits):
+        raise InputError(f"{root}: none of its {len(fits)} records can be read; {fits[0].reason}")
+    return FolderPage(folder, fits, model=model, labels=labels, on_step=on_step).html()

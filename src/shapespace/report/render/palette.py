@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import InputError
-from shapespace.types import FloatArray
+from shapespace.types import FloatArray, read_only
 
 Colour: TypeAlias = tuple[float, float, float]
 """Red, green, blue in [0, 1], sRGB."""
@@ -97,21 +97,12 @@ def _even(anchors: npt.ArrayLike, count: int) -> FloatArray:
 
 
 def _between(positions: npt.NDArray[Any], known: npt.NDArray[Any], colours: FloatArray) -> FloatArray:
-    out = np.empty((len(positions), 3))
-    for k in range(3):
-        out[:, k] = np.interp(positions, known, colours[:, k])
-    return out
-
-
-def _frozen(colours: FloatArray) -> FloatArray:
-    colours = np.ascontiguousarray(colours)
-    colours.setflags(write=False)
-    return colours
+    return np.stack([np.interp(positions, known, colours[:, k]) for k in range(3)], axis=1)
 
 
 def _sequential() -> FloatArray:
     anchors = ("f6f1e4", "f3cf8e", "e98f53", "c24a5c", "7a2669", "2b1250")
-    return _frozen(_even(oklab([_hex(name) for name in anchors]), 256))
+    return read_only(_even(oklab([_hex(name) for name in anchors]), 256))
 
 
 def _diverging() -> FloatArray:
@@ -122,7 +113,7 @@ def _diverging() -> FloatArray:
     # Equal distances from zero must look equally far, so both arms get the mean lightness of the two.
     cold[:, 0] = warm[:, 0] = (cold[:, 0] + warm[:, 0]) / 2
     arms = [_even(np.concatenate([middle, arm]), 128) for arm in (cold, warm)]
-    return _frozen(np.concatenate([arms[0][::-1], arms[1]]))
+    return read_only(np.concatenate([arms[0][::-1], arms[1]]))
 
 
 def _hex(text: str) -> list[float]:

@@ -228,8 +228,13 @@ def render_series(
     for layer in {id(layer): layer for layers in pictures for layer in layers}.values():
         # Layers hold views of their scalars: those of one array begin at one place.
         scalars = None if layer.scalars is None else layer.scalars.ctypes.data
-        across = None if layer.across is None else layer.across.ctypes.data
-        cache_key = (id(layer.mesh), scalars, across, layer.point_radius_mm, layer.categories)
+        cache_key = (
+            id(layer.mesh),
+            scalars,
+            (None if layer.across is None else layer.across.ctypes.data),
+            layer.point_radius_mm,
+            layer.categories,
+        )
         if cache_key not in surfels_by_key:
             surfels_by_key[cache_key] = _surfels(layer, camera, fine, supersample)
         pieces[id(layer)] = (_shaded(layer, surfels_by_key[cache_key]), surfels_by_key[cache_key])
@@ -439,11 +444,19 @@ def _linear(colours: npt.ArrayLike) -> _Single:
 def _shaded(layer: Layer, surfels: _Surfels) -> _Single:
     """Return linear colours (n, 3)."""
     out = np.empty((len(surfels.pixel), 3), dtype=np.float32)
-    table = _linear(layer.colour if layer.scalars is None or layer.colormap is None else layer.colormap)
     shade_pixels(
-        surfels.normal, surfels.scalar, table, _linear(UNKNOWN_COLOUR)[0], float(layer.vmin), float(layer.vmax),
-        layer.scalars is not None and layer.across is None, _LIGHTS, surfels.occlusion, surfels.back, out,
-    )  # fmt: skip
+        surfels.normal,
+        surfels.scalar,
+        _linear(layer.colour if layer.scalars is None or layer.colormap is None else layer.colormap),
+        _linear(UNKNOWN_COLOUR)[0],
+        float(layer.vmin),
+        float(layer.vmax),
+        layer.scalars is not None and layer.across is None,
+        _LIGHTS,
+        surfels.occlusion,
+        surfels.back,
+        out,
+    )
     return out
 
 

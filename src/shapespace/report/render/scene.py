@@ -20,15 +20,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from shapespace.cohort.orientation import current_orientation
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.remesh import collapse
 from shapespace.report.inputs.staged_fit import StagedFit, measured_mm
+from shapespace.report.render import palette as colours
 from shapespace.schemas import FitRecord, to_json
-from shapespace.types import FloatArray, IntArray, Mesh, Similarity
+from shapespace.types import FloatArray, IntArray, Mesh
 
 if TYPE_CHECKING:
     from shapespace.model.shape_model import ShapeModel
-    from shapespace.report.figures.morphospace_figures import Morphospace
+    from shapespace.report.figures.landmark_figures import Morphospace
 
 
 _DTYPES = ("float32", "int32", "uint32", "uint16", "int16", "uint8")
@@ -69,11 +71,17 @@ def quantise(values: npt.ArrayLike, *, step: float = 0.0, by_row: bool = False, 
     array = np.asarray(values, dtype=np.float64)
     known = np.isfinite(array)
     size = np.where(known, np.abs(array), 0.0)
-    largest = size.reshape(len(array), -1).max(axis=1, initial=0.0) if by_row else size.max(initial=0.0)
-    scale = np.maximum(np.asarray(largest) / _MOST_STEPS, step)
+    scale = np.maximum(
+        np.asarray(size.reshape(len(array), -1).max(axis=1, initial=0.0) if by_row else size.max(initial=0.0))
+        / _MOST_STEPS,
+        step,
+    )
     scale = np.where(scale > 0, scale, 1.0)
-    steps = np.rint(np.where(known, array, 0.0) / (scale.reshape(-1, *[1] * (array.ndim - 1)) if by_row else scale))
-    whole_steps = np.where(known, steps, _UNKNOWN).astype(np.int16)
+    whole_steps = np.where(
+        known,
+        np.rint(np.where(known, array, 0.0) / (scale.reshape(-1, *[1] * (array.ndim - 1)) if by_row else scale)),
+        _UNKNOWN,
+    ).astype(np.int16)
     return Steps(whole_steps, [float(value) for value in scale] if by_row else float(scale), coded)
 
 
@@ -119,8 +127,13 @@ def _coded(array: npt.NDArray[Any], reference: npt.NDArray[Any] | None) -> bytes
     if reference is not None:
         values = values - reference.reshape(-1, columns).view(np.uint16)
     steps = np.diff(values, axis=0, prepend=np.zeros((1, columns), np.uint16)).view(np.int16).astype(np.int32)
-    zigzag = np.where(steps < 0, -2 * steps - 1, 2 * steps).astype("<u2")
-    return np.ascontiguousarray(zigzag.T).view(np.uint8).reshape(columns, -1, 2).transpose(0, 2, 1).tobytes()
+    return (
+        np.ascontiguousarray(np.where(steps < 0, -2 * steps - 1, 2 * steps).astype("<u2").T)
+        .view(np.uint8)
+        .reshape(columns, -1, 2)
+        .transpose(0, 2, 1)
+        .tobytes()
+    )
 
 
 def pack_model(model: ShapeModel, modes: int | None = None, *, small: bool = False) -> bytes:
@@ -143,20 +156,14 @@ def pack_model(model: ShapeModel, modes: int | None = None, *, small: bool = Fal
     order, faces = np.arange(model.n_vertices), model.faces
     if small and faces is not None:
         order, faces = _neighbours_together(faces, model.n_vertices)
-    unit = np.zeros(K)
-    mode_shapes = np.empty((K, model.n_vertices, 3))
-    for k in range(K):
-        unit[k] = model.stddev[k]
-        mode_shapes[k] = model.reconstruct(unit) - model.mean_vertices
-        unit[k] = 0.0
+    mode_shapes = np.stack([model.reconstruct(b) - model.mean_vertices for b in np.diag(model.stddev[:K])])
     arrays: dict[str, npt.NDArray[Any] | Steps] = {
         "mean": quantise(model.mean_vertices[order], step=_PLACE_STEP_MM, coded=True) if small else model.mean_vertices,
         "modes": quantise(mode_shapes[:, order], step=_MODE_STEP_MM if small else 0.0, by_row=True, coded=small),
         "stddev": model.stddev[:K],
         "share": model.stddev[:K] ** 2 / model.total_variance,
     }
-    if faces is not None:
-        arrays["faces"] = _indices(faces, model.n_vertices, coded=small)
+    arrays |= _indices("faces", faces, model.n_vertices, coded=small)
     rank = np.argsort(order)
     facts = {
         "kind": "model",
@@ -209,10 +216,18 @@ def pack_morph(
         "mean": quantise(mesh.vertices, step=min(_PLACE_STEP_MM, extent / 4000), coded=True),
         "modes": quantise(modes[:, source_rows], step=min(_MODE_STEP_MM, extent / 8000), by_row=True, coded=True),
     }
-    if mesh.faces is not None:
-        arrays["faces"] = _indices(mesh.faces, len(mesh.vertices), coded=True)
-    facts = {"low": labels[0], "high": labels[1], "weights": weights.tolist(), "variable": variable, "range": ends}
-    return pack(arrays, {"kind": "morph", **facts})
+    arrays |= _indices("faces", mesh.faces, len(mesh.vertices), coded=True)
+    return pack(
+        arrays,
+        {
+            "kind": "morph",
+            "low": labels[0],
+            "high": labels[1],
+            "weights": weights.tolist(),
+            "variable": variable,
+            "range": ends,
+        },
+    )
 
 
 def pack_morphospace(space: Morphospace, *, largest: int = 12_000) -> bytes:
@@ -222,8 +237,6 @@ def pack_morphospace(space: Morphospace, *, largest: int = 12_000) -> bytes:
         space: the plot.
         largest: how many triangles of a surface are kept.
     """
-    from shapespace.report.figures.analysis_figures import current_orientation
-
     part, given, rows = space.part, dict(space.arrays), np.arange(len(space.arrays["mean"]))
     mesh = Mesh(given.pop("mean"), space.faces)
     if space.faces is not None:
@@ -234,14 +247,24 @@ def pack_morphospace(space: Morphospace, *, largest: int = 12_000) -> bytes:
         "mean": quantise(mesh.vertices, step=float(np.ptp(mesh.vertices)) / 16000, coded=True),
         "modes": quantise(given.pop("shape_axes")[:, rows], by_row=True, coded=True), **given, **codes,
     }  # fmt: skip
-    if mesh.faces is not None:
-        arrays["faces"] = _indices(mesh.faces, len(mesh.vertices), coded=True)
-    links = [[a - 1, b - 1] for a, b in current_orientation().links if max(a, b) <= space.n_landmarks]
-    return pack(arrays, {
-        "names": part.names, "axes": part.axes, "labels": space.labels, "first": part.first, "groups": part.groups,
-        "variable": part.variable, "radii": space.radii.tolist(), "planar": space.is_planar, "grid": space.grid,
-        "landmarks": space.n_landmarks, "links": links, "unit": part.unit,
-    })  # fmt: skip
+    arrays |= _indices("faces", mesh.faces, len(mesh.vertices), coded=True)
+    return pack(
+        arrays,
+        {
+            "names": part.names,
+            "axes": part.axes,
+            "labels": space.labels,
+            "first": part.first,
+            "groups": part.groups,
+            "variable": part.variable,
+            "radii": space.radii.tolist(),
+            "planar": space.is_planar,
+            "grid": space.grid,
+            "landmarks": space.n_landmarks,
+            "links": [[a - 1, b - 1] for a, b in current_orientation().links if max(a, b) <= space.n_landmarks],
+            "unit": part.unit,
+        },
+    )
 
 
 def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: int | None = None) -> bytes:
@@ -278,10 +301,8 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: i
     elif most_sent is not None:
         scan, of_scan = decimate(scan, most_sent)
     arrays: dict[str, npt.NDArray[Any] | Steps] = {"scan": _places(scan.vertices, small)}
-    if scan.faces is not None:
-        arrays["scan_faces"] = _indices(scan.faces, len(scan.vertices), coded=small)
-    if model.faces is not None:
-        arrays["faces"] = _indices(model.faces, len(model.vertices), coded=small)
+    arrays |= _indices("scan_faces", scan.faces, len(scan.vertices), coded=small)
+    arrays |= _indices("faces", model.faces, len(model.vertices), coded=small)
     arrays |= _stage_arrays(staged, of_model, of_scan, small=small)
     arrays |= {
         "b": staged.b,
@@ -332,9 +353,7 @@ def pack_surfaces(
     model, source_rows = (last, np.arange(len(last.vertices))) if largest is None else _decimate(last, largest)
     small = largest is not None
     places = {f"surface_{stage}": surface.vertices[source_rows] for stage, surface in surfaces.items()}
-    arrays: dict[str, npt.NDArray[Any] | Steps] = {}
-    if model.faces is not None:
-        arrays["faces"] = _indices(model.faces, len(model.vertices), coded=small)
+    arrays = _indices("faces", model.faces, len(model.vertices), coded=small)
     arrays |= _shared_steps(places) if small else {key: _places(points, small) for key, points in places.items()}
     arrays |= {key: np.array(getattr(record, key), dtype=np.float64) for key in ("b", "z", "b_stddev")}
     facts = {
@@ -374,21 +393,20 @@ def _colours(
     staged: StagedFit, of_model: npt.NDArray[np.intp], of_scan: npt.NDArray[np.intp]
 ) -> dict[str, npt.NDArray[Any] | Steps]:
     """Return the colours of the scan, and the colours transferred from it to the surfaces, if there are any."""
-    arrays: dict[str, npt.NDArray[Any] | Steps] = {}
-    if staged.scan.colours is not None:
-        arrays["scan_colours"] = staged.scan.colours[of_scan]
-    for stage, surface in staged.surfaces.items():
-        if surface.colours is not None:
-            arrays[f"colours_{stage}"] = surface.colours[of_model]
-    return arrays
+    colours = {"scan_colours": (staged.scan.colours, of_scan)}
+    colours |= {f"colours_{stage}": (surface.colours, of_model) for stage, surface in staged.surfaces.items()}
+    return {name: values[rows] for name, (values, rows) in colours.items() if values is not None}
 
 
 def _history(staged: StagedFit) -> dict[str, npt.NDArray[Any]]:
     """Return the iterations as arrays."""
-    moments, K = staged.history, len(staged.b)
+    moments = staged.history
+    poses = [moment.T_final_now for moment in moments]
     return {
-        "history_b": np.array([moment.b for moment in moments]).reshape(-1, K),
-        "history_T": np.array([_matrix(moment.T_final_now) for moment in moments]).reshape(-1, 3, 4),
+        "history_b": np.array([moment.b for moment in moments]).reshape(-1, len(staged.b)),
+        "history_T": np.array([np.column_stack([T.scale * T.rotation, T.translation]) for T in poses]).reshape(
+            -1, 3, 4
+        ),
         "history_phase": np.array([moment.phase for moment in moments], dtype=np.int32),
         "history_iteration": np.array([moment.iteration for moment in moments], dtype=np.int32),
         "history_rms_mm": np.array([moment.rms_mm for moment in moments], dtype=np.float32),
@@ -424,15 +442,14 @@ def pack_scatter(
             f"coefficient, not {len(labels)}, {len(names)} and {len(axes)}."
         )
     kinds = list(dict.fromkeys(labels))
-    codes = np.array([kinds.index(label) for label in labels], dtype=np.int32)
-    facts = {"kind": "scatter", "labels": kinds, "names": list(names), "axes": list(axes), "unit": unit}
-    return pack({"points": points, "labels": codes}, facts)
+    return pack(
+        {"points": points, "labels": np.array([kinds.index(label) for label in labels], dtype=np.int32)},
+        {"kind": "scatter", "labels": kinds, "names": list(names), "axes": list(axes), "unit": unit},
+    )
 
 
 def scripts() -> str:
     """Return the JavaScript for the scenes of a page, for one inline `<script>`."""
-    from shapespace.report.render import palette as colours
-
     folder = files("shapespace.report").joinpath("assets")
     shared = {
         "sequential": colours.as_list(colours.SEQUENTIAL),
@@ -481,10 +498,11 @@ def _portable(name: str, array: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return array
 
 
-def _indices(faces: IntArray, vertices: int, *, coded: bool) -> npt.NDArray[Any] | Steps:
-    if vertices > 1 << 16:
-        return faces.astype(np.uint32)
-    return Steps(faces.astype(np.uint16), coded=coded)
+def _indices(name: str, faces: IntArray | None, vertices: int, *, coded: bool) -> dict[str, npt.NDArray[Any] | Steps]:
+    """Return the triangles of a surface by their name; none of points."""
+    if faces is None:
+        return {}
+    return {name: faces.astype(np.uint32) if vertices > 1 << 16 else Steps(faces.astype(np.uint16), coded=coded)}
 
 
 def _places(points: FloatArray, small: bool) -> npt.NDArray[Any] | Steps:
@@ -493,14 +511,13 @@ def _places(points: FloatArray, small: bool) -> npt.NDArray[Any] | Steps:
 
 def _shared_steps(surfaces: Mapping[str, FloatArray]) -> dict[str, Steps]:
     """Quantise surfaces of the same vertices in one step, each after the first as the difference to the previous."""
-    largest = max(float(np.abs(points).max(initial=0.0)) for points in surfaces.values())
-    step = max(largest / _MOST_STEPS, _PLACE_STEP_MM)
-    out: dict[str, Steps] = {}
-    previous: str | None = None
-    for name, points in surfaces.items():
-        out[name] = Steps(np.rint(points / step).astype(np.int16), step, True, previous)
-        previous = name
-    return out
+    step = max(
+        max(float(np.abs(points).max(initial=0.0)) for points in surfaces.values()) / _MOST_STEPS, _PLACE_STEP_MM
+    )
+    return {
+        name: Steps(np.rint(points / step).astype(np.int16), step, True, previous)
+        for (name, points), previous in zip(surfaces.items(), [None, *surfaces], strict=False)
+    }
 
 
 def _decimate(mesh: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
@@ -518,21 +535,24 @@ def _neighbours_together(faces: IntArray, vertices: int) -> tuple[npt.NDArray[np
     from scipy.sparse.csgraph import reverse_cuthill_mckee
 
     rows, columns = faces[:, [0, 1, 2, 1, 2, 0]].ravel(), faces[:, [1, 2, 0, 0, 1, 2]].ravel()
-    graph = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(vertices, vertices)).tocsr()
-    order = np.asarray(reverse_cuthill_mckee(graph, symmetric_mode=True), dtype=np.intp)
+    order = np.asarray(
+        reverse_cuthill_mckee(
+            coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(vertices, vertices)).tocsr(),
+            symmetric_mode=True,
+        ),
+        dtype=np.intp,
+    )
     rank = np.empty(vertices, dtype=np.int32)
     rank[order] = np.arange(vertices, dtype=np.int32)
     new_faces = rank[faces]
-    rotation = new_faces.argmin(axis=1)[:, None]
-    new_faces = np.take_along_axis(new_faces, (rotation + np.arange(3)) % 3, axis=1)
+    new_faces = np.take_along_axis(new_faces, (new_faces.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
     return order, new_faces[np.lexsort((new_faces[:, 2], new_faces[:, 1], new_faces[:, 0]))]
 
 
 def _region_shares(staged: StagedFit) -> list[float]:
     """Return the share of each region of `fit.regions.REGIONS`; empty where the regions were not saved."""
-    if staged.regions is None:
-        return []
-    return (np.bincount(staged.regions, minlength=4) / max(len(staged.regions), 1)).tolist()
+    regions = staged.regions
+    return [] if regions is None else (np.bincount(regions, minlength=4) / max(len(regions), 1)).tolist()
 
 
 def _mean(signed_mm: FloatArray) -> float:
@@ -542,12 +562,9 @@ def _mean(signed_mm: FloatArray) -> float:
 
 def _shares_beyond(signed_mm: FloatArray) -> npt.NDArray[Any]:
     sorted_mm = np.sort(measured_mm(signed_mm))
-    counts = np.searchsorted(sorted_mm, np.arange(101) / 10.0 + 1e-9, side="right")
-    return (1.0 - counts / max(len(sorted_mm), 1)).astype(np.float32)
-
-
-def _matrix(T: Similarity) -> FloatArray:
-    return np.column_stack([T.scale * T.rotation, T.translation])
+    return (
+        1.0 - np.searchsorted(sorted_mm, np.arange(101) / 10.0 + 1e-9, side="right") / max(len(sorted_mm), 1)
+    ).astype(np.float32)
 
 
 SCENE_SCRIPTS = tuple(f"scene-{part}.js" for part in (
@@ -624,10 +641,7 @@ def _clustered(scan: Mesh, cell: float) -> tuple[Mesh, npt.NDArray[np.intp]]:
     _, group = np.unique((cells[:, 0] * side[1] + cells[:, 1]) * side[2] + cells[:, 2], return_inverse=True)
     size = np.bincount(group)
     middle = np.stack([np.bincount(group, points[:, k]) / size for k in range(3)], axis=1)
-    squared_distance = ((points - middle[group]) ** 2).sum(axis=1)
-    order = np.lexsort((squared_distance, group))
-    first = np.r_[0, np.cumsum(size)[:-1]]
-    representatives = order[first]
+    representatives = np.lexsort((((points - middle[group]) ** 2).sum(axis=1), group))[np.r_[0, np.cumsum(size)[:-1]]]
     if scan.faces is None:
         return Mesh(points[representatives], None, name=scan.name), representatives
     faces = group[scan.faces].astype(np.int32)

@@ -5,15 +5,15 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
-from PIL import Image as PillowImage
 
 from shapespace.errors import InputError
 from shapespace.geometry.distortion import Distortion
 from shapespace.geometry.normals import faces_of
 from shapespace.report.inputs.correspondence_folder import drawable, observed_mask
+from shapespace.report.inputs.staged_fit import StagedFit
 from shapespace.report.render.palette import CATEGORIES, DIVERGING, MODEL_COLOUR, SCAN_COLOUR, SEQUENTIAL, Colour
 from shapespace.report.render.renderer import (
     SQUARE_COLOURS,
@@ -25,10 +25,6 @@ from shapespace.report.render.renderer import (
     render_series,
 )
 from shapespace.types import FloatArray, IntArray, Mesh
-
-if TYPE_CHECKING:
-    from shapespace.report.inputs.staged_fit import StagedFit
-
 
 PANEL = (176, 232)
 """Width and height of a panel in pixels."""
@@ -56,8 +52,11 @@ def fit_strip(fit: StagedFit, limit_mm: float, panel: tuple[int, int] = PANEL) -
     camera = Camera.framing(surface.vertices, aspect=panel[0] / panel[1], margin=0.02)
     scan, model = Layer(fit.scan, SCAN_COLOUR), Layer(surface, MODEL_COLOUR)
     plain, overlay = render_series([[scan], [scan, model]], camera=camera, size=panel)
-    distances = distance_layer(surface, fit.model_to_scan_mm["final"], limit_mm, signed=fit.scan.faces is not None)
-    distance_image = render(distances, camera=camera, size=panel)
+    distance_image = render(
+        distance_layer(surface, fit.model_to_scan_mm["final"], limit_mm, signed=fit.scan.faces is not None),
+        camera=camera,
+        size=panel,
+    )
     return encoded(np.concatenate([plain, overlay, distance_image], axis=1))
 
 
@@ -94,10 +93,12 @@ def correspondence_strip(
         around = np.isin(faces, faces[distortion.folded]).any(axis=1) & observed_mask(vertices)[faces].all(axis=1)
         # Of equally near surfaces the first stays.
         area.insert(0, Layer(Mesh(np.nan_to_num(vertices), faces[around]), FOLD_COLOUR))
-    framed = np.concatenate([mean.vertices, drawn_surface.vertices])
-    camera = Camera.framing(framed, aspect=panel[0] / panel[1], margin=0.02)
-    pictures = [render(*layer_group, camera=camera, size=panel) for layer_group in (*layers, area)]
-    return encoded(np.concatenate(pictures, axis=1))
+    camera = Camera.framing(
+        np.concatenate([mean.vertices, drawn_surface.vertices]), aspect=panel[0] / panel[1], margin=0.02
+    )
+    return encoded(
+        np.concatenate([render(*layer_group, camera=camera, size=panel) for layer_group in (*layers, area)], axis=1)
+    )
 
 
 def _at_vertices(values: FloatArray, faces: IntArray, vertices: int) -> FloatArray:
@@ -105,8 +106,9 @@ def _at_vertices(values: FloatArray, faces: IntArray, vertices: int) -> FloatArr
     known = np.isfinite(values)
     flat = faces[known].ravel()
     count = np.bincount(flat, minlength=vertices)
-    total = np.bincount(flat, np.repeat(values[known], 3), vertices)
-    return np.divide(total, count, out=np.full(vertices, np.nan), where=count > 0)
+    return np.divide(
+        np.bincount(flat, np.repeat(values[known], 3), vertices), count, out=np.full(vertices, np.nan), where=count > 0
+    )
 
 
 def mesh_still(mesh: Mesh, panel: tuple[int, int] = PANEL) -> Still:
@@ -119,12 +121,13 @@ def mesh_still(mesh: Mesh, panel: tuple[int, int] = PANEL) -> Still:
 
 def colour_bar(colours: Sequence[Sequence[float]] | np.ndarray = DIVERGING) -> Still:
     """Return a map as a bar of 256 by 10 pixels."""
-    row = np.rint(255 * np.asarray(colours)).astype(np.uint8)
-    return encoded(np.repeat(row[None], 10, axis=0), lossless=True)
+    return encoded(np.repeat(np.rint(255 * np.asarray(colours)).astype(np.uint8)[None], 10, axis=0), lossless=True)
 
 
 def encoded(image: Image, *, lossless: bool = False, quality: int = 84, effort: int = 3) -> Still:
     """Return pixels (H, W, 3) uint8 as WebP."""
+    from PIL import Image as PillowImage  # of the extra `report`
+
     stream = io.BytesIO()
     PillowImage.fromarray(np.ascontiguousarray(image)).save(
         stream, format="WEBP", lossless=lossless, quality=quality, method=effort
@@ -152,8 +155,7 @@ def checker_places(mean: Mesh, yaw_deg: float = 0.0) -> tuple[FloatArray, FloatA
         InputError: the shape has no extent.
     """
     yaw = np.radians(yaw_deg)
-    across = mean.vertices @ np.array([np.cos(yaw), 0.0, np.sin(yaw)])
-    plane = np.stack([across, mean.vertices[:, 1]])
+    plane = np.stack([(mean.vertices @ np.array([np.cos(yaw), 0.0, np.sin(yaw)])), mean.vertices[:, 1]])
     low, high = plane.min(axis=1), plane.max(axis=1)
     wide, high_up = (float(extent) for extent in high - low)
     # Of a long thin object, the squares must be small enough that there are some across.
