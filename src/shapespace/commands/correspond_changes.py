@@ -38,8 +38,7 @@ from shapespace.commands.correspond import (
     write_mean,
     write_results,
 )
-from shapespace.commands.inputs import Given
-from shapespace.commands.landmark_files import LandmarkFiles
+from shapespace.commands.inputs import Given, LandmarkFiles
 from shapespace.correspondence.correspondence_result import Correspondence
 from shapespace.correspondence.groupwise import FinishedCorrespondence, add_scans
 from shapespace.correspondence.settings import FEWEST, CorrespondConfig

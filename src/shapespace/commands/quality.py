@@ -8,11 +8,13 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from msgspec import structs
 
 from shapespace.batch.execution import ExecutionConfig
 from shapespace.batch.fit_work import naming
 from shapespace.batch.progress import progress, steps, waiting
 from shapespace.batch.quality_work import QualityRunner
+from shapespace.commands.outcome import Outcome
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.files import make_folder, write_text
@@ -22,7 +24,7 @@ from shapespace.model.foreign import looks_like_model
 from shapespace.model.model_quality import Curve, ModelQuality, QualityConfig, Runner, measure_quality
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
-from shapespace.schemas import BySize, Measured, Quality, json_text
+from shapespace.schemas import BySize, Measured, Quality, json_text, to_json
 from shapespace.store.corresponding import SURFACE, surface_files, surface_stem
 from shapespace.store.review_text import review_summary
 from shapespace.types import Mesh
@@ -36,7 +38,6 @@ class QualityOptions:
     """What to measure, and against what.
 
     Args:
-        config: folds, modes, samples, seed and gauge.
         representations: what the modes move, for all targets or one for each; two for one target compare it with
             itself.
         scans: folder of the scans that the surfaces were made from, with the same names, pose and unit: distances are
@@ -49,7 +50,6 @@ class QualityOptions:
         InputError: representations that there are not.
     """
 
-    config: QualityConfig = field(default_factory=QualityConfig)
     representations: Sequence[str] = ("vertices",)
     scans: Path | None = None
     unseen: Path | None = None
@@ -77,13 +77,20 @@ class _Target:
 
 
 def quality(
-    targets: Sequence[Path], output: Path, options: QualityOptions, execution: ExecutionConfig, *, quiet: bool
-) -> tuple[Quality, list[str]]:
-    """Measure one target or two, write `quality.json` and the curves, and return what was found and what to know.
+    targets: Sequence[Path],
+    output: Path,
+    config: QualityConfig,
+    options: QualityOptions,
+    execution: ExecutionConfig,
+    *,
+    quiet: bool,
+) -> Outcome:
+    """Measure one target or two, and write `quality.json` and the curves.
 
     Args:
         targets: models, or folders of meshes in correspondence.
         output: the folder to write to.
+        config: folds, modes, samples, seed and gauge.
         options: what to measure.
         execution: Executor of folds and random shapes.
         quiet: no progress.
@@ -94,7 +101,7 @@ def quality(
         InputError: targets that there are not, too few meshes, or two that have not the same shapes.
     """
     notes: list[str] = []
-    loaded = _targets(targets, options, notes, quiet=quiet)
+    loaded = _targets(targets, config, options, notes, quiet=quiet)
     make_folder(output)
     run = QualityRunner(execution, output, quiet)
     measured = [_measure(target, options, run, quiet=quiet) for target in loaded]
@@ -104,7 +111,7 @@ def quality(
     if len(parts) > 1:
         differences = {name: _measured(c) for name, c in measured[0].differences(measured[1]).items()}
         comparison = _comparison_sentences(loaded, measured[0].differences(measured[1]))
-        result = replace_quality(
+        result = structs.replace(
             result, others=(parts[1],), differences=differences, sentences=(*result.sentences, *comparison)
         )
     for target in loaded:
@@ -117,21 +124,37 @@ def quality(
     write_text(output / "quality.json", json_text(result))
     with waiting("drawing the curves", quiet=quiet):
         _draw(result, output, notes)
-    return result, notes
+    lines = [line for one in (result, *result.others) for line in quality_lines(one)]
+    lines += [*result.sentences, f"All numbers are in {output / 'quality.json'}"]
+    return Outcome({"folder": str(output), **to_json(result)}, lines, notes)
 
 
-def replace_quality(quality: Quality, **changes: object) -> Quality:
-    """Return `quality` with other fields."""
-    import msgspec
+def quality_lines(quality: Quality) -> list[str]:
+    """Return the measures with most modes, in words."""
+    out: list[str] = [quality.name]
+    for key, unit in (
+        ("compactness", "of the variance"),
+        ("generalisation", "mm, surface to surface, on shapes left out"),
+        ("generalisation_vertices", "mm, vertex to vertex, on shapes left out"),
+        ("specificity", "mm, surface to surface, from random shapes to the nearest one"),
+        ("specificity_vertices", "mm, vertex to vertex, from random shapes to the nearest one"),
+        ("reconstruction", "mm, surface to surface, on unseen shapes"),
+        ("reconstruction_vertices", "mm, vertex to vertex, on unseen shapes"),
+    ):
+        measure = getattr(quality, key)
+        if measure is not None:
+            band = f" (95 %: {measure.low[-1]:.3f} to {measure.high[-1]:.3f})" if measure.low != measure.mean else ""
+            out.append(f"  {key.split('_')[0]}, {measure.modes[-1]:g} modes: {measure.mean[-1]:.3f}{band} {unit}")
+    return out
 
-    return msgspec.structs.replace(quality, **changes)
 
-
-def _targets(paths: Sequence[Path], options: QualityOptions, notes: list[str], *, quiet: bool) -> list[_Target]:
+def _targets(
+    paths: Sequence[Path], config: QualityConfig, options: QualityOptions, notes: list[str], *, quiet: bool
+) -> list[_Target]:
     names = list(options.representations)
     if len(paths) > _MOST_TARGETS or len(names) > _MOST_TARGETS:
         raise InputError("At most two targets or representations are compared; give one or two.")
-    gauge = options.config.gauge if options.config.align else "form"
+    gauge = config.gauge if config.align else "form"
     loaded: list[tuple[ShapeModel | list[Mesh], dict[str, float]]] = [
         (ShapeModel.load(p), {})
         if not p.is_dir() and looks_like_model(p)
@@ -145,7 +168,7 @@ def _targets(paths: Sequence[Path], options: QualityOptions, notes: list[str], *
     out: list[_Target] = []
     for k, name in pairs:
         called = f"{paths[k]}, {name}" if several else str(paths[k])
-        out.append(_Target(called, loaded[k][0], _of_representation(options.config, name, names), loaded[k][1]))
+        out.append(_Target(called, loaded[k][0], _of_representation(config, name, names), loaded[k][1]))
     if len(out) == _MOST_TARGETS and not any(isinstance(target.data, ShapeModel) for target in out):
         _refuse_unlike(out)
     return out
