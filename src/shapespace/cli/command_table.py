@@ -668,7 +668,7 @@ COMMANDS: tuple[Command, ...] = (
     Command(
         "landmarks check", "check landmark data, or compare landmarks of marked specimens with their prediction",
         ("shapespace landmarks check skulls.tps", "shapespace landmarks check marked same -o check.csv"),
-        "commands.landmarks:check_landmarks",
+        "commands.landmark_data:check_landmarks",
         (
             basic("marked", "DATA", "file or folder with the landmarks of many specimens; with SAME, a folder of "
                   "landmark files with the names of the scans", parse=Path),

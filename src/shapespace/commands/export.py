@@ -84,10 +84,7 @@ def export(
                 say(str(error))
             bar.update()
     if table is not None:
-        if table.suffix.lower() == ".mat":
-            write_mat(results, table)
-        else:
-            write_table(results, table)
+        (write_mat if table.suffix.lower() == ".mat" else write_table)(results, table)
     for problem in results.problems:
         say(problem)
     written, table_name = len(wanted) - len(failed), None if table is None else str(table)
@@ -100,12 +97,10 @@ def export(
 def _write(results: Results, name: str, output: Path) -> None:
     # The record comes last, as in a fit: what lies there with a record is whole.
     for kind, ending in ENDINGS.items():
-        if not results.has(name, kind):
-            continue
         path = output / f"{name}{ending}"
-        if kind == "stages":
+        if kind == "stages" and results.has(name, kind):
             write_bytes(path, results.stages(name))
-        else:
+        elif results.has(name, kind):
             write_mesh(path, results.surface(name, kind))
     # No table of a store has the landmarks in columns; the record has them, and their files are made of it again.
     if landmarks := results.fit(name).found_landmarks:

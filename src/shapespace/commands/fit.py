@@ -302,14 +302,10 @@ def scan_jobs(given: Sequence[Given], landmarks: Path | None, many: LandmarkFile
         for job, one in zip(made, given, strict=True)
     ]
     for job in jobs:
-        _refuse_to_overwrite(job, folder)
+        written = {(folder / f"{job.name}{ending}").resolve() for ending in FIDUCIAL_ENDINGS}
+        if job.landmarks is not None and job.landmarks.resolve() in written:
+            raise InputError(f"{job.landmarks} would be overwritten by the landmarks of the fit; rename it.")
     return jobs
-
-
-def _refuse_to_overwrite(job: Job, folder: Path) -> None:
-    written = {(folder / f"{job.name}{ending}").resolve() for ending in FIDUCIAL_ENDINGS}
-    if job.landmarks is not None and job.landmarks.resolve() in written:
-        raise InputError(f"{job.landmarks} would be overwritten by the landmarks of the fit; rename it.")
 
 
 def _scans(scans: Sequence[str | Path], folder: Path, *, recursive: bool, say: Callable[[str], None]) -> list[Given]:

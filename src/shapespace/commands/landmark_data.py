@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -69,19 +69,37 @@ def convert_landmarks(
     return Outcome(facts, [line], notes)
 
 
-def check_configurations(data: Path, sliders: Sequence[Path] = ()) -> Outcome:
+def check_landmarks(
+    marked: Path,
+    scans: Path | None,
+    output: Path | None,
+    *,
+    sliders: Sequence[Path] = (),
+    say: Callable[[str], None],
+) -> Outcome:
     """Say what landmark data contain: counts, missing landmarks, and `findings`, a sentence each.
 
-    Findings are duplicates, specimens of another scale, mirrored specimens, swapped landmarks, and outliers.
+    Findings are duplicates, specimens of another scale, mirrored specimens, swapped landmarks, and outliers. With
+    scans in correspondence the landmarks are compared with their predictions.
 
     Args:
-        data: file or folder with the landmarks of many specimens.
+        marked: file or folder with the landmarks of many specimens.
+        scans: see `check_marked`; None for landmark data alone.
+        output: see `check_marked`.
         sliders: CSV of the semilandmarks as geomorph has them.
+        say: called with each message.
 
     Raises:
         FileError: something cannot be read.
+        InputError: an output without scans, and as for `check_marked`.
     """
-    raw = read_configurations(data, sliders=sliders)
+    if scans is not None:
+        from shapespace.commands.landmarks import check_marked  # loads much
+
+        return check_marked(marked, scans, output, say=say)
+    if output is not None:
+        raise InputError("-o goes with SAME, the folder that correspond wrote; leave it out.")
+    raw = read_configurations(marked, sliders=sliders)
     absent = ~raw.observed
     findings = [*_duplicates(raw), *find_other_scales(raw)]
     try:

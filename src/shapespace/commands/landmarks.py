@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean
@@ -15,7 +15,6 @@ import numpy as np
 from shapespace.batch.fit_work import Job
 from shapespace.batch.progress import progress
 from shapespace.commands.inputs import Given, LandmarkFiles
-from shapespace.commands.landmark_data import check_configurations
 from shapespace.commands.outcome import LISTED, Outcome, first_lines
 from shapespace.correspondence.landmark_transfer import LandmarkCheck, MarkedSpecimens, TransferredLandmarks
 from shapespace.correspondence.semilandmarks import Semilandmarks, SemilandmarkSet
@@ -135,26 +134,19 @@ def _read_sets(file: Path) -> list[SemilandmarkSet]:
     return sets
 
 
-def check_landmarks(
-    marked: Path, scans: Path | None, output: Path | None = None, *, sliders: Sequence[Path] = (), say: Say
-) -> Outcome:
-    """Compare the landmarks of each marked specimen with their prediction from the others, or check landmark data.
+def check_marked(marked: Path, scans: Path, output: Path | None, *, say: Say) -> Outcome:
+    """Compare the landmarks of each marked specimen with their prediction from the others.
 
     Args:
-        marked: folder of landmark files with the names of the scans; without scans, any landmarks of many specimens.
-        scans: folder that `correspond` wrote, or None.
+        marked: folder of landmark files with the names of the scans.
+        scans: folder that `correspond` wrote.
         output: table of all landmarks and specimens (CSV), or None.
-        sliders: without scans, CSV of the semilandmarks.
         say: called with each message.
 
     Raises:
-        InputError: no correspondence, fewer than two marked specimens, or an output without scans.
+        InputError: no correspondence, or fewer than two marked specimens.
         FileError: something cannot be read or written.
     """
-    if scans is None:
-        if output is not None:
-            raise InputError("-o goes with SAME, the folder that correspond wrote; leave it out.")
-        return check_configurations(marked, sliders)
     checks = _open(scans, marked, say).specimens.check()
     if output is not None:
         header = list(asdict(checks[0]))

@@ -249,7 +249,8 @@ def correspondence_facts(folder: Path) -> dict[str, Any]:
 
 def model_facts(model: ShapeModel) -> dict[str, Any]:
     """Return the facts of a model as plain values."""
-    counts = model.coding.get("control_counts")
+    counts, residuals = model.coding.get("control_counts"), model.residuals
+    off = model.landmarks.distance_mm.tolist()  # zero for landmarks that were given on the surface
     needed = {f"{share:g}": model.modes_for_variance(share) for share in (0.9, 0.95, 0.98, 0.985, 0.99)}
     return {
         "vertices": model.n_vertices,
@@ -265,10 +266,17 @@ def model_facts(model: ShapeModel) -> dict[str, Any]:
         "variance_of": "people left out" if model.held_out else "training shapes",
         "modes_for_variance": {share: modes for share, modes in needed.items() if modes is not None},
         "stddev_mm": model.stddev.tolist(),
-        **({} if model.residuals is None else _residual_facts(model)),
+        **(
+            {}
+            if residuals is None
+            else {
+                "residuals_mm2": residuals.tolist(),
+                "largest_residual_share": float(residuals.max() / model.stddev[0] ** 2),
+            }
+        ),
         "noise_variance_mm2": model.noise_variance,
         "landmarks": list(model.landmarks),
-        **_landmark_distances(model),
+        **({"landmark_distances_mm": dict(zip(model.landmarks, off, strict=True))} if any(off) else {}),
         **({"regions": {name: len(vertices) for name, vertices in model.regions.items()}} if model.regions else {}),
         "representation": model.representation,
         **({} if counts is None else {"control_points": counts.tolist()}),
@@ -288,17 +296,3 @@ def training_shapes_note(model: ShapeModel) -> str:
         f"The model contains {count} training shapes, from which their surfaces can be reconstructed; if they show "
         "people, share it without them (build --without-training-shapes, or convert)."
     )
-
-
-def _landmark_distances(model: ShapeModel) -> dict[str, dict[str, float]]:
-    """Return the distances of the given landmarks from the surface; empty if all were on it."""
-    distances = model.landmarks.distance_mm.tolist()
-    return {"landmark_distances_mm": dict(zip(model.landmarks, distances, strict=True))} if any(distances) else {}
-
-
-def _residual_facts(model: ShapeModel) -> dict[str, Any]:
-    residuals = np.zeros(0) if model.residuals is None else model.residuals
-    return {
-        "residuals_mm2": residuals.tolist(),
-        "largest_residual_share": float(residuals.max() / model.stddev[0] ** 2),
-    }

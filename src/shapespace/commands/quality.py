@@ -30,6 +30,16 @@ from shapespace.store.review_text import review_summary
 from shapespace.types import Mesh
 
 _SURFACES = (".dense.ply", ".fitted.ply", SURFACE)
+_UNITS = {
+    "compactness": "of the variance",
+    "generalisation": "mm, surface to surface, on shapes left out",
+    "generalisation_vertices": "mm, vertex to vertex, on shapes left out",
+    "specificity": "mm, surface to surface, from random shapes to the nearest one",
+    "specificity_vertices": "mm, vertex to vertex, from random shapes to the nearest one",
+    "reconstruction": "mm, surface to surface, on unseen shapes",
+    "reconstruction_vertices": "mm, vertex to vertex, on unseen shapes",
+}
+"""Measures, and what their numbers are."""
 _MOST_TARGETS = 2  # differences are computed between two targets
 
 
@@ -114,13 +124,13 @@ def quality(
         result = structs.replace(
             result, others=(parts[1],), differences=differences, sentences=(*result.sentences, *comparison)
         )
-    for target in loaded:
-        if isinstance(target.data, ShapeModel):
-            notes.append(
-                f"{target.name} is a model file, which does not keep its training shapes: only compactness is "
-                "computed; generalisation and specificity need a folder"
-                + ("." if options.unseen else "; --unseen FOLDER measures it on shapes that it did not see.")
-            )
+    notes += [
+        f"{target.name} is a model file, which does not keep its training shapes: only compactness is computed; "
+        "generalisation and specificity need a folder"
+        + ("." if options.unseen else "; --unseen FOLDER measures it on shapes that it did not see.")
+        for target in loaded
+        if isinstance(target.data, ShapeModel)
+    ]
     write_text(output / "quality.json", json_text(result))
     with waiting("drawing the curves", quiet=quiet):
         _draw(result, output, notes)
@@ -132,15 +142,7 @@ def quality(
 def quality_lines(quality: Quality) -> list[str]:
     """Return the measures with most modes, in words."""
     out: list[str] = [quality.name]
-    for key, unit in (
-        ("compactness", "of the variance"),
-        ("generalisation", "mm, surface to surface, on shapes left out"),
-        ("generalisation_vertices", "mm, vertex to vertex, on shapes left out"),
-        ("specificity", "mm, surface to surface, from random shapes to the nearest one"),
-        ("specificity_vertices", "mm, vertex to vertex, from random shapes to the nearest one"),
-        ("reconstruction", "mm, surface to surface, on unseen shapes"),
-        ("reconstruction_vertices", "mm, vertex to vertex, on unseen shapes"),
-    ):
+    for key, unit in _UNITS.items():
         measure = getattr(quality, key)
         if measure is not None:
             band = f" (95 %: {measure.low[-1]:.3f} to {measure.high[-1]:.3f})" if measure.low != measure.mean else ""
@@ -225,11 +227,6 @@ def _meshes(
     return out, {surface_stem(file): ratio for file, ratio in listed.unit_ratios.items()}
 
 
-def _scaled(mesh: Mesh, ratio: float) -> Mesh:
-    """Return `mesh` in the unit of most."""
-    return mesh if ratio == 1.0 else mesh.with_vertices(mesh.vertices / ratio)
-
-
 def _scans(target: _Target, folder: Path | None, *, quiet: bool) -> list[Mesh] | None:
     """Return the scans of the meshes of a target, in their order; None where none are given, or none are needed."""
     if folder is None or isinstance(target.data, ShapeModel):
@@ -241,8 +238,9 @@ def _scans(target: _Target, folder: Path | None, *, quiet: bool) -> list[Mesh] |
     with progress(len(target.names), "reading", "scan", quiet=quiet) as bar:
         out: list[Mesh] = []
         for name in target.names:
-            scan = replace(read_mesh(by_name[name]), name=by_name[name].name)
-            out.append(_scaled(scan, target.unit_ratios.get(name, 1.0)))
+            scan, ratio = read_mesh(by_name[name]), target.unit_ratios.get(name, 1.0)
+            vertices = scan.vertices if ratio == 1.0 else scan.vertices / ratio  # in the unit of most
+            out.append(replace(scan, vertices=vertices, name=by_name[name].name))
             bar.update()
     for scan in out:
         if not len(scan.vertices) or not np.isfinite(scan.vertices).all():
@@ -273,24 +271,14 @@ def _measured(curve: Curve) -> Measured:
 
 
 def _as_quality(target: _Target, result: ModelQuality, options: QualityOptions) -> Quality:
-    def measured(curve: Curve | None) -> Measured | None:
-        return None if curve is None else _measured(curve)
-
-    size = result.by_shapes
-    by_shapes = None
+    curves: dict[str, Curve | None] = {name: getattr(result, name) for name in _UNITS}
+    size, by_shapes = result.by_shapes, None
     if size is not None:
-        lists = (tuple(values.tolist()) for values in (size.mean, size.low, size.high))
-        mean, low, high = lists
+        mean, low, high = (tuple(values.tolist()) for values in (size.mean, size.low, size.high))
         by_shapes = BySize(shapes=tuple(size.counts.tolist()), mean=mean, low=low, high=high)
     return Quality(
         name=target.name,
-        compactness=measured(result.compactness),
-        generalisation=measured(result.generalisation),
-        specificity=measured(result.specificity),
-        generalisation_vertices=measured(result.generalisation_vertices),
-        specificity_vertices=measured(result.specificity_vertices),
-        reconstruction=measured(result.reconstruction),
-        reconstruction_vertices=measured(result.reconstruction_vertices),
+        **{name: _measured(curve) for name, curve in curves.items() if curve is not None},
         generalisation_by_shapes=by_shapes,
         supported_modes=result.supported_modes,
         sentences=result.sentences(),
@@ -315,8 +303,8 @@ def _comparison_sentences(targets: Sequence[_Target], differences: dict[str, Cur
     off, low, high = (float(values[-1]) for values in (curve.mean, curve.low, curve.high))
     difference = (
         f"the surfaces of {targets[1].name} are off by {off:+.3f} mm (95 %: {low:+.3f} to {high:+.3f}) against "
+        f"{targets[0].name}"
     )
-    difference += f"{targets[0].name}"
     verdict = "no difference shows" if low <= 0 <= high else f"{targets[0 if off > 0 else 1].name} is better"
     return [f"On unseen shapes with {curve.counts[-1]} modes {difference}: {verdict}."]
 

@@ -68,7 +68,9 @@ def write_surfaces(
     make_folder(output)
     files = list({path.resolve(): path for path in listed.files}.values())
     records: list[dict[str, Any]] = []
-    limit = _default_limit() if max_memory_bytes is None else max_memory_bytes
+    free = available_bytes()
+    usual = MAX_MEMORY_BYTES if free is None else min(MAX_MEMORY_BYTES, int(_MOST_OF_MEMORY * free))
+    limit = usual if max_memory_bytes is None else max_memory_bytes
     with progress(len(files), "making", "surface", quiet=quiet) as bar:
         for path, name in zip(files, _names(files), strict=True):
             target = output / f"{name}.ply"
@@ -95,6 +97,8 @@ def write_surfaces(
             bar.update()
     usable = [record for record in records if "error" not in record]
     _name_the_odd(usable)
+    for record in usable:
+        record["notes"] += record["odd"]
     facts = {"folder": str(output), "volumes": len(records), "surfaces": len(usable), "records": records}
     lines = _lines(usable, len(records), output) if usable else ()
     return Outcome(facts, lines, exit_code=exit_code_of(len(records) - len(usable), len(records)))
@@ -114,11 +118,6 @@ def _described(record: Mapping[str, Any]) -> list[str]:
         f"voxels of {size} mm"
     )
     return [line, *(f"  {note}" for note in record["notes"])]
-
-
-def _default_limit() -> int:
-    free = available_bytes()
-    return MAX_MEMORY_BYTES if free is None else min(MAX_MEMORY_BYTES, int(_MOST_OF_MEMORY * free))
 
 
 def _names(files: Sequence[Path]) -> list[str]:
@@ -157,7 +156,7 @@ def _name_the_odd(records: Sequence[dict[str, Any]]) -> None:
     for record in records:
         earlier = first.setdefault((record["vertices"], record["volume_mm3"], *record["bounds_mm"][0]), record["name"])
         if earlier != record["name"]:
-            _add(record, f"It is the same surface as {earlier}.ply.")
+            record["odd"].append(f"It is the same surface as {earlier}.ply.")
     if len(records) < _MANY:
         return
     middle = float(np.median([record["volume_mm3"] for record in records]))
@@ -166,12 +165,7 @@ def _name_the_odd(records: Sequence[dict[str, Any]]) -> None:
     voxel_text = " x ".join(f"{mm:.3g}" for mm in usual)
     for record, other in zip(records, others, strict=True):
         if other and sum(others) < len(others) / 2:
-            _add(record, f"Most of the others have voxels of {voxel_text} mm.")
+            record["odd"].append(f"Most of the others have voxels of {voxel_text} mm.")
         ratio = float(record["volume_mm3"]) / middle
         if not 1 / _OTHER_VOLUME < ratio < _OTHER_VOLUME:
-            _add(record, f"Its volume is {ratio:.2g} times that in the middle of all.")
-
-
-def _add(record: dict[str, Any], note: str) -> None:
-    record["odd"].append(note)
-    record["notes"].append(note)
+            record["odd"].append(f"Its volume is {ratio:.2g} times that in the middle of all.")
