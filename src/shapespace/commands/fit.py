@@ -21,7 +21,7 @@ from shapespace.batch.progress import progress, telling_of_compiling
 from shapespace.batch.result_folder import RECORD
 from shapespace.batch.run import BatchConfig, Plan, fit_many, make_jobs
 from shapespace.batch.sinks import STORE_FROM, FolderSink, StoreSink
-from shapespace.commands.inputs import Given, LandmarkFiles, given_scans, with_ids
+from shapespace.commands.inputs import Given, LandmarkFiles, given_scans, is_of_fit, with_ids
 from shapespace.commands.outcome import LISTED, Outcome, exit_code_of, first_lines
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.fit.fit_scan import FitConfig
@@ -315,10 +315,7 @@ def _scans(scans: Sequence[str | Path], folder: Path, *, recursive: bool, say: C
     given = {Path(one).resolve() for one in scans if not is_address(str(one))}
 
     def is_result(scan: Path | str) -> bool:
-        if isinstance(scan, str):
-            return False
-        name = next((scan.name.removesuffix(ending) for ending in _SURFACES if scan.name.endswith(ending)), None)
-        if name is None or not scan.with_name(f"{name}{RECORD}").is_file():
+        if isinstance(scan, str) or not is_of_fit(scan, _SURFACES):
             return False
         return scan.parent.resolve() == here or not {scan.resolve(), scan.parent.resolve()} & given
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from shapespace.batch.fit_work import Job
+from shapespace.batch.result_folder import RECORD
 from shapespace.cohort.table import fold_name, refuse_repeated
 from shapespace.errors import FileError, InputError, ShapespaceError
 from shapespace.io.containers.json_files import check_file
@@ -207,10 +208,10 @@ def _refuse_doubles(scans: Sequence[Given]) -> None:
             raise InputError(f"Two scans have the id {one.called}; give each one of its own.")
 
 
-def _is_result(file: Path) -> bool:
-    """Return whether a fit wrote `file` beside its record."""
-    name = next((file.name.removesuffix(e) for e in FIDUCIAL_ENDINGS if file.name.endswith(e)), None)
-    return name is not None and file.with_name(f"{name}.fit.json").is_file()
+def is_of_fit(file: Path, endings: Sequence[str]) -> bool:
+    """Return whether a fit wrote `file`, which has one of `endings`, beside its record."""
+    names = [file.name.removesuffix(ending) for ending in endings if file.name.endswith(ending)]
+    return any(file.with_name(f"{name}{RECORD}").is_file() for name in names)
 
 
 @dataclass(frozen=True)
@@ -248,7 +249,7 @@ class LandmarkFiles:
         duplicates: dict[str, list[Path]] = {}
         for file in sorted(folder.iterdir()):
             ending = next((one for one in endings if file.name.lower().endswith(one)), None)
-            if ending is None or not file.is_file() or _is_result(file):
+            if ending is None or not file.is_file() or is_of_fit(file, FIDUCIAL_ENDINGS):
                 continue
             first = files.setdefault(file.name[: -len(ending)], file)
             if first is not file:

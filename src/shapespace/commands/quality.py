@@ -276,9 +276,8 @@ def _as_quality(target: _Target, result: ModelQuality, options: QualityOptions) 
     if size is not None:
         mean, low, high = (tuple(values.tolist()) for values in (size.mean, size.low, size.high))
         by_shapes = BySize(shapes=tuple(size.counts.tolist()), mean=mean, low=low, high=high)
-    return Quality(
+    quality = Quality(
         name=target.name,
-        **{name: _measured(curve) for name, curve in curves.items() if curve is not None},
         generalisation_by_shapes=by_shapes,
         supported_modes=result.supported_modes,
         sentences=result.sentences(),
@@ -293,6 +292,8 @@ def _as_quality(target: _Target, result: ModelQuality, options: QualityOptions) 
             "unseen": None if options.unseen is None else str(options.unseen),
         },
     )
+    measured = {name: _measured(curve) for name, curve in curves.items() if curve is not None}
+    return structs.replace(quality, **measured)
 
 
 def _comparison_sentences(targets: Sequence[_Target], differences: dict[str, Curve]) -> list[str]:
