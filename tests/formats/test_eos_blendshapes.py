@@ -40,7 +40,7 @@ def test_shape_and_blendshapes_of_two_files_are_one_additive_model(model: ShapeM
     file = blendshapes(tmp_path / "expressions.bin", smiles(), ["smile", "frown"])
     found = read_blendshapes(file)
     assert found.names == ("smile", "frown") and np.allclose(found.moved, smiles(), atol=1e-6)
-    said = convert(tmp_path / "shape.bin", tmp_path / "face.h5", to=None, mm=None, expressions=file)[2]
+    said = convert(tmp_path / "shape.bin", tmp_path / "face.h5", expressions=file).facts["notes"]
     assert any("2 blendshapes is one standard deviation" in note for note in said)
     face = AdditiveModel.load(tmp_path / "face.h5")
     assert (face.n_identity, face.n_expression) == (model.n_modes, 2)
@@ -59,9 +59,9 @@ def test_expressions_of_another_model_are_refused(model: ShapeModel, tmp_path: P
     shape, out = tmp_path / "shape.bin", tmp_path / "out.h5"
     other = blendshapes(tmp_path / "other.bin", smiles(20), ["a", "b"])
     with pytest.raises(ModelFileError, match="is of 20 vertices"):
-        convert(shape, out, to=None, mm=None, expressions=other)
+        convert(shape, out, expressions=other)
     with pytest.raises(ModelFileError, match="no blendshapes of eos"):
-        convert(shape, out, to=None, mm=None, expressions=shape)
+        convert(shape, out, expressions=shape)
     whole = other.read_bytes()
     for length in (4, 30, len(whole) - 1):
         other.write_bytes(whole[:length])
@@ -69,4 +69,4 @@ def test_expressions_of_another_model_are_refused(model: ShapeModel, tmp_path: P
             read_blendshapes(other)
     model.save(tmp_path / "ours.h5")
     with pytest.raises(InputError, match="goes with the models of eos"):
-        convert(tmp_path / "ours.h5", out, to=None, mm=None, expressions=other)
+        convert(tmp_path / "ours.h5", out, expressions=other)

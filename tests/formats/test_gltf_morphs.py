@@ -76,7 +76,7 @@ def test_a_plain_reader_finds_mean_modes_names_and_normals_in_metres(model: Shap
 def convert_to(model: ShapeModel | AdditiveModel, path: Path) -> list[str]:
     source = path.parent / "source.h5"
     model.save(source)
-    return convert(source, path, to=None, mm=None)[2]
+    return convert(source, path).facts["notes"]
 
 
 def test_trimesh_opens_it(model: ShapeModel, tmp_path: Path) -> None:
@@ -217,7 +217,7 @@ def test_many_targets_on_one_array_are_refused_before_they_are_made(tmp_path: Pa
 def test_regions_that_another_format_has_no_place_for_are_said_to_be_left_out(tmp_path: Path) -> None:
     model = dataclasses.replace(blob_model(), regions={"tip": np.arange(9, dtype=np.int32)})
     model.save(tmp_path / "m.h5")
-    notes = convert(tmp_path / "m.h5", tmp_path / "m.glb", to=None, mm=None)[2]
+    notes = convert(tmp_path / "m.h5", tmp_path / "m.glb").facts["notes"]
     assert any("region tip" in note and "no place" in note for note in notes)
-    assert not any("region" in note for note in convert(tmp_path / "m.h5", tmp_path / "n.h5", to=None, mm=None)[2])
+    assert not any("region" in note for note in convert(tmp_path / "m.h5", tmp_path / "n.h5").facts["notes"])
     assert "tip" in ShapeModel.load(tmp_path / "n.h5").regions

@@ -37,11 +37,11 @@ def covariance_gap(first: ShapeModel, second: ShapeModel) -> float:
 def test_each_converts_to_our_format_and_to_all_that_are_written_and_back(
     one: ModelFormat, file: str, tmp_path: Path
 ) -> None:
-    convert(MODELS / file, tmp_path / "own.h5", to=None, mm=None)
+    convert(MODELS / file, tmp_path / "own.h5")
     own = ShapeModel.load(tmp_path / "own.h5")
     there = tmp_path / f"there{one.suffixes[0] if one.suffixes else ''}"
-    convert(tmp_path / "own.h5", there, to=one.name, mm=None)
-    convert(there, tmp_path / "back.h5", to=None, mm=None)
+    convert(tmp_path / "own.h5", there, to=one.name)
+    convert(there, tmp_path / "back.h5")
     back = ShapeModel.load(tmp_path / "back.h5")
     extent = float(np.ptp(own.mean_vertices))
     assert np.abs(back.mean_vertices - own.mean_vertices).max() < 2e-6 * extent

@@ -166,7 +166,7 @@ def test_a_face_model_of_199_modes_is_known_to_be_for_research_only_and_says_so(
         tmp_path / "model2019_face12.h5", one, Truth(0 * one.mean, basis[:, ::2], one.variance[::2], one.faces)
     )
     for name in ("own.h5", "eos.bin"):
-        _, _, said = convert(tmp_path / "model2019_face12.h5", tmp_path / name, to=None, mm=None)
+        said = convert(tmp_path / "model2019_face12.h5", tmp_path / name).facts["notes"]
         assert any("Basel Face Model: non-commercial research only" in note for note in said)
     assert "research" in ShapeModel.load(tmp_path / "own.h5").licence
 

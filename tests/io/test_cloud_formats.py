@@ -139,7 +139,7 @@ def test_packed_scans_of_a_folder_are_taken(tmp_path: Path) -> None:
     (tmp_path / "notes.txt.gz").write_bytes(gzip.compress(b"a"))
     found = mesh_files([tmp_path])
     assert [path.name for path in found.files] == ["a.ply", "b.xyz.gz"] and not found.left_out
-    assert all(report["usable"] for report in check([tmp_path], recursive=False, say=print))
+    assert all(report["usable"] for report in check([tmp_path], recursive=False, say=print).facts)
 
 
 def test_a_packed_scan_goes_by_the_name_of_what_is_packed() -> None:

@@ -485,7 +485,7 @@ def test_check_goes_on_after_files_that_cannot_be_read(tmp_path: Path, monkeypat
 
     monkeypatch.setattr("shapespace.commands.look.read_mesh", short)
     said: list[str] = []
-    reports = check([tmp_path], recursive=False, say=said.append)
+    reports = check([tmp_path], recursive=False, say=said.append).facts
     assert [report["usable"] for report in reports] == [True, False, False, False, False, True]
     assert all(str(tmp_path) in report["error"] for report in reports[1:5])
     assert "not enough memory" in reports[3]["error"] and "compressed data" in reports[4]["error"]

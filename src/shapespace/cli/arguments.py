@@ -7,9 +7,11 @@ import difflib
 import itertools
 import textwrap
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 from shapespace.cli.command_table import COMMANDS, GROUPS, Command
+from shapespace.cli.dispatch import run_command
 from shapespace.cli.options import Container, Option, apply_settings
 from shapespace.version import __version__
 
@@ -92,7 +94,7 @@ class CommandParser(argparse.ArgumentParser):
         command = self._command
         if command is None or self.description is not None:
             return
-        self.set_defaults(run=command.run, command=command, **command.defaults)
+        self.set_defaults(run=partial(run_command, command.run), command=command, **command.defaults)
         more = sum(not option.basic for option in command.options)
         self.usage, self.description = command.usage, _sentence(command.summary)
         self.epilog = "example: " + "\n         ".join(command.examples)

@@ -5,28 +5,12 @@ An option with a source takes its help, type, choices and default from the field
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from shapespace.cli import run, values
-from shapespace.cli.answers import (
-    answer_align,
-    answer_asymmetry,
-    answer_change,
-    answer_cohort,
-    answer_compare,
-    answer_complete,
-    answer_figures,
-    answer_identify,
-    answer_morphospace,
-    answer_regress,
-    answer_score,
-    answer_shape_tests,
-    answer_verify,
-)
+from shapespace.cli import values
 from shapespace.cli.options import Option, Source, advanced, basic, setting
 from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS, ShapeTest
 
@@ -94,7 +78,7 @@ class Command:
         name: its words after `shapespace`.
         summary: what it does, without a capital and a full stop.
         examples: command lines.
-        run: takes the parsed arguments, and returns the exit code.
+        run: module and name of the function that runs it, as of `cli.dispatch.run_command`.
         arguments: Its arguments in the order of the help.
         details: paragraphs on what it reads and writes, for `--help-all` and the reference.
         json: whether it prints facts, with `--json`.
@@ -105,7 +89,7 @@ class Command:
     name: str
     summary: str
     examples: tuple[str, ...]
-    run: Callable[[argparse.Namespace], int]
+    run: str
     arguments: tuple[Option, ...] = ()
     details: tuple[str, ...] = ()
     json: bool = True
@@ -249,7 +233,7 @@ def _shape_test(test: ShapeTest) -> Command:
         for number, (field, metavar) in enumerate(test.options.items())
     )
     return Command(
-        f"test {test.name}", test.summary, (test.example,), answer_shape_tests,
+        f"test {test.name}", test.summary, (test.example,), "cli.answers:answer_shape_tests",
         (
             *_COHORT,
             *own,
@@ -264,7 +248,7 @@ COMMANDS: tuple[Command, ...] = (
     Command(
         "demo",
         "run both experiments of the paper on simulated faces, ending in a report", ("shapespace demo --quick",),
-        run.demo,
+        "commands.demo:demo",
         (
             basic("-o --output", "DIR", "output folder; results of an earlier demo in it are replaced",
                   default=Path("shapespace-demo"), parse=Path, dest="out"),
@@ -278,9 +262,11 @@ COMMANDS: tuple[Command, ...] = (
         ),
     ),
     Command("data list",
-            "list the open data sets: licence, citation, source, size, hash", ("shapespace data list",), run.data_list),
+            "list the open data sets: licence, citation, source, size, hash", ("shapespace data list",),
+            "commands.data:data_list"),
     Command(
-        "data get", "download, verify and convert an open data set", ("shapespace data get ict-facekit",), run.data_get,
+        "data get", "download, verify and convert an open data set", ("shapespace data get ict-facekit",),
+        "commands.data:data_get",
         (
             basic("name", "NAME", "name of the data set, as data list prints it"),
             basic("--to", "DIR", "also copy it to DIR/NAME", parse=Path),
@@ -288,7 +274,7 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command(
         "data faces", "write simulated corresponding faces (PLY) with labels.csv",
-        ("shapespace data faces -o faces --subjects 100 --expressions neutral",), run.data_faces,
+        ("shapespace data faces -o faces --subjects 100 --expressions neutral",), "commands.data:write_simulated_faces",
         (
             _OUTPUT,
             basic("--subjects", "N", source=FACES, parse=values.positive),
@@ -308,7 +294,7 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command(
         "data organs", "write simulated organs, smooth as spleens: raw surfaces (PLY), or label volumes",
-        ("shapespace data organs -o organs --count 40",), run.data_organs,
+        ("shapespace data organs -o organs --count 40",), "commands.data:write_simulated_organs",
         (
             _OUTPUT,
             basic("--count", "N", source=ORGANS, parse=values.positive),
@@ -319,7 +305,7 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command(
         "data bones", "write simulated bones of two groups: raw scans (PLY), and their table bones.csv",
-        ("shapespace data bones -o bones --count 16",), run.data_bones,
+        ("shapespace data bones -o bones --count 16",), "commands.data:write_simulated_bones",
         (
             _OUTPUT,
             basic("--count", "N", source=BONES, parse=values.positive),
@@ -333,7 +319,7 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command(
         "data landmarks", "write simulated landmarks of skulls (TPS, 2-D) of two species, and their table skulls.csv",
-        ("shapespace data landmarks -o skulls",), run.data_landmarks,
+        ("shapespace data landmarks -o skulls",), "commands.data:write_simulated_landmarks",
         (
             _OUTPUT,
             basic("--count", "N", source=SKULLS, parse=values.positive),
@@ -347,7 +333,7 @@ COMMANDS: tuple[Command, ...] = (
     Command(
         "surface", "extract surfaces of labels from label volumes (NIfTI, NRRD), as PLY in LPS mm",
         ("shapespace surface masks -o surfaces --label 1", "shapespace fit model.h5 surfaces -o out --unit mm"),
-        run.surface,
+        "commands.surface:write_surfaces",
         (
             basic("volumes", "MASK", "label volumes, or folders of them", nargs="+", parse=Path),
             basic("-o --output", "DIR", "output folder; each surface is NAME.ply", parse=Path, required=True),
@@ -367,7 +353,7 @@ COMMANDS: tuple[Command, ...] = (
         "check",
         "check meshes: contents, defects, and their repair before a fit",
         ("shapespace check scan.obj", "shapespace check left_bones -o mirrored --mirror --unit cm",
-         "shapespace check template.ply -o symmetric --symmetric"), run.check,
+         "shapespace check template.ply -o symmetric --symmetric"), "commands.look:check",
         (
             basic("files", "FILE", "mesh files, or folders of them", nargs="+", parse=Path),
             basic("-o --output", "DIR", "output folder for the repaired meshes in mm, as NAME.ply", parse=Path),
@@ -387,7 +373,7 @@ COMMANDS: tuple[Command, ...] = (
         "correspond", "bring raw scans into dense correspondence; no model is needed",
         ("shapespace correspond scans -o same", "shapespace build same -o model.h5",
          "shapespace correspond new_scans --add -o same"),
-        run.correspond,
+        "commands.correspond_choice:correspond",
         (
             basic("scans", "SCAN", "scans of one kind of object: files, folders, patterns, addresses or lists (.csv)",
                   nargs="*"),
@@ -437,7 +423,7 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command(
         "build", "build a shape model from corresponding meshes: Procrustes and PCA",
-        ("shapespace build faces/*.ply -o model.h5 --variance 0.98",), run.build,
+        ("shapespace build faces/*.ply -o model.h5 --variance 0.98",), "commands.build:build_from_files",
         (
             basic("meshes", "MESH", "mesh files, or folders of them", nargs="+", parse=Path),
             basic("-o --output", "MODEL.h5", "the model", parse=Path, required=True),
@@ -479,7 +465,7 @@ COMMANDS: tuple[Command, ...] = (
     Command(
         "quality", "measure a shape model: compactness, generalisation, specificity",
         ("shapespace quality faces -o quality",
-         "shapespace quality registered_a registered_b --scans scans -o quality"), run.quality,
+         "shapespace quality registered_a registered_b --scans scans -o quality"), "commands.quality:quality",
         (
             basic("targets", "TARGET", "a folder of meshes in correspondence or a model; two are compared", nargs="+",
                   parse=Path),
@@ -511,7 +497,7 @@ COMMANDS: tuple[Command, ...] = (
     Command(
         "info",
         "print facts of a model, a mesh, a fit, a store or a folder of correspond", ("shapespace info model.h5",),
-        run.info,
+        "commands.look:info",
         (basic("file",
                "FILE|DIR", "a model, a mesh, a record, a store, or a folder that correspond wrote", parse=Path),),
         (
@@ -524,7 +510,7 @@ COMMANDS: tuple[Command, ...] = (
     Command(
         "fit", "fit a model to raw scans: coefficients, pose and fitted surfaces",
         ("shapespace fit model.h5 scan.obj -o out", "shapespace fit model.h5 scans -o out --dense",
-         "shapespace build out/*.dense.ply -o new.h5"), run.fit,
+         "shapespace build out/*.dense.ply -o new.h5"), "commands.fit:fit",
         (
             basic("model", "MODEL.h5", "the shape model", parse=Path),
             basic("scans", "SCAN", "scans, folders, patterns, addresses such as s3://bucket/x, or lists of these",
@@ -574,7 +560,7 @@ COMMANDS: tuple[Command, ...] = (
         "complete", "complete partial scans: the missing part with its uncertainty, and samples of the whole shape",
         ("shapespace complete model.h5 broken.ply -o completed",
          "shapespace complete model.h5 scans -o completed --mirror combined --stl",
-         "shapespace compare completed '~ group' -o compared"), answer_complete,
+         "shapespace compare completed '~ group' -o compared"), "cli.answers:answer_complete",
         (
             basic("model", "MODEL.h5", "the shape model", parse=Path),
             basic("scans", "SCAN", "scans, folders, patterns, addresses such as s3://bucket/x, or lists of these",
@@ -602,7 +588,7 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command(
         "report", "write one HTML report of the fits, correspondence or study in a folder",
-        ("shapespace fit model.h5 scans -o out --stages", "shapespace report out"), run.report,
+        ("shapespace fit model.h5 scans -o out --stages", "shapespace report out"), "commands.answers:report",
         (
             basic("folder", "DIR", "written by shapespace fit, correspond, recognise study or demo", parse=Path),
             basic("-o --output", "FILE.html", "the report (default: DIR/report.html)", parse=Path),
@@ -616,7 +602,7 @@ COMMANDS: tuple[Command, ...] = (
     Command(
         "view", "view a shape model, fits, surfaces in correspondence or a project in the browser",
         ("shapespace view model.h5",),
-        run.view,
+        "cli.pages:view",
         (
             basic("path", "MODEL.h5|DIR", "a model, a folder that fit or correspond wrote, or a project of the studio",
                   parse=Path),
@@ -635,7 +621,7 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command(
         "studio", "do the whole work in the browser: scans, correspondence, model, fits, analyses",
-        ("shapespace studio teeth",), run.studio,
+        ("shapespace studio teeth",), "cli.pages:studio",
         (
             basic("project", "PROJECT", "folder of the project, created if it is new or empty (default: a page with "
                   "the projects that were opened last)", parse=Path, nargs="?"),
@@ -656,7 +642,7 @@ COMMANDS: tuple[Command, ...] = (
     Command(
         "landmarks transfer", "transfer landmarks from a few marked specimens to all scans in correspondence",
         ("shapespace correspond scans -o same", "shapespace landmarks transfer marked same -o landmarks"),
-        run.landmarks_transfer,
+        "commands.landmarks:transfer_landmarks",
         (_MARKED, _SAME, _OUTPUT, basic("--semilandmarks", "FILE.csv", source=LANDMARKS_TRANSFER, parse=Path)),
         (
             "Writes the landmarks of each scan, in its frame and unit: NAME.landmarks.csv (position, triangle with "
@@ -669,7 +655,7 @@ COMMANDS: tuple[Command, ...] = (
     Command(
         "landmarks convert", "convert landmarks of many specimens between TPS, NTS, MorphoJ, CSV, R and Slicer files",
         ("shapespace landmarks convert skulls.tps -o skulls.csv",
-         "shapespace landmarks convert plethodon.rda -o morphoj.txt"), run.landmarks_convert,
+         "shapespace landmarks convert plethodon.rda -o morphoj.txt"), "commands.landmark_data:convert_landmarks",
         (
             _LANDMARK_DATA,
             basic("-o --output", "OUT", "file; a folder for formats with a file for each specimen", parse=Path,
@@ -688,7 +674,7 @@ COMMANDS: tuple[Command, ...] = (
     Command(
         "landmarks check", "check landmark data, or compare landmarks of marked specimens with their prediction",
         ("shapespace landmarks check skulls.tps", "shapespace landmarks check marked same -o check.csv"),
-        run.landmarks_check,
+        "commands.landmark_data:check_landmarks",
         (
             basic("marked", "DATA", "file or folder with the landmarks of many specimens; with SAME, a folder of "
                   "landmark files with the names of the scans", parse=Path),
@@ -706,7 +692,8 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command(
         "landmarks plot", "draw landmarks of all specimens, superimposed around their mean",
-        ("shapespace landmarks plot skulls.tps -o skulls.pdf --links links.csv",), run.landmarks_plot,
+        ("shapespace landmarks plot skulls.tps -o skulls.pdf --links links.csv",),
+        "commands.landmark_data:plot_configurations",
         (
             _LANDMARK_DATA,
             basic("-o --output", "FILE", "figure: .svg, .pdf or .png", parse=Path, required=True),
@@ -717,7 +704,7 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command(
         "landmarks suggest", "name the specimens to mark next",
-        ("shapespace landmarks suggest same --marked marked",), run.landmarks_suggest,
+        ("shapespace landmarks suggest same --marked marked",), "commands.landmarks:suggest_specimens",
         (
             _SAME,
             basic("--marked", "DIR", source=LANDMARKS, parse=Path),
@@ -727,7 +714,7 @@ COMMANDS: tuple[Command, ...] = (
     Command(
         "align", "align landmarks by generalised Procrustes analysis, and name specimens to check",
         ("shapespace align skulls.tps --table skulls.csv -o aligned",
-         "shapespace compare aligned '~ sex' -o sex"), answer_align,
+         "shapespace compare aligned '~ sex' -o sex"), "cli.answers:answer_align",
         (
             basic("data", "DATA", "a landmark file (TPS, NTS, MorphoJ, CSV, .rda), or a folder of landmark files",
                   parse=Path),
@@ -762,7 +749,7 @@ COMMANDS: tuple[Command, ...] = (
         ("shapespace recognise train out --labels labels.csv -o expressions.skops",
          "shapespace recognise train out --labels labels.csv -o expressions.skops --relative --classifier "
          "mean-direction"),
-        run.recognise_train,
+        "commands.recognise:recognise_train",
         (
             _RESULTS,
             basic("--labels", "FILE", "table of scans and their labels (column label or expression), with the column "
@@ -783,7 +770,8 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command(
         "recognise predict", "classify fitted scans by a trained classifier, as a CSV table",
-        ("shapespace recognise predict expressions.skops out -o predictions.csv",), run.recognise_predict,
+        ("shapespace recognise predict expressions.skops out -o predictions.csv",),
+        "commands.recognise:recognise_predict",
         (
             basic("classifier", "FILE.skops", "the classifier", parse=Path),
             _RESULTS,
@@ -801,7 +789,7 @@ COMMANDS: tuple[Command, ...] = (
     Command(
         "recognise transfer", "transfer the expression of one person to another, from fits by an additive model",
         ("shapespace recognise transfer model.h5 out/anna.fit.json out/ben.fit.json -o anna.ply",),
-        run.recognise_transfer,
+        "commands.recognise:recognise_transfer",
         (
             basic("model", "MODEL.h5", "made by build --additive LABELS.csv", parse=Path),
             basic("person", "PERSON.fit.json", "fit of the person", parse=Path),
@@ -812,7 +800,7 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command(
         "recognise study", "measure recognition on unseen subjects, ending in a report",
-        ("shapespace recognise study --data BU-3DFE --model model.h5 -o study",), run.recognise_study,
+        ("shapespace recognise study --data BU-3DFE --model model.h5 -o study",), "commands.recognise:recognise_study",
         (
             basic("-o --output", "DIR", "output folder; an interrupted study is continued", parse=Path,
                   default=Path("shapespace-study")),
@@ -832,7 +820,7 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command(
         "recognise verify", "test whether two scans are of one subject: error rates, likelihood ratios",
-        ("shapespace recognise verify scans.csv -o verified --gallery session=1",), answer_verify,
+        ("shapespace recognise verify scans.csv -o verified --gallery session=1",), "cli.answers:answer_verify",
         (
             *_IDENTITY_OPTIONS,
             advanced("--curve", "K,K,...", source=IDENTITY, parse=values.mode_counts),
@@ -846,7 +834,8 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command(
         "recognise identify", "identify the subject of a scan among the enrolled ones: ranks and error rates",
-        ("shapespace recognise identify scans.csv -o identified --gallery expression=neutral",), answer_identify,
+        ("shapespace recognise identify scans.csv -o identified --gallery expression=neutral",),
+        "cli.answers:answer_identify",
         _IDENTITY_OPTIONS,
         (
             "Computes ranks (CMC), and the rate of misses if subjects who are not enrolled are searched for too.",
@@ -857,7 +846,7 @@ COMMANDS: tuple[Command, ...] = (
     Command(
         "cohort", "write a cohort file: shapes, table and settings, which all questions about shapes read",
         ("shapespace cohort people.csv --shapes same --gauge form -o bones.toml",
-         "shapespace compare bones.toml '~ sex' -o sex"), answer_cohort,
+         "shapespace compare bones.toml '~ sex' -o sex"), "cli.answers:answer_cohort",
         (
             _DATA,
             basic("-o --output", "FILE.toml", "the cohort file", parse=Path, required=True),
@@ -873,7 +862,7 @@ COMMANDS: tuple[Command, ...] = (
     Command(
         "figures", "draw the figures of an answer as files for a paper",
         ("shapespace figures sex --format svg,pdf", "shapespace figures sex --format png --dpi 600 --views dorsal"),
-        answer_figures,
+        "cli.answers:answer_figures",
         (
             basic("folder", "OUT", "written by compare or another question about shapes", parse=Path),
             basic("--format", "LIST", source=FIGURES, field="formats"),
@@ -885,7 +874,7 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command(
         "compare", "test effects of groups and covariates on shape by linear models",
-        ("shapespace compare people.csv '~ sex + age' -o sex-and-age",), answer_compare,
+        ("shapespace compare people.csv '~ sex + age' -o sex-and-age",), "cli.answers:answer_compare",
         (
             *_COHORT,
             basic("formula", "FORMULA", "linear model of shape, such as '~ sex + age'; size and log_size are available "
@@ -913,7 +902,7 @@ COMMANDS: tuple[Command, ...] = (
     Command(
         "morphospace", "draw shapes on axes of an ordination, and the shape at any place: PCA, CVA, phylogenetic axes",
         ("shapespace morphospace people.csv --group sex -o morphospace",
-         "shapespace morphospace species.tps --tree species.nwk -o phylomorphospace"), answer_morphospace,
+         "shapespace morphospace species.tps --tree species.nwk -o phylomorphospace"), "cli.answers:answer_morphospace",
         (
             *_COHORT,
             basic("--method", source=MORPHOSPACE),
@@ -931,7 +920,7 @@ COMMANDS: tuple[Command, ...] = (
     *(_shape_test(test) for test in SHAPE_TESTS),
     Command(
         "change", "measure change between visits of the same subjects, in mm, and its noise",
-        ("shapespace change visits.csv -o change --order before,after",), answer_change,
+        ("shapespace change visits.csv -o change --order before,after",), "cli.answers:answer_change",
         (
             *_COHORT,
             basic("--time", "COLUMN", source=CHANGE),
@@ -948,7 +937,7 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command(
         "asymmetry", "measure asymmetry: scores and maps, directional and fluctuating asymmetry",
-        ("shapespace asymmetry skulls.csv -o asymmetry --set surfaces=dense",), answer_asymmetry,
+        ("shapespace asymmetry skulls.csv -o asymmetry --set surfaces=dense",), "cli.answers:answer_asymmetry",
         (
             *_COHORT,
             basic("--reference", "COLUMN=VALUE", "group that scores are compared with (default: all)"),
@@ -966,7 +955,8 @@ COMMANDS: tuple[Command, ...] = (
     Command(
         "regress", "predict a number, such as age, from shape, or the mean shape along a number, with intervals",
         ("shapespace regress people.csv --target age -o age --predict new.csv",
-         "shapespace regress people.csv --along age --at 20,40,60 --covariates sex -o growth"), answer_regress,
+         "shapespace regress people.csv --along age --at 20,40,60 --covariates sex -o growth"),
+        "cli.answers:answer_regress",
         (
             *_COHORT,
             basic("--target", "COLUMN", source=REGRESS, either=_TARGET, required=True),
@@ -994,7 +984,7 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command(
         "score", "score new subjects against a reference population: distance, percentile, z-map",
-        ("shapespace score patients -o scored --reference controls.csv",), answer_score,
+        ("shapespace score patients -o scored --reference controls.csv",), "cli.answers:answer_score",
         (
             *_COHORT,
             basic("--reference", "DATA", "the population: a table, a cohort file, fits or landmarks; its doubtful fits "
@@ -1007,7 +997,7 @@ COMMANDS: tuple[Command, ...] = (
     Command(
         "export", "export fits as single files or one table, or any cohort to geomorph, MorphoJ, TPS or CSV",
         ("shapespace export out anna ben -o single", "shapespace export out --table fits.csv",
-         "shapespace export aligned --to geomorph --formula '~ sex' -o r"), run.export,
+         "shapespace export aligned --to geomorph --formula '~ sex' -o r"), "cli.export_choice:export",
         (
             basic("store", "DATA", "a folder that shapespace fit wrote; with --to, any data of compare", parse=Path),
             basic("names", "NAME", "names of the fits", nargs="*"),
@@ -1030,7 +1020,8 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command(
         "convert", "convert a shape model from or to the format of another tool",
-        ("shapespace convert femur.h5.json femur.h5", "shapespace convert model.h5 model.bin --to eos"), run.convert,
+        ("shapespace convert femur.h5.json femur.h5", "shapespace convert model.h5 model.bin --to eos"),
+        "commands.convert:convert",
         (
             basic("source", "IN", "a model in any format that can be read", parse=Path),
             basic("output", "OUT", "its extension sets the format; .h5 is the format of shapespace", parse=Path),
@@ -1041,7 +1032,8 @@ COMMANDS: tuple[Command, ...] = (
         ("Prints what was kept, changed and left out. Training shapes are always left out.",),
     ),
     Command(
-        "cache", "print the folder and size of the cache, or clear it", ("shapespace cache --clear",), run.cache,
+        "cache", "print the folder and size of the cache, or clear it", ("shapespace cache --clear",),
+        "commands.cache:cache",
         (basic("--clear", help="remove all entries; fits compute them again"),),
         (
             "The cache holds residual modes of the models that were fitted. SHAPESPACE_CACHE names another folder; "

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-import math
 import sys
-from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from typing import Any
+
+from shapespace.commands.outcome import Aside, Outcome, plain_value
 
 
 def say(sentence: str) -> None:
@@ -24,15 +24,6 @@ def show(line: str) -> None:
     print(_visible(line))
 
 
-def arrow() -> str:
-    """Return an arrow as the encoding of standard output allows it."""
-    try:
-        "\N{RIGHTWARDS ARROW}".encode(sys.stdout.encoding or "ascii")
-    except (UnicodeEncodeError, LookupError):
-        return "->"
-    return "\N{RIGHTWARDS ARROW}"
-
-
 def now(line: str) -> None:
     """Print a line at once, for a command that goes on."""
     show(line)
@@ -41,31 +32,25 @@ def now(line: str) -> None:
 
 def show_json(facts: Any) -> None:
     """Print facts as JSON; numbers that are not finite become null."""
-    print(json.dumps(_plain(facts), indent=1, allow_nan=False))
+    print(json.dumps(plain_value(facts), indent=1, allow_nan=False))
 
 
-def short(value: Any) -> str:
-    """Return a value in words that fit a line."""
-    plain = _plain(value)
-    if isinstance(plain, list):
-        items = cast(list[Any], plain)
-        items_text = ", ".join(short(item) for item in items[:8])
-        return f"[{items_text}{', ...' if len(items) > 8 else ''}]" + (f" ({len(items)})" if len(items) > 8 else "")
-    if isinstance(plain, dict):
-        return ", ".join(f"{key} {short(item)}" for key, item in cast(dict[str, Any], plain).items())
-    return f"{plain:.6g}" if isinstance(plain, float) else str(plain)
+def show_outcome(outcome: Outcome, *, as_json: bool) -> int:
+    """Print what a command did, open its page, and return its exit code."""
+    for note in outcome.notes:
+        say(note)
+    if as_json:
+        show_json(outcome.facts)
+    else:
+        for line in outcome.lines:
+            (say if isinstance(line, Aside) else show)(line)
+    for error in outcome.errors:
+        say(error)
+    if outcome.page is not None:
+        import webbrowser  # loads much
 
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in cast(Mapping[Any, Any], value).items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in cast(Sequence[Any], value)]
-    if hasattr(value, "tolist"):
-        return _plain(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value if isinstance(value, (str, int, float, type(None))) else str(value)
+        webbrowser.open(outcome.page.absolute().as_uri())
+    return outcome.exit_code
 
 
 def _visible(line: str) -> str:

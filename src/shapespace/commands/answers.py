@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from shapespace.batch.progress import progress, waiting
+from shapespace.commands.outcome import Outcome
 from shapespace.errors import ShapespaceError
 from shapespace.report.analyses.analysis_report import AnalysisReport
 
@@ -33,6 +34,19 @@ def save_report(report: AnalysisReport, output: Path, *, quiet: bool) -> tuple[P
     except ShapespaceError as error:
         return None, [*notes, str(error)]
     return write_report(output, None, model=None, labels=None, quiet=quiet), notes
+
+
+def report(
+    folder: Path, output: Path | None, *, model: Path | None, labels: Path | None, no_open: bool, quiet: bool
+) -> Outcome:
+    """Write the report on the results in `folder`, and open it.
+
+    Raises:
+        FileError, InputError, ShapespaceError: as for `write_report`.
+    """
+    page = write_report(folder, output, model=model, labels=labels, quiet=quiet)
+    facts = {"report": str(page), "bytes": page.stat().st_size}
+    return Outcome(facts, [f"The report is {page}"], page=None if no_open else page)
 
 
 def write_report(folder: Path, output: Path | None, *, model: Path | None, labels: Path | None, quiet: bool) -> Path:

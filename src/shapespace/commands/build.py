@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -16,8 +17,9 @@ from shapespace.batch.progress import progress, waiting
 from shapespace.batch.result_folder import RECORD
 from shapespace.cohort.labels import read_labels
 from shapespace.cohort.table import names_of_file
-from shapespace.commands.data import ABOUT, read_about
-from shapespace.commands.look import training_shapes_note
+from shapespace.commands.look import model_facts, training_shapes_note
+from shapespace.commands.outcome import Outcome
+from shapespace.datasets.about import ABOUT, read_about
 from shapespace.errors import InputError, MeshError, ShapespaceError
 from shapespace.geometry.landmark_placement import far_landmarks, landmarks_in_frame_of, place_landmarks
 from shapespace.geometry.normals import without_estimates
@@ -204,6 +206,46 @@ def build(
         notes.append(f"The shapes are kept in {shapes_folder(output)} ({size / 1e6:.1f} MB), for --add.")
     odd = [] if config.unit == "mm" else odd_size_notes(model.mean_vertices)
     return model, [*notes, *(note for note in model.notes if note not in odd), training_shapes_note(model)]
+
+
+def build_from_files(
+    meshes: Sequence[Path],
+    output: Path,
+    model: BuildConfig,
+    config: BuildFilesConfig,
+    *,
+    variance: float | None,
+    region: Sequence[tuple[str, Path]],
+    arguments: argparse.Namespace,
+    quiet: bool,
+) -> Outcome:
+    """Build a model from mesh files and save it.
+
+    Args:
+        meshes: files and folders.
+        output: the model file.
+        model: options of the model.
+        config: other options.
+        variance: share of the variance that determines the number of modes, or None.
+        region: names of regions and files of their vertices.
+        arguments: of the command line; they get `goes_on`, of the message after an interruption.
+        quiet: no progress.
+
+    Raises:
+        FileError, FileFormatError, MeshError, CorrespondenceError, InputError: as for `build`.
+    """
+    model = model if variance is None else replace(model, modes=variance)
+    config = replace(config, model=model, regions=dict(region))
+    if config.streams:
+        arguments.goes_on = "; the same command goes on from there"
+    built, notes = build(meshes, output, config, quiet=quiet)
+    facts = model_facts(built)
+    line = (
+        f"{output}: {facts['modes']} modes of {facts['vertices']} vertices from {facts['training_shapes']} meshes, "
+        f"{100 * facts['variance_held']:.2f} % of "
+        f"{'the variance of subjects left out' if built.held_out else 'their variance'}, gauge {facts['gauge']}"
+    )
+    return Outcome({"model": str(output), **facts}, [line], notes)
 
 
 def shapes_folder(model: Path) -> Path:

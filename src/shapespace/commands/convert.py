@@ -7,12 +7,14 @@ from pathlib import Path
 
 from shapespace.batch.progress import waiting
 from shapespace.commands.look import NOT_CALIBRATED
+from shapespace.commands.outcome import Outcome
 from shapespace.errors import InputError
 from shapespace.formats.model_parts import ModelFormat
 from shapespace.formats.registry import MODEL_FORMATS, format_to_write
 from shapespace.model.additive import AdditiveModel, load_model, model_of_foreign
 from shapespace.model.foreign import OWN_ENDINGS, is_foreign, load_foreign
 from shapespace.model.shape_model import ShapeModel
+from shapespace.types import MM_PER_UNIT
 
 OWN = ("shapespace", OWN_ENDINGS)
 
@@ -21,18 +23,18 @@ def convert(
     source: Path,
     output: Path,
     *,
-    to: str | None,
-    mm: float | None,
+    to: str | None = None,
+    unit: str | None = None,
     expressions: Path | None = None,
     quiet: bool = False,
-) -> tuple[str, str, list[str]]:
-    """Write the model in `source` to `output`; return the formats of both, and sentences on what became of it.
+) -> Outcome:
+    """Write the model in `source` to `output`, and say what became of it.
 
     Args:
         source: a model in any format that is read.
         output: its name tells the format, where `to` does not.
         to: format to write, by its name, if the extension of the output does not determine it.
-        mm: how many mm one unit of `source` is, where its format does not say; None for what the format says, or 1.
+        unit: unit of `source`, where its format does not say; None for what the format says, or mm.
         expressions: blendshapes that eos keeps in a file of their own.
         quiet: no progress.
 
@@ -40,7 +42,7 @@ def convert(
         FileError: `source` cannot be read, or `output` not written.
         InputError: an unknown format, one that is only read, or one that cannot hold the model.
     """
-    target = _target(output, to)
+    target, mm = _target(output, to), None if unit is None else MM_PER_UNIT[unit]
     if source.resolve() == output.resolve():
         raise InputError(f"{output} is the model itself; give another name to write to.")
     with waiting(f"reading {source.name}", quiet=quiet):
@@ -48,20 +50,23 @@ def convert(
         linear = model.as_linear()
     model, left_out = _without_training_shapes(model)
     notes += left_out
-    if target is None:
-        with waiting(f"writing {output.name}", quiet=quiet):
+    with waiting(f"writing {output.name}", quiet=quiet):
+        if target is None:
             model.save(output)
-    else:
-        with waiting(f"writing {output.name}", quiet=quiet):
+        else:
             notes += target.write(linear, output)
-        if regions := sorted((model if isinstance(model, ShapeModel) else model.shape).regions):
-            notes.append(
-                f"Left out: the region{'' if len(regions) == 1 else 's'} {', '.join(regions)}, which {target.title} "
-                "has no place for."
-            )
+    regions = sorted((model if isinstance(model, ShapeModel) else model.shape).regions)
+    if target is not None and regions:
+        notes.append(
+            f"Left out: the region{'' if len(regions) == 1 else 's'} {', '.join(regions)}, which {target.title} has no "
+            "place for."
+        )
     if "research" in linear.licence.lower() or "non-commercial" in linear.licence.lower():
         notes.append(f"The licence holds for the new file too: {linear.licence.rstrip('.')}.")
-    return of, OWN[0] if target is None else target.title, notes
+    into = OWN[0] if target is None else target.title
+    facts = {"source": of, "target": into, "output": str(output), "notes": notes}
+    lines = [f"{output} ({into}) holds the model of {source} ({of}).", *(f"  {note}" for note in notes)]
+    return Outcome(facts, lines)
 
 
 def _without_training_shapes(

@@ -19,8 +19,7 @@ from shapespace.batch.lock import only_writer
 from shapespace.batch.parallel_rounds import RoundRunner
 from shapespace.batch.progress import progress, telling_of_compiling, waiting
 from shapespace.batch.result_folder import names_for
-from shapespace.commands.inputs import given_scans, with_ids
-from shapespace.commands.landmark_files import LandmarkFiles
+from shapespace.commands.inputs import LandmarkFiles, given_scans, with_ids
 from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
 from shapespace.correspondence.first_template import first_template, usable_scan
 from shapespace.correspondence.groupwise import correspond

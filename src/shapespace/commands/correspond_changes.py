@@ -32,8 +32,7 @@ from shapespace.commands.correspond import (
     results_hash_of,
     with_scans,
 )
-from shapespace.commands.inputs import Given
-from shapespace.commands.landmark_files import LandmarkFiles
+from shapespace.commands.inputs import Given, LandmarkFiles
 from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
 from shapespace.correspondence.groupwise import FinishedCorrespondence, add_scans
 from shapespace.correspondence.scan_status import SurfaceMeasures

@@ -2,36 +2,47 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 from shapespace.batch.progress import progress, steps
+from shapespace.commands.outcome import Outcome
+from shapespace.datasets import face_files, fetch, ict
+from shapespace.datasets.about import write_about
+from shapespace.datasets.bones import write_bones
+from shapespace.datasets.faces import LICENSE
+from shapespace.datasets.organs import write_organs
+from shapespace.datasets.skull_landmarks import write_skull_landmarks
 from shapespace.errors import InputError
-from shapespace.io.containers.json_files import read_json
-from shapespace.io.files import make_folder, write_text
+from shapespace.io.files import make_folder
 
 
-def data_list() -> list[dict[str, object]]:
-    """Return the open data sets with licence, size, hash, and whether they are here already."""
-    from shapespace.datasets import fetch  # loads much, as the generators of faces do
+def data_list() -> Outcome:
+    """List the open data sets with licence, size, hash, and whether they are here already."""
+    rows = fetch.data_list()
+    lines = [f"{'  ' if number else ''}{key}: {row[key]}" for row in rows for number, key in enumerate(row)]
+    return Outcome(rows, lines)
 
-    return fetch.data_list()
 
-
-def data_get(name: str, to: Path | None, *, quiet: bool) -> Path:
-    """Return the folder of a data set, downloaded and verified if it is not here yet.
+def data_get(name: str, to: Path | None, *, quiet: bool) -> Outcome:
+    """Download and verify a data set that is not here yet.
 
     Raises:
         DataError: no such data set, no network, or content that does not match its hash.
     """
-    from shapespace.datasets import fetch
+    folder = str(fetch.data_get(name, to=to, progress=False if quiet else None))
+    return Outcome({"folder": folder}, [folder])
 
-    return fetch.data_get(name, to=to, progress=False if quiet else None)
+
+def _written(folder: Path, noun: str, count: int, provenance: str, licence: str = LICENSE) -> Outcome:
+    """Write what the simulated shapes in a folder are, and return how many there are."""
+    write_about(folder, provenance, licence)
+    line = f"{count} {noun}{'' if count == 1 else 's'} in {folder}"
+    return Outcome({"folder": str(folder), f"{noun}s": count}, [line])
 
 
 def write_simulated_faces(
-    folder: Path,
+    output: Path,
     *,
     source: str = "bundled",
     subjects: int = 100,
@@ -43,11 +54,11 @@ def write_simulated_faces(
     wide: bool = False,
     intensities: Sequence[float] = (1.0,),
     effect_mm: float | None = None,
-) -> int:
-    """Write corresponded faces of the bundled or of the ICT generator, or raw scans of them, and return how many.
+) -> Outcome:
+    """Write corresponded faces of the bundled or of the ICT generator, or raw scans of them.
 
     Args:
-        folder: output folder.
+        output: output folder.
         source: `bundled`, or `ict-facekit`, which must be downloaded already.
         subjects: number of people.
         expressions: names with commas between them: neutral, anger, disgust, fear, smile, sadness, surprise.
@@ -66,9 +77,6 @@ def write_simulated_faces(
         DataError: ICT-FaceKit is asked for and absent.
         FileError: the folder cannot be written.
     """
-    from shapespace.datasets import face_files, ict
-    from shapespace.datasets.faces import LICENSE
-
     if area not in (None, "face", "face_and_head"):
         raise InputError(f"The area must be face or face_and_head, not {area!r}.")
     if wide and source == "ict-facekit":
@@ -77,34 +85,33 @@ def write_simulated_faces(
         raise InputError("Expressions of ICT-FaceKit are written at full intensity; leave --intensity out.")
     if effect_mm is not None and source == "ict-facekit":
         raise InputError("Effects of sex are put in bundled people only; leave --effect out.")
-    make_folder(folder)
+    make_folder(output)
     total = subjects * len(expressions)
     with steps(total, "writing", "face", quiet=quiet) as step:
         if source == "ict-facekit":
             ict.write_people(
-                folder, subjects=subjects, seed=seed, area=area or "face", expressions=expressions, raw=raw,
+                output, subjects=subjects, seed=seed, area=area or "face", expressions=expressions, raw=raw,
                 progress=step,
             )  # fmt: skip
         else:
             face_files.write_faces(
-                folder, subjects=subjects, expressions=expressions, seed=seed, raw=raw, wide=wide,
+                output, subjects=subjects, expressions=expressions, seed=seed, raw=raw, wide=wide,
                 face_only=area == "face", intensities=intensities, effect_mm=effect_mm,
                 progress=step,
             )  # fmt: skip
     licence, of = ("MIT", f"ICT-FaceKit, area {area or 'face'}") if source == "ict-facekit" else (LICENSE, "shapespace")
     who = "people who vary widely" if wide else "people"
     description = f"{subjects} simulated {who} of {of}, seed {seed}, expressions: {', '.join(expressions)}"
-    write_about(folder, description, licence)
-    return total
+    return _written(output, "face", total, description, licence)
 
 
 def write_simulated_bones(
-    folder: Path, *, count: int = 16, seed: int = 0, effect_mm: float = 4.0, quiet: bool = False
-) -> None:
+    output: Path, *, count: int = 16, seed: int = 0, effect_mm: float = 4.0, quiet: bool = False
+) -> Outcome:
     """Write raw scans of simulated bones of two groups, and their table.
 
     Args:
-        folder: output folder.
+        output: output folder.
         count: number of bones; the groups alternate.
         seed: random seed; bone k of a seed is the same for every count.
         effect_mm: difference of the snout length between the two groups in mm, at most 10.
@@ -114,23 +121,16 @@ def write_simulated_bones(
         InputError: a count or an effect out of range.
         FileError: the folder cannot be written.
     """
-    from shapespace.datasets.bones import write_bones
-    from shapespace.datasets.faces import LICENSE
-
     with progress(count, "writing", "bone", quiet=quiet) as bar:
-
-        def one_more() -> None:
-            bar.update()
-
-        write_bones(folder, count=count, seed=seed, effect_mm=effect_mm, progress=one_more)
-    write_about(folder, f"{count} simulated bones of shapespace in two groups, seed {seed}", LICENSE)
+        write_bones(output, count=count, seed=seed, effect_mm=effect_mm, progress=bar.update)
+    return _written(output, "bone", count, f"{count} simulated bones of shapespace in two groups, seed {seed}")
 
 
-def write_simulated_landmarks(folder: Path, *, count: int = 40, seed: int = 0) -> None:
+def write_simulated_landmarks(output: Path, *, count: int = 40, seed: int = 0) -> Outcome:
     """Write simulated landmarks of skulls of two species at two sites (TPS, 2-D), and their table.
 
     Args:
-        folder: output folder.
+        output: output folder.
         count: number of skulls; species and sites alternate.
         seed: random seed; skull k of a seed is the same for every count.
 
@@ -138,20 +138,17 @@ def write_simulated_landmarks(folder: Path, *, count: int = 40, seed: int = 0) -
         InputError: a count out of range.
         FileError: the folder cannot be written.
     """
-    from shapespace.datasets.faces import LICENSE
-    from shapespace.datasets.skull_landmarks import write_skull_landmarks
-
-    write_skull_landmarks(folder, count=count, seed=seed)
-    write_about(folder, f"landmarks of {count} simulated skulls of shapespace, seed {seed}", LICENSE)
+    write_skull_landmarks(output, count=count, seed=seed)
+    return _written(output, "skull", count, f"landmarks of {count} simulated skulls of shapespace, seed {seed}")
 
 
 def write_simulated_organs(
-    folder: Path, *, count: int = 40, seed: int = 0, volumes: bool = False, quiet: bool = False
-) -> None:
+    output: Path, *, count: int = 40, seed: int = 0, volumes: bool = False, quiet: bool = False
+) -> Outcome:
     """Write raw surfaces, or label volumes, of simulated organs.
 
     Args:
-        folder: output folder.
+        output: output folder.
         count: number of organs.
         seed: random seed; organ k of a seed is the same for every count.
         volumes: write label volumes (NIfTI) of the same organs instead; needs the extra `volumes`.
@@ -162,37 +159,6 @@ def write_simulated_organs(
         ShapespaceError: volumes, without the extra `volumes`.
         FileError: the folder cannot be written.
     """
-    from shapespace.datasets.faces import LICENSE
-    from shapespace.datasets.organs import write_organs
-
     with progress(count, "writing", "organ", quiet=quiet) as bar:
-
-        def one_more() -> None:
-            bar.update()
-
-        write_organs(folder, count=count, seed=seed, volumes=volumes, progress=one_more)
-    write_about(folder, f"{count} simulated organs of shapespace, seed {seed}", LICENSE)
-
-
-ABOUT = "about.json"
-
-
-def write_about(folder: Path, provenance: str, licence: str) -> None:
-    """Write what the meshes in `folder` are.
-
-    Raises:
-        FileError: it cannot be written.
-    """
-    write_text(folder / ABOUT, json.dumps({"provenance": provenance, "licence": licence}, indent=1) + "\n")
-
-
-def read_about(folder: Path) -> tuple[str, str] | None:
-    """Return the provenance and licence of the meshes in `folder`, or None if no file states them."""
-    path = folder / ABOUT
-    if not path.is_file():
-        return None
-    try:
-        stored = read_json(path, "make the faces again")
-        return str(stored["provenance"]), str(stored["licence"])
-    except (ValueError, KeyError, TypeError):
-        return None
+        write_organs(output, count=count, seed=seed, volumes=volumes, progress=bar.update)
+    return _written(output, "organ", count, f"{count} simulated organs of shapespace, seed {seed}")

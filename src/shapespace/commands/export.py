@@ -15,6 +15,7 @@ import numpy.typing as npt
 from shapespace.batch.progress import progress
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.table import numbers_as_text
+from shapespace.commands.outcome import Outcome, exit_code_of
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.io.files import atomic_path, make_folder, write_bytes, write_error, write_text
 from shapespace.io.landmarks.configuration_io import CONFIGURATION_FORMATS, write_configurations
@@ -44,8 +45,8 @@ def export(
     table: Path | None,
     quiet: bool,
     say: Callable[[str], None],
-) -> tuple[list[str], list[str]]:
-    """Write fits of a folder as the single files that `fit` writes; return the names written, and those that failed.
+) -> Outcome:
+    """Write fits of a folder as the single files that `fit` writes.
 
     Records and landmarks are the same to the byte, surfaces to a 16-millionth of their half extent (float32).
 
@@ -83,24 +84,23 @@ def export(
                 say(str(error))
             bar.update()
     if table is not None:
-        if table.suffix.lower() == ".mat":
-            write_mat(results, table)
-        else:
-            write_table(results, table)
+        (write_mat if table.suffix.lower() == ".mat" else write_table)(results, table)
     for problem in results.problems:
         say(problem)
-    return [name for name in wanted if name not in failed], failed
+    written, table_name = len(wanted) - len(failed), None if table is None else str(table)
+    facts = {"folder": str(output), "written": written, "failed": failed, "table": table_name}
+    lines = [f"{written} {'fit' if written == 1 else 'fits'} in {output}"] if written else []
+    lines += [] if table is None else [f"The table is {table}"]
+    return Outcome(facts, lines, exit_code=exit_code_of(len(failed), len(wanted)))
 
 
 def _write(results: Results, name: str, output: Path) -> None:
     # The record comes last, as in a fit: what lies there with a record is whole.
     for kind, ending in ENDINGS.items():
-        if not results.has(name, kind):
-            continue
         path = output / f"{name}{ending}"
-        if kind == "stages":
+        if kind == "stages" and results.has(name, kind):
             write_bytes(path, results.stages(name))
-        else:
+        elif results.has(name, kind):
             write_mesh(path, results.surface(name, kind))
     # No table of a store has the landmarks in columns; the record has them, and their files are made of it again.
     if landmarks := results.fit(name).found_landmarks:
@@ -184,8 +184,8 @@ def _rows(results: Results, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
             yield dict(zip(asked, values, strict=True))
 
 
-def export_cohort(cohort: Cohort, output: Path, to: Target, formula: str | None = None) -> tuple[list[Path], list[str]]:
-    """Write the aligned coordinates of a cohort, its table and sizes; return the files, and sentences on the contents.
+def export_cohort(cohort: Cohort, output: Path, to: Target, formula: str | None = None) -> Outcome:
+    """Write the aligned coordinates of a cohort, its table and sizes.
 
     `geomorph` is a folder with coordinates, covariates, and a script in R of the linear model `formula`.
 
@@ -199,7 +199,7 @@ def export_cohort(cohort: Cohort, output: Path, to: Target, formula: str | None 
         InputError: a formula that cannot be read, or missing values in its columns.
         FileError: something cannot be written.
     """
-    notes: list[str] = []
+    given, notes = cohort, list[str]()
     if formula is not None:
         cohort = complete_cohort(cohort, (formula,), (), drop_missing=False)
         notes += cohort.cautions
@@ -213,7 +213,7 @@ def export_cohort(cohort: Cohort, output: Path, to: Target, formula: str | None 
         ending = CONFIGURATION_FORMATS[to]
         if output.suffix.lower() != ending:
             output = make_folder(output) / f"landmarks{ending}"
-        return [output], [*notes, *write_configurations(output, configurations, to)]
+        return _exported(given, [output], [*notes, *write_configurations(output, configurations, to)])
     make_folder(output)
     write_configurations(output / COORDINATES, replace(configurations, columns={}), "csv")
     table = zip(cohort.names, *columns.values(), strict=True)
@@ -222,7 +222,13 @@ def export_cohort(cohort: Cohort, output: Path, to: Target, formula: str | None 
     write_text(output / R_SCRIPT, _R.replace("@FORMULA", model).replace("@K", str(cohort.dimensions)))
     if cohort.position_std is not None:
         notes.append("The script gives all vertices the same weight, as compare does with --set weights=none.")
-    return [output / name for name in (COORDINATES, COVARIATES, R_SCRIPT)], notes
+    return _exported(given, [output / name for name in (COORDINATES, COVARIATES, R_SCRIPT)], notes)
+
+
+def _exported(cohort: Cohort, files: Sequence[Path], notes: Sequence[str]) -> Outcome:
+    facts = {"files": [str(file) for file in files], "shapes": len(cohort), "notes": notes}
+    lines = [f"{len(cohort)} shapes in {', '.join(map(str, files))}"]
+    return Outcome(facts, lines, [*cohort.notes, *notes])
 
 
 _R = """\

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -19,71 +21,67 @@ from shapespace.batch.progress import progress, telling_of_compiling
 from shapespace.batch.result_folder import RECORD
 from shapespace.batch.run import BatchConfig, Plan, fit_many, make_jobs
 from shapespace.batch.sinks import STORE_FROM, FolderSink, StoreSink
-from shapespace.commands.inputs import Given, given_scans, with_ids
-from shapespace.commands.landmark_files import LandmarkFiles
+from shapespace.commands.inputs import Given, LandmarkFiles, given_scans, is_of_fit, with_ids
+from shapespace.commands.outcome import LISTED, Outcome, exit_code_of, first_lines
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.fit.fit_scan import FitConfig
 from shapespace.fit.iteration_state import IcpState
+from shapespace.fit.method_choices import method_named
 from shapespace.geometry.doctor import NON_FINITE
 from shapespace.io.files import make_folder, read_bytes, remove_file, write_bytes, write_text
 from shapespace.io.landmarks.fiducials import FIDUCIAL_ENDINGS
-from shapespace.io.meshes.mesh_io import probe_mesh, read_mesh
+from shapespace.io.meshes.mesh_io import probe_mesh, read_mesh, stem_of
+from shapespace.io.meshes.region_files import read_region
 from shapespace.io.remote import is_address
 from shapespace.io.tables.table_io import table_rows, table_text
 from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import first_names
-from shapespace.schemas import FitRecord
+from shapespace.schemas import FitRecord, OverlapDistances
 from shapespace.store.manifest import read_manifest
 
 FULL_CHECK_BYTES = 2**28
 """Scans of so many bytes together are read whole before the first fit (256 MiB: 0.4 s of binary PLY, 14 s of OBJ)."""
-_LISTED = 10  # names in a message, so that it stays readable
 _STATUSES = ("converged", "max_iterations", "doubtful", "failed")
 _SURFACES = (".fitted.ply", ".dense.ply")
 
 
-@dataclass(frozen=True)
-class BatchSettings:
-    """How many scans are fitted.
+def fit(
+    model: Path,
+    scans: Sequence[str | Path],
+    output: Path,
+    config: FitConfig,
+    execution: ExecutionConfig,
+    *,
+    method: str,
+    search: str,
+    region: str | None,
+    landmarks: Path | None,
+    again: bool,
+    stages: bool,
+    recursive: bool,
+    store: bool,
+    strict: bool,
+    quiet: bool,
+    say: Callable[[str], None],
+) -> Outcome:
+    """Fit scans into a folder; of a store, only counts are returned.
 
     Args:
-        config: settings of each fit.
+        model: the model's file.
+        scans: files, folders, patterns, addresses and lists, as `given_scans` takes them.
+        output: where results go.
+        config: settings of each fit, except method and region.
+        execution: Executor of the fits.
+        method: name of the method.
+        search: closest points of the method paper; `auto` for the default of the method.
+        region: name of a region of the model, or file of its vertices; None for the whole model.
         landmarks: a file of the one scan there is, or a folder with a file for each, named as the scans; None where
             there are none, or a list of scans names them.
-        execution: Executor of the fits.
         again: fit also scans whose results still hold.
         stages: also write the surfaces at each stage.
         recursive: take scans in folders below those given too.
         store: keep results in a store, as is done from `STORE_FROM` scans on, and where there is one.
-    """
-
-    config: FitConfig = field(default_factory=FitConfig)
-    landmarks: Path | None = None
-    execution: ExecutionConfig = field(default_factory=ExecutionConfig)
-    again: bool = False
-    stages: bool = False
-    recursive: bool = False
-    store: bool = False
-
-
-def fit_scans(
-    model_path: Path,
-    scans: Sequence[str | Path],
-    folder: Path,
-    settings: BatchSettings,
-    *,
-    quiet: bool,
-    say: Callable[[str], None],
-) -> tuple[dict[str, int], dict[str, FitRecord]]:
-    """Fit scans into `folder`; return how many have which status, and NAME -> record of each, in order.
-
-    Of a store there are the counts alone.
-
-    Args:
-        model_path: the model's file.
-        scans: files, folders, patterns, addresses and lists, as `given_scans` takes them.
-        folder: where results go.
-        settings: how.
+        strict: whether a doubtful fit makes the exit code 1.
         quiet: no progress.
         say: called with what was not taken, and of each scan whose fit did not converge.
 
@@ -91,33 +89,97 @@ def fit_scans(
         FileError: the model cannot be read, or the results not written.
         InputError: one file of landmarks for more than one scan, landmarks of no scan, or no scans.
     """
-    given = _scans(scans, folder, recursive=settings.recursive, say=say)
-    one, many = landmark_files(settings.landmarks, len(given))
-    model = ShapeModel.load(model_path)
-    make_folder(folder)
-    write_bytes(folder / ".writable", b"")
-    remove_file(folder / ".writable")
-    work = list({job.name: job for job in scan_jobs(given, one, many, folder)}.values())
+    config = replace(
+        config,
+        method=method_named(method, **({} if search == "auto" else {"search": search})),
+        region=read_region(region) if region is not None and Path(region).is_file() else region,
+    )
+    given = _scans(scans, output, recursive=recursive, say=say)
+    one, many = landmark_files(landmarks, len(given))
+    loaded = ShapeModel.load(model)
+    make_folder(output)
+    write_bytes(output / ".writable", b"")
+    remove_file(output / ".writable")
+    work = list({job.name: job for job in scan_jobs(given, one, many, output)}.values())
     many.report_unused(say)
     if len(work) < len(given):
         say(f"Scans given more than once are fitted once: {len(work)} of {len(given)}.")
-    stored = settings.store or len(work) >= STORE_FROM or read_manifest(folder) is not None
-    if stored and not settings.store:
-        say(f"Results are kept in a store ({folder}); shapespace export gives single files back.")
+    stored = store or len(work) >= STORE_FROM or read_manifest(output) is not None
+    if stored and not store:
+        say(f"Results are kept in a store ({output}); shapespace export gives single files back.")
     first = find_suspects(work, quiet=quiet)
-    config = BatchConfig(model, model_path, settings.config, settings.stages, not settings.again, first)
-    executor = settings.execution.executor(len(work), quiet=quiet)
-    sink = StoreSink(folder) if stored else FolderSink(folder)
+    batch = BatchConfig(loaded, model, config, stages, not again, first)
+    executor = execution.executor(len(work), quiet=quiet)
+    sink = StoreSink(output) if stored else FolderSink(output)
     with (
         progress(len(work), "fitting", "scan", quiet=quiet) as bar,
         telling_of_compiling(quiet=quiet or not isinstance(executor, Serial)),
     ):
         watch = _Watch(bar, say)
-        counts = fit_many(work, config, executor, sink, on_plan=watch.plan, on_done=watch.done, on_state=watch.state)
+        done = fit_many(work, batch, executor, sink, on_plan=watch.plan, on_done=watch.done, on_state=watch.state)
         if len(work) > 1 or stored:
             watch.say_removed()
-    _write_list(folder, work)
-    return dict.fromkeys(_STATUSES, 0) | counts, {job.name: sink.records[job.name] for job in work if sink.records}
+    _write_list(output, work)
+    counts = dict.fromkeys(_STATUSES, 0) | done
+    records = {job.name: sink.records[job.name] for job in work if sink.records}
+    contents = [
+        {"name": name, **{key: value for key, value in record.to_json().items() if key != "history"}}
+        for name, record in records.items()
+    ]
+    every, failed = sum(counts.values()), counts["failed"]
+    return Outcome(
+        {"folder": str(output), "scans": every, **counts, "records": contents},
+        _lines(records, counts, output) if failed < every else (),
+        exit_code=exit_code_of(failed, every) or int(strict and counts["doubtful"] > 0),
+    )
+
+
+def _lines(records: Mapping[str, FitRecord], counts: Mapping[str, int], folder: Path) -> list[str]:
+    fitted = [(name, record) for name, record in records.items() if record.is_fitted]
+    noun = "scan" if len(fitted) == LISTED + 1 else "scans"
+    lines = first_lines(fitted, _fit_lines, f"more {noun}; all are in {folder / 'coefficients.csv'}")
+    every = sum(counts.values())
+    statuses = ", ".join(f"{count} {status}" for status, count in counts.items() if count)
+    return [*lines, f"{every} {'scan' if every == 1 else 'scans'}: {statuses}; results in {folder}"]
+
+
+def _fit_lines(named: tuple[str, FitRecord]) -> list[str]:
+    name, record = named
+    file = record.scan.name
+    # A scan that shares its file's name with others goes by the name of its results.
+    called = file if stem_of(file) == name else f"{name} ({file})"
+    distances, dense = _distances(record.shown), _distances(record.shown_dense, measure="median")
+    return [
+        f"{called}: {record.status}" + (f": {distances}" if distances else ""),
+        *([f"  dense surface: {dense}"] if dense else []),
+        *(f"  {note}" for note in record.notes),
+    ]
+
+
+def _distances(overlap: OverlapDistances | None, measure: str = "mean") -> str:
+    """Return the overlap distances as text; empty if the record has none."""
+    if overlap is None:
+        return ""
+    distances = [getattr(way, measure) for way in (overlap.model_to_scan, overlap.scan_to_model)]
+    if any(value is None or not math.isfinite(value) for value in distances):
+        return "scan and model do not overlap"
+    shares = [
+        f"{100 * (share or 0.0):.0f} % overlap" for share in (overlap.model_seen_share, overlap.scan_covered_share)
+    ]
+    to = _arrow()
+    return (
+        f"{measure} distance model{to}scan {distances[0]:.2f} mm ({shares[0]}), "
+        f"scan{to}model {distances[1]:.2f} mm ({shares[1]})"
+    )
+
+
+def _arrow() -> str:
+    """Return an arrow as the encoding of standard output allows it."""
+    try:
+        "\N{RIGHTWARDS ARROW}".encode(sys.stdout.encoding or "ascii")
+    except (UnicodeEncodeError, LookupError):
+        return "->"
+    return "\N{RIGHTWARDS ARROW}"
 
 
 def _write_list(folder: Path, jobs: Sequence[Job]) -> None:
@@ -157,7 +219,7 @@ class _Watch:
 
     def say_removed(self) -> None:
         if self.removed:
-            named = first_names(self.removed, _LISTED)
+            named = first_names(self.removed, LISTED)
             count_text = "1 scan has" if len(self.removed) == 1 else f"{len(self.removed)} scans have"
             self.say(
                 f"{count_text} vertices with {NON_FINITE}, which were removed with their triangles ({named}); --strict "
@@ -240,14 +302,10 @@ def scan_jobs(given: Sequence[Given], landmarks: Path | None, many: LandmarkFile
         for job, one in zip(made, given, strict=True)
     ]
     for job in jobs:
-        _refuse_to_overwrite(job, folder)
+        written = {(folder / f"{job.name}{ending}").resolve() for ending in FIDUCIAL_ENDINGS}
+        if job.landmarks is not None and job.landmarks.resolve() in written:
+            raise InputError(f"{job.landmarks} would be overwritten by the landmarks of the fit; rename it.")
     return jobs
-
-
-def _refuse_to_overwrite(job: Job, folder: Path) -> None:
-    written = {(folder / f"{job.name}{ending}").resolve() for ending in FIDUCIAL_ENDINGS}
-    if job.landmarks is not None and job.landmarks.resolve() in written:
-        raise InputError(f"{job.landmarks} would be overwritten by the landmarks of the fit; rename it.")
 
 
 def _scans(scans: Sequence[str | Path], folder: Path, *, recursive: bool, say: Callable[[str], None]) -> list[Given]:
@@ -257,10 +315,7 @@ def _scans(scans: Sequence[str | Path], folder: Path, *, recursive: bool, say: C
     given = {Path(one).resolve() for one in scans if not is_address(str(one))}
 
     def is_result(scan: Path | str) -> bool:
-        if isinstance(scan, str):
-            return False
-        name = next((scan.name.removesuffix(ending) for ending in _SURFACES if scan.name.endswith(ending)), None)
-        if name is None or not scan.with_name(f"{name}{RECORD}").is_file():
+        if isinstance(scan, str) or not is_of_fit(scan, _SURFACES):
             return False
         return scan.parent.resolve() == here or not {scan.resolve(), scan.parent.resolve()} & given
 

@@ -1,4 +1,4 @@
-"""The scans that a command is given: files, folders, patterns, addresses, and lists of any of these."""
+"""What a command is given: scans in files, folders, patterns, addresses and lists, and landmarks named as the scans."""
 
 from __future__ import annotations
 
@@ -9,20 +9,26 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from shapespace.batch.fit_work import Job
+from shapespace.batch.result_folder import RECORD
 from shapespace.cohort.table import fold_name, refuse_repeated
 from shapespace.errors import FileError, InputError, ShapespaceError
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import read_bytes
+from shapespace.io.landmarks.fiducials import FIDUCIAL_ENDINGS
+from shapespace.io.landmarks.landmark_io import LANDMARK_FORMATS, READ_ONLY_LANDMARKS, read_landmarks
 from shapespace.io.meshes.mesh_folders import mesh_files
 from shapespace.io.meshes.mesh_io import MESH_FILE_ENDINGS, stem_of
 from shapespace.io.remote import addresses, is_address
 from shapespace.io.tables.table_io import decoded_text, key_column, table_rows
+from shapespace.reprs import first_names
+from shapespace.types import Mesh
 
 _LISTS = (".csv", ".tsv", ".txt", ".xlsx")
 _PLACES = ("scan", "file", "path", "specimen", "name", "id")
 _LANDMARKS, _ID = "landmarks", "id"
 _LARGEST_BYTES = 2**26
 """Largest size of a list of scans in bytes; a million rows need less."""
+_FILES_LISTED = 5  # names of files in a message, so that it stays short
 _LONGEST = 200  # bytes of an id; file systems allow 255, and endings follow it
 
 
@@ -200,3 +206,103 @@ def _refuse_doubles(scans: Sequence[Given]) -> None:
     for one in scans:
         if one.called and named.setdefault(one.called.casefold(), one).source != one.source:
             raise InputError(f"Two scans have the id {one.called}; give each one of its own.")
+
+
+def is_of_fit(file: Path, endings: Sequence[str]) -> bool:
+    """Return whether a fit wrote `file`, which has one of `endings`, beside its record."""
+    names = [file.name.removesuffix(ending) for ending in endings if file.name.endswith(ending)]
+    return any(file.with_name(f"{name}{RECORD}").is_file() for name in names)
+
+
+@dataclass(frozen=True)
+class LandmarkFiles:
+    """The landmark files of a folder.
+
+    Args:
+        folder: where they are; None where there are none.
+        files: name of a scan without its ending -> file.
+        used: names that a scan had.
+        unread: what is to be said of files that cannot be used.
+        duplicates: name of a scan -> further files with its landmarks.
+    """
+
+    folder: Path | None
+    files: dict[str, Path] = field(default_factory=dict[str, Path])
+    used: set[str] = field(default_factory=set[str])
+    unread: list[str] = field(default_factory=list[str])
+    duplicates: dict[str, list[Path]] = field(default_factory=dict[str, list[Path]])
+
+    @staticmethod
+    def of(folder: Path | None) -> LandmarkFiles:
+        """Return the landmark files in `folder`.
+
+        Raises:
+            FileError: it is no folder, or holds no such file.
+        """
+        if folder is None:
+            return LandmarkFiles(None)
+        if not folder.is_dir():
+            raise FileError(f"{folder} is no folder; give one with landmarks in files named as the scans.")
+        endings = sorted([*LANDMARK_FORMATS, *READ_ONLY_LANDMARKS], key=len, reverse=True)
+        files: dict[str, Path] = {}
+        unread: list[str] = []
+        duplicates: dict[str, list[Path]] = {}
+        for file in sorted(folder.iterdir()):
+            ending = next((one for one in endings if file.name.lower().endswith(one)), None)
+            if ending is None or not file.is_file() or is_of_fit(file, FIDUCIAL_ENDINGS):
+                continue
+            first = files.setdefault(file.name[: -len(ending)], file)
+            if first is not file:
+                duplicates.setdefault(file.name[: -len(ending)], []).append(file)
+                unread.append(f"{file.name} is not read, since {first.name} has landmarks of the same scan.")
+        if not files:
+            raise FileError(f"{folder} holds no landmarks; they are read from files with {', '.join(endings)}.")
+        return LandmarkFiles(folder, files, unread=unread, duplicates=duplicates)
+
+    def refuse_shared(self, scans: Sequence[Path]) -> None:
+        """Raise InputError where two of `scans`, of one name in different folders, would take the same landmarks."""
+        owner: dict[str, Path] = {}
+        for path in scans:
+            name = stem_of(path)
+            if name in self.files and owner.setdefault(name, path) != path:
+                raise InputError(
+                    f"{owner[name]} and {path} would both take the landmarks in {self.files[name]}; rename one of the "
+                    "scans."
+                )
+
+    def of_scan(self, scan: Path) -> Path | None:
+        """Return the file with the landmarks of `scan`, None where there is none."""
+        file = self.files.get(stem_of(scan))
+        if file is not None:
+            self.used.add(stem_of(scan))
+        return file
+
+    def onto(self, mesh: Mesh, path: Path, own: Path | None = None) -> Mesh:
+        """Return `mesh`, read from `path`, with the landmarks in the file `own`, or those of the folder for it."""
+        file = own or self.of_scan(path)
+        if file is None:
+            return mesh
+        try:
+            return replace(mesh, landmarks=read_landmarks(file))
+        except ShapespaceError as error:
+            self.unread.append(f"{path.name} goes without landmarks: {error}")
+            return mesh
+
+    def report_unused(self, say: Callable[[str], None]) -> None:
+        """Print which files belong to no scan.
+
+        Raises:
+            InputError: all files belong to none.
+        """
+        if self.folder is None:
+            return
+        if not self.used:
+            names = ", ".join(file.name for file in list(self.files.values())[:_FILES_LISTED])
+            raise InputError(
+                f"No file of landmarks in {self.folder} ({names}) is named as one of the scans; name them alike, "
+                "such as anna.ply and anna.csv."
+            )
+        for sentence in self.unread:
+            say(sentence)
+        if left := sorted(set(self.files) - self.used):
+            say(f"{len(left)} files of landmarks belong to no scan that is given: {first_names(left, _FILES_LISTED)}.")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,20 +11,24 @@ import numpy as np
 from msgspec import structs
 
 from shapespace.cohort.orientation import find_orientation, read_links
+from shapespace.commands.outcome import Aside, Outcome, short
 from shapespace.errors import InputError
 from shapespace.geometry.landmark_alignment import align_landmarks, find_outliers
 from shapespace.io.files import write_text
 from shapespace.io.landmarks.configuration_io import read_configurations, slider_texts, write_configurations
 from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations
 from shapespace.lazy import require_package
+from shapespace.report.blocks.wording import counted
 from shapespace.schemas import Orientation
 
+_LONGEST = 400
+"""Characters of a line on landmark data."""
 _OTHER_SCALE = 4.0
 """Ratio to the median size of a specimen in another unit: units differ by 10 or more, individuals by less than 2."""
 
 
 def convert_landmarks(
-    source: Path,
+    data: Path,
     output: Path,
     *,
     to: str | None = None,
@@ -32,13 +36,13 @@ def convert_landmarks(
     object_name: str | None = None,
     curve_points: int | None = None,
     dimensions: int | None = None,
-) -> tuple[LandmarkConfigurations, tuple[str, ...]]:
-    """Write the landmarks of many specimens in another format; return them, and sentences on what changed.
+) -> Outcome:
+    """Write the landmarks of many specimens in another format, and say what changed.
 
     Sliders are written next to the output as OUT.curveslide.csv and OUT.surfslide.csv.
 
     Args:
-        source: file or folder with landmarks.
+        data: file or folder with landmarks.
         output: file, or folder for formats with a file for each specimen.
         to: format: tps, nts, morphoj, csv (a row for each specimen), long (a row for each landmark), or a folder of
             mrk.json or fcsv (default: by the ending of OUT)
@@ -51,32 +55,51 @@ def convert_landmarks(
         FileError: something cannot be read or written.
         InputError: an unknown format, or one that cannot hold the landmarks.
     """
-    if source.resolve() == output.resolve():
+    if data.resolve() == output.resolve():
         raise InputError(f"{output} is the file to convert; give another name to write to.")
-    raw = read_configurations(
-        source, name=object_name, sliders=sliders, curve_points=curve_points, dimensions=dimensions
-    )
+    raw = read_configurations(data, name=object_name, sliders=sliders, curve_points=curve_points, dimensions=dimensions)
     notes = [*raw.notes, *write_configurations(output, raw, to)]
     for name, text in slider_texts(raw).items():
         path = output.with_name(f"{output.name.removesuffix(output.suffix)}.{name}")
         write_text(path, text)
         notes.append(f"The sliders are in {path.name}.")
-    return raw, tuple(notes)
+    facts = {"output": str(output), "specimens": len(raw), "landmarks": len(raw.landmarks),
+             "dimensions": raw.dimensions, "notes": notes}  # fmt: skip
+    line = f"{counted(len(raw), 'specimen')} with {counted(len(raw.landmarks), 'landmark')} in {output}"
+    return Outcome(facts, [line], notes)
 
 
-def check_configurations(data: Path, sliders: Sequence[Path] = ()) -> dict[str, Any]:
-    """Return what landmark data contain: counts, missing landmarks, and `findings`, a sentence each.
+def check_landmarks(
+    marked: Path,
+    scans: Path | None,
+    output: Path | None,
+    *,
+    sliders: Sequence[Path] = (),
+    say: Callable[[str], None],
+) -> Outcome:
+    """Say what landmark data contain: counts, missing landmarks, and `findings`, a sentence each.
 
-    Findings are duplicates, specimens of another scale, mirrored specimens, swapped landmarks, and outliers.
+    Findings are duplicates, specimens of another scale, mirrored specimens, swapped landmarks, and outliers. With
+    scans in correspondence the landmarks are compared with their predictions.
 
     Args:
-        data: file or folder with the landmarks of many specimens.
+        marked: file or folder with the landmarks of many specimens.
+        scans: see `check_marked`; None for landmark data alone.
+        output: see `check_marked`.
         sliders: CSV of the semilandmarks as geomorph has them.
+        say: called with each message.
 
     Raises:
         FileError: something cannot be read.
+        InputError: an output without scans, and as for `check_marked`.
     """
-    raw = read_configurations(data, sliders=sliders)
+    if scans is not None:
+        from shapespace.commands.landmarks import check_marked  # loads much
+
+        return check_marked(marked, scans, output, say=say)
+    if output is not None:
+        raise InputError("-o goes with SAME, the folder that correspond wrote; leave it out.")
+    raw = read_configurations(marked, sliders=sliders)
     absent = ~raw.observed
     findings = [*_duplicates(raw), *find_other_scales(raw)]
     try:
@@ -84,7 +107,7 @@ def check_configurations(data: Path, sliders: Sequence[Path] = ()) -> dict[str, 
     except InputError as error:
         findings.append(f"The landmarks cannot be aligned: {error}")
     at = np.argwhere(absent).tolist()
-    return {
+    facts: dict[str, Any] = {
         "specimens": len(raw),
         "landmarks": len(raw.landmarks),
         "semilandmarks": len({*raw.curve_sliders[:, 1].tolist(), *raw.surface_sliders.tolist()}),
@@ -93,9 +116,13 @@ def check_configurations(data: Path, sliders: Sequence[Path] = ()) -> dict[str, 
         "missing": int(absent.sum()),
         "missing_by_specimen": dict(Counter(raw.names[k] for k, _ in at).most_common()),
         "missing_by_landmark": dict(Counter(raw.landmarks[k] for _, k in at).most_common()),
-        "notes": list(raw.notes),
-        "findings": findings,
     }
+    texts = {key.replace("_", " "): short(value) for key, value in facts.items() if value not in ([], {})}
+    lines = [f"{key}: {text if len(text) < _LONGEST else f'{text[:_LONGEST]}, ...'}" for key, text in texts.items()]
+    asides = [Aside(sentence) for sentence in (*raw.notes, *findings)]
+    found = counted(len(findings), "finding") if findings else "no problems found"
+    facts |= {"notes": list(raw.notes), "findings": findings}
+    return Outcome(facts, [*asides, *lines, found], exit_code=int(bool(findings)))
 
 
 def _duplicates(raw: LandmarkConfigurations) -> list[str]:
@@ -130,10 +157,8 @@ def find_other_scales(raw: LandmarkConfigurations) -> list[str]:
     ]
 
 
-def plot_configurations(
-    data: Path, output: Path, links: Path | None = None, sliders: Sequence[Path] = ()
-) -> tuple[str, ...]:
-    """Draw all specimens superimposed around their mean with numbered landmarks; return the notes of the alignment.
+def plot_configurations(data: Path, output: Path, links: Path | None = None, sliders: Sequence[Path] = ()) -> Outcome:
+    """Draw all specimens superimposed around their mean with numbered landmarks.
 
     Views and links are those of orientation.json and links.csv next to the data.
 
@@ -160,4 +185,5 @@ def plot_configurations(
     with figures.publication_style(), figures.oriented(orientation):
         figure = figures.superimposed_landmarks(aligned)
         figures.save_figure(figure, output.with_suffix(""), (output.suffix.lower().lstrip("."),))
-    return (*raw.notes, *aligned.notes)
+    notes = (*raw.notes, *aligned.notes)
+    return Outcome({"figure": str(output), "notes": notes}, [f"The figure is {output}"], notes)

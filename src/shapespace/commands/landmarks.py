@@ -7,14 +7,15 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import numpy as np
 
 from shapespace.batch.fit_work import Job
 from shapespace.batch.progress import progress
-from shapespace.commands.inputs import Given
-from shapespace.commands.landmark_files import LandmarkFiles
+from shapespace.commands.inputs import Given, LandmarkFiles
+from shapespace.commands.outcome import LISTED, Outcome, first_lines
 from shapespace.correspondence.landmark_transfer import LandmarkCheck, MarkedSpecimens, TransferredLandmarks
 from shapespace.correspondence.semilandmarks import Semilandmarks, SemilandmarkSet
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
@@ -53,8 +54,8 @@ class _Correspondence:
 
 
 def transfer_landmarks(
-    marked: Path, scans: Path, folder: Path, semilandmarks: Path | None = None, *, quiet: bool = False, say: Say
-) -> list[dict[str, Any]]:
+    marked: Path, scans: Path, output: Path, semilandmarks: Path | None = None, *, quiet: bool = False, say: Say
+) -> Outcome:
     """Write the landmarks of all scans of a correspondence, predicted from those of marked specimens.
 
     Each scan gets NAME.landmarks.csv, .mrk.json and .fcsv; `TPS` has those of all, `CURVE_SLIDERS` and
@@ -63,15 +64,12 @@ def transfer_landmarks(
     Args:
         marked: folder of landmark files with the names of the scans.
         scans: folder that `correspond` wrote.
-        folder: output folder.
+        output: output folder.
         semilandmarks: table of curves and patches for evenly spaced semilandmarks: name, kind (curve or patch), along
             (names of landmarks along the curve, with > between them; of landmarks and curves around the patch, which
             end where they begin), points
         quiet: show no progress.
         say: called with each message.
-
-    Returns:
-        A record of each scan.
 
     Raises:
         InputError: no correspondence, no usable landmarks, or landmarks that contradict each other.
@@ -86,25 +84,33 @@ def transfer_landmarks(
                 say(f"{_sentence(one)} See shapespace landmarks check.")
     records: list[dict[str, Any]] = []
     names, all_points = [*same.specimens.names, *(planned.names if planned else ())], dict[str, FloatArray]()
-    make_folder(folder)
+    make_folder(output)
     with progress(len(same.specimens.surfaces), "landmarks on", "scan", quiet=quiet) as bar:
         for surface in same.specimens.surfaces:
             scan = _scan(same, surface, say)
             record, texts = _transferred(same, surface, scan, planned)
             for ending, text in texts.items():
-                write_text(folder / f"{surface.name}{ending}", text)
+                write_text(output / f"{surface.name}{ending}", text)
             points = {row["name"]: np.array(row["position"]) for row in record["landmarks"]}
             all_points[surface.name] = np.stack([points.get(name, np.full(3, np.nan)) for name in names])
             records.append(record)
             bar.update()
-    write_text(folder / TPS, tps_text(all_points))
+    write_text(output / TPS, tps_text(all_points))
     if planned:
         number = {name: k for k, name in enumerate(names, start=1)}
         curves = [[number[name] for name in row] for row in planned.sliders()]
-        write_rows(folder / CURVE_SLIDERS, ("before", "slide", "after"), curves)
+        write_rows(output / CURVE_SLIDERS, ("before", "slide", "after"), curves)
         surface_rows = [[number[name]] for one in sets if one.kind == "patch" for name in one.names]
-        write_rows(folder / SURFACE_SLIDERS, ("surface",), surface_rows)
-    return records
+        write_rows(output / SURFACE_SLIDERS, ("surface",), surface_rows)
+    doubtful = [record for record in records if record["status"] == "doubtful"]
+    lines = first_lines(doubtful, _doubts, "more scans with doubtful landmarks")
+    total = f"landmarks of {len(records)} scans in {output} and in {output / TPS}"
+    return Outcome({"folder": str(output), "records": records}, [*lines, total])
+
+
+def _doubts(record: Mapping[str, Any]) -> list[str]:
+    reasons = ", ".join(f"{one['name']} ({one['reason']})" for one in record["landmarks"] if one["reason"])
+    return [f"{record['name']}: doubtful landmarks: {reasons}"]
 
 
 def _read_sets(file: Path) -> list[SemilandmarkSet]:
@@ -128,7 +134,7 @@ def _read_sets(file: Path) -> list[SemilandmarkSet]:
     return sets
 
 
-def check_landmarks(marked: Path, scans: Path, output: Path | None = None, *, say: Say) -> list[LandmarkCheck]:
+def check_marked(marked: Path, scans: Path, output: Path | None, *, say: Say) -> Outcome:
     """Compare the landmarks of each marked specimen with their prediction from the others.
 
     Args:
@@ -145,14 +151,23 @@ def check_landmarks(marked: Path, scans: Path, output: Path | None = None, *, sa
     if output is not None:
         header = list(asdict(checks[0]))
         write_rows(output, header, [list(asdict(one).values()) for one in checks])
-    for one in checks:
-        if one.finding:
-            say(_sentence(one))
-    return checks
+    found = [one for one in checks if one.finding]
+    for one in found:
+        say(_sentence(one))
+    lines: list[str] = []
+    for kind in ("landmark", "specimen"):
+        errors: dict[str, list[float]] = {}
+        for one in checks:
+            errors.setdefault(getattr(one, kind), []).append(100 * one.error_share)
+        means = sorted(((fmean(shares), name) for name, shares in errors.items()), reverse=True)
+        listed = ", ".join(f"{name} {share:.1f} %" for share, name in means[:LISTED])
+        lines.append(f"mean leave-one-out error by {kind}, largest first, of the size: {listed}")
+    lines.append(f"{len(checks)} landmarks compared, {len(found)} with a finding")
+    return Outcome([asdict(one) for one in checks], lines, exit_code=int(bool(found)))
 
 
-def suggest_specimens(scans: Path, marked: Path | None = None, count: int = 5, *, say: Say) -> list[tuple[str, float]]:
-    """Return the specimens to mark next, best first, each with the mean shape distance that is then left.
+def suggest_specimens(scans: Path, marked: Path | None = None, count: int = 5, *, say: Say) -> Outcome:
+    """Name the specimens to mark next, best first, each with the mean shape distance that is then left.
 
     Args:
         scans: folder that `correspond` wrote.
@@ -163,7 +178,12 @@ def suggest_specimens(scans: Path, marked: Path | None = None, count: int = 5, *
     Raises:
         InputError: no correspondence, or no usable landmarks in `marked`.
     """
-    return _open(scans, marked, say).specimens.suggest(count)
+    found = _open(scans, marked, say).specimens.suggest(count)
+    lines = [
+        f"{rank}. {name}: mean shape distance to the nearest marked specimen {100 * share:.1f} % of the size"
+        for rank, (name, share) in enumerate(found, start=1)
+    ]
+    return Outcome([{"name": name, "mean_distance_share": share} for name, share in found], lines)
 
 
 def _open(scans: Path, marked: Path | None, say: Say) -> _Correspondence:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ import numpy as np
 from shapespace.batch.fit_records import read_record
 from shapespace.batch.fit_work import naming
 from shapespace.batch.result_folder import names_for
+from shapespace.commands.outcome import Outcome, exit_code_of, short
 from shapespace.errors import FileError, InputError, ShapespaceError
 from shapespace.geometry.doctor import examine, examine_and_repair
 from shapespace.geometry.mirror_plane import mirror_image
@@ -27,11 +28,13 @@ from shapespace.store.corresponding import json_of
 from shapespace.store.results import Results, mesh_at, modes_of, results_at
 from shapespace.types import MM_PER_UNIT, Mesh
 
+_BY_SCAN = ("set_aside", "unreadable", "needs_review")
+"""Facts of a correspondence that have a text for some scans."""
 NOT_CALIBRATED = "its results are not calibrated: statuses, intervals and expected errors come from the model alone"
 
 
 def check(
-    paths: Sequence[Path],
+    files: Sequence[Path],
     *,
     recursive: bool,
     strict: bool = False,
@@ -40,13 +43,13 @@ def check(
     mirror: bool = False,
     symmetric: bool = False,
     say: Callable[[str], None],
-) -> list[dict[str, Any]]:
-    """Return what is in each mesh file, what is wrong with it, and what fitting will do about it.
+) -> Outcome:
+    """Say what is in each mesh file, what is wrong with it, and what fitting will do about it.
 
     A file that cannot be read, or takes more memory than there is, is reported with an error, and the next one read.
 
     Args:
-        paths: files and folders.
+        files: files and folders.
         recursive: whether to take what lies in folders below these too.
         strict: whether a mesh with triangles that use vertices with non-finite coordinates is not usable.
         output: folder in which the repaired meshes are written in mm, as NAME.ply (default: none is written).
@@ -64,7 +67,7 @@ def check(
             "--unit, --mirror and --symmetric apply to the meshes that are written; give their folder with -o."
         )
     reports: list[dict[str, Any]] = []
-    listed = mesh_files(paths, recursive=recursive, apart_from=output)
+    listed = mesh_files(files, recursive=recursive, apart_from=output)
     for sentence in listed.left_out:
         say(sentence)
     targets: dict[Path, Path] = {}
@@ -86,12 +89,10 @@ def check(
                 repaired = replace(repaired, vertices=MM_PER_UNIT[unit or "mm"] * repaired.vertices, landmarks={})
                 if symmetric:
                     repaired, facts = _symmetrised(repaired)
-        except ShapespaceError as error:
-            reports.append({"file": str(path), "usable": False, "error": naming(path, str(error))})
-            continue
-        except MemoryError:
-            short = f"{path}: not enough memory to read it; thin the scan first, as by MeshLab."
-            reports.append({"file": str(path), "usable": False, "error": short})
+        except (ShapespaceError, MemoryError) as error:
+            no_memory = f"{path}: not enough memory to read it; thin the scan first, as by MeshLab."
+            reason = no_memory if isinstance(error, MemoryError) else naming(path, str(error))
+            reports.append({"file": str(path), "usable": False, "error": reason})
             continue
         findings = [{"level": one.level, "what": one.problem, "action": one.action} for one in report.findings]
         findings += [{"level": "note", "what": note, "action": ""} for note in mesh.notes]
@@ -100,7 +101,23 @@ def check(
         if repaired is not None and path in targets:
             write_mesh(targets[path], mirror_image(repaired) if mirror else repaired)
             reports[-1]["written"] = str(targets[path])
-    return reports
+    lines = [line for report in reports for line in _check_lines(report)]
+    errors = [f"shapespace: {report['error']}" for report in reports if "error" in report]
+    bad = sum(not report["usable"] for report in reports)
+    return Outcome(reports, lines, errors=errors, exit_code=exit_code_of(bad, len(reports)))
+
+
+def _check_lines(report: Mapping[str, Any]) -> list[str]:
+    if "error" in report:
+        return [report["file"], f"  unusable: {report['error']}"]
+    facts = {key: value for key, value in report.items() if key not in ("file", "usable", "findings", "name")}
+    lines = [report["file"], *(f"  {key}: {short(value)}" for key, value in facts.items())]
+    for finding in report["findings"]:
+        problem, action = finding["what"], finding["action"]
+        refused = finding["level"] == "refused"
+        text = f"{problem[:-1]}; {action}" if refused else f"{problem} {action}".rstrip()
+        lines.append(f"  {finding['level']}: {text}")
+    return [*lines, "  usable" if report["usable"] else "  not usable for fitting"]
 
 
 def _symmetrised(mesh: Mesh) -> tuple[Mesh, dict[str, Any]]:
@@ -118,12 +135,22 @@ def _symmetrised(mesh: Mesh) -> tuple[Mesh, dict[str, Any]]:
     }
 
 
-def info(path: Path) -> dict[str, Any]:
-    """Return the facts of a model, a mesh, the record of a fit, a folder with a store, or one in correspondence.
+def info(file: Path) -> Outcome:
+    """Say what a model, a mesh, the record of a fit, a folder with a store, or one in correspondence contains.
 
     Raises:
         FileError: it cannot be read, or is none of these.
     """
+    facts = _facts(file)
+    lines: list[str] = []
+    for key, value in facts.items():
+        scans: Mapping[str, str] = value if key in _BY_SCAN else {}
+        lines.append(f"{key}: {len(value) if key in _BY_SCAN else short(value)}")
+        lines += [f"  {name}: {text}" for name, text in scans.items()]
+    return Outcome(facts, lines)
+
+
+def _facts(path: Path) -> dict[str, Any]:
     if path.is_dir() and (results := results_at(path)) is not None:
         return {"kind": "store", **store_facts(results)}
     if path.is_dir() and looks_like_model(path):
@@ -222,7 +249,8 @@ def correspondence_facts(folder: Path) -> dict[str, Any]:
 
 def model_facts(model: ShapeModel) -> dict[str, Any]:
     """Return the facts of a model as plain values."""
-    counts = model.coding.get("control_counts")
+    counts, residuals = model.coding.get("control_counts"), model.residuals
+    off = model.landmarks.distance_mm.tolist()  # zero for landmarks that were given on the surface
     needed = {f"{share:g}": model.modes_for_variance(share) for share in (0.9, 0.95, 0.98, 0.985, 0.99)}
     return {
         "vertices": model.n_vertices,
@@ -238,10 +266,17 @@ def model_facts(model: ShapeModel) -> dict[str, Any]:
         "variance_of": "people left out" if model.held_out else "training shapes",
         "modes_for_variance": {share: modes for share, modes in needed.items() if modes is not None},
         "stddev_mm": model.stddev.tolist(),
-        **({} if model.residuals is None else _residual_facts(model)),
+        **(
+            {}
+            if residuals is None
+            else {
+                "residuals_mm2": residuals.tolist(),
+                "largest_residual_share": float(residuals.max() / model.stddev[0] ** 2),
+            }
+        ),
         "noise_variance_mm2": model.noise_variance,
         "landmarks": list(model.landmarks),
-        **_landmark_distances(model),
+        **({"landmark_distances_mm": dict(zip(model.landmarks, off, strict=True))} if any(off) else {}),
         **({"regions": {name: len(vertices) for name, vertices in model.regions.items()}} if model.regions else {}),
         "representation": model.representation,
         **({} if counts is None else {"control_points": counts.tolist()}),
@@ -261,17 +296,3 @@ def training_shapes_note(model: ShapeModel) -> str:
         f"The model contains {count} training shapes, from which their surfaces can be reconstructed; if they show "
         "people, share it without them (build --without-training-shapes, or convert)."
     )
-
-
-def _landmark_distances(model: ShapeModel) -> dict[str, dict[str, float]]:
-    """Return the distances of the given landmarks from the surface; empty if all were on it."""
-    distances = model.landmarks.distance_mm.tolist()
-    return {"landmark_distances_mm": dict(zip(model.landmarks, distances, strict=True))} if any(distances) else {}
-
-
-def _residual_facts(model: ShapeModel) -> dict[str, Any]:
-    residuals = np.zeros(0) if model.residuals is None else model.residuals
-    return {
-        "residuals_mm2": residuals.tolist(),
-        "largest_residual_share": float(residuals.max() / model.stddev[0] ** 2),
-    }

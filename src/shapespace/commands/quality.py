@@ -8,11 +8,13 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from msgspec import structs
 
 from shapespace.batch.execution import ExecutionConfig
 from shapespace.batch.fit_work import naming
 from shapespace.batch.progress import progress, steps, waiting
 from shapespace.batch.quality_work import QualityRunner
+from shapespace.commands.outcome import Outcome
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.files import make_folder, write_text
@@ -22,12 +24,22 @@ from shapespace.model.foreign import looks_like_model
 from shapespace.model.model_quality import Curve, ModelQuality, QualityConfig, Runner, measure_quality
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
-from shapespace.schemas import BySize, Measured, Quality, json_text
+from shapespace.schemas import BySize, Measured, Quality, json_text, to_json
 from shapespace.store.corresponding import SURFACE, surface_files, surface_stem
 from shapespace.store.review_text import review_summary
 from shapespace.types import Mesh
 
 _SURFACES = (".dense.ply", ".fitted.ply", SURFACE)
+_UNITS = {
+    "compactness": "of the variance",
+    "generalisation": "mm, surface to surface, on shapes left out",
+    "generalisation_vertices": "mm, vertex to vertex, on shapes left out",
+    "specificity": "mm, surface to surface, from random shapes to the nearest one",
+    "specificity_vertices": "mm, vertex to vertex, from random shapes to the nearest one",
+    "reconstruction": "mm, surface to surface, on unseen shapes",
+    "reconstruction_vertices": "mm, vertex to vertex, on unseen shapes",
+}
+"""Measures, and what their numbers are."""
 _MOST_TARGETS = 2  # differences are computed between two targets
 
 
@@ -36,7 +48,6 @@ class QualityOptions:
     """What to measure, and against what.
 
     Args:
-        config: folds, modes, samples, seed and gauge.
         representations: what the modes move, for all targets or one for each; two for one target compare it with
             itself.
         scans: folder of the scans that the surfaces were made from, with the same names, pose and unit: distances are
@@ -49,7 +60,6 @@ class QualityOptions:
         InputError: representations that there are not.
     """
 
-    config: QualityConfig = field(default_factory=QualityConfig)
     representations: Sequence[str] = ("vertices",)
     scans: Path | None = None
     unseen: Path | None = None
@@ -77,13 +87,20 @@ class _Target:
 
 
 def quality(
-    targets: Sequence[Path], output: Path, options: QualityOptions, execution: ExecutionConfig, *, quiet: bool
-) -> tuple[Quality, list[str]]:
-    """Measure one target or two, write `quality.json` and the curves, and return what was found and what to know.
+    targets: Sequence[Path],
+    output: Path,
+    config: QualityConfig,
+    options: QualityOptions,
+    execution: ExecutionConfig,
+    *,
+    quiet: bool,
+) -> Outcome:
+    """Measure one target or two, and write `quality.json` and the curves.
 
     Args:
         targets: models, or folders of meshes in correspondence.
         output: the folder to write to.
+        config: folds, modes, samples, seed and gauge.
         options: what to measure.
         execution: Executor of folds and random shapes.
         quiet: no progress.
@@ -94,7 +111,7 @@ def quality(
         InputError: targets that there are not, too few meshes, or two that have not the same shapes.
     """
     notes: list[str] = []
-    loaded = _targets(targets, options, notes, quiet=quiet)
+    loaded = _targets(targets, config, options, notes, quiet=quiet)
     make_folder(output)
     run = QualityRunner(execution, output, quiet)
     measured = [_measure(target, options, run, quiet=quiet) for target in loaded]
@@ -104,34 +121,42 @@ def quality(
     if len(parts) > 1:
         differences = {name: _measured(c) for name, c in measured[0].differences(measured[1]).items()}
         comparison = _comparison_sentences(loaded, measured[0].differences(measured[1]))
-        result = replace_quality(
+        result = structs.replace(
             result, others=(parts[1],), differences=differences, sentences=(*result.sentences, *comparison)
         )
-    for target in loaded:
-        if isinstance(target.data, ShapeModel):
-            notes.append(
-                f"{target.name} is a model file, which does not keep its training shapes: only compactness is "
-                "computed; generalisation and specificity need a folder"
-                + ("." if options.unseen else "; --unseen FOLDER measures it on shapes that it did not see.")
-            )
+    notes += [
+        f"{target.name} is a model file, which does not keep its training shapes: only compactness is computed; "
+        "generalisation and specificity need a folder"
+        + ("." if options.unseen else "; --unseen FOLDER measures it on shapes that it did not see.")
+        for target in loaded
+        if isinstance(target.data, ShapeModel)
+    ]
     write_text(output / "quality.json", json_text(result))
     with waiting("drawing the curves", quiet=quiet):
         _draw(result, output, notes)
-    return result, notes
+    lines = [line for one in (result, *result.others) for line in quality_lines(one)]
+    lines += [*result.sentences, f"All numbers are in {output / 'quality.json'}"]
+    return Outcome({"folder": str(output), **to_json(result)}, lines, notes)
 
 
-def replace_quality(quality: Quality, **changes: object) -> Quality:
-    """Return `quality` with other fields."""
-    import msgspec
+def quality_lines(quality: Quality) -> list[str]:
+    """Return the measures with most modes, in words."""
+    out: list[str] = [quality.name]
+    for key, unit in _UNITS.items():
+        measure = getattr(quality, key)
+        if measure is not None:
+            band = f" (95 %: {measure.low[-1]:.3f} to {measure.high[-1]:.3f})" if measure.low != measure.mean else ""
+            out.append(f"  {key.split('_')[0]}, {measure.modes[-1]:g} modes: {measure.mean[-1]:.3f}{band} {unit}")
+    return out
 
-    return msgspec.structs.replace(quality, **changes)
 
-
-def _targets(paths: Sequence[Path], options: QualityOptions, notes: list[str], *, quiet: bool) -> list[_Target]:
+def _targets(
+    paths: Sequence[Path], config: QualityConfig, options: QualityOptions, notes: list[str], *, quiet: bool
+) -> list[_Target]:
     names = list(options.representations)
     if len(paths) > _MOST_TARGETS or len(names) > _MOST_TARGETS:
         raise InputError("At most two targets or representations are compared; give one or two.")
-    gauge = options.config.gauge if options.config.align else "form"
+    gauge = config.gauge if config.align else "form"
     loaded: list[tuple[ShapeModel | list[Mesh], dict[str, float]]] = [
         (ShapeModel.load(p), {})
         if not p.is_dir() and looks_like_model(p)
@@ -145,7 +170,7 @@ def _targets(paths: Sequence[Path], options: QualityOptions, notes: list[str], *
     out: list[_Target] = []
     for k, name in pairs:
         called = f"{paths[k]}, {name}" if several else str(paths[k])
-        out.append(_Target(called, loaded[k][0], _of_representation(options.config, name, names), loaded[k][1]))
+        out.append(_Target(called, loaded[k][0], _of_representation(config, name, names), loaded[k][1]))
     if len(out) == _MOST_TARGETS and not any(isinstance(target.data, ShapeModel) for target in out):
         _refuse_unlike(out)
     return out
@@ -202,11 +227,6 @@ def _meshes(
     return out, {surface_stem(file): ratio for file, ratio in listed.unit_ratios.items()}
 
 
-def _scaled(mesh: Mesh, ratio: float) -> Mesh:
-    """Return `mesh` in the unit of most."""
-    return mesh if ratio == 1.0 else mesh.with_vertices(mesh.vertices / ratio)
-
-
 def _scans(target: _Target, folder: Path | None, *, quiet: bool) -> list[Mesh] | None:
     """Return the scans of the meshes of a target, in their order; None where none are given, or none are needed."""
     if folder is None or isinstance(target.data, ShapeModel):
@@ -218,8 +238,9 @@ def _scans(target: _Target, folder: Path | None, *, quiet: bool) -> list[Mesh] |
     with progress(len(target.names), "reading", "scan", quiet=quiet) as bar:
         out: list[Mesh] = []
         for name in target.names:
-            scan = replace(read_mesh(by_name[name]), name=by_name[name].name)
-            out.append(_scaled(scan, target.unit_ratios.get(name, 1.0)))
+            scan, ratio = read_mesh(by_name[name]), target.unit_ratios.get(name, 1.0)
+            vertices = scan.vertices if ratio == 1.0 else scan.vertices / ratio  # in the unit of most
+            out.append(replace(scan, vertices=vertices, name=by_name[name].name))
             bar.update()
     for scan in out:
         if not len(scan.vertices) or not np.isfinite(scan.vertices).all():
@@ -250,24 +271,13 @@ def _measured(curve: Curve) -> Measured:
 
 
 def _as_quality(target: _Target, result: ModelQuality, options: QualityOptions) -> Quality:
-    def measured(curve: Curve | None) -> Measured | None:
-        return None if curve is None else _measured(curve)
-
-    size = result.by_shapes
-    by_shapes = None
+    curves: dict[str, Curve | None] = {name: getattr(result, name) for name in _UNITS}
+    size, by_shapes = result.by_shapes, None
     if size is not None:
-        lists = (tuple(values.tolist()) for values in (size.mean, size.low, size.high))
-        mean, low, high = lists
+        mean, low, high = (tuple(values.tolist()) for values in (size.mean, size.low, size.high))
         by_shapes = BySize(shapes=tuple(size.counts.tolist()), mean=mean, low=low, high=high)
-    return Quality(
+    quality = Quality(
         name=target.name,
-        compactness=measured(result.compactness),
-        generalisation=measured(result.generalisation),
-        specificity=measured(result.specificity),
-        generalisation_vertices=measured(result.generalisation_vertices),
-        specificity_vertices=measured(result.specificity_vertices),
-        reconstruction=measured(result.reconstruction),
-        reconstruction_vertices=measured(result.reconstruction_vertices),
         generalisation_by_shapes=by_shapes,
         supported_modes=result.supported_modes,
         sentences=result.sentences(),
@@ -282,6 +292,8 @@ def _as_quality(target: _Target, result: ModelQuality, options: QualityOptions) 
             "unseen": None if options.unseen is None else str(options.unseen),
         },
     )
+    measured = {name: _measured(curve) for name, curve in curves.items() if curve is not None}
+    return structs.replace(quality, **measured)
 
 
 def _comparison_sentences(targets: Sequence[_Target], differences: dict[str, Curve]) -> list[str]:
@@ -292,8 +304,8 @@ def _comparison_sentences(targets: Sequence[_Target], differences: dict[str, Cur
     off, low, high = (float(values[-1]) for values in (curve.mean, curve.low, curve.high))
     difference = (
         f"the surfaces of {targets[1].name} are off by {off:+.3f} mm (95 %: {low:+.3f} to {high:+.3f}) against "
+        f"{targets[0].name}"
     )
-    difference += f"{targets[0].name}"
     verdict = "no difference shows" if low <= 0 <= high else f"{targets[0 if off > 0 else 1].name} is better"
     return [f"On unseen shapes with {curve.counts[-1]} modes {difference}: {verdict}."]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from shapespace.batch.progress import telling_of_compiling
 from shapespace.batch.result_folder import RECORD
 from shapespace.cohort.classes import notes_on_classes
 from shapespace.cohort.labels import read_labels
+from shapespace.commands.outcome import Outcome, first_lines
 from shapespace.errors import InputError
 from shapespace.io.files import make_folder, read_bytes, read_error
 from shapespace.io.meshes.mesh_io import write_mesh
@@ -68,8 +69,8 @@ def recognise_train(
     modes: int | None = None,
     expression_of: Path | None = None,
     seed: int = 0,
-) -> tuple[dict[str, Any], list[str]]:
-    """Train a classifier on the fits in `results` and save it; return its facts and what the user should know.
+) -> Outcome:
+    """Train a classifier on the fits in `results` and save it.
 
     Args:
         results: a folder that `fit` wrote, or its coefficients.csv.
@@ -114,8 +115,23 @@ def recognise_train(
     )  # fmt: skip
     make_folder(output.absolute().parent)
     saved.save(output)
-    classes = notes_on_classes("label", [scan.label for scan in scans])
-    return {**saved.facts(), "notes_on_classes": list(classes)}, [*problems, *unmatched, *notes]
+    facts = saved.facts()
+    classes = list(notes_on_classes("label", [scan.label for scan in scans]))
+    training, checked = facts["training"], facts["cross_validation"]
+    line = (
+        f"{output}: {facts['classifier']} of {len(facts['classes'])} classes from {training['scans']} scans"
+        + (f" of {training['subjects']} subjects" if training["subjects"] else "")
+        + f", {facts['modes']} modes"
+        + (", relative to neutral" if facts["relative_to_neutral"] else "")
+    )
+    left_out = "subjects" if checked["by"] == "subject" else "scans"
+    share = checked["macro_accuracy"]
+    accuracy = [] if share is None else [f"macro accuracy on {left_out} left out: {100 * share:.1f} %"]
+    return Outcome(
+        {"file": str(output), **facts, "notes_on_classes": classes},
+        [line, *classes, *accuracy],
+        [*problems, *unmatched, *notes],
+    )
 
 
 def recognise_predict(
@@ -124,9 +140,10 @@ def recognise_predict(
     output: Path,
     *,
     labels: Path | None,
-    say: Callable[[str], None] = lambda _: None,
-) -> tuple[list[dict[str, Any]], dict[str, int]]:
-    """Write the classifier's answer for each fit in `results`; return the rows, and counts of what came out.
+    strict: bool,
+    say: Callable[[str], None],
+) -> Outcome:
+    """Write the classifier's answer for each fit in `results`, and count what came out.
 
     The counts are `answered`, `unsure`, `doubtful` (unsure for the fit's sake), `failed` (the fit failed, or its
     neutral face is missing) and `neutral` (faces that others are compared with). `say` is called with what cannot be
@@ -173,10 +190,25 @@ def recognise_predict(
             "probabilities": {} if p is None else dict(zip(saved.classes, p.tolist(), strict=True)),
             "reason": answer.reason,
         })  # fmt: skip
-    return rows, counts
+    counts_text = ", ".join(f"{count} {outcome}" for outcome, count in counts.items() if count)
+    total = f"{len(rows)} {'scan' if len(rows) == 1 else 'scans'}: {counts_text}; answers in {output}"
+    none = counts["failed"] == len(rows) - counts["neutral"]
+    return Outcome(
+        {"file": str(output), **counts, "answers": rows},
+        [*first_lines(rows, _answer_line, f"more; all are in {output}"), total],
+        errors=["shapespace: no scan could be answered for; the reasons stand in the table."] if none else (),
+        exit_code=2 if none else int(counts["failed"] > 0 or (strict and counts["doubtful"] + counts["unsure"] > 0)),
+    )
 
 
-def recognise_transfer(model: Path, person: Path, expression: Path, output: Path) -> None:
+def _answer_line(row: Mapping[str, Any]) -> list[str]:
+    p = max(row["probabilities"].values(), default=None)
+    share = f" ({p:.2f})" if p is not None and not row["reason"] else ""
+    reason = f"; {row['reason']}" if row["reason"] else ""
+    return [f"{row['scan']}: {row['prediction'] or 'no answer'}{share}{reason}"]
+
+
+def recognise_transfer(model: Path, person: Path, expression: Path, output: Path) -> Outcome:
     """Write the person of one fit with the expression of another, as a mesh.
 
     Raises:
@@ -201,6 +233,8 @@ def recognise_transfer(model: Path, person: Path, expression: Path, output: Path
             )
         z.append(values)
     write_mesh(output, additive.transfer(z[0], z[1]))
+    line = f"{output}: {person.name} with the expression of {expression.name}"
+    return Outcome({"file": str(output)}, [line])
 
 
 def recognise_study(
@@ -211,9 +245,10 @@ def recognise_study(
     folds: int,
     seed: int = 0,
     execution: ExecutionConfig,
+    no_open: bool,
     quiet: bool,
-) -> tuple[Path, list[dict[str, Any]], str]:
-    """Run the recognition study on labelled scans; return its report, its targets and what the scans are, in words.
+) -> Outcome:
+    """Run the recognition study on labelled scans.
 
     Raises:
         FileError: something cannot be read or written.
@@ -229,5 +264,9 @@ def recognise_study(
 
     with telling_of_compiling(quiet=quiet):
         report, holds = run_own_study(output, data, model, folds=folds, execution=execution, seed=seed, quiet=quiet)
-    content = json.loads(read_bytes(output / "recognition.json"))
-    return report, content["targets"], holds
+    targets = json.loads(read_bytes(output / "recognition.json"))["targets"]
+    reached = [
+        f"{one['what']}: {one['reached']} ({one['target']}{'' if one['met'] else '; missed'})" for one in targets
+    ]
+    lines = [*holds.splitlines(), *reached, f"The report is {report}"]
+    return Outcome({"report": str(report), "targets": targets}, lines, page=None if no_open else report)

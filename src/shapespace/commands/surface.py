@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 from shapespace.batch.fit_work import naming
 from shapespace.batch.progress import progress
 from shapespace.batch.result_folder import names_for
+from shapespace.commands.outcome import LISTED, Outcome, exit_code_of, first_lines
 from shapespace.errors import ShapespaceError
 from shapespace.geometry.volume_surface import SMOOTH, VolumeSurface, surface_of_volume
 from shapespace.io.files import make_folder, remove_file
@@ -28,8 +29,8 @@ _OTHER_VOLUME = 4.0  # ratio to the median volume; beyond it probably another ob
 
 
 def write_surfaces(
-    paths: Sequence[Path],
-    folder: Path,
+    volumes: Sequence[Path],
+    output: Path,
     *,
     labels: int | str | Sequence[int | str] | None = None,
     smooth: float = SMOOTH,
@@ -38,15 +39,14 @@ def write_surfaces(
     max_memory_bytes: int | None = None,
     quiet: bool = False,
     say: Callable[[str], None],
-) -> list[dict[str, Any]]:
-    """Write the surface of each volume as NAME.ply into `folder`, in LPS coordinates and mm.
+) -> Outcome:
+    """Write the surface of each volume as NAME.ply into `output`, in LPS coordinates and mm.
 
-    Returns:
-        A record of each volume, in order; that of an unusable volume has an `error`.
+    The record of an unusable volume has an `error`.
 
     Args:
-        paths: label volumes, and folders of them.
-        folder: output folder.
+        volumes: label volumes, and folders of them.
+        output: output folder.
         labels: labels or names of segments that form one object, or `all` (default: the only label of the volume).
         smooth: standard deviation of the smoothing in voxels, 0 to 10; 0 for none (default 1.3).
         keep_pieces: keep all pieces and cavities (default: the largest piece, cavities filled, with a message).
@@ -62,17 +62,19 @@ def write_surfaces(
         InputError: a folder without volumes.
     """
     require_volumes_extra()
-    listed = mesh_files(paths, recursive=recursive, apart_from=folder, endings=VOLUME_ENDINGS, kind_name="volumes")
+    listed = mesh_files(volumes, recursive=recursive, apart_from=output, endings=VOLUME_ENDINGS, kind_name="volumes")
     for sentence in listed.left_out:
         say(sentence)
-    make_folder(folder)
+    make_folder(output)
     files = list({path.resolve(): path for path in listed.files}.values())
     records: list[dict[str, Any]] = []
-    limit = _default_limit() if max_memory_bytes is None else max_memory_bytes
+    free = available_bytes()
+    usual = MAX_MEMORY_BYTES if free is None else min(MAX_MEMORY_BYTES, int(_MOST_OF_MEMORY * free))
+    limit = usual if max_memory_bytes is None else max_memory_bytes
     with progress(len(files), "making", "surface", quiet=quiet) as bar:
         for path, name in zip(files, _names(files), strict=True):
-            target = folder / f"{name}.ply"
-            facts: dict[str, Any] = {"name": name, "volume": str(path)}
+            target = output / f"{name}.ply"
+            known: dict[str, Any] = {"name": name, "volume": str(path)}
             try:
                 made = surface_of_volume(
                     read_volume(path, max_memory_bytes=limit),
@@ -88,18 +90,34 @@ def write_surfaces(
                 remove_file(target)
                 bar.clear()
                 say(reason)
-                records.append({**facts, "error": reason})
+                records.append({**known, "error": reason})
             else:
                 write_mesh(target, made.mesh)
-                records.append({**facts, "surface": str(target), **_facts(made)})
+                records.append({**known, "surface": str(target), **_facts(made)})
             bar.update()
-    _name_the_odd([record for record in records if "error" not in record])
-    return records
+    usable = [record for record in records if "error" not in record]
+    _name_the_odd(usable)
+    for record in usable:
+        record["notes"] += record["odd"]
+    facts = {"folder": str(output), "volumes": len(records), "surfaces": len(usable), "records": records}
+    lines = _lines(usable, len(records), output) if usable else ()
+    return Outcome(facts, lines, exit_code=exit_code_of(len(records) - len(usable), len(records)))
 
 
-def _default_limit() -> int:
-    free = available_bytes()
-    return MAX_MEMORY_BYTES if free is None else min(MAX_MEMORY_BYTES, int(_MOST_OF_MEMORY * free))
+def _lines(made: Sequence[Mapping[str, Any]], volumes: int, folder: Path) -> list[str]:
+    odd = [f"{record['name']}.ply: {note}" for record in made[LISTED:] for note in record["odd"]]
+    total = f"{len(made)} of {volumes} {'volume' if volumes == 1 else 'volumes'} to surfaces in {folder}: LPS, mm"
+    return [*first_lines(made, _described), *odd, total]
+
+
+def _described(record: Mapping[str, Any]) -> list[str]:
+    size = " x ".join(f"{mm:.3g}" for mm in record["voxel_mm"])
+    labels = f"label{'s' if len(record['labels']) > 1 else ''} {', '.join(map(str, record['labels']))}"
+    line = (
+        f"{record['name']}.ply: {record['triangles']:,} triangles around {record['volume_mm3']:.4g} mm3 of {labels}, "
+        f"voxels of {size} mm"
+    )
+    return [line, *(f"  {note}" for note in record["notes"])]
 
 
 def _names(files: Sequence[Path]) -> list[str]:
@@ -138,7 +156,7 @@ def _name_the_odd(records: Sequence[dict[str, Any]]) -> None:
     for record in records:
         earlier = first.setdefault((record["vertices"], record["volume_mm3"], *record["bounds_mm"][0]), record["name"])
         if earlier != record["name"]:
-            _add(record, f"It is the same surface as {earlier}.ply.")
+            record["odd"].append(f"It is the same surface as {earlier}.ply.")
     if len(records) < _MANY:
         return
     middle = float(np.median([record["volume_mm3"] for record in records]))
@@ -147,12 +165,7 @@ def _name_the_odd(records: Sequence[dict[str, Any]]) -> None:
     voxel_text = " x ".join(f"{mm:.3g}" for mm in usual)
     for record, other in zip(records, others, strict=True):
         if other and sum(others) < len(others) / 2:
-            _add(record, f"Most of the others have voxels of {voxel_text} mm.")
+            record["odd"].append(f"Most of the others have voxels of {voxel_text} mm.")
         ratio = float(record["volume_mm3"]) / middle
         if not 1 / _OTHER_VOLUME < ratio < _OTHER_VOLUME:
-            _add(record, f"Its volume is {ratio:.2g} times that in the middle of all.")
-
-
-def _add(record: dict[str, Any], note: str) -> None:
-    record["odd"].append(note)
-    record["notes"].append(note)
+            record["odd"].append(f"Its volume is {ratio:.2g} times that in the middle of all.")

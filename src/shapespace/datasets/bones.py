@@ -108,7 +108,7 @@ def write_bones(
     count: int,
     seed: int = 0,
     effect_mm: float = EFFECT_MM,
-    progress: Callable[[], None] | None = None,
+    progress: Callable[[], object] | None = None,
 ) -> Path:
     """Write bone_000.ply and so on, raw scans of skulls of two groups in turn, and the table bones.csv.
 

@@ -131,7 +131,7 @@ def label_volume(organ: Organ, rng: np.random.Generator) -> LabelVolume:
 
 
 def write_organs(
-    folder: Path, *, count: int, seed: int = 0, volumes: bool = False, progress: Callable[[], None] | None = None
+    folder: Path, *, count: int, seed: int = 0, volumes: bool = False, progress: Callable[[], object] | None = None
 ) -> Path:
     """Write organ_000.ply and so on as raw surfaces, or organ_000.nii.gz as label volumes; those are of one organ.
 

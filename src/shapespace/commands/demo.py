@@ -1,0 +1,19 @@
+"""What `demo` does: both experiments of the paper, ending in a report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from shapespace.commands.outcome import Outcome
+from shapespace.demo import run_demo
+
+
+def demo(out: Path, *, quick: bool, no_open: bool, quiet: bool) -> Outcome:
+    """Run both experiments of the paper on simulated faces, and write their report.
+
+    Raises:
+        ShapespaceError: the extra `report` is not installed.
+        FileError: something cannot be written.
+    """
+    report = run_demo(out, quick=quick, quiet=quiet)
+    return Outcome({"report": str(report)}, [f"The report is {report}"], page=None if no_open else report)
