@@ -91,7 +91,7 @@ def _summary(result: AsymmetryResult, order: Any) -> tuple[str, ...]:
     sentences = [
         f"{apart[0].upper()}{apart[1:]}, RMS {_direction(result)}.",
         f"On average the sides differ by {lengths.text(directional)} RMS (directional asymmetry): "
-        f"F = {_number_text(side.f)}, p = {_p_text(side)}.",
+        f"F = {_number_text(side.f)}, p = {_number_text(side.p)}.",
     ]
     if interaction.p is None and interaction.f is None:
         sentences.append(
@@ -101,7 +101,7 @@ def _summary(result: AsymmetryResult, order: Any) -> tuple[str, ...]:
     else:
         sentences.append(
             f"Subjects differ in their asymmetry beyond measurement error (fluctuating asymmetry): "
-            f"F = {_number_text(interaction.f)}, p = {_p_text(interaction)}; the error alone would be taken for "
+            f"F = {_number_text(interaction.f)}, p = {_number_text(interaction.p)}; the error alone would be taken for "
             f"{lengths.text(result.scores.error_mm)} "
             "in one shape, and is subtracted."
         )
@@ -185,10 +185,6 @@ def _limitation_notes(result: AsymmetryResult) -> list[str]:
 
 def _number_text(value: float | None) -> str:
     return "not known" if value is None else f"{value:.3g}"
-
-
-def _p_text(effect: AnovaRow) -> str:
-    return "not known" if effect.p is None else f"{effect.p:.3g}"
 
 
 def _anova_table(result: AsymmetryResult, title: str, anova: Sequence[AnovaRow], file: str, note: str) -> Table:

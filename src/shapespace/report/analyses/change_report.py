@@ -252,12 +252,10 @@ def _mean_change_parts(
 
 
 def _region_table(change: ChangeResult, test: MapTest) -> Part:
-    rows: list[tuple[Any, ...]] = []
     volumes = np.array([change_or_rate(one, rate=change.config.rate).volumes_mm3 for one in change.subjects])
     unit = _VolumeUnit.of(volumes.mean(axis=0))
-    for k, name in enumerate(change.regions):
-        own = volumes[:, k] / unit.mm3
-        rows.append((name, float(own.mean()), *interval_of_mean(own), float(test.p[k])))
+    every = zip(change.regions, [own / unit.mm3 for own in volumes.T], test.p, strict=True)
+    rows = [(name, float(own.mean()), *interval_of_mean(own), float(p)) for name, own, p in every]
     return TablePart.of(
         "Volumes swept", ("of", f"mean, {unit.name}", "low", "high", "p"), rows,
         note="With the 95 % interval of the mean; p with the error over all parts held.",
@@ -521,19 +519,18 @@ def _landmark_rows(change: ChangeResult, subject: SubjectChange) -> list[Sequenc
 
 
 def _maps(change: ChangeResult) -> dict[str, npt.NDArray[Any]]:
-    maps = {
+    def single(values: Sequence[FloatArray]) -> npt.NDArray[Any]:
+        return np.stack(values).astype(np.float32)
+
+    rates = [change_or_rate(one, rate=True) for one in change.subjects] if change.time_unit else []
+    return {
         "subjects": np.array([one.name for one in change.subjects]),
-        "change_mm": np.stack([blank_where(one.change.along_mm, one.unobserved) for one in change.subjects]).astype(
-            np.float32
-        ),
-        "stddev_mm": np.stack([one.change.stddev_mm for one in change.subjects]).astype(np.float32),
+        "change_mm": single([blank_where(one.change.along_mm, one.unobserved) for one in change.subjects]),
+        "stddev_mm": single([one.change.stddev_mm for one in change.subjects]),
+        "beyond": np.stack([one.change.beyond for one in change.subjects]),
+        **({"rate_mm": single([one.along_mm for one in rates])} if rates else {}),
+        **({"rate_stddev_mm": single([one.stddev_mm for one in rates])} if rates else {}),
     }
-    maps["beyond"] = np.stack([one.change.beyond for one in change.subjects])
-    if change.time_unit:
-        rates = [change_or_rate(one, rate=True) for one in change.subjects]
-        maps["rate_mm"] = np.stack([one.along_mm for one in rates]).astype(np.float32)
-        maps["rate_stddev_mm"] = np.stack([one.stddev_mm for one in rates]).astype(np.float32)
-    return maps
 
 
 def _notes(change: ChangeResult) -> list[str]:

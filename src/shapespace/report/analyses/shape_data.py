@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
-from msgspec import structs
+from msgspec import Struct, structs
 from scipy.spatial.distance import pdist
 
 from shapespace.cohort.cohort import SUBJECT, Cohort
@@ -22,7 +22,9 @@ from shapespace.schemas import (
     MorphPart,
     Part,
     Series,
+    TableColumn,
     TablePart,
+    TestScheme,
     TextPart,
 )
 from shapespace.statistics.methods import methods_of
@@ -34,6 +36,16 @@ _FILE = "observed.csv"
 _MOST_ROWS = 10  # rows that fit one screen; files have all
 _VERTEX_WORDS = re.compile(r"(?<![A-Za-z])[Vv]ert(?:ices|ex)(?![A-Za-z])")  # in sentences and names of columns
 _LANDMARK_WORDS = {"vertices": "landmarks", "vertex": "landmark", "Vertices": "Landmarks", "Vertex": "Landmark"}
+_WORDED: Mapping[type[Struct], tuple[str, ...]] = {
+    Part: ("title", "note"),
+    TextPart: ("text",),
+    HistogramPart: ("x",),
+    TablePart: ("columns",),
+    TableColumn: ("name",),
+    Methods: ("corrected_over", "assumptions", "tests"),
+    TestScheme: ("tested",),
+}
+"""Fields with words on vertices."""
 MOST_LANDMARKS = 500
 """Points of a shape without triangles up to which they are drawn as landmarks: more cover each other."""
 _MOST_PAIRS = 1000  # dots of a figure: more cover each other
@@ -205,32 +217,22 @@ def shape_settings(cohort: Cohort) -> dict[str, Any]:
     return out
 
 
+def _landmark_words(value: Any) -> Any:
+    """Return a text, part or record, or a tuple of these, that calls the vertices of shapes landmarks."""
+    if isinstance(value, tuple):
+        return tuple(map(_landmark_words, cast(tuple[Any, ...], value)))
+    if isinstance(value, Struct):
+        names = (name for kind, own in _WORDED.items() if isinstance(value, kind) for name in own)
+        return structs.replace(value, **{name: _landmark_words(getattr(value, name)) for name in names})
+    return _VERTEX_WORDS.sub(lambda found: _LANDMARK_WORDS[found[0]], value or "")
+
+
 def _in_landmarks(report: AnalysisReport) -> AnalysisReport:
     """Return a report whose sentences, labels and columns of files call the vertices of shapes landmarks."""
-
-    def named(text: str | None) -> str:
-        return _VERTEX_WORDS.sub(lambda found: _LANDMARK_WORDS[found[0]], text or "")
-
-    def renamed(part: Part) -> Part:
-        changed: dict[str, Any] = {"title": named(part.title), "note": named(part.note)}
-        if isinstance(part, TextPart):
-            changed["text"] = named(part.text) if isinstance(part.text, str) else tuple(map(named, part.text))
-        if isinstance(part, HistogramPart):
-            changed["x"] = named(part.x)
-        if isinstance(part, TablePart):
-            changed["columns"] = tuple(structs.replace(one, name=named(one.name)) for one in part.columns)
-        return structs.replace(part, **changed)
-
-    methods = report.methods
-    if methods is not None:
-        over, assumptions = tuple(map(named, methods.corrected_over)), tuple(map(named, methods.assumptions))
-        tests = tuple(structs.replace(test, tested=tuple(map(named, test.tested))) for test in methods.tests)
-        methods = structs.replace(methods, corrected_over=over, assumptions=assumptions, tests=tests)
-    summary, notes = tuple(map(named, report.summary)), tuple(map(named, report.notes))
-    tables = {name: (tuple(map(named, header)), rows) for name, (header, rows) in report.tables.items()}
-    return replace(
-        report, summary=summary, notes=notes, parts=tuple(map(renamed, report.parts)), methods=methods, tables=tables
-    )
+    words = {name: _landmark_words(getattr(report, name)) for name in ("summary", "notes", "parts")}
+    methods = None if report.methods is None else _landmark_words(report.methods)
+    tables = {name: (_landmark_words(tuple(header)), rows) for name, (header, rows) in report.tables.items()}
+    return replace(report, **words, methods=methods, tables=tables)
 
 
 def cohort_report(
