@@ -50,24 +50,23 @@ def compare_report(result: CompareResult) -> AnalysisReport:
     """Return a comparison with all that its report shows; files are numbered as its effects are."""
     effects, config = result.effects, result.config
     morphospace, plotted = compared_morphospace(result)
+    arrays = {f"effect_{number}.npz": _arrays(result, effect) for number, effect in enumerate(effects, 1)}
     content: list[Part | Table] = [
         _term_table(result),
         *_term_histograms(result),
         _effect_table(result),
         *_angle_tables(result),
         morphospace,
-        *(part for number, effect in enumerate(effects, 1) for part in _effect_parts(result, effect, number)),
-    ]
+        *(part for effect, (file, own) in zip(effects, arrays.items(), strict=True)
+          for part in _effect_parts(result, effect, file, own)),
+    ]  # fmt: skip
     return cohort_report(
         "compare",
         f"Shape {result.design.formula.strip()}",
         content,
         result.cohort,
         summary=tuple(_summary(result)),
-        arrays={
-            morphospace.arrays: plotted,
-            **{f"effect_{number}.npz": _arrays(result, effect) for number, effect in enumerate(effects, 1)},
-        },
+        arrays={morphospace.arrays: plotted, **arrays},
         meshes=dict(_meshes(result)),
         notes=(*result.cohort.notes, *_repeated_measures_notes(result)),
         settings={
@@ -394,15 +393,16 @@ def _angle_tables(result: CompareResult) -> Iterator[Table]:
         )  # fmt: skip
 
 
-def _effect_parts(result: CompareResult, effect: ShapeEffect, number: int) -> Iterator[Part]:
-    file, level = f"effect_{number}.npz", f"{100 * result.config.alpha:g} %"
+def _effect_parts(
+    result: CompareResult, effect: ShapeEffect, file: str, arrays: Mapping[str, npt.NDArray[Any]]
+) -> Iterator[Part]:
+    level = f"{100 * result.config.alpha:g} %"
     yield TextPart(
         title=effect.label,
         level=2,
         text=_size_sentence(result, effect),
     )
     if effect.map is not None:
-        arrays = _arrays(result, effect)
         blank = effect.map.blank
         note = _PALE if blank is None else f"{_PALE} {blank_sentence(int(blank.sum()), len(blank))}"
         for title, values, mask in (
