@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar, Literal, Self, TypeAlias, TypeVar, cast, get_args
 
@@ -446,25 +447,24 @@ class SurfaceReview(Struct, frozen=True, kw_only=True):
     def of(codes: Iterable[Sequence[ReviewCode]]) -> SurfaceReview:
         """Count surfaces by the `codes` of their reasons, which are empty for a surface that needs no review."""
         every = [set(own) for own in codes]
-        known: tuple[ReviewCode, ...] = get_args(ReviewCode)
-        counts = {code: sum(code in own for own in every) for code in known}
-        reasons: dict[ReviewCode, int] = {code: counts[code] for code in known if counts[code]}
-        return SurfaceReview(surfaces=len(every), needs_review=sum(map(bool, every)), reasons=reasons)
+        counts: Counter[ReviewCode] = Counter(code for own in every for code in own)
+        return SurfaceReview(surfaces=len(every), needs_review=sum(map(bool, every)), reasons=_in_order(counts))
 
     def __add__(self, other: SurfaceReview) -> SurfaceReview:
-        codes: tuple[ReviewCode, ...] = get_args(ReviewCode)
-        counts: dict[ReviewCode, int] = {code: self.reasons.get(code, 0) + other.reasons.get(code, 0) for code in codes}
-        reasons: dict[ReviewCode, int] = {code: count for code, count in counts.items() if count}
         return SurfaceReview(
             surfaces=self.surfaces + other.surfaces,
             needs_review=self.needs_review + other.needs_review,
-            reasons=reasons,
+            reasons=_in_order(Counter(self.reasons) + Counter(other.reasons)),
         )
 
     @property
     def is_majority(self) -> bool:
         """Whether more than half of the surfaces need review."""
         return 2 * self.needs_review > self.surfaces
+
+
+def _in_order(counts: Mapping[ReviewCode, int]) -> dict[ReviewCode, int]:
+    return {code: counts[code] for code in get_args(ReviewCode) if code in counts}
 
 
 class CorrespondRecord(Struct, frozen=True, kw_only=True):
@@ -807,57 +807,53 @@ class SurfaceMapPart(Part, frozen=True, kw_only=True, tag="surface_map"):
     limit: float | None = None
 
 
-class MorphPart(Part, frozen=True, kw_only=True, tag="morph"):
-    """Two shapes in correspondence in an .npz file, between which a slider moves.
-
-    The slider moves on a line, or through the shapes low + weights[k] modes, at equal steps of a variable.
+class ShapeChangePart(Part, frozen=True, kw_only=True):
+    """Two shapes in correspondence in an .npz file, such as both ends of a change.
 
     Args:
-        arrays: the file; the next three, `modes` and `weights` are names of arrays in it.
+        arrays: the file; the next two are names of arrays in it.
         low: (V, 3) mm.
         high: (V, 3) mm.
-        faces: (F, 3).
         low_label: what `low` is.
         high_label: what `high` is.
         times: factor of the difference in both; 1 is the true difference, below 1 it is drawn smaller.
-        modes: (q, V, 3) mm; empty for a line.
-        weights: (B, q), 0 in the first row.
-        variable: name of the variable.
-        range: its values at `low` and `high`.
     """
 
     arrays: str
     low: str = "low"
     high: str = "high"
-    faces: str = "faces"
     low_label: str = "low"
     high_label: str = "high"
     times: float = 1.0
+
+
+class MorphPart(ShapeChangePart, frozen=True, kw_only=True, tag="morph"):
+    """Two surfaces, between which a slider moves.
+
+    The slider moves on a line, or through the shapes low + weights[k] modes, at equal steps of a variable.
+
+    Args:
+        faces: name of an array (F, 3).
+        modes: name of an array (q, V, 3), mm; empty for a line.
+        weights: name of an array (B, q), 0 in the first row.
+        variable: name of the variable.
+        range: its values at `low` and `high`.
+    """
+
+    faces: str = "faces"
     modes: str = ""
     weights: str = ""
     variable: str = ""
     range: tuple[float, float] = (0.0, 1.0)
 
 
-class DeformationPart(Part, frozen=True, kw_only=True, tag="deformation"):
-    """Two configurations of landmarks in an .npz file: a deformation grid, or a vector for each landmark.
+class DeformationPart(ShapeChangePart, frozen=True, kw_only=True, tag="deformation"):
+    """Two configurations of landmarks: a deformation grid, or a vector for each landmark; z is 0 for planar ones.
 
     Args:
-        arrays: the file; the next two are names of arrays in it.
-        low: (L, 3); z is 0 for planar landmarks.
-        high: (L, 3).
-        low_label: what `low` is.
-        high_label: what `high` is.
-        times: factor of the difference in both, as of a morph.
         drawing: `grid` for a thin-plate spline of planar landmarks, `vectors` for any.
     """
 
-    arrays: str
-    low: str = "low"
-    high: str = "high"
-    low_label: str = "low"
-    high_label: str = "high"
-    times: float = 1.0
     drawing: Literal["grid", "vectors"] = "vectors"
 
 

@@ -217,7 +217,7 @@ def answer_complete(arguments: argparse.Namespace) -> int:
 def answer_verify(arguments: argparse.Namespace) -> int:
     """Verify whether two scans are of one subject."""
     from shapespace.batch.progress import steps
-    from shapespace.report.analyses.verify_report import verify_report
+    from shapespace.report.analyses.identity_report import verify_report
     from shapespace.statistics.identity.verify import verify
 
     cohort, config = _cohort_and_config(arguments)
@@ -229,7 +229,7 @@ def answer_verify(arguments: argparse.Namespace) -> int:
 def answer_identify(arguments: argparse.Namespace) -> int:
     """Identify the subject of a scan among the enrolled ones."""
     from shapespace.batch.progress import steps
-    from shapespace.report.analyses.identity import identify_report
+    from shapespace.report.analyses.identity_report import identify_report
     from shapespace.statistics.identity.identify import identify
 
     cohort, config = _cohort_and_config(arguments)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -18,8 +19,19 @@ from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.io.tables.table_io import write_rows
 from shapespace.report.analyses.methods_section import methods_text
 from shapespace.reprs import short_repr
-from shapespace.schemas import Analysis, Methods, Orientation, Part, TableColumn, Target, json_text
-from shapespace.types import Mesh
+from shapespace.schemas import (
+    Analysis,
+    Counts,
+    HistogramPart,
+    Methods,
+    Orientation,
+    Part,
+    TableColumn,
+    TablePart,
+    Target,
+    json_text,
+)
+from shapespace.types import FloatArray, Mesh
 from shapespace.version import __version__
 
 Rows = tuple[Sequence[str], Sequence[Sequence[object]]]
@@ -30,6 +42,98 @@ METHODS_FILE = "methods.txt"
 """A paragraph for the methods section of a paper, with references."""
 REDUCED_MORPH_NOTE = "Drawn smaller than it is, so that no triangle flips."
 """The note of a morph whose full size would flip triangles."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table: on the page, in the CSV file, or in both.
+
+    Args:
+        name: heading on the page; empty for a column of the file alone.
+        kind: kind of its cells on the page.
+        field: name in the file; empty for a column of the page alone.
+    """
+
+    name: str = ""
+    kind: Literal["text", "percent", "interval", "number", "mm", "p", "count"] = "text"
+    field: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """A table, from which its part of the page and its CSV file follow; numbers that are not finite are unknown.
+
+    Args:
+        title: title on the page.
+        columns: columns of the page and of the file, in the order of both.
+        rows: a cell for each column.
+        note: note on the page.
+        level: level of the title; None for a table within a chapter.
+        file: name of the CSV file; empty for none.
+        shown: numbers of the rows on the page, in their order; None for all. Numbers beyond the last row are omitted.
+    """
+
+    title: str = ""
+    columns: Sequence[Column]
+    rows: Sequence[Sequence[Any]]
+    note: str = ""
+    level: int | None = None
+    file: str = ""
+    shown: Iterable[int] | None = None
+
+    @staticmethod
+    def of_fields(file: str, fields: Sequence[str], rows: Sequence[Sequence[Any]]) -> Table:
+        """Return a table that is a file alone, with the columns `fields`."""
+        return Table(columns=[Column(field=one) for one in fields], rows=rows, file=file)
+
+    @property
+    def part(self) -> TablePart:
+        """The table of the page."""
+        columns = tuple(TableColumn(name=one.name, kind=one.kind) for one in self.columns if one.name)
+        every = range(len(self.rows)) if self.shown is None else self.shown
+        shown = [self.rows[k] for k in every if k < len(self.rows)]
+        rows = self._cells(shown, [bool(one.name) for one in self.columns])
+        return TablePart(title=self.title, columns=columns, rows=rows, note=self.note, level=self.level)
+
+    @property
+    def file_rows(self) -> Rows:
+        """Header and rows of the file."""
+        in_file = [bool(one.field) for one in self.columns]
+        return tuple(one.field for one in self.columns if one.field), self._cells(self.rows, in_file)
+
+    @staticmethod
+    def _cells(rows: Sequence[Sequence[Any]], used: Sequence[bool]) -> tuple[tuple[Any, ...], ...]:
+        return tuple(
+            tuple(
+                None if isinstance(cell, float) and not math.isfinite(cell) else cell
+                for cell, own in zip(row, used, strict=True)
+                if own
+            )
+            for row in rows
+        )
+
+
+def floats(values: npt.NDArray[Any] | Sequence[float]) -> tuple[float, ...]:
+    """Return numbers as a tuple for a part."""
+    return tuple(map(float, values))
+
+
+def histogram_part(
+    title: str, values: Mapping[str, FloatArray], bins: int | FloatArray, *, shares: bool = False, **known: Any
+) -> HistogramPart:
+    """Return the histogram of one or more sets of values.
+
+    Args:
+        title: its title.
+        values: label -> values.
+        bins: number of bins between the ends of all values, or the edges of the bins.
+        shares: shares of each set instead of counts.
+        **known: further fields of the part.
+    """
+    edges = np.histogram_bin_edges(np.concatenate(list(values.values())), bins)
+    counts = {label: np.histogram(own, edges)[0] / (len(own) if shares else 1) for label, own in values.items()}
+    series = tuple(Counts(counts=floats(own), label=label) for label, own in counts.items())
+    return HistogramPart(title=title, edges=floats(edges), series=series, **known)
 
 
 @dataclass(frozen=True)
@@ -60,9 +164,9 @@ class LengthFormat:
         """The unit after a space; empty for none."""
         return f" {self.unit}" if self.unit else ""
 
-    def column(self, name: str) -> TableColumn:
-        """Return the column of lengths of a table in a report."""
-        return TableColumn(name=name, kind="mm" if self.unit else "number")
+    def column(self, name: str = "", field: str = "") -> Column:
+        """Return a column of lengths; `name` is its heading, `field` its name in the file without the unit."""
+        return Column(name, "mm" if self.unit else "number", field and self.field(field))
 
     def label(self, name: str, power: str = "") -> str:
         """Return a name of lengths with its unit, such as `score, mm`; `power` is `²` for areas."""
@@ -117,6 +221,23 @@ class AnalysisReport:
     orientation: Orientation | None = None
 
     __repr__ = short_repr
+
+    @classmethod
+    def of(cls, question: str, title: str, content: Iterable[Part | Table], **known: Any) -> Self:
+        """Return a report whose parts and CSV files are those of its content.
+
+        Args:
+            question: the command.
+            title: title of the report.
+            content: parts and tables in their order; a table without a title is a file alone.
+            **known: further fields of the report.
+        """
+        every = tuple(content)
+        parts = tuple(
+            one.part if isinstance(one, Table) else one for one in every if one.title or isinstance(one, Part)
+        )
+        tables = {one.file: one.file_rows for one in every if isinstance(one, Table) and one.file}
+        return cls(question=question, title=title, parts=parts, tables=tables, **known)
 
     def analysis(self) -> Analysis:
         """Return what analysis.json says."""

@@ -11,20 +11,16 @@ import numpy as np
 from shapespace.errors import InputError
 from shapespace.geometry.distortion import factor_to_draw, flip_factor
 from shapespace.geometry.normals import rms_size
-from shapespace.report.analyses.analysis_report import REDUCED_MORPH_NOTE, AnalysisReport, LengthFormat, Rows
-from shapespace.report.analyses.methods_section import methods_parts
-from shapespace.report.analyses.shape_data import MOST_LANDMARKS, add_shape_data, blank_sentence, model_hashes
-from shapespace.schemas import (
-    Counts,
-    DeformationPart,
-    HistogramPart,
-    MorphPart,
-    Part,
-    SurfaceMapPart,
-    TableColumn,
-    TablePart,
-    TextPart,
+from shapespace.report.analyses.analysis_report import (
+    REDUCED_MORPH_NOTE,
+    AnalysisReport,
+    Column,
+    LengthFormat,
+    Table,
+    histogram_part,
 )
+from shapespace.report.analyses.shape_data import MOST_LANDMARKS, blank_sentence, cohort_report
+from shapespace.schemas import DeformationPart, HistogramPart, MorphPart, Part, SurfaceMapPart, TextPart
 from shapespace.statistics.asymmetry import AnovaRow, AsymmetryResult, first_pattern
 from shapespace.statistics.observation_weights import blank_where
 from shapespace.types import BoolArray, FloatArray, Mesh, SurfaceLandmarks
@@ -44,24 +40,23 @@ def asymmetry_report(result: AsymmetryResult) -> AnalysisReport:
     order = np.argsort(-result.scores.mm, kind="stable")
     arrays, pictures = _maps_and_morphs(result, order)
     cohort = result.cohort
-    parts: list[Part] = [
-        TextPart(title="What is measured", text=_method_sentences(result)),
-        *_anova_parts(result),
-        _histogram(result),
-        _most_asymmetric(result, order),
-        *pictures,
-        *methods_parts(result.methods),
-    ]
-    report = AnalysisReport(
-        question="asymmetry",
-        title="How symmetric?",
+    anova_note = "df are those of the observations."
+    size_anova = [_anova_table(result, "ANOVA of centroid size", result.size_anova, "size_anova.csv", anova_note)]
+    if result.degrees_of_freedom == "klingenberg":
+        anova_note = "df are those of subjects times dimensions."
+    return cohort_report(
+        "asymmetry",
+        "How symmetric?",
+        [
+            TextPart(title="What is measured", text=_method_sentences(result)),
+            _anova_table(result, "Procrustes ANOVA", result.anova, "anova.csv", anova_note),
+            *(size_anova if result.size_anova else ()),
+            _histogram(result),
+            _subject_table(result, order),
+            *pictures,
+        ],
+        cohort,
         summary=_summary(result, order),
-        parts=tuple(parts),
-        tables={
-            "anova.csv": _anova_rows(result, result.anova),
-            "subjects.csv": _subject_rows(result),
-            **({"size_anova.csv": _anova_rows(result, result.size_anova)} if result.size_anova else {}),
-        },
         arrays={_FILE: arrays},
         meshes=_meshes(result, order),
         notes=(*cohort.notes, *result.sides.notes, *_limitation_notes(result)),
@@ -76,10 +71,9 @@ def asymmetry_report(result: AsymmetryResult) -> AnalysisReport:
             "degrees_of_freedom": result.degrees_of_freedom,
             "sides": result.sides.classes,
         },
-        model_hashes=model_hashes(cohort),
         methods=result.methods,
+        imputations=result.imputations,
     )
-    return add_shape_data(report, cohort, result.imputations)
 
 
 def _summary(result: AsymmetryResult, order: Any) -> tuple[str, ...]:
@@ -97,7 +91,7 @@ def _summary(result: AsymmetryResult, order: Any) -> tuple[str, ...]:
     sentences = [
         f"{apart[0].upper()}{apart[1:]}, RMS {_direction(result)}.",
         f"On average the sides differ by {lengths.text(directional)} RMS (directional asymmetry): "
-        f"F = {_number_text(side.f)}, p = {_p_text(side)}.",
+        f"F = {_number_text(side.f)}, p = {_number_text(side.p)}.",
     ]
     if interaction.p is None and interaction.f is None:
         sentences.append(
@@ -107,7 +101,7 @@ def _summary(result: AsymmetryResult, order: Any) -> tuple[str, ...]:
     else:
         sentences.append(
             f"Subjects differ in their asymmetry beyond measurement error (fluctuating asymmetry): "
-            f"F = {_number_text(interaction.f)}, p = {_p_text(interaction)}; the error alone would be taken for "
+            f"F = {_number_text(interaction.f)}, p = {_number_text(interaction.p)}; the error alone would be taken for "
             f"{lengths.text(result.scores.error_mm)} "
             "in one shape, and is subtracted."
         )
@@ -193,88 +187,53 @@ def _number_text(value: float | None) -> str:
     return "not known" if value is None else f"{value:.3g}"
 
 
-def _p_text(effect: AnovaRow) -> str:
-    return "not known" if effect.p is None else f"{effect.p:.3g}"
-
-
-def _anova_parts(result: AsymmetryResult) -> tuple[TablePart, ...]:
+def _anova_table(result: AsymmetryResult, title: str, anova: Sequence[AnovaRow], file: str, note: str) -> Table:
     lengths = _lengths(result)
-    names = (lengths.label("SS", "²"), "df", lengths.label("MS", "²"), "R²", "F", "Z")
-    columns = ("source", *names, "p")
-    note = "df are those of subjects times dimensions."
-    observed = "df are those of the observations."
-    parts = [("Procrustes ANOVA", result.anova, note if result.degrees_of_freedom == "klingenberg" else observed)]
-    if result.size_anova:
-        parts.append(("ANOVA of centroid size", result.size_anova, observed))
-    return tuple(
-        TablePart.of(
-            title, columns, [(e.source, e.ss, float(e.df), e.ms, e.r2, e.f, e.z, e.p) for e in anova], note=text
-        )
-        for title, anova, text in parts
-    )
-
-
-def _anova_rows(result: AsymmetryResult, anova: Sequence[AnovaRow]) -> Rows:
-    field = _lengths(result).field
-    return ("source", field("ss", "2"), "df", field("ms", "2"), "r2", "f", "z", "p"), [
-        (e.source, e.ss, e.df, e.ms, e.r2, *("" if value is None else value for value in (e.f, e.z, e.p)))
-        for e in anova
-    ]
-
-
-def _subject_rows(result: AsymmetryResult) -> Rows:
-    field = _lengths(result).field
-    header = (
-        "subject", "shapes", *map(field, ("asymmetry", "low", "high", "measured")), "z", "z_low", "z_high",
-        "in_reference", *map(field, ("vertices", "vertices_low", "vertices_high")),
+    return Table(
+        title=title,
+        columns=(
+            Column("source", field="source"),
+            Column(lengths.label("SS", "²"), "number", lengths.field("ss", "2")),
+            Column("df", "number"), Column(field="df"),
+            Column(lengths.label("MS", "²"), "number", lengths.field("ms", "2")),
+            Column("R²", "number", "r2"), Column("F", "number", "f"), Column("Z", "number", "z"), Column("p", "p", "p"),
+        ),
+        rows=[(e.source, e.ss, float(e.df), e.df, e.ms, e.r2, e.f, e.z, e.p) for e in anova],
+        note=note,
+        file=file,
     )  # fmt: skip
-    s, v = result.scores, result.vertex_scores
-    columns = (s.mm, s.low, s.high, s.raw_mm, result.z, result.z_low, result.z_high)
-    rows = [
-        (name, int(result.counts[k]), *(_cell(c[k]) for c in columns), int(result.in_reference[k]), _cell(v.mm[k]),
-         _cell(v.low[k]), _cell(v.high[k]))
-        for k, name in enumerate(result.subjects)
-    ]  # fmt: skip
-    return header, rows
-
-
-def _cell(value: float) -> object:
-    return "" if np.isnan(value) else float(value)
 
 
 def _histogram(result: AsymmetryResult) -> HistogramPart:
-    edges = np.histogram_bin_edges(result.scores.mm, bins=min(_BINS, max(4, len(result.subjects) // 3)))
-    series = [("reference group" if not result.in_reference.all() else "", result.in_reference)]
-    if not result.in_reference.all():
-        series.append(("others", ~result.in_reference))
-    return HistogramPart(
-        title="Distances of subjects from their mirror images",
-        edges=tuple(edges.tolist()),
-        series=tuple(
-            Counts(label=label, counts=tuple(np.histogram(result.scores.mm[members], edges)[0].astype(float).tolist()))
-            for label, members in series
-        ),
+    mm, inside = result.scores.mm, result.in_reference
+    values = {"": mm} if inside.all() else {"reference group": mm[inside], "others": mm[~inside]}
+    return histogram_part(
+        "Distances of subjects from their mirror images", values, min(_BINS, max(4, len(result.subjects) // 3)),
         x=f"asymmetry (RMS {_lengths(result).label(_direction(result))})",
-    )
-
-
-def _most_asymmetric(result: AsymmetryResult, order: Any) -> TablePart:
-    s, lengths = result.scores, _lengths(result)
-    columns = (
-        TableColumn(name="subject"), TableColumn(name="shapes", kind="count"), lengths.column("asymmetry"),
-        lengths.column("low"), lengths.column("high"),
-        TableColumn(name="standard deviations", kind="number"),
     )  # fmt: skip
-    rows = tuple(
-        (result.subjects[k], int(result.counts[k]), *(_finite_or_none(c[k]) for c in (s.mm, s.low, s.high, result.z)))
-        for k in map(int, order[:_MOST_ROWS])
-    )
-    title = "The most asymmetric subjects" if len(order) > _MOST_ROWS else "Subjects"
-    return TablePart(title=title, columns=columns, rows=rows, note="All of them stand in subjects.csv.")
 
 
-def _finite_or_none(value: float) -> float | None:
-    return None if np.isnan(value) else float(value)
+def _subject_table(result: AsymmetryResult, order: Any) -> Table:
+    s, v, lengths = result.scores, result.vertex_scores, _lengths(result)
+    numbers = (s.mm, s.low, s.high, s.raw_mm, result.z, result.z_low, result.z_high)
+    return Table(
+        title="The most asymmetric subjects" if len(order) > _MOST_ROWS else "Subjects",
+        columns=(
+            Column("subject", field="subject"), Column("shapes", "count", "shapes"),
+            *(lengths.column(name, name) for name in ("asymmetry", "low", "high")), lengths.column(field="measured"),
+            Column("standard deviations", "number", "z"), Column(field="z_low"), Column(field="z_high"),
+            Column(field="in_reference"),
+            *(lengths.column(field=name) for name in ("vertices", "vertices_low", "vertices_high")),
+        ),
+        rows=[
+            (name, int(result.counts[k]), *(own[k] for own in numbers), int(result.in_reference[k]), v.mm[k], v.low[k],
+             v.high[k])
+            for k, name in enumerate(result.subjects)
+        ],
+        note="All of them stand in subjects.csv.",
+        file="subjects.csv",
+        shown=order[:_MOST_ROWS],
+    )  # fmt: skip
 
 
 def _vectors(mean: FloatArray, half_difference: FloatArray, arrays: dict[str, Any]) -> tuple[Part, ...]:
@@ -288,7 +247,7 @@ def _vectors(mean: FloatArray, half_difference: FloatArray, arrays: dict[str, An
                             low_label="the mirrored mean", high_label="the mean", times=times),)  # fmt: skip
 
 
-def _maps_and_morphs(result: AsymmetryResult, order: Any) -> tuple[Mapping[str, Any], list[Part]]:
+def _maps_and_morphs(result: AsymmetryResult, order: Any) -> tuple[Mapping[str, Any], list[Part | Table]]:
     subjects = [int(k) for k in order[:_MOST_MAPS]]
     half_difference = result.difference.mean(axis=0) / 2.0
     arrays: dict[str, Any] = {
@@ -307,7 +266,7 @@ def _maps_and_morphs(result: AsymmetryResult, order: Any) -> tuple[Mapping[str, 
         return arrays, [_point_table(result), *_vectors(result.mean, half_difference, arrays)]
     arrays["faces"] = result.sides.faces
     untested = not result.permutations
-    parts: list[Part] = [
+    parts: list[Part | Table] = [
         SurfaceMapPart(
             title="Directional asymmetry", level=2, arrays=_FILE, values="directional_mm",
             mask="" if untested else "shown",
@@ -367,18 +326,15 @@ def _blank_note(result: AsymmetryResult) -> str:
     return "" if result.blank is None else f" {blank_sentence(int(result.blank.sum()), len(result.blank))}"
 
 
-def _point_table(result: AsymmetryResult) -> TablePart:
-    of = {vertex: name for name, vertex in (result.cohort.landmarks or SurfaceLandmarks()).items()}
-    columns = (
-        TableColumn(name="vertex"), _lengths(result).column("directional"), TableColumn(name="p", kind="p"),
-        _lengths(result).column("fluctuating"),
+def _point_table(result: AsymmetryResult) -> Table:
+    names = {vertex: name for name, vertex in (result.cohort.landmarks or SurfaceLandmarks()).items()}
+    lengths, vertices = _lengths(result), map(int, result.sides.vertices)
+    columns = (Column("vertex"), lengths.column("directional"), Column("p", "p"), lengths.column("fluctuating"))
+    rows = zip(
+        [names.get(v, str(v)) for v in vertices], result.directional, result.directional_p, result.fluctuating,
+        strict=True,
     )  # fmt: skip
-    rows = tuple(
-        (of.get(int(v), str(int(v))), float(result.directional[k]), _finite_or_none(result.directional_p[k]),
-         float(result.fluctuating[k]))
-        for k, v in enumerate(result.sides.vertices)
-    )  # fmt: skip
-    return TablePart(title="Vertices", columns=columns, rows=rows, note="p is family-wise.")
+    return Table(title="Vertices", columns=columns, rows=list(rows), note="p is family-wise.")
 
 
 def _meshes(result: AsymmetryResult, order: Any) -> dict[str, Mesh]:

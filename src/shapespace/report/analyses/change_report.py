@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,21 +11,19 @@ import numpy.typing as npt
 
 from shapespace.cohort.table import list_names
 from shapespace.geometry.distortion import factor_to_draw, flip_factor
-from shapespace.report.analyses.analysis_report import REDUCED_MORPH_NOTE, AnalysisReport, Rows
+from shapespace.report.analyses.analysis_report import REDUCED_MORPH_NOTE, AnalysisReport, Column, Table
 from shapespace.report.analyses.methods_section import (
     dispersion_sentence,
     is_dispersion_warning,
-    methods_parts,
     multiplicity_sentence,
 )
-from shapespace.report.analyses.shape_data import add_shape_data, blank_sentence, model_hashes
+from shapespace.report.analyses.shape_data import blank_sentence, cohort_report
 from shapespace.schemas import (
     CurvePart,
     MorphPart,
     Part,
     Series,
     SurfaceMapPart,
-    TableColumn,
     TablePart,
     TextPart,
 )
@@ -68,29 +66,30 @@ def change_report(change: ChangeResult) -> AnalysisReport:
         "faces": np.asarray(change.cohort.faces),
         "stable_share": np.mean([subject.stable for subject in change.subjects], axis=0),
     }
-    parts: list[Part] = []
+    parts: list[Part | Table] = []
     if change.mean_change is not None:
         parts += _mean_change_parts(change, change.mean_change, arrays)
     if change.group_difference is not None:
         parts += _group_difference_parts(change, change.group_difference, arrays)
-    parts += _noise_parts(change, arrays)
-    parts += _subject_parts(change, arrays)
-    parts += _time_series(change)
-    parts.append(
+    parts += [
+        *_noise_parts(change, arrays),
+        *_subject_parts(change, arrays),
+        *_time_series(change),
         SurfaceMapPart(
             title="What was taken as stable", level=2, arrays=ARRAYS, vertices="before", values="stable_share",
             unit="share of subjects", signed=False, limit=1.0,
             note=f"Asked for: {config.stable if isinstance(config.stable, str) else 'vertices of a list'}. The "
             "scans of a subject were brought to each other rigidly by these vertices.",
-        )
-    )  # fmt: skip
+        ),
+        *_file_tables(change),
+    ]  # fmt: skip
     stable = config.stable
-    report = AnalysisReport(
+    return cohort_report(
         "change",
         "What changed?",
-        tuple(_summary(change)),
-        (*parts, *methods_parts(change.methods)),
-        tables=_tables(change),
+        parts,
+        change.cohort,
+        summary=tuple(_summary(change)),
         arrays={ARRAYS: arrays, MAPS: _maps(change)},
         meshes={
             "before.ply": Mesh(change.before, change.cohort.faces, name="before"),
@@ -110,10 +109,8 @@ def change_report(change: ChangeResult) -> AnalysisReport:
             "unequal_variances": change.methods.unequal_variances,
             "uncertainty": change.uncertainty,
         },
-        model_hashes=model_hashes(change.cohort),
         methods=change.methods,
     )
-    return add_shape_data(report, change.cohort)
 
 
 def _summary(change: ChangeResult) -> list[str]:
@@ -220,7 +217,9 @@ def _per_time(change: ChangeResult) -> str:
     return f" per {change.time_unit}" if change.config.rate else ""
 
 
-def _mean_change_parts(change: ChangeResult, tests: MeanChangeTests, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
+def _mean_change_parts(
+    change: ChangeResult, tests: MeanChangeTests, arrays: dict[str, npt.NDArray[Any]]
+) -> list[Part | Table]:
     test = tests.surface
     unit = f"mm{_per_time(change)}"
     arrays |= {
@@ -238,7 +237,7 @@ def _mean_change_parts(change: ChangeResult, tests: MeanChangeTests, arrays: dic
         f"{test.permutations} sign flips{' (all there are)' if test.every else ''}; no p can be below {least:.2g}."
     )
     note = f"Mean of {test.n[0]} subjects along the normals, outwards positive. {marked}{grey}"
-    parts: list[Part] = [
+    parts: list[Part | Table] = [
         SurfaceMapPart(
             title="The mean change", level=2, arrays=ARRAYS, vertices="before", values="mean",
             mask="" if least > _LEVEL else "mean_found", unit=unit, note=note,
@@ -248,38 +247,34 @@ def _mean_change_parts(change: ChangeResult, tests: MeanChangeTests, arrays: dic
     if len(change.regions) > 1:
         parts.append(_region_table(change, tests.volumes))
     if tests.landmarks is not None:
-        header, rows = _landmark_summary(change, tests.landmarks)
-        kinds = ("text", "mm", "mm", "mm", "mm", "p")
-        columns = tuple(TableColumn(name=name, kind=kind) for name, kind in zip(header, kinds, strict=True))  # type: ignore[arg-type]
-        parts.append(
-            TablePart(
-                title="Landmarks", columns=columns, rows=tuple(tuple(row) for row in rows),
-                note=f"Along the normals, {unit}, with the 95 % interval of the mean; p with the error over all held.",
-            )
-        )  # fmt: skip
+        parts.append(_landmark_table(change, tests.landmarks, unit))
     return parts
 
 
 def _region_table(change: ChangeResult, test: MapTest) -> Part:
-    rows: list[tuple[Any, ...]] = []
     volumes = np.array([change_or_rate(one, rate=change.config.rate).volumes_mm3 for one in change.subjects])
     unit = _VolumeUnit.of(volumes.mean(axis=0))
-    for k, name in enumerate(change.regions):
-        own = volumes[:, k] / unit.mm3
-        rows.append((name, float(own.mean()), *interval_of_mean(own), float(test.p[k])))
+    every = zip(change.regions, [own / unit.mm3 for own in volumes.T], test.p, strict=True)
+    rows = [(name, float(own.mean()), *interval_of_mean(own), float(p)) for name, own, p in every]
     return TablePart.of(
         "Volumes swept", ("of", f"mean, {unit.name}", "low", "high", "p"), rows,
         note="With the 95 % interval of the mean; p with the error over all parts held.",
     )  # fmt: skip
 
 
-def _landmark_summary(change: ChangeResult, test: MapTest) -> tuple[Sequence[str], list[list[Any]]]:
-    rows: list[list[Any]] = []
+def _landmark_table(change: ChangeResult, test: MapTest, unit: str) -> Table:
     maps = np.stack([change_or_rate(one, rate=change.config.rate).along_mm for one in change.subjects])
-    for k, (name, values) in enumerate(zip(change.landmarks.names, change.landmarks.interpolate(maps.T), strict=True)):
-        low, high = interval_of_mean(values)
-        rows.append([name, values.mean(), values.std(ddof=1), low, high, test.p[k]])
-    return ("landmark", "mean", "stddev", "low", "high", "p"), rows
+    names = ("mean", "stddev", "low", "high")
+    every = zip(change.landmarks.names, change.landmarks.interpolate(maps.T), test.p, strict=True)
+    return Table(
+        title="Landmarks",
+        columns=(
+            Column("landmark", field="landmark"), *(Column(one, "mm", one) for one in names), Column("p", "p", "p"),
+        ),
+        rows=[(name, own.mean(), own.std(ddof=1), *interval_of_mean(own), p) for name, own, p in every],
+        note=f"Along the normals, {unit}, with the 95 % interval of the mean; p with the error over all held.",
+        file="group_landmarks.csv",
+    )  # fmt: skip
 
 
 def _group_difference_parts(
@@ -355,34 +350,50 @@ def _noise_parts(change: ChangeResult, arrays: dict[str, npt.NDArray[Any]]) -> l
     ]  # fmt: skip
 
 
-def _subject_parts(change: ChangeResult, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
+def _subject_table(change: ChangeResult) -> Table:
     every = len(change.subjects)
     more = f" The first {MOST_ROWS} of {every}; all are in subjects.csv." if every > MOST_ROWS else ""
-    volumes = (one.change.volumes_mm3[0] for one in change.subjects[:MOST_ROWS])
-    unit = _VolumeUnit.of(*volumes)
+    unit = _VolumeUnit.of(*(one.change.volumes_mm3[0] for one in change.subjects[:MOST_ROWS]))
     columns = [
-        TableColumn(name="subject"), TableColumn(name="first"), TableColumn(name="last"),
-        TableColumn(name="RMS", kind="mm"), TableColumn(name="beyond its uncertainty", kind="percent"),
-        *(TableColumn(name=f"{quantity}, {unit.name}", kind="number") for quantity in ("volume", "stddev")),
+        Column("subject", field="subject"), Column(field="group"), Column("first", field="first"),
+        Column("last", field="last"), Column("RMS", "mm", "rms_mm"), Column(field="most_mm"),
+        Column("beyond its uncertainty", "percent", "beyond_share"), Column(f"volume, {unit.name}", "number"),
+        Column(f"stddev, {unit.name}", "number"), Column(field="volume_change_mm3"),
+        Column(field="volume_change_stddev_mm3"),
+        Column("of the volume before" if change.is_closed else "", "percent", "volume_change_share"),
+        Column(field="visits"), Column(field="scans"), Column(field="median_stddev_mm"),
+        Column("" if change.group_difference is None else "group"),
     ]  # fmt: skip
-    if change.is_closed:
-        columns.append(TableColumn(name="of the volume before", kind="percent"))
-    has_groups = change.group_difference is not None
-    if has_groups:
-        columns.append(TableColumn(name="group"))
-    rows: list[tuple[Any, ...]] = []
-    for one in change.subjects[:MOST_ROWS]:
+    if change.time_unit:
+        rates = ("rms_rate", "volume_rate_mm3", "volume_rate_stddev_mm3", "time_unit")
+        columns += [Column(field=one) for one in rates]
+    rows: list[Sequence[Any]] = []
+    for one in change.subjects:
         volume, stddev = float(one.change.volumes_mm3[0]), float(one.change.volumes_stddev_mm3[0])
-        row = [one.name, one.visits[0].label, one.visits[-1].label, one.rms_mm, one.beyond_share]
-        row += [volume / unit.mm3, _finite_or_none(stddev / unit.mm3)]
-        row += [volume / one.volume_before_mm3] if change.is_closed else []
-        rows.append((*row, *([one.group] if has_groups else [])))
-    parts: list[Part] = [
-        TablePart(
-            title="Subjects", level=2, columns=tuple(columns), rows=tuple(rows),
-            note=f"Last visit less first. {_SOURCES[change.uncertainty]}{more}",
-        )
-    ]  # fmt: skip
+        observed = ... if one.observed is None else one.observed
+        along = one.change.along_mm[observed]
+        row = [
+            one.name, one.group, one.visits[0].label, one.visits[-1].label, one.rms_mm,
+            float(along[np.abs(along).argmax()]), one.beyond_share, volume / unit.mm3, stddev / unit.mm3, volume,
+            stddev, volume / one.volume_before_mm3, len(one.visits), sum(visit.scans for visit in one.visits),
+            float(np.median(one.change.stddev_mm)), one.group,
+        ]  # fmt: skip
+        if one.rate is not None:
+            row += [
+                float(np.sqrt(np.average(one.rate.along_mm**2, weights=one.area_mm2))),
+                float(one.rate.volumes_mm3[0]),
+                float(one.rate.volumes_stddev_mm3[0]),
+                change.time_unit,
+            ]
+        rows.append(row)
+    return Table(
+        title="Subjects", level=2, columns=columns, rows=rows, file="subjects.csv", shown=range(MOST_ROWS),
+        note=f"Last visit less first. {_SOURCES[change.uncertainty]}{more}",
+    )  # fmt: skip
+
+
+def _subject_parts(change: ChangeResult, arrays: dict[str, npt.NDArray[Any]]) -> list[Part | Table]:
+    parts: list[Part | Table] = [_subject_table(change)]
     most = sorted(change.subjects, key=lambda one: -one.beyond_share)[:MOST_MAPS]
     for number, subject in enumerate(most, 1):
         before, after = change.surfaces(subject.name)
@@ -454,44 +465,10 @@ def _time_series(change: ChangeResult) -> list[Part]:
     ]
 
 
-def _subject_rows(change: ChangeResult) -> tuple[list[str], list[list[Any]]]:
-    header = [
-        "subject", "group", "first", "last", "rms_mm", "most_mm", "beyond_share", "volume_change_mm3",
-        "volume_change_stddev_mm3", "volume_change_share", "visits", "scans", "median_stddev_mm",
-    ]  # fmt: skip
-    if change.time_unit:
-        header += ["rms_rate", "volume_rate_mm3", "volume_rate_stddev_mm3", "time_unit"]
-    rows: list[list[Any]] = []
-    for one in change.subjects:
-        row: list[Any] = [
-            one.name,
-            one.group,
-            one.visits[0].label,
-            one.visits[-1].label,
-            one.rms_mm,
-            _largest(one),
-            one.beyond_share,
-            float(one.change.volumes_mm3[0]),
-            _finite_or_none(one.change.volumes_stddev_mm3[0]),
-            _finite_or_none(one.change.volumes_mm3[0] / one.volume_before_mm3),
-            len(one.visits),
-            sum(visit.scans for visit in one.visits),
-            float(np.median(one.change.stddev_mm)),
-        ]
-        if one.rate is not None:
-            row += [
-                float(np.sqrt(np.average(one.rate.along_mm**2, weights=one.area_mm2))),
-                float(one.rate.volumes_mm3[0]),
-                _finite_or_none(one.rate.volumes_stddev_mm3[0]),
-                change.time_unit,
-            ]
-        rows.append(row)
-    return header, rows
-
-
-def _tables(change: ChangeResult) -> dict[str, Rows]:
-    tables: dict[str, Rows] = {"subjects.csv": _subject_rows(change)}
-    tables["visits.csv"] = (
+def _file_tables(change: ChangeResult) -> Iterator[Table]:
+    """Yield the tables that are files alone."""
+    yield Table.of_fields(
+        "visits.csv",
         ("subject", "visit", "time", "scans", "rms_since_first_mm", "volume_since_first_mm3"),
         [
             (one.name, visit.label, visit.time, visit.scans, visit.rms_mm, visit.volume_mm3)
@@ -500,23 +477,22 @@ def _tables(change: ChangeResult) -> dict[str, Rows]:
         ],
     )
     if len(change.regions) > 1:
-        tables["regions.csv"] = (
+        yield Table.of_fields(
+            "regions.csv",
             ("subject", "region", "volume_change_mm3", "stddev_mm3"),
             [
-                (one.name, name, float(one.change.volumes_mm3[k]), _finite_or_none(one.change.volumes_stddev_mm3[k]))
+                (one.name, name, float(one.change.volumes_mm3[k]), float(one.change.volumes_stddev_mm3[k]))
                 for one in change.subjects
                 for k, name in enumerate(change.regions)
             ],
         )
     if change.landmarks:
-        tables["landmarks.csv"] = (
+        yield Table.of_fields(
+            "landmarks.csv",
             ("subject", "landmark", "x_mm", "y_mm", "z_mm", "moved_mm", "stddev_mm", "along_normal_mm",
              "along_normal_stddev_mm", "smallest_detectable_mm"),
             [row for one in change.subjects for row in _landmark_rows(change, one)],
         )  # fmt: skip
-        if change.mean_change is not None and change.mean_change.landmarks is not None:
-            tables["group_landmarks.csv"] = _landmark_summary(change, change.mean_change.landmarks)
-    return tables
 
 
 def _landmark_rows(change: ChangeResult, subject: SubjectChange) -> list[Sequence[object]]:
@@ -542,26 +518,19 @@ def _landmark_rows(change: ChangeResult, subject: SubjectChange) -> list[Sequenc
     ]
 
 
-def _largest(subject: SubjectChange) -> float:
-    """Return the largest change, mm, of the vertices that are observed."""
-    along = subject.change.along_mm if subject.observed is None else subject.change.along_mm[subject.observed]
-    return float(along[np.abs(along).argmax()])
-
-
 def _maps(change: ChangeResult) -> dict[str, npt.NDArray[Any]]:
-    maps = {
+    def single(values: Sequence[FloatArray]) -> npt.NDArray[Any]:
+        return np.stack(values).astype(np.float32)
+
+    rates = [change_or_rate(one, rate=True) for one in change.subjects] if change.time_unit else []
+    return {
         "subjects": np.array([one.name for one in change.subjects]),
-        "change_mm": np.stack([blank_where(one.change.along_mm, one.unobserved) for one in change.subjects]).astype(
-            np.float32
-        ),
-        "stddev_mm": np.stack([one.change.stddev_mm for one in change.subjects]).astype(np.float32),
+        "change_mm": single([blank_where(one.change.along_mm, one.unobserved) for one in change.subjects]),
+        "stddev_mm": single([one.change.stddev_mm for one in change.subjects]),
+        "beyond": np.stack([one.change.beyond for one in change.subjects]),
+        **({"rate_mm": single([one.along_mm for one in rates])} if rates else {}),
+        **({"rate_stddev_mm": single([one.stddev_mm for one in rates])} if rates else {}),
     }
-    maps["beyond"] = np.stack([one.change.beyond for one in change.subjects])
-    if change.time_unit:
-        rates = [change_or_rate(one, rate=True) for one in change.subjects]
-        maps["rate_mm"] = np.stack([one.along_mm for one in rates]).astype(np.float32)
-        maps["rate_stddev_mm"] = np.stack([one.stddev_mm for one in rates]).astype(np.float32)
-    return maps
 
 
 def _notes(change: ChangeResult) -> list[str]:
@@ -580,7 +549,3 @@ def _notes(change: ChangeResult) -> list[str]:
             "give --set surfaces=dense."
         )
     return notes
-
-
-def _finite_or_none(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None

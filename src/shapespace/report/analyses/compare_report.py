@@ -4,35 +4,31 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from shapespace.cohort.cohort import Cohort
-from shapespace.report.analyses.analysis_report import AnalysisReport, LengthFormat, Rows
+from shapespace.report.analyses.analysis_report import (
+    AnalysisReport,
+    Column,
+    LengthFormat,
+    Table,
+    floats,
+    histogram_part,
+)
 from shapespace.report.analyses.methods_section import (
     bias_of_p,
     dispersion_sentence,
     effect_size_sentence,
     is_dispersion_warning,
-    methods_parts,
     multiplicity_sentence,
 )
 from shapespace.report.analyses.morphospace_report import compared_morphospace
-from shapespace.report.analyses.shape_data import add_shape_data, blank_sentence, model_hashes, shape_change_parts
-from shapespace.schemas import (
-    Counts,
-    CurvePart,
-    HistogramPart,
-    Part,
-    Series,
-    SurfaceMapPart,
-    TableColumn,
-    TablePart,
-    TextPart,
-)
+from shapespace.report.analyses.shape_data import blank_sentence, cohort_report, shape_change_parts
+from shapespace.schemas import CurvePart, Part, Series, SurfaceMapPart, TextPart
 from shapespace.statistics.compare_maps import EffectMap, Tested
 from shapespace.statistics.compare_shapes import MOST_LEVELS, CompareResult, ShapeEffect, TermTest
 from shapespace.statistics.observation_weights import blank_where
@@ -52,60 +48,49 @@ _NO_FACES = np.zeros((0, 3), dtype=np.int32)
 
 def compare_report(result: CompareResult) -> AnalysisReport:
     """Return a comparison with all that its report shows; files are numbered as its effects are."""
-    effects = result.effects
+    effects, config = result.effects, result.config
     morphospace, plotted = compared_morphospace(result)
-    parts: list[Part] = [
-        *_term_parts(result),
-        *_pair_parts(result),
-        *_angle_parts(result),
+    arrays = {f"effect_{number}.npz": _arrays(result, effect) for number, effect in enumerate(effects, 1)}
+    content: list[Part | Table] = [
+        _term_table(result),
+        *_term_histograms(result),
+        _effect_table(result),
+        *_angle_tables(result),
         morphospace,
-        *(part for number, effect in enumerate(effects, 1) for part in _effect_parts(result, effect, number)),
-        *methods_parts(result.methods),
-    ]
-    report = AnalysisReport(
-        question="compare",
-        title=f"Shape {result.design.formula.strip()}",
+        *(part for effect, (file, own) in zip(effects, arrays.items(), strict=True)
+          for part in _effect_parts(result, effect, file, own)),
+    ]  # fmt: skip
+    return cohort_report(
+        "compare",
+        f"Shape {result.design.formula.strip()}",
+        content,
+        result.cohort,
         summary=tuple(_summary(result)),
-        parts=tuple(parts),
-        tables=_tables(result),
-        arrays={
-            morphospace.arrays: plotted,
-            **{f"effect_{number}.npz": _arrays(result, effect) for number, effect in enumerate(effects, 1)},
-        },
+        arrays={morphospace.arrays: plotted, **arrays},
         meshes=dict(_meshes(result)),
         notes=(*result.cohort.notes, *_repeated_measures_notes(result)),
         settings={
             "formula": result.design.formula,
-            "squares": result.config.anova_type,
-            "blocks": result.config.blocks,
-            "random": result.config.random,
-            "permutations": result.config.permutations,
-            "seed": result.config.seed,
-            "level": result.config.alpha,
-            "variances": result.config.variances,
+            "squares": config.anova_type,
+            "blocks": config.blocks,
+            "random": config.random,
+            "permutations": config.permutations,
+            "seed": config.seed,
+            "level": config.alpha,
+            "variances": config.variances,
             "unequal_variances": result.unequal_variances,
-            "effect_size": result.config.effect_size,
-            "coding": result.config.coding,
+            "effect_size": config.effect_size,
+            "coding": config.coding,
             "gauge": result.cohort.gauge,
             "shapes": len(result.cohort),
             "subjects": result.n_subjects,
-            **dict(_special_settings(result)),
+            **({} if config.bump_width_mm is None else {"bump_width_mm": config.bump_width_mm}),
+            **({"weights": config.weights} if result.cohort.source.kind == "corresponding" else {}),
+            **({"errors": dict(config.errors), "error_permutation": config.error_permutation} if config.errors else {}),
         },
-        model_hashes=model_hashes(result.cohort),
         methods=result.methods,
+        imputations=result.imputations,
     )
-    return add_shape_data(report, result.cohort, result.imputations)
-
-
-def _special_settings(result: CompareResult) -> Iterator[tuple[str, Any]]:
-    """Yield the settings that not all cohorts and models have."""
-    config = result.config
-    if config.bump_width_mm is not None:
-        yield "bump_width_mm", config.bump_width_mm
-    if result.cohort.source.kind == "corresponding":
-        yield "weights", config.weights
-    if config.errors:
-        yield from (("errors", dict(config.errors)), ("error_permutation", config.error_permutation))
 
 
 def _summary(result: CompareResult) -> Iterator[str]:
@@ -316,111 +301,108 @@ def _near_landmark(cohort: Cohort, vertex: int) -> str:
     return f" at landmark {name}" if cohort.source.kind == "landmarks" else f" near {name}"
 
 
-def _column(name: str, kind: Any = "text") -> TableColumn:
-    return TableColumn(name=name, kind=kind)
-
-
-def _term_parts(result: CompareResult) -> Iterator[Part]:
-    strata, lengths = any(test.stratum for test in result.tests), _lengths(result)
-    rows: list[tuple[Any, ...]] = []
-    for stratum in result.strata:
-        tests = [test for test in result.tests if test.stratum == stratum.stratum]
-        rows += [
-            (t.term, t.stratum, t.df, t.squares, t.squares / t.df, t.r2, t.f, t.z, t.p, t.f_other, t.p_other)
-            for t in tests
-        ]
-        share = stratum.squares / stratum.squares_total
-        rows.append(
-            ("residual", stratum.stratum, stratum.df, stratum.squares, stratum.squares / stratum.df, share, *[None] * 5)
-        )
-        rows.append(("total", stratum.stratum, stratum.df_total, stratum.squares_total, None, None, *[None] * 5))
-    columns = (
-        _column("term"), _column("tested"), _column("df", "count"),
-        _column(lengths.label("sum of squares", "²"), "number"),
-        _column(lengths.label("mean square", "²"), "number"), _column("R²", "percent"), _column("F", "number"),
-        _column("Z", "number"), _column("p", "p"),
-    )  # fmt: skip
-    if any(test.p_other is not None for test in result.tests):
-        other = "equal" if result.unequal_variances else "unequal"
-        columns = (*columns, _column(f"F, {other} variances", "number"), _column(f"p, {other} variances", "p"))
-    rows = [row[: len(columns)] for row in rows]
-    if not strata:
-        columns = (*columns[:1], *columns[2:])
-        rows = [(*row[:1], *row[2:]) for row in rows]
-    if result.config.errors:
-        errors = {(test.term, test.stratum): test.error for test in result.tests}
-        columns = (*columns, _column("F over"))
-        rows = [(*row, errors.get((row[0], row[1] if strata else ""), "")) for row in rows]
-    note = (
-        f"Type {result.config.anova_type} sums of squares of Procrustes distances. {_f_sentence(result)} "
-        f"{effect_size_sentence(result.config.effect_size)} R² is the share of the total of its stratum."
+def _term_table(result: CompareResult) -> Table:
+    strata, lengths, config = (
+        any(test.stratum for test in result.tests),
+        LengthFormat(result.cohort.unit),
+        result.config,
     )
-    yield TablePart(title="What shape varies with", level=2, note=note, columns=columns, rows=tuple(rows))
+    rows: list[tuple[Any, ...]] = [
+        (t.term, t.stratum, t.df, t.squares, t.squares / t.df, t.r2, t.r2, t.f, t.z, t.p,
+         "unequal" if t.unequal_variances else "equal", t.f_other, t.p_other, t.error if config.errors else "",
+         t.error)
+        for t in result.tests
+    ]  # fmt: skip
+    shown: list[int] = []
+    for one in result.strata:
+        shown += [k for k, test in enumerate(result.tests) if test.stratum == one.stratum]
+        shown += [len(rows), len(rows) + 1]
+        share, mean_square, unknown = one.squares / one.squares_total, one.squares / one.df, (*[None] * 6, "", None)
+        rows += [
+            ("residual", one.stratum, one.df, one.squares, mean_square, share, share, *unknown),
+            ("total", one.stratum, one.df_total, one.squares_total, None, None, 1.0, *unknown),
+        ]
+    other = "equal" if result.unequal_variances else "unequal"
+    has_other = any(test.p_other is not None for test in result.tests)
+    return Table(
+        title="What shape varies with",
+        level=2,
+        columns=(
+            Column("term", field="term"), Column("tested" if strata else "", field="stratum"),
+            Column("df", "count", "df"),
+            Column(lengths.label("sum of squares", "²"), "number", lengths.field("squares", "2")),
+            Column(lengths.label("mean square", "²"), "number"), Column("R²", "percent"), Column(field="r2"),
+            Column("F", "number", "f"), Column("Z", "number", "z"), Column("p", "p", "p"), Column(field="variances"),
+            Column(f"F, {other} variances" if has_other else "", "number", "f_other_variances"),
+            Column(f"p, {other} variances" if has_other else "", "p", "p_other_variances"),
+            Column("F over" if config.errors else ""), Column(field="error"),
+        ),
+        rows=rows,
+        shown=shown,
+        note=f"Type {config.anova_type} sums of squares of Procrustes distances. {_f_sentence(result)} "
+        f"{effect_size_sentence(config.effect_size)} R² is the share of the total of its stratum.",
+        file="terms.csv",
+    )  # fmt: skip
+
+
+def _term_histograms(result: CompareResult) -> Iterator[Part]:
     for test in result.tests:
         f = np.log10(np.maximum(test.arrangements, 1e-12))
-        counts, edges = np.histogram(f, bins=_BINS)
-        yield HistogramPart(
-            title=f"log10 F of {test.term} among its arrangements",
-            edges=_floats(edges),
-            series=(Counts(counts=_floats(counts), label="arrangements"),),
-            x="log10 F",
-            observed=float(f[0]),
-            observed_label="observed",
-        )
+        yield histogram_part(
+            f"log10 F of {test.term} among its arrangements", {"arrangements": f}, _BINS, x="log10 F",
+            observed=float(f[0]), observed_label="observed",
+        )  # fmt: skip
 
 
-def _pair_parts(result: CompareResult) -> Iterator[Part]:
-    pairs = Counter(effect.name for effect in result.effects)
+def _effect_table(result: CompareResult) -> Table:
+    pairs, lengths = Counter(effect.name for effect in result.effects), LengthFormat(result.cohort.unit)
     several = max(pairs.values(), default=0) > 1
-    rows = tuple(
-        (
-            e.name,
-            e.label,
-            e.distance_mm,
-            e.rms_mm,
-            e.f,
-            e.z,
-            e.p,
-            *[e.p_family if pairs[e.name] > 1 else None] * several,
-        )
-        for e in result.effects
-    )
-    yield TablePart(
+    return Table(
         title="How far apart",
         level=2,
         note="Distances of least-squares means: one variable changes, the others stay. The Procrustes distance is "
         "summed over vertices, the RMS is a vertex's share."
         f"{' The last column counts all pairs of one variable.' if several else ''}",
         columns=(
-            _column("variable"), _column("from, to"), _lengths(result).column("Procrustes distance"),
-            _lengths(result).column("RMS"),
-            _column("F", "number"), _column("Z", "number"), _column("p", "p"),
-            *[_column("p of all pairs", "p")] * several,
+            Column(field="number"), Column("variable", field="variable"), Column("from, to"), Column(field="from"),
+            Column(field="to"), Column(field="stratum"), lengths.column("Procrustes distance", "distance"),
+            lengths.column("RMS", "rms"), Column("F", "number", "f"), Column("Z", "number", "z"),
+            Column("p", "p", "p"), Column("p of all pairs" if several else "", "p"), Column(field="p_of_all_pairs"),
         ),
-        rows=rows,
+        rows=[
+            (number, e.name, e.label, e.low, e.high, e.stratum, e.distance_mm, e.rms_mm, e.f, e.z, e.p,
+             e.p_family if pairs[e.name] > 1 else None, e.p_family)
+            for number, e in enumerate(result.effects, 1)
+        ],
+        file="effects.csv",
     )  # fmt: skip
 
 
-def _angle_parts(result: CompareResult) -> Iterator[Part]:
+def _angle_tables(result: CompareResult) -> Iterator[Table]:
     if result.angles:
-        yield TablePart(
+        yield Table(
             title="Angles between changes of shape",
             note="0° is the same change, 90° nothing in common, 180° the opposite; p is that of parallel changes"
             f"{', not known where both are no longer than noise' if any(a.unknown_p for a in result.angles) else ''}.",
-            columns=(_column("one"), _column("other"), _column("angle, degrees", "number"), _column("p", "p")),
-            rows=tuple((a.first, a.second, a.degrees, a.p) for a in result.angles),
-        )
+            columns=(
+                Column("one", field="first"), Column("other", field="second"),
+                Column("angle, degrees", "number", "degrees"), Column("p", "p", "p"), Column(field="p_not_known"),
+            ),
+            rows=[(a.first, a.second, a.degrees, a.p, a.unknown_p or "") for a in result.angles],
+            file="angles.csv",
+        )  # fmt: skip
 
 
-def _effect_parts(result: CompareResult, effect: ShapeEffect, number: int) -> Iterator[Part]:
-    file, level = f"effect_{number}.npz", f"{100 * result.config.alpha:g} %"
+def _effect_parts(
+    result: CompareResult, effect: ShapeEffect, file: str, arrays: Mapping[str, npt.NDArray[Any]]
+) -> Iterator[Part]:
+    level = f"{100 * result.config.alpha:g} %"
     yield TextPart(
         title=effect.label,
         level=2,
         text=_size_sentence(result, effect),
     )
     if effect.map is not None:
-        arrays = _arrays(result, effect)
         blank = effect.map.blank
         note = _PALE if blank is None else f"{_PALE} {blank_sentence(int(blank.sum()), len(blank))}"
         for title, values, mask in (
@@ -482,8 +464,8 @@ def _score_parts(result: CompareResult, effect: ShapeEffect) -> Iterator[Part]:
         x=one.name,
         y=_lengths(result).label("score"),
         series=(
-            Series(x=_floats(x), y=_floats(y), label="shapes", points=True),
-            Series(x=_floats(ends), y=_floats(slope * (ends - one.middle)), label="model"),
+            Series(x=floats(x), y=floats(y), label="shapes", points=True),
+            Series(x=floats(ends), y=floats(slope * (ends - one.middle)), label="model"),
         ),
     )
 
@@ -532,74 +514,3 @@ def _meshes(result: CompareResult) -> Iterator[tuple[str, Mesh]]:
     for number, effect in enumerate(result.effects, 1):
         for end, shape, name in (("low", effect.at_low, effect.low), ("high", effect.at_high, effect.high)):
             yield f"effect_{number}_{end}.ply", result.cohort.mesh(shape, name)
-
-
-def _tables(result: CompareResult) -> Mapping[str, Rows]:
-    terms: list[tuple[object, ...]] = [
-        (
-            t.term,
-            t.stratum,
-            t.df,
-            t.squares,
-            t.r2,
-            t.f,
-            t.z,
-            t.p,
-            "unequal" if t.unequal_variances else "equal",
-            "" if t.f_other is None else t.f_other,
-            "" if t.p_other is None else t.p_other,
-            t.error,
-        )
-        for t in result.tests
-    ]
-    for left in result.strata:
-        share = left.squares / left.squares_total
-        terms.append(("residual", left.stratum, left.df, left.squares, share, *[""] * 7))
-        terms.append(("total", left.stratum, left.df_total, left.squares_total, 1.0, *[""] * 7))
-    field = _lengths(result).field
-    tables: dict[str, Rows] = {
-        "terms.csv": (
-            (
-                "term",
-                "stratum",
-                "df",
-                field("squares", "2"),
-                "r2",
-                "f",
-                "z",
-                "p",
-                "variances",
-                "f_other_variances",
-                "p_other_variances",
-                "error",
-            ),
-            terms,
-        ),
-        "effects.csv": (
-            (
-                "number",
-                "variable",
-                "from",
-                "to",
-                "stratum",
-                field("distance"),
-                field("rms"),
-                "f",
-                "z",
-                "p",
-                "p_of_all_pairs",
-            ),
-            [
-                (number, e.name, e.low, e.high, e.stratum, e.distance_mm, e.rms_mm, e.f, e.z, e.p, e.p_family)
-                for number, e in enumerate(result.effects, 1)
-            ],
-        ),
-    }
-    if result.angles:
-        rows = [(a.first, a.second, a.degrees, a.p, a.unknown_p or "") for a in result.angles]
-        tables["angles.csv"] = (("first", "second", "degrees", "p", "p_not_known"), rows)
-    return tables
-
-
-def _floats(values: FloatArray | npt.NDArray[np.int64] | Sequence[float]) -> tuple[float, ...]:
-    return tuple(float(value) for value in values)

@@ -10,10 +10,10 @@ import numpy.typing as npt
 
 from shapespace.fit.completion.complete import ESTIMATED, OBSERVED, UNKNOWABLE, Completion, CompletionConfig
 from shapespace.geometry.closest import build_engine
-from shapespace.report.analyses.analysis_report import AnalysisReport, Rows
+from shapespace.report.analyses.analysis_report import AnalysisReport, Column, Table
 from shapespace.report.render.scene import decimate
 from shapespace.reprs import first_names
-from shapespace.schemas import MorphPart, Part, SurfaceMapPart, TablePart, TextPart
+from shapespace.schemas import MorphPart, Part, SurfaceMapPart, TextPart
 from shapespace.types import FloatArray, Mesh
 
 _MOST_SURFACES = 12  # scans whose surfaces are drawn; the files have all
@@ -90,36 +90,41 @@ class CompletionReport:
         settings = {"samples": self.config.samples, "seed": self.config.seed, "mirror": self.config.mirror,
                     "part": self.config.part, "with_doubtful": self.config.with_doubtful}  # fmt: skip
         count = len(self._rows)
-        quantities = TablePart.of(
-            "Quantities", ("scan", "quantity", "unit", "completed surface", "SD", "95 % from", "to"),
-            [(*row[:4], *row[5:8]) for row in self._estimates[:_MOST_ROWS]],
-            note=f"95 % intervals, {_source(self._calibrated_on)}. All quantities are in estimates.csv.",
-        )  # fmt: skip
-        columns = ("scan", "status", "observed", "estimated", "unknowable", "SD of missing vertices, mm", "noise, mm")
-        scans = TablePart.of(
-            "Scans", columns, self._rows[:_MOST_ROWS], percent=("observed", "estimated", "unknowable"),
+        scans = Table(
+            title="Scans",
+            columns=(
+                Column("scan", field="scan"), Column("status", field="status"),
+                *(Column(one, "percent", f"{one}_share") for one in ("observed", "estimated", "unknowable")),
+                Column("SD of missing vertices, mm", "number", "missing_stddev_mm"),
+                Column("noise, mm", "number", "noise_mm"),
+            ),
+            rows=self._rows,
+            shown=range(_MOST_ROWS),
             note="Observed: the scan shows the vertex. Estimated: it is predicted better than by the mean shape. "
             "Unknowable: it is not.",
+            file="completions.csv",
         )  # fmt: skip
-        tables: dict[str, Rows] = {
-            "completions.csv": (
-                ("scan", "status", "observed_share", "estimated_share", "unknowable_share", "missing_stddev_mm",
-                 "noise_mm"), self._rows,
+        quantities = Table(
+            title="Quantities",
+            columns=(
+                Column("scan", field="scan"), Column("quantity", field="quantity"), Column("unit", field="unit"),
+                Column("completed surface", "number", "value"), Column(field="mean"), Column("SD", "number", "stddev"),
+                Column("95 % from", "number", "low_95"), Column("to", "number", "high_95"),
+                Column(field="calibrated_on"),
             ),
-            "estimates.csv": (
-                ("scan", "quantity", "unit", "value", "mean", "stddev", "low_95", "high_95", "calibrated_on"),
-                self._estimates,
-            ),
-        }  # fmt: skip
-        if self._landmarks:
-            head = ("scan", "landmark", *(f"{axis}_mm" for axis in "xyz"), *(f"stddev_{axis}_mm" for axis in "xyz"))
-            tables["landmarks.csv"] = (head, self._landmarks)
-        return AnalysisReport(
-            question="complete",
-            title=f"Completion of {count} partial scan{'' if count == 1 else 's'}",
+            rows=self._estimates,
+            shown=range(_MOST_ROWS),
+            note=f"95 % intervals, {_source(self._calibrated_on)}. All quantities are in estimates.csv.",
+            file="estimates.csv",
+        )  # fmt: skip
+        fields = ("scan", "landmark", *(f"{axis}_mm" for axis in "xyz"), *(f"stddev_{axis}_mm" for axis in "xyz"))
+        landmarks = [Table.of_fields("landmarks.csv", fields, self._landmarks)] if self._landmarks else []
+        method = TextPart(title="Method", level=2, text=self._method())
+        return AnalysisReport.of(
+            "complete",
+            f"Completion of {count} partial scan{'' if count == 1 else 's'}",
+            [scans, quantities, *self._parts, method, *landmarks],
             summary=tuple(self._summary[:_MOST_SENTENCES]),
-            parts=(scans, quantities, *self._parts, TextPart(title="Method", level=2, text=self._method())),
-            tables=tables,
             arrays={_FILE: self._arrays},
             notes=tuple(self._note(note, names, count) for note, names in self._notes.items())
             + ((f"{failed} scan{' has' if failed == 1 else 's have'} no completion.",) if failed else ()),

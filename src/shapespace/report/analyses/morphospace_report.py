@@ -10,10 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import InputError
-from shapespace.report.analyses.analysis_report import AnalysisReport, LengthFormat, Rows
-from shapespace.report.analyses.methods_section import methods_parts
-from shapespace.report.analyses.shape_data import add_shape_data, model_hashes, scree_part, tangent_parts
-from shapespace.schemas import ConfusionPart, MorphospacePart, TablePart
+from shapespace.report.analyses.analysis_report import AnalysisReport, Column, LengthFormat, Table
+from shapespace.report.analyses.shape_data import cohort_report, scree_part, tangent_parts
+from shapespace.schemas import ConfusionPart, MorphospacePart
 from shapespace.statistics.compare_shapes import CompareResult
 from shapespace.statistics.methods import methods_of, sample_sizes
 from shapespace.statistics.shape_tests.ordination import Ordination, OrdinationMethod, ordinate
@@ -70,31 +69,29 @@ def morphospace_report(result: Ordination, first: tuple[int, int] = (1, 2)) -> A
         InputError: there are no such axes.
     """
     part, arrays = morphospace_part(result, first)
-    cohort, eigenvalues = result.cohort, _eigenvalue_table(result)
+    cohort = result.cohort
     variables = [(result.variable, _classes(result, result.groups.codes))] if result.groups is not None else []
     assumptions = [f"The axes are {_AXES[result.method]}s."]
     if result.edges is not None:
         assumptions.append("Ancestral shapes follow from Brownian motion along the branches of the phylogeny.")
     sizes = sample_sizes(cohort.names, variables)
     methods = methods_of(cohort, len(cohort), sizes=sizes, assumptions=tuple(assumptions))
-    report = AnalysisReport(
-        question="morphospace",
-        title=f"Morphospace: {_AXES[result.method]}s",
+    return cohort_report(
+        "morphospace",
+        f"Morphospace: {_AXES[result.method]}s",
+        [part, *_confusion_parts(result), scree_part(result.eigenvalues, axis=_AXES[result.method]),
+         *tangent_parts(cohort), _eigenvalue_table(result), *_file_tables(result)],
+        cohort,
         summary=tuple(_summary(result)),
-        parts=(part, *_confusion_parts(result), scree_part(result.eigenvalues, axis=_AXES[result.method]),
-               *tangent_parts(cohort), eigenvalues, *methods_parts(methods)),
-        tables=_tables(result, eigenvalues),
         arrays={FILE: arrays},
         notes=(*cohort.notes, *result.notes),
         settings={
             "method": result.method, "group": result.variable or None, "components": result.components,
             "phylogeny": result.edges is not None, "gauge": cohort.gauge, "shapes": len(cohort),
         },
-        model_hashes=model_hashes(cohort),
         methods=methods,
         citations=(*_CITATIONS[result.method], *((_PHYLOMORPHOSPACE,) if result.edges is not None else ())),
     )  # fmt: skip
-    return add_shape_data(report, cohort)
 
 
 def compared_morphospace(result: CompareResult) -> tuple[MorphospacePart, dict[str, npt.NDArray[Any]]]:
@@ -185,21 +182,25 @@ def _confusion_parts(result: Ordination) -> Iterator[ConfusionPart]:
         yield ConfusionPart(title="Leave-one-out classification", classes=result.groups.names, counts=rows)
 
 
-def _eigenvalue_table(result: Ordination) -> TablePart:
+def _eigenvalue_table(result: Ordination) -> Table:
     shares = result.explained_variance_ratio
-    values, columns = [result.eigenvalues, shares, shares.cumsum()], ["axis", "eigenvalue", "share", "cumulative"]
+    values = [result.eigenvalues, shares, shares.cumsum()]
+    kinds: dict[str, Any] = {"axis": "text", "eigenvalue": "number", "share": "percent", "cumulative": "percent"}
     if result.method != "cva":
         values.append(np.sqrt(result.eigenvalues / result.cohort.n_vertices))
-        columns.append(LengthFormat(result.cohort.unit).label("standard deviation, RMS per point"))
-    rows = [(name, *map(float, row)) for name, row in zip(result.names, np.stack(values, axis=1), strict=True)]
-    return TablePart.of("Eigenvalues", columns, rows, percent=("share", "cumulative"))
+        kinds[LengthFormat(result.cohort.unit).label("standard deviation, RMS per point")] = "number"
+    columns = [Column(name, kind, name) for name, kind in kinds.items()]
+    return Table(
+        title="Eigenvalues", columns=columns, rows=list(zip(result.names, *values, strict=True)), file="eigenvalues.csv"
+    )
 
 
 def _classes(result: Ordination, codes: npt.NDArray[Any]) -> list[str]:
     return [] if result.groups is None else [result.groups.names[int(code)] for code in codes]
 
 
-def _tables(result: Ordination, eigenvalues: TablePart) -> Mapping[str, Rows]:
+def _file_tables(result: Ordination) -> tuple[Table, Table]:
+    """Return the tables of scores and loadings, which are files alone."""
     cohort, names, shown = result.cohort, result.names, result.names[:_SHOWN_AXES]
     columns: dict[str, Any] = {"name": cohort.names, **dict(zip(names, result.scores.T, strict=True))}
     if result.groups is not None:
@@ -215,8 +216,9 @@ def _tables(result: Ordination, eigenvalues: TablePart) -> Mapping[str, Rows]:
     is_landmarks = cohort.source.kind == "landmarks" and cohort.landmarks is not None
     points = cohort.landmarks.names if is_landmarks and cohort.landmarks else range(cohort.n_vertices)
     rows = [(point, "xyz"[d], *values[3 * v + d]) for v, point in enumerate(points) for d in range(cohort.dimensions)]
-    return {
-        "scores.csv": (tuple(columns), list(zip(*columns.values(), strict=True))),
-        "loadings.csv": (("point", "coordinate", *(f"{name}{kind}" for kind in loadings for name in shown)), rows),
-        "eigenvalues.csv": (tuple(column.name for column in eigenvalues.columns), eigenvalues.rows),
-    }
+    return (
+        Table.of_fields("scores.csv", tuple(columns), list(zip(*columns.values(), strict=True))),
+        Table.of_fields(
+            "loadings.csv", ("point", "coordinate", *(f"{name}{kind}" for kind in loadings for name in shown)), rows
+        ),
+    )

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 
 from shapespace.cohort.cohort import Cohort, subjects_of
-from shapespace.report.analyses.analysis_report import AnalysisReport, Rows
-from shapespace.report.analyses.methods_section import methods_parts
-from shapespace.report.analyses.shape_data import add_shape_data, model_hashes
+from shapespace.report.analyses.analysis_report import AnalysisReport, Column, Table
+from shapespace.report.analyses.shape_data import cohort_report
 from shapespace.report.analyses.shape_prediction_report import SHAPES_FILE, shape_prediction_parts
 from shapespace.schemas import CurvePart, Part, Series, TablePart, TextPart
 from shapespace.statistics.methods import methods_of
@@ -36,20 +35,16 @@ _MEASURE_NAMES = {
 
 def regression_report(result: RegressionResult, new: tuple[Cohort, Predictions] | None = None) -> AnalysisReport:
     """Return the answer to what number goes with a shape, with what is predicted of new shapes."""
-    parts: list[Part] = [_measures_part(result), _calibration_part(result)]
-    if new is not None:
-        parts.append(_prediction_part(result.predictor, new[1]))
     pictures, arrays, meshes = shape_prediction_parts(result.shapes)
-    measures = ("measure", "value", "low", "high"), [(n, m.value, m.low, m.high) for n, m in result.measures.items()]
-    tables = {"predictions.csv": _rows(result), "measures.csv": measures}
-    if new is not None:
-        tables["new.csv"] = _prediction_rows(*new)
-    report = AnalysisReport(
-        question="regress",
-        title=f"{result.target} from shape",
+    return cohort_report(
+        "regress",
+        f"{result.target} from shape",
+        [
+            _measures_part(result), _calibration_part(result), *_new_tables(result.predictor, new), *pictures,
+            *_file_tables(result),
+        ],
+        result.cohort,
         summary=_summary(result, new),
-        parts=(*parts, *pictures, *methods_parts(result.methods)),
-        tables=tables,
         arrays={SHAPES_FILE: arrays},
         meshes=meshes,
         notes=(*result.cohort.notes, *(() if new is None else new[0].notes)),
@@ -58,38 +53,35 @@ def regression_report(result: RegressionResult, new: tuple[Cohort, Predictions] 
             "subjects": result.n_subjects, "folds": result.folds, "permutations": result.permutations,
             "level": result.confidence, "choice": result.choice.words(), "seed": result.seed,
         },
-        model_hashes=model_hashes(result.cohort),
         methods=result.methods,
         citations=_CITATIONS,
+        imputations=result.imputations,
     )  # fmt: skip
-    return add_shape_data(report, result.cohort, result.imputations)
 
 
 def prediction_report(predictor: Predictor, cohort: Cohort, predictions: Predictions) -> AnalysisReport:
     """Return the answer of a predictor that was learned earlier."""
-    report = AnalysisReport(
-        question="regress",
-        title=f"{predictor.target} from shape",
+    assumption = (
+        f"{predictor.target} is predicted by {predictor.method}, learned from {predictor.subjects} other "
+        f"subjects, with prediction intervals of {100 * predictor.confidence:.0f} % by cross-validation (CV+)."
+    )
+    return cohort_report(
+        "regress",
+        f"{predictor.target} from shape",
+        _new_tables(predictor, (cohort, predictions)),
+        cohort,
         summary=(
             f"{predictor.target} of {len(predictions.names)} shapes, by {predictor.method} of {predictor.subjects} "
             "subjects.",
             _outside_sentence(predictor, predictions),
         ),
-        parts=(_prediction_part(predictor, predictions),),
-        tables={"new.csv": _prediction_rows(cohort, predictions)},
-        notes=cohort.notes,
         settings={"target": predictor.target, "gauge": predictor.gauge, "level": predictor.confidence},
-        methods=methods_of(
-            cohort, len(cohort),
-            assumptions=(
-                f"{predictor.target} is predicted by {predictor.method}, learned from {predictor.subjects} other "
-                f"subjects, with prediction intervals of {100 * predictor.confidence:.0f} % by cross-validation (CV+).",
-            ),
-        ),
+        methods=methods_of(cohort, len(cohort), assumptions=(assumption,)),
+        state_methods=False,
         model_hashes=(predictor.model_hash,) if predictor.model_hash else (),
         citations=_CITATIONS,
-    )  # fmt: skip
-    return add_shape_data(report, cohort, predictions.imputations)
+        imputations=predictions.imputations,
+    )
 
 
 def _summary(result: RegressionResult, new: tuple[Cohort, Predictions] | None) -> tuple[str, ...]:
@@ -158,7 +150,7 @@ def _measures_part(result: RegressionResult) -> TablePart:
     level = f"{100 * result.confidence:.0f} %"
     rows: list[tuple[object, ...]] = []
     for name, measure in result.measures.items():
-        rows.append((_MEASURE_NAMES[name], *(_finite_or_none(v) for v in (measure.value, measure.low, measure.high))))
+        rows.append((_MEASURE_NAMES[name], measure.value, measure.low, measure.high))
         if name in ("rmse", "mae"):
             rows.append((f"{_MEASURE_NAMES[name]} of the mean alone", getattr(result, f"baseline_{name}"), None, None))
     if result.p is not None:
@@ -183,47 +175,35 @@ def _calibration_part(result: RegressionResult) -> CurvePart:
     )  # fmt: skip
 
 
-def _rows(result: RegressionResult) -> Rows:
-    header = ("scan", "subject", "observed", "predicted", "low", "high", "baseline")
+def _file_tables(result: RegressionResult) -> tuple[Table, Table]:
+    """Return the tables of predictions and of measures, which are files alone."""
     columns = (result.observed, result.predicted, result.low, result.high, result.baseline)
-    return header, [
-        (name, result.subjects[k], *(float(column[k]) for column in columns))
-        for k, name in enumerate(result.cohort.names)
-    ]
-
-
-def _prediction_rows(cohort: Cohort, predictions: Predictions) -> Rows:
-    return ("scan", "predicted", "low", "high", "outside"), [
-        (
-            name,
-            float(predictions.value[k]),
-            float(predictions.low[k]),
-            float(predictions.high[k]),
-            predictions.outside[k],
-        )
-        for k, name in enumerate(cohort.names)
-    ]
-
-
-def _prediction_part(predictor: Predictor, predictions: Predictions) -> Part:
-    level = f"{100 * predictor.confidence:.0f} %"
-    rows = tuple(
-        (
-            predictions.names[k],
-            float(predictions.value[k]),
-            float(predictions.low[k]),
-            float(predictions.high[k]),
-            predictions.outside[k],
-        )
-        for k in range(min(_MOST_ROWS, len(predictions.names)))
+    fields = ("scan", "subject", "observed", "predicted", "low", "high", "baseline")
+    every = zip(result.cohort.names, result.subjects, *columns, strict=True)
+    measures = [(name, m.value, m.low, m.high) for name, m in result.measures.items()]
+    return (
+        Table.of_fields("predictions.csv", fields, list(every)),
+        Table.of_fields("measures.csv", ("measure", "value", "low", "high"), measures),
     )
-    if not rows:
-        return TextPart(title="New shapes", text="There are none.")
-    return TablePart.of(
-        f"{predictor.target} of new shapes", ("scan", "predicted", "low", "high", "outside"), rows,
-        note=f"With {level} intervals; all of them stand in new.csv.",
-    )  # fmt: skip
 
 
-def _finite_or_none(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
+def _new_tables(predictor: Predictor, new: tuple[Cohort, Predictions] | None) -> tuple[Part | Table, ...]:
+    """Return the predictions of new shapes."""
+    if new is None:
+        return ()
+    predictions = new[1]
+    table = Table(
+        title=f"{predictor.target} of new shapes" if predictions.names else "",
+        columns=(
+            Column("scan", field="scan"),
+            *(Column(name, "number", name) for name in ("predicted", "low", "high")),
+            Column("outside", field="outside"),
+        ),
+        rows=list(
+            zip(new[0].names, predictions.value, predictions.low, predictions.high, predictions.outside, strict=True)
+        ),
+        note=f"With {100 * predictor.confidence:.0f} % intervals; all of them stand in new.csv.",
+        file="new.csv",
+        shown=range(_MOST_ROWS),
+    )
+    return (table,) if predictions.names else (TextPart(title="New shapes", text="There are none."), table)

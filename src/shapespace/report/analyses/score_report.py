@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.report.analyses.analysis_report import AnalysisReport, LengthFormat, Rows
-from shapespace.report.analyses.methods_section import methods_parts
-from shapespace.report.analyses.shape_data import add_shape_data, model_hashes, shape_change_parts
+from shapespace.report.analyses.analysis_report import AnalysisReport, Column, LengthFormat, Table, histogram_part
+from shapespace.report.analyses.shape_data import cohort_report, shape_change_parts
 from shapespace.report.blocks.wording import counted
-from shapespace.schemas import Counts, HistogramPart, Part, SurfaceMapPart, TableColumn, TablePart, TextPart
+from shapespace.schemas import HistogramPart, Part, SurfaceMapPart, TextPart
 from shapespace.statistics.score_subjects import SMALL, ScoreResult
 
 # maps, morphs, sentences and bins of the report: what can be looked through; files have all
@@ -23,24 +22,24 @@ _FILE = "score.npz"
 
 def score_report(result: ScoreResult) -> AnalysisReport:
     """Return scores with all that their report shows; subjects are numbered from 1 in the arrays."""
-    order = _order(result)
-    tables, arrays = _tables(result), _arrays(result, order)
-    parts: list[Part] = [
+    # Those outside the known range are first, then those who lie farthest out.
+    order = sorted(map(int, np.lexsort((-result.distance, result.farther))), key=lambda k: not result.outside[k])
+    content: list[Part | Table] = [
         TextPart(title="The subjects", level=2, text=_method_sentences(result)),
-        _table(result),
+        _score_table(result),
+        *_file_tables(result),
         _histogram(result),
         *_maps(result, order),
         *_morphs(result, order),
-        *methods_parts(result.methods),
     ]
     many = len(result.names) != 1
-    report = AnalysisReport(
-        question="score",
-        title=f"{f'{len(result.names)} subjects' if many else result.names[0]} against a reference of {result.people}",
+    return cohort_report(
+        "score",
+        f"{f'{len(result.names)} subjects' if many else result.names[0]} against a reference of {result.people}",
+        content,
+        result.subjects,
         summary=tuple(_sentence(result, k) for k in order[:_MOST_SENTENCES]),
-        parts=tuple(parts),
-        tables=tables,
-        arrays={_FILE: arrays},
+        arrays={_FILE: _arrays(result, order)},
         notes=result.notes,
         settings={
             "gauge": result.subjects.gauge,
@@ -50,16 +49,9 @@ def score_report(result: ScoreResult) -> AnalysisReport:
             "draws": result.config.draws,
             "seed": result.config.seed,
         },
-        model_hashes=model_hashes(result.subjects),
         methods=result.methods,
+        imputations=result.imputations,
     )
-    return add_shape_data(report, result.subjects, result.imputations)
-
-
-def _order(result: ScoreResult) -> list[int]:
-    """Return the subjects, those who lie farthest out first."""
-    order = np.lexsort((-result.distance, result.farther))
-    return sorted(map(int, order), key=lambda k: not result.outside[k])
 
 
 def _sentence(result: ScoreResult, k: int) -> str:
@@ -96,57 +88,71 @@ def _method_sentences(result: ScoreResult) -> tuple[str, ...]:
     )
 
 
-def _table(result: ScoreResult) -> TablePart:
+def _score_table(result: ScoreResult) -> Table:
+    lengths, sized = LengthFormat(result.subjects.unit), bool(np.isfinite(result.size_z).all())
     columns = [
-        TableColumn(name="Subject", kind="text"),
-        TableColumn(name="Distance (SD)", kind="number"),
-        TableColumn(name="Percentile", kind="percent"),
-        TableColumn(name="p (F)", kind="p"),
-        LengthFormat(result.subjects.unit).column("Left by the modes"),
-        TableColumn(name="Its percentile", kind="percent"),
-        TableColumn(name="Beyond 2 SD", kind="percent"),
-        TableColumn(name="Size (SD)", kind="number"),
-        TableColumn(name="Nearest", kind="text"),
-        TableColumn(name="Outside", kind="text"),
-    ]
-    sized = bool(np.isfinite(result.size_z).all())
+        Column("Subject", field="subject"), Column("Distance (SD)", "number", "distance_sd"),
+        Column("Percentile", "percent"), Column(field="percentile"), Column(field="p_left_out"),
+        Column("p (F)", "p", "p_f"), lengths.column("Left by the modes", "rest"), Column("Its percentile", "percent"),
+        Column(field="rest_p"), lengths.column(field="beyond_model"), Column(field="beyond_model_p"),
+        Column("Beyond 2 SD", "percent", "vertices_beyond_2sd"), lengths.column(field="centroid_size"),
+        Column("Size (SD)" if sized else "", "number", "size_sd"), Column("Nearest"),
+        Column("Outside", field="outside"), Column(field="map"),
+    ]  # fmt: skip
     rows = [
         (
-            name, result.distance[k], 1 - result.farther[k], result.p_value[k], result.rest_mm[k],
-            1 - result.rest_farther[k], result.beyond_2[k], result.size_z[k],
-            ", ".join(one.name for one in result.nearest[k]), "; ".join(result.outside[k]),
+            name, result.distance[k], 1 - result.farther[k], result.percentile[k], result.farther[k],
+            result.p_value[k], result.rest_mm[k], 1 - result.rest_farther[k], result.rest_farther[k],
+            result.beyond_mm[k], result.beyond_farther[k], result.beyond_2[k], result.size_mm[k], result.size_z[k],
+            ", ".join(one.name for one in result.nearest[k]), "; ".join(result.outside[k]), f"z_{k + 1}",
         )
         for k, name in enumerate(result.names)
     ]  # fmt: skip
-    if not sized:
-        del columns[7]
-        rows = [(*row[:7], *row[8:]) for row in rows]
-    return TablePart(
-        title="Scores", columns=tuple(columns), rows=tuple(rows),
+    if result.imputations is not None:
+        std = result.imputations.stddev
+        columns += [Column(field="distance_imputation_sd"), Column(field="percentile_imputation_sd")]
+        rows = [(*row, std["distance"][k], 100 * std["farther"][k]) for k, row in enumerate(rows)]
+    return Table(
+        title="Scores", columns=columns, rows=rows, file="scores.csv",
         note="Percentiles: share of the reference's subjects who lie nearer to its mean. On average 4.6 % of the "
         "vertices of a usual shape lie beyond 2 SD.",
     )  # fmt: skip
 
 
+def _file_tables(result: ScoreResult) -> tuple[Table, Table]:
+    """Return the tables of the nearest subjects and of the reference, which are files alone."""
+    field = LengthFormat(result.subjects.unit).field
+    near = [
+        (name, rank, one.name, one.distance, one.rms_mm)
+        for name, references in zip(result.names, result.nearest, strict=True)
+        for rank, one in enumerate(references, 1)
+    ]
+    reference = zip(result.reference_names, result.reference_distance, result.reference_rest_mm, strict=True)
+    return (
+        Table.of_fields("nearest.csv", ("subject", "rank", "reference", "distance_sd", field("rms")), near),
+        Table.of_fields("reference.csv", ("reference", "distance_sd", field("rest")), list(reference)),
+    )
+
+
 def _histogram(result: ScoreResult) -> HistogramPart:
     every = np.concatenate([result.reference_distance, result.distance])
-    edges = np.linspace(0.0, float(every.max()) * 1.02, _BINS + 1)
-    series = [_counts(result.reference_distance, edges, "reference, each by the others")]
     one = len(result.names) == 1
-    if not one:
-        series.append(_counts(result.distance, edges, "subjects"))
-    return HistogramPart(
-        title="Distances", edges=tuple(edges.tolist()), series=tuple(series), x="Mahalanobis distance (SD)",
+    values = {"reference, each by the others": result.reference_distance}
+    return histogram_part(
+        "Distances", values if one else {**values, "subjects": result.distance},
+        np.linspace(0.0, float(every.max()) * 1.02, _BINS + 1), x="Mahalanobis distance (SD)",
         observed=float(result.distance[0]) if one else None, observed_label=result.names[0] if one else "",
     )  # fmt: skip
 
 
-def _counts(values: npt.NDArray[Any], edges: npt.NDArray[Any], label: str) -> Counts:
-    return Counts(counts=tuple(map(float, np.histogram(values, edges)[0])), label=label)
-
-
 def _maps(result: ScoreResult, order: list[int]) -> list[Part]:
-    parts: list[Part] = [TextPart(title="Maps", level=2, text=_maps_sentence(result, order))]
+    rest = len(order) - _MOST_MAPS
+    text = (
+        "How far each vertex lies from the reference's mean along its normal, in standard deviations of the reference"
+        f"{'' if result.subjects.fitted is None else ' and what the fit is unsure of'}."
+        f"{f' Maps of {rest} more are in {_FILE}.' if rest > 0 else ''}"
+    )
+    parts: list[Part] = [TextPart(title="Maps", level=2, text=text)]
     for k in order[:_MOST_MAPS]:
         beyond = ""
         if math.isfinite(result.z_limit):
@@ -161,15 +167,6 @@ def _maps(result: ScoreResult, order: list[int]) -> list[Part]:
             )
         )  # fmt: skip
     return parts
-
-
-def _maps_sentence(result: ScoreResult, order: list[int]) -> str:
-    rest = len(order) - _MOST_MAPS
-    more = f" Maps of {rest} more are in {_FILE}." if rest > 0 else ""
-    return (
-        "How far each vertex lies from the reference's mean along its normal, in standard deviations of the reference"
-        f"{'' if result.subjects.fitted is None else ' and what the fit is unsure of'}.{more}"
-    )
 
 
 def _morphs(result: ScoreResult, order: list[int]) -> list[Part]:
@@ -196,49 +193,3 @@ def _arrays(result: ScoreResult, order: list[int]) -> dict[str, npt.NDArray[Any]
     for k in order[:_MOST_MORPHS]:
         arrays[f"shape_{k + 1}"] = result.subjects.vertices(k)
     return arrays
-
-
-def _tables(result: ScoreResult) -> dict[str, Rows]:
-    field = LengthFormat(result.subjects.unit).field
-    head = (
-        "subject", "distance_sd", "percentile", "p_left_out", "p_f", field("rest"), "rest_p", field("beyond_model"),
-        "beyond_model_p", "vertices_beyond_2sd", field("centroid_size"), "size_sd", "outside", "map",
-    )  # fmt: skip
-    rows = [
-        (
-            name,
-            result.distance[k],
-            result.percentile[k],
-            result.farther[k],
-            result.p_value[k],
-            result.rest_mm[k],
-            result.rest_farther[k],
-            _finite_or_empty(result.beyond_mm[k]),
-            _finite_or_empty(result.beyond_farther[k]),
-            result.beyond_2[k],
-            _finite_or_empty(result.size_mm[k]),
-            _finite_or_empty(result.size_z[k]),
-            "; ".join(result.outside[k]),
-            f"z_{k + 1}",
-        )
-        for k, name in enumerate(result.names)
-    ]
-    near = [
-        (name, rank, one.name, one.distance, one.rms_mm)
-        for name, references in zip(result.names, result.nearest, strict=True)
-        for rank, one in enumerate(references, 1)
-    ]
-    if result.imputations is not None:
-        std = result.imputations.stddev
-        head = (*head, "distance_imputation_sd", "percentile_imputation_sd")
-        rows = [(*row, std["distance"][k], 100 * std["farther"][k]) for k, row in enumerate(rows)]
-    reference = zip(result.reference_names, result.reference_distance, result.reference_rest_mm, strict=True)
-    return {
-        "scores.csv": (head, rows),
-        "nearest.csv": (("subject", "rank", "reference", "distance_sd", field("rms")), near),
-        "reference.csv": (("reference", "distance_sd", field("rest")), list(reference)),
-    }
-
-
-def _finite_or_empty(value: float) -> float | str:
-    return float(value) if math.isfinite(value) else ""

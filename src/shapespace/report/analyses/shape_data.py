@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
-from msgspec import structs
+from msgspec import Struct, structs
 from scipy.spatial.distance import pdist
 
 from shapespace.cohort.cohort import SUBJECT, Cohort
-from shapespace.report.analyses.analysis_report import AnalysisReport, Rows
+from shapespace.report.analyses.analysis_report import AnalysisReport, Column, Table, floats
+from shapespace.report.analyses.methods_section import methods_parts
 from shapespace.schemas import (
     CurvePart,
     DeformationPart,
     HistogramPart,
+    Methods,
     MorphPart,
     Part,
     Series,
+    TableColumn,
     TablePart,
+    TestScheme,
     TextPart,
 )
 from shapespace.statistics.methods import methods_of
@@ -31,6 +36,16 @@ _FILE = "observed.csv"
 _MOST_ROWS = 10  # rows that fit one screen; files have all
 _VERTEX_WORDS = re.compile(r"(?<![A-Za-z])[Vv]ert(?:ices|ex)(?![A-Za-z])")  # in sentences and names of columns
 _LANDMARK_WORDS = {"vertices": "landmarks", "vertex": "landmark", "Vertices": "Landmarks", "Vertex": "Landmark"}
+_WORDED: Mapping[type[Struct], tuple[str, ...]] = {
+    Part: ("title", "note"),
+    TextPart: ("text",),
+    HistogramPart: ("x",),
+    TablePart: ("columns",),
+    TableColumn: ("name",),
+    Methods: ("corrected_over", "assumptions", "tests"),
+    TestScheme: ("tested",),
+}
+"""Fields with words on vertices."""
 MOST_LANDMARKS = 500
 """Points of a shape without triangles up to which they are drawn as landmarks: more cover each other."""
 _MOST_PAIRS = 1000  # dots of a figure: more cover each other
@@ -69,7 +84,7 @@ def scree_part(eigenvalues: FloatArray, *, axis: str = "principal component") ->
     shares = 100 * eigenvalues / eigenvalues.sum()
     numbers = tuple(map(float, range(1, len(shares) + 1)))
     return CurvePart(
-        title="Scree plot", x=axis, y="share of the variance (%)", series=(Series(x=numbers, y=_floats(shares)),)
+        title="Scree plot", x=axis, y="share of the variance (%)", series=(Series(x=numbers, y=floats(shares)),)
     )
 
 
@@ -120,14 +135,10 @@ def tangent_part(coords: FloatArray, *, projected: bool = False) -> CurvePart:
         note=f"Slope through the origin {slope:.6f}, uncentred correlation {r:.6f}; both are 1 where distances in the "
         "tangent space represent those of shapes.",
         series=(
-            Series(x=_floats(procrustes[order]), y=_floats(euclidean[order]), label="pairs of shapes", points=True),
-            Series(x=_floats(ends), y=_floats(ends), label="equal distances"),
+            Series(x=floats(procrustes[order]), y=floats(euclidean[order]), label="pairs of shapes", points=True),
+            Series(x=floats(ends), y=floats(ends), label="equal distances"),
         ),
     )
-
-
-def _floats(values: FloatArray) -> tuple[float, ...]:
-    return tuple(map(float, values))
 
 
 def blank_sentence(count: int, total: int) -> str:
@@ -138,11 +149,6 @@ def blank_sentence(count: int, total: int) -> str:
         f"{count} of {total} vertices are grey: the shapes that observe them carry less than "
         f"{100 * LEAST_INFORMATION:.0f} % of the information."
     )
-
-
-def model_hashes(cohort: Cohort) -> tuple[str, ...]:
-    """Return the content hash of the model of the fits; nothing for other surfaces."""
-    return () if cohort.fitted is None else (cohort.fitted.model.content_hash,)
 
 
 def shape_notes(cohort: Cohort) -> tuple[str, ...]:
@@ -211,38 +217,54 @@ def shape_settings(cohort: Cohort) -> dict[str, Any]:
     return out
 
 
+def _landmark_words(value: Any) -> Any:
+    """Return a text, part or record, or a tuple of these, that calls the vertices of shapes landmarks."""
+    if isinstance(value, tuple):
+        return tuple(map(_landmark_words, cast(tuple[Any, ...], value)))
+    if isinstance(value, Struct):
+        names = (name for kind, own in _WORDED.items() if isinstance(value, kind) for name in own)
+        return structs.replace(value, **{name: _landmark_words(getattr(value, name)) for name in names})
+    return _VERTEX_WORDS.sub(lambda found: _LANDMARK_WORDS[found[0]], value or "")
+
+
 def _in_landmarks(report: AnalysisReport) -> AnalysisReport:
     """Return a report whose sentences, labels and columns of files call the vertices of shapes landmarks."""
-
-    def named(text: str | None) -> str:
-        return _VERTEX_WORDS.sub(lambda found: _LANDMARK_WORDS[found[0]], text or "")
-
-    def renamed(part: Part) -> Part:
-        changed: dict[str, Any] = {"title": named(part.title), "note": named(part.note)}
-        if isinstance(part, TextPart):
-            changed["text"] = named(part.text) if isinstance(part.text, str) else tuple(map(named, part.text))
-        if isinstance(part, HistogramPart):
-            changed["x"] = named(part.x)
-        if isinstance(part, TablePart):
-            changed["columns"] = tuple(structs.replace(one, name=named(one.name)) for one in part.columns)
-        return structs.replace(part, **changed)
-
-    methods = report.methods
-    if methods is not None:
-        over, assumptions = tuple(map(named, methods.corrected_over)), tuple(map(named, methods.assumptions))
-        tests = tuple(structs.replace(test, tested=tuple(map(named, test.tested))) for test in methods.tests)
-        methods = structs.replace(methods, corrected_over=over, assumptions=assumptions, tests=tests)
-    summary, notes = tuple(map(named, report.summary)), tuple(map(named, report.notes))
-    tables = {name: (tuple(map(named, header)), rows) for name, (header, rows) in report.tables.items()}
-    return replace(
-        report, summary=summary, notes=notes, parts=tuple(map(renamed, report.parts)), methods=methods, tables=tables
-    )
+    words = {name: _landmark_words(getattr(report, name)) for name in ("summary", "notes", "parts")}
+    methods = None if report.methods is None else _landmark_words(report.methods)
+    tables = {name: (_landmark_words(tuple(header)), rows) for name, (header, rows) in report.tables.items()}
+    return replace(report, **words, methods=methods, tables=tables)
 
 
-def _count_subjects(cohort: Cohort, column: str | None) -> int:
-    """Return the number of subjects; each shape of which none is known is of another one."""
-    cells = cohort.table.columns.get(column or SUBJECT, cohort.names)
-    return len({cell or (name,) for cell, name in zip(cells, cohort.names, strict=True)})
+def cohort_report(
+    question: str,
+    title: str,
+    content: Iterable[Part | Table],
+    cohort: Cohort,
+    *,
+    methods: Methods | None,
+    model_hashes: tuple[str, ...] | None = None,
+    imputations: Imputations | None = None,
+    state_methods: bool = True,
+    **known: Any,
+) -> AnalysisReport:
+    """Return the report of an analysis of a cohort, with the methods and the data on its shapes.
+
+    Args:
+        question: the command.
+        title: title of the report.
+        content: parts and tables; the methods and the shares of estimated vertices follow them.
+        cohort: the shapes.
+        methods: sample sizes, tests and assumptions; None for those of `add_shape_data`.
+        model_hashes: content hashes of models; None for that of the fits.
+        imputations: those that the analysis combines.
+        state_methods: whether the methods are parts of the page.
+        **known: further fields of the report; `notes` are those of the cohort by default.
+    """
+    if model_hashes is None:
+        model_hashes = () if cohort.fitted is None else (cohort.fitted.model.content_hash,)
+    stated = methods_parts(methods) if methods is not None and state_methods else ()
+    fields = {"notes": cohort.notes, "methods": methods, "model_hashes": model_hashes, **known}
+    return add_shape_data(AnalysisReport.of(question, title, (*content, *stated), **fields), cohort, imputations)
 
 
 def add_shape_data(report: AnalysisReport, cohort: Cohort, imputations: Imputations | None = None) -> AnalysisReport:
@@ -253,38 +275,49 @@ def add_shape_data(report: AnalysisReport, cohort: Cohort, imputations: Imputati
         cohort: its shapes.
         imputations: those that the analysis combines; None for an analysis of the shapes as they are.
     """
-    share = cohort.estimated_share
-    notes, settings = (*report.notes, *shape_notes(cohort)), {**report.settings, **shape_settings(cohort)}
-    sentence = _imputation_sentence(cohort, imputations)
-    methods = report.methods
+    sentence, methods = _imputation_sentence(cohort, imputations), report.methods
     if methods is None and len(cohort) > 1:
-        methods = methods_of(cohort, _count_subjects(cohort, report.settings.get("subject")))
-    summary = (*report.summary[:1], *cohort.cautions, *report.summary[1:])
-    report = replace(
-        report, summary=summary, notes=notes, settings=settings, methods=methods, orientation=cohort.orientation
-    )
-    if sentence and methods is not None:
-        methods = structs.replace(methods, assumptions=(*methods.assumptions, sentence))
-        report = replace(report, notes=(*notes, sentence), methods=methods)
+        # Shapes whose subject is not known are of different subjects.
+        cells = cohort.table.columns.get(report.settings.get("subject") or SUBJECT, cohort.names)
+        known = {cell or (name,) for cell, name in zip(cells, cohort.names, strict=True)}
+        methods = methods_of(cohort, len(known))
+    stated = (sentence,) if sentence and methods is not None else ()
+    if methods is not None:
+        methods = structs.replace(methods, assumptions=(*methods.assumptions, *stated))
+    combined: dict[str, Any] = {}
     if imputations is not None:
-        own = {"imputations": imputations.count, "missing_information": dict(imputations.missing_information)}
-        report = replace(report, citations=(*report.citations, *_IMPUTATION), settings={**settings, **own})
-    if cohort.source.kind == "landmarks":
-        report = _in_landmarks(report)
-    if not share.any():
-        return report
-    order = sorted(range(len(share)), key=lambda k: (-share[k], k))
-    rows: list[tuple[str, float]] = [(cohort.names[k], float(share[k])) for k in order if share[k] > 0]
-    table: Rows = (("shape", "estimated_share"), rows)
-    title = "Estimated vertices"
+        combined = {"imputations": imputations.count, "missing_information": dict(imputations.missing_information)}
+    tables = _estimate_tables(cohort)
+    report = replace(
+        report,
+        summary=(*report.summary[:1], *cohort.cautions, *report.summary[1:]),
+        notes=(*report.notes, *shape_notes(cohort), *stated),
+        settings={**report.settings, **shape_settings(cohort), **combined},
+        methods=methods,
+        citations=(*report.citations, *(_IMPUTATION if combined else ())),
+        orientation=cohort.orientation,
+        parts=(*report.parts, *(one.part for one in tables)),
+        tables={**report.tables, **{one.file: one.file_rows for one in tables}},
+    )
+    return _in_landmarks(report) if cohort.source.kind == "landmarks" else report
+
+
+def _estimate_tables(cohort: Cohort) -> tuple[Table, ...]:
+    """Return the share of estimated vertices of each shape; nothing if all are observed."""
+    share, title = cohort.estimated_share, "Estimated vertices"
     note = (
         "Share of the vertices of a shape that its scan does not show, largest first; they are estimated by the "
         "conditional mean of a PCA model with missing data, without the table."
     )
     if cohort.source.kind == "landmarks":
         title, note = "Estimated landmarks", "Share of the landmarks of a specimen that are estimates, largest first."
-    part = TablePart.of(
-        title, ("shape", "estimated"), rows[:_MOST_ROWS], percent=("estimated",),
+    order = sorted(range(len(share)), key=lambda k: (-share[k], k))
+    table = Table(
+        title=title,
+        columns=(Column("shape", field="shape"), Column("estimated", "percent", "estimated_share")),
+        rows=[(cohort.names[k], float(share[k])) for k in order if share[k] > 0],
+        shown=range(_MOST_ROWS),
         note=f"{note} All of them are in {_FILE}.",
-    )  # fmt: skip
-    return replace(report, tables={**report.tables, _FILE: table}, parts=(*report.parts, part))
+        file=_FILE,
+    )
+    return (table,) if share.any() else ()

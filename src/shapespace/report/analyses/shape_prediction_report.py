@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from shapespace.cohort.cohort import subjects_of
-from shapespace.report.analyses.analysis_report import AnalysisReport, LengthFormat, Rows
-from shapespace.report.analyses.methods_section import methods_parts
-from shapespace.report.analyses.shape_data import add_shape_data, model_hashes, shape_change_parts
-from shapespace.schemas import CurvePart, MorphPart, Part, Series, SurfaceMapPart, TableColumn, TablePart
+from shapespace.report.analyses.analysis_report import AnalysisReport, Column, LengthFormat, Table, floats
+from shapespace.report.analyses.shape_data import cohort_report, shape_change_parts
+from shapespace.schemas import CurvePart, MorphPart, Part, Series, SurfaceMapPart
 from shapespace.statistics.observation_weights import blank_where, weights_of
 from shapespace.statistics.shape_prediction import ShapePrediction
 from shapespace.types import FloatArray, Mesh
@@ -30,26 +29,23 @@ _CITATIONS = (
 def shape_prediction_report(result: ShapePrediction) -> AnalysisReport:
     """Return the report of mean shapes along a number."""
     parts, arrays, meshes = shape_prediction_parts(result)
-    report = AnalysisReport(
-        question="regress",
-        title=f"Shape along {result.along}",
+    return cohort_report(
+        "regress",
+        f"Shape along {result.along}",
+        [_value_table(result), *_measure_parts(result), *parts, *_landmark_tables(result)],
+        result.cohort,
         summary=tuple(_summary(result)),
-        parts=(_value_part(result), *_measure_parts(result), *parts, *methods_parts(result.methods)),
-        tables=dict(_tables(result)),
         arrays={SHAPES_FILE: arrays},
         meshes=meshes,
-        notes=result.cohort.notes,
         settings={
             "along": result.along, "formula": result.formula, "held": dict(result.held) or None,
             "gauge": result.cohort.gauge, "shapes": len(result.cohort), "subjects": result.n_subjects,
             "permutations": result.permutations, "level": result.confidence, "seed": result.seed,
             "subject": result.subject,
         },
-        model_hashes=model_hashes(result.cohort),
         methods=result.methods,
         citations=_CITATIONS,
     )  # fmt: skip
-    return add_shape_data(report, result.cohort)
 
 
 def shape_prediction_parts(result: ShapePrediction) -> tuple[list[Part], dict[str, Any], dict[str, Mesh]]:
@@ -141,8 +137,8 @@ def _summary(result: ShapePrediction) -> Iterator[str]:
         )
 
 
-def _columns(result: ShapePrediction) -> tuple[list[str], list[list[float | None]]]:
-    """Return the columns of lengths, and their values at each value of the number."""
+def _value_table(result: ShapePrediction) -> Table:
+    lengths = LengthFormat(result.cohort.unit)
     names = ["distance_from_first", "standard_error", "half_width"]
     widths = [np.linalg.norm(result.half_width_mm(k)) for k in range(len(result.values))]
     columns = [result.distance_mm, result.distance_std_mm, np.array(widths) / result.cohort.n_vertices**0.5]
@@ -150,16 +146,11 @@ def _columns(result: ShapePrediction) -> tuple[list[str], list[list[float | None
         name = re.sub(r"\W+", "_", one.name)
         names += [name, f"{name}_low", f"{name}_high"]
         columns += [one.value, one.low, one.high]
-    return names, [[float(v) if np.isfinite(v) else None for v in row] for row in zip(*columns, strict=True)]
-
-
-def _value_part(result: ShapePrediction) -> Part:
-    lengths, (names, rows) = LengthFormat(result.cohort.unit), _columns(result)
-    return TablePart(
-        title=f"Mean shapes along {result.along}", level=2,
-        columns=(TableColumn(name=result.along, kind="number"),
-                 *(lengths.column(name.replace("_", " ")) for name in names)),
-        rows=tuple((float(value), *row) for value, row in zip(result.values, rows, strict=True)),
+    return Table(
+        title=f"Mean shapes along {result.along}", level=2, file="shapes.csv",
+        columns=(Column(result.along, "number", result.along),
+                 *(lengths.column(name.replace("_", " "), name) for name in names), Column(field="df")),
+        rows=list(zip(result.values, *columns, result.df[: len(result.values)], strict=True)),
         note="RMS over vertices: distance from the first shape with its standard error, and half the width of the "
         f"pointwise {100 * result.confidence:g} % interval. Empty where an interval is not known.",
     )  # fmt: skip
@@ -171,16 +162,13 @@ def _measure_parts(result: ShapePrediction) -> Iterator[Part]:
         yield CurvePart(
             title=f"{one.name.capitalize()} along {result.along}", x=result.along,
             y=LengthFormat(result.cohort.unit).label(one.name),
-            series=(Series(x=_floats(result.observed), y=_floats(one.observed), label="shapes", points=True),
-                    Series(x=_floats(result.values), y=_floats(one.value), label="mean", low=tuple(low),
+            series=(Series(x=floats(result.observed), y=floats(one.observed), label="shapes", points=True),
+                    Series(x=floats(result.values), y=floats(one.value), label="mean", low=tuple(low),
                            high=tuple(high))),
         )  # fmt: skip
 
 
-def _tables(result: ShapePrediction) -> Iterator[tuple[str, Rows]]:
-    field, (names, rows) = LengthFormat(result.cohort.unit).field, _columns(result)
-    values = [(value, *row, df) for value, row, df in zip(result.values, rows, result.df, strict=False)]
-    yield "shapes.csv", ((result.along, *map(field, names), "df"), values)
+def _landmark_tables(result: ShapePrediction) -> Iterator[Table]:
     if result.cohort.source.kind == "landmarks" and result.cohort.landmarks is not None:
         axes = "xyz"[: result.cohort.dimensions]
         header = (result.along, "landmark", *axes, *(f"{axis}_{end}" for end in ("low", "high") for axis in axes))
@@ -189,8 +177,4 @@ def _tables(result: ShapePrediction) -> Iterator[tuple[str, Rows]]:
             shape, width = result.cohort.vertices(result.coefficients[k]), result.half_width_mm(k)
             for name, *ends in zip(result.cohort.landmarks.names, shape, shape - width, shape + width, strict=True):
                 points.append((value, name, *(float(v) for end in ends for v in end[: len(axes)])))
-        yield "landmarks.csv", (header, points)
-
-
-def _floats(values: FloatArray) -> tuple[float, ...]:
-    return tuple(map(float, values))
+        yield Table.of_fields("landmarks.csv", header, points)

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from shapespace.report.analyses.analysis_report import AnalysisReport, Rows
-from shapespace.report.analyses.methods_section import methods_parts, points_word
-from shapespace.report.analyses.shape_data import add_shape_data, model_hashes
-from shapespace.schemas import Counts, HistogramPart, Part, TablePart
+from shapespace.report.analyses.analysis_report import AnalysisReport, Column, Table, histogram_part
+from shapespace.report.analyses.methods_section import points_word
+from shapespace.report.analyses.shape_data import cohort_report
+from shapespace.schemas import HistogramPart
 from shapespace.statistics.effect_size import permutation_p
 from shapespace.statistics.shape_tests.shape_test_result import ShapeTestResult, Statistic
 from shapespace.statistics.tolerances import TIE
@@ -28,24 +28,26 @@ _HAS_UNIT = re.compile("Procrustes|^distance|length|difference of disparity")
 
 def shape_test_report(result: ShapeTestResult) -> AnalysisReport:
     """Return the report of a test of shape."""
-    methods = result.methods
     summary = result.test.summary
-    report = AnalysisReport(
-        question=f"test {result.test.name}",
-        title=f"{summary[:1].upper()}{summary[1:]}",
+    files = [
+        Table.of_fields(
+            f"{re.sub(r'[^a-z0-9]+', '_', (one.title or 'table').lower()).strip('_')}.csv",
+            [own.name for own in one.columns],
+            one.rows,
+        )
+        for one in result.tables
+    ]
+    return cohort_report(
+        f"test {result.test.name}",
+        f"{summary[:1].upper()}{summary[1:]}",
+        [_statistics_table(result), *result.tables, *result.figures, *_histograms(result), *files],
+        result.cohort,
         summary=tuple(_sentences(result)),
-        parts=(_statistics_table(result), *result.tables, *result.figures, *_histograms(result),
-               *methods_parts(methods)),
-        tables={"statistics.csv": _rows(result),
-                **{_file_name(one): ([own.name for own in one.columns], one.rows) for one in result.tables}},
         arrays=result.arrays,
-        notes=result.cohort.notes,
         settings={**result.settings, "shapes": len(result.cohort)},
-        model_hashes=model_hashes(result.cohort),
-        methods=methods,
+        methods=result.methods,
         citations=result.test.references,
-    )  # fmt: skip
-    return add_shape_data(report, result.cohort)
+    )
 
 
 def _sentences(result: ShapeTestResult) -> Iterator[str]:
@@ -90,33 +92,29 @@ def _least_p(arrangements: FloatArray) -> float:
     return min(float((np.abs(arrangements - end) <= TIE * abs(end)).mean()) for end in ends)
 
 
-def _statistics_table(result: ShapeTestResult) -> TablePart:
-    rows = [(one.name, one.tested, one.value, one.z, one.p) for one in result.statistics]
+def _statistics_table(result: ShapeTestResult) -> Table:
     note = f"{result.test.statistics[:1].upper()}{result.test.statistics[1:]}."
     unknown = dict.fromkeys(one.name for one in result.statistics if one.unknown_p)
     note += f" p of {', '.join(unknown)} is not known where it is blank." if unknown else ""
-    return TablePart.of("Statistics", ("statistic", "tested", "value", "Z", "p"), rows, note=note, level=2)
+    return Table(
+        title="Statistics",
+        columns=(
+            Column("statistic", field="statistic"), Column("tested", field="tested"),
+            Column("value", "number", "value"), Column("Z", "number", "z"), Column("p", "p", "p"),
+            *(Column(field=one) for one in ("low", "high", "p_not_known")),
+        ),
+        rows=[
+            (s.name, s.tested, s.value, s.z, s.p, s.low, s.high, s.unknown_p or "") for s in result.statistics
+        ],
+        note=note,
+        level=2,
+        file="statistics.csv",
+    )  # fmt: skip
 
 
-def _histograms(result: ShapeTestResult) -> Iterator[Part]:
+def _histograms(result: ShapeTestResult) -> Iterator[HistogramPart]:
     for one in [each for each in result.statistics if len(each.arrangements) > 1][:_MOST_HISTOGRAMS]:
-        finite = one.arrangements[np.isfinite(one.arrangements)]
-        counts, edges = np.histogram(finite, bins=_BINS)
-        yield HistogramPart(
-            title=f"{one.label} among its permutations",
-            edges=tuple(map(float, edges)),
-            series=(Counts(counts=tuple(map(float, counts)), label="permutations"),),
-            x=one.name,
-            observed=one.value,
-            observed_label="observed",
-        )
-
-
-def _rows(result: ShapeTestResult) -> Rows:
-    header = ("statistic", "tested", "value", "z", "p", "low", "high", "p_not_known")
-    return header, [(s.name, s.tested, s.value, s.z, s.p, s.low, s.high, s.unknown_p or "") for s in result.statistics]
-
-
-def _file_name(table: TablePart) -> str:
-    words = re.sub(r"[^a-z0-9]+", "_", (table.title or "table").lower()).strip("_")
-    return f"{words}.csv"
+        yield histogram_part(
+            f"{one.label} among its permutations", {"permutations": one.arrangements[np.isfinite(one.arrangements)]},
+            _BINS, x=one.name, observed=one.value, observed_label="observed",
+        )  # fmt: skip

@@ -47,7 +47,7 @@ def html_of_analysis(result: AnalysisResult) -> str:
     blocks: list[Block] = []
     for part in tables[:MOST_TABLES]:
         for block in parts.blocks(part, part.title or TITLES["table"]):
-            blocks += _shorten(block) if isinstance(block, Table) else [block]
+            blocks += _shorten(block, len(block.rows)) if isinstance(block, Table) else [block]
     blocks.append(Notes([*report.notes[:_MOST_NOTES], "result.save(folder) writes tables, maps and report."]))
     return notebook_html(result, report.title, report.summary, [], blocks=blocks)
 
@@ -166,17 +166,15 @@ def html_of_predictions(predictions: Predictions) -> str:
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], caption: str, total: int) -> list[Block]:
     """Return a table of the first of `total` rows, and how many there are beyond them."""
-    blocks: list[Block] = [
-        Table([Column(head) for head in heads], [[Cell(text) for text in row] for row in rows], caption)
-    ]
-    return blocks if total <= len(rows) else [*blocks, Text(f"{total - len(rows):,} more are left out.")]
+    cells = [[Cell(text) for text in row] for row in rows]
+    return _shorten(Table([Column(head) for head in heads], cells, caption), total, "more")
 
 
-def _shorten(table: Table) -> list[Block]:
-    """Return a table with at most `MOST_ROWS` rows, and the number of further rows."""
-    short_table = Table(table.columns, table.rows[:MOST_ROWS], table.caption)
-    left = len(table.rows) - MOST_ROWS
-    return [short_table] if left <= 0 else [short_table, Text(f"{left:,} more rows are left out.")]
+def _shorten(table: Table, total: int, rest: str = "more rows") -> list[Block]:
+    """Return a table with at most `MOST_ROWS` rows, and the number of further ones of `total` rows."""
+    shown = Table(table.columns, table.rows[:MOST_ROWS], table.caption)
+    left = total - len(shown.rows)
+    return [shown] if left <= 0 else [shown, Text(f"{left:,} {rest} are left out.")]
 
 
 def _surface(mesh: Mesh, caption: str) -> Callable[[], Drawn]:

@@ -14,6 +14,7 @@ from shapespace.reprs import list_briefly, short_repr
 from shapespace.statistics.identity.rates import RateEstimate, people_drawn, rate_estimate
 from shapespace.statistics.identity.trial import IdentityConfig, Trial, scores_of, trial_of
 from shapespace.statistics.methods import AnalysisResult
+from shapespace.step_counter import StepCounter
 from shapespace.types import BoolArray, FloatArray, IntArray, require
 
 FPIR = (1e-1, 1e-2)
@@ -188,10 +189,10 @@ def identify(
             parts[name].append(search(scores, gallery, probes))
     people = people_drawn(trial.tested, config.draws, config.seed)
     rates: list[IdentificationRates] = []
-    for number, (name, searches) in enumerate(parts.items()):
+    step = StepCounter(len(parts), progress)
+    for name, searches in parts.items():
         rates.append(identification_rates(name, joined(searches), min(sizes), people))
-        if progress is not None:
-            progress(number + 1, len(parts))
+        step.add()
     return IdentificationResult(
         scores=tuple(rates),
         enrolled=min(sizes),

@@ -16,6 +16,7 @@ from shapespace.reprs import list_briefly, short_repr
 from shapespace.statistics.identity.rates import Pairs, RateEstimate, Roc, Sweep, people_drawn, rate_estimate, resampled
 from shapespace.statistics.identity.trial import IdentityConfig, Trial, scores_of, trial_of
 from shapespace.statistics.methods import AnalysisResult
+from shapespace.step_counter import StepCounter
 from shapespace.types import BoolArray, FloatArray, IntArray, require
 
 FAR = (1e-1, 1e-2, 1e-3)
@@ -133,14 +134,7 @@ def verify(
     values = trial.cohort.table.texts(config.by) if config.by else ()
     chosen = {value: _with_value(values, value, pairs, all_pairs=trial.all_pairs) for value in sorted(set(values))}
     people = people_drawn(trial.tested, config.draws, config.seed)
-    total, done = len(scores) * config.draws, 0
-
-    def step() -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress(done, total)
-
+    step = StepCounter(len(scores) * config.draws, progress).add
     curves: dict[int, Mapping[str, FloatArray]] = {
         modes: _pairs_and_scores(trial, config, modes)[1] for modes in config.curve
     }
@@ -218,7 +212,6 @@ def verification_rates(
         own_sweep = Sweep(score[own], part.same)
         spread = resampled(part, people[:_BY_DRAWS], lambda w, s=own_sweep: _figures(s.roc(w)), 1 + len(FAR))
         by[value] = SubgroupRates(genuine, len(part) - genuine, *_rate_estimates(own_sweep.roc(), part, spread))
-    least = cllr_min(score, pairs.same)
     return VerificationRates(
         name=name,
         score=score,
@@ -227,7 +220,7 @@ def verification_rates(
         eer=eer,
         tar=tar,
         cllr=rate_estimate(cost, drawn[:, 0]),
-        cllr_min=least,
+        cllr_min=cllr_min(score, pairs.same),
         band=band,
         by=by,
         curve=dict(curve or {}),
