@@ -43,7 +43,7 @@ _ARRAY_NAMES: Final = {
         for module in ("", "_")
     },
 }
-"""Names of what arrays in pickles are made of, which stand for `_Noted` objects here: what they name is never called."""
+"""Names of what arrays in pickles are made of; `_Noted` objects stand for them, and what they name is never called."""
 _CHUMPY = re.compile(r"chumpy(\.\w+)*")
 _DTYPE = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248])")
 
@@ -196,6 +196,7 @@ class _Noted:
     """An object that a pickle would create: its arguments, and its state."""
 
     kind = ""
+    arguments: tuple[Any, ...] = ()
     state: Any = None
 
     def __init__(self, *arguments: Any) -> None:
