@@ -14,8 +14,7 @@ from shapespace.errors import ModelFileError
 from shapespace.formats.model_parts import LinearModel, Modes
 from shapespace.io.containers.archives import read_arrays
 from shapespace.io.containers.json_files import check_file
-from shapespace.io.containers.pickled_arrays import PickleRefusedError, pickled_array, pickled_dict
-from shapespace.io.files import read_bytes
+from shapespace.io.sandbox import SandboxError, read_pickle_sandboxed
 
 _AGAIN = "give the file as it was downloaded"
 _LARGEST_BYTES = 2**30  # 1 GiB
@@ -107,7 +106,7 @@ def _has_template(path: Path) -> bool:
 
 def _unpickled(path: Path, array_names: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
     try:
-        values = pickled_dict(read_bytes(path))
-        return {name: pickled_array(values[name]) for name in array_names if name in values}
-    except PickleRefusedError as error:
+        arrays = read_pickle_sandboxed(path, array_names).arrays
+    except SandboxError as error:
         raise ModelFileError(f"{path} is not read: {error}; {_AGAIN}.") from error
+    return {name.removeprefix("/"): array for name, array in arrays.items()}

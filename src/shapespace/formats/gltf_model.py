@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mmap
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,7 +16,7 @@ from shapespace.formats.model_parts import LinearModel, Modes
 from shapespace.geometry.normals import vertex_normals
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import read_bytes, write_bytes
-from shapespace.io.meshes.gltf_mesh import Morphs, glb_bytes, gltf_bytes, read_morphs
+from shapespace.io.meshes.gltf_mesh import GltfBuffer, Morphs, centre_if_far, glb_bytes, gltf_bytes, read_morphs
 from shapespace.io.read_limits import LARGEST_MESH_FILE_BYTES
 from shapespace.types import FloatArray, IntArray, Mesh
 
@@ -24,12 +24,8 @@ _MM: Final = 1000.0
 """In one unit of glTF, which is a metre."""
 _AGAIN = "export it again"
 _TARGETS = b'"targets"'
-_FLOAT, _INDEX = 5126, 5125  # glTF 2.0 accessor.componentType: FLOAT, UNSIGNED_INT
-_VERTICES, _TRIANGLES = 34962, 34963  # glTF 2.0 bufferView.target: ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER
 _POINT_CLOUD, _SURFACE = 0, 4  # glTF 2.0 primitive.mode: POINTS, TRIANGLES
 _IDENTITY = re.compile(r"identity[ _.-]?\d+", re.IGNORECASE)
-_FAR = 16.0
-"""Times its own size; from there on single precision is too coarse, so that the centre goes into the node."""
 
 
 class Gltf:
@@ -149,10 +145,7 @@ def _content(model: LinearModel, path: Path) -> tuple[dict[str, Any], bytes]:
     mean = model.mean * scale
     blocks = [model.shape] if model.expression is None else [model.shape, model.expression]
     displacements = np.concatenate([block.moved for block in blocks], axis=1) * scale
-    low, high = mean.min(axis=0), mean.max(axis=0)
-    is_far = bool(np.abs([low, high]).max() > _FAR * float((high - low).max()))
-    centre = (low + high) / 2 if is_far else np.zeros(3)
-    buffer = _Buffer()
+    centre, buffer = centre_if_far(mean), GltfBuffer()
     attributes = {"POSITION": buffer.vectors(mean - centre)}
     steps = [column.reshape(-1, 3) for column in displacements.T]
     targets = [{"POSITION": buffer.vectors(step)} for step in steps]
@@ -166,22 +159,10 @@ def _content(model: LinearModel, path: Path) -> tuple[dict[str, Any], bytes]:
         primitive |= {"mode": _SURFACE, "indices": buffer.indices(model.faces)}
     if not buffer.is_finite:
         raise InputError(f"{path} cannot be written: glTF is of single precision, and the model is too large for it.")
-    node: dict[str, Any] = {"mesh": 0, "name": path.stem}
-    if is_far:
-        node["translation"] = centre.tolist()
     extras = {"targetNames": target_names(model), KEY: facts_of(model)}
-    asset = {"version": "2.0", "generator": "shapespace"}
-    if model.licence:
-        asset["copyright"] = model.licence
-    return {
-        "asset": asset,
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [node],
-        "meshes": [{"name": path.stem, "primitives": [primitive], "weights": [0.0] * len(targets), "extras": extras}],
-        "accessors": buffer.accessors,
-        "bufferViews": buffer.views,
-    }, b"".join(buffer.parts)
+    mesh = {"name": path.stem, "primitives": [primitive], "weights": [0.0] * len(targets), "extras": extras}
+    licence = {"copyright": model.licence} if model.licence else {}
+    return buffer.content(mesh, path.stem, centre, **licence)
 
 
 def _normals(vertices: FloatArray, faces: IntArray, *, upright: bool = False) -> FloatArray:
@@ -190,34 +171,3 @@ def _normals(vertices: FloatArray, faces: IntArray, *, upright: bool = False) ->
         # glTF asks for unit vectors, also where no triangle gives one.
         normals[~normals.any(axis=1)] = (0.0, 0.0, 1.0)
     return normals
-
-
-class _Buffer:
-    """Binary data of a file, with the offset of each array."""
-
-    def __init__(self) -> None:
-        self.parts: list[bytes] = []
-        self.views: list[dict[str, Any]] = []
-        self.accessors: list[dict[str, Any]] = []
-        self.is_finite = True
-        self._at = 0
-
-    def vectors(self, values: FloatArray, *, bounds: bool = True) -> int:
-        """Add (V, 3) vectors and return the number of their accessor; those of positions say their bounds."""
-        with np.errstate(over="ignore"):
-            single = values.astype("<f4")
-        self.is_finite &= bool(np.isfinite(single).all())
-        limits = {"min": single.min(axis=0).tolist(), "max": single.max(axis=0).tolist()} if bounds else {}
-        return self._add(single.tobytes(), _VERTICES, {"componentType": _FLOAT, "type": "VEC3", **limits}, len(single))
-
-    def indices(self, faces: IntArray) -> int:
-        """Add triangles and return the number of their accessor."""
-        kind = {"componentType": _INDEX, "type": "SCALAR"}
-        return self._add(faces.astype("<u4").tobytes(), _TRIANGLES, kind, faces.size)
-
-    def _add(self, data: bytes, target: int, kind: Mapping[str, Any], count: int) -> int:
-        self.views.append({"buffer": 0, "byteOffset": self._at, "byteLength": len(data), "target": target})
-        self.accessors.append({"bufferView": len(self.views) - 1, "count": count, **kind})
-        self.parts.append(data)
-        self._at += len(data)
-        return len(self.accessors) - 1

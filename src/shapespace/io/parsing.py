@@ -6,6 +6,7 @@ import json
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -309,6 +310,21 @@ def bytes_of_colours(values: npt.NDArray[Any]) -> ByteArray | None:
         return None
     scale = 255.0 if high <= 1.0 else 1.0 if high <= 255.0 else 255.0 / 65535.0
     return np.rint(values * scale).astype(np.uint8)
+
+
+def colours_of_words(rows: Sequence[Sequence[bytes]], first: int, path: Path) -> FloatArray | None:
+    """Return the three numbers from word `first` of each row, (n, 3); None where some row has none."""
+    try:
+        columns = chain.from_iterable(words[first : first + 3] for words in rows)
+        return floats(columns, path).reshape(-1, 3) if min(map(len, rows)) >= first + 3 else None
+    except FileFormatError:
+        return None
+
+
+def joined_colours(parts: Sequence[npt.NDArray[Any] | None]) -> ByteArray | None:
+    """Return the colours of all parts (V, 3), as `bytes_of_colours` does; None where one part has none."""
+    known = [part for part in parts if part is not None]
+    return bytes_of_colours(np.concatenate(known)) if known and len(known) == len(parts) else None
 
 
 def number_lines(values: npt.NDArray[Any], pattern: str) -> str:

@@ -1,4 +1,4 @@
-"""HDF5 and MATLAB files from other tools, read by a library in a sandboxed process.
+"""HDF5 and MATLAB files and pickles from other tools, read by a library in a sandboxed process.
 
 Those libraries take what memory a file asks for, follow links to other files, and hang or crash in damaged structures.
 In that process they see one open file and can open no other, are held to a share of memory and time, and only numbers
@@ -76,6 +76,16 @@ def read_matlab_sandboxed(path: Path, variables: Sequence[str]) -> Tree:
         SandboxError: See `read_hdf5_sandboxed`.
     """
     return _read(path, {"kind": "matlab", "wanted": list(variables)})
+
+
+def read_pickle_sandboxed(path: Path, names: Sequence[str]) -> Tree:
+    """Return the arrays `names` of the dictionary in a pickle, those that are there; nothing in it is called.
+
+    Raises:
+        FileError: it cannot be read.
+        SandboxError: It is damaged, or names what no array needs.
+    """
+    return _read(path, {"kind": "pickle", "wanted": list(names)})
 
 
 def _read(path: Path, request: dict[str, Any]) -> Tree:

@@ -6,8 +6,12 @@ Its standard input is the file. It writes one line of JSON on what it found and,
 from __future__ import annotations
 
 import codecs
+import io
 import json
 import math
+import pickle
+import pickletools
+import re
 import sys
 from typing import Any, BinaryIO, Final
 
@@ -23,6 +27,25 @@ _LONGEST_NAME = 1024  # characters
 _FILTERS = {1, 2, 3}
 """Deflate, shuffle and checksums: those that HDF5 itself brings, and that models use."""
 _NUMBERS: Final = "biuf"
+_DEEPEST_CHUMPY = 8  # nested chumpy objects
+_MOST_STEPS = 400_000  # opcodes of a pickle; limit on time
+_ARRAY_NAMES: Final = {
+    ("numpy", "ndarray"): "class",
+    ("numpy", "dtype"): "dtype",
+    ("__builtin__", "object"): "class",
+    ("builtins", "object"): "class",
+    **{(f"numpy.{core}.multiarray", "_reconstruct"): "array" for core in ("core", "_core")},
+    **{(f"numpy.{core}.multiarray", "scalar"): "scalar" for core in ("core", "_core")},
+    **{(f"numpy.{core}.numeric", "_frombuffer"): "buffer" for core in ("core", "_core")},
+    **{
+        (f"scipy.sparse.{module}{kind}", f"{kind}_matrix"): "class"
+        for kind in ("csc", "csr", "coo")
+        for module in ("", "_")
+    },
+}
+"""Names of what arrays in pickles are made of; `_Noted` objects stand for them, and what they name is never called."""
+_CHUMPY = re.compile(r"chumpy(\.\w+)*")
+_DTYPE = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248])")
 
 
 class _RefusedError(ValueError):
@@ -169,12 +192,133 @@ def _add_variable(value: Any, path: str, content: _FileContent) -> None:
             _add_variable(value.reshape(-1)[0][name], f"{path}/{name}", content)
 
 
+class _Noted:
+    """An object that a pickle would create: its arguments, and its state."""
+
+    kind = ""
+    arguments: tuple[Any, ...] = ()
+    state: Any = None
+
+    def __init__(self, *arguments: Any) -> None:
+        self.arguments = arguments
+
+    def __setstate__(self, state: Any) -> None:
+        self.state = state
+
+
+class _Unpickler(pickle.Unpickler):
+    """An unpickler of numbers, texts, lists, dictionaries and what arrays are made of."""
+
+    def find_class(self, module: str, name: str, /) -> Any:
+        if module in ("copy_reg", "copyreg") and name == "_reconstructor":
+            return _create_noted
+        if (module, name) == ("_codecs", "encode"):
+            return _latin_bytes
+        kind = "chumpy" if _CHUMPY.fullmatch(module) and name.isidentifier() else _ARRAY_NAMES.get((module, name))
+        if kind is None:
+            raise _RefusedError(f"it asks for {module[:40]}.{name[:40]}, which no array needs")
+        return type(kind, (_Noted,), {"kind": kind})
+
+
+def _create_noted(kind: type[_Noted], *_: Any) -> _Noted:
+    if not issubclass(kind, _Noted):
+        raise _RefusedError("it calls what is no name")
+    return kind()
+
+
+def _latin_bytes(text: str, encoding: str) -> bytes:
+    if encoding not in ("latin1", "latin-1"):
+        raise _RefusedError("it asks for a strange text")
+    return text.encode("latin-1", "replace")
+
+
+def _pickle(stream: BinaryIO, request: dict[str, Any], content: _FileContent) -> None:
+    data = stream.read()
+    _forbid_opening_files()
+    try:
+        for step, (opcode, argument, _) in enumerate(pickletools.genops(data)):
+            # A place in the memo beyond the length of the file would only fill the memory.
+            if step > _MOST_STEPS or (opcode.name.endswith("PUT") and argument > len(data)):
+                raise _RefusedError(f"it has more than {_MOST_STEPS} steps, or remembers more than it holds")
+        values = _Unpickler(io.BytesIO(data), encoding="latin-1").load()
+    except (_RefusedError, MemoryError):
+        raise
+    except Exception as error:  # pickles may raise anything at all
+        raise _RefusedError("it is no pickle of arrays, or it is cut short") from error
+    if type(values) is not dict:
+        raise _RefusedError("it holds no dictionary")
+    for name in request["wanted"]:
+        if name in values:
+            array = _pickled_array(values[name])
+            content.charge(array.nbytes, f"/{name}")
+            content.add(f"/{name}", array)
+
+
+def _pickled_array(value: Any, depth: int = 0) -> npt.NDArray[Any]:
+    """Return the array that `value` of a pickle describes, also inside chumpy."""
+    if type(value) is list and all(type(number) in (int, float) for number in value):
+        return np.array(value, dtype=np.float64)
+    if not isinstance(value, _Noted) or depth > _DEEPEST_CHUMPY:
+        raise _RefusedError("what should be an array is none")
+    match value.kind, value.state, value.arguments:
+        case "array", (_, shape, dtype, fortran, data), _:
+            return _numbers(data, dtype, shape, bool(fortran))
+        case "buffer", _, (data, dtype, shape, order, *_):
+            return _numbers(data, dtype, shape, order == "F")
+        case "scalar", _, (dtype, data):
+            return _numbers(data, dtype, (), False)
+        case "chumpy", {"x": inner}, _:
+            return _pickled_array(inner, depth + 1)
+        case "chumpy", {"a": inner, "idxs": indices, **others}, _:  # elements that chumpy's Select takes
+            flat = _pickled_array(inner, depth + 1).ravel()
+            chosen = _pickled_array(indices, depth + 1).astype(np.int64).ravel()
+            if chosen.size and (chosen.min() < 0 or chosen.max() >= len(flat)):
+                raise _RefusedError("it takes parts of an array that are not there")
+            return flat[chosen].reshape(_shape(others.get("preferred_shape") or (len(chosen),), len(chosen)))
+        case _:
+            raise _RefusedError("what should be an array is none")
+
+
+def _numbers(data: Any, described: Any, shape: Any, fortran: bool) -> npt.NDArray[Any]:
+    kind = described.arguments[0] if isinstance(described, _Noted) and described.arguments else None
+    match = _DTYPE.fullmatch(kind) if isinstance(kind, str) else None
+    if match is None:
+        raise _RefusedError("an array in it is not of numbers")
+    is_big = described.arguments[0][:1] == ">" or (
+        isinstance(described.state, tuple) and described.state[1:2] == (">",)
+    )
+    dtype = np.dtype(match[1]).newbyteorder(">" if is_big else "<")
+    if isinstance(data, str):  # as Python 2 wrote bytes
+        data = data.encode("latin-1", "replace")
+    if not isinstance(data, bytes | bytearray):
+        raise _RefusedError("an array in it holds objects")
+    if len(data) % dtype.itemsize:
+        raise _RefusedError("an array in it is not as long as it says")
+    sizes = _shape(shape, len(data) // dtype.itemsize)
+    return np.frombuffer(data, dtype).reshape(sizes, order="F" if fortran else "C")
+
+
+def _shape(shape: Any, count: int) -> tuple[int, ...]:
+    sizes = tuple(shape) if type(shape) in (tuple, list) else (-1,)
+    if len(sizes) > _MOST_AXES or not all(type(size) is int and 0 <= size < 2**40 for size in sizes):
+        raise _RefusedError("an array in it has a strange shape")
+    if math.prod(sizes) != count:
+        raise _RefusedError("an array in it is not as long as it says")
+    return sizes
+
+
 def _forbid_opening_files() -> None:
     """Limit this process to the files that are open, where the system supports it."""
     if sys.platform != "win32":
         import resource
 
-        for name in ("ascii", "latin-1", "utf-8", "utf-16"):  # which are files too, opened when first used
+        for name in (
+            "ascii",
+            "latin-1",
+            "raw-unicode-escape",
+            "utf-8",
+            "utf-16",
+        ):  # which are files too, opened when first used
             codecs.lookup(name)
         resource.setrlimit(resource.RLIMIT_NOFILE, (3, 3))
 
@@ -195,7 +339,7 @@ def _main() -> None:
     _limit_resources(request["most_memory"], request["most_seconds"])
     content, out = _FileContent(request["most_bytes"]), sys.stdout.buffer
     try:
-        {"hdf5": _hdf5, "matlab": _matlab}[request["kind"]](sys.stdin.buffer, request, content)
+        {"hdf5": _hdf5, "matlab": _matlab, "pickle": _pickle}[request["kind"]](sys.stdin.buffer, request, content)
     except _RefusedError as error:
         out.write(json.dumps({"wrong": str(error)}).encode() + b"\n")
     except MemoryError:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import base64
 import binascii
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -32,12 +32,13 @@ from shapespace.io.parsing import (
     strip_triangles,
 )
 from shapespace.io.read_limits import LARGEST_MESH_FILE_BYTES, Allowance
-from shapespace.types import GREY, ByteArray, FloatArray, Mesh
+from shapespace.types import GREY, ByteArray, FloatArray, IntArray, Mesh
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 # glTF 2.0 primitive.mode: POINTS, TRIANGLES, TRIANGLE_STRIP, TRIANGLE_FAN
 _POINTS, _TRIANGLES, _STRIP, _FAN = 0, 4, 5, 6
+_VERTICES, _CORNERS = 34962, 34963  # glTF 2.0 bufferView.target: ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER
 _COMPRESSIONS = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 # What a file may require without its points and triangles becoming others.
 _HARMLESS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", "KHR_lights_", "EXT_lights_", "KHR_xmp")
@@ -504,54 +505,79 @@ def _to_linear(colours: ByteArray) -> Values:
     return out
 
 
+class GltfBuffer:
+    """Binary data of a file to write, with the place of each array in it."""
+
+    def __init__(self) -> None:
+        self.parts: list[bytes] = []
+        self.views: list[dict[str, Any]] = []
+        self.accessors: list[dict[str, Any]] = []
+        self.is_finite = True
+
+    def vectors(self, values: FloatArray, *, bounds: bool = True) -> int:
+        """Add (V, 3) vectors in single precision and return the number of their accessor; positions state bounds."""
+        with np.errstate(over="ignore"):
+            single = values.astype("<f4")
+        self.is_finite &= bool(np.isfinite(single).all())
+        limits = {"min": single.min(axis=0).tolist(), "max": single.max(axis=0).tolist()} if bounds else {}
+        return self._add(single, _VERTICES, type="VEC3", **limits)
+
+    def indices(self, faces: IntArray) -> int:
+        """Add triangles and return the number of their accessor."""
+        return self._add(faces.astype("<u4").reshape(-1), _CORNERS, type="SCALAR")
+
+    def colours(self, colours: ByteArray) -> int:
+        """Add colours (V, 3) and return the number of their accessor."""
+        return self._add(_to_linear(colours), _VERTICES, type="VEC4", normalized=True)
+
+    def _add(self, values: Values, target: int, **kind: Any) -> int:
+        data = values.tobytes()
+        start = sum(map(len, self.parts))
+        self.views.append({"buffer": 0, "byteOffset": start, "byteLength": len(data), "target": target})
+        code = next(code for code, component in _COMPONENTS.items() if component == values.dtype.str)
+        view = {"bufferView": len(self.views) - 1, "componentType": code, "count": len(values)}
+        self.accessors.append({**view, **kind})
+        self.parts.append(data)
+        return len(self.accessors) - 1
+
+    def content(
+        self, mesh: Mapping[str, Any], name: str, centre: FloatArray, **asset: str
+    ) -> tuple[dict[str, Any], bytes]:
+        """Return the tree of a scene with one mesh, whose positions are from `centre` (3,), and its buffer."""
+        translation = {"translation": centre.tolist()} if centre.any() else {}
+        tree = {
+            "asset": {"version": "2.0", "generator": "shapespace", **asset},
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{"mesh": 0, "name": name, **translation}],
+            "meshes": [mesh],
+            "accessors": self.accessors,
+            "bufferViews": self.views,
+        }
+        return tree, b"".join(self.parts)
+
+
+def centre_if_far(points: FloatArray) -> FloatArray:
+    """Return (3,) the centre of points (V, 3) that are far from the origin for their size, else zeros."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    extent = max(float((high - low).max()), np.finfo(np.float64).tiny)
+    return (low + high) / 2 if np.abs([low, high]).max() > _FAR * extent else np.zeros(3)
+
+
 def _content(mesh: Mesh) -> tuple[dict[str, Any], bytes]:
     if not len(mesh.vertices):
         raise InputError(f"{mesh.name} has no points, so it cannot be written as glTF.")
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+    if not np.isfinite(mesh.vertices).all():
         raise InputError(f"{mesh.name} has points that are not finite, which glTF cannot hold; write it as PLY.")
-    is_far = np.abs([low, high]).max() > _FAR * max(float((high - low).max()), np.finfo(np.float64).tiny)
-    centre = (low + high) / 2 if is_far else np.zeros(3)
-    with np.errstate(over="ignore"):
-        positions = (mesh.vertices - centre).astype("<f4")
-    if not np.isfinite(positions).all():
+    centre, buffer = centre_if_far(mesh.vertices), GltfBuffer()
+    primitive: dict[str, Any] = {"attributes": {"POSITION": buffer.vectors(mesh.vertices - centre)}, "mode": _POINTS}
+    if not buffer.is_finite:
         raise InputError(f"{mesh.name} has coordinates too large for glTF; write it as PLY instead.")
-    binary = positions.tobytes()
-    views: list[dict[str, Any]] = [{"buffer": 0, "byteOffset": 0, "byteLength": len(binary), "target": 34962}]
-    bounds = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
-    accessors: list[dict[str, Any]] = [
-        {"bufferView": 0, "componentType": 5126, "count": len(positions), "type": "VEC3", **bounds}
-    ]
-    primitive: dict[str, Any] = {"attributes": {"POSITION": 0}, "mode": _POINTS}
     if mesh.faces is not None:
-        indices = mesh.faces.astype("<u4").tobytes()
-        views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(indices), "target": 34963})
-        count = mesh.faces.size
-        accessors.append({"bufferView": 1, "componentType": 5125, "count": count, "type": "SCALAR"})
-        primitive = {"attributes": {"POSITION": 0}, "indices": 1, "mode": _TRIANGLES}
-        binary += indices
+        primitive |= {"indices": buffer.indices(mesh.faces), "mode": _TRIANGLES}
     if mesh.colours is not None:
-        colour_bytes = _to_linear(mesh.colours).tobytes()
-        primitive["attributes"]["COLOR_0"] = len(accessors)
-        views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(colour_bytes), "target": 34962})
-        accessors.append({
-            "bufferView": len(views) - 1, "componentType": 5123, "normalized": True, "count": len(mesh.colours),
-            "type": "VEC4",
-        })  # fmt: skip
-        binary += colour_bytes
-    node: dict[str, Any] = {"mesh": 0, "name": mesh.name}
-    if is_far:
-        node["translation"] = centre.tolist()
-    tree: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": "shapespace"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [node],
-        "meshes": [{"primitives": [primitive]}],
-        "accessors": accessors,
-        "bufferViews": views,
-    }
-    return tree, binary
+        primitive["attributes"]["COLOR_0"] = buffer.colours(mesh.colours)
+    return buffer.content({"primitives": [primitive]}, mesh.name, centre)
 
 
 def write_gltf(mesh: Mesh) -> bytes:

@@ -7,18 +7,18 @@ from pathlib import Path
 
 import numpy as np
 
-from shapespace.errors import FileFormatError
 from shapespace.io.meshes.obj_textures import texture_colours
 from shapespace.io.parsing import (
     CUT_SHORT,
     SPACE,
     IndexArray,
-    bytes_of_colours,
+    colours_of_words,
     damage_error,
     fan_triangles,
     floats,
     ints,
     join_parts,
+    joined_colours,
     line_blocks,
     mesh_of,
     number_lines,
@@ -66,15 +66,16 @@ def read_obj(data: bytes, path: Path) -> Mesh:
                 vertices_above.append(count + len(points))
         if points:
             vertices.append(_points(points, count, path))
-            colours.append(_colours(points, path))
+            # Six numbers are x y z and a colour; a fourth alone is a weight.
+            is_coloured = set(map(len, points)) == {_COLOURED_WORDS}
+            colours.append(colours_of_words(points, 4, path) if is_coloured else None)
             count += len(points)
         if polygons:
             faces.append(_faces(polygons, vertices_above, polygon_count, path))
             polygon_count += len(polygons)
     if not count:
         raise damage_error(path, "it has no 'v' lines, so it is not an OBJ file or holds no points")
-    known_colours = [part for part in colours if part is not None]
-    vertex_colours = bytes_of_colours(np.concatenate(known_colours)) if len(known_colours) == len(colours) else None
+    vertex_colours = joined_colours(colours)
     notes: tuple[str, ...] = ()
     if vertex_colours is None:
         vertex_colours, notes = texture_colours(data, count, path)
@@ -93,16 +94,6 @@ def _points(points: list[list[bytes]], lines_before: int, path: Path) -> FloatAr
         flat = list(chain.from_iterable(points))
         return np.stack([floats(flat[axis :: len(points[0])], path) for axis in (1, 2, 3)], axis=1)
     return floats(chain.from_iterable(words[1:4] for words in points), path).reshape(-1, 3)
-
-
-def _colours(points: list[list[bytes]], path: Path) -> FloatArray | None:
-    """Return the numbers after the coordinates, (n, 3), if every vertex has three."""
-    if set(map(len, points)) != {_COLOURED_WORDS}:
-        return None
-    try:
-        return floats(chain.from_iterable(words[4:] for words in points), path).reshape(-1, 3)
-    except FileFormatError:
-        return None
 
 
 def _faces(polygons: list[list[bytes]], vertices_above: list[int], lines_before: int, path: Path) -> IndexArray:

@@ -9,17 +9,17 @@ from pathlib import Path
 
 import numpy as np
 
-from shapespace.errors import FileFormatError
 from shapespace.io.parsing import (
     CUT_SHORT,
     IndexArray,
-    bytes_of_colours,
     check_count,
+    colours_of_words,
     damage_error,
     fan_triangles,
     floats,
     ints,
     join_parts,
+    joined_colours,
     line_blocks,
     mesh_of,
     number_lines,
@@ -64,16 +64,10 @@ def read_off(data: bytes, path: Path) -> Mesh:
     colours: list[FloatArray | None] = []
     for part in _batches(rows, n, "vertices", path):
         points.append(_points(part, path))
-        colours.append(_colours(part, colour_column, path) if colour_column else None)
+        colours.append(colours_of_words(part, colour_column, path) if colour_column else None)
     vertices = join_parts(points, np.float64, 3)
-    known_colours = [part for part in colours if part is not None]
-    vertex_colours = (
-        bytes_of_colours(np.concatenate(known_colours))
-        if known_colours and len(known_colours) == len(colours)
-        else None
-    )
     faces = join_parts([_faces(part, path) for part in _batches(rows, m, "faces", path)], np.int64, 3)
-    return mesh_of(vertices, faces, path, vertex_colours)
+    return mesh_of(vertices, faces, path, joined_colours(colours))
 
 
 def _rows(data: bytes) -> Iterator[list[bytes]]:
@@ -102,18 +96,6 @@ def _points(rows: list[list[bytes]], path: Path) -> FloatArray:
     if min(map(len, rows)) < 3:
         raise damage_error(path, f"a vertex has fewer than three numbers; {CUT_SHORT}")
     return floats(chain.from_iterable(words[:3] for words in rows), path).reshape(-1, 3)
-
-
-def _colours(rows: list[list[bytes]], first_column: int, path: Path) -> FloatArray | None:
-    """Return the three numbers from word `first_column` of each line, (n, 3); None where some line has none."""
-    if min(map(len, rows)) < first_column + 3:
-        return None
-    try:
-        return floats(chain.from_iterable(words[first_column : first_column + 3] for words in rows), path).reshape(
-            -1, 3
-        )
-    except FileFormatError:
-        return None
 
 
 def _faces(rows: list[list[bytes]], path: Path) -> IndexArray:

@@ -31,6 +31,7 @@ from shapespace.io.parsing import (
     ints,
     ints_of,
     join_parts,
+    joined_colours,
     mesh_of,
     numeric_text,
     plain_text,
@@ -488,12 +489,11 @@ def _read_xml(data: bytes, path: Path) -> tuple[Mesh, list[Cells]]:
         n_vertices += len(vertices)
     if not points:
         raise damage_error(path, f"it holds no points; {CUT_SHORT}")
-    known_colours = [part for part in colours if part is not None]
-    vertex_colours = np.concatenate(known_colours) if len(known_colours) == len(colours) else None
     fields = root.iterfind("PolyData/FieldData/*")
     spaces = [_data_array(a, xml).astype(np.uint8) for a in fields if a.get("Name", "").upper() == "SPACE"]
     return mesh_of(
-        np.concatenate(points), join_parts(faces, np.int64, 3), path, vertex_colours, (LINE_NOTE,) if lines else (),
+        np.concatenate(points), join_parts(faces, np.int64, 3), path, joined_colours(colours),
+        (LINE_NOTE,) if lines else (),
         header=b"".join(b" SPACE=" + codes.tobytes() for codes in spaces),
     ), lines  # fmt: skip
 
