@@ -58,7 +58,8 @@ def cohort_of(
     chosen = {name: known[name] for name in arguments.chosen if name in known}
     if data is None and arguments.shapes is not None:
         chosen["shapes"] = arguments.shapes
-    config = CohortConfig(**{**stated, "least": least, "accept_review": accept_review, **chosen, **fixed})
+    stated |= {"least": least, "accept_review": accept_review, **chosen, **fixed}
+    config = CohortConfig(**stated)
     with steps(None, "reading", "shape", quiet=arguments.quiet) as step:
         return read_cohort(place, config, onto=onto, on_shape=step)
 

@@ -226,13 +226,16 @@ def apply_settings(arguments: argparse.Namespace, settings: Sequence[Option]) ->
         if option.initial is not NO_DEFAULT:
             setattr(arguments, option.attribute, option.initial)
     chosen: set[str] = set()
-    for text in arguments.set or ():
+    given_texts: list[str] = arguments.set or []
+    for text in given_texts:
         name, equals, value = (part.strip() for part in text.partition("="))
         if not equals:
             raise argparse.ArgumentTypeError(f"argument --set: {text!r} is not NAME=VALUE")
         if name not in known:
-            nearest = ", ".join(difflib.get_close_matches(name, known, 1) or sorted(known))
-            raise argparse.ArgumentTypeError(f"argument --set: there is no setting {name!r}; choose {nearest}")
+            nearest = difflib.get_close_matches(name, list(known), 1) or sorted(known)
+            raise argparse.ArgumentTypeError(
+                f"argument --set: there is no setting {name!r}; choose {', '.join(nearest)}"
+            )
         option = known[name]
         try:
             setattr(arguments, option.attribute, option.parse_value(value))

@@ -42,6 +42,7 @@ PATHS = ("shapes", "model", "landmarks", "orientation")
 COHORT_ENDING = ".toml"
 """Ending of cohort files."""
 _LONGEST_FILE = 1_000_000  # bytes of a cohort file
+_KINDS = {"a text": str, "a whole number": int, "true or false": bool}  # of values in a cohort file
 _OF_QUESTIONS = ("least", "accept_review")
 """Fields of `CohortConfig` that a question sets."""
 _USED = ("converged", "max_iterations")
@@ -126,11 +127,13 @@ def read_cohort_file(path: Path) -> tuple[Path, dict[str, Any]]:
         stated = tomllib.loads(read_bytes(path, _LONGEST_FILE).decode("utf-8-sig"))
     except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
         raise FileFormatError(f"{path} is not a TOML file ({str(error)[:100]}); {again}.") from error
-    defaults = {field.name: field.default for field in fields(CohortConfig) if field.name not in _OF_QUESTIONS}
+    defaults: dict[str, Any] = {field.name: field.default for field in fields(CohortConfig)}
+    defaults = {name: value for name, value in defaults.items() if name not in _OF_QUESTIONS}
     for name in ("data", *defaults):
-        kind = str if defaults.get(name) is None else type(defaults[name])
-        if (name in stated or name == "data") and type(stated.get(name)) is not kind:
-            expected = {str: "a text", int: "a whole number", bool: "true or false"}[kind]
+        default = defaults.get(name)
+        expected = "true or false" if isinstance(default, bool) else "a whole number"
+        expected = "a text" if default is None or isinstance(default, str) else expected
+        if (name in stated or name == "data") and type(stated.get(name)) is not _KINDS[expected]:
             raise FileFormatError(f"{path} needs {expected} as its {name}; {again}.")
     if unknown := sorted(stated.keys() - defaults.keys() - {"data"}):
         raise FileFormatError(f"{path} has a setting {unknown[0][:40]!r}, which cohorts do not have; {again}.")
@@ -213,7 +216,8 @@ def read_cohort(
     if config.subject is not None:
         columns = {**cohort.table.columns, SUBJECT: cohort.table.texts(config.subject)}
         cohort = replace(cohort, table=replace(cohort.table, columns=columns))
-    places = [Path(place) for place in (config.shapes, data) if isinstance(place, str | PathLike)]
+    given: list[Any] = [place for place in (config.shapes, data) if isinstance(place, str | PathLike)]
+    places = list(map(Path, given))
     orientation = find_orientation(
         None if config.orientation is None else Path(config.orientation),
         [place if place.is_dir() else place.parent for place in places],

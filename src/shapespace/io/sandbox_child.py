@@ -13,7 +13,7 @@ import pickle
 import pickletools
 import re
 import sys
-from typing import Any, BinaryIO, Final
+from typing import Any, BinaryIO, Final, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -220,8 +220,8 @@ class _Unpickler(pickle.Unpickler):
         return type(kind, (_Noted,), {"kind": kind})
 
 
-def _create_noted(kind: type[_Noted], *_: Any) -> _Noted:
-    if not issubclass(kind, _Noted):
+def _create_noted(kind: Any, *_: Any) -> _Noted:
+    if not (isinstance(kind, type) and issubclass(kind, _Noted)):
         raise _RefusedError("it calls what is no name")
     return kind()
 
@@ -238,7 +238,7 @@ def _pickle(stream: BinaryIO, request: dict[str, Any], content: _FileContent) ->
     try:
         for step, (opcode, argument, _) in enumerate(pickletools.genops(data)):
             # A place in the memo beyond the length of the file would only fill the memory.
-            if step > _MOST_STEPS or (opcode.name.endswith("PUT") and argument > len(data)):
+            if step > _MOST_STEPS or (opcode.name.endswith("PUT") and (argument or 0) > len(data)):
                 raise _RefusedError(f"it has more than {_MOST_STEPS} steps, or remembers more than it holds")
         values = _Unpickler(io.BytesIO(data), encoding="latin-1").load()
     except (_RefusedError, MemoryError):
@@ -256,7 +256,7 @@ def _pickle(stream: BinaryIO, request: dict[str, Any], content: _FileContent) ->
 
 def _pickled_array(value: Any, depth: int = 0) -> npt.NDArray[Any]:
     """Return the array that `value` of a pickle describes, also inside chumpy."""
-    if type(value) is list and all(type(number) in (int, float) for number in value):
+    if isinstance(value, list) and set(map(type, cast(list[object], value))) <= {int, float}:
         return np.array(value, dtype=np.float64)
     if not isinstance(value, _Noted) or depth > _DEEPEST_CHUMPY:
         raise _RefusedError("what should be an array is none")
