@@ -26,7 +26,7 @@ import pytest
 from PIL import Image
 
 from shapespace import cli
-from shapespace.cli.command_table import COMMANDS, Command
+from shapespace.cli.command_table import COHORT_SETTINGS, COMMANDS, JSON, QUIET, SET, Command
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENTS = [
@@ -546,10 +546,13 @@ def test_the_pages_of_commands_are_those_of_the_parser() -> None:
 def test_the_reference_has_every_option_of_the_parser_and_no_other(command: Command) -> None:
     text = (ROOT / "docs" / "cli" / f"{command.name.replace(' ', '-')}.md").read_text("utf-8")
     cells = [line.split(" | ")[0] for line in text.splitlines() if line.startswith("| `-")]
-    shown = [option for option in command.options if not option.is_positional]
-    assert [name for cell in cells for name in re.findall(r"`(-[\w-]+)", cell)] == [
+    of_all = (JSON, QUIET, SET)  # the index describes them
+    shown = [option for option in command.options if not option.is_positional and option not in of_all]
+    settings = [option.names for option in command.settings if option not in COHORT_SETTINGS]
+    assert [name for cell in cells for name in re.findall(r"`(-[\w-]+)", cell) if name != "--set"] == [
         name for option in sorted(shown, key=lambda option: not option.basic) for name in option.spellings
     ]
+    assert re.findall(r"^\| `--set (\w+)=", text, re.MULTILINE) == settings
 
 
 def test_the_reference_lists_every_key_of_a_fit_record() -> None:
