@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from shapespace.cli.options import given
 from shapespace.cli.printing import say, show, show_json, warn
+from shapespace.commands.outcome import Outcome
 from shapespace.errors import InputError
 
 if TYPE_CHECKING:
@@ -17,6 +20,9 @@ if TYPE_CHECKING:
     from shapespace.cohort.read import Surfaces
     from shapespace.report.analyses.analysis_report import AnalysisReport
     from shapespace.statistics.identity.trial import IdentityConfig
+
+
+_Result = TypeVar("_Result")
 
 
 def column_value(text: str, option: str) -> tuple[str, str]:
@@ -124,6 +130,27 @@ def finish(report: AnalysisReport, arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _answer(
+    arguments: argparse.Namespace, doing: str, what: str, compute: Callable[..., _Result],
+    report: Callable[[_Result], AnalysisReport], count: int | None = None,
+) -> int:  # fmt: skip
+    """Compute a result with a progress bar, and write its report.
+
+    Args:
+        arguments: parsed arguments.
+        doing: what the progress bar says, such as `permuting`.
+        what: what it counts.
+        compute: takes `progress`.
+        report: of the result.
+        count: number of steps, if it is known.
+    """
+    from shapespace.batch.progress import steps
+
+    with steps(count, doing, what, quiet=arguments.quiet) as step:
+        result = compute(progress=step)
+    return finish(report(result), arguments)
+
+
 def answer_align(arguments: argparse.Namespace) -> int:
     """Align landmarks, and name the specimens to check."""
     from shapespace.commands.align import align
@@ -148,7 +175,6 @@ def answer_align(arguments: argparse.Namespace) -> int:
 
 def answer_asymmetry(arguments: argparse.Namespace) -> int:
     """Measure the asymmetry of a cohort, and write its report."""
-    from shapespace.batch.progress import steps
     from shapespace.report.analyses.asymmetry_report import asymmetry_report
     from shapespace.statistics.asymmetry import measure_asymmetry
     from shapespace.statistics.sides import read_pairs
@@ -157,14 +183,12 @@ def answer_asymmetry(arguments: argparse.Namespace) -> int:
     cohort = cohort_of(arguments)
     pairs = None if arguments.pairs is None else read_pairs(arguments.pairs, cohort)
     options = given(arguments, measure_asymmetry, pairs=pairs, reference=reference)
-    with steps(None, "permuting", "shape", quiet=arguments.quiet) as step:
-        result = measure_asymmetry(cohort, **options, where=str(arguments.pairs), progress=step)
-    return finish(asymmetry_report(result), arguments)
+    compute = partial(measure_asymmetry, cohort, **options, where=str(arguments.pairs))
+    return _answer(arguments, "permuting", "shape", compute, asymmetry_report)
 
 
 def answer_change(arguments: argparse.Namespace) -> int:
     """Measure the changes, and write the report."""
-    from shapespace.batch.progress import steps
     from shapespace.io.meshes.region_files import read_region
     from shapespace.report.analyses.change_report import change_report
     from shapespace.statistics.change_result import ChangeConfig
@@ -173,22 +197,18 @@ def answer_change(arguments: argparse.Namespace) -> int:
     cohort = cohort_of(arguments, gauge="form")
     regions = {name: read_region(path) for name, path in arguments.region} or None
     config = ChangeConfig(**given(arguments, ChangeConfig, regions=regions))
-    with steps(None, "comparing", "subject", quiet=arguments.quiet) as step:
-        result = change(cohort, config, progress=step)
-    return finish(change_report(result), arguments)
+    return _answer(arguments, "comparing", "subject", partial(change, cohort, config), change_report)
 
 
 def answer_compare(arguments: argparse.Namespace) -> int:
     """Compare the shapes of a cohort."""
-    from shapespace.batch.progress import steps
     from shapespace.report.analyses.compare_report import compare_report
     from shapespace.statistics.compare_shapes import CompareConfig, compare
 
     config = CompareConfig(**given(arguments, CompareConfig, errors=dict(arguments.error)))
     cohort = cohort_of(arguments)
-    with steps(None, "permuting", "step", quiet=arguments.quiet) as step:
-        result = compare(cohort, arguments.formula, config, progress=step)
-    return finish(compare_report(result), arguments)
+    compute = partial(compare, cohort, arguments.formula, config)
+    return _answer(arguments, "permuting", "step", compute, compare_report)
 
 
 def answer_complete(arguments: argparse.Namespace) -> int:
@@ -217,26 +237,20 @@ def answer_complete(arguments: argparse.Namespace) -> int:
 
 def answer_verify(arguments: argparse.Namespace) -> int:
     """Verify whether two scans are of one subject."""
-    from shapespace.batch.progress import steps
     from shapespace.report.analyses.identity_report import verify_report
     from shapespace.statistics.identity.verify import verify
 
     cohort, config = _cohort_and_config(arguments)
-    with steps(None, "comparing", "draw", quiet=arguments.quiet) as step:
-        result = verify(cohort, config, progress=step)
-    return finish(verify_report(result), arguments)
+    return _answer(arguments, "comparing", "draw", partial(verify, cohort, config), verify_report)
 
 
 def answer_identify(arguments: argparse.Namespace) -> int:
     """Identify the subject of a scan among the enrolled ones."""
-    from shapespace.batch.progress import steps
     from shapespace.report.analyses.identity_report import identify_report
     from shapespace.statistics.identity.identify import identify
 
     cohort, config = _cohort_and_config(arguments)
-    with steps(None, "searching", "score", quiet=arguments.quiet) as step:
-        result = identify(cohort, config, progress=step)
-    return finish(identify_report(result), arguments)
+    return _answer(arguments, "searching", "score", partial(identify, cohort, config), identify_report)
 
 
 def _cohort_and_config(arguments: argparse.Namespace) -> tuple[Cohort, IdentityConfig]:
@@ -284,9 +298,8 @@ def answer_regress(arguments: argparse.Namespace) -> int:
         hold = dict(column_value(word, "--hold") for word in arguments.hold or ())
         options = {**given(arguments, predict_shapes, hold=hold), **shared}
         options = {name: value for name, value in options.items() if value is not None}
-        with steps(None, "flipping signs", "step", quiet=arguments.quiet) as step:
-            shapes = predict_shapes(cohort, **options, progress=step)
-        return finish(shape_prediction_report(shapes), arguments)
+        compute = partial(predict_shapes, cohort, **options)
+        return _answer(arguments, "flipping signs", "step", compute, shape_prediction_report)
     with steps(None, "learning", "fold", quiet=arguments.quiet) as step:
         result = regress(cohort, arguments.target, folds=arguments.folds, **shared, progress=step)
     new = None
@@ -303,7 +316,6 @@ def answer_regress(arguments: argparse.Namespace) -> int:
 
 def answer_score(arguments: argparse.Namespace) -> int:
     """Score subjects against a reference."""
-    from shapespace.batch.progress import steps
     from shapespace.report.analyses.score_report import score_report
     from shapespace.statistics.score_subjects import ScoreConfig, score
 
@@ -313,20 +325,36 @@ def answer_score(arguments: argparse.Namespace) -> int:
         arguments, arguments.reference, accept_review=doubtful, surfaces="coefficients", doubtful=False
     )
     subjects = cohort_of(arguments, onto=reference, surfaces="coefficients")
-    with steps(len(subjects), "scoring", "subject", quiet=arguments.quiet) as step:
-        result = score(reference, subjects, config, progress=step)
-    return finish(score_report(result), arguments)
+    compute = partial(score, reference, subjects, config)
+    return _answer(arguments, "scoring", "subject", compute, score_report, len(subjects))
 
 
 def answer_shape_tests(arguments: argparse.Namespace) -> int:
     """Run a test of shape on a cohort, and write its report."""
-    from shapespace.batch.progress import steps
     from shapespace.report.analyses.shape_test_report import shape_test_report
 
     test = arguments.shape_test
     function = resolve_name(f"shapespace.statistics.shape_tests.{test.function}")
-    cohort = cohort_of(arguments)
-    options = given(arguments, function)
-    with steps(None, "permuting", "permutation", quiet=arguments.quiet) as step:
-        result = function(cohort, **options, progress=step)
-    return finish(shape_test_report(result), arguments)
+    compute = partial(function, cohort_of(arguments), **given(arguments, function))
+    return _answer(arguments, "permuting", "permutation", compute, shape_test_report)
+
+
+def answer_export(arguments: argparse.Namespace) -> Outcome:
+    """Write fits of a store as single files, or all of them as a table; with `--to`, the shapes of a cohort.
+
+    Raises:
+        InputError: options of both.
+    """
+    from shapespace.commands.export import export, export_cohort
+
+    if arguments.to is None and arguments.formula is None:
+        return export(
+            arguments.store, arguments.names, arguments.output, every=arguments.all, table=arguments.table,
+            quiet=arguments.quiet, say=warn,
+        )  # fmt: skip
+    if arguments.names or arguments.all or arguments.table is not None:
+        raise InputError("--to exports all shapes of DATA; leave out names, --all and --table.")
+    if arguments.formula is not None and arguments.to != "geomorph":
+        raise InputError("--formula is the model of the script for geomorph; give --to geomorph too.")
+    arguments.data = arguments.store
+    return export_cohort(cohort_of(arguments), arguments.output, **given(arguments, export_cohort))

@@ -997,7 +997,7 @@ COMMANDS: tuple[Command, ...] = (
     Command(
         "export", "export fits as single files or one table, or any cohort to geomorph, MorphoJ, TPS or CSV",
         ("shapespace export out anna ben -o single", "shapespace export out --table fits.csv",
-         "shapespace export aligned --to geomorph --formula '~ sex' -o r"), "cli.export_choice:export",
+         "shapespace export aligned --to geomorph --formula '~ sex' -o r"), "cli.answers:answer_export",
         (
             basic("store", "DATA", "a folder that shapespace fit wrote; with --to, any data of compare", parse=Path),
             basic("names", "NAME", "names of the fits", nargs="*"),
