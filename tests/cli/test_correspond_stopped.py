@@ -123,7 +123,7 @@ def test_results_that_are_not_all_written_are_not_taken(
     # The template of another seed is another one, and the first surface on it lies beside others on the old one.
     with monkeypatch.context() as stopped:
         stopped.setattr(correspond, "write_mesh", after(1, correspond.write_mesh, KeyboardInterrupt()))
-        assert run("correspond", raw, "-o", same, *QUICK, "--seed", "5").code == 130
+        assert run("correspond", raw, "-o", same, *QUICK, "--set", "seed=5").code == 130
     for command in ("build", "quality"):
         outcome = run(command, same, "-o", model)
         assert outcome.code == 2 and "not finished; run shapespace correspond again" in outcome.sentence()

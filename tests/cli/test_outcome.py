@@ -16,10 +16,9 @@ from shapespace.commands.outcome import Aside, Outcome, exit_code_of, first_line
 def test_each_parameter_of_a_command_is_an_option(command: Command) -> None:
     function = resolve_name(f"shapespace.{command.run}")
     kinds = get_type_hints(function)
-    known = {option.attribute for option in command.options} | {"say", "arguments"}
-    known |= {
-        option.field_name for option in command.options if option.source and option.source.name == function.__name__
-    }
+    options = (*command.options, *command.settings)
+    known = {option.attribute for option in options} | {"say", "arguments"}
+    known |= {option.field_name for option in options if option.source and option.source.name == function.__name__}
     for name, parameter in inspect.signature(function).parameters.items():
         assert name in known or is_dataclass(kinds[name]) or parameter.default is not parameter.empty, name
 

@@ -58,7 +58,7 @@ def test_the_quoted_command_fits_the_shown_scans_and_no_others(
     monkeypatch.chdir(tmp_path)
     Path("list.csv").write_text("id,file,sex\nfirst,my scans/a 1.ply,f\nsecond,my scans/it's.ply,m\n")
     Path("list.txt").write_text("my scans/a 1.ply\nmy scans/b.ply\n")
-    assert run("fit", "model.h5", *given, "-o", "out", *QUICK, "--seed", 3, "--quiet").code == 0
+    assert run("fit", "model.h5", *given, "-o", "out", *QUICK, "--set", "seed=3", "--quiet").code == 0
     before = fitted(tmp_path / "out")
     assert sorted(before) == names
     monkeypatch.chdir(tmp_path / "out")

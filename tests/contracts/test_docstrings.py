@@ -11,7 +11,7 @@ import shapespace
 ROOT = Path(shapespace.__file__).parent
 TREES = {path: ast.parse(path.read_text("utf-8")) for path in sorted(ROOT.rglob("*.py"))}
 CLASSES = {node.name: node for tree in TREES.values() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
-FOREIGN_ERRORS = {"LinAlgError", "np.linalg.LinAlgError"}
+FOREIGN_ERRORS = {"LinAlgError", "np.linalg.LinAlgError", "ArgumentTypeError"}
 ENTRY = re.compile(r"^    (\*{0,2}[\w.]+(?:, \*{0,2}[\w.]+)*)(?:: |:$)")
 REFERENCE = re.compile(r"`(\w+)\.(\w+)(?:\(\))?`")
 

@@ -295,7 +295,7 @@ def answer_regress(arguments: argparse.Namespace) -> int:
         return finish(prediction_report(learned, cohort, learned.predict(cohort)), arguments)
     cohort = cohort_of(arguments)
     if arguments.along is not None:
-        hold = dict(column_value(word, "--hold") for word in arguments.hold or ())
+        hold = dict(column_value(word, "--set hold") for word in arguments.hold or ())
         options = {**given(arguments, predict_shapes, hold=hold), **shared}
         options = {name: value for name, value in options.items() if value is not None}
         compute = partial(predict_shapes, cohort, **options)

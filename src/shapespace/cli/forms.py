@@ -29,11 +29,12 @@ _FIRST: Mapping[str, tuple[str, ...]] = {
 }
 """Command -> the options that its form shows; the others are folded."""
 _FILES = frozenset(
-    {
-        "--output", "--shapes", "--model", "--table", "--labels", "--template", "--subjects", "--add", "--redo",
-        "--remove", "--update", "--recursive", "--dask", "--executor", "--predictor", "--predict", "--no-open",
-        "--json", "--quiet", "--all", "--groups", "--surfaces", "--set", "--orientation",
-    }
+    f"--{name}"
+    for name in (
+        "output", "shapes", "model", "table", "labels", "template", "subjects", "add", "redo", "remove", "update",
+        "recursive", "dask", "executor", "predictor", "predict", "no-open", "json", "quiet", "all", "groups",
+        "surfaces", "set", "orientation",
+    )
 )  # fmt: skip
 """Options that the studio sets itself, or that name files."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
@@ -207,7 +207,16 @@ def fit_scan(
                 replace(limits, modes=None, part=True),
                 None if on_state is None else held.telling(on_state),
             )
-        driven = _drive(config.fitting.states(own, placed.target, placed.start, limits), placed, on_state)
+        recorder = _Recorder(placed, on_state)
+        states = config.fitting.states(own, placed.target, placed.start, limits)
+        try:
+            while True:
+                recorder.add(next(states))
+        except StopIteration as end:
+            driven = recorder.driven(end.value)
+        except InputError as error:
+            advice = "give landmarks (--landmarks), or crop the scan (--crop)"
+            raise FitError(f"{placed.scan.name}: the fit diverged ({error}); {advice}.") from error
         clock.append(time.perf_counter())
         stages = _measure(own, placed, driven, config)
         clock.append(time.perf_counter())
@@ -311,32 +320,36 @@ class _Driven:
     fitted: Fitted
 
 
-def _drive(states: Generator[IcpState, None, Fitted], placed: _Placed, on_state: OnState | None) -> _Driven:
-    """Run a method to its end, and return its states.
+class _Recorder:
+    """Collects the states of a method."""
 
-    Raises:
-        FitError: the fit diverged, or the model has shrunk to a point.
-    """
-    history, ended, phase_2_from = list[IcpState](), dict[int, IcpState](), time.perf_counter()
-    while True:
-        try:
-            state = next(states)
-        except StopIteration as end:
-            return _Driven(history, ended, phase_2_from, end.value)
-        except InputError as error:
-            advice = "give landmarks (--landmarks), or crop the scan (--crop)"
-            raise FitError(f"{placed.scan.name}: the fit diverged ({error}); {advice}.") from error
-        if state.phase == 2 and 2 not in ended:
-            phase_2_from = time.perf_counter()
-        history.append(state)
-        ended[state.phase] = state
-        if on_state is not None:
-            on_state(state)
-        if state.T_scan_model.scale < _VANISHED * placed.start.T_scan_model.scale:
+    def __init__(self, placed: _Placed, on_state: OnState | None) -> None:
+        self._placed, self._on_state = placed, on_state
+        self._history: list[IcpState] = []
+        self._ended: dict[int, IcpState] = {}
+        self._phase_2_from = time.perf_counter()
+
+    def add(self, state: IcpState) -> None:
+        """Append a state.
+
+        Raises:
+            FitError: the model has shrunk to a point.
+        """
+        if state.phase == 2 and 2 not in self._ended:
+            self._phase_2_from = time.perf_counter()
+        self._history.append(state)
+        self._ended[state.phase] = state
+        if self._on_state is not None:
+            self._on_state(state)
+        if state.T_scan_model.scale < _VANISHED * self._placed.start.T_scan_model.scale:
             raise FitError(
-                f"{placed.scan.name}: the model shrank to a point, as the plain method does when a large part of the "
-                "scan is missing; hold the scale (--scale fixed), or fit only the part that it shows (--region)."
+                f"{self._placed.scan.name}: the model shrank to a point, as the plain method does when a large part of "
+                "the scan is missing; hold the scale (--scale fixed), or fit only the part that it shows (--region)."
             )
+
+    def driven(self, fitted: Fitted) -> _Driven:
+        """Return the states together with the end of the fit."""
+        return _Driven(self._history, self._ended, self._phase_2_from, fitted)
 
 
 def _place(

@@ -240,7 +240,7 @@ def align_landmarks(configurations: LandmarkConfigurations, config: AlignConfig 
     if not converged:
         notes.append(
             f"The alignment ended after {iterations} iterations, before the summed squared distances changed by less "
-            f"than {config.tolerance:g}, as gpagen of geomorph ends it; allow more with --iterations."
+            f"than {config.tolerance:g}, as gpagen of geomorph ends it; allow more with --set iterations=N."
         )
     return AlignedLandmarks(
         names=configurations.names,
