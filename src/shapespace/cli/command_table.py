@@ -373,7 +373,7 @@ COMMANDS: tuple[Command, ...] = (
         "correspond", "bring raw scans into dense correspondence; no model is needed",
         ("shapespace correspond scans -o same", "shapespace build same -o model.h5",
          "shapespace correspond new_scans --add -o same"),
-        "commands.correspond_choice:correspond",
+        "commands.correspond_changes:correspond",
         (
             basic("scans", "SCAN", "scans of one kind of object: files, folders, patterns, addresses or lists (.csv)",
                   nargs="*"),

@@ -6,13 +6,14 @@ With an update one more round over all scans follows, which computes the mean an
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from msgspec import structs
 
+from shapespace.batch.execution import ExecutionConfig
 from shapespace.batch.fit_work import Job
 from shapespace.batch.lock import only_writer
 from shapespace.commands.correspond import (
@@ -24,6 +25,8 @@ from shapespace.commands.correspond import (
     bring,
     complete_change,
     content_hash_of,
+    correspond_files,
+    correspond_groups,
     find_jobs,
     inputs_hash_of,
     publish,
@@ -33,6 +36,7 @@ from shapespace.commands.correspond import (
     with_scans,
 )
 from shapespace.commands.inputs import Given, LandmarkFiles
+from shapespace.commands.outcome import Aside, Outcome, first_lines
 from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
 from shapespace.correspondence.groupwise import FinishedCorrespondence, add_scans
 from shapespace.correspondence.scan_status import SurfaceMeasures
@@ -45,8 +49,9 @@ from shapespace.io.landmarks.landmark_io import read_surface_landmarks
 from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.io.remote import is_address
 from shapespace.reprs import first_names
-from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, read
+from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, SurfaceReview, read, to_json
 from shapespace.store.corresponding import LANDMARKS, MEAN, SUMMARY, SURFACE
+from shapespace.store.review_text import describe_review, review_summary
 from shapespace.types import Mesh, SurfaceLandmarks
 
 _OPTIONS = {
@@ -351,3 +356,88 @@ def _summary(
         groups=[there, *groups] if groups else [],
         added=[] if change.update else [name for name in added if name in there],
     )
+
+
+def correspond(
+    scans: Sequence[str | Path],
+    output: Path,
+    config: CorrespondConfig,
+    change: Change,
+    execution: ExecutionConfig,
+    *,
+    template: Path | None,
+    model: Path | None,
+    landmarks: Path | None,
+    subjects: str | None,
+    groups: bool,
+    recursive: bool,
+    strict: bool,
+    quiet: bool,
+    say: Callable[[str], None],
+) -> Outcome:
+    """Bring scans into correspondence, or change a finished correspondence.
+
+    Args:
+        scans: files, folders, patterns, addresses and lists of these.
+        output: where results go, or the finished correspondence.
+        config: settings.
+        change: what is changed.
+        execution: Executor of the registrations.
+        template: see `CorrespondFiles`, as for the following.
+        model: to begin with.
+        landmarks: a folder of files that are named as the scans.
+        subjects: column of the list of scans.
+        groups: bring each kind of object into correspondence.
+        recursive: take scans in folders below those given too.
+        strict: exclude scans with non-finite coordinates.
+        quiet: no progress.
+        say: called with each message.
+
+    Raises:
+        FileError: something cannot be read or written.
+        InputError: options that do not go together, or too few scans.
+    """
+    if change and groups:
+        raise InputError(f"--groups cannot be combined with {change.option}; leave one of them out.")
+    if subjects and (change or groups):
+        other = change.option if change else "--groups"
+        raise InputError(f"--subjects cannot be combined with {other}; leave one of them out.")
+    if not (change or scans):
+        raise InputError("Give scans, or a change of a finished correspondence by --redo, --remove or --update.")
+    files = CorrespondFiles(scans, template, model, landmarks, execution, recursive, strict, subjects)
+    if change:
+        summary, records = change_correspondence(change, files, output, config, quiet=quiet, say=say)
+    else:
+        bring = correspond_groups if groups else correspond_files
+        summary, records = bring(files, output, config, quiet=quiet, say=say)
+    facts = {"folder": str(output), **to_json(summary), "records": to_json(records)}
+    return Outcome(facts, _lines(summary, records, output), exit_code=int(bool(summary.set_aside)))
+
+
+def _needs_review(record: CorrespondRecord) -> list[str]:
+    return [f"{record.name} needs review: {'; '.join(describe_review(record))}"]
+
+
+def _lines(summary: CorrespondenceRecord, records: Sequence[CorrespondRecord], folder: Path) -> list[str]:
+    rounds = [
+        f"round {number}: vertices moved by {100 * moved:.2f} % of the size (RMS)"
+        for number, moved in enumerate(summary.rounds, 1)
+    ]
+    warnings = [
+        f"{record.name} is {'excluded' if record.reason else 'doubtful'}: {record.reason or record.doubt}"
+        for record in records
+        if record.reason or record.doubt
+    ]
+    there = [record for record in records if not record.reason]
+    unusual = [record for record in there if record.review and not record.doubt]
+    warnings += first_lines(unusual, _needs_review, "more surfaces need review")
+    seen = sum(record.seen_share or 0.0 for record in there) / len(there)
+    doubtful = sum(bool(record.doubt) for record in there)
+    total = (
+        f"{len(there)} of {len(records)} scans in correspondence{f' ({doubtful} doubtful)' if doubtful else ''}, "
+        f"{summary.vertices} vertices, of which a scan shows {100 * seen:.1f} % on average; results in {folder}"
+    )
+    review = review_summary(SurfaceReview.of(record.review_codes for record in there))
+    reviewed = [f"{review}; inspect them with shapespace report {folder}"] if review else []
+    asides = [Aside(f"shapespace: {warning}") for warning in warnings]
+    return [summary.template, *rounds, *asides, total, *reviewed, f"next: shapespace build {folder} -o model.h5"]
