@@ -180,7 +180,8 @@ def complete_by_population(
             completed = model.W @ np.append(y, 1.0)
             completed[is_observed] = placed
             previous, T = T, _pose(completed, mean, gauge) @ T
-            if _moved(previous, T, shape[is_observed]) <= _SETTLED * centroid_size(mean):
+            points = shape[is_observed]
+            if np.abs(previous.apply(points) - T.apply(points)).max() <= _SETTLED * centroid_size(mean):
                 break
         out[row, ~is_observed] = T.inverse().apply(model.W[~is_observed] @ np.append(y, 1.0))
     return out
@@ -188,7 +189,3 @@ def complete_by_population(
 
 def _pose(shape: FloatArray, mean: FloatArray, gauge: Gauge) -> Similarity:
     return fit_similarity(shape, mean, with_scale=gauge == "shape")
-
-
-def _moved(first: Similarity, second: Similarity, points: FloatArray) -> float:
-    return float(np.abs(first.apply(points) - second.apply(points)).max())

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from shapespace.fit.result import FitResult
 from shapespace.fit.scan_target import mm_frame
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import FloatArray, Similarity
+from shapespace.types import Similarity
 
 STAGES_VERSION = 3  # of the file with the stages of a fit
 
@@ -51,7 +51,9 @@ def stage_arrays(result: FitResult, model: ShapeModel) -> dict[str, npt.NDArray[
     arrays["history_phase"] = np.array([state.phase for state in result.history], dtype=np.int32)
     arrays["history_iteration"] = np.array([state.iteration for state in result.history], dtype=np.int32)
     arrays["history_rms_mm"] = np.array([state.rms_mm for state in result.history], dtype=np.float32)
-    arrays["history_b"] = np.array([_padded(state.b, len(result.b)) for state in result.history], dtype=np.float32)
+    modes = len(result.b)
+    b = [np.pad(state.b[:modes], (0, max(modes - len(state.b), 0))) for state in result.history]
+    arrays["history_b"] = np.array(b, dtype=np.float32)
     arrays["history_T"] = np.array(
         [np.column_stack([each.scale * each.rotation, each.translation]) for each in T], dtype=np.float64
     ).reshape(-1, 3, 4)
@@ -62,7 +64,3 @@ def picture_frame(T_scan_model: Similarity, mm_per_scan_unit: float) -> Similari
     """Return the similarity from the scan's own frame and unit to the picture frame of its fit."""
     R = T_scan_model.rotation.T
     return Similarity(mm_per_scan_unit, R, -mm_per_scan_unit * (R @ T_scan_model.translation))
-
-
-def _padded(b: FloatArray, modes: int) -> FloatArray:
-    return np.pad(b[:modes], (0, max(modes - len(b), 0)))

@@ -15,7 +15,6 @@ from shapespace.formats.model_parts import LinearModel, Modes, are_measurable, s
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import open_file
 from shapespace.io.sandbox import HDF5_SIGNATURE, SandboxError, Tree, read_hdf5_sandboxed, read_matlab_sandboxed
-from shapespace.types import FloatArray
 
 _AGAIN = "give the file as it was downloaded"
 _LARGEST_BYTES = 2**31  # 2 GiB
@@ -116,7 +115,9 @@ def _tree(path: Path) -> Tree:
 
 
 def _model(tree: Tree, layout: _Layout) -> LinearModel:
-    mean, basis, spread = (_floats(tree.arrays[name]) for name in (layout.mean, layout.basis, layout.spread))
+    mean, basis, spread = (
+        np.asarray(tree.arrays[name], dtype=np.float64) for name in (layout.mean, layout.basis, layout.spread)
+    )
     mean, spread = mean.ravel(), spread.ravel()
     if basis.shape == (len(spread), len(mean)) != (len(mean), len(spread)):
         basis = basis.T
@@ -142,10 +143,6 @@ def _model(tree: Tree, layout: _Layout) -> LinearModel:
         licence=layout.licence,
         notes=("Its model of colour is left out.",) if layout.textured in tree.groups else (),
     )
-
-
-def _floats(array: npt.NDArray[Any]) -> FloatArray:
-    return np.asarray(array, dtype=np.float64)
 
 
 def _faces(triangles: npt.NDArray[Any] | None, layout: _Layout, n: int) -> npt.NDArray[np.int32] | None:

@@ -185,7 +185,8 @@ def _of(value: Any, key: str) -> Any:
 
 def _text_of(tree: Tree) -> Generator[str]:
     """Yield the file in pieces; attributes and texts are scalars, since scalismo reads no lists of one."""
-    known_as = {path: _id(path) for path in (*tree.groups, *tree.arrays, *tree.texts)}
+    paths = (*tree.groups, *tree.arrays, *tree.texts)
+    known_as = {path: str(uuid.uuid5(uuid.NAMESPACE_URL, f"shapespace:{path}")) for path in paths}
     inside: dict[str, list[str]] = {path: [] for path in tree.groups}
     for path in known_as:
         if path != "/":
@@ -235,10 +236,6 @@ def _numbers(array: npt.NDArray[Any]) -> Generator[str]:
     for number, row in enumerate(array):
         yield from ("," if number else "", *_numbers(row))
     yield "]"
-
-
-def _id(path: str) -> str:
-    return str(uuid.uuid5(uuid.NAMESPACE_URL, f"shapespace:{path}"))
 
 
 def _json(value: Any) -> str:

@@ -219,7 +219,7 @@ class ModelView:
             "expected_error_mm": _number(fit.expected_error_mm),
         }
         if self._is_of_this_model(fit) and fit.record.z:
-            row["z"] = _rounded(fit.record.z)
+            row["z"] = [float(f"{value:.{_DIGITS}g}") for value in fit.record.z]
         return row
 
 
@@ -274,7 +274,3 @@ def _rank(status: str) -> int:
 
 def _number(value: float) -> float | None:
     return value if math.isfinite(value) else None
-
-
-def _rounded(values: Any) -> list[float]:
-    return [float(f"{value:.{_DIGITS}g}") for value in values]
