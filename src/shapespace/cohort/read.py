@@ -155,10 +155,9 @@ def write_cohort_file(path: Path | str, data: Path | str, **settings: Any) -> No
 
     Example:
         >>> ss.write_cohort_file("bones.toml", "people.csv", shapes="same", gauge="form")
-        >>> print(open("bones.toml").read(), end="")
-        data = "people.csv"
-        shapes = "same"
-        gauge = "form"
+        >>> from pathlib import Path
+        >>> Path("bones.toml").read_text().splitlines()
+        ['data = "people.csv"', 'shapes = "same"', 'gauge = "form"']
     """
     path = Path(path)
     if not is_cohort_file(path):
