@@ -211,7 +211,7 @@ def test_who_lacks_a_value_is_refused_by_name_or_left_out_and_counted() -> None:
     names, _ = blank(COUNT)
     cells = {"age": ("1", "", "3", "4", "5", "", "7", "8"), "none": ("",) * COUNT}
     cohort = Cohort.of_fits(fitted_of(model()), names, Table(cells, names, "data.csv"), np.full(COUNT, np.nan))
-    with pytest.raises(InputError, match=r"age of 2 of 8 shapes is missing \(scan1, scan5\).*--drop-missing"):
+    with pytest.raises(InputError, match=r"age of 2 of 8 shapes is missing \(scan1, scan5\).*--set missing=drop"):
         cohort.complete(["age"])
     kept = cohort.complete(["age"], drop_missing=True)
     assert len(kept) == 6 and "2 of 8 shapes are left out" in kept.notes[-1] and "scan1, scan5" in kept.notes[-1]
@@ -321,7 +321,7 @@ def test_fits_of_different_models_are_refused(fits: Path) -> None:
 
 def test_a_model_that_moved_or_is_another_is_told(fits: Path) -> None:
     kept = (fits.parent / "model.h5").rename(fits.parent / "moved.h5")
-    with pytest.raises(InputError, match=r"no longer at.*give it with --model"):
+    with pytest.raises(InputError, match=r"no longer at.*give it with --set model="):
         read_cohort(fits)
     assert len(read_cohort(fits, CohortConfig(model=kept))) == 7
     blob_model(VERTICES, 3).save(fits.parent / "other.h5")
