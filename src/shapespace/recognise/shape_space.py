@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Mapping, Sequence
 from os import PathLike
@@ -26,6 +27,7 @@ Surface: TypeAlias = MeshLike | FitResult | FitRecord | Mapping[str, Any]
 """A mesh or what `as_mesh` takes, the result of a fit, or its record, typed or as the content of NAME.fit.json."""
 Surfaces: TypeAlias = Sequence[Surface] | FloatArray | str | PathLike[str]
 """Several of them; (n, V, 3) vertices; or the folder of meshes in correspondence."""
+_COUNT = re.compile(r"\d+ (of \d+ )?(vertex is|vertices are) (missing|taken)")  # sentences on missing vertices
 
 
 class ShapeSpace(TransformerMixin, BaseEstimator):
@@ -119,8 +121,12 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
             alignment_vertices=self.alignment_vertices,
             seed=self.seed,
         )
-        # How many vertices are missing is a count that each fold of a cross-validation would repeat.
-        for note in [note for note in model.notes if " vertices are missing (" not in note]:
+        # Counts of missing vertices are no warnings: each fold of a cross-validation would repeat them.
+        for note in [
+            note
+            for note in model.notes
+            if not re.match(r"\d+ (of \d+ )?(vertex is|vertices are) (missing|taken)", note)
+        ]:
             warnings.warn(note, stacklevel=3)
         return model
 
