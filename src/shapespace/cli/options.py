@@ -225,7 +225,6 @@ def apply_settings(arguments: argparse.Namespace, settings: Sequence[Option]) ->
     for option in settings:
         if option.initial is not NO_DEFAULT:
             setattr(arguments, option.attribute, option.initial)
-    chosen: set[str] = set()
     given_texts: list[str] = arguments.set or []
     for text in given_texts:
         name, equals, value = (part.strip() for part in text.partition("="))
@@ -241,8 +240,7 @@ def apply_settings(arguments: argparse.Namespace, settings: Sequence[Option]) ->
             setattr(arguments, option.attribute, option.parse_value(value))
         except argparse.ArgumentTypeError as error:
             raise argparse.ArgumentTypeError(f"argument --set: {name} {error}") from None
-        chosen.add(name)
-    arguments.chosen = frozenset(chosen)
+    arguments.chosen = frozenset(text.partition("=")[0].strip() for text in given_texts)
 
 
 def given(arguments: argparse.Namespace, taker: Callable[..., Any], **instead: Any) -> dict[str, Any]:

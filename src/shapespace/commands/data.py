@@ -7,12 +7,8 @@ from pathlib import Path
 
 from shapespace.batch.progress import progress, steps
 from shapespace.commands.outcome import Outcome
-from shapespace.datasets import face_files, fetch, ict
+from shapespace.datasets import fetch
 from shapespace.datasets.about import write_about
-from shapespace.datasets.bones import write_bones
-from shapespace.datasets.faces import LICENSE
-from shapespace.datasets.organs import write_organs
-from shapespace.datasets.skull_landmarks import write_skull_landmarks
 from shapespace.errors import InputError
 from shapespace.io.files import make_folder
 
@@ -34,9 +30,11 @@ def data_get(name: str, to: Path | None, *, quiet: bool) -> Outcome:
     return Outcome({"folder": folder}, [folder])
 
 
-def _written(folder: Path, noun: str, count: int, provenance: str, licence: str = LICENSE) -> Outcome:
-    """Write what the simulated shapes in a folder are, and return how many there are."""
-    write_about(folder, provenance, licence)
+def _written(folder: Path, noun: str, count: int, provenance: str, licence: str = "") -> Outcome:
+    """Write what the simulated shapes in a folder are, and return how many there are; empty: our licence."""
+    from shapespace.datasets.faces import LICENSE
+
+    write_about(folder, provenance, licence or LICENSE)
     line = f"{count} {noun}{'' if count == 1 else 's'} in {folder}"
     return Outcome({"folder": str(folder), f"{noun}s": count}, [line])
 
@@ -77,6 +75,8 @@ def write_simulated_faces(
         DataError: ICT-FaceKit is asked for and absent.
         FileError: the folder cannot be written.
     """
+    from shapespace.datasets import face_files, ict  # these load the geometry, which data list does not need
+
     if area not in (None, "face", "face_and_head"):
         raise InputError(f"The area must be face or face_and_head, not {area!r}.")
     if wide and source == "ict-facekit":
@@ -99,7 +99,7 @@ def write_simulated_faces(
                 face_only=area == "face", intensities=intensities, effect_mm=effect_mm,
                 progress=step,
             )  # fmt: skip
-    licence, of = ("MIT", f"ICT-FaceKit, area {area or 'face'}") if source == "ict-facekit" else (LICENSE, "shapespace")
+    licence, of = ("MIT", f"ICT-FaceKit, area {area or 'face'}") if source == "ict-facekit" else ("", "shapespace")
     who = "people who vary widely" if wide else "people"
     description = f"{subjects} simulated {who} of {of}, seed {seed}, expressions: {', '.join(expressions)}"
     return _written(output, "face", total, description, licence)
@@ -121,6 +121,8 @@ def write_simulated_bones(
         InputError: a count or an effect out of range.
         FileError: the folder cannot be written.
     """
+    from shapespace.datasets.bones import write_bones
+
     with progress(count, "writing", "bone", quiet=quiet) as bar:
         write_bones(output, count=count, seed=seed, effect_mm=effect_mm, progress=bar.update)
     return _written(output, "bone", count, f"{count} simulated bones of shapespace in two groups, seed {seed}")
@@ -138,6 +140,8 @@ def write_simulated_landmarks(output: Path, *, count: int = 40, seed: int = 0) -
         InputError: a count out of range.
         FileError: the folder cannot be written.
     """
+    from shapespace.datasets.skull_landmarks import write_skull_landmarks
+
     write_skull_landmarks(output, count=count, seed=seed)
     return _written(output, "skull", count, f"landmarks of {count} simulated skulls of shapespace, seed {seed}")
 
@@ -159,6 +163,8 @@ def write_simulated_organs(
         ShapespaceError: volumes, without the extra `volumes`.
         FileError: the folder cannot be written.
     """
+    from shapespace.datasets.organs import write_organs
+
     with progress(count, "writing", "organ", quiet=quiet) as bar:
         write_organs(output, count=count, seed=seed, volumes=volumes, progress=bar.update)
     return _written(output, "organ", count, f"{count} simulated organs of shapespace, seed {seed}")
