@@ -135,7 +135,7 @@ def test_a_role_that_is_none_is_refused():
 def test_missing_cells_of_the_columns_of_expressions_are_counted(options):
     visits = ("", *("1" if k % 3 else "0" for k in range(1, 36)))
     shapes = with_columns(cohort(), **{"Visit #": visits})
-    with pytest.raises(InputError, match=r"Visit # of 1 of 36 shapes is missing .*--drop-missing"):
+    with pytest.raises(InputError, match=r"Visit # of 1 of 36 shapes is missing .*missing=drop"):
         trial_of(shapes, replace(FEW, **options))
     if "train" not in options:  # which would be learned from people who are tested
         trial = trial_of(shapes, replace(FEW, drop_missing=True, **options))
