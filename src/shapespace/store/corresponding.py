@@ -122,7 +122,7 @@ class SurfaceFiles:
         if self.unit_ratios:
             raise InputError(
                 f"{self._others()}, so that their sizes cannot be compared; bring the scans to one unit, or use "
-                "--set gauge=shape."
+                "--gauge shape."
             )
 
     def _others(self) -> str:
