@@ -69,8 +69,8 @@ Every command has `--help` with an example and its basic options, `--help-all` w
 that is rarely changed. Messages go to standard error. Without a terminal a step longer than five seconds writes lines
 to the log in place of a progress bar. One line reports that code is being compiled, once on a machine.
 
-Where several meshes are expected, a folder stands for all meshes in it, in the order of their names, with
-`--recursive` also for those in its subfolders. Skipped folders and broken links are named.
+A folder in place of several meshes means all meshes in it, in the order of their names; with `--recursive` it includes
+those in its subfolders. Skipped folders and broken links are named.
 
 ## Commands
 

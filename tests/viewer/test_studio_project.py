@@ -272,7 +272,7 @@ def test_the_studio_and_the_command_give_the_same_answer(
     studio = answer_of(made.arguments, capsys)
     lines = [f"{name},{','.join(cells)}" for name, cells in reversed(GROUPS.items())]
     Path("table.csv").write_text("\n".join(["specimen,Group #,sex (m/f),age", *lines]))
-    way = {option["flag"]: option["way"].split() for option in described[kind]["options"]}
+    way = {option["flag"]: option["argument"].split() for option in described[kind]["options"]}
     given: list[str] = []
     for flag, value in options.items():
         option, *setting = way[flag] or [""]

@@ -142,7 +142,7 @@ def _files(name: str, folder: Path) -> dict[str, Path]:
 
 def _stale(files: Mapping[str, Path], *, dense: bool, stages: bool, landmarks: bool) -> list[Path]:
     """Return what an earlier fit may have left that this one does not write."""
-    # Without a record they are no results of ours, but perhaps a scan and the landmarks that somebody placed.
+    # Files without a record may be a scan and its landmarks of the user, not results.
     left = [files["dense"]] if dense and files["record"].is_file() else []
     if landmarks and has_written_landmarks(files["record"]):
         left += [files[ending] for ending in FIDUCIAL_ENDINGS]

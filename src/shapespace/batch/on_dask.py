@@ -82,7 +82,7 @@ class OnDask:
         except (OSError, TimeoutError, ValueError) as error:
             location = f"at {self.cluster}" if self.cluster else "on this machine"
             raise InputError(
-                f"There is no Dask scheduler {location} that answers; start it, or mend --set dask=ADDRESS."
+                f"There is no Dask scheduler {location} that answers; start it, or correct --set dask=ADDRESS."
             ) from error
 
 

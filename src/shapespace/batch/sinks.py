@@ -55,7 +55,7 @@ class FolderSink:
     records: dict[str, FitRecord] = field(default_factory=dict[str, FitRecord], init=False)
 
     def open(self, names: Sequence[str], model: ShapeModel, *, reuse: bool) -> None:
-        """Read what is there.
+        """Read the results of earlier runs.
 
         Args:
             names: of the jobs of this run.
@@ -84,7 +84,7 @@ class FolderSink:
         return has_surface(job, self.folder)
 
     def start(self, names: Sequence[str]) -> None:
-        """Prepare for the jobs `names`, which are fitted now."""
+        """Prepare for the fits of the jobs `names`."""
         self._started = tuple(names)
         self._table.catch_up(names)
 
@@ -125,7 +125,7 @@ class StoreSink:
     records: Mapping[str, FitRecord] = field(default_factory=dict[str, FitRecord], init=False)
 
     def open(self, names: Sequence[str], model: ShapeModel, *, reuse: bool) -> None:
-        """Read what is there.
+        """Read the results of earlier runs.
 
         Args:
             names: of the jobs of this run.
@@ -152,7 +152,7 @@ class StoreSink:
         return stored is not None and stored[0].is_fitted
 
     def start(self, names: Sequence[str]) -> None:
-        """Prepare for the jobs `names`, which are fitted now: free the memory of what was stored."""
+        """Prepare for the fits of the jobs `names`: free the memory of stored results."""
         self._stored.clear()
 
     def add(self, name: str, record: FitRecord) -> None:

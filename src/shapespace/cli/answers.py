@@ -1,4 +1,4 @@
-"""The commands that answer questions about cohorts: they read the cohort, analyse it, and print and write results."""
+"""The commands that answer questions about cohorts: they read the cohort, analyse it, and write the results."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from shapespace.cli.options import given
-from shapespace.cli.printing import say, show, show_json, warn
+from shapespace.cli.printing import warn
 from shapespace.commands.outcome import Outcome
 from shapespace.errors import InputError
 
@@ -70,7 +70,7 @@ def cohort_of(
         return read_cohort(place, config, onto=onto, on_shape=step)
 
 
-def answer_cohort(arguments: argparse.Namespace) -> int:
+def answer_cohort(arguments: argparse.Namespace) -> Outcome:
     """Write a cohort file, and say what the cohort is."""
     from shapespace.batch.progress import steps
     from shapespace.cohort.read import CohortConfig, read_cohort, write_cohort_file
@@ -82,18 +82,12 @@ def answer_cohort(arguments: argparse.Namespace) -> int:
         cohort = read_cohort(arguments.data, config, on_shape=step)
     stated = {name: value for name, value in settings.items() if value != getattr(initial, name)}
     write_cohort_file(arguments.output, arguments.data, **stated)
-    for note in cohort.notes:
-        say(note)
-    if arguments.json:
-        facts = {"shapes": len(cohort), "vertices": cohort.n_vertices, "gauge": cohort.gauge}
-        columns = list(cohort.table.columns)
-        show_json({"cohort": str(arguments.output), **facts, "source": cohort.source.kind, "columns": columns})
-    else:
-        show(f"{arguments.output}: {repr(cohort)[1:-1]}")
-    return 0
+    facts = {"cohort": str(arguments.output), "shapes": len(cohort), "vertices": cohort.n_vertices}
+    facts |= {"gauge": cohort.gauge, "source": cohort.source.kind, "columns": list(cohort.table.columns)}
+    return Outcome(facts, [f"{arguments.output}: {repr(cohort)[1:-1]}"], cohort.notes)
 
 
-def answer_figures(arguments: argparse.Namespace) -> int:
+def answer_figures(arguments: argparse.Namespace) -> Outcome:
     """Draw the figures of an answer as files."""
     from shapespace.batch.progress import waiting
     from shapespace.report.pages.study_page import FigureConfig, write_figures
@@ -103,43 +97,21 @@ def answer_figures(arguments: argparse.Namespace) -> int:
     require_report_extra()
     with waiting("drawing the figures", quiet=arguments.quiet):
         paths, notes = write_figures(arguments.folder, config)
-    for note in notes:
-        say(note)
-    if arguments.json:
-        show_json({"folder": str(arguments.folder), "figures": list(map(str, paths)), "notes": notes})
-    else:
-        show(f"{len(paths)} files in {paths[0].parent}" if paths else f"{arguments.folder} has nothing to draw.")
-    return 0
-
-
-def finish(report: AnalysisReport, arguments: argparse.Namespace) -> int:
-    """Write a report to the output folder, and print its summary."""
-    from shapespace.commands.answers import save_report
-    from shapespace.schemas import to_json
-
-    page, notes = save_report(report, arguments.output, quiet=arguments.quiet)
-    for note in notes:
-        say(note)
-    if arguments.json:
-        analysis = to_json(report.analysis())
-        show_json({"folder": str(arguments.output), "report": None if page is None else str(page), **analysis})
-        return 0
-    for sentence in report.summary:
-        show(sentence)
-    show(f"The report is {page}" if page is not None else f"All numbers are in {arguments.output}")
-    return 0
+    facts = {"folder": str(arguments.folder), "figures": list(map(str, paths)), "notes": notes}
+    line = f"{len(paths)} files in {paths[0].parent}" if paths else f"{arguments.folder} has nothing to draw."
+    return Outcome(facts, [line], notes)
 
 
 def _answer(
     arguments: argparse.Namespace, doing: str, what: str, compute: Callable[..., _Result],
     report: Callable[[_Result], AnalysisReport], count: int | None = None,
-) -> int:  # fmt: skip
+) -> Outcome:  # fmt: skip
     """Compute a result with a progress bar, and write its report.
 
     Args:
         arguments: parsed arguments.
-        doing: what the progress bar says, such as `permuting`.
-        what: what it counts.
+        doing: text of the progress bar, such as `permuting`.
+        what: name of one step, such as `shape`.
         compute: takes `progress`.
         report: of the result.
         count: number of steps, if it is known.
@@ -148,10 +120,16 @@ def _answer(
 
     with steps(count, doing, what, quiet=arguments.quiet) as step:
         result = compute(progress=step)
-    return finish(report(result), arguments)
+    return _written(report(result), arguments)
 
 
-def answer_align(arguments: argparse.Namespace) -> int:
+def _written(report: AnalysisReport, arguments: argparse.Namespace) -> Outcome:
+    from shapespace.commands.answers import write_answer
+
+    return write_answer(report, arguments.output, quiet=arguments.quiet)
+
+
+def answer_align(arguments: argparse.Namespace) -> Outcome:
     """Align landmarks, and name the specimens to check."""
     from shapespace.commands.align import align
     from shapespace.geometry.landmark_alignment import AlignConfig
@@ -161,19 +139,16 @@ def answer_align(arguments: argparse.Namespace) -> int:
     config = AlignConfig(**given(arguments, AlignConfig))
     reflect = column_value(arguments.reflect, "--reflect") if arguments.reflect else None
     _, record = align(arguments.data, arguments.output, config, **given(arguments, align, reflect=reflect))
-    for note in record.notes:
-        say(note)
-    if arguments.json:
-        show_json({"folder": str(arguments.output), **to_json(record)})
-    else:
-        show(f"{record.specimens} specimens with {record.landmarks} landmarks ({record.dimensions}-D) are aligned.")
-        check = len({finding.specimen for finding in record.findings})
-        show(f"{counted(check, 'specimen')} to check." if check else "No outliers, swaps or mirrored specimens.")
-        show(f"Results are in {arguments.output}")
-    return 0
+    check = len({finding.specimen for finding in record.findings})
+    lines = [
+        f"{record.specimens} specimens with {record.landmarks} landmarks ({record.dimensions}-D) are aligned.",
+        f"{counted(check, 'specimen')} to check." if check else "No outliers, swaps or mirrored specimens.",
+        f"Results are in {arguments.output}",
+    ]
+    return Outcome({"folder": str(arguments.output), **to_json(record)}, lines, record.notes)
 
 
-def answer_asymmetry(arguments: argparse.Namespace) -> int:
+def answer_asymmetry(arguments: argparse.Namespace) -> Outcome:
     """Measure the asymmetry of a cohort, and write its report."""
     from shapespace.report.analyses.asymmetry_report import asymmetry_report
     from shapespace.statistics.asymmetry import measure_asymmetry
@@ -187,7 +162,7 @@ def answer_asymmetry(arguments: argparse.Namespace) -> int:
     return _answer(arguments, "permuting", "shape", compute, asymmetry_report)
 
 
-def answer_change(arguments: argparse.Namespace) -> int:
+def answer_change(arguments: argparse.Namespace) -> Outcome:
     """Measure the changes, and write the report."""
     from shapespace.io.meshes.region_files import read_region
     from shapespace.report.analyses.change_report import change_report
@@ -200,7 +175,7 @@ def answer_change(arguments: argparse.Namespace) -> int:
     return _answer(arguments, "comparing", "subject", partial(change, cohort, config), change_report)
 
 
-def answer_compare(arguments: argparse.Namespace) -> int:
+def answer_compare(arguments: argparse.Namespace) -> Outcome:
     """Compare the shapes of a cohort."""
     from shapespace.report.analyses.compare_report import compare_report
     from shapespace.statistics.compare_shapes import CompareConfig, compare
@@ -211,7 +186,7 @@ def answer_compare(arguments: argparse.Namespace) -> int:
     return _answer(arguments, "permuting", "step", compute, compare_report)
 
 
-def answer_complete(arguments: argparse.Namespace) -> int:
+def answer_complete(arguments: argparse.Namespace) -> Outcome | int:
     """Complete scans; 1 if some failed, 2 if all did."""
     from shapespace.commands.complete import CompletionFiles, complete_scans
     from shapespace.fit.completion.complete import CompletionConfig
@@ -230,12 +205,12 @@ def answer_complete(arguments: argparse.Namespace) -> int:
     )  # fmt: skip
     if not collected.count:
         return 2
-    finish(collected.report(len(failed)), arguments)
+    outcome = _written(collected.report(len(failed)), arguments)
     write_text(arguments.output / METHODS_FILE, collected.methods_text())
-    return 1 if failed else 0
+    return replace(outcome, exit_code=int(bool(failed)))
 
 
-def answer_verify(arguments: argparse.Namespace) -> int:
+def answer_verify(arguments: argparse.Namespace) -> Outcome:
     """Verify whether two scans are of one subject."""
     from shapespace.report.analyses.identity_report import verify_report
     from shapespace.statistics.identity.verify import verify
@@ -244,7 +219,7 @@ def answer_verify(arguments: argparse.Namespace) -> int:
     return _answer(arguments, "comparing", "draw", partial(verify, cohort, config), verify_report)
 
 
-def answer_identify(arguments: argparse.Namespace) -> int:
+def answer_identify(arguments: argparse.Namespace) -> Outcome:
     """Identify the subject of a scan among the enrolled ones."""
     from shapespace.report.analyses.identity_report import identify_report
     from shapespace.statistics.identity.identify import identify
@@ -262,16 +237,16 @@ def _cohort_and_config(arguments: argparse.Namespace) -> tuple[Cohort, IdentityC
     return cohort, IdentityConfig(**given(arguments, IdentityConfig))
 
 
-def answer_morphospace(arguments: argparse.Namespace) -> int:
+def answer_morphospace(arguments: argparse.Namespace) -> Outcome:
     """Compute an ordination of a cohort, and write its report."""
     from shapespace.report.analyses.morphospace_report import morphospace_report
     from shapespace.statistics.shape_tests.ordination import ordinate
 
     result = ordinate(cohort_of(arguments), **given(arguments, ordinate))
-    return finish(morphospace_report(result, arguments.axes), arguments)
+    return _written(morphospace_report(result, arguments.axes), arguments)
 
 
-def answer_regress(arguments: argparse.Namespace) -> int:
+def answer_regress(arguments: argparse.Namespace) -> Outcome:
     """Fit a regression on shape, predict with it, and write the report."""
     from shapespace.batch.progress import steps
     from shapespace.io.files import make_folder
@@ -285,14 +260,15 @@ def answer_regress(arguments: argparse.Namespace) -> int:
     for name in others:
         if getattr(arguments, name):
             needed = "--along" if arguments.along is None else "--target"
-            raise InputError(f"--{name.replace('_', '-')} needs {needed}; name the column of the number with it.")
+            option = f"--set {name}" if name in arguments.chosen else f"--{name}"
+            raise InputError(f"{option} needs {needed}; name the column of the number with it.")
     names = ("seed", "permutations", "confidence")
     shared = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
     if arguments.predictor is not None:
         learned = Predictor.load(arguments.predictor)
         surfaces: Surfaces | None = "coefficients" if learned.model_hash else None
         cohort = cohort_of(arguments, least=1, surfaces=surfaces, gauge=learned.gauge)
-        return finish(prediction_report(learned, cohort, learned.predict(cohort)), arguments)
+        return _written(prediction_report(learned, cohort, learned.predict(cohort)), arguments)
     cohort = cohort_of(arguments)
     if arguments.along is not None:
         hold = dict(column_value(word, "--set hold") for word in arguments.hold or ())
@@ -311,10 +287,10 @@ def answer_regress(arguments: argparse.Namespace) -> int:
         new = (fresh, result.predictor.predict(fresh))
     make_folder(arguments.output)
     result.predictor.save(arguments.output / "predictor.npz")
-    return finish(regression_report(result, new), arguments)
+    return _written(regression_report(result, new), arguments)
 
 
-def answer_score(arguments: argparse.Namespace) -> int:
+def answer_score(arguments: argparse.Namespace) -> Outcome:
     """Score subjects against a reference."""
     from shapespace.report.analyses.score_report import score_report
     from shapespace.statistics.score_subjects import ScoreConfig, score
@@ -329,7 +305,7 @@ def answer_score(arguments: argparse.Namespace) -> int:
     return _answer(arguments, "scoring", "subject", compute, score_report, len(subjects))
 
 
-def answer_shape_tests(arguments: argparse.Namespace) -> int:
+def answer_shape_tests(arguments: argparse.Namespace) -> Outcome:
     """Run a test of shape on a cohort, and write its report."""
     from shapespace.report.analyses.shape_test_report import shape_test_report
 

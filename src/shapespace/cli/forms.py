@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from typing import Any
 
-from shapespace.cli.options import NO_DEFAULT, Option
+from shapespace.cli.options import Option
 from shapespace.formats.registry import MODEL_FORMATS
 
 _KINDS: Mapping[str, str] = {"identify": "recognise identify"}
@@ -69,17 +69,12 @@ def _flag(option: Option) -> str:
 
 
 def _described(option: Option, *, visible: bool) -> dict[str, Any]:
-    initial = option.initial
-    known = initial is not NO_DEFAULT and initial not in (None, (), [], "") and not option.is_flag
-    words = " ".join(map(str, cast(tuple[Any, ...], initial))) if isinstance(initial, tuple) else str(initial)
-    choices = list(option.accepted)
-    if option.setting and isinstance(initial, bool):
-        choices, words = ["yes", "no"], "yes" if initial else "no"
-    way = f"--set {option.names}" if option.setting else "" if option.is_positional else option.spellings[-1]
+    choices = list(option.accepted) or (["yes", "no"] if option.value_name == "yes|no" else [])
+    argument = f"--set {option.names}" if option.setting else "" if option.is_positional else option.spellings[-1]
     return {
-        "flag": _flag(option), "way": way, "help": option.text.replace("`", ""),
+        "flag": _flag(option), "argument": argument, "help": option.text.replace("`", ""),
         "kind": "choice" if choices else _kind(option), "choices": choices,
-        "initial": words if known else None, "visible": visible,
+        "initial": option.initial_text or None, "visible": visible,
         "required": (option.required and not option.either) or option.names in ("formula", "--to"),
     }  # fmt: skip
 

@@ -159,12 +159,18 @@ class Option:
     def text(self) -> str:
         """Its help, with the default if the text does not state it."""
         text = self.help or (self._field.help if self._field else "")
-        initial = self.initial
-        if self.is_flag or initial in (NO_DEFAULT, None, "", (), []) or "(default" in text or self.required:
+        if not self.initial_text or "(default" in text or self.required:
             return text
+        return f"{text} (default: {self.initial_text})"
+
+    @property
+    def initial_text(self) -> str:
+        """Its value if it is not given, as text; empty for a flag, and where the class or the function sets it."""
+        initial = self.initial
+        if self.is_flag or initial in (NO_DEFAULT, None, "", (), []):
+            return ""
         words = cast(Sequence[Any], initial) if isinstance(initial, tuple) else (initial,)
-        default_text = " ".join({True: "yes", False: "no"}[w] if isinstance(w, bool) else str(w) for w in words)
-        return f"{text} (default: {default_text})"
+        return " ".join({True: "yes", False: "no"}[word] if isinstance(word, bool) else str(word) for word in words)
 
     @property
     def _field(self) -> Field | None:

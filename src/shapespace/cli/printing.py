@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-from typing import Any
 
 from shapespace.commands.outcome import Aside, Outcome, plain_value
 
@@ -30,17 +29,13 @@ def now(line: str) -> None:
     sys.stdout.flush()
 
 
-def show_json(facts: Any) -> None:
-    """Print facts as JSON; numbers that are not finite become null."""
-    print(json.dumps(plain_value(facts), indent=1, allow_nan=False))
-
-
 def show_outcome(outcome: Outcome, *, as_json: bool) -> int:
-    """Print what a command did, open its page, and return its exit code."""
+    """Print the outcome of a command, open its page, and return its exit code."""
     for note in outcome.notes:
         say(note)
     if as_json:
-        show_json(outcome.facts)
+        facts = outcome.facts() if callable(outcome.facts) else outcome.facts
+        print(json.dumps(plain_value(facts), indent=1, allow_nan=False))
     else:
         for line in outcome.lines:
             (say if isinstance(line, Aside) else show)(line)

@@ -64,7 +64,7 @@ class CohortConfig:
         doubtful: include doubtful fits and corresponding surfaces (default: excluded, and counted), and use a
             correspondence in which more than half of the surfaces need review.
         accept_review: use such a correspondence, without its doubtful surfaces (default: the value of `doubtful`).
-        geometry: what is analysed of surfaces with landmarks: the `surface`, or the `landmarks` alone.
+        geometry: analysed part of surfaces with landmarks: the `surface`, or the `landmarks` alone.
         least: shapes that there must be; one will do where it is compared with what is known already.
         imputations: number of samples of each completed shape (NAME.samples.npz next to NAME.ply) that compare,
             regress, asymmetry and score combine by Rubin's rules; 0 or 1 ignores samples.
@@ -200,7 +200,7 @@ def read_cohort(
         FileError: something cannot be read.
         FileFormatError: something is damaged, or the table is none.
         InputError: no row has a shape, fits of different models, the same scan twice, fewer than two shapes, or
-            settings beside those of a cohort file.
+            settings in addition to those of a cohort file.
         CorrespondenceError: meshes that are not in correspondence.
     """
     if is_cohort_file(data):

@@ -8,18 +8,16 @@ from shapespace.batch.progress import progress, waiting
 from shapespace.commands.outcome import Outcome
 from shapespace.errors import ShapespaceError
 from shapespace.report.analyses.analysis_report import AnalysisReport
+from shapespace.schemas import to_json
 
 
-def save_report(report: AnalysisReport, output: Path, *, quiet: bool) -> tuple[Path | None, list[str]]:
-    """Write a report to a folder, with its HTML page if the extra `report` is installed.
+def write_answer(report: AnalysisReport, output: Path, *, quiet: bool) -> Outcome:
+    """Write the report of an analysis to a folder, with its HTML page if the extra `report` is installed.
 
     Args:
         report: of the analysis.
         output: the folder.
         quiet: no progress.
-
-    Returns:
-        The path of the page, None where it cannot be drawn; and notes for the user.
 
     Raises:
         FileError: the folder cannot be written.
@@ -28,12 +26,18 @@ def save_report(report: AnalysisReport, output: Path, *, quiet: bool) -> tuple[P
 
     with waiting("writing the results", quiet=quiet):
         report.save(output)
-    notes = list(report.notes)
+    page, notes = None, list(report.notes)
     try:
         require_report_extra()
     except ShapespaceError as error:
-        return None, [*notes, str(error)]
-    return write_report(output, None, model=None, labels=None, quiet=quiet), notes
+        notes.append(str(error))
+    else:
+        page = str(write_report(output, None, model=None, labels=None, quiet=quiet))
+    return Outcome(
+        lambda: {"folder": str(output), "report": page, **to_json(report.analysis())},
+        [*report.summary, f"The report is {page}" if page is not None else f"All numbers are in {output}"],
+        notes,
+    )
 
 
 def report(

@@ -34,7 +34,7 @@ def convert(
         source: a model in any format that is read.
         output: its name tells the format, where `to` does not.
         to: format to write, by its name, if the extension of the output does not determine it.
-        unit: unit of `source`, where its format does not say; None for what the format says, or mm.
+        unit: unit of `source` if its format does not contain it; None for the unit of the format, or mm.
         expressions: blendshapes that eos keeps in a file of their own.
         quiet: no progress.
 

@@ -122,13 +122,17 @@ def fit(
     _write_list(output, work)
     counts = dict.fromkeys(_STATUSES, 0) | done
     records = {job.name: sink.records[job.name] for job in work if sink.records}
-    contents = [
-        {"name": name, **{key: value for key, value in record.to_json().items() if key != "history"}}
-        for name, record in records.items()
-    ]
+
+    def facts() -> dict[str, Any]:
+        contents = [
+            {"name": name, **{key: value for key, value in record.to_json().items() if key != "history"}}
+            for name, record in records.items()
+        ]
+        return {"folder": str(output), "scans": every, **counts, "records": contents}
+
     every, failed = sum(counts.values()), counts["failed"]
     return Outcome(
-        {"folder": str(output), "scans": every, **counts, "records": contents},
+        facts,
         _lines(records, counts, output) if failed < every else (),
         exit_code=exit_code_of(failed, every) or int(strict and counts["doubtful"] > 0),
     )

@@ -6,11 +6,13 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeAlias, TypeVar, cast
 
 LISTED = 10
 """Items that a command lists."""
 _T = TypeVar("_T")
+Facts: TypeAlias = Mapping[str, Any] | Sequence[Any]
+"""Content of `--json`."""
 
 
 class Aside(str):
@@ -24,7 +26,7 @@ class Outcome:
     """What a command did.
 
     Args:
-        facts: what `--json` prints.
+        facts: content of `--json`, or a function that returns it, for content that takes time to make.
         lines: what is printed on standard output without `--json`; only an `Aside` goes to standard error.
         notes: sentences on standard error, before the facts or lines.
         errors: sentences on standard error, after the facts or lines.
@@ -32,7 +34,7 @@ class Outcome:
         page: HTML file that the browser opens at the end; None for none.
     """
 
-    facts: Mapping[str, Any] | Sequence[Any]
+    facts: Facts | Callable[[], Facts]
     lines: Sequence[str]
     notes: Sequence[str] = ()
     errors: Sequence[str] = ()

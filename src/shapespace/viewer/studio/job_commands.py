@@ -11,8 +11,8 @@ from shapespace.viewer.studio.jobs import Job, Order
 from shapespace.viewer.studio.project import Project, Specimen
 
 Forms = Mapping[str, Mapping[str, Any]]
-"""Kind -> `command` (its words), `summary`, and `options`, each with `flag`, `way` (of the command line; empty for a
-positional argument), `help`, `kind`, `choices`, `initial`, `visible` and `required`."""
+"""Kind -> `command` (its words), `summary`, and `options`, each with `flag`, `argument`, `help`, `kind`, `choices`,
+`initial`, `visible` and `required`; `argument` is `--set NAME` for a setting, and empty for a positional argument."""
 
 QUESTIONS = ("compare", "change", "asymmetry", "regress", "score", "identify", "morphospace")
 CORRESPONDENCES = ("correspond", "redo")
@@ -220,7 +220,7 @@ def _given(forms: Forms, kind: str, options: Mapping[str, Any]) -> list[str]:
             arguments += [flag] if value else []
         elif value is not None and (text := str(value).strip()):
             # One argument, so that a value that begins with a dash is not taken for an option.
-            option, _, setting = str(known[flag]["way"]).partition(" ")
+            option, _, setting = str(known[flag]["argument"]).partition(" ")
             arguments += [option, f"{setting}={text}"] if setting else [f"{option}={text}" if option else text]
     return arguments
 
