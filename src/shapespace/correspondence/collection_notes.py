@@ -1,4 +1,4 @@
-"""What only the whole collection shows of scans in correspondence: their sizes and units, and odd surfaces."""
+"""Sizes, units and unusual surfaces of scans in correspondence, by comparison with the other scans."""
 
 from __future__ import annotations
 
