@@ -124,6 +124,7 @@ def test_a_cohort_that_cannot_be_read_has_no_file(run: Run, home: Path) -> None:
     [
         (("--set", "gauge"), "'gauge' is not NAME=VALUE"),
         (("--set", "guage=form"), "there is no setting 'guage'; choose gauge"),
+        (("--set", "permutations=20"), "permutations is an option; write --permutations 20"),
         (("--set", "gauge=size"), "gauge is 'size'; choose from form, shape"),
         (("--set", "maps=perhaps"), "maps must be yes or no, not 'perhaps'"),
         (("--set", "seed=x"), "seed 'x' is not a whole number"),

@@ -4,12 +4,14 @@ import base64
 import io
 import json
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from fontTools.ttLib import TTFont
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
@@ -20,8 +22,8 @@ from shapespace.report import figures
 from shapespace.report.analyses.analysis_report import AnalysisReport
 from shapespace.report.analyses.shape_data import scree_part, tangent_part
 from shapespace.report.figures.analysis_figures import views_of
-from shapespace.report.figures.draw import ONE_COLUMN_MM, TWO_COLUMNS_MM
-from shapespace.report.pages.study_page import FigureConfig, write_figures
+from shapespace.report.figures.draw import ONE_COLUMN_MM, TWO_COLUMNS_MM, charts, finish, legend, legend_columns
+from shapespace.report.pages.write_html import FigureConfig, write_figures
 from shapespace.schemas import CurvePart, DeformationPart, NamedView, Orientation, Series, SurfaceMapPart, TextPart
 from shapespace.types import FloatArray, Mesh
 
@@ -166,6 +168,36 @@ def test_all_figures_of_an_analysis_are_files_named_after_their_titles(
     before = {path: path.read_bytes() for path in paths}
     write_figures(tmp_path, FigureConfig(formats=("png",), dpi=80))
     assert before == {path: path.read_bytes() for path in paths}
+
+
+@pytest.mark.parametrize("results", ["fits_template", "demo_template"])
+def test_the_figures_of_fits_and_of_the_demo_are_files_with_captions(
+    results: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    shutil.copytree(request.getfixturevalue(results), tmp_path / "work")
+    folder = tmp_path / "work" / ("out" if results == "fits_template" else "")
+    paths, notes = write_figures(folder, FigureConfig(formats=("svg",), dpi=72))
+    captions = (folder / "figures" / "captions.txt").read_text().splitlines()
+    assert [path.stem for path in paths] == [caption.partition(":")[0] for caption in captions]
+    assert {path.name for path in paths} | {"captions.txt"} == {path.name for path in (folder / "figures").iterdir()}
+    assert any("distance" in caption for caption in captions) and notes == ()
+    with pytest.raises(InputError, match="There is no view 'dorsal'; the views are none; give --orientation"):
+        write_figures(folder, FigureConfig(views=("dorsal",)))
+
+
+def test_no_legend_of_a_printed_figure_is_cut(head: Callable[..., Mesh]) -> None:
+    names = ["mean", "95 % of the points", "99 %", "farthest point"]
+    assert legend_columns(names, 4) == 4
+    with figures.publication_style():
+        assert legend_columns(names, 4) == 3
+        figure, (axes,) = charts("", [3.0])
+        for name in names:
+            axes.plot([0, 1], [0, 1], label=name)
+        legend(axes, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4)
+        finish(figure)
+    FigureCanvasAgg(figure).draw()
+    box = axes.get_legend().get_window_extent()
+    assert box.x0 >= 0 and box.x1 <= figure.bbox.width
 
 
 def test_named_views_turn_what_faces_the_viewer_to_the_front() -> None:

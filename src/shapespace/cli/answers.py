@@ -87,16 +87,14 @@ def answer_cohort(arguments: argparse.Namespace) -> Outcome:
     return Outcome(facts, [f"{arguments.output}: {repr(cohort)[1:-1]}"], cohort.notes)
 
 
-def answer_figures(arguments: argparse.Namespace) -> Outcome:
-    """Draw the figures of an answer as files."""
-    from shapespace.batch.progress import waiting
-    from shapespace.report.pages.study_page import FigureConfig, write_figures
-    from shapespace.report.pages.write_html import require_report_extra
+def result_figures(arguments: argparse.Namespace) -> Outcome:
+    """Draw the figures of results as files."""
+    from shapespace.commands.answers import drawing
+    from shapespace.report.pages.write_html import FigureConfig, write_figures
 
     config = FigureConfig(**given(arguments, FigureConfig))
-    require_report_extra()
-    with waiting("drawing the figures", quiet=arguments.quiet):
-        paths, notes = write_figures(arguments.folder, config)
+    with drawing(quiet=arguments.quiet) as step:
+        paths, notes = write_figures(arguments.folder, config, model=arguments.model, on_step=step)
     facts = {"folder": str(arguments.folder), "figures": list(map(str, paths)), "notes": notes}
     line = f"{len(paths)} files in {paths[0].parent}" if paths else f"{arguments.folder} has nothing to draw."
     return Outcome(facts, [line], notes)

@@ -30,7 +30,7 @@ COMPLETION = Source("fit.completion.complete", "CompletionConfig")
 COMPLETION_FILES = Source("commands.complete", "CompletionFiles")
 PAPER = Source("fit.paper.paper_method", "Paper")
 IDENTITY = Source("statistics.identity.trial", "IdentityConfig")
-FIGURES = Source("report.pages.study_page", "FigureConfig")
+FIGURES = Source("report.pages.write_html", "FigureConfig")
 COMPARE = Source("statistics.compare_shapes", "CompareConfig")
 MORPHOSPACE = Source("statistics.shape_tests.ordination", "ordinate")
 CHANGE = Source("statistics.change_result", "ChangeConfig")
@@ -84,6 +84,7 @@ class Command:
         json: whether it prints facts, with `--json`.
         defaults: further attributes of the parsed arguments.
         settings: values that are rarely changed, given as `--set NAME=VALUE`.
+        has_workers: whether it reads many scans in worker processes, which load their code while the command starts.
     """
 
     name: str
@@ -95,6 +96,7 @@ class Command:
     json: bool = True
     defaults: Mapping[str, Any] = field(default_factory=dict[str, Any])
     settings: tuple[Option, ...] = ()
+    has_workers: bool = False
 
     @property
     def options(self) -> tuple[Option, ...]:
@@ -420,6 +422,7 @@ COMMANDS: tuple[Command, ...] = (
             *_EXECUTION_SETTINGS,
             setting("seed", "S", source=CORRESPOND),
         ),
+        has_workers=True,
     ),
     Command(
         "build", "build a shape model from corresponding meshes: Procrustes and PCA",
@@ -555,6 +558,7 @@ COMMANDS: tuple[Command, ...] = (
             *_EXECUTION_SETTINGS,
             setting("seed", "S", source=FIT),
         ),
+        has_workers=True,
     ),
     Command(
         "complete", "complete partial scans: the missing part with its uncertainty, and samples of the whole shape",
@@ -860,15 +864,17 @@ COMMANDS: tuple[Command, ...] = (
         ),
     ),
     Command(
-        "figures", "draw the figures of an answer as files for a paper",
+        "figures", "draw the figures of results as files for a paper",
         ("shapespace figures sex --format svg,pdf", "shapespace figures sex --format png --dpi 600 --views dorsal"),
-        "cli.answers:answer_figures",
+        "cli.answers:result_figures",
         (
-            basic("folder", "OUT", "written by compare or another question about shapes", parse=Path),
+            basic("folder", "OUT", "written by compare or another question, fit, correspond, recognise study or demo",
+                  parse=Path),
             basic("--format", "LIST", source=FIGURES, field="formats"),
             basic("--dpi", "N", source=FIGURES, parse=values.positive),
             basic("--views", "LIST", source=FIGURES),
             basic("--orientation", "FILE", source=FIGURES),
+            _MODEL_OF_FITS,
         ),
         ("Writes OUT/figures with captions.txt. Needs the extra report.",),
     ),

@@ -22,7 +22,7 @@ def run_command(name: str, arguments: argparse.Namespace) -> int:
             prints itself.
         arguments: parsed arguments.
     """
-    if arguments.command.name in ("fit", "correspond"):
+    if arguments.command.has_workers:
         _start_workers(arguments)
     function = resolve_name(f"shapespace.{name}")
     outcome: Outcome | int = function(**_values(arguments, function))
@@ -44,7 +44,7 @@ def _values(arguments: argparse.Namespace, function: Callable[..., object]) -> d
 
 def _start_workers(arguments: argparse.Namespace) -> None:
     """Load the code of the workers while this process loads its own: half of the time that many scans take to start."""
-    one = arguments.command.name == "fit" and len(arguments.scans) == 1 and Path(arguments.scans[0]).is_file()
+    one = len(arguments.scans) == 1 and Path(arguments.scans[0]).is_file()
     if not one and arguments.jobs != 1 and arguments.executor == "local":
         from shapespace.batch.workers import start_loading
 

@@ -237,6 +237,10 @@ def apply_settings(arguments: argparse.Namespace, settings: Sequence[Option]) ->
         if not equals:
             raise argparse.ArgumentTypeError(f"argument --set: {text!r} is not NAME=VALUE")
         if name not in known:
+            options: Sequence[Option] = arguments.command.options
+            spelling = next((one.spellings[-1] for one in options if one.attribute == name.replace("-", "_")), "")
+            if spelling.startswith("--"):
+                raise argparse.ArgumentTypeError(f"argument --set: {name} is an option; write {spelling} {value}")
             nearest = difflib.get_close_matches(name, list(known), 1) or sorted(known)
             raise argparse.ArgumentTypeError(
                 f"argument --set: there is no setting {name!r}; choose {', '.join(nearest)}"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from pathlib import Path
 
 from shapespace.batch.progress import progress, waiting
@@ -63,10 +65,17 @@ def write_report(folder: Path, output: Path | None, *, model: Path | None, label
     """
     from shapespace.report.pages import write_html as html
 
+    with drawing(quiet=quiet) as step:
+        return html.write_report(folder, output, model=model, labels=labels, on_step=step)
+
+
+@contextmanager
+def drawing(*, quiet: bool) -> Generator[Callable[[str, int], None]]:
+    """Return a context with the progress of pictures, whose function is called after each."""
     with progress(None, "drawing", "picture", quiet=quiet) as bar:
 
         def step(name: str, planned: int) -> None:
             bar.total = max(planned, bar.n + 1)
             bar.update()
 
-        return html.write_report(folder, output, model=model, labels=labels, on_step=step)
+        yield step

@@ -24,9 +24,9 @@ from shapespace.report.figures.draw import (
     FORWARD,
     GREY,
     INK,
+    LAYOUT,
     MOST_PANELS,
     SMALL,
-    WIDTH,
     Row,
     Scale,
     axis_label,
@@ -45,6 +45,7 @@ from shapespace.report.figures.draw import (
     plain,
     plain_decades,
     short,
+    type_size,
     view,
 )
 from shapespace.report.inputs.correspondence_folder import upright
@@ -395,7 +396,7 @@ def nearness_figure(distances: FloatArray, *, title: str = "") -> Figure:
     axes.set(xlabel="distance, % of the object's size", ylabel="scans up to there (%)")
     axes.set(xscale="log", xlim=(low, high), ylim=(0, 102))
     plain_decades(axes.xaxis)
-    legend(axes, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncol=4)
+    legend(axes, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4)
     return finish(figure)
 
 
@@ -477,8 +478,8 @@ def confusion_figure(counts: npt.ArrayLike, classes: Sequence[str], *, title: st
     shares = np.divide(table, per_class[:, None], out=np.zeros_like(table), where=per_class[:, None] > 0)
     rows = [f"{short(name, 18)} ({count:g})" for name, count in zip(classes, per_class, strict=True)]
     columns = [short(name, 14) for name in classes]
-    longest = max(measured(text, SMALL) for text in columns)
-    wide = (WIDTH - max(measured(text, SMALL) for text in rows) - 60) / n
+    longest = max(measured(text, type_size(SMALL)) for text in columns)
+    wide = (LAYOUT.get().chart_width - max(measured(text, type_size(SMALL)) for text in rows) - 60) / n
     high = max(min(wide, 78.0), 280 / n)
     upright = longest > 0.94 * wide
     figure, axes = chart(
@@ -492,7 +493,7 @@ def confusion_figure(counts: npt.ArrayLike, classes: Sequence[str], *, title: st
         across, up = 1 - 5 / wide, 1 - 5 / high
         axes.add_patch(Rectangle((r - across / 2, r - up / 2), across, up, fill=False, ec=INK, lw=1.8, zorder=4))
         if per_class[r] == 0:
-            axes.text((n - 1) / 2, r, "none", ha="center", va="center", fontsize=SMALL, color=GREY)
+            axes.text((n - 1) / 2, r, "none", ha="center", va="center", fontsize=type_size(SMALL), color=GREY)
         for c in range(n):
             if table[r, c] > 0 and n <= 2 * _MOST_CLASSES_IN_FULL:
                 _cell(axes, r, c, shares[r, c], table[r, c], n)
@@ -522,11 +523,18 @@ def _cell(axes: Axes, row: int, column: int, share: float, count: float, n: int)
     weight = "bold" if row == column else "normal"
     if n <= _MOST_CLASSES_IN_FULL:
         axes.text(
-            column, row - 0.14, percent(share), ha="center", va="center", fontsize=SMALL, color=ink, weight=weight
+            column,
+            row - 0.14,
+            percent(share),
+            ha="center",
+            va="center",
+            fontsize=type_size(SMALL),
+            color=ink,
+            weight=weight,
         )
-        axes.text(column, row + 0.25, f"{count:g}", ha="center", va="center", fontsize=SMALL - 2, color=ink)
+        axes.text(column, row + 0.25, f"{count:g}", ha="center", va="center", fontsize=type_size(SMALL - 2), color=ink)
     else:
-        axes.text(column, row, f"{100 * share:.0f}", ha="center", va="center", fontsize=SMALL - 3, color=ink)
+        axes.text(column, row, f"{100 * share:.0f}", ha="center", va="center", fontsize=type_size(SMALL - 3), color=ink)
 
 
 def calibration_figure(

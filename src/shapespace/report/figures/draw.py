@@ -66,6 +66,7 @@ FEWEST_BINNED = 10
 """Values of which a histogram tells something; fewer are drawn one by one."""
 _GAP, _EDGE = 8, 4  # layout: pixels
 _MOST_LINES = 4  # layout: lines of a caption
+_LEGEND_MARK = 3.6  # layout: width of an entry of a legend without its name, in sizes of its type
 # steps between tick labels, and how many labels fit beside each other
 _STEPS, _MOST_NUMBERS = (1, 5, 10, 20, 50, 100, 200, 500), 22
 
@@ -411,10 +412,23 @@ def style(axes: Axes) -> None:
 
 
 def legend(axes: Axes, **options: Any) -> None:
-    """Add the legend of a plot."""
+    """Add the legend of a plot, in fewer columns than `ncols` if these are wider than the figure."""
+    names = [str(one.get_label()) for one in options["handles"]] if "handles" in options else None
+    names = axes.get_legend_handles_labels()[1] if names is None else names
+    options["ncols"] = legend_columns(names, options.get("ncols", 1))
     cast(Any, axes).legend(
         **{"fontsize": type_size(SMALL), "labelcolor": INK, "framealpha": 0.9, "handlelength": 1.5, **options}
     ).get_frame().set_linewidth(0.0)
+
+
+def legend_columns(names: Sequence[str], most: int = 5) -> int:
+    """Return the number of columns, up to `most`, with which a legend is not wider than a chart."""
+    widths = np.array([max(measured(line, type_size(SMALL)) for line in name.split("\n")) for name in names])
+    mark = _LEGEND_MARK * type_size(SMALL) * DPI / 72
+    for columns in range(min(len(names), most), 1, -1):
+        if sum(float(part.max()) + mark for part in np.array_split(widths, columns)) < LAYOUT.get().chart_width:
+            return columns
+    return 1
 
 
 def legend_above(axes: Axes, room: float, **options: Any) -> None:

@@ -42,6 +42,7 @@ from shapespace.report.figures.draw import (
     scan_over,
     short,
     surroundings,
+    type_size,
     unknown,
     view,
 )
@@ -254,11 +255,11 @@ def distance_histograms(fit: StagedFit, *, title: str = "", bins: int = 60) -> F
                 axes.plot([min(max(mean, low), high)] * 2, [0, sign * tallest], color=colour, lw=1.6, ls=(0, (3, 1.5)))
             axes.text(
                 0.012, 0.5 + 0.47 * sign, f"{name}: {summary}", transform=axes.transAxes, color=colour,
-                fontsize=SMALL - 1, va="top" if sign > 0 else "bottom",
+                fontsize=type_size(SMALL - 1), va="top" if sign > 0 else "bottom",
                 bbox={"facecolor": "white", "lw": 0, "pad": 1.5},
             )  # fmt: skip
         axes.axhline(0, color=GREY, lw=0.8)
-        axes.set_title(STAGE_WORDS.get(stage, stage), fontsize=TEXT, color=INK, loc="left", pad=4)
+        axes.set_title(STAGE_WORDS.get(stage, stage), fontsize=type_size(TEXT), color=INK, loc="left", pad=4)
         axes.set(xscale="log", xlim=(low, high), ylim=(-axis_top, axis_top))
         axes.yaxis.set_major_locator(MaxNLocator(3, symmetric=True))
         axes.yaxis.set_major_formatter(lambda value, _: f"{abs(value):g}")
@@ -307,7 +308,7 @@ def history_figure(fit: StagedFit, *, title: str = "") -> Figure:
     # Above the plot, where it hides nothing.
     legend(axes, loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2, borderpad=0.2)
     finish(figure)
-    axes.tick_params(axis="y", which="minor", labelsize=SMALL - 1)
+    axes.tick_params(axis="y", which="minor", labelsize=type_size(SMALL - 1))
     return figure
 
 
@@ -494,7 +495,7 @@ def error_curves(fits: Sequence[StagedFit], *, stage: str = "final", title: str 
         axes.plot([distance], [100 * share], "o", color=INK, ms=6, zorder=5)
         axes.annotate(
             f"{100 * share:.0f} % within {mm(distance)}", (distance, 100 * share), xytext=(10, -5),
-            textcoords="offset points", fontsize=SMALL, color=INK, va="top",
+            textcoords="offset points", fontsize=type_size(SMALL), color=INK, va="top",
         )  # fmt: skip
     axes.set(xlabel="distance from the model to the scan (mm)", ylabel="vertices that the scan shows (%)")
     axes.set(xlim=(0, nice_ceiling(1.15 * float(np.quantile(pooled, 0.985)))), ylim=(0, 102))

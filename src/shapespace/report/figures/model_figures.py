@@ -36,6 +36,7 @@ from shapespace.report.figures.draw import (
     mm,
     number_axis,
     percent,
+    type_size,
     view,
 )
 from shapespace.report.inputs.staged_fit import nice_ceiling
@@ -314,7 +315,7 @@ def quality_figure(quality: Quality | Mapping[str, object], *, title: str = "") 
         for name, lines, colour, band in zip(names, curves, _COLOURS, _BANDS, strict=False):
             _draw_lines(axes, key, name, lines, colour, band)
         heading, unit = _QUALITY[key]
-        axes.set_title(heading, fontsize=TEXT, color=INK, loc="left")
+        axes.set_title(heading, fontsize=type_size(TEXT), color=INK, loc="left")
         axes.set(ylabel=unit, ylim=(0, 104 if key == "compactness" else None))
         number_axis(axes, largest_mode_count)
         _legend_above(axes)
@@ -360,7 +361,7 @@ def _draw_sizes(axes: Axes, names: Sequence[str], sizes: Sequence[BySize | None]
         if size is not None:
             axes.plot(size.shapes, size.mean, color=colour, lw=2, ls="--", marker="o", ms=4, label=name or None)
             axes.fill_between(size.shapes, size.low, size.high, color=band, alpha=0.5, lw=0)
-    axes.set_title(_BY_SHAPES, fontsize=TEXT, color=INK, loc="left")
+    axes.set_title(_BY_SHAPES, fontsize=type_size(TEXT), color=INK, loc="left")
     axes.set(xlabel="number of training shapes", ylabel="mean error (mm)", ylim=(0, None))
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     _legend_above(axes)

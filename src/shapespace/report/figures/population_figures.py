@@ -23,6 +23,7 @@ from shapespace.report.figures.draw import (
     FORWARD,
     GREY,
     INK,
+    LAYOUT,
     SMALL,
     WIDTH,
     chart,
@@ -32,9 +33,11 @@ from shapespace.report.figures.draw import (
     finish,
     legend,
     legend_above,
+    legend_columns,
     line_height,
     measured,
     short,
+    type_size,
 )
 from shapespace.report.render.palette import CATEGORIES, MODEL_COLOUR, SEQUENTIAL
 from shapespace.types import FloatArray
@@ -90,8 +93,8 @@ def distributions_figure(values: Mapping[str, FloatArray], trusted: Any, *, titl
             axes.axvline(middle, color=INK, lw=1.2, ls="--")
             axes.annotate(
                 f"median {middle:.3g}", (middle, 0.97), xycoords=("data", "axes fraction"),
-                xytext=(4 if middle < (low + high) / 2 else -4, 0), textcoords="offset points", fontsize=SMALL,
-                va="top", ha="left" if middle < (low + high) / 2 else "right", color=INK,
+                xytext=(4 if middle < (low + high) / 2 else -4, 0), textcoords="offset points",
+                fontsize=type_size(SMALL), va="top", ha="left" if middle < (low + high) / 2 else "right", color=INK,
             )  # fmt: skip
     legend(plots[0], loc="center right")
     return finish(figure)
@@ -285,7 +288,7 @@ def levels_figure(groups: Sequence[tuple[str, Any]], values: FloatArray, *, word
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 _MOST_IN_LEGEND = 16  # layout: entries
 _MOST_DOTS_BIG = 60  # layout: dots drawn at full size
-_LEGEND_MARK, _LEGEND_LINE = 3.6 * SMALL * DPI / 72, 1.1
+_LEGEND_LINE = 1.1
 _SPACE_INCHES = 2.5  # layout: inches per panel
 
 
@@ -359,7 +362,7 @@ def scatter_matrix(points: Sequence[Coefficients], modes: int = 4, *, title: str
     finish(figure, w_pad=0.3, h_pad=0.3)
     if handles:
         figure.legend(
-            handles=handles, loc="upper right", fontsize=SMALL, frameon=False, labelcolor=INK,
+            handles=handles, loc="upper right", fontsize=type_size(SMALL), frameon=False, labelcolor=INK,
             handletextpad=0.2, ncols=1 if len(groups) < 9 else 2,
             bbox_to_anchor=(0.995, cast(Any, figure).plots_within[3]),
         )  # fmt: skip
@@ -430,14 +433,17 @@ def b_space(
     room = 0.06 * np.maximum(high - low, 1e-9 + 0.01 * float((high - low).max()))
     groups = _groups(scans)
     handles = _handles(groups, neutral)
-    columns = _legend_columns([str(handle.get_label()) for handle in handles])
+    columns = legend_columns([str(handle.get_label()) for handle in handles])
     # Panels are placed by hand, since matplotlib leaves half of a 3-D plot empty.
-    foot_px = int(np.ceil(len(handles) / columns)) * _LEGEND_LINE * line_height(SMALL)
+    foot_px = int(np.ceil(len(handles) / columns)) * _LEGEND_LINE * line_height(type_size(SMALL))
+    layout = LAYOUT.get()
+    inches = _SPACE_INCHES * layout.row_width / WIDTH + foot_px / DPI
     of = f"of {counted(len(scans), 'scan')}" if neutral is None else "and the lines of the expressions"
     figure, plots = charts(
-        title or f"The first three coefficients {of}, from two sides", [_SPACE_INCHES + foot_px / DPI]
+        title or f"The first three coefficients {of}, from two sides", [inches / layout.scale], columns=2
     )
-    figure.delaxes(plots[0])
+    for plot in plots:
+        figure.delaxes(plot)
     plot_box = cast(tuple[float, float, float, float], cast(Any, figure).plots_within)
     total = figure.get_figheight()
     foot = plot_box[1] + foot_px / DPI / total
@@ -465,13 +471,13 @@ def b_space(
                     axes.plot([point[0]] * 2, [point[1]] * 2, [low[2] - room[2], point[2]], color="#cfd1d5", lw=0.6)
         if neutral is not None:
             axes.plot(*neutral.b[:3, None], marker="+", ms=14, mew=2.4, color=INK, ls="")
-        aside = _style_space(axes, low - room, high + room) / 72 * DPI / WIDTH
+        aside = _style_space(axes, low - room, high + room) / 72 * DPI / layout.row_width
         axes.set_position((axes_box[0] + k * aside, axes_box[1], axes_box[2] - aside, axes_box[3]))
         axes.view_init(elev=20, azim=azimuth)
         axes.set_box_aspect((1, 1, 0.85), zoom=0.92)
     if handles:
         figure.legend(
-            handles=handles, loc="lower center", ncols=columns, fontsize=SMALL, frameon=False,
+            handles=handles, loc="lower center", ncols=columns, fontsize=type_size(SMALL), frameon=False,
             labelcolor=INK, handletextpad=0.2, columnspacing=1.2, bbox_to_anchor=(0.5, plot_box[1]), borderpad=0.1,
         )  # fmt: skip
     return figure
@@ -480,13 +486,13 @@ def b_space(
 def _style_space(axes: Any, low: FloatArray, high: FloatArray) -> float:
     """Set names, end points (3,) and pale panes of a 3-D plot; return the extra width in points."""
     for axis, dimension in zip("xyz", range(3), strict=True):
-        getattr(axes, f"set_{axis}label")(f"b{dimension + 1} (mm)", fontsize=SMALL, color=INK, labelpad=2)
+        getattr(axes, f"set_{axis}label")(f"b{dimension + 1} (mm)", fontsize=type_size(SMALL), color=INK, labelpad=2)
         getattr(axes, f"set_{axis}lim")(low[dimension], high[dimension])
         getattr(axes, f"{axis}axis").set_pane_color((0.965, 0.967, 0.972, 1.0))
         axes.locator_params(axis=axis, nbins=4)
     axes.zaxis.set_rotate_label(False)
     axes.zaxis.label.set_rotation(90)
-    axes.tick_params(labelsize=SMALL - 2, colors=GREY, pad=-1)
+    axes.tick_params(labelsize=type_size(SMALL - 2), colors=GREY, pad=-1)
     # Of the three, only numbers beside an upright axis reach towards it, its label and the other panel.
     wider = _wider_than_three(axes.zaxis)
     axes.tick_params(axis="z", pad=wider / 2 - 1)
@@ -500,24 +506,14 @@ def _wider_than_three(axis: Any) -> float:
     low, high = axis.get_view_interval()
     tick_labels = formatter.format_ticks([location for location in axis.get_majorticklocs() if low <= location <= high])
     return (
-        max(0.0, max((measured(text, SMALL - 2) for text in tick_labels), default=0.0) - measured("000", SMALL - 2))
+        max(
+            0.0,
+            max((measured(text, type_size(SMALL - 2)) for text in tick_labels), default=0.0)
+            - measured("000", type_size(SMALL - 2)),
+        )
         * 72
         / DPI
     )
-
-
-def _legend_columns(names: Sequence[str]) -> int:
-    """Return the number of columns that a legend below a figure needs so that no entry is cut."""
-    for columns in range(min(len(names), 5), 1, -1):
-        if (
-            sum(
-                float(part.max()) + _LEGEND_MARK
-                for part in np.array_split(np.array([measured(name, SMALL) for name in names]), columns)
-            )
-            < WIDTH
-        ):
-            return columns
-    return 1
 
 
 def _stack_coefficients(scans: Sequence[Coefficients]) -> FloatArray:

@@ -41,7 +41,7 @@ def html_of_analysis(result: AnalysisResult) -> str:
     except ShapespaceError as error:
         return notebook_html(result, type(result).__name__, [f"Nothing can be reported: {error}"], [])
     # Tables need neither files nor pictures; the folder is never read.
-    parts = StudyParts(Page(1), Folder(Path()), ANALYSIS)
+    parts = StudyParts(Page(), Folder(Path()), ANALYSIS)
     parts_as_kept = [read_part(to_json(part), ANALYSIS.file, ANALYSIS.again) for part in report.parts]
     tables = [part for part in parts_as_kept if isinstance(part, TablePart)]
     blocks: list[Block] = []

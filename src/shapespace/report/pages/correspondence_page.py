@@ -58,7 +58,7 @@ from shapespace.report.inputs.correspondence_folder import (
 )
 from shapespace.report.inputs.saved_fits import Folder
 from shapespace.report.inputs.staged_fit import nice_ceiling
-from shapespace.report.pages.page import Chapter, Page, Step
+from shapespace.report.pages.page import Chapter, Page
 from shapespace.report.render import thumbnails
 from shapespace.report.render.palette import DIVERGING, SEQUENTIAL
 from shapespace.report.render.scene import decimate
@@ -89,18 +89,19 @@ class CorrespondencePage:
 
     Args:
         folder: that `shapespace correspond` wrote.
-        on_step: called after each picture and each scan that is read.
+        page: page that it fills.
 
     Raises:
         FileError: correspondence.json or the mean shape cannot be read.
         FileFormatError: one of them is damaged, or no scan's record can be read.
     """
 
-    def __init__(self, folder: Folder, on_step: Step | None = None) -> None:
+    def __init__(self, folder: Folder, page: Page) -> None:
         self.result = Corresponded(folder.root)
         if not self.result.records:
             raise FileFormatError(f"{folder.root} holds no record of a scan; {CORRESPOND_AGAIN}.")
-        self.page = Page(len(self.result.corresponding) + min(len(self.result.records), MOST_CARDS) + 5, on_step)
+        self.page = page
+        page.planned = len(self.result.corresponding) + min(len(self.result.records), MOST_CARDS) + 5
         self.all = self.result.population(self.page.step)
         self.mean = self.result.mean
         self.size = dict(zip(self.all.names, self.all.sizes, strict=True))

@@ -16,7 +16,7 @@ from shapespace.report.blocks.blocks import Block, Facts, Figure, Folded, Notice
 from shapespace.report.blocks.wording import DASH, STATUS_WORDS, isfinite, mm, moment, plain, setting, words
 from shapespace.report.inputs.saved_fits import Folder, SavedFit, read_fit, staged_fit
 from shapespace.report.inputs.staged_fit import StagedFit
-from shapespace.report.pages.page import Chapter, Make, Page, Step
+from shapespace.report.pages.page import Chapter, Make, Page
 from shapespace.schemas import DEMO_AGAIN, Case, Demo, DemoModel, ExpressionsOfOne, FitEntry, read
 
 _RESERVE_BYTES = 1_200_000  # bytes that stay free for the parts after the fits
@@ -30,15 +30,16 @@ class DemoPage:
 
     Args:
         folder: of the demo.
-        on_step: called after each picture.
+        page: page that it fills.
 
     Raises:
         FileError: demo.json cannot be read.
         FileFormatError: demo.json is damaged.
     """
 
-    def __init__(self, folder: Folder, on_step: Step | None = None) -> None:
-        self.page = Page(_PICTURES, on_step)
+    def __init__(self, folder: Folder, page: Page) -> None:
+        self.page = page
+        page.planned = _PICTURES
         self.folder = folder
         self.demo = read(Demo, folder.json("demo.json"), "demo.json", DEMO_AGAIN)
         self.provenance = f"shapespace {self.demo.version}, {moment(self.demo.created)}"

@@ -67,7 +67,7 @@ from shapespace.report.inputs.saved_fits import (
 )
 from shapespace.report.inputs.staged_fit import StagedFit, nice_ceiling
 from shapespace.report.pages import study_page
-from shapespace.report.pages.page import Chapter, Page, Step
+from shapespace.report.pages.page import Chapter, Page
 from shapespace.report.render import thumbnails
 from shapespace.schemas import Quality, read
 from shapespace.store.results import Results
@@ -94,9 +94,9 @@ class FolderPage:
     Args:
         folder: that the fits lie in.
         fits: found there, one or more.
+        page: page that it fills.
         model: the model's file, or None to go by the records.
         labels: a table of labels, or None to look for one.
-        on_step: called after each picture.
     """
 
     def __init__(
@@ -104,9 +104,9 @@ class FolderPage:
         folder: Folder,
         fits: Sequence[SavedFit],
         *,
+        page: Page,
         model: Path | None = None,
         labels: Path | None = None,
-        on_step: Step | None = None,
     ) -> None:
         self.folder = folder
         self.recognised = (folder.root / study_page.STUDY.file).is_file()
@@ -121,9 +121,8 @@ class FolderPage:
             self.label_note = f"There are no labels: {error}"
         self.fits = sorted(map(with_label, fits, found_labels), key=sections.concern)
         self.main = _main_fits(self.fits)
-        self.page = Page(
-            (sections.MODEL_PICTURES + min(len(fits), MOST_CARDS) + 4 + len(self.main) * sections.FIT_PICTURES), on_step
-        )
+        self.page = page
+        page.planned = sections.MODEL_PICTURES + min(len(fits), MOST_CARDS) + 4 + len(self.main) * sections.FIT_PICTURES
         self.model_path = model
         if model is not None:
             self.model()
@@ -648,9 +647,9 @@ class ManyPage(FolderPage):
     Args:
         folder: that the fits lie in.
         results: of it.
+        page: page that it fills.
         model: the model's file, or None to go by the records.
         labels: a table of labels, or None to look for one.
-        on_step: called after each picture.
 
     Raises:
         InputError: none of the fits can be read.
@@ -661,9 +660,9 @@ class ManyPage(FolderPage):
         folder: Folder,
         results: Results,
         *,
+        page: Page,
         model: Path | None = None,
         labels: Path | None = None,
-        on_step: Step | None = None,
     ) -> None:
         self.population = Population(results)
         self.problems = results.problems
@@ -680,7 +679,7 @@ class ManyPage(FolderPage):
             [saved_fit(folder, results, name) for name in sorted(set(names))],
             model=model,
             labels=labels,
-            on_step=on_step,
+            page=page,
         )
 
     @property

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing
 
     from shapespace.report.render.thumbnails import Still
+    from shapespace.schemas import Orientation
 
 LARGEST_REPORT_BYTES = 8_000_000
 """A report stays below this size, so that it can be mailed."""
@@ -48,12 +50,13 @@ class Page:
     """A page in the making: what it embeds, how many bytes are spent so far, and where its sections failed.
 
     Args:
-        planned: about how many pictures there will be.
         on_step: called after each picture.
     """
 
-    def __init__(self, planned: int, on_step: Step | None = None) -> None:
-        self._planned = planned
+    planned: int = 1
+    """About how many pictures there will be."""
+
+    def __init__(self, on_step: Step | None = None) -> None:
         self._on_step = on_step
         self._payloads: list[str] = []
         self._anchors: set[str] = set()
@@ -74,7 +77,7 @@ class Page:
     def step(self, name: str) -> None:
         """Tell the progress bar what was just made."""
         if self._on_step is not None:
-            self._on_step(name, self._planned)
+            self._on_step(name, self.planned)
 
     def anchor(self, text: str) -> str:
         """Return a name for a place in the page, made of `text` and taken only once."""
@@ -107,8 +110,16 @@ class Page:
         try:
             made = make()
         except ShapespaceError as error:
-            return [Text(f"This part could not be made. {error}", "broken")]
+            return [self.failed(error)]
         return made if isinstance(made, Sequence) else [made]
+
+    def failed(self, error: ShapespaceError) -> Text:
+        """Return why a part of the page could not be made."""
+        return Text(f"This part could not be made. {error}", "broken")
+
+    def oriented(self, orientation: Orientation | None) -> AbstractContextManager[None]:
+        """Return a context in which surfaces are drawn in the views of an analysis."""
+        return figures.oriented(orientation)
 
     def figure(self, figure: Drawing, caption: str, *, alt: str, chart: bool = False) -> Figure:
         """Return a drawing with its caption; `alt` says what is seen in it."""

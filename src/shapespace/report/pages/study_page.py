@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import os
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain, groupby
-from itertools import count as count_from
+from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
 from msgspec import structs
 
-from shapespace.cohort.orientation import find_orientation
-from shapespace.errors import FileFormatError, InputError, ShapespaceError
-from shapespace.io.files import make_folder, write_text
+from shapespace.errors import FileFormatError
 from shapespace.report import figures
 from shapespace.report.analyses.shape_data import MOST_LANDMARKS
 from shapespace.report.blocks import sections
@@ -30,7 +26,6 @@ from shapespace.report.blocks.blocks import (
     Figure,
     Folded,
     Group,
-    Image,
     Notice,
     Table,
     Text,
@@ -41,7 +36,6 @@ from shapespace.report.blocks.blocks import (
 )
 from shapespace.report.blocks.wording import (
     DASH,
-    anchor,
     counted,
     known,
     listed,
@@ -51,7 +45,7 @@ from shapespace.report.blocks.wording import (
     without_folders,
 )
 from shapespace.report.inputs.saved_fits import Folder, has_fits
-from shapespace.report.pages.page import Chapter, Make, Page, Step, rendered
+from shapespace.report.pages.page import Chapter, Make, Page, rendered
 from shapespace.report.render.scene import pack_morph, pack_morphospace
 from shapespace.schemas import (
     ANALYSIS_AGAIN,
@@ -80,9 +74,6 @@ from shapespace.schemas import (
 )
 from shapespace.types import Mesh
 from shapespace.version import __version__
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure as Drawing
 
 
 @dataclass(frozen=True)
@@ -492,22 +483,20 @@ def standalone_file(folder: Folder) -> PartsFile | None:
     return next((parts_file for parts_file in there if "format" in _content(folder, parts_file)), None)
 
 
-def study_page(folder: Folder, parts_file: PartsFile, on_step: Step | None = None) -> str:
+def study_page(folder: Folder, parts_file: PartsFile, page: Page) -> str:
     """Return the report of a study or an analysis alone.
 
     Args:
         folder: with its file.
         parts_file: which of them it is.
-        on_step: called after each picture.
+        page: page that it fills.
 
     Raises:
         FileError: the file cannot be read.
         FileFormatError: it is damaged, or no file of this format.
     """
     content = _content(folder, parts_file)
-    page = Page(
-        max(len([part for part in _raw_parts(content) if _raw(part, "kind") not in ("table", "text")]), 1), on_step
-    )
+    page.planned = max(sum(_raw(part, "kind") not in ("table", "text") for part in _raw_parts(content)), 1)
     study = _Study(page, folder, parts_file, content)
     name = folder.root.resolve().name
     created = f", {moment(study.head['created'])}" if study.head["created"] else ""
@@ -746,7 +735,7 @@ class _Study:
         """Return a part by its kind."""
         one = read_part(part, self.parts_file.file, self.parts_file.again)
         known = self.content.get("orientation") is not None
-        with figures.oriented(self._read("orientation", Orientation) if known else None):
+        with self.page.oriented(self._read("orientation", Orientation) if known else None):
             return self.kinds.blocks(one, _title(part))
 
     def settings(self) -> list[Block]:
@@ -782,128 +771,3 @@ class _Study:
 def _title(part: object) -> str:
     title, kind = _raw(part, "title"), str(_raw(part, "kind"))
     return title[:200] if isinstance(title, str) and title else TITLES.get(kind, "A part")
-
-
-_FORMATS = ("svg", "pdf", "png")
-FOLDER = "figures"
-"""Folder of the figures in that of the analysis."""
-_LONGEST = 80  # characters of a file name, which file systems allow with any ending
-
-
-class _Drawings(Page):
-    """Collects the drawings that a page would have, and their captions."""
-
-    def __init__(self) -> None:
-        super().__init__(0)
-        self.drawings: list[Drawing] = []
-        self.captions: list[str] = []
-
-    def still(self, figure: Drawing, alt: str, *, lossless: bool = False) -> Image:
-        """Keep a drawing."""
-        self.drawings.append(figure)
-        return Image(b"", (1, 1), alt)
-
-    def step(self, name: str) -> None:
-        """Keep the caption of a drawing."""
-        self.captions.append(name)
-
-    def turning(self, widget: Any, payload: bytes, poster: Image, caption: str, *, label: str, still: str) -> Figure:
-        """Return the still of something that turns."""
-        self.step(caption)
-        return Figure(poster, caption)
-
-
-@dataclass(frozen=True, kw_only=True)
-class FigureConfig:
-    """Figures for a paper.
-
-    Args:
-        formats: formats of the figures: svg, pdf, png.
-        dpi: resolution of PNG figures, and of surfaces in SVG and PDF.
-        views: names of the views to draw, from the orientation (default: all of it).
-        orientation: JSON file with named views of the object, such as dorsal, and links between landmarks (default:
-            that of the answer).
-
-    Raises:
-        InputError: another format, or a resolution below 72 or above 1200.
-    """
-
-    formats: tuple[str, ...] = ("pdf",)
-    dpi: int = 300
-    views: tuple[str, ...] = ()
-    orientation: Path | None = None
-
-    def __post_init__(self) -> None:
-        unknown = [name for name in self.formats if name not in _FORMATS]
-        if unknown or not self.formats:
-            raise InputError(f"--format is {(*unknown, '')[0][:40]!r}; choose from {', '.join(_FORMATS)}.")
-        if not 72 <= self.dpi <= 1200:
-            raise InputError(f"--dpi is {self.dpi}; choose a resolution from 72 to 1200.")
-
-    def oriented(self, own: Orientation | None) -> Orientation | None:
-        """Return the orientation of the figures: the chosen views of the file, or of an answer.
-
-        Args:
-            own: orientation of the answer.
-
-        Raises:
-            FileError: the file cannot be read.
-            FileFormatError: it is damaged.
-            InputError: a view that there is not.
-        """
-        found = own if self.orientation is None else find_orientation(self.orientation, ())
-        if not self.views:
-            return found
-        known = {} if found is None else {view.name: view for view in found.views}
-        if unknown := [name for name in self.views if name not in known]:
-            names = ", ".join(known) or "none; give --orientation"
-            raise InputError(f"There is no view {unknown[0][:40]!r}; the views are {names}.")
-        return structs.replace(found or Orientation(), views=tuple(known[name] for name in self.views))
-
-
-def write_figures(folder: Path, config: FigureConfig) -> tuple[tuple[Path, ...], tuple[str, ...]]:
-    """Write the figures of the analysis in a folder to `figures` in it, with captions.txt.
-
-    Args:
-        folder: with analysis.json.
-        config: formats, resolution and views.
-
-    Returns:
-        The paths of the figures, and a sentence on each part that cannot be drawn.
-
-    Raises:
-        FileError: the folder cannot be read or written.
-        FileFormatError: analysis.json or the orientation is damaged.
-        InputError: a view that there is not.
-    """
-    source = Folder(folder, ANALYSIS.again)
-    analysis = Analysis.from_json(source.json(Analysis.FILE))
-    output, paths, captions, notes = make_folder(folder / FOLDER), list[Path](), list[str](), list[str]()
-    with figures.oriented(config.oriented(analysis.orientation)), figures.publication_style(config.dpi):
-        for name, title, part in _named(read_part(one, Analysis.FILE, ANALYSIS.again) for one in analysis.parts):
-            page = _Drawings()
-            try:
-                StudyParts(page, source, ANALYSIS).blocks(part, title)
-            except ShapespaceError as error:
-                notes.append(f"The figure {title!r} could not be drawn: {error}")
-            for drawing in page.drawings:
-                paths += figures.save_figure(drawing, output / name, config.formats, config.dpi)
-                captions.append(f"{name}: {title}. {' '.join(page.captions)}".strip())
-    write_text(output / "captions.txt", "".join(f"{caption}\n" for caption in captions))
-    return tuple(paths), tuple(notes)
-
-
-def _named(parts: Iterator[Part]) -> Iterator[tuple[str, str, Part]]:
-    """Yield the parts that are drawn with a file name of the title, and of the chapter where titles repeat."""
-    taken: set[str] = set()
-    chapter, titled = "", [(one.title or TITLES.get(str(one.__struct_config__.tag), "Figure"), one) for one in parts]
-    count = Counter(anchor(title) for title, one in titled if not isinstance(one, TextPart | TablePart))
-    for title, part in titled:
-        chapter = title if part.level == 2 else chapter
-        if isinstance(part, TextPart | TablePart):
-            continue
-        prefix = f"{anchor(chapter)[:_LONGEST]}-" if count[anchor(title)] > 1 and chapter != title else ""
-        base = f"{prefix}{anchor(title)[:_LONGEST]}".strip("-")
-        name = next(one for one in chain([base], (f"{base}-{k}" for k in count_from(2))) if one not in taken)
-        taken.add(name)
-        yield name, title, part

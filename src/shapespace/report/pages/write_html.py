@@ -1,22 +1,42 @@
-"""One self-contained HTML file from saved results: of the demo, of fits, of a correspondence. It runs no fit."""
+"""Reports and figures of saved results: of the demo, of fits, of a correspondence, of an analysis. No fit is run."""
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from importlib.util import find_spec
+from itertools import chain, count
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from msgspec import structs
+
+from shapespace.cohort.orientation import find_orientation
 from shapespace.errors import InputError, ShapespaceError
-from shapespace.io.files import write_text
+from shapespace.io.files import make_folder, write_text
+from shapespace.report import figures
+from shapespace.report.blocks.blocks import Block, Figure, Image, Section, Text, Turning
+from shapespace.report.blocks.wording import anchor
 from shapespace.report.inputs.saved_fits import Folder, find_fits
 from shapespace.report.pages.correspondence_page import CorrespondencePage
 from shapespace.report.pages.demo_page import DemoPage
 from shapespace.report.pages.folder_page import FolderPage, ManyPage, is_many
-from shapespace.report.pages.page import LARGEST_REPORT_BYTES, Step
-from shapespace.report.pages.study_page import standalone_file, study_page
-from shapespace.schemas import CorrespondenceRecord
+from shapespace.report.pages.page import LARGEST_REPORT_BYTES, Chapter, Make, Page, Step
+from shapespace.report.pages.study_page import ANALYSIS, standalone_file, study_page
+from shapespace.schemas import Analysis, CorrespondenceRecord, Orientation
 from shapespace.store.results import Results
 
-__all__ = ["LARGEST_REPORT_BYTES", "require_report_extra", "write_report"]
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Drawing
+
+__all__ = ["LARGEST_REPORT_BYTES", "FigureConfig", "require_report_extra", "write_figures", "write_report"]
+
+FIGURES_FOLDER = "figures"
+"""Folder of the figures in that of the results."""
+_FORMATS = ("svg", "pdf", "png")
+_LONGEST = 80  # characters of a file name, which file systems allow with any ending
 
 
 def require_report_extra() -> None:
@@ -64,11 +84,11 @@ def write_report(
     """
     require_report_extra()
     path = Path(output) if output is not None else Path(folder) / "report.html"
-    write_text(path, _page(Folder(Path(folder)), model, labels, on_step))
+    write_text(path, _html(Folder(Path(folder)), model, labels, Page(on_step)))
     return path
 
 
-def _page(folder: Folder, model: Path | None, labels: Path | None, on_step: Step | None) -> str:
+def _html(folder: Folder, model: Path | None, labels: Path | None, page: Page) -> str:
     """Return the page on the results in `folder`."""
     root, given = folder.root, model is not None or labels is not None
     if (root / "demo.json").is_file():
@@ -76,18 +96,175 @@ def _page(folder: Folder, model: Path | None, labels: Path | None, on_step: Step
             raise InputError(
                 f"{root} is a demo, which names its models and labels itself; leave out --model and --labels."
             )
-        return DemoPage(folder, on_step).html()
+        return DemoPage(folder, page).html()
     if (root / CorrespondenceRecord.FILE).is_file():
         if given:
             raise InputError(f"{root} is a correspondence without fits; leave out --model and --labels.")
-        return CorrespondencePage(folder, on_step).html()
+        return CorrespondencePage(folder, page).html()
     if (standalone := standalone_file(folder)) is not None:
         if given:
             raise InputError(f"{root} holds {standalone.article} without fits; leave out --model and --labels.")
-        return study_page(folder, standalone, on_step)
+        return study_page(folder, standalone, page)
     if is_many(results := Results(root)):
-        return ManyPage(folder, results, model=model, labels=labels, on_step=on_step).html()
+        return ManyPage(folder, results, model=model, labels=labels, page=page).html()
     fits = find_fits(folder)
     if all(fit.status == "unreadable" for fit in fits):
         raise InputError(f"{root}: none of its {len(fits)} records can be read; {fits[0].reason}")
-    return FolderPage(folder, fits, model=model, labels=labels, on_step=on_step).html()
+    return FolderPage(folder, fits, model=model, labels=labels, page=page).html()
+
+
+@dataclass(frozen=True, kw_only=True)
+class FigureConfig:
+    """Figures for a paper.
+
+    Args:
+        formats: formats of the figures: svg, pdf, png.
+        dpi: resolution of PNG figures, and of surfaces in SVG and PDF.
+        views: names of the views to draw, from the orientation (default: all of it).
+        orientation: JSON file with named views of the object, such as dorsal, and links between landmarks (default:
+            that of the analysis).
+
+    Raises:
+        InputError: another format, or a resolution below 72 or above 1200.
+    """
+
+    formats: tuple[str, ...] = ("pdf",)
+    dpi: int = 300
+    views: tuple[str, ...] = ()
+    orientation: Path | None = None
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.formats if name not in _FORMATS]
+        if unknown or not self.formats:
+            raise InputError(f"--format is {(*unknown, '')[0][:40]!r}; choose from {', '.join(_FORMATS)}.")
+        if not 72 <= self.dpi <= 1200:
+            raise InputError(f"--dpi is {self.dpi}; choose a resolution from 72 to 1200.")
+
+    def oriented(self, own: Orientation | None) -> Orientation | None:
+        """Return the orientation of the figures: the chosen views of the file, or of an analysis.
+
+        Args:
+            own: orientation of the analysis.
+
+        Raises:
+            FileError: the file cannot be read.
+            FileFormatError: it is damaged.
+            InputError: a view that there is not.
+        """
+        found = own if self.orientation is None else find_orientation(self.orientation, ())
+        if not self.views:
+            return found
+        known = {} if found is None else {view.name: view for view in found.views}
+        if unknown := [name for name in self.views if name not in known]:
+            names = ", ".join(known) or "none; give --orientation"
+            raise InputError(f"There is no view {unknown[0][:40]!r}; the views are {names}.")
+        return structs.replace(found or Orientation(), views=tuple(known[name] for name in self.views))
+
+
+class _FigureFiles(Page):
+    """Writes the figures of a page as files in place of the page, with captions.txt.
+
+    Args:
+        output: folder of the files.
+        config: formats, resolution and views.
+        on_step: called after each figure.
+    """
+
+    def __init__(self, output: Path, config: FigureConfig, on_step: Step | None = None) -> None:
+        super().__init__(on_step)
+        self.output = output
+        self.config = config
+        self.headings: list[str] = []
+        self.drawn: list[tuple[str, str, Drawing]] = []
+        self.captions: dict[Drawing, str] = {}
+        self.notes: list[str] = []
+        self.paths: list[Path] = []
+
+    @property
+    def left(self) -> int:
+        """Number of bytes that the page has left: files need none of it."""
+        return LARGEST_REPORT_BYTES
+
+    def oriented(self, orientation: Orientation | None) -> AbstractContextManager[None]:
+        """Return a context without effect, as all figures have the views of the configuration."""
+        return nullcontext()
+
+    def section(self, heading: str, make: Make, *args: Any, **options: Any) -> Section:
+        """Return a section, after whose heading its figures are named."""
+        self.headings.append(heading)
+        section = super().section(heading, make, *args, **options)
+        self.headings.pop()
+        return section
+
+    def failed(self, error: ShapespaceError) -> Text:
+        """Keep why a figure could not be drawn."""
+        self.notes.append(f"The figure {self.headings[-1]!r} could not be drawn: {error}")
+        return super().failed(error)
+
+    def still(self, figure: Drawing, alt: str, *, lossless: bool = False) -> Image:
+        """Keep a drawing."""
+        self.drawn.append((self.headings[0], self.headings[-1], figure))
+        return Image(b"", (1, 1), alt)
+
+    def figure(self, figure: Drawing, caption: str, *, alt: str, chart: bool = False) -> Figure:
+        """Keep a drawing with its caption."""
+        self.captions[figure] = caption
+        return super().figure(figure, caption, alt=alt, chart=chart)
+
+    def turning(
+        self, widget: Any, payload: bytes, poster: Image, caption: str, *, label: str, still: str
+    ) -> Turning | Figure:
+        """Return the still of something that turns; it has no bytes if it is the drawing that was kept last."""
+        if not poster.data:
+            self.captions[self.drawn[-1][-1]] = caption
+        self.step(caption)
+        return Figure(poster, caption)
+
+    def html(self, title: str, lead: Sequence[Block], made: str, chapters: Sequence[Chapter]) -> str:
+        """Write the figures of the chapters, each named after its heading, and after its chapter if headings repeat."""
+        for chapter in chapters:
+            self.section(chapter.heading, chapter.make)
+        make_folder(self.output)
+        named = Counter(anchor(heading) for _, heading in {(chapter, heading) for chapter, heading, _ in self.drawn})
+        taken: set[str] = set()
+        captions: list[str] = []
+        for chapter, heading, drawing in self.drawn:
+            name = anchor(heading)
+            repeats = named[name] > 1 and chapter != heading
+            base = f"{anchor(chapter)[:_LONGEST]}-{name[:_LONGEST]}" if repeats else name[:_LONGEST]
+            name = next(one for one in chain([base], (f"{base}-{k}" for k in count(2))) if one not in taken)
+            taken.add(name)
+            self.paths += figures.save_figure(drawing, self.output / name, self.config.formats, self.config.dpi)
+            captions.append(f"{name}: {heading}. {self.captions.get(drawing, '')}".strip())
+        write_text(self.output / "captions.txt", "".join(f"{caption}\n" for caption in captions))
+        return ""
+
+
+def write_figures(
+    folder: Path, config: FigureConfig, *, model: Path | None = None, on_step: Step | None = None
+) -> tuple[tuple[Path, ...], tuple[str, ...]]:
+    """Write the figures of the report of `folder` to `figures` in it, with captions.txt.
+
+    Args:
+        folder: of any results that `write_report` reports.
+        config: formats, resolution and views.
+        model: file of the model of fits; None for that of their records.
+        on_step: called after each figure.
+
+    Returns:
+        The paths of the figures, and a sentence on each part that cannot be drawn.
+
+    Raises:
+        FileError: the folder cannot be read or written.
+        FileFormatError: the results or the orientation are damaged.
+        InputError: the folder holds no results, or a view that there is not.
+        ShapespaceError: the extra `report` is not installed.
+    """
+    require_report_extra()
+    source, own = Folder(folder, ANALYSIS.again), None
+    if (folder / Analysis.FILE).is_file():
+        own = Analysis.from_json(source.json(Analysis.FILE)).orientation
+    page = _FigureFiles(folder / FIGURES_FOLDER, config, on_step)
+    with figures.oriented(config.oriented(own)), figures.publication_style(config.dpi):
+        _html(Folder(folder), model, None, page)
+    return tuple(page.paths), tuple(page.notes)
