@@ -153,7 +153,9 @@ def test_figures_draw_the_chosen_views_of_an_answer(run: Run, home: Path) -> Non
     assert endings == {".svg", ".png", ".txt"}
     assert "the views are front, side" in run("figures", "out", "--views", "dorsal").sentence()
     assert "choose from svg, pdf, png" in run("figures", "out", "--format", "gif").sentence()
-    assert "analysis.json" in run("figures", "same").sentence()
+    assert run("figures", "same").out == "5 files in same/figures\n"  # of a correspondence
+    (home / "empty").mkdir()
+    assert "holds no result" in run("figures", "empty").sentence()
 
 
 def test_missing_values_are_dropped_by_every_question_of_a_cohort_that_says_so() -> None:
