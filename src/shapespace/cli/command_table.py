@@ -852,7 +852,7 @@ COMMANDS: tuple[Command, ...] = (
         ("shapespace cohort people.csv --shapes same --gauge form -o bones.toml",
          "shapespace compare bones.toml '~ sex' -o sex"), "cli.answers:answer_cohort",
         (
-            _DATA,
+            replace(_DATA, help=_DATA.help.replace("a cohort file (.toml); ", "")),
             basic("-o --output", "FILE.toml", "the cohort file", parse=Path, required=True),
             _SHAPES,
             *(replace(one, names=f"--{one.names}", setting=False, basic=one.names in _BASIC_OF_COHORT)
