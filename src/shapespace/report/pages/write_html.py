@@ -35,6 +35,9 @@ __all__ = ["LARGEST_REPORT_BYTES", "FigureConfig", "require_report_extra", "writ
 
 FIGURES_FOLDER = "figures"
 """Folder of the figures in that of the results."""
+_OWN_VIEWS = (
+    "Named views are those of the maps and morphs of analyses; pictures of fits and correspondences have their own."
+)
 _FORMATS = ("svg", "pdf", "png")
 _LONGEST = 80  # characters of a file name, which file systems allow with any ending
 
@@ -261,10 +264,12 @@ def write_figures(
         ShapespaceError: the extra `report` is not installed.
     """
     require_report_extra()
-    source, own = Folder(folder, ANALYSIS.again), None
+    source, own, notes = Folder(folder, ANALYSIS.again), None, ()
     if (folder / Analysis.FILE).is_file():
         own = Analysis.from_json(source.json(Analysis.FILE)).orientation
+    elif config.orientation is not None:
+        notes = (_OWN_VIEWS,)
     page = _FigureFiles(folder / FIGURES_FOLDER, config, on_step)
     with figures.oriented(config.oriented(own)), figures.publication_style(config.dpi):
         _html(Folder(folder), model, None, page)
-    return tuple(page.paths), tuple(page.notes)
+    return tuple(page.paths), (*notes, *page.notes)
