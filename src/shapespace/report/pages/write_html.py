@@ -36,7 +36,7 @@ __all__ = ["LARGEST_REPORT_BYTES", "FigureConfig", "require_report_extra", "writ
 FIGURES_FOLDER = "figures"
 """Folder of the figures in that of the results."""
 _OWN_VIEWS = (
-    "Named views are those of the maps and morphs of analyses; pictures of fits and correspondences have their own."
+    "Named views are those of maps and morphs of analyses; pictures of fits and correspondences have their own."
 )
 _FORMATS = ("svg", "pdf", "png")
 _LONGEST = 80  # characters of a file name, which file systems allow with any ending
