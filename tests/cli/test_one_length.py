@@ -10,8 +10,8 @@ import pytest
 
 from conftest import Outcome, Run
 from shapespace.fit.fit_scan import FitConfig, fit_scan
+from shapespace.fit.iteration_state import SHOWN
 from shapespace.fit.result import FitResult
-from shapespace.fit.vertex_regions import SHOWN
 from shapespace.geometry.closest import build_engine
 from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel

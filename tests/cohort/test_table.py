@@ -6,8 +6,15 @@ from pathlib import Path, PurePath
 import numpy as np
 import pytest
 
-from shapespace.cohort.classes import notes_on_classes
-from shapespace.cohort.table import Table, list_names, match_rows, names_of_file, numbers_as_text, read_table
+from shapespace.cohort.table import (
+    Table,
+    list_names,
+    match_rows,
+    names_of_file,
+    notes_on_classes,
+    numbers_as_text,
+    read_table,
+)
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.files import write_text
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from shapespace.fit.robust.weights import WEIGHTS, spread, tails
+from shapespace.fit.robust.matching import WEIGHTS, spread, tails
 
 
 @pytest.mark.parametrize("name", WEIGHTS)

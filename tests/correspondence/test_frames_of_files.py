@@ -12,7 +12,7 @@ from shapespace.correspondence import groupwise
 from shapespace.correspondence.register import ElasticSettings
 from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.errors import InputError
-from shapespace.geometry.mirrored_scans import Sides
+from shapespace.geometry.mirror_plane import Sides
 from shapespace.types import FloatArray, Mesh, Similarity
 from synthetic_shapes import sphere
 

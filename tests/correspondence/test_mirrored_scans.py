@@ -14,8 +14,7 @@ from shapespace.correspondence.groupwise import correspond
 from shapespace.correspondence.register import ElasticSettings
 from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.geometry.closest import build_engine
-from shapespace.geometry.mirror_plane import FLIP, mirror_image
-from shapespace.geometry.mirrored_scans import solve_sides
+from shapespace.geometry.mirror_plane import FLIP, mirror_image, solve_sides
 from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.schemas import CorrespondenceRecord
 from shapespace.types import FloatArray, Mesh

@@ -13,7 +13,7 @@ from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.datasets.bones import Bone
 from shapespace.datasets.organs import Organ, raw_surface
 from shapespace.errors import InputError, MeshError
-from shapespace.geometry.distance import surface_distances
+from shapespace.geometry.closest import surface_distances
 from shapespace.geometry.mirror_plane import find_mirror, pairs_of_triangles, reflect
 from shapespace.geometry.normals import boundary_edges, face_areas, faces_of, part_of
 from shapespace.model.shape_model import ShapeModel

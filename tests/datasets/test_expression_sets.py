@@ -5,8 +5,8 @@ import pytest
 
 from shapespace.datasets import expression_sets as sets
 from shapespace.datasets.expression_sets import EXPRESSIONS, KINDS, ScanEntry, find_scans, scan_set
-from shapespace.datasets.face_files import write_faces
 from shapespace.datasets.faces import EXPRESSIONS as FACE_EXPRESSIONS
+from shapespace.datasets.faces import write_faces
 from shapespace.errors import FileError, InputError
 
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 import shapespace.datasets.faces as module
-from shapespace.datasets.face_files import write_faces
-from shapespace.datasets.faces import EXPRESSIONS, Expression, Person, Warp, load_faces
+from shapespace.datasets.faces import EXPRESSIONS, Expression, Person, Warp, load_faces, write_faces
 from shapespace.errors import DataError, InputError
 from shapespace.io.meshes.mesh_io import read_mesh
 

@@ -14,8 +14,7 @@ from shapespace.fit.diagnostics.failure_model import (
     failure_score,
     find_failure_reasons,
 )
-from shapespace.fit.diagnostics.reason_text import text_of
-from shapespace.fit.diagnostics.reasons import ReasonCode
+from shapespace.fit.diagnostics.reasons import ReasonCode, text_of
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.result import FitResult
 from shapespace.fit.robust.posterior import lack_of_new_shapes

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from shapespace.fit.fit_scan import FitConfig, fit_scan
-from shapespace.fit.vertex_regions import BORDER, FOLLOWED, REGIONS, REJECTED, UNSEEN
+from shapespace.fit.iteration_state import BORDER, FOLLOWED, REGIONS, REJECTED, UNSEEN
 from shapespace.types import FloatArray, Mesh
 from synthetic_shapes import blob, blob_model, sphere
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from shapespace.fit.search import rigid_search as rigid
+from shapespace.fit.search import pose_search as rigid
 from shapespace.geometry.kdtree import KdTree
 from shapespace.types import FloatArray
 from synthetic_shapes import angle_deg, blob, sphere

@@ -13,7 +13,7 @@ from shapespace.fit.robust.normal_equations import Estimate
 from shapespace.fit.robust.posterior import variance_of_new_shapes
 from shapespace.fit.robust.prepared_model import prepare
 from shapespace.fit.robust.robust_icp import in_span
-from shapespace.geometry.distance import surface_distances
+from shapespace.geometry.closest import surface_distances
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh, Similarity
 from synthetic_shapes import blob, blob_model, raw_scan, similarity, sphere, training_meshes

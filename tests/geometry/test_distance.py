@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from shapespace.geometry.distance import DistanceSummary, surface_distances
+from shapespace.geometry.closest import DistanceSummary, surface_distances
 from shapespace.types import Mesh
 from synthetic_shapes import similarity, sphere
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from shapespace.errors import MeshError
-from shapespace.geometry.loop import loop_operator
+from shapespace.geometry.remesh import loop_operator
 
 TETRAHEDRON = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
 

@@ -11,7 +11,7 @@ from PIL import Image
 
 from shapespace.errors import InputError
 from shapespace.fit.fit_scan import FitConfig, fit_scan
-from shapespace.fit.vertex_regions import UNSEEN
+from shapespace.fit.iteration_state import UNSEEN
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report import figures
 from shapespace.report.figures import draw

@@ -17,7 +17,7 @@ from shapespace.errors import FileFormatError
 from shapespace.fit.result import FitResult
 from shapespace.fit.result import OverlapDistances as FitOverlap
 from shapespace.fit.stages import stage_arrays
-from shapespace.geometry.distance import SurfaceDistances
+from shapespace.geometry.closest import SurfaceDistances
 from shapespace.geometry.normals import face_areas, rms_size
 from shapespace.io.files import atomic_path, sha256_of_file, write_bytes, write_text
 from shapespace.io.meshes.ply import ply_comment, write_ply

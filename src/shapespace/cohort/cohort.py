@@ -14,10 +14,9 @@ from typing import Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.cohort.classes import class_notes
 from shapespace.cohort.incomplete import complete_by_population, completed_shapes
 from shapespace.cohort.shape_samples import ShapeSamples
-from shapespace.cohort.table import Table, cell_text, list_names, numbers_as_text
+from shapespace.cohort.table import Table, cell_text, class_notes, list_names, numbers_as_text
 from shapespace.errors import InputError
 from shapespace.geometry.landmark_alignment import AlignedLandmarks, project_to_tangent
 from shapespace.geometry.procrustes import Gauge, align_in_place, centroid_size, scale_to_tangent

@@ -75,7 +75,7 @@ def write_simulated_faces(
         DataError: ICT-FaceKit is asked for and absent.
         FileError: the folder cannot be written.
     """
-    from shapespace.datasets import face_files, ict  # these load the geometry, which data list does not need
+    from shapespace.datasets import faces, ict  # these load the geometry, which data list does not need
 
     if area not in (None, "face", "face_and_head"):
         raise InputError(f"The area must be face or face_and_head, not {area!r}.")
@@ -94,7 +94,7 @@ def write_simulated_faces(
                 progress=step,
             )  # fmt: skip
         else:
-            face_files.write_faces(
+            faces.write_faces(
                 output, subjects=subjects, expressions=expressions, seed=seed, raw=raw, wide=wide,
                 face_only=area == "face", intensities=intensities, effect_mm=effect_mm,
                 progress=step,

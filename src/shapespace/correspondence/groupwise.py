@@ -49,8 +49,7 @@ from shapespace.correspondence.vertex_confidence import VertexConfidence
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.geometry.distortion import Distortion
 from shapespace.geometry.landmark_placement import place_landmarks
-from shapespace.geometry.mirror_plane import FLIP, mirror_image
-from shapespace.geometry.mirrored_scans import ASYMMETRIC, Sides, solve_sides
+from shapespace.geometry.mirror_plane import ASYMMETRIC, FLIP, Sides, mirror_image, solve_sides
 from shapespace.geometry.normals import face_areas, rms_size, without_estimates
 from shapespace.geometry.procrustes import align_to_weighted_mean
 from shapespace.geometry.similarity import fit_similarity

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import eigsh
 
-from shapespace.geometry.laplacian import cotangent_laplacian
+from shapespace.geometry.normals import cotangent_laplacian
 from shapespace.types import FloatArray, Mesh
 
 _SHIFT = 1e-7

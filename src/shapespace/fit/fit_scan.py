@@ -32,8 +32,7 @@ from shapespace.fit.search.initialisation import (
     start_from_landmarks,
     start_of_any_size,
 )
-from shapespace.geometry.closest import ClosestPoints
-from shapespace.geometry.distance import SurfaceDistances, surface_distances
+from shapespace.geometry.closest import ClosestPoints, SurfaceDistances, surface_distances
 from shapespace.geometry.doctor import repair
 from shapespace.geometry.landmark_placement import landmarks_in_frame_of
 from shapespace.geometry.normals import rms_size

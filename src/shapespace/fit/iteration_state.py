@@ -1,4 +1,4 @@
-"""What an iteration knows, and when to stop: shared by both phases."""
+"""What an iteration knows, when to stop, and which parts of the model the scan decides: shared by both phases."""
 
 from __future__ import annotations
 
@@ -127,3 +127,19 @@ class StopRule:
 def largest_motion(moved: FloatArray) -> float:
     """Return the length of the longest of `moved` (V, 3)."""
     return float(np.sqrt(np.einsum("ij,ij->i", moved, moved).max()))
+
+
+REGIONS = ("followed", "rejected", "border", "unseen")
+"""Codes 0 to 3: the match counted; the scan shows something else there; it ends there; it shows nothing there."""
+
+FOLLOWED, REJECTED, BORDER, UNSEEN = range(4)
+SHOWN = (FOLLOWED, REJECTED)
+"""Where the scan shows something, be it what the model follows or not."""
+
+MATCHED = (FOLLOWED, BORDER)
+"""Where the model follows the scan, up to its border."""
+
+
+def all_followed(vertices: int) -> IntArray:
+    """Return the codes (V,) of a method that takes every vertex for matched."""
+    return np.full(vertices, FOLLOWED, dtype=np.int32)

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from shapespace.fit.iteration_state import Fitted, IcpState
-from shapespace.fit.vertex_regions import UNSEEN
+from shapespace.fit.iteration_state import UNSEEN, Fitted, IcpState
 from shapespace.model.region import Part
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import IntArray, SurfaceLandmarks

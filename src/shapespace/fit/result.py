@@ -14,12 +14,9 @@ import numpy as np
 from shapespace.errors import InputError
 from shapespace.fit.diagnostics.evidence import FitEvidence
 from shapespace.fit.diagnostics.odd_scans import Chirality, chirality_of
-from shapespace.fit.diagnostics.reason_text import sentence_of
-from shapespace.fit.diagnostics.reasons import Reason
-from shapespace.fit.iteration_state import IcpState
-from shapespace.fit.vertex_regions import MATCHED, SHOWN
-from shapespace.geometry.closest import ClosestPoints
-from shapespace.geometry.distance import DistanceSummary, SurfaceDistances
+from shapespace.fit.diagnostics.reasons import Reason, sentence_of
+from shapespace.fit.iteration_state import MATCHED, SHOWN, IcpState
+from shapespace.geometry.closest import ClosestPoints, DistanceSummary, SurfaceDistances
 from shapespace.lazy import OpenViewer, lazy_import
 from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import describe_briefly, short_repr

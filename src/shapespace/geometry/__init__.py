@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from shapespace.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from shapespace.geometry.distance import SurfaceDistances, surface_distances
+    from shapespace.geometry.closest import SurfaceDistances, surface_distances
     from shapespace.geometry.landmark_alignment import (
         AlignConfig,
         AlignedLandmarks,
@@ -37,7 +37,7 @@ __all__ = [
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
-        "geometry.distance": ("SurfaceDistances", "surface_distances"),
+        "geometry.closest": ("SurfaceDistances", "surface_distances"),
         "geometry.landmark_placement": ("place_landmarks",),
         "geometry.volume_surface": ("VolumeSurface", "surface_of_volume"),
         "types": ("Similarity", "SurfaceLandmarks"),

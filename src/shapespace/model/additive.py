@@ -19,7 +19,7 @@ from scipy.linalg import eigh
 
 from shapespace.errors import InputError, ModelFileError
 from shapespace.formats.model_parts import LinearModel
-from shapespace.geometry.mirrored_scans import mirrored_note
+from shapespace.geometry.mirror_plane import mirrored_note
 from shapespace.geometry.normals import without_estimates
 from shapespace.geometry.procrustes import Gauge, align_in_place
 from shapespace.geometry.similarity import fit_similarity

@@ -14,7 +14,7 @@ import numpy as np
 from shapespace.errors import InputError
 from shapespace.geometry.bspline import SplineSquare
 from shapespace.geometry.flatten import disc_map
-from shapespace.geometry.mirrored_scans import mirrored_note
+from shapespace.geometry.mirror_plane import mirrored_note
 from shapespace.geometry.normals import without_estimates
 from shapespace.geometry.procrustes import Gauge, align_shapes, centroid_size
 from shapespace.geometry.similarity import fit_similarity

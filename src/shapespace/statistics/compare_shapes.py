@@ -16,10 +16,10 @@ from typing import Literal, TypeAlias
 import numpy as np
 from msgspec import structs
 
-from shapespace.cohort.classes import number_caution
 from shapespace.cohort.cohort import Cohort, with_columns
+from shapespace.cohort.table import number_caution
 from shapespace.errors import InputError
-from shapespace.geometry.mirrored_scans import mirrored_note
+from shapespace.geometry.mirror_plane import mirrored_note
 from shapespace.reprs import list_briefly, short_repr
 from shapespace.schemas import Methods, TestScheme
 from shapespace.statistics.compare_formula import (

@@ -22,8 +22,7 @@ from shapespace.fit.completion.shape_posterior import AS_LIKELY, OTHER_SIZE, Sha
 from shapespace.fit.completion.surface_calibration import SurfaceCalibration, calibrate
 from shapespace.fit.dense.dense_fit import dense_surface
 from shapespace.fit.diagnostics.odd_scans import converged_reason
-from shapespace.fit.diagnostics.reason_text import sentence_of
-from shapespace.fit.diagnostics.reasons import Reason, ReasonCode
+from shapespace.fit.diagnostics.reasons import Reason, ReasonCode, sentence_of
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.landmark_terms import SHARE, LandmarkConstraint
 from shapespace.fit.result import FitResult, Status
@@ -33,10 +32,10 @@ from shapespace.fit.scan_target import ScanTarget, mm_frame
 from shapespace.fit.search.initialisation import start_from_any_pose
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.landmark_placement import landmarks_in_frame_of
-from shapespace.geometry.loop import loop_operator
 from shapespace.geometry.mirror_plane import SYMMETRIC_SHARE, find_mirror
 from shapespace.geometry.normals import boundary_edges, enclosed_volume, face_areas, face_vectors, part_of, rms_size
 from shapespace.geometry.procrustes import centroid_size
+from shapespace.geometry.remesh import loop_operator
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.interop import MeshLike
 from shapespace.io.landmarks.landmark_io import read_landmarks

@@ -21,13 +21,11 @@ import numpy as np
 from shapespace.errors import FitError
 from shapespace.fit.dense.field_kernels import compare_triangles, solve_field
 from shapespace.fit.robust.kernels import normals_into
-from shapespace.fit.robust.matching import Matcher, Matches, MatchHint, Weights, choose_bulging
+from shapespace.fit.robust.matching import Matcher, Matches, MatchHint, Weights, choose_bulging, spread
 from shapespace.fit.robust.prepared_model import ModelSurface, Topology, prepare
 from shapespace.fit.robust.robust_settings import DenseSettings
-from shapespace.fit.robust.weights import spread
 from shapespace.fit.scan_target import ScanTarget
-from shapespace.geometry.laplacian import half_cotangents, owned_areas
-from shapespace.geometry.normals import face_vectors, rms_size
+from shapespace.geometry.normals import face_vectors, half_cotangents, owned_areas, rms_size
 from shapespace.io.memory_cache import cached_with_owner
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity

@@ -11,11 +11,10 @@ import numpy as np
 
 from shapespace.errors import InputError
 from shapespace.fit.diagnostics.reasons import Reason, ReasonCode
-from shapespace.fit.iteration_state import Fitted, IcpState, StopRule, largest_motion
+from shapespace.fit.iteration_state import Fitted, IcpState, StopRule, all_followed, largest_motion
 from shapespace.fit.method import Ended, Limits
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.search.initialisation import Start
-from shapespace.fit.vertex_regions import all_followed
 from shapespace.geometry.closest import ENGINES, ClosestPointEngine
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.pca import modes_for_variance

@@ -27,9 +27,19 @@ from scipy.linalg import LinAlgError
 from shapespace.errors import FitError
 from shapespace.fit.dense.residual_modes import residual_modes
 from shapespace.fit.diagnostics.evidence import MatchEvidence
-from shapespace.fit.iteration_state import IcpState, RobustFitted
+from shapespace.fit.iteration_state import BORDER, FOLLOWED, REJECTED, UNSEEN, IcpState, RobustFitted
 from shapespace.fit.landmark_terms import LandmarkConstraint, worth
-from shapespace.fit.robust.matching import Gathered, Matcher, Matches, MatchHint, Weights, match_vertices
+from shapespace.fit.robust.matching import (
+    Gathered,
+    Matcher,
+    Matches,
+    MatchHint,
+    Weights,
+    match_vertices,
+    match_weights,
+    spread,
+    tails,
+)
 from shapespace.fit.robust.normal_equations import Estimate, NormalEquations, Prior, normal_equations, small_similarity
 from shapespace.fit.robust.posterior import (
     Posterior,
@@ -40,10 +50,8 @@ from shapespace.fit.robust.posterior import (
 )
 from shapespace.fit.robust.prepared_model import LinearShape, ModelSurface, PreparedModel, prepare
 from shapespace.fit.robust.robust_settings import Level, RobustSettings
-from shapespace.fit.robust.weights import match_weights, spread, tails
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.search.initialisation import Start
-from shapespace.fit.vertex_regions import BORDER, FOLLOWED, REJECTED, UNSEEN
 from shapespace.geometry.closest import on_boundary
 from shapespace.geometry.kdtree import KdTree
 from shapespace.geometry.normals import rms_size

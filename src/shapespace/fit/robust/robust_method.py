@@ -17,12 +17,11 @@ from shapespace.fit.diagnostics.odd_scans import (
     is_side_undecidable,
 )
 from shapespace.fit.diagnostics.reasons import Reason
-from shapespace.fit.iteration_state import Fitted, IcpState, RobustFitted
+from shapespace.fit.iteration_state import SHOWN, Fitted, IcpState, RobustFitted
 from shapespace.fit.method import Ended, Limits
 from shapespace.fit.robust.robust_settings import RobustSettings
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.search.initialisation import Start
-from shapespace.fit.vertex_regions import SHOWN
 from shapespace.model.shape_model import ShapeModel
 
 _COMPLETE = 0.95  # share of the vertices; a complete scan still omits vertices at its border

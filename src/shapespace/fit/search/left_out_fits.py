@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from shapespace.errors import FitError, InputError
-from shapespace.fit.iteration_state import RobustFitted, last_of
+from shapespace.fit.iteration_state import MATCHED, RobustFitted, last_of
 from shapespace.fit.robust.robust_icp import robust_icp
 from shapespace.fit.robust.robust_settings import RobustSettings
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.search.initialisation import Start
-from shapespace.fit.vertex_regions import MATCHED
 from shapespace.geometry.normals import part_of
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh, Similarity

@@ -14,9 +14,9 @@ from scipy.spatial import cKDTree
 from shapespace.errors import FitError, InputError
 from shapespace.fit.diagnostics.failure_model import failure_score, is_doubtful
 from shapespace.fit.iteration_state import RobustFitted, last_of
+from shapespace.fit.robust.matching import spread
 from shapespace.fit.robust.robust_icp import robust_icp
 from shapespace.fit.robust.robust_settings import RobustSettings
-from shapespace.fit.robust.weights import spread
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.search.initialisation import Start
 from shapespace.fit.search.left_out_fits import fit_left_out

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from shapespace.errors import InputError
-from shapespace.fit.vertex_regions import REGIONS
+from shapespace.fit.iteration_state import REGIONS
 from shapespace.report.figures.draw import (
     BACKWARD,
     FORWARD,

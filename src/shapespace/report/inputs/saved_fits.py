@@ -16,7 +16,7 @@ import numpy.typing as npt
 from msgspec import structs
 
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
-from shapespace.fit.diagnostics.reason_text import text_of
+from shapespace.fit.diagnostics.reasons import text_of
 from shapespace.fit.fit_scan import FitConfig
 from shapespace.geometry.doctor import repair
 from shapespace.io.files import read_bytes, sha256_of_file

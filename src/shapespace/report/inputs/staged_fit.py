@@ -11,11 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import FileFormatError, ShapespaceError
+from shapespace.fit.iteration_state import REGIONS, SHOWN
 from shapespace.fit.result import STAGES, FitResult
 from shapespace.fit.stages import STAGES_VERSION, stage_arrays
-from shapespace.fit.vertex_regions import REGIONS, SHOWN
-from shapespace.geometry.closest import build_engine, on_boundary
-from shapespace.geometry.distance import surface_distances
+from shapespace.geometry.closest import build_engine, on_boundary, surface_distances
 from shapespace.geometry.normals import boundary_vertices
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import FitRecord

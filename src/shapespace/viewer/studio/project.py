@@ -17,8 +17,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from shapespace.batch.result_folder import names_for
-from shapespace.cohort.classes import notes_on_classes
-from shapespace.cohort.table import match_rows, names_of_file, read_table
+from shapespace.cohort.table import match_rows, names_of_file, notes_on_classes, read_table
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.containers.json_files import read_json
 from shapespace.io.files import atomic_path, make_folder, write_error, write_text
