@@ -1,8 +1,8 @@
 """The bundled simulated faces: a generator of people and expressions on one topology, made from CC0 MakeHuman assets.
 
 The surface is head, face, ears and neck of an adult in millimetres: y up, the face looks along +z, x to the subject's
-left, the pupils of the average adult 62 mm apart. A face is linear in its weights; only the weights are random. Faces are written as files in correspondence,
-or as raw scans, with their labels and landmarks.
+left, the pupils of the average adult 62 mm apart. A face is linear in its weights; only the weights are random. Faces
+are written as files in correspondence, or as raw scans, with their labels and landmarks.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Matches between a surface on the model's triangles and the scan, both ways: of every stage of a fit the same.
 
 Each scan point goes to the closest point of the moving surface, which a walk from the last answer finds, and each
-vertex of the surface to the closest point of the scan. A robust weight, chosen by its name, is how much a match counts. Equation numbers are those of docs/robust.md.
+vertex of the surface to the closest point of the scan. A robust weight, chosen by its name, is how much a match counts.
+Equation numbers are those of docs/robust.md.
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@ model comes once its leading modes have adapted. So poses are narrowed down in f
 the one before, and compared by that. Lengths in the settings are shares of the model's size, so any object will do.
 
 Rigid steps are symmetric ICP from many poses at once, on grids of near points: a grid holds a near point for each cell,
-so that a match is one look-up. Weights are Geman and McClure's, with a reach that falls from step to step (graduated, as
-in Zhang, Yao and Deng, PAMI 44(7), 2022).
+so that a match is one look-up. Weights are Geman and McClure's, with a reach that falls from step to step (graduated,
+as in Zhang, Yao and Deng, PAMI 44(7), 2022).
 """
 
 from __future__ import annotations
