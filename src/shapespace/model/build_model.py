@@ -17,11 +17,10 @@ from shapespace.geometry.flatten import disc_map
 from shapespace.geometry.mirrored_scans import mirrored_note
 from shapespace.geometry.normals import without_estimates
 from shapespace.geometry.procrustes import Gauge, align_shapes, centroid_size
-from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.interop import MeshLike, as_meshes
 from shapespace.model.build_config import BuildConfig
 from shapespace.model.choose_modes import modes_notes, number_of_modes
-from shapespace.model.missing import CompletedShapes, ObservedMeshes, complete, missing_notes
+from shapespace.model.missing import CompletedShapes, ObservedMeshes, complete, missing_notes, pose_on_shared
 from shapespace.model.pca import Modes, PrincipalComponents, principal_components
 from shapespace.model.representation import Representation, Vertices, representation_named
 from shapespace.model.shape_model import ShapeModel, odd_size_notes
@@ -37,7 +36,7 @@ from shapespace.model.streamed import (
     streaming_note,
 )
 from shapespace.model.training_shapes import TrainingShapes
-from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity, SurfaceLandmarks, common_faces, require
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, SurfaceLandmarks, common_faces, require
 
 
 def build_model(
@@ -401,7 +400,9 @@ def fill_holes(shapes: FloatArray, faces: IntArray | None, names: Sequence[str])
             f"Vertex {nowhere[0]} is missing in every mesh, so nothing is known of it; take it out of all."
         )
     first = int(seen.sum(axis=1).argmax())
-    T_mean_shape = [_pose(shapes[i], shapes[first], seen[i] & seen[first], names[i]) for i in range(len(shapes))]
+    T_mean_shape = [
+        pose_on_shared(shapes[i], shapes[first], seen[i] & seen[first], names[i]) for i in range(len(shapes))
+    ]
     mean = np.zeros_like(shapes[0])
     for shape, there, T in zip(shapes, seen, T_mean_shape, strict=True):
         mean[there] += T.apply(shape[there])
@@ -410,7 +411,7 @@ def fill_holes(shapes: FloatArray, faces: IntArray | None, names: Sequence[str])
     for _ in range(_ROUNDS):
         previous, mean = mean, np.zeros_like(mean)
         for i, (shape, there) in enumerate(zip(shapes, seen, strict=True)):
-            T = _pose(shape, previous, there, names[i])
+            T = pose_on_shared(shape, previous, there, names[i])
             change = np.zeros_like(mean)
             change[there] = T.apply(shape[there]) - previous[there]
             if not there.all():
@@ -418,12 +419,3 @@ def fill_holes(shapes: FloatArray, faces: IntArray | None, names: Sequence[str])
                 change[~there] = moved[~there]
                 shape[~there] = T.inverse().apply(previous[~there] + moved[~there])
             mean += (previous + change) / len(shapes)
-
-
-def _pose(shape: FloatArray, mean: FloatArray, shared: BoolArray, name: str) -> Similarity:
-    try:
-        return fit_similarity(shape[shared], mean[shared])
-    except InputError as error:
-        raise InputError(
-            f"{name}: too little of it is there to be aligned with the other meshes; leave it out."
-        ) from error

@@ -8,10 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import eigh
 
 from shapespace.errors import InputError
-from shapespace.model.pca import Modes
+from shapespace.model.krylov import largest_eigenpairs
+from shapespace.model.pca import ALL_EQUAL, Modes, varying
 from shapespace.types import BoolArray, FloatArray, IntArray
 
 FEWEST_SHAPES = 4
@@ -19,9 +19,7 @@ FEWEST_SHAPES = 4
 MOST_SHAPES = 2000
 """Of more, so many are drawn: the choice takes the cube of their number, and its standard error is small by then."""
 _LEAST_NOISE = 1e-6  # share of the first variance per dimension, so that the likelihood of noise-free shapes is finite
-_NO_VARIANCE = 1e-10
-"""Of the first mode's, as in `pca`."""
-_ALL_EQUAL = 1e-24
+_NO_VARIATION = 1e-24
 """Of the variance of all shapes: what rounding leaves of shapes that are equal."""
 
 
@@ -180,9 +178,8 @@ def _errors_of_hidden(
 def _modes_as_sums(products: FloatArray, of_all: float) -> tuple[FloatArray, FloatArray]:
     """Return the variances (R,) and modes (N, R) of shapes with centred `products` (N, N), as sums of these shapes."""
     n = len(products)
-    if float(products.trace()) <= _ALL_EQUAL * of_all:
-        raise InputError("The training shapes are all equal, so there is no variation to model; give different ones.")
-    values, vectors = eigh(products, check_finite=False)
-    variance = np.asarray(values[::-1], dtype=np.float64) / (n - 1)
-    variance = variance[variance > _NO_VARIANCE * variance[0]][: n - 1]
-    return variance, np.asarray(vectors[:, ::-1][:, : len(variance)]) / np.sqrt(variance * (n - 1))
+    if float(products.trace()) <= _NO_VARIATION * of_all:
+        raise InputError(ALL_EQUAL)
+    values, vectors = largest_eigenpairs(products)
+    variance = varying(values / (n - 1))[: n - 1]
+    return variance, vectors[:, : len(variance)] / np.sqrt(variance * (n - 1))

@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.linalg import eigh
 
+from shapespace.model.krylov import largest_eigenpairs
 from shapespace.model.new_shapes import HeldOut
 from shapespace.types import FloatArray
 
@@ -42,8 +42,7 @@ def held_out_shapes(gram: FloatArray, groups: Sequence[str], modes: int, *, cent
             cross = cross - cross.mean(axis=1, keepdims=True) - row + inner.mean()
             inner = inner - row - row[:, None] + inner.mean()
         count = min(modes, len(own))
-        values, vectors = eigh(inner, subset_by_index=(len(own) - count, len(own) - 1), check_finite=False)
-        values, vectors = values[::-1], vectors[:, ::-1]
+        values, vectors = largest_eigenpairs(inner, count)
         retained = int((values > _NO_VARIANCE * max(values[0], 0.0)).sum())
         along = (cross @ (vectors[:, :retained] / np.sqrt(values[:retained]))) ** 2
         squares[:retained] += along.sum(axis=0)

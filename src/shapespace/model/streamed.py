@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import shutil
 import tempfile
 from collections.abc import Callable, Generator, Iterator
@@ -18,6 +19,7 @@ from typing import Any, Protocol, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
+from filelock import lock_descriptor
 
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.geometry.normals import without_estimates
@@ -37,9 +39,7 @@ from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_
 from shapespace.io.memory_cache import available_bytes
 from shapespace.model.build_config import BuildConfig
 from shapespace.model.choose_modes import drawn, number_of_modes
-from shapespace.model.krylov import KeptPasses
-from shapespace.model.large_pca import checked_large_modes, large_components
-from shapespace.model.pca import ALL_EQUAL, Modes, PrincipalComponents
+from shapespace.model.pca import ALL_EQUAL, Modes, PrincipalComponents, checked_large_modes, principal_components
 from shapespace.model.spurious import rounding_mm
 from shapespace.model.training_shapes import TrainingShapes
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, common_faces
@@ -186,31 +186,30 @@ class Aligned:
     Args:
         shapes: N rows of 3V numbers about `training.template`.
         training: the other data of the shapes; its folder and model are not yet set.
-        passes: where those of the PCA are kept; None keeps nothing.
+        passes: folder where those of the PCA are kept; None keeps nothing.
     """
 
     shapes: Spill
     training: KeptShapes
-    passes: KeptPasses | None
+    passes: Path | None
 
     def components(self, modes: Modes, seed: int, tell: Tell) -> PrincipalComponents:
         """Return mean and modes, as `principal_components` does of shapes in memory.
 
         Raises:
-            InputError: as `large_components`, or too few shapes to choose the number of modes.
+            InputError: as `principal_components`, or too few shapes to choose the number of modes.
         """
         if modes == "auto":
             tell("choosing the number of modes")
             modes = number_of_modes(modes, _sample(self.shapes, seed), seed)
-        pc = large_components(
+        pc = principal_components(
             self.shapes,
             modes,
             seed=seed,
             passes=self.passes,
             on_pass=lambda n, share: tell(f"finding the modes, pass {n} (residual {share:.0e} of the first)"),
         )
-        mean = pc.mean + self.training.template.reshape(-1)
-        return PrincipalComponents(mean, pc.basis, pc.variance, pc.total_variance, pc.n_samples, pc.residuals)
+        return replace(pc, mean=pc.mean + self.training.template.reshape(-1))
 
     def shape(self, index: int) -> FloatArray:
         """Return the vertices (V, 3), mm, of one aligned shape."""
@@ -304,8 +303,7 @@ def aligned_on_disk(
         path = folder / _SHAPES
         try:
             with work.aligned() as shapes:
-                passes = None if scratch is None else KeptPasses(folder)
-                yield Aligned(shapes, work.kept_shapes(), passes)
+                yield Aligned(shapes, work.kept_shapes(), None if scratch is None else folder)
         finally:
             path.unlink(missing_ok=True)
 
@@ -351,20 +349,15 @@ def _empty(folder: Path) -> None:
 @contextlib.contextmanager
 def _only_one(folder: Path) -> Generator[None]:
     """Hold the folder for this process; the system lets go of it whatever ends the process."""
-    try:
-        import fcntl
-    except ImportError:  # Windows refuses to remove open files, which does as well
+    if os.name == "nt":  # Windows refuses to remove open files, which does as well
         yield
         return
     with (folder / _LOCK).open("w") as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise FileError(
-                f"Another build is at work in {folder}; wait for it, or give another name for the model."
-            ) from error
-        except OSError:
-            pass  # a file system without locks
+        is_free = True
+        with contextlib.suppress(OSError):  # a file system without locks
+            is_free = lock_descriptor(stream.fileno(), blocking=False)
+        if not is_free:
+            raise FileError(f"Another build is at work in {folder}; wait for it, or give another name for the model.")
         yield
 
 
