@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from shapespace.batch.execution import ExecutionConfig
+from shapespace.batch.executors import ExecutionConfig
 from shapespace.batch.fit_records import read_record
 from shapespace.batch.run import BatchConfig, fit_many, make_jobs
 from shapespace.batch.sinks import FolderSink

@@ -34,7 +34,7 @@ LAZY_FUNCTIONS: Mapping[str, str] = MappingProxyType(
         "plot_model": "report.notebook.notebook_fits",
         "plot_quality": "report.notebook.notebook_fits",
         "save_analysis": "report.analyses.result_tables",
-        "save_fit": "batch.save",
+        "save_fit": "batch.fit_work",
         "to_menpo": "io.interop",
         "to_meshio": "io.interop",
         "to_open3d": "io.interop",

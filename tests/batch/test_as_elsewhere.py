@@ -24,7 +24,6 @@ POSIX_ONLY = {
     ("datasets/fetch.py", "fcntl"): "elsewhere msvcrt",
     ("io/sandbox_child.py", "resource"): "elsewhere its parent ends it when it is late",
     ("io/files.py", "kill"): "on Windows nothing is asked, and files are left for an hour",
-    ("model/streamed.py", "fcntl"): "Windows refuses to remove open files",
     ("viewer/fitting.py", "nice"): "elsewhere the process keeps its place",
 }
 """Each use of what Windows lacks, with what happens there."""

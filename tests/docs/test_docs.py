@@ -188,7 +188,7 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     # The meshes need not be split for so many, which takes four times as long as all the rest of a scan.
     monkeypatch.setattr("shapespace.datasets.simulated_scan.PLAIN_TRIANGLES", 16_000)
     # Workers that start for three scans take longer than the scans; what they do is tested in tests/batch.
-    monkeypatch.setattr("shapespace.batch.execution.cores", lambda: 1)
+    monkeypatch.setattr("shapespace.batch.executors.cores", lambda: 1)
     for name in ("SHAPESPACE_DATA", "SHAPESPACE_DATA_URL"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("SHAPESPACE_CACHE", str(tmp_path / "cache"))

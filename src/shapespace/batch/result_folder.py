@@ -1,4 +1,4 @@
-"""A folder of results: names of the results of scans, and the table of all records."""
+"""A folder of results: names of the results of scans, the table of all records, and one run at a time that writes."""
 
 from __future__ import annotations
 
@@ -6,20 +6,76 @@ import contextlib
 import hashlib
 import os
 from collections import Counter
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Container, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
 import msgspec
+from filelock import lock_descriptor
 
 from shapespace.batch.fit_records import Source, coefficient_row, read_record, write_coefficients
 from shapespace.errors import FileError, ShapespaceError
 from shapespace.io.containers.json_files import LARGEST_BYTES, check_file
-from shapespace.io.files import sha256_of_file
+from shapespace.io.files import sha256_of_file, sweep, write_error
 from shapespace.io.meshes.mesh_io import stem_of
 from shapespace.schemas import FIT_AGAIN, File, FitRecord
 from shapespace.store.results import results_at
+
+LOCK = ".shapespace.lock"
+"""Is there while a run writes: the system holds the lock, and lets go of it whatever ends the process."""
+
+
+@contextlib.contextmanager
+def only_writer(folder: Path) -> Generator[None]:
+    """Keep other runs from writing into `folder` during the block, and remove what killed ones left half written.
+
+    Raises:
+        FileError: another run writes into it, or it cannot be written.
+    """
+    path = folder / LOCK
+    try:
+        descriptor = _locked(path)
+    except OSError as error:
+        raise write_error(path, error) from error
+    try:
+        sweep(folder)
+        yield
+    finally:
+        sweep(folder)
+        # While it is held; Windows alone removes no file that is open.
+        if os.name == "nt":
+            os.close(descriptor)
+        with contextlib.suppress(OSError):
+            path.unlink()
+        if os.name != "nt":
+            os.close(descriptor)
+
+
+def _locked(path: Path) -> int:
+    while True:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            if not lock_descriptor(descriptor, blocking=False):
+                raise FileError(
+                    f"{path.parent} is being written by another run of shapespace; wait for its end, or give another "
+                    "folder."
+                )
+            if _is_open_as(path, descriptor):
+                return descriptor
+        except BaseException:
+            os.close(descriptor)
+            raise
+        os.close(descriptor)
+
+
+def _is_open_as(path: Path, descriptor: int) -> bool:
+    """Return whether `path` is still the file that is open, and not removed by the run that held it."""
+    try:
+        return os.path.samestat(path.stat(), os.fstat(descriptor))
+    except FileNotFoundError:
+        return False
+
 
 COEFFICIENTS = "coefficients.csv"
 RECORD = ".fit.json"

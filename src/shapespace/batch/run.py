@@ -9,8 +9,7 @@ from pathlib import Path
 
 from shapespace.batch.executors import Executor, Serial
 from shapespace.batch.fit_work import FitTask, FitWork, Job
-from shapespace.batch.lock import only_writer
-from shapespace.batch.result_folder import names_for
+from shapespace.batch.result_folder import names_for, only_writer
 from shapespace.batch.sinks import Sink
 from shapespace.fit.fit_scan import FitConfig
 from shapespace.fit.iteration_state import IcpState

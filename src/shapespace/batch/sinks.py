@@ -14,12 +14,11 @@ from typing import TypeAlias
 
 from msgspec import structs
 
-from shapespace.batch.fit_records import fit_identity, write_record
-from shapespace.batch.fit_work import FitTask, Job, has_surface, is_same_scan, resumed
+from shapespace.batch.fit_records import write_record
+from shapespace.batch.fit_work import FitTask, Job, has_surface, is_fit_of, resumed
 from shapespace.batch.result_folder import RECORD, CoefficientTable
 from shapespace.batch.store import Store
 from shapespace.errors import FileError
-from shapespace.io.files import sha256_of_file
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import File, FitRecord
 from shapespace.store.results import Results
@@ -174,14 +173,14 @@ class StoreSink:
 
     def _is_valid(self, stored: _Stored, task: FitTask) -> bool:
         """Return whether a stored fit has what the task asks for, or more: a dense surface, or stages."""
-        (record, staged), config, job = stored, task.config, task.job
-        if not record.is_fitted or not record.id or (task.stages and not staged):
+        record, staged = stored
+        if not record.is_fitted or (task.stages and not staged):
             return False
-        configs = [config] if config.dense else [config, replace(config, dense=True)]
         try:
-            marks, scan_hash = sha256_of_file(job.landmarks) if job.landmarks else "", record.scan.hash
-            identities = {fit_identity(scan_hash, self._model_hash, one.as_dict(), marks) for one in configs}
-            return record.id in identities and is_same_scan(record.scan, job, self.folder)
+            return any(
+                is_fit_of(record.id, record.scan, task, self._model_hash, self.folder, dense=dense)
+                for dense in {task.config.dense, True}
+            )
         except FileError:
             return False  # the fit reports it
 

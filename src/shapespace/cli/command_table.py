@@ -18,7 +18,7 @@ from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS, ShapeTest
 COHORT = Source("cohort.read", "CohortConfig")
 ALIGN = Source("geometry.landmark_alignment", "AlignConfig")
 ALIGN_FILES = Source("commands.align", "align")
-EXECUTION = Source("batch.execution", "ExecutionConfig")
+EXECUTION = Source("batch.executors", "ExecutionConfig")
 CORRESPOND = Source("correspondence.settings", "CorrespondConfig")
 CHANGE_CORRESPONDENCE = Source("commands.correspond_changes", "Change")
 BUILD = Source("model.build_config", "BuildConfig")

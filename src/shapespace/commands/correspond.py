@@ -13,12 +13,11 @@ from typing import TypeAlias
 import numpy as np
 from msgspec import structs
 
-from shapespace.batch.execution import ExecutionConfig
+from shapespace.batch.executors import ExecutionConfig
 from shapespace.batch.fit_work import Job
-from shapespace.batch.lock import only_writer
 from shapespace.batch.parallel_rounds import RoundRunner
 from shapespace.batch.progress import progress, telling_of_compiling, waiting
-from shapespace.batch.result_folder import names_for
+from shapespace.batch.result_folder import names_for, only_writer
 from shapespace.commands.inputs import LandmarkFiles, given_scans, with_ids
 from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
 from shapespace.correspondence.first_template import first_template, usable_scan

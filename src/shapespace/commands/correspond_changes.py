@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from msgspec import structs
 
-from shapespace.batch.execution import ExecutionConfig
+from shapespace.batch.executors import ExecutionConfig
 from shapespace.batch.fit_work import Job
-from shapespace.batch.lock import only_writer
+from shapespace.batch.result_folder import only_writer
 from shapespace.commands.correspond import (
     CHANGE_FOLDER,
     CorrespondFiles,
@@ -50,8 +50,7 @@ from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.io.remote import is_address
 from shapespace.reprs import first_names
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, SurfaceReview, read, to_json
-from shapespace.store.corresponding import LANDMARKS, MEAN, SUMMARY, SURFACE
-from shapespace.store.review_text import describe_review, review_summary
+from shapespace.store.corresponding import LANDMARKS, MEAN, SUMMARY, SURFACE, describe_review, review_summary
 from shapespace.types import Mesh, SurfaceLandmarks
 
 _OPTIONS = {

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from shapespace.batch.execution import ExecutionConfig
-from shapespace.batch.executors import Serial
+from shapespace.batch.executors import ExecutionConfig, Serial
 from shapespace.batch.fit_records import Source
 from shapespace.batch.fit_work import Job
 from shapespace.batch.progress import progress, telling_of_compiling

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from msgspec import structs
 
-from shapespace.batch.execution import ExecutionConfig
-from shapespace.batch.fit_work import naming
+from shapespace.batch.executors import ExecutionConfig
 from shapespace.batch.progress import progress, steps, waiting
 from shapespace.batch.quality_work import QualityRunner
+from shapespace.commands.inputs import SurfacesOnDisk
 from shapespace.commands.outcome import Outcome
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.procrustes import Gauge
@@ -25,8 +25,7 @@ from shapespace.model.model_quality import Curve, ModelQuality, QualityConfig, R
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import BySize, Measured, Quality, json_text, to_json
-from shapespace.store.corresponding import SURFACE, surface_files, surface_stem
-from shapespace.store.review_text import review_summary
+from shapespace.store.corresponding import SURFACE, review_summary, surface_files, surface_stem
 from shapespace.types import Mesh
 
 _SURFACES = (".dense.ply", ".fitted.ply", SURFACE)
@@ -213,18 +212,8 @@ def _meshes(
                 notes.append(f"{folder}: of {len(files)} meshes the {len(surfaces)} that end in {ending} are taken.")
             files = surfaces
             break
-    out: list[Mesh] = []
-    with progress(len(files), "reading", "mesh", quiet=quiet) as bar:
-        for file in files:
-            try:
-                mesh = listed.mesh(file)
-            except MeshError as error:
-                raise MeshError(naming(file, str(error))) from error
-            if not len(mesh.vertices):
-                raise MeshError(f"{file}: it has no vertices; leave it out.")
-            out.append(replace(mesh, name=file.name))
-            bar.update()
-    return out, {surface_stem(file): ratio for file, ratio in listed.unit_ratios.items()}
+    meshes = SurfacesOnDisk(files, listed).read(quiet=quiet)
+    return meshes, {surface_stem(file): ratio for file, ratio in listed.unit_ratios.items()}
 
 
 def _scans(target: _Target, folder: Path | None, *, quiet: bool) -> list[Mesh] | None:

@@ -29,10 +29,9 @@ from shapespace.lazy import lazy_import
 from shapespace.model import model_file
 from shapespace.model.choose_modes import modes_notes
 from shapespace.model.foreign import Foreign, is_foreign, load_foreign, parted
-from shapespace.model.held_out import held_out_shapes
 from shapespace.model.krylov import largest_eigenpairs
 from shapespace.model.local_modes import local_modes
-from shapespace.model.new_shapes import HeldOut, variances_of_new_shapes
+from shapespace.model.new_shapes import HeldOut, held_out_shapes, variances_of_new_shapes
 from shapespace.model.pca import modes_for_variance, plain_modes, principal_components, varying
 from shapespace.model.shape_model import ShapeModel, odd_size_notes
 from shapespace.reprs import short_repr

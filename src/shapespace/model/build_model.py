@@ -19,12 +19,11 @@ from shapespace.geometry.normals import without_estimates
 from shapespace.geometry.procrustes import Gauge, align_shapes, centroid_size
 from shapespace.io.interop import MeshLike, as_meshes
 from shapespace.model.build_config import BuildConfig
-from shapespace.model.choose_modes import modes_notes, number_of_modes
+from shapespace.model.choose_modes import below_precision, made_by_alignment, modes_notes, number_of_modes, rounding_mm
 from shapespace.model.missing import CompletedShapes, ObservedMeshes, complete, missing_notes, pose_on_shared
 from shapespace.model.pca import Modes, PrincipalComponents, principal_components
 from shapespace.model.representation import Representation, Vertices, representation_named
 from shapespace.model.shape_model import ShapeModel, odd_size_notes
-from shapespace.model.spurious import below_precision, made_by_alignment, rounding_mm
 from shapespace.model.streamed import (
     Aligned,
     KeptShapes,

@@ -38,9 +38,8 @@ from shapespace.io.containers.row_spill import Spill
 from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_error, write_text
 from shapespace.io.memory_cache import available_bytes
 from shapespace.model.build_config import BuildConfig
-from shapespace.model.choose_modes import drawn, number_of_modes
+from shapespace.model.choose_modes import drawn, number_of_modes, rounding_mm
 from shapespace.model.pca import ALL_EQUAL, Modes, PrincipalComponents, checked_large_modes, principal_components
-from shapespace.model.spurious import rounding_mm
 from shapespace.model.training_shapes import TrainingShapes
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, common_faces
 

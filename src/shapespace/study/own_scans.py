@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.batch.execution import ExecutionConfig
+from shapespace.batch.executors import ExecutionConfig
 from shapespace.batch.fit_work import Job
 from shapespace.batch.progress import progress
 from shapespace.batch.run import BatchConfig, fit_many, make_jobs
