@@ -55,11 +55,9 @@ class Work(Protocol[TaskT, AnswerT]):
         Raises:
             ShapespaceError: an error that would stop every other task too, such as a full disk.
         """
-        ...
 
     def give_up(self, task: TaskT, reason: str, /) -> AnswerT:
         """Return the answer for a task that could not be done; `do` in the same run then returns it too."""
-        ...
 
 
 class Executor(Protocol):
@@ -72,7 +70,6 @@ class Executor(Protocol):
             FitError: no workers are left, or none can start.
             ShapespaceError: raised by `work`.
         """
-        ...
 
 
 @dataclass(frozen=True)

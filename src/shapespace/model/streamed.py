@@ -301,8 +301,8 @@ def aligned_on_disk(
             checked_large_modes(modes, work.count, work.first.vertices.size)
         path = folder / _SHAPES
         try:
-            with work.aligned() as shapes:
-                yield Aligned(shapes, work.kept_shapes(), None if scratch is None else folder)
+            with work.aligned() as (shapes, training):
+                yield Aligned(shapes, training, None if scratch is None else folder)
         finally:
             path.unlink(missing_ok=True)
 
@@ -377,46 +377,27 @@ class _Work:
             raise InputError(
                 f"A shape model needs at least two meshes, not {len(meshes)}; with one there is nothing that varies."
             )
-        self.folder, self.meshes, self.align, self.onto, self.tell = folder, meshes, align, onto, tell
-        self.gauge: Gauge = gauge
-        self.alignment_vertices = alignment_vertices
+        self.folder, self.meshes, self.onto, self.tell = folder, meshes, onto, tell
         self.before = 0 if onto is None else len(onto.sizes)
         self.count = self.before + len(meshes)
         self.first = meshes[0] if onto is None else Mesh(onto.template, onto.faces, name="the model")
-        self.chosen = check_alignment(gauge, alignment_vertices, len(self.first.vertices))
-        self.template: FloatArray = np.empty((0, 3))
-        self.sizes: FloatArray = np.empty(0)
-
-    def kept_shapes(self) -> KeptShapes:
-        if self.onto is not None:
-            reference, rounding = self.onto.reference, self.onto.rounding
-        else:
-            reference, rounding = self.first.vertices, rounding_mm(self.first.vertices)
-        return KeptShapes(
-            folder=self.folder,
-            model_hash="",
-            digest="",
-            faces=self.first.faces,
-            template=self.template,
-            reference=reference,
-            sizes=self.sizes,
-            gauge=self.gauge,
-            align=self.align,
-            alignment_vertices=self.alignment_vertices,
-            rounding=rounding,
-        )
+        x = self.first.vertices
+        self.training = onto or KeptShapes(
+            folder, "", "", self.first.faces, template=np.empty((0, 3)), reference=x, sizes=np.empty(0), gauge=gauge,
+            align=align, alignment_vertices=alignment_vertices, rounding=rounding_mm(x),
+        )  # fmt: skip
+        self.chosen = check_alignment(gauge, alignment_vertices, len(x))
 
     @contextlib.contextmanager
-    def aligned(self) -> Generator[Spill]:
-        """Yield the file of aligned shapes: as a build that was killed left it, or made anew."""
+    def aligned(self) -> Generator[tuple[Spill, KeptShapes]]:
+        """Yield the file of aligned shapes, and what is known of them: as a build that was killed left it, or made anew."""
         path, start, done = (self.folder / name for name in (_SHAPES, _START, _ALIGNED))
         poses = read_arrays(self.folder / _POSES)
         complete = path.is_file() and path.stat().st_size == 4 * self.count * self.first.vertices.size
         near = read_arrays(start) if complete else None
         if complete and done.is_file() and poses is not None:
-            self.template, self.sizes = poses["template"], poses["sizes"]
-            with Spill(path, self.count, self.template.size, new=False) as shapes:
-                yield shapes
+            with Spill(path, self.count, self.first.vertices.size, new=False) as shapes:
+                yield shapes, self._about(poses)
             return
         remove_file(done)
         with Spill(path, self.count, self.first.vertices.size, new=near is None) as shapes:
@@ -428,18 +409,25 @@ class _Work:
             if poses is None:
                 poses = self._posed(shapes, near)
                 write_arrays(self.folder / _POSES, poses)
-            self.template, self.sizes = poses["template"], poses["sizes"]
             # From here on the file is neither as read nor aligned, until it is.
             remove_file(start)
-            self._move(shapes, near["template"], Poses(poses["linear"], poses["offset"]))
+            self._move(shapes, near["template"], poses)
             shapes.to_disk()
             write_text(done, "")
-            yield shapes
+            yield shapes, self._about(poses)
+
+    def _about(self, poses: dict[str, npt.NDArray[Any]]) -> KeptShapes:
+        return replace(
+            self.training, folder=self.folder, model_hash="", digest="", template=poses["template"],
+            sizes=poses["sizes"],
+        )  # fmt: skip
 
     def _read(self, shapes: Spill) -> dict[str, npt.NDArray[Any]]:
         """Fill the file with shapes in poses near the template's, and return what is known of them."""
         if self.onto is None:
-            template = self.first.vertices - (self.first.vertices[self.chosen].mean(axis=0) if self.align else 0.0)
+            template = self.first.vertices - (
+                self.first.vertices[self.chosen].mean(axis=0) if self.training.align else 0.0
+            )
         else:
             template = self.onto.template
         sizes, posed, bounds = np.empty(self.count), np.empty(self.count), list[FloatArray]()
@@ -449,8 +437,8 @@ class _Work:
             if index >= self.before:
                 low, high = bounds or (vertices, vertices)
                 bounds[:] = np.minimum(low, vertices), np.maximum(high, vertices)
-                if self.align:
-                    with_scale = self.gauge == "shape"
+                if self.training.align:
+                    with_scale = self.training.gauge == "shape"
                     T = fit_similarity(vertices[self.chosen], template[self.chosen], with_scale=with_scale)
                     vertices = T.apply(vertices)
             posed[index] = centroid_size(vertices[self.chosen])
@@ -484,7 +472,7 @@ class _Work:
             mesh = without_estimates(self.meshes[index - self.before])
             common_faces((self.first, mesh))
             _refuse_holes(mesh)
-            if self.align:
+            if self.training.align:
                 refuse_without_extent(mesh.vertices, mesh.name)
             yield index, mesh.vertices
 
@@ -492,18 +480,18 @@ class _Work:
         """Return the poses of the shapes in the file, and their mean."""
         template: FloatArray = near["template"]
         poses = Poses(np.broadcast_to(np.eye(3), (self.count, 3, 3)).copy(), np.zeros((self.count, 3)))
-        if self.align:
+        if self.training.align:
             source = Streamed(shapes.row_blocks, self.count, template, near["posed"])
             alignment, poses = align_streamed(
                 source,
-                self.gauge,
+                self.training.gauge,
                 size=float(near["sizes"].mean()),
-                reference=self.first.vertices if self.onto is None else self.onto.reference,
-                alignment_vertices=self.alignment_vertices,
+                reference=self.training.reference,
+                alignment_vertices=self.training.alignment_vertices,
                 on_iteration=lambda n, moved: self.tell(f"aligning, round {n} (the mean moved by {moved:.1e} mm)"),
             )
             mean = alignment.mean
-            if self.gauge == "shape" and self.alignment_vertices is None:
+            if self.training.gauge == "shape" and self.training.alignment_vertices is None:
                 self.tell("scaling to the tangent")
                 mean = scale_to_tangent_streamed(source, mean, poses)
         else:
@@ -513,11 +501,12 @@ class _Work:
             mean = template + summed.reshape(-1, 3) / self.count
         return {"template": mean, "sizes": near["sizes"], "linear": poses.linear, "offset": poses.offset}
 
-    def _move(self, shapes: Spill, template: FloatArray, poses: Poses) -> None:
-        """Turn differences from `template` in the file into those of the posed shapes from their mean."""
+    def _move(self, shapes: Spill, near: FloatArray, poses: dict[str, npt.NDArray[Any]]) -> None:
+        """Turn differences from the template `near` in the file into those of the posed shapes from their mean."""
+        T = Poses(poses["linear"], poses["offset"])
         for start, block in shapes.row_blocks():
-            vertices = block.reshape(len(block), -1, 3) + template
-            shapes.write_rows(start, (poses.apply(start, vertices) - self.template).reshape(len(block), -1))
+            vertices = block.reshape(len(block), -1, 3) + near
+            shapes.write_rows(start, (T.apply(start, vertices) - poses["template"]).reshape(len(block), -1))
 
 
 def refuse_without_extent(vertices: FloatArray, name: str) -> None:
