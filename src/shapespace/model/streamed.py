@@ -384,13 +384,13 @@ class _Work:
         x = self.first.vertices
         self.training = onto or KeptShapes(
             folder, "", "", self.first.faces, template=np.empty((0, 3)), reference=x, sizes=np.empty(0), gauge=gauge,
-            align=align, alignment_vertices=alignment_vertices, rounding=rounding_mm(x),
+            align=align, alignment_vertices=alignment_vertices, rounding=rounding_mm(np.nan_to_num(x, posinf=0.0, neginf=0.0)),
         )  # fmt: skip
         self.chosen = check_alignment(gauge, alignment_vertices, len(x))
 
     @contextlib.contextmanager
     def aligned(self) -> Generator[tuple[Spill, KeptShapes]]:
-        """Yield the file of aligned shapes, and what is known of them: as a build that was killed left it, or made anew."""
+        """Yield the file of aligned shapes, and the data of the shapes: as a killed build left it, or made anew."""
         path, start, done = (self.folder / name for name in (_SHAPES, _START, _ALIGNED))
         poses = read_arrays(self.folder / _POSES)
         complete = path.is_file() and path.stat().st_size == 4 * self.count * self.first.vertices.size
