@@ -27,6 +27,7 @@ from shapespace.io.memory_cache import LatestValue
 
 T = TypeVar("T")
 R = TypeVar("R")
+S = TypeVar("S")
 TaskT = TypeVar("TaskT", contravariant=True)
 AnswerT = TypeVar("AnswerT", covariant=True)
 
@@ -55,9 +56,11 @@ class Work(Protocol[TaskT, AnswerT]):
         Raises:
             ShapespaceError: an error that would stop every other task too, such as a full disk.
         """
+        ...
 
     def give_up(self, task: TaskT, reason: str, /) -> AnswerT:
         """Return the answer for a task that could not be done; `do` in the same run then returns it too."""
+        ...
 
 
 class Executor(Protocol):
@@ -70,6 +73,7 @@ class Executor(Protocol):
             FitError: no workers are left, or none can start.
             ShapespaceError: raised by `work`.
         """
+        ...
 
 
 @dataclass(frozen=True)
@@ -123,7 +127,7 @@ class Shared(Generic[T]):
 
     @staticmethod
     @contextmanager
-    def by(executor: Executor, value: T, folder: Path) -> Generator[Shared[T]]:
+    def by(executor: Executor, value: S, folder: Path) -> Generator[Shared[S]]:
         """Yield a dataclass `value` as the tasks of an executor share it, during the block.
 
         Args:
@@ -135,7 +139,7 @@ class Shared(Generic[T]):
             FileError: it cannot be written.
         """
         with temporary_folder(make_folder(folder)) as temporary:
-            shared = Shared[T](temporary / "shared.pickle")
+            shared = Shared[S](temporary / "shared.pickle")
             if not isinstance(executor, Serial):
                 write_bytes(shared.file, pickle.dumps(replace(cast(Any, value))))  # without what it has cached
             _latest.set(shared.file, value)

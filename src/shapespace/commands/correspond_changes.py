@@ -15,24 +15,20 @@ from msgspec import structs
 
 from shapespace.batch.executors import ExecutionConfig
 from shapespace.batch.fit_work import Job
-from shapespace.batch.result_folder import only_writer
 from shapespace.commands.correspond import (
     CHANGE_FOLDER,
+    CorrespondenceFolder,
     CorrespondFiles,
     RoundsWithProgress,
     Say,
     ScansRead,
     bring,
-    complete_change,
     content_hash_of,
     correspond_files,
     correspond_groups,
     find_jobs,
     inputs_hash_of,
-    publish,
-    read_finished,
     read_scans,
-    results_hash_of,
     with_scans,
 )
 from shapespace.commands.inputs import Given, LandmarkFiles
@@ -92,28 +88,28 @@ class _Finished:
     """A finished correspondence in a folder.
 
     Args:
-        folder: with its files.
+        results: the folder.
         summary: of the run.
         records: of all scans by name, those in correspondence first.
         mean: its mean shape.
         surfaces: of the scans in correspondence, by name; those of mirrored scans are reflected.
     """
 
-    folder: Path
+    results: CorrespondenceFolder
     summary: CorrespondenceRecord
     records: dict[str, CorrespondRecord]
     mean: Mesh
     surfaces: dict[str, Mesh]
 
     @staticmethod
-    def of(folder: Path) -> _Finished:
-        """Read all files of the correspondence in `folder`.
+    def of(results: CorrespondenceFolder) -> _Finished:
+        """Read all files of a correspondence.
 
         Raises:
             InputError: its files do not belong together.
             FileError, FileFormatError: a file cannot be read, or is damaged.
         """
-        summary, records = read_finished(folder)
+        folder, (summary, records) = results.path, results.read()
         mean = read_mesh(folder / MEAN)
         files = {name: read_mesh(folder / f"{name}{SURFACE}") for name in summary.corresponding}
         surfaces = {name: mirror_image(one) if name in summary.mirrored else one for name, one in files.items()}
@@ -122,11 +118,11 @@ class _Finished:
             fault = f"{MEAN} has {len(mean.vertices)} vertices, and the correspondence {summary.vertices}"
         elif other := [name for name, one in surfaces.items() if not np.array_equal(faces_of(one), faces_of(mean))]:
             fault = f"{other[0]}{SURFACE} and {MEAN} have different triangles, so one of them was changed"
-        elif summary.results_hash not in ("", results_hash_of(summary, folder)):
+        elif summary.results_hash not in ("", results.hash_of(summary)):
             fault = "its files were changed after the correspondence"
         if fault:
             raise InputError(f"{folder}: {fault}; {CORRESPOND_AGAIN}.")
-        return _Finished(folder, summary, records, mean, surfaces)
+        return _Finished(results, summary, records, mean, surfaces)
 
     def config(self, files: CorrespondFiles, asked: CorrespondConfig) -> CorrespondConfig:
         """Return the settings of the correspondence, which `asked` must not contradict.
@@ -134,10 +130,10 @@ class _Finished:
         Raises:
             InputError: options ask for something else.
         """
-        config = read(CorrespondConfig, self.summary.settings, str(self.folder / SUMMARY), CORRESPOND_AGAIN)
+        config = read(CorrespondConfig, self.summary.settings, str(self.results.path / SUMMARY), CORRESPOND_AGAIN)
         if self.summary.settings.get("symmetric"):
             raise InputError(
-                f"{self.folder} was computed with the setting symmetric, which was removed; {CORRESPOND_AGAIN}."
+                f"{self.results.path} was computed with the setting symmetric, which was removed; {CORRESPOND_AGAIN}."
             )
         for option, file in (("--template", files.template), ("--model", files.model)):
             if file is not None:
@@ -147,7 +143,9 @@ class _Finished:
             own = getattr(config, name)
             if getattr(asked, name) not in (own, getattr(usual, name)):
                 value = f"without {option}" if own is False else f"with {option} {own}"
-                raise InputError(f"{self.folder} was computed {value}, and a change keeps that; leave {option} out.")
+                raise InputError(
+                    f"{self.results.path} was computed {value}, and a change keeps that; leave {option} out."
+                )
         return config
 
     def refuse_unknown(self, names: Sequence[str], option: str) -> None:
@@ -155,7 +153,7 @@ class _Finished:
         for name in names:
             if name not in self.records:
                 known = first_names(list(self.records), _LISTED)
-                raise InputError(f"{option} {name}: {self.folder} has no scan of that name; it has {known}.")
+                raise InputError(f"{option} {name}: {self.results.path} has no scan of that name; it has {known}.")
 
     def job(self, name: str) -> Job:
         """Return the job of a scan, from where it was."""
@@ -163,7 +161,7 @@ class _Finished:
         known = {key: str(value) for key, value in record.metadata.items() if value is not None}
         if is_address(record.path):
             return Job(name, Given(record.path).path, metadata=known, address=record.path)
-        return Job(name, Path(os.path.normpath(self.folder / record.path)), metadata=known)
+        return Job(name, Path(os.path.normpath(self.results.path / record.path)), metadata=known)
 
 
 def change_correspondence(
@@ -182,16 +180,16 @@ def change_correspondence(
             f"{folder} contains no finished correspondence, and {change.option} needs one; run shapespace correspond "
             f"without {change.option} first."
         )
-    with only_writer(folder):
-        complete_change(folder)
-        finished = _Finished.of(folder)
+    results = CorrespondenceFolder(folder)
+    with results.writing():
+        finished = _Finished.of(results)
         return _changed(finished, change, files, finished.config(files, config), quiet=quiet, say=say)
 
 
 def _changed(
     finished: _Finished, change: Change, files: CorrespondFiles, config: CorrespondConfig, *, quiet: bool, say: Say
 ) -> tuple[CorrespondenceRecord, list[CorrespondRecord]]:
-    folder, summary = finished.folder, finished.summary
+    folder, summary = finished.results.path, finished.summary
     marks = LandmarkFiles.of(files.landmarks)
     for record in finished.records.values():
         marks.of_scan(Path(record.path))  # so that it is not said to belong to no scan
@@ -222,7 +220,7 @@ def _changed(
     def make(rounds: RoundsWithProgress) -> Correspondence:
         return _registered(finished, kept, read, marks, replace(config, outer=False), rounds, update=change.update)
 
-    made, records = bring(jobs, read, marks, files, folder, make, quiet=quiet, say=say)
+    made, records = bring(jobs, read, marks, files, finished.results, make, quiet=quiet, say=say)
     every = {name: record for name, record in finished.records.items() if name not in change.remove}
     every |= {record.name: record for record in records}
     summary = structs.replace(_summary(finished, change, records, every), inputs_hash=inputs_hash)
@@ -233,7 +231,7 @@ def _changed(
         count = len(set(change.remove)) or sum(not record.reason for record in records)
         were = "scan was" if count == 1 else "scans were"
         say(f"{count} {were} {done} {folder}; the other {len(kept)} are unchanged.")
-    summary = publish(made, records, summary, folder, with_mean=change.update)
+    summary = finished.results.publish(made, records, summary, with_mean=change.update)
     return summary, list(every.values())
 
 
@@ -261,8 +259,8 @@ def _not_there(finished: _Finished, given: Sequence[Job]) -> list[Job]:
         record = finished.records.get(job.name)
         if record is not None and record.hash and record.hash != content_hash_of(job):
             raise InputError(
-                f"{job.label} differs from the scan {job.name} in {finished.folder}; register it again with --redo "
-                f"{job.name}, or rename its file."
+                f"{job.label} differs from the scan {job.name} in {finished.results.path}; register it again with "
+                f"--redo {job.name}, or rename its file."
             )
     return [job for job in given if job.name not in finished.records]
 
@@ -306,7 +304,7 @@ def _registered(
         return Correspondence(finished.mean, (), "", ())
     added = [scan for name, scan in read.scans.items() if not update or name not in kept]
     raw = [read.scans[name] for name in kept] if update else []
-    file = finished.folder / LANDMARKS
+    file = finished.results.path / LANDMARKS
     landmarks = read_surface_landmarks(file) if file.is_file() else SurfaceLandmarks()
     surfaces = [replace(finished.surfaces[name], name=name) for name in kept]
     if not landmarks and not raw:  # the landmarks of scans that stay determine where the mean has them

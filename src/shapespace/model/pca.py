@@ -51,9 +51,11 @@ class Table(Protocol):
 
     def row_blocks(self) -> Iterator[tuple[int, FloatArray]]:
         """Yield the number of the first row, and rows, of the whole table in order."""
+        ...
 
     def column_blocks(self) -> Iterator[FloatArray]:
         """Yield copies of some columns, of the whole table in order."""
+        ...
 
 
 class _InMemory:

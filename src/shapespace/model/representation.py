@@ -30,6 +30,7 @@ class Representation(Protocol):
         Raises:
             InputError: they cannot be.
         """
+        ...
 
     @classmethod
     def of(cls, template: Mesh, control_points: tuple[int, int] | None) -> Representation:
@@ -42,6 +43,7 @@ class Representation(Protocol):
         Raises:
             InputError: this representation cannot be had of such surfaces.
         """
+        ...
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]]) -> Representation:
@@ -50,18 +52,23 @@ class Representation(Protocol):
         Raises:
             InputError: they do not belong together.
         """
+        ...
 
     def arrays(self) -> Mapping[str, npt.NDArray[Any]]:
         """Return what a model file keeps of it, by the names of the datasets."""
+        ...
 
     def encode(self, vertices: FloatArray) -> FloatArray:
         """Return (..., D) from vertices (..., V, 3), mm."""
+        ...
 
     def decode(self, vector: FloatArray) -> FloatArray:
         """Return vertices (..., V, 3) from (..., D), mm."""
+        ...
 
     def directions(self, basis: FloatArray) -> FloatArray:
         """Return (3V, K): how the vertices move along each column of `basis` (D, K)."""
+        ...
 
 
 class Vertices:

@@ -382,9 +382,10 @@ class _Work:
         self.count = self.before + len(meshes)
         self.first = meshes[0] if onto is None else Mesh(onto.template, onto.faces, name="the model")
         x = self.first.vertices
+        rounding = rounding_mm(np.nan_to_num(x, posinf=0.0, neginf=0.0))
         self.training = onto or KeptShapes(
             folder, "", "", self.first.faces, template=np.empty((0, 3)), reference=x, sizes=np.empty(0), gauge=gauge,
-            align=align, alignment_vertices=alignment_vertices, rounding=rounding_mm(np.nan_to_num(x, posinf=0.0, neginf=0.0)),
+            align=align, alignment_vertices=alignment_vertices, rounding=rounding,
         )  # fmt: skip
         self.chosen = check_alignment(gauge, alignment_vertices, len(x))
 
@@ -425,9 +426,8 @@ class _Work:
     def _read(self, shapes: Spill) -> dict[str, npt.NDArray[Any]]:
         """Fill the file with shapes in poses near the template's, and return what is known of them."""
         if self.onto is None:
-            template = self.first.vertices - (
-                self.first.vertices[self.chosen].mean(axis=0) if self.training.align else 0.0
-            )
+            x = self.first.vertices
+            template = x - x[self.chosen].mean(axis=0) if self.training.align else x
         else:
             template = self.onto.template
         sizes, posed, bounds = np.empty(self.count), np.empty(self.count), list[FloatArray]()
