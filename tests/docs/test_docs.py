@@ -556,13 +556,14 @@ def test_the_reference_has_every_option_of_the_parser_and_no_other(command: Comm
 
 
 def test_the_reference_lists_every_key_of_a_fit_record() -> None:
-    from shapespace.batch.fit_records import Source, fit_record
+    from shapespace.batch.fit_records import fit_record
     from shapespace.fit.fit_scan import fit_scan
+    from shapespace.schemas import File
     from synthetic_shapes import blob_model, raw_scan
 
     model = blob_model()
     record = fit_record(
-        fit_scan(model, raw_scan(0.5 * model.stddev / model.stddev).scan), Source("a", ""), Source("b", "")
+        fit_scan(model, raw_scan(0.5 * model.stddev / model.stddev).scan), File(name="a"), File(name="b")
     )
     written = [key for row in rows(ROOT / "docs" / "fit-results.md", "NAME.fit.json") for key in code_in(row[0])]
     assert sorted(written) == sorted(record.to_json())

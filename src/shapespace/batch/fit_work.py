@@ -18,12 +18,13 @@ from typing import Any
 from msgspec import structs
 
 from shapespace.batch.fit_records import (
-    Source,
     failed_record,
     fit_identity,
     fit_record,
+    hashed_source,
     is_surface_of,
     read_record,
+    source_of,
     write_fitted_mesh,
     write_record,
     write_stages,
@@ -82,19 +83,20 @@ class Job:
         with fetch_copy(self.address, LARGEST_MESH_FILE_BYTES) as file:
             yield file
 
-    def source(self, folder: Path) -> Source:
+    def source(self, folder: Path) -> File:
         """Return what results in `folder` say of where the scan is, without reading it."""
-        return Source(self.scan.name, "", self.address) if self.address else Source.of_file(self.scan, "", folder)
+        return File(name=self.scan.name, path=self.address) if self.address else source_of(self.scan, "", folder)
 
-    def read_source(self, file: Path, folder: Path) -> Source:
+    def read_source(self, file: Path, folder: Path) -> File:
         """Return the same, with what the scan is known again by; `file` is that of `readable`.
 
         Raises:
             FileError: it cannot be read.
         """
         if not self.address:
-            return Source.hashed(file, folder)
-        return replace(self.source(folder), content_hash=sha256_of_file(file), remote_version=version_of(self.address))
+            return hashed_source(file, folder)
+        version = version_of(self.address)
+        return structs.replace(self.source(folder), hash=sha256_of_file(file), remote_version=version)
 
 
 def fit_file(
@@ -206,7 +208,7 @@ class FitWork:
             if earlier is not None:
                 return earlier
         job, model = task.job, _model.get(self.model_hash, self._load)
-        model_source = Source.of_file(self.model_file, self.model_hash, self.folder)
+        model_source = source_of(self.model_file, self.model_hash, self.folder)
         scan_source, marks_source = job.source(self.folder), None
         try:
             with job.readable() as file:
@@ -214,7 +216,7 @@ class FitWork:
                 scan = read_mesh(file)
             landmarks: Mapping[str, FloatArray] | None = None
             if job.landmarks is not None:
-                marks_source = Source(job.landmarks.name, sha256_of_file(job.landmarks))
+                marks_source = File(name=job.landmarks.name, hash=sha256_of_file(job.landmarks))
                 landmarks = read_landmarks(job.landmarks)
             result = fit_scan(model, scan, task.config, landmarks=landmarks, on_state=self.on_state)
         except (MemoryError, ShapespaceError) as error:
@@ -228,11 +230,11 @@ class FitWork:
 
     def give_up(self, task: FitTask, reason: str) -> FitRecord:
         """Write and return the record of a scan whose workers were lost."""
-        model = Source.of_file(self.model_file, self.model_hash, self.folder)
+        model = source_of(self.model_file, self.model_hash, self.folder)
         scan = task.job.source(self.folder)
         if not task.job.address:
             with contextlib.suppress(ShapespaceError):
-                scan = Source.hashed(task.job.scan, self.folder)
+                scan = hashed_source(task.job.scan, self.folder)
         record = failed_record(scan, model, f"{task.job.label}: {reason}.", task.config.as_dict(), task.job.metadata)
         return _write_failed(structs.replace(record, given_up=self.run), task.job, self.folder)
 
@@ -326,7 +328,7 @@ def is_same_scan(recorded: File, job: Job, folder: Path) -> bool:
         return recorded.path == job.address and recorded.remote_version == version_of(job.address)
     with contextlib.suppress(OSError):
         there = job.scan.stat()
-        now = (there.st_size, there.st_mtime_ns, Source.of_file(job.scan, "", folder).path)
+        now = (there.st_size, there.st_mtime_ns, source_of(job.scan, "", folder).path)
         if (recorded.size_bytes, recorded.modified_ns, recorded.path) == now:
             return True
     return recorded.hash == sha256_of_file(job.scan)
@@ -355,10 +357,10 @@ def save_fit(result: FitResult, folder: Path, name: str, *, stages: bool) -> Pat
     return folder / f"{name}{RECORD}"
 
 
-def _scan_source(result: FitResult, folder: Path) -> Source:
+def _scan_source(result: FitResult, folder: Path) -> File:
     if "scan" in result.files:
-        return Source.hashed(result.files["scan"], folder)
-    return Source(result.scan_name, _hash_of(result.scan))
+        return hashed_source(result.files["scan"], folder)
+    return File(name=result.scan_name, hash=_hash_of(result.scan))
 
 
 def _hash_of(mesh: Mesh) -> str:
@@ -368,22 +370,22 @@ def _hash_of(mesh: Mesh) -> str:
     return content.hexdigest()
 
 
-def _model_source(result: FitResult, folder: Path) -> Source:
+def _model_source(result: FitResult, folder: Path) -> File:
     file = result.files.get("model") or result.model.file
-    return Source.of_file(file, result.model_hash, folder) if file else Source("", result.model_hash)
+    return source_of(file, result.model_hash, folder) if file else File(hash=result.model_hash)
 
 
-def _landmarks_source(result: FitResult) -> Source | None:
+def _landmarks_source(result: FitResult) -> File | None:
     file = result.files.get("landmarks")
-    return Source(file.name, sha256_of_file(file)) if file else None
+    return File(name=file.name, hash=sha256_of_file(file)) if file else None
 
 
-def _free_name(scan: Source, folder: Path) -> str:
+def _free_name(scan: File, folder: Path) -> str:
     """Return NAME for a scan without a file: its own name, unless another scan has results of that name."""
     stem = _FORBIDDEN.sub("_", Path(scan.name).stem).strip(". ") or "scan"
     results = Results(folder)
     try:
-        free = stem not in results or results.fit(stem).scan.hash == scan.content_hash
+        free = stem not in results or results.fit(stem).scan.hash == scan.hash
     except ShapespaceError:
         free = False
-    return stem if free else f"{stem}_{scan.content_hash[:_HASH_CHARACTERS]}"
+    return stem if free else f"{stem}_{scan.hash[:_HASH_CHARACTERS]}"

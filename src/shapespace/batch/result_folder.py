@@ -7,14 +7,13 @@ import hashlib
 import os
 from collections import Counter
 from collections.abc import Container, Generator, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeAlias
 
 import msgspec
 from filelock import lock_descriptor
 
-from shapespace.batch.fit_records import Source, coefficient_row, read_record, write_coefficients
+from shapespace.batch.fit_records import coefficient_row, read_record, source_of, write_coefficients
 from shapespace.errors import FileError, ShapespaceError
 from shapespace.io.containers.json_files import LARGEST_BYTES, check_file
 from shapespace.io.files import sha256_of_file, sweep, write_error
@@ -94,21 +93,8 @@ def records_in(folder: Path, without: Container[str] = ()) -> Iterator[tuple[str
             continue  # a report names it
 
 
-@dataclass(frozen=True)
-class _Scan:
-    """Where a scan is; two are the same if these are.
-
-    Args:
-        name: of the file.
-        path: as records of the folder have it.
-    """
-
-    name: str
-    path: str
-
-    @staticmethod
-    def of(source: Mapping[str, Any]) -> _Scan:
-        return _Scan(str(source.get("name", "")), str(source.get("path", "")))
+_Scan: TypeAlias = tuple[str, str]
+"""Name of the file of a scan, and its path as records of the folder have it; two are the same if these are."""
 
 
 def names_for(
@@ -124,13 +110,8 @@ def names_for(
         folder: where results go; None if nothing can be there.
         addresses: of scans that lie elsewhere, by what their paths would be.
     """
-    taken: dict[str, _Scan] = {}
-    hashes: dict[str, str] = {}
-    for name, content in _sources_in(folder) if folder is not None else ():
-        if isinstance(content, dict):
-            source = cast(dict[str, Any], content)
-            taken[name] = _Scan.of(source)
-            hashes[name] = str(source.get("hash", ""))
+    sources = dict(_sources_in(folder)) if folder is not None else {}
+    taken: dict[str, _Scan] = {name: (source.name, source.path) for name, source in sources.items()}
     own = {scan: name for name, scan in reversed(taken.items())}
     keys = {scan: _key(scan, folder, (addresses or {}).get(scan, "")) for scan in scans}
     names = {key: own[key] for key in keys.values() if key in own}
@@ -143,7 +124,7 @@ def names_for(
     for _, group in sorted(groups.items(), key=lambda item: (len(item[1]) > 1, item[0])):
         (key, scan), *others = group.items()
         stem = _stem(scan)
-        if not others and (stem.casefold() not in used or _is_same(scan, taken.get(stem), hashes.get(stem), folder)):
+        if not others and (stem.casefold() not in used or _is_same(scan, sources.get(stem), folder)):
             new = {key: stem}
         else:
             new = _distinct_names(group, used)
@@ -152,18 +133,17 @@ def names_for(
     return [names[keys[scan]] for scan in scans]
 
 
-def _sources_in(folder: Path) -> Iterator[tuple[str, object]]:
+def _sources_in(folder: Path) -> Iterator[tuple[str, File]]:
     """Yield NAME of each result in `folder`, of a store too, and the scan in its record."""
     if (results := results_at(folder)) is not None:
         for rows in results.iter_rows(_SCAN_COLUMNS):
             for name, scan_name, path, content_hash in zip(*(rows[column] for column in _SCAN_COLUMNS), strict=True):
-                yield name, {"name": scan_name, "path": path, "hash": content_hash}
+                yield name, File(name=scan_name or "", path=path or "", hash=content_hash or "")
     else:
         for file in sorted(folder.glob(f"*{RECORD}")):
             with contextlib.suppress(ShapespaceError, msgspec.MsgspecError, ValueError):  # a report names it
                 check_file(file, LARGEST_BYTES, FIT_AGAIN)
-                scan = msgspec.json.decode(file.read_bytes(), type=_ScanOnly).scan
-                yield file.name.removesuffix(RECORD), {"name": scan.name, "path": scan.path, "hash": scan.hash}
+                yield file.name.removesuffix(RECORD), msgspec.json.decode(file.read_bytes(), type=_ScanOnly).scan
 
 
 class _ScanOnly(msgspec.Struct, frozen=True):
@@ -174,24 +154,24 @@ class _ScanOnly(msgspec.Struct, frozen=True):
 
 def _key(scan: Path, folder: Path | None, address: str) -> _Scan:
     if address:
-        return _Scan(scan.name, address)
+        return scan.name, address
     if folder is None:
-        return _Scan(scan.name, str(scan.parent.resolve()))
-    return _Scan(scan.name, Source.of_file(scan, "", folder).path)
+        return scan.name, str(scan.parent.resolve())
+    return scan.name, source_of(scan, "", folder).path
 
 
 def _stem(scan: Path) -> str:
     return _shortened(stem_of(scan) or scan.name)
 
 
-def _is_same(scan: Path, of_record: _Scan | None, content_hash: str | None, folder: Path | None) -> bool:
+def _is_same(scan: Path, source: File | None, folder: Path | None) -> bool:
     """Return whether results of the same name are of `scan`, which has moved since, or do not say of what they are."""
-    if of_record is None or folder is None:
+    if source is None or folder is None:
         return False
-    if not of_record.path:
-        return of_record.name == scan.name
+    if not source.path:
+        return source.name == scan.name
     try:
-        return not (folder / of_record.path).exists() and sha256_of_file(scan) == content_hash
+        return not (folder / source.path).exists() and sha256_of_file(scan) == source.hash
     except FileError:
         return False
 
