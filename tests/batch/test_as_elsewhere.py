@@ -11,8 +11,7 @@ import pytest
 
 from shapespace.batch import workers
 from shapespace.batch.executors import Local, Serial
-from shapespace.batch.run import BatchConfig, fit_many, make_jobs
-from shapespace.batch.sinks import FolderSink
+from shapespace.batch.run import BatchConfig, FolderSink, fit_many, make_jobs
 from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.report.inputs.saved_fits import Folder, find_fits
 from shapespace.report.inputs.saved_fits import raw_scan as saved_scan

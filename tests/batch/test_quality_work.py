@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from shapespace.batch.executors import EXECUTORS, ExecutionConfig, Local, Serial, Shared
-from shapespace.batch.quality_work import QualityRunner, QualityWork
+from shapespace.commands.quality import QualityRunner, QualityWork
 from shapespace.errors import FitError
 from shapespace.io import memory_cache
 from shapespace.model.model_quality import Curve, ModelQuality, Part, QualityConfig, Shapes, measure_quality

@@ -11,8 +11,7 @@ from scipy.spatial import Delaunay
 import shapespace as ss
 from raw_blobs import dispersion_mm, raw_blob, without_ball
 from shapespace.cli import main
-from shapespace.correspondence.collection_notes import copies, unit_ratios
-from shapespace.correspondence.correspondence_result import Correspondence
+from shapespace.correspondence.correspondence_result import Correspondence, copies, unit_ratios
 from shapespace.correspondence.register import ElasticSettings
 from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.correspondence.template import choose_template, clean_scan, resample

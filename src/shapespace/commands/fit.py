@@ -18,8 +18,7 @@ from shapespace.batch.fit_records import source_of
 from shapespace.batch.fit_work import Job
 from shapespace.batch.progress import progress, telling_of_compiling
 from shapespace.batch.result_folder import RECORD
-from shapespace.batch.run import BatchConfig, Plan, fit_many, make_jobs
-from shapespace.batch.sinks import STORE_FROM, FolderSink, StoreSink
+from shapespace.batch.run import STORE_FROM, BatchConfig, FolderSink, Plan, StoreSink, fit_many, make_jobs
 from shapespace.commands.inputs import Given, LandmarkFiles, given_scans, is_of_fit, with_ids
 from shapespace.commands.outcome import LISTED, Outcome, exit_code_of, first_lines
 from shapespace.errors import InputError, ShapespaceError

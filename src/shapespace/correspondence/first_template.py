@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from shapespace.correspondence.collection_notes import copies
+from shapespace.correspondence.correspondence_result import copies
 from shapespace.correspondence.landmark_guide import contradicts_most, with_own_landmarks
 from shapespace.correspondence.settings import FEWEST, SIZE, CorrespondConfig
 from shapespace.correspondence.symmetric_template import symmetrise

@@ -18,8 +18,13 @@ from typing import TypeAlias
 import numpy as np
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
-from shapespace.correspondence.collection_notes import judge_collection, unit_ratios
-from shapespace.correspondence.correspondence_result import ANOTHER_SHAPE, Correspondence, Corresponding
+from shapespace.correspondence.correspondence_result import (
+    ANOTHER_SHAPE,
+    Correspondence,
+    Corresponding,
+    judge_collection,
+    unit_ratios,
+)
 from shapespace.correspondence.first_template import FirstTemplate, first_template, repaired_scans
 from shapespace.correspondence.harmonics import Harmonics, Reliefs, agreement, relief
 from shapespace.correspondence.isometry import common_symmetries
