@@ -17,8 +17,6 @@ from shapespace.errors import ShapespaceError
 
 LAZY_FUNCTIONS: Mapping[str, str] = MappingProxyType(
     {
-        "build_model": "model.build_model",
-        "extend_model": "model.build_model",
         "html_of_additive_model": "report.notebook.notebook_results",
         "html_of_analysis": "report.notebook.notebook_results",
         "html_of_cohort": "report.notebook.notebook_results",

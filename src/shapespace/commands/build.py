@@ -26,8 +26,7 @@ from shapespace.geometry.procrustes import Gauge
 from shapespace.io.files import make_folder, read_error
 from shapespace.io.landmarks.landmark_io import is_of_vertices, read_landmarks, read_surface_landmarks
 from shapespace.io.meshes.region_files import read_region
-from shapespace.model.build_config import BuildConfig
-from shapespace.model.build_model import build_model, extend_model
+from shapespace.model.build_model import BuildConfig, build_model, extend_model
 from shapespace.model.missing import MIN_SEEN, ObservedMeshes
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel, odd_size_notes, region_vertices

@@ -22,7 +22,6 @@ from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.interop import MeshLike
 from shapespace.lazy import OpenViewer, lazy_import
 from shapespace.model import model_file
-from shapespace.model.build_config import BuildConfig
 from shapespace.model.foreign import Foreign, as_linear, is_foreign, load_foreign
 from shapespace.model.missing import MIN_SEEN
 from shapespace.model.pca import Modes
@@ -222,6 +221,8 @@ class ShapeModel:
 
         The arguments are those of `build_model` and the fields of `BuildConfig`.
         """
+        from shapespace.model.build_model import BuildConfig, build_model  # imports this module
+
         config = BuildConfig(
             modes=modes,
             gauge=gauge,
@@ -237,7 +238,7 @@ class ShapeModel:
             out_of_core=out_of_core,
             without_training_shapes=without_training_shapes,
         )
-        return lazy_import("build_model")(meshes, config, scratch=scratch, keep_shapes=keep_shapes, log=tell)
+        return build_model(meshes, config, scratch=scratch, keep_shapes=keep_shapes, log=tell)
 
     def with_more(
         self,
@@ -253,10 +254,10 @@ class ShapeModel:
         tell: Tell | None = None,
     ) -> ShapeModel:
         """Return the model of the shapes that this one was made of and of `meshes`; see `build_model.extend_model`."""
+        from shapespace.model.build_model import BuildConfig, extend_model  # imports this module
+
         config = BuildConfig(modes=modes, provenance=provenance, licence=licence, seed=seed)
-        return lazy_import("extend_model")(
-            self, meshes, shapes, config, scratch=scratch, keep_shapes=keep_shapes, log=tell
-        )
+        return extend_model(self, meshes, shapes, config, scratch=scratch, keep_shapes=keep_shapes, log=tell)
 
     @property
     def _vector(self) -> FloatArray:

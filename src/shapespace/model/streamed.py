@@ -15,7 +15,7 @@ import tempfile
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -37,11 +37,13 @@ from shapespace.io.containers.arrays import read_arrays, write_arrays
 from shapespace.io.containers.row_spill import Spill
 from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_error, write_text
 from shapespace.io.memory_cache import available_bytes
-from shapespace.model.build_config import BuildConfig
 from shapespace.model.choose_modes import drawn, number_of_modes, rounding_mm
 from shapespace.model.pca import ALL_EQUAL, Modes, PrincipalComponents, checked_large_modes, principal_components
 from shapespace.model.training_shapes import TrainingShapes
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, common_faces
+
+if TYPE_CHECKING:
+    from shapespace.model.build_model import BuildConfig
 
 Tell: TypeAlias = Callable[[str], None]
 _SHAPES, _START, _POSES, _ALIGNED = "shapes.f32", "start.npz", "poses.npz", "aligned"
