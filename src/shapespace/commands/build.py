@@ -34,7 +34,7 @@ from shapespace.model.streamed import Scratch, streaming_note
 from shapespace.recognise.labelled_scans import NEUTRAL
 from shapespace.reprs import first_names
 from shapespace.schemas import FitRecord
-from shapespace.store.corresponding import provenance_with_review, review_summary, surface_files
+from shapespace.store.corresponding import provenance_with_review, review_summary, reviewed_surfaces
 from shapespace.store.results import is_result
 from shapespace.types import MM_PER_UNIT, Mesh, SurfaceLandmarks
 from shapespace.version import __version__
@@ -149,9 +149,9 @@ def build(
     """
     if output.suffix.lower() not in (".h5", ".hdf5"):
         raise InputError(f"{output}: a model file is HDF5, so give it a name that ends in .h5.")
-    listed = surface_files(meshes, recursive=config.recursive)
-    review = listed.review(listed.files, "--with-doubtful", accept=config.with_doubtful)
-    listed = listed if config.with_doubtful else listed.without_doubtful("--with-doubtful")
+    listed, review = reviewed_surfaces(
+        meshes, "--with-doubtful", recursive=config.recursive, with_doubtful=config.with_doubtful
+    )
     notes = [*([f"{summary}."] if (summary := review_summary(review)) else []), *listed.notes]
     parent = None if config.add is None else _parent(config.add, output)
     gauge = parent.gauge if parent is not None else config.gauge or "shape"

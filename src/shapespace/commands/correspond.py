@@ -94,9 +94,40 @@ def correspond_files(
         InputError: fewer than two scans, or too few that can be reached.
     """
     jobs = find_jobs(files, folder, say)
-    results = CorrespondenceFolder(make_folder(folder))
-    with results.writing():
-        return _corresponding(jobs, files, results, config, quiet=quiet, say=say)
+    with CorrespondenceFolder(make_folder(folder)).writing() as results:
+        marks = LandmarkFiles.of(files.landmarks)
+        marks.refuse_shared([job.scan for job in jobs if job.landmarks is None])
+        subjects = _subjects_of(jobs, files.subjects)
+        inputs_hash = inputs_hash_of(jobs, marks, files, config)
+        if (finished := results.finished(inputs_hash, [job.name for job in jobs])) is not None:
+            say(f"{results.path} already contains the results of these scans and settings; nothing is computed.")
+            return finished
+        template = None if files.template is None else marks.onto(read_mesh(files.template), files.template)
+        model = None if files.model is None else ShapeModel.load(files.model)
+        read = read_scans(jobs, marks, strict=files.strict, outer=config.outer, quiet=quiet, say=say)
+        without_inner = replace(config, outer=False)  # the scans that are read are without inner surfaces
+
+        def make(rounds: RoundsWithProgress) -> Correspondence:
+            scans = list(read.scans.values())
+            with waiting("choosing the template", quiet=quiet):
+                first = first_template(scans, template, without_inner, model)
+            of_scans = [subjects[name] for name in read.scans] if subjects else []
+            return correspond(
+                scans, without_inner, template=template, model=model, first=first, subjects=of_scans, run=rounds
+            )
+
+        made, records = bring(jobs, read, marks, files, results, make, quiet=quiet, say=say)
+        # Until all is written the folder is none that build takes.
+        remove_file(results.path / SUMMARY)
+        summary = CorrespondenceRecord(
+            template=made.why, vertices=len(made.template.vertices), rounds=list(made.moved), corresponding=[],
+            set_aside={}, settings=asdict(config), version=__version__, sides_decided=made.sides_decided,
+            groups=[list(group) for group in made.groups], inputs_hash=inputs_hash,
+        )  # fmt: skip
+        # Surfaces of an earlier run are on another template.
+        if old := results.forget_others({record.name for record in records}):
+            say(f"Results of {old} scans that are not among those given were removed from {results.path}.")
+        return results.publish(made, records, with_scans(summary, records), with_mean=True), records
 
 
 def correspond_groups(
@@ -135,50 +166,6 @@ def find_jobs(files: CorrespondFiles, folder: Path, say: Say) -> list[Job]:
     return with_ids(
         [Job(n, one.path, one.landmarks, address=one.address) for n, one in zip(names, scans, strict=True)], scans
     )
-
-
-def _corresponding(
-    jobs: Sequence[Job],
-    files: CorrespondFiles,
-    results: CorrespondenceFolder,
-    config: CorrespondConfig,
-    *,
-    quiet: bool,
-    say: Say,
-) -> tuple[CorrespondenceRecord, list[CorrespondRecord]]:
-    marks = LandmarkFiles.of(files.landmarks)
-    marks.refuse_shared([job.scan for job in jobs if job.landmarks is None])
-    subjects = _subjects_of(jobs, files.subjects)
-    inputs_hash = inputs_hash_of(jobs, marks, files, config)
-    if (finished := results.finished(inputs_hash, [job.name for job in jobs])) is not None:
-        say(f"{results.path} already contains the results of these scans and settings; nothing is computed.")
-        return finished
-    template = None if files.template is None else marks.onto(read_mesh(files.template), files.template)
-    model = None if files.model is None else ShapeModel.load(files.model)
-    read = read_scans(jobs, marks, strict=files.strict, outer=config.outer, quiet=quiet, say=say)
-    without_inner = replace(config, outer=False)  # the scans that are read are without inner surfaces
-
-    def make(rounds: RoundsWithProgress) -> Correspondence:
-        scans = list(read.scans.values())
-        with waiting("choosing the template", quiet=quiet):
-            first = first_template(scans, template, without_inner, model)
-        of_scans = [subjects[name] for name in read.scans] if subjects else []
-        return correspond(
-            scans, without_inner, template=template, model=model, first=first, subjects=of_scans, run=rounds
-        )
-
-    made, records = bring(jobs, read, marks, files, results, make, quiet=quiet, say=say)
-    # Until all is written the folder is none that build takes.
-    remove_file(results.path / SUMMARY)
-    summary = CorrespondenceRecord(
-        template=made.why, vertices=len(made.template.vertices), rounds=list(made.moved), corresponding=[],
-        set_aside={}, settings=asdict(config), version=__version__, sides_decided=made.sides_decided,
-        groups=[list(group) for group in made.groups], inputs_hash=inputs_hash,
-    )  # fmt: skip
-    # Surfaces of an earlier run are on another template.
-    if old := results.forget_others({record.name for record in records}):
-        say(f"Results of {old} scans that are not among those given were removed from {results.path}.")
-    return results.publish(made, records, with_scans(summary, records), with_mean=True), records
 
 
 def bring(
@@ -412,15 +399,15 @@ class CorrespondenceFolder:
     path: Path
 
     @contextlib.contextmanager
-    def writing(self) -> Generator[None]:
-        """Keep other runs out during the block, and first complete a change that an earlier run has left.
+    def writing(self) -> Generator[CorrespondenceFolder]:
+        """Yield the folder, into which no other run writes during the block, and in which no change is incomplete.
 
         Raises:
             FileError: another run writes into the folder, or files cannot be moved.
         """
         with only_writer(self.path):
             self._complete_change()
-            yield
+            yield self
 
     def read(self) -> tuple[CorrespondenceRecord, dict[str, CorrespondRecord]]:
         """Return the summary, and all records by name, those in correspondence first.

@@ -180,59 +180,52 @@ def change_correspondence(
             f"{folder} contains no finished correspondence, and {change.option} needs one; run shapespace correspond "
             f"without {change.option} first."
         )
-    results = CorrespondenceFolder(folder)
-    with results.writing():
+    with CorrespondenceFolder(folder).writing() as results:
         finished = _Finished.of(results)
-        return _changed(finished, change, files, finished.config(files, config), quiet=quiet, say=say)
+        config, summary = finished.config(files, config), finished.summary
+        marks = LandmarkFiles.of(files.landmarks)
+        for record in finished.records.values():
+            marks.of_scan(Path(record.path))  # so that it is not said to belong to no scan
+        given = find_jobs(files, folder, say) if files.scans else []
+        new = _new_jobs(finished, change, given)
+        kept = [name for name in summary.corresponding if name not in (*change.redo, *change.remove)]
+        old = _old_jobs(finished, change, given) if change.update else []
+        jobs = list({job.name: job for job in (*old, *new)}.values())
+        marks.refuse_shared([job.scan for job in jobs if job.landmarks is None])
+        what = [change.option, sorted({*change.redo, *change.remove}), change.update]
+        inputs_hash = inputs_hash_of(sorted(jobs, key=lambda job: job.name), marks, files, config, what)
+        if inputs_hash == summary.inputs_hash or not (new or change.remove or change.update):
+            say(f"{folder} already contains the results of this command; nothing is computed.")
+            return summary, list(finished.records.values())
+        finished.refuse_unknown(change.remove, "--remove")
+        if len(kept) < (1 if new else FEWEST):
+            raise InputError(
+                f"{change.option} leaves {len(kept)} of the scans in {folder} as they are, which are too few; run "
+                "shapespace correspond on all scans instead."
+            )
+        read = read_scans(jobs, marks, strict=files.strict, outer=config.outer, quiet=quiet, say=say)
+        _refuse_changed(finished, read, files, kept if change.update else [])
+        first = {finished.records[name].hash: name for name in kept if name not in read.scans}
+        for name, content_hash in read.hashes.items():
+            if name in read.notes and content_hash in first:
+                read.notes[name].append(f"It is {first[content_hash]} again; leave one of them out.")
 
+        def make(rounds: RoundsWithProgress) -> Correspondence:
+            return _registered(finished, kept, read, marks, replace(config, outer=False), rounds, update=change.update)
 
-def _changed(
-    finished: _Finished, change: Change, files: CorrespondFiles, config: CorrespondConfig, *, quiet: bool, say: Say
-) -> tuple[CorrespondenceRecord, list[CorrespondRecord]]:
-    folder, summary = finished.results.path, finished.summary
-    marks = LandmarkFiles.of(files.landmarks)
-    for record in finished.records.values():
-        marks.of_scan(Path(record.path))  # so that it is not said to belong to no scan
-    given = find_jobs(files, folder, say) if files.scans else []
-    new = _new_jobs(finished, change, given)
-    kept = [name for name in summary.corresponding if name not in (*change.redo, *change.remove)]
-    old = _old_jobs(finished, change, given) if change.update else []
-    jobs = list({job.name: job for job in (*old, *new)}.values())
-    marks.refuse_shared([job.scan for job in jobs if job.landmarks is None])
-    what = [change.option, sorted({*change.redo, *change.remove}), change.update]
-    inputs_hash = inputs_hash_of(sorted(jobs, key=lambda job: job.name), marks, files, config, what)
-    if inputs_hash == summary.inputs_hash or not (new or change.remove or change.update):
-        say(f"{folder} already contains the results of this command; nothing is computed.")
-        return summary, list(finished.records.values())
-    finished.refuse_unknown(change.remove, "--remove")
-    if len(kept) < (1 if new else FEWEST):
-        raise InputError(
-            f"{change.option} leaves {len(kept)} of the scans in {folder} as they are, which are too few; run "
-            "shapespace correspond on all scans instead."
-        )
-    read = read_scans(jobs, marks, strict=files.strict, outer=config.outer, quiet=quiet, say=say)
-    _refuse_changed(finished, read, files, kept if change.update else [])
-    first = {finished.records[name].hash: name for name in kept if name not in read.scans}
-    for name, content_hash in read.hashes.items():
-        if name in read.notes and content_hash in first:
-            read.notes[name].append(f"It is {first[content_hash]} again; leave one of them out.")
-
-    def make(rounds: RoundsWithProgress) -> Correspondence:
-        return _registered(finished, kept, read, marks, replace(config, outer=False), rounds, update=change.update)
-
-    made, records = bring(jobs, read, marks, files, finished.results, make, quiet=quiet, say=say)
-    every = {name: record for name, record in finished.records.items() if name not in change.remove}
-    every |= {record.name: record for record in records}
-    summary = structs.replace(_summary(finished, change, records, every), inputs_hash=inputs_hash)
-    if change.update:
-        summary = structs.replace(summary, rounds=[*summary.rounds, *made.moved])
-    else:
-        done = "removed from" if change.remove else "registered to the mean in"
-        count = len(set(change.remove)) or sum(not record.reason for record in records)
-        were = "scan was" if count == 1 else "scans were"
-        say(f"{count} {were} {done} {folder}; the other {len(kept)} are unchanged.")
-    summary = finished.results.publish(made, records, summary, with_mean=change.update)
-    return summary, list(every.values())
+        made, records = bring(jobs, read, marks, files, finished.results, make, quiet=quiet, say=say)
+        every = {name: record for name, record in finished.records.items() if name not in change.remove}
+        every |= {record.name: record for record in records}
+        summary = structs.replace(_summary(finished, change, records, every), inputs_hash=inputs_hash)
+        if change.update:
+            summary = structs.replace(summary, rounds=[*summary.rounds, *made.moved])
+        else:
+            done = "removed from" if change.remove else "registered to the mean in"
+            count = len(set(change.remove)) or sum(not record.reason for record in records)
+            were = "scan was" if count == 1 else "scans were"
+            say(f"{count} {were} {done} {folder}; the other {len(kept)} are unchanged.")
+        summary = finished.results.publish(made, records, summary, with_mean=change.update)
+        return summary, list(every.values())
 
 
 # Which scans
@@ -411,10 +404,6 @@ def correspond(
     return Outcome(facts, _lines(summary, records, output), exit_code=int(bool(summary.set_aside)))
 
 
-def _needs_review(record: CorrespondRecord) -> list[str]:
-    return [f"{record.name} needs review: {'; '.join(describe_review(record))}"]
-
-
 def _lines(summary: CorrespondenceRecord, records: Sequence[CorrespondRecord], folder: Path) -> list[str]:
     rounds = [
         f"round {number}: vertices moved by {100 * moved:.2f} % of the size (RMS)"
@@ -427,7 +416,11 @@ def _lines(summary: CorrespondenceRecord, records: Sequence[CorrespondRecord], f
     ]
     there = [record for record in records if not record.reason]
     unusual = [record for record in there if record.review and not record.doubt]
-    warnings += first_lines(unusual, _needs_review, "more surfaces need review")
+    warnings += first_lines(
+        unusual,
+        lambda record: [f"{record.name} needs review: {'; '.join(describe_review(record))}"],
+        "more surfaces need review",
+    )
     seen = sum(record.seen_share or 0.0 for record in there) / len(there)
     doubtful = sum(bool(record.doubt) for record in there)
     total = (

@@ -24,7 +24,7 @@ from shapespace.model.model_quality import Curve, ModelQuality, Part, QualityCon
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import BySize, Measured, Quality, json_text, to_json
-from shapespace.store.corresponding import SURFACE, review_summary, surface_files, surface_stem
+from shapespace.store.corresponding import SURFACE, review_summary, reviewed_surfaces, surface_stem
 from shapespace.types import FloatArray, Mesh
 
 _SURFACES = (".dense.ply", ".fitted.ply", SURFACE)
@@ -199,10 +199,9 @@ def _meshes(
     folder: Path, notes: list[str], gauge: Gauge, options: QualityOptions, *, quiet: bool
 ) -> tuple[list[Mesh], dict[str, float]]:
     """Return the meshes of a folder in the unit of most of them, and the ratios of those that were in another."""
-    listed = surface_files([folder])
-    if review := review_summary(listed.review(listed.files, "--with-doubtful", accept=options.with_doubtful)):
-        notes.append(f"{folder}: {review}.")
-    listed = listed if options.with_doubtful else listed.without_doubtful("--with-doubtful")
+    listed, review = reviewed_surfaces([folder], "--with-doubtful", with_doubtful=options.with_doubtful)
+    if summary := review_summary(review):
+        notes.append(f"{folder}: {summary}.")
     notes += listed.notes
     if gauge == "form":
         listed.refuse_mixed_units()

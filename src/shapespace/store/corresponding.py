@@ -242,15 +242,32 @@ def surface_files(paths: Sequence[Path], *, recursive: bool = False) -> SurfaceF
     return SurfaceFiles(tuple(files), ratios, frozenset(mirrored), frozenset(doubtful), tuple(notes), needs_review)
 
 
+def reviewed_surfaces(
+    paths: Sequence[Path], option: str = "", *, recursive: bool = False, with_doubtful: bool = False
+) -> tuple[SurfaceFiles, SurfaceReview]:
+    """Return the surfaces of `surface_files` without doubtful ones, and how many of all need review.
+
+    Args:
+        paths: files and folders.
+        option: of the command, which is given as `with_doubtful`; empty where there is none.
+        recursive: also search subfolders.
+        with_doubtful: include doubtful surfaces, and accept that more than half need review.
+
+    Raises:
+        InputError: as `surface_files`; all are doubtful, or more than half need review.
+    """
+    listing = surface_files(paths, recursive=recursive)
+    review = listing.review(listing.files, option, accept=with_doubtful)
+    return listing if with_doubtful else listing.without_doubtful(option), review
+
+
 def trusted_surfaces(folder: Path) -> SurfaceFiles:
     """Return the surfaces of a folder that `build` takes, with its notes as warnings.
 
     Raises:
         InputError: as `surface_files`; all are doubtful, or more than half need review.
     """
-    listing = surface_files([folder])
-    listing.review(listing.files, accept=False)
-    listing = listing.without_doubtful()
+    listing, _ = reviewed_surfaces([folder])
     for note in listing.notes:
         warnings.warn(note, stacklevel=4)
     return listing
