@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from shapespace.batch.execution import ExecutionConfig
+from shapespace.batch.executors import ExecutionConfig
 from shapespace.batch.parallel_rounds import RoundRunner
 from shapespace.correspondence.correspondence_result import Correspondence
 from shapespace.correspondence.groupwise import correspond, run_here

@@ -27,7 +27,7 @@ from shapespace.datasets.simulated_scan import simulate_scan
 from shapespace.errors import ShapespaceError
 from shapespace.geometry.closest import build_engine, on_boundary, surface_distances
 from shapespace.geometry.normals import boundary_vertices, face_areas, face_vectors
-from shapespace.model.floor import floor_mm as floor_of
+from shapespace.model.model_quality import floor_mm as floor_of
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import MM_PER_UNIT, BoolArray, FloatArray, Mesh, Similarity
 

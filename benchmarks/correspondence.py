@@ -30,7 +30,7 @@ from pathlib import Path
 import numpy as np
 from reliability import Femora
 
-from shapespace.batch.execution import ExecutionConfig
+from shapespace.batch.executors import ExecutionConfig
 from shapespace.batch.parallel_rounds import RoundRunner
 from shapespace.correspondence.correspondence_result import Correspondence
 from shapespace.correspondence.groupwise import FinishedCorrespondence, add_scans, correspond, run_here

@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 import peers
 
-from shapespace.batch.execution import ExecutionConfig
+from shapespace.batch.executors import ExecutionConfig
 from shapespace.commands.correspond import CorrespondFiles, correspond_files
 from shapespace.commands.surface import write_surfaces
 from shapespace.correspondence.settings import CorrespondConfig

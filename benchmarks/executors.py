@@ -23,8 +23,7 @@ from trivial import Nothing
 
 from shapespace.batch.executors import Executor, Local
 from shapespace.batch.on_dask import OnDask
-from shapespace.batch.run import BatchConfig, fit_many, make_jobs
-from shapespace.batch.sinks import FolderSink
+from shapespace.batch.run import BatchConfig, FolderSink, fit_many, make_jobs
 from shapespace.io.meshes.mesh_io import write_mesh
 
 

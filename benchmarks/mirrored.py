@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from correspondence import faces, femora
-from shapespace.batch.execution import ExecutionConfig
+from shapespace.batch.executors import ExecutionConfig
 from shapespace.batch.parallel_rounds import RoundRunner
 from shapespace.correspondence.groupwise import correspond
 from shapespace.correspondence.settings import CorrespondConfig

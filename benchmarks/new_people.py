@@ -18,8 +18,7 @@ from scipy.optimize import isotonic_regression
 from shapespace.datasets.faces import load_faces
 from shapespace.datasets.ict import load_ict
 from shapespace.geometry.mirror_plane import FLIP
-from shapespace.model.held_out import held_out_shapes
-from shapespace.model.new_shapes import variances_of_new_shapes
+from shapespace.model.new_shapes import held_out_shapes, variances_of_new_shapes
 from shapespace.model.pca import modes_for_variance
 from shapespace.types import FloatArray
 

@@ -25,9 +25,8 @@ import numpy as np
 
 from shapespace.geometry.procrustes import Streamed, align_streamed, scale_to_tangent_streamed
 from shapespace.io.containers.row_spill import Spill
-from shapespace.model import large_pca
-from shapespace.model.large_pca import large_components
-from shapespace.model.pca import syrk
+from shapespace.model import pca
+from shapespace.model.pca import principal_components, syrk
 
 TRUE_MODES, SPREAD_MM, NOISE_MM, SIZE_MM = 300, 2.0, 0.1, 80.0
 
@@ -88,10 +87,10 @@ def measure(path: Path, n: int, vertices: int, modes: int) -> dict[str, float]:
         return out
 
     # In one run with all the rest, so that a busy machine slows both.
-    large_pca.syrk = timed
+    pca.syrk = timed
     with Spill(path, n, 3 * vertices, new=False) as shapes:
         began, ticks = time.perf_counter(), time.process_time()
-        pc = large_components(shapes, modes, on_pass=on_pass)
+        pc = principal_components(shapes, modes, on_pass=on_pass)
         found = {"wall s": time.perf_counter() - began, "CPU s": time.process_time() - ticks}
     assert pc.residuals is not None
     if in_product:

@@ -26,8 +26,8 @@ from shapespace.geometry.closest import build_engine, surface_distances
 from shapespace.geometry.flatten import cylinder_map, disc_map, folded_triangles
 from shapespace.geometry.normals import face_areas, vertex_normals
 from shapespace.io.files import make_folder, read_bytes, write_text
-from shapespace.model.floor import floor_mm
 from shapespace.model.missing import MIN_SEEN, ObservedMeshes
+from shapespace.model.model_quality import floor_mm
 from shapespace.model.representation import BSplineSurface
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh

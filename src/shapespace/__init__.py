@@ -32,8 +32,7 @@ if TYPE_CHECKING:
     from shapespace.geometry.closest import surface_distances
     from shapespace.io.interop import as_mesh
     from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
-    from shapespace.model.build_config import BuildConfig
-    from shapespace.model.build_model import build_model
+    from shapespace.model.build_model import BuildConfig, build_model
     from shapespace.model.shape_model import ShapeModel
     from shapespace.recognise.predict import train_classifier
     from shapespace.recognise.shape_space import ShapeSpace
@@ -85,8 +84,7 @@ _name, __dir__ = lazy_names(
         "geometry.closest": ("surface_distances",),
         "io.interop": ("as_mesh",),
         "io.meshes.mesh_io": ("read_mesh", "write_mesh"),
-        "model.build_config": ("BuildConfig",),
-        "model.build_model": ("build_model",),
+        "model.build_model": ("BuildConfig", "build_model"),
         "model.shape_model": ("ShapeModel",),
         "recognise.predict": ("train_classifier",),
         "recognise.shape_space": ("ShapeSpace",),

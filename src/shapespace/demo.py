@@ -19,10 +19,9 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from shapespace.batch.execution import ExecutionConfig
+from shapespace.batch.executors import ExecutionConfig
 from shapespace.batch.fit_records import read_record
-from shapespace.batch.run import BatchConfig, fit_many, make_jobs
-from shapespace.batch.sinks import FolderSink
+from shapespace.batch.run import BatchConfig, FolderSink, fit_many, make_jobs
 from shapespace.datasets.faces import LICENSE, FaceGenerator, load_faces
 from shapespace.datasets.ict import ict_available, landmark_vertices, load_ict
 from shapespace.datasets.james import james_available, load_james

@@ -17,8 +17,6 @@ from shapespace.errors import ShapespaceError
 
 LAZY_FUNCTIONS: Mapping[str, str] = MappingProxyType(
     {
-        "build_model": "model.build_model",
-        "extend_model": "model.build_model",
         "html_of_additive_model": "report.notebook.notebook_results",
         "html_of_analysis": "report.notebook.notebook_results",
         "html_of_cohort": "report.notebook.notebook_results",
@@ -34,7 +32,7 @@ LAZY_FUNCTIONS: Mapping[str, str] = MappingProxyType(
         "plot_model": "report.notebook.notebook_fits",
         "plot_quality": "report.notebook.notebook_fits",
         "save_analysis": "report.analyses.result_tables",
-        "save_fit": "batch.save",
+        "save_fit": "batch.fit_work",
         "to_menpo": "io.interop",
         "to_meshio": "io.interop",
         "to_open3d": "io.interop",

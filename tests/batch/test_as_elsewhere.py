@@ -11,8 +11,7 @@ import pytest
 
 from shapespace.batch import workers
 from shapespace.batch.executors import Local, Serial
-from shapespace.batch.run import BatchConfig, fit_many, make_jobs
-from shapespace.batch.sinks import FolderSink
+from shapespace.batch.run import BatchConfig, FolderSink, fit_many, make_jobs
 from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.report.inputs.saved_fits import Folder, find_fits
 from shapespace.report.inputs.saved_fits import raw_scan as saved_scan
@@ -24,7 +23,6 @@ POSIX_ONLY = {
     ("datasets/fetch.py", "fcntl"): "elsewhere msvcrt",
     ("io/sandbox_child.py", "resource"): "elsewhere its parent ends it when it is late",
     ("io/files.py", "kill"): "on Windows nothing is asked, and files are left for an hour",
-    ("model/streamed.py", "fcntl"): "Windows refuses to remove open files",
     ("viewer/fitting.py", "nice"): "elsewhere the process keeps its place",
 }
 """Each use of what Windows lacks, with what happens there."""

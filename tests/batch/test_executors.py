@@ -13,8 +13,7 @@ from typing import Any
 
 import pytest
 
-from shapespace.batch.execution import EXECUTORS, ExecutionConfig
-from shapespace.batch.executors import Executor, Local, Serial
+from shapespace.batch.executors import EXECUTORS, ExecutionConfig, Executor, Local, Serial
 from shapespace.errors import FileError, FitError, InputError
 
 SEVERAL = [kind for kind in EXECUTORS if kind != "serial"]

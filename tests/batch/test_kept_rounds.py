@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from raw_blobs import marked, raw_blob
-from shapespace.batch.execution import ExecutionConfig
+from shapespace.batch.executors import ExecutionConfig
 from shapespace.batch.parallel_rounds import RoundRunner
 from shapespace.correspondence.groupwise import correspond
 from shapespace.correspondence.harmonics import Harmonics

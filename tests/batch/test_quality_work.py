@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shapespace.batch.execution import EXECUTORS, ExecutionConfig
-from shapespace.batch.executors import Serial
-from shapespace.batch.quality_work import QualityRunner, QualityWork
+from shapespace.batch.executors import EXECUTORS, ExecutionConfig, Local, Serial, Shared
+from shapespace.commands.quality import QualityRunner, QualityWork
 from shapespace.errors import FitError
+from shapespace.io import memory_cache
 from shapespace.model.model_quality import Curve, ModelQuality, Part, QualityConfig, Shapes, measure_quality
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model
@@ -41,7 +41,7 @@ def test_every_executor_measures_the_same_to_the_bit(
         ExecutionConfig(kind, jobs=2 if kind == "local" else 0, dask=dask), tmp_path / "out", quiet=True
     )
     assert numbers(measure_quality(meshes, SETTINGS, run=run)) == numbers(measure_quality(meshes, SETTINGS))
-    assert not list(tmp_path.rglob("*.npz"))
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
 @pytest.mark.parametrize("judged_by", ["themselves", "scans"])
@@ -51,13 +51,14 @@ def test_what_workers_read_is_what_was_to_be_measured(judged_by: str, meshes: li
         scans = [Mesh(mesh.vertices[:150], None, name=f"scan of {mesh.name}") for mesh in meshes]
     config = QualityConfig(folds=None, samples=4, representation="vertices", gauge="form", align=False, modes=3)
     shapes = Shapes(meshes, scans, config)
-    work = QualityWork(tmp_path / "shapes.npz")
-    work.save(shapes)
-    first, last = shapes.parts()[0], shapes.parts()[-1]
-    for part in (first, last):
-        assert np.array_equal(np.asarray(work.do(part)[0]), shapes.do(part))
-    read = work._load()  # pyright: ignore[reportPrivateUsage]
-    assert read.config == config
+    with Shared.by(Local(), shapes, tmp_path) as shared:
+        work = QualityWork(shared)
+        memory_cache.clear()  # as in another process
+        first, last = shapes.parts()[0], shapes.parts()[-1]
+        for part in (first, last):
+            assert np.array_equal(np.asarray(work.do(part)[0]), shapes.do(part))
+        read = shared.value()
+    assert read is not shapes and read.config == config
     assert [mesh.name for mesh in read.meshes] == [mesh.name for mesh in meshes]
 
 

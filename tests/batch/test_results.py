@@ -11,11 +11,11 @@ from msgspec import structs
 from scipy.spatial.transform import Rotation
 
 from shapespace.batch.fit_records import (
-    Source,
     coefficient_row,
     failed_record,
     fit_record,
     read_record,
+    source_of,
     write_coefficients,
     write_fitted_mesh,
     write_record,
@@ -32,7 +32,7 @@ from shapespace.schemas import File
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model, raw_scan, similarity
 
-SCAN, MODEL = Source("raw.ply", "a" * 64), Source("blob.h5", "b" * 64)
+SCAN, MODEL = File(name="raw.ply", hash="a" * 64), File(name="blob.h5", hash="b" * 64)
 SUMMARY = {"mean", "median", "rms", "p95", "max", "count"}
 
 
@@ -141,7 +141,7 @@ def test_distances_over_the_overlap_are_in_millimetres_of_the_scan(tmp_path: Pat
 
 
 def test_the_table_tells_pose_size_and_where_the_scan_was(result: FitResult, tmp_path: Path) -> None:
-    record = fit_record(result, Source.of_file(tmp_path / "scans" / "raw.ply", "a", tmp_path / "out"), MODEL)
+    record = fit_record(result, source_of(tmp_path / "scans" / "raw.ply", "a", tmp_path / "out"), MODEL)
     row = coefficient_row("one", record)
     turn = np.radians([row[f"rotation_{axis}_deg"] for axis in "xyz"])
     assert np.allclose(Rotation.from_rotvec(turn).as_matrix(), result.T_scan_model.rotation)
@@ -191,7 +191,7 @@ def test_the_iterations_kept_end_in_the_final_surface(tmp_path: Path, result: Fi
 
 
 def test_sources_are_told_relative_to_the_results(tmp_path: Path) -> None:
-    source = Source.of_file(tmp_path / "models" / "m.h5", "h", tmp_path / "out")
+    source = source_of(tmp_path / "models" / "m.h5", "h", tmp_path / "out")
     assert source.to_file() == File(name="m.h5", hash="h", path="../models/m.h5")
 
 

@@ -14,8 +14,7 @@ import pytest
 from shapespace.batch.executors import Executor, Local, Serial
 from shapespace.batch.fit_work import Job
 from shapespace.batch.on_dask import OnDask
-from shapespace.batch.run import BatchConfig, Plan, fit_many, make_jobs
-from shapespace.batch.sinks import FolderSink
+from shapespace.batch.run import BatchConfig, FolderSink, Plan, fit_many, make_jobs
 from shapespace.errors import FileError
 from shapespace.fit.fit_scan import FitConfig
 from shapespace.fit.iteration_state import IcpState

@@ -5,10 +5,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shapespace.batch.fit_records import Source, coefficient_row, fit_record
+from shapespace.batch.fit_records import coefficient_row, fit_record
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.result import FitResult
 from shapespace.geometry.normals import face_areas
+from shapespace.schemas import File
 from shapespace.store.rows import coefficient_columns
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model, raw_scan, similarity
@@ -23,7 +24,7 @@ def fitted(request: pytest.FixtureRequest) -> Fitted:
     raw = raw_scan(np.array([1.0, -0.5, 0.5, 0.8, -0.3]), similarity(1, 20.0, 1.1), noise_mm=0.1)
     scan = raw.scan.with_vertices(request.param * raw.scan.vertices)
     result = fit_scan(MODEL, scan, FitConfig())
-    record = fit_record(result, Source("scan.ply", "0" * 64), Source("m.h5", MODEL.content_hash))
+    record = fit_record(result, File(name="scan.ply", hash="0" * 64), File(name="m.h5", hash=MODEL.content_hash))
     return (
         result,
         result.surface().with_vertices(result.surface().vertices / request.param),

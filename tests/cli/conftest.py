@@ -12,7 +12,7 @@ import pytest
 from shapespace.batch import progress
 from shapespace.batch.warm import COMPILING
 from shapespace.cli import main
-from shapespace.correspondence import generic
+from shapespace.correspondence import template
 from shapespace.io.landmarks.landmark_io import write_landmark_indices
 from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.types import FloatArray, Mesh
@@ -30,7 +30,7 @@ Z = (
 def few_modes() -> Iterator[None]:
     """Search poses with few smooth modes, which blobs need no more of; this takes most of the time of a test."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(generic, "MODES", 15)
+        patch.setattr(template, "MODES", 15)
         yield
 
 

@@ -11,7 +11,7 @@ import pytest
 from shapespace.cli.arguments import parser
 from shapespace.cli.command_table import COMMANDS
 from shapespace.cli.options import NO_DEFAULT, Option, Source, given
-from shapespace.model.build_config import BuildConfig
+from shapespace.model.build_model import BuildConfig
 
 JUSTIFIED = {
     ("fit", "search"): (

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from conftest import Run, World, leftovers
-from shapespace.batch import sinks
+from shapespace.batch import run as batch_run
 from shapespace.store.results import Results
 
 pytest.importorskip("zarr", reason="the extra 'store' is not installed")
@@ -57,7 +57,7 @@ def test_a_run_into_a_store_that_is_killed_goes_on(
 ) -> None:
     raw, out = scans(world, tmp_path, 60), tmp_path / "out"
     code = (
-        "from shapespace.batch import sinks; sinks.ROWS = 10\n"
+        "from shapespace.batch import run; run.ROWS = 10\n"
         "import sys\nfrom shapespace.cli import main\nsys.exit(main(sys.argv[1:]))"
     )
     told = ["fit", str(world.model), str(raw), "-o", str(out), "--store", "--jobs", "1", *FAST]
@@ -71,7 +71,7 @@ def test_a_run_into_a_store_that_is_killed_goes_on(
     process.wait()
     done = Results(out).identities()
     assert 0 < len(done) < 60
-    monkeypatch.setattr(sinks, "ROWS", 10)
+    monkeypatch.setattr(batch_run, "ROWS", 10)
     outcome = run(*told)
     assert outcome.code == 0 and f"{len(done)} of 60" in outcome.err, outcome.err
     found = Results(out)

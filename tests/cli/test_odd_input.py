@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from conftest import Run, World, leftovers
-from shapespace.batch.execution import EXECUTORS
+from shapespace.batch.executors import EXECUTORS
 from shapespace.errors import FitError
 from shapespace.io import disk_cache
 from shapespace.io.meshes.mesh_io import MESH_FORMATS, write_mesh

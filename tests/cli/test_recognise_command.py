@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from conftest import Run, World
-from shapespace.batch.fit_records import Source, coefficient_row, failed_record, write_coefficients, write_record
+from shapespace.batch.fit_records import coefficient_row, failed_record, write_coefficients, write_record
 from shapespace.errors import InputError
 from shapespace.io.tables.table_io import write_rows
 from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
-from shapespace.schemas import FitRecord
+from shapespace.schemas import File, FitRecord
 
 pytest.importorskip("sklearn", reason="the extra `recognise` is not installed")
 
@@ -52,7 +52,9 @@ def make_results(folder: Path, people: int, seed: int, model_hash: str = HASH) -
 
 
 def fail(folder: Path, name: str, model_hash: str = HASH) -> None:
-    record = failed_record(Source(f"{name}.ply", "x"), Source("m.h5", model_hash), f"{name}.ply is empty.", {})
+    record = failed_record(
+        File(name=f"{name}.ply", hash="x"), File(name="m.h5", hash=model_hash), f"{name}.ply is empty.", {}
+    )
     write_record(folder / f"{name}.fit.json", record)
 
 

@@ -11,9 +11,8 @@ from scipy.spatial import Delaunay
 import shapespace as ss
 from raw_blobs import dispersion_mm, raw_blob, without_ball
 from shapespace.cli import main
-from shapespace.correspondence.correspondence_result import Correspondence
+from shapespace.correspondence.correspondence_result import Correspondence, copies, unit_ratios
 from shapespace.correspondence.register import ElasticSettings
-from shapespace.correspondence.scan_set import copies, unit_ratios
 from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.correspondence.template import choose_template, clean_scan, resample
 from shapespace.errors import InputError, MeshError
@@ -51,7 +50,7 @@ def test_points_without_triangles_are_put_where_their_meshes_are(plain: list[Flo
 
 
 def test_a_whole_object_of_another_kind_is_no_template_of_open_scans(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shapespace.correspondence.generic.MODES", 15)
+    monkeypatch.setattr("shapespace.correspondence.template.MODES", 15)
     scans = [without_ball(scan, scan.vertices[np.argmax(scan.vertices[:, 0])], 45.0) for scan in SCANS[:3]]
     directions, faces = sphere(700)
     choice = choose_template([Mesh(1e3 * directions, faces, name="ball"), *scans], 0)

@@ -8,7 +8,7 @@ import pytest
 import shapespace as ss
 from raw_blobs import raw_blob
 from shapespace.cli import main
-from shapespace.correspondence import generic
+from shapespace.correspondence import template
 from shapespace.types import Mesh
 from synthetic_shapes import training_meshes
 
@@ -16,7 +16,7 @@ from synthetic_shapes import training_meshes
 def test_notes_on_scans_are_those_of_the_command(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(generic, "MODES", 15)
+    monkeypatch.setattr(template, "MODES", 15)
     first, second = (raw_blob(k, points=600).scan for k in range(2))
     copy = Mesh(first.vertices + 9.0, first.faces, name="copy")
     in_metres = Mesh(0.001 * raw_blob(2, points=600).scan.vertices, raw_blob(2, points=600).scan.faces, name="metres")

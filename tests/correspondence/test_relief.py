@@ -5,8 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from raw_blobs import raw_blob
-from shapespace.correspondence.harmonics import Harmonics
-from shapespace.correspondence.relief import Reliefs, agreement, relief
+from shapespace.correspondence.harmonics import Harmonics, Reliefs, agreement, relief
 from shapespace.correspondence.template import resample
 from shapespace.types import Mesh, Similarity
 

@@ -14,7 +14,7 @@ from shapespace.correspondence.scan_status import SurfaceMeasures, find_review_r
 from shapespace.correspondence.template import TemplateChoice
 from shapespace.errors import InputError
 from shapespace.schemas import SurfaceReview
-from shapespace.store.review_text import provenance_with_review, review_of_provenance, review_summary
+from shapespace.store.corresponding import provenance_with_review, review_of_provenance, review_summary
 from shapespace.types import Mesh
 
 USUAL = SurfaceMeasures(
@@ -61,7 +61,7 @@ def test_a_review_counts_surfaces_once_and_every_reason() -> None:
 
 
 def test_settings_with_which_the_median_surface_is_folded_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shapespace.correspondence.generic.MODES", 15)
+    monkeypatch.setattr("shapespace.correspondence.template.MODES", 15)
     scans = [raw_blob(k, points=600).scan for k in range(3)]
     made = ss.correspond(scans, CONFIG, template=scans[0])
     assert [scan.measures.folded for scan in made.scans if scan.measures] == [0.0] * 3

@@ -188,7 +188,7 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     # The meshes need not be split for so many, which takes four times as long as all the rest of a scan.
     monkeypatch.setattr("shapespace.datasets.simulated_scan.PLAIN_TRIANGLES", 16_000)
     # Workers that start for three scans take longer than the scans; what they do is tested in tests/batch.
-    monkeypatch.setattr("shapespace.batch.execution.cores", lambda: 1)
+    monkeypatch.setattr("shapespace.batch.executors.cores", lambda: 1)
     for name in ("SHAPESPACE_DATA", "SHAPESPACE_DATA_URL"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("SHAPESPACE_CACHE", str(tmp_path / "cache"))
@@ -556,13 +556,14 @@ def test_the_reference_has_every_option_of_the_parser_and_no_other(command: Comm
 
 
 def test_the_reference_lists_every_key_of_a_fit_record() -> None:
-    from shapespace.batch.fit_records import Source, fit_record
+    from shapespace.batch.fit_records import fit_record
     from shapespace.fit.fit_scan import fit_scan
+    from shapespace.schemas import File
     from synthetic_shapes import blob_model, raw_scan
 
     model = blob_model()
     record = fit_record(
-        fit_scan(model, raw_scan(0.5 * model.stddev / model.stddev).scan), Source("a", ""), Source("b", "")
+        fit_scan(model, raw_scan(0.5 * model.stddev / model.stddev).scan), File(name="a"), File(name="b")
     )
     written = [key for row in rows(ROOT / "docs" / "fit-results.md", "NAME.fit.json") for key in code_in(row[0])]
     assert sorted(written) == sorted(record.to_json())

@@ -21,7 +21,6 @@ from msgspec import structs
 
 from own_file_fuzz import VALUES, damaged_bytes, damaged_json, fuzzed
 from shapespace.batch.fit_records import (
-    Source,
     coefficient_row,
     failed_record,
     fit_record,
@@ -46,6 +45,7 @@ from shapespace.schemas import (
     CorrespondenceRecord,
     CorrespondRecord,
     Demo,
+    File,
     Quality,
     Recognition,
     json_text,
@@ -77,7 +77,10 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     model = blob_model(vertices=200)
     model.save(home / "m.h5")
     result = fit_scan(model, raw_scan(np.full(5, 0.3), vertices=150).scan, FitConfig(method="paper", max_iterations=4))
-    source = Source("one.ply", "a" * 64, "../one.ply"), Source("m.h5", model.content_hash, "m.h5")
+    source = (
+        File(name="one.ply", hash="a" * 64, path="../one.ply"),
+        File(name="m.h5", hash=model.content_hash, path="m.h5"),
+    )
     record = fit_record(result, *source)
     write_record(home / "one.fit.json", record)
     write_stages(home / "one.stages.npz", result, model)

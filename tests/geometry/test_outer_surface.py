@@ -116,7 +116,7 @@ def test_a_scan_with_inner_surfaces_is_no_template_where_others_have_none() -> N
 
 @pytest.mark.parametrize("at", [0, 3])
 def test_another_object_without_inner_surfaces_is_no_template(at: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shapespace.correspondence.generic.MODES", 15)
+    monkeypatch.setattr("shapespace.correspondence.template.MODES", 15)
     scans = [with_shell(raw_blob(k, points=700).scan) for k in range(3)]
     directions, faces = sphere(700)
     scans.insert(at, Mesh(0.1 * directions, faces, name="ball"))

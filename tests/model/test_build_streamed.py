@@ -25,9 +25,9 @@ SLOW = """
 import sys, time
 from shapespace import cli
 from shapespace.io.containers.row_spill import Spill
-from shapespace.model import large_pca
-large_pca.EXACT, large_pca._LEAST_BLOCK = 10, 5
-for owner, name, wait in ((large_pca._Covariance, "__call__", 0.1), (Spill, "to_disk", 0.3)):
+from shapespace.model import pca
+pca.EXACT, pca._LEAST_BLOCK = 10, 5
+for owner, name, wait in ((pca.Covariance, "__call__", 0.1), (Spill, "to_disk", 0.3)):
     def slow(*given, plain=getattr(owner, name), wait=wait):
         time.sleep(wait)
         return plain(*given)

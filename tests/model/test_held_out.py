@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from shapespace.model.held_out import held_out_shapes
+from shapespace.model.new_shapes import held_out_shapes
 
 
 def by_brute_force(data: np.ndarray, groups: list[str], modes: int, centred: bool) -> tuple[np.ndarray, float]:

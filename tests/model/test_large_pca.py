@@ -9,9 +9,8 @@ import pytest
 from shapespace.errors import FileFormatError, InputError
 from shapespace.io.containers import row_spill as spill
 from shapespace.io.containers.row_spill import Spill
-from shapespace.model import krylov, large_pca
-from shapespace.model.krylov import KeptPasses, Stop, leading
-from shapespace.model.large_pca import large_components
+from shapespace.model import krylov, pca
+from shapespace.model.krylov import Stop, leading
 from shapespace.model.pca import PrincipalComponents, principal_components
 from shapespace.types import FloatArray
 
@@ -42,7 +41,7 @@ def angles(a: PrincipalComponents, b: PrincipalComponents) -> FloatArray:
 @pytest.fixture(params=["gram", "krylov"])
 def method(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     if request.param == "krylov":
-        monkeypatch.setattr(large_pca, "EXACT", 10)
+        monkeypatch.setattr(pca, "EXACT", 10)
     return str(request.param)
 
 
@@ -51,7 +50,7 @@ def test_modes_are_those_of_the_exact_method(method: str, power: float, noise: f
     data = shapes(power=power, noise=noise)
     there = principal_components(data, 40)
     with on_disk(tmp_path, data) as table:
-        found = large_components(table, 40)
+        found = principal_components(table, 40)
     assert angles(found, there).max() < RADIANS
     assert np.allclose(found.variance, there.variance, rtol=1e-9)
     assert np.allclose(found.mean, there.mean, atol=1e-12)
@@ -63,7 +62,7 @@ def test_modes_are_those_of_the_exact_method(method: str, power: float, noise: f
 def test_the_residuals_are_those_of_the_covariance(method: str, tmp_path: Path) -> None:
     data = shapes(300, 200)
     with on_disk(tmp_path, data) as table:
-        found = large_components(table, 12)
+        found = principal_components(table, 12)
     C = np.cov(data.T)
     true = np.linalg.norm(C @ found.basis - found.basis * found.variance, axis=0)
     assert found.residuals is not None
@@ -85,7 +84,7 @@ def test_a_mode_that_is_off_has_a_residual_that_says_so() -> None:
 def test_a_share_of_the_variance_takes_as_many_modes_as_in_memory(method: str, share: float, tmp_path: Path) -> None:
     data = shapes(300, 400)
     with on_disk(tmp_path, data) as table:
-        found = large_components(table, share)
+        found = principal_components(table, share)
     there = principal_components(data, share)
     assert found.basis.shape == there.basis.shape
     assert angles(found, there).max() < RADIANS
@@ -95,9 +94,9 @@ def test_the_first_modes_of_a_large_gram_matrix_are_those_of_the_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     data = shapes(400, 300)
-    monkeypatch.setattr(large_pca, "_WHOLE", 100)
+    monkeypatch.setattr(pca, "_WHOLE", 100)
     with on_disk(tmp_path, data) as table:
-        found = large_components(table, 20)
+        found = principal_components(table, 20)
     assert angles(found, principal_components(data, 20)).max() < RADIANS
 
 
@@ -105,7 +104,7 @@ def test_shapes_of_few_directions_give_no_more_modes(method: str, tmp_path: Path
     rng = np.random.default_rng(2)
     data = rng.standard_normal((200, 5)) @ rng.standard_normal((5, 90))
     with on_disk(tmp_path, data) as table:
-        found = large_components(table, 20)
+        found = principal_components(table, 20)
     assert found.basis.shape == (90, 5)
     assert angles(found, principal_components(data.astype(np.float32).astype(float), 5)).max() < RADIANS
 
@@ -113,26 +112,26 @@ def test_shapes_of_few_directions_give_no_more_modes(method: str, tmp_path: Path
 def test_all_modes_of_few_shapes_are_found(tmp_path: Path) -> None:
     data = shapes(30, 90)
     with on_disk(tmp_path, data) as table:
-        assert angles(large_components(table, None), principal_components(data)).max() < 1e-5
+        assert angles(principal_components(table, None), principal_components(data)).max() < 1e-5
 
 
 def test_all_modes_of_many_shapes_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(large_pca, "EXACT", 10)
+    monkeypatch.setattr(pca, "EXACT", 10)
     with on_disk(tmp_path, shapes(30, 90)) as table, pytest.raises(InputError, match="All modes of 30 shapes"):
-        large_components(table, None)
+        principal_components(table, None)
 
 
 def test_modes_that_memory_does_not_hold_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(large_pca, "available_bytes", lambda: 10_000)
+    monkeypatch.setattr(pca, "available_bytes", lambda: 10_000)
     with on_disk(tmp_path, shapes(30, 90)) as table, pytest.raises(InputError, match="20 modes of 30 vertices take"):
-        large_components(table, 20)
+        principal_components(table, 20)
 
 
 def test_a_basis_that_may_not_grow_enough_ends_in_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(large_pca, "EXACT", 10)
-    monkeypatch.setattr(large_pca, "_BASIS_BYTES", 8 * 900 * 40)
+    monkeypatch.setattr(pca, "EXACT", 10)
+    monkeypatch.setattr(pca, "_BASIS_BYTES", 8 * 900 * 40)
     with on_disk(tmp_path, shapes()) as table, pytest.raises(InputError, match="in 40 directions"):
-        large_components(table, 0.9999)
+        principal_components(table, 0.9999)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
@@ -140,68 +139,68 @@ def test_values_that_are_not_finite_are_refused(bad: float, tmp_path: Path) -> N
     data = shapes(20, 60)
     data[3, 5] = bad
     with on_disk(tmp_path, data) as table, pytest.raises(InputError, match="not finite"):
-        large_components(table, 3)
+        principal_components(table, 3)
 
 
 @pytest.mark.parametrize("level", [0.0, 0.1])
 def test_equal_shapes_are_refused(level: float, tmp_path: Path) -> None:
     with on_disk(tmp_path, np.full((9, 60), level)) as table, pytest.raises(InputError, match="all equal"):
-        large_components(table, 3)
+        principal_components(table, 3)
 
 
 @pytest.mark.parametrize("share", [0.0, 1.5])
 def test_shares_that_are_none_are_refused(share: float, tmp_path: Path) -> None:
     with on_disk(tmp_path, shapes(20, 60)) as table, pytest.raises(InputError, match="A share of the variance"):
-        large_components(table, share)
+        principal_components(table, share)
 
 
 def test_two_runs_are_the_same_to_the_bit(method: str, tmp_path: Path) -> None:
     with on_disk(tmp_path, shapes(300, 300)) as table:
-        first, second = (large_components(table, 15, seed=3) for _ in range(2))
+        first, second = (principal_components(table, 15, seed=3) for _ in range(2))
     assert np.array_equal(first.basis, second.basis) and np.array_equal(first.variance, second.variance)
 
 
 def test_a_run_that_was_stopped_goes_on_with_its_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(large_pca, "EXACT", 10)
-    data, kept = shapes(), KeptPasses(tmp_path)
+    monkeypatch.setattr(pca, "EXACT", 10)
+    data, kept = shapes(), tmp_path
     with on_disk(tmp_path, data) as table:
-        undisturbed = large_components(table, 30)
+        undisturbed = principal_components(table, 30)
 
         def stop(number: int, share: float) -> None:
             if number == 3:
                 raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):
-            large_components(table, 30, passes=kept, on_pass=stop)
+            principal_components(table, 30, passes=kept, on_pass=stop)
         assert len(list(tmp_path.glob("pass-*.npz"))) == 3
         # A pass that is cut short is made again.
         third = tmp_path / "pass-003.npz"
         third.write_bytes(third.read_bytes()[:-100])
         products: list[int] = []
-        covariance = large_pca._Covariance.__call__
+        covariance = pca.Covariance.__call__
 
-        def counted(self: large_pca._Covariance, Q: FloatArray) -> FloatArray:
+        def counted(self: pca.Covariance, Q: FloatArray) -> FloatArray:
             products.append(Q.shape[1])
             return covariance(self, Q)
 
-        monkeypatch.setattr(large_pca._Covariance, "__call__", counted)
+        monkeypatch.setattr(pca.Covariance, "__call__", counted)
         passes: list[int] = []
-        again = large_components(table, 30, passes=kept, on_pass=lambda number, share: passes.append(number))
+        again = principal_components(table, 30, passes=kept, on_pass=lambda number, share: passes.append(number))
     assert np.array_equal(again.basis, undisturbed.basis)
     # Two of the passes were kept, and the last product is that of the residuals.
     assert len(products) == passes[-1] - 2 + 1
 
 
 def test_memory_does_not_grow_with_the_shapes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(large_pca, "EXACT", 10)
+    monkeypatch.setattr(pca, "EXACT", 10)
     monkeypatch.setattr(spill, "_BLOCK_BYTES", 1 << 20)
     peaks: list[int] = []
     for n in (2000, 8000):
         data = np.random.default_rng(0).standard_normal((n, 300)) * np.geomspace(30, 0.1, 300)
         with on_disk(tmp_path, data) as table:
-            large_components(table, 3)  # what scipy loads
+            principal_components(table, 3)  # what scipy loads
             tracemalloc.start()
-            large_components(table, 3)
+            principal_components(table, 3)
             peaks.append(tracemalloc.get_traced_memory()[1])
             tracemalloc.stop()
     assert peaks[1] < 1.1 * peaks[0]

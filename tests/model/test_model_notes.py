@@ -11,8 +11,7 @@ import shapespace as ss
 from shapespace.cli import main
 from shapespace.geometry.mirror_plane import mirror_image
 from shapespace.model.additive import AdditiveModel
-from shapespace.model.build_config import BuildConfig
-from shapespace.model.build_model import build_model, extend_model
+from shapespace.model.build_model import BuildConfig, build_model, extend_model
 from shapespace.report.blocks.wording import training_text
 from shapespace.statistics.compare_shapes import complete_cohort
 from shapespace.types import FloatArray, Mesh

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from shapespace.model.held_out import held_out_shapes
-from shapespace.model.new_shapes import HeldOut, variances_of_new_shapes
+from shapespace.model.new_shapes import HeldOut, held_out_shapes, variances_of_new_shapes
 from shapespace.types import FloatArray
 
 COORDINATES = 200

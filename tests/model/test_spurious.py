@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from shapespace.errors import InputError
+from shapespace.model.choose_modes import rounding_mm
 from shapespace.model.shape_model import ShapeModel
-from shapespace.model.spurious import rounding_mm
 from shapespace.types import FloatArray, Mesh
 from synthetic_shapes import training_meshes
 

@@ -22,7 +22,7 @@ from shapespace.geometry.procrustes import (
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.containers.row_spill import Spill
 from shapespace.model import choose_modes as choosing
-from shapespace.model import large_pca, shape_model, streamed
+from shapespace.model import pca, shape_model, streamed
 from shapespace.model.shape_model import ShapeModel
 from shapespace.model.streamed import Scratch
 from shapespace.types import FloatArray, IntArray, Mesh
@@ -112,7 +112,7 @@ def test_a_streamed_model_is_that_in_memory(
     method: str, options: dict[str, object], monkeypatch: pytest.MonkeyPatch, temporary: Path
 ) -> None:
     if method == "krylov":
-        monkeypatch.setattr(large_pca, "EXACT", 10)
+        monkeypatch.setattr(pca, "EXACT", 10)
     meshes = posed()
     there = ShapeModel.fit(meshes, **options)
     found = ShapeModel.fit(meshes, **options, out_of_core=True)
@@ -283,7 +283,7 @@ def interrupted(meshes: Sequence[Mesh], folder: Path, at: str) -> None:
 
 
 def test_after_ctrl_c_the_file_is_gone_and_the_passes_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(large_pca, "EXACT", 10)
+    monkeypatch.setattr(pca, "EXACT", 10)
     meshes, folder = posed(60), tmp_path / "scratch"
     undisturbed = ShapeModel.fit(meshes, modes=4, out_of_core=True)
     interrupted(meshes, folder, "reading mesh 1 ")
@@ -304,7 +304,7 @@ def test_after_ctrl_c_the_file_is_gone_and_the_passes_go_on(tmp_path: Path, monk
 
 
 def test_what_another_build_kept_is_not_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(large_pca, "EXACT", 10)
+    monkeypatch.setattr(pca, "EXACT", 10)
     meshes, folder = posed(60), tmp_path / "scratch"
     interrupted(meshes, folder, "finding the modes, pass 2")
     others = meshes[::-1]

@@ -10,8 +10,7 @@ import pytest
 
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model import training_shapes
-from shapespace.model.build_config import BuildConfig
-from shapespace.model.build_model import build_model, extend_model
+from shapespace.model.build_model import BuildConfig, build_model, extend_model
 from shapespace.model.shape_model import ShapeModel
 from shapespace.model.training_shapes import TrainingShapes
 from shapespace.types import FloatArray, Mesh

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from shapespace import schemas
-from shapespace.batch.fit_records import Source, coefficient_row, failed_record, write_coefficients
+from shapespace.batch.fit_records import coefficient_row, failed_record, write_coefficients
 from shapespace.cohort.labels import Label, Labels
 from shapespace.cohort.table import Table
 from shapespace.errors import FileError, FileFormatError, InputError
@@ -18,7 +18,7 @@ from shapespace.recognise.labelled_scans import (
     with_labels,
 )
 from shapespace.recognise.predict import predict_scans, train_classifier, write_answers
-from shapespace.schemas import FitRecord
+from shapespace.schemas import File, FitRecord
 
 HASH = "a" * 64
 NAMES = ("anger", "fear", "smile")
@@ -198,7 +198,7 @@ def test_answers_are_written_in_order_and_harmless_to_spreadsheets(tmp_path):
 
 def record(name, status="converged", z=(1.0, 2.0)):
     if status == "failed":
-        return failed_record(Source(f"{name}.ply", "x"), Source("m.h5", HASH), "It is empty.", {})
+        return failed_record(File(name=f"{name}.ply", hash="x"), File(name="m.h5", hash=HASH), "It is empty.", {})
     content = {
         "scan": {"name": f"{name}.ply"}, "model": {"hash": HASH}, "status": status, "reason": "Fine.", "b": list(z),
         "z": list(z), "b_stddev": list(z), "mm_per_scan_unit": 1.0,

@@ -7,11 +7,12 @@ from sklearn.model_selection import GridSearchCV, cross_val_score
 from sklearn.pipeline import make_pipeline
 
 import shapespace as ss
-from shapespace.batch.fit_records import Source, failed_record, fit_record
+from shapespace.batch.fit_records import failed_record, fit_record
 from shapespace.errors import CorrespondenceError, FileFormatError, InputError
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.recognise.classifiers import CLASSIFIERS
+from shapespace.schemas import File
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model, raw_scan, similarity, training_meshes
 
@@ -51,8 +52,10 @@ def test_scans_are_fitted_and_fits_and_records_are_taken_as_they_are():
     config = FitConfig(max_iterations=20)
     result = fit_scan(model, scan, config)
     space = ss.ShapeSpace(model=model, meshes="scans", config=config).fit([])
-    record = fit_record(result, Source("s.ply", "a"), Source("m.h5", model.content_hash))
-    failed = failed_record(Source("t.ply", "b"), Source("m.h5", model.content_hash), "t.ply is empty.", {})
+    record = fit_record(result, File(name="s.ply", hash="a"), File(name="m.h5", hash=model.content_hash))
+    failed = failed_record(
+        File(name="t.ply", hash="b"), File(name="m.h5", hash=model.content_hash), "t.ply is empty.", {}
+    )
     z = space.transform([scan, result, record, failed])
     np.testing.assert_allclose(z[:3], [result.z] * 3)
     assert np.isnan(z[3]).all()
@@ -75,7 +78,7 @@ def test_what_does_not_belong_to_the_model_is_refused():
     scan = raw_scan(np.zeros(5), similarity(2, 8.0, 1.0)).scan
     with pytest.raises(CorrespondenceError, match="fit this one instead"):
         space.transform([scan])
-    other = failed_record(Source("t.ply", "b"), Source("m.h5", "f" * 64), "t.ply is empty.", {})
+    other = failed_record(File(name="t.ply", hash="b"), File(name="m.h5", hash="f" * 64), "t.ply is empty.", {})
     with pytest.raises(InputError, match=r"t\.ply was fitted with the model ffffffffffff"):
         space.transform([other])
     with pytest.raises(FileFormatError, match="record of number 1 is incomplete"):

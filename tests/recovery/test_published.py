@@ -14,7 +14,7 @@ from shapespace.datasets.faces import load_faces
 from shapespace.datasets.simulated_scan import Cut, Hole, random_similarity, simulate_scan
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.robust.robust_method import Robust
-from shapespace.model.floor import floor_mm
+from shapespace.model.model_quality import floor_mm
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh
 

@@ -11,8 +11,7 @@ import pytest
 from report_page import edit
 
 from shapespace.batch.executors import Serial
-from shapespace.batch.run import BatchConfig, fit_many, make_jobs
-from shapespace.batch.sinks import FolderSink
+from shapespace.batch.run import BatchConfig, FolderSink, fit_many, make_jobs
 from shapespace.fit.fit_scan import FitConfig
 from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.io.tables.table_io import write_rows

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from shapespace.batch.executors import Serial
-from shapespace.batch.run import BatchConfig, fit_many, make_jobs
-from shapespace.batch.sinks import FolderSink
+from shapespace.batch.run import BatchConfig, FolderSink, fit_many, make_jobs
 from shapespace.errors import FileFormatError, InputError
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.io.meshes.mesh_io import read_mesh, write_mesh

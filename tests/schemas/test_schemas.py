@@ -9,10 +9,10 @@ import pytest
 from msgspec import structs
 
 from shapespace import schemas
-from shapespace.batch.fit_records import Source, fit_record, read_record, write_record
+from shapespace.batch.fit_records import fit_record, read_record, write_record
 from shapespace.errors import FileFormatError
 from shapespace.fit.fit_scan import FitConfig, fit_scan
-from shapespace.schemas import FitRecord
+from shapespace.schemas import File, FitRecord
 from synthetic_shapes import blob_model, raw_scan
 
 
@@ -20,7 +20,7 @@ from synthetic_shapes import blob_model, raw_scan
 def record() -> dict[str, Any]:
     model = blob_model(300, 4)
     result = fit_scan(model, raw_scan(np.zeros(5), seed=1, vertices=500).scan, FitConfig(max_iterations=3))
-    return fit_record(result, Source("a.ply", "ab", "../a.ply"), Source("m.h5", "cd")).to_json()
+    return fit_record(result, File(name="a.ply", hash="ab", path="../a.ply"), File(name="m.h5", hash="cd")).to_json()
 
 
 def test_a_record_that_was_written_comes_back_as_it_was(record: dict[str, Any]) -> None:

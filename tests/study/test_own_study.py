@@ -38,7 +38,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def studied(world: Path) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         # Workers that start for a dozen scans take longer than the scans; tests/batch tests them.
-        patch.setattr("shapespace.batch.execution.cores", lambda: 1)
+        patch.setattr("shapespace.batch.executors.cores", lambda: 1)
         code = command("recognise", "study", "--data", str(world / "scans"), "--model", str(world / "model.h5"),
                        "--folds", "5", "-o", str(world / "study"), "--no-open")  # fmt: skip
     assert code == 0

@@ -2,25 +2,33 @@
 
 All executors have one interface, `Executor.run`, and one contract: each task has one answer, in any order, and a task
 that its workers do not survive is given up with a reason while the others continue.
+
+`ExecutionConfig` chooses one by its name and the settings of the command line.
 """
 
 from __future__ import annotations
 
+import hashlib
+import pickle
 import time
 from collections import deque
-from collections.abc import Generator, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
-from dataclasses import dataclass
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection, wait
-from typing import Any, Protocol, TypeVar
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar, cast
 
 from threadpoolctl import threadpool_limits
 
 from shapespace.batch.workers import Worker, cores, life_line, start_loading, wait_until_loaded
-from shapespace.errors import FitError
+from shapespace.errors import FileFormatError, FitError, InputError
+from shapespace.io.files import make_folder, read_bytes, temporary_folder, write_bytes
+from shapespace.io.memory_cache import LatestValue
 
 T = TypeVar("T")
 R = TypeVar("R")
+S = TypeVar("S")
 TaskT = TypeVar("TaskT", contravariant=True)
 AnswerT = TypeVar("AnswerT", covariant=True)
 
@@ -39,7 +47,8 @@ _NO_START = (
 class Work(Protocol[TaskT, AnswerT]):
     """What is done with each task: frozen, small, and sent to every worker.
 
-    It names the data that the tasks share by path or hash; `do` loads them once in each process (`LatestValue`).
+    It names the data that the tasks share by path or hash; `do` loads them once in each process (`Shared`,
+    `LatestValue`).
     """
 
     def do(self, task: TaskT, /) -> AnswerT:
@@ -101,6 +110,63 @@ class Local:
         with closing(Team(work, self.workers or cores(), self.timeout_s, quiet=self.quiet)) as team:
             for number, answer in team.run(tasks):
                 yield tasks[number], answer
+
+
+_latest = LatestValue[Any]()
+"""The value that the tasks of this process share, by its file."""
+
+
+@dataclass(frozen=True)
+class Shared(Generic[T]):
+    """What all tasks of a work use; each worker reads it once from a file that only the run itself writes.
+
+    Args:
+        file: of the value, during the run.
+        sha256: of the file's content, so that nothing is read that another program wrote there; empty without a file.
+    """
+
+    file: Path
+    sha256: str = ""
+
+    @staticmethod
+    @contextmanager
+    def by(executor: Executor, value: S, folder: Path) -> Generator[Shared[S]]:
+        """Yield a dataclass `value` as the tasks of an executor share it, during the block.
+
+        Args:
+            executor: of the tasks; with `Serial`, nothing is written.
+            value: what is shared.
+            folder: that all workers see; made if absent.
+
+        Raises:
+            FileError: it cannot be written.
+        """
+        with temporary_folder(make_folder(folder)) as temporary:
+            shared = Shared[S](temporary / "shared.pickle")
+            if not isinstance(executor, Serial):
+                content = pickle.dumps(replace(cast(Any, value)))  # without what it has cached
+                shared = Shared[S](shared.file, hashlib.sha256(content).hexdigest())
+                write_bytes(shared.file, content)
+            _latest.set(shared.file, value)
+            try:
+                yield shared
+            finally:
+                _latest.clear()
+
+    def value(self) -> T:
+        """Return the value.
+
+        Raises:
+            FileError: its file cannot be read.
+            FileFormatError: it is not the file that the run wrote.
+        """
+        return _latest.get(self.file, self._read)
+
+    def _read(self) -> T:
+        content = read_bytes(self.file)
+        if hashlib.sha256(content).hexdigest() != self.sha256:
+            raise FileFormatError(f"{self.file} was changed during the run; run the command again.")
+        return pickle.loads(content)
 
 
 @dataclass
@@ -230,3 +296,65 @@ def _value(answer: tuple[bool, Any]) -> Any:
     if not done:
         raise value
     return value
+
+
+@dataclass(frozen=True)
+class ExecutionConfig:
+    """Execution settings.
+
+    Args:
+        kind: a name of `EXECUTORS`.
+        jobs: number of parallel tasks; 0 for one per core. On a cluster it is the number of its workers.
+        timeout_s: a task that takes longer is given up; None for no limit.
+        dask: address of a Dask scheduler, a scheduler file, or empty for a cluster by Dask's configuration.
+
+    Raises:
+        InputError: the kind does not exist, or does not support the other settings.
+    """
+
+    kind: str = "local"
+    jobs: int = 0
+    timeout_s: float | None = None
+    dask: str = ""
+
+    def __post_init__(self) -> None:
+        if self.kind not in EXECUTORS:
+            raise InputError(f"There is no executor {self.kind!r}; use one of {', '.join(EXECUTORS)}.")
+        if self.dask and self.kind != "dask":
+            raise InputError(f"A Dask scheduler is for executor=dask, not {self.kind}; leave out one of them.")
+        if self.kind == "serial" and self.timeout_s is not None:
+            raise InputError("executor=serial cannot stop a scan that hangs; leave out timeout or executor.")
+
+    def executor(self, tasks: int, *, quiet: bool = True) -> Executor:
+        """Return the executor for a number of tasks.
+
+        Args:
+            tasks: their number; one task alone runs in this process where nothing else is asked for.
+            quiet: whether workers do not report that code is compiled.
+        """
+        return EXECUTORS[self.kind](self, tasks, quiet)
+
+
+def _local(execution: ExecutionConfig, tasks: int, quiet: bool) -> Executor:
+    workers = min(execution.jobs or cores(), tasks)
+    if workers <= 1 and execution.timeout_s is None:
+        return Serial()
+    return Local(max(workers, 1), execution.timeout_s, quiet)
+
+
+def _serial(_execution: ExecutionConfig, _tasks: int, _quiet: bool) -> Executor:
+    return Serial()
+
+
+def _dask(execution: ExecutionConfig, _tasks: int, _quiet: bool) -> Executor:
+    from shapespace.batch.on_dask import OnDask  # needs the extra
+
+    return OnDask(execution.dask, execution.timeout_s)
+
+
+EXECUTORS: dict[str, Callable[[ExecutionConfig, int, bool], Executor]] = {
+    "local": _local,
+    "serial": _serial,
+    "dask": _dask,
+}
+"""Executors by name: functions of the settings, the number of tasks, and whether to be quiet."""

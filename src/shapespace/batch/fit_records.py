@@ -6,12 +6,13 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+from msgspec import structs
 
 from shapespace.errors import FileFormatError
 from shapespace.fit.result import FitResult
@@ -53,53 +54,31 @@ def _resolved(file: Path) -> Path:
     return file.resolve() if file.is_symlink() else _resolved_folder(file.parent.absolute()) / file.name
 
 
-@dataclass(frozen=True)
-class Source:
-    """An input file of a fit.
+def source_of(file: Path, content_hash: str, folder: Path) -> File:
+    """Return an input file of a fit as results in `folder` refer to it.
 
     Args:
-        name: name of the file.
+        file: the file.
         content_hash: SHA-256 of its content; the content hash of a model.
-        path: its path, relative to the folder of the results where possible; empty if unknown.
-        size_bytes: its size, which with `modified_ns` identifies it without reading it; None if unknown.
-        modified_ns: time of its last change, ns since 1970; None if unknown.
-        remote_version: version of a scan at an address; else empty.
+        folder: of the results, to which its path is relative where possible.
     """
+    try:
+        path = os.path.relpath(_resolved(file), _resolved_folder(folder.absolute()))
+    except (ValueError, OSError):  # another drive, or a folder that is gone
+        path = str(file)
+    return File(name=file.name, hash=content_hash, path=Path(path).as_posix())
 
-    name: str
-    content_hash: str
-    path: str = ""
-    size_bytes: int | None = None
-    modified_ns: int | None = None
-    remote_version: str = ""
 
-    @staticmethod
-    def of_file(file: Path, content_hash: str, folder: Path) -> Source:
-        """Return the source `file` as results in `folder` refer to it."""
-        try:
-            path = os.path.relpath(_resolved(file), _resolved_folder(folder.absolute()))
-        except (ValueError, OSError):  # another drive, or a folder that is gone
-            path = str(file)
-        return Source(file.name, content_hash, Path(path).as_posix())
+def hashed_source(file: Path, folder: Path) -> File:
+    """Return an input file with its hash, size and time of change.
 
-    @staticmethod
-    def hashed(file: Path, folder: Path) -> Source:
-        """Return the source `file` with its hash, size and time of change.
-
-        Raises:
-            FileError: it cannot be read.
-        """
-        content_hash = sha256_of_file(file)
-        stat = file.stat()
-        source = Source.of_file(file, content_hash, folder)
-        return replace(source, size_bytes=stat.st_size, modified_ns=stat.st_mtime_ns)
-
-    def to_file(self) -> File:
-        """Return the source as a part of a record."""
-        return File(
-            name=self.name, hash=self.content_hash, path=self.path, size_bytes=self.size_bytes,
-            modified_ns=self.modified_ns, remote_version=self.remote_version,
-        )  # fmt: skip
+    Raises:
+        FileError: it cannot be read.
+    """
+    content_hash = sha256_of_file(file)
+    stat = file.stat()
+    source = source_of(file, content_hash, folder)
+    return structs.replace(source, size_bytes=stat.st_size, modified_ns=stat.st_mtime_ns)
 
 
 def fit_identity(
@@ -112,9 +91,9 @@ def fit_identity(
 
 def fit_record(
     result: FitResult,
-    scan: Source,
-    model: Source,
-    landmarks: Source | None = None,
+    scan: File,
+    model: File,
+    landmarks: File | None = None,
     metadata: Mapping[str, str] | None = None,
 ) -> FitRecord:
     """Return the record of a fit, the content of NAME.fit.json.
@@ -127,13 +106,13 @@ def fit_record(
         metadata: of the scan, by the columns of a list of scans.
     """
     T = result.T_scan_model
-    marks = landmarks.content_hash if landmarks else ""
+    marks = landmarks.hash if landmarks else ""
     settings = {key: value for key, value in result.config.items() if key not in ("version", "scale_in_effect")}
     return FitRecord(
-        id=fit_identity(scan.content_hash, model.content_hash, settings, marks),
-        scan=scan.to_file(),
-        model=model.to_file(),
-        landmarks=landmarks.to_file() if landmarks else None,
+        id=fit_identity(scan.hash, model.hash, settings, marks),
+        scan=scan,
+        model=model,
+        landmarks=landmarks,
         metadata=dict(metadata or {}),
         status=result.status,
         reason=result.reason,
@@ -213,12 +192,12 @@ def _overlap(result: FitResult, stage: str) -> OverlapDistances | None:
 
 
 def failed_record(
-    scan: Source, model: Source, reason: str, config: Mapping[str, Any], metadata: Mapping[str, str] | None = None
+    scan: File, model: File, reason: str, config: Mapping[str, Any], metadata: Mapping[str, str] | None = None
 ) -> FitRecord:
     """Return the record of a scan that could not be fitted."""
     return FitRecord(
-        scan=scan.to_file(),
-        model=model.to_file(),
+        scan=scan,
+        model=model,
         metadata=dict(metadata or {}),
         status="failed",
         reason=reason,

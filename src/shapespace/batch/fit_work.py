@@ -1,34 +1,40 @@
-"""One scan of a batch: its fit, its result files, and whether the result of an earlier run is still valid."""
+"""One scan of a batch: its fit, its result files, and whether the result of an earlier run is still valid.
+
+`save_fit` writes a fit made in Python as the command line does.
+"""
 
 from __future__ import annotations
 
 import contextlib
-import json
+import hashlib
+import re
 import uuid
 from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from msgspec import structs
 
 from shapespace.batch.fit_records import (
-    Source,
     failed_record,
+    fit_identity,
     fit_record,
+    hashed_source,
     is_surface_of,
     read_record,
+    source_of,
     write_fitted_mesh,
     write_record,
     write_stages,
 )
-from shapespace.batch.result_folder import RECORD
-from shapespace.errors import FileError, ShapespaceError
-from shapespace.fit.fit_scan import OPTIONS, FitConfig, fit_scan
+from shapespace.batch.result_folder import RECORD, CoefficientTable, names_for, only_writer
+from shapespace.errors import FileError, InputError, ShapespaceError
+from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.iteration_state import IcpState
 from shapespace.fit.result import FitResult
-from shapespace.io.files import sha256_of_file, write_text, write_together
+from shapespace.io.files import make_folder, sha256_of_file, write_text, write_together
 from shapespace.io.landmarks.fiducials import FIDUCIAL_ENDINGS, fiducial_texts
 from shapespace.io.landmarks.landmark_io import read_landmarks
 from shapespace.io.memory_cache import LatestValue
@@ -37,9 +43,8 @@ from shapespace.io.read_limits import LARGEST_MESH_FILE_BYTES
 from shapespace.io.remote import fetch_copy, is_address, name_of, version_of
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import File, FitRecord, to_json
-from shapespace.store.results import ENDINGS, has_written_landmarks
-from shapespace.types import FloatArray
-from shapespace.version import __version__
+from shapespace.store.results import ENDINGS, Results, has_written_landmarks
+from shapespace.types import FloatArray, Mesh
 
 
 @dataclass(frozen=True)
@@ -78,19 +83,20 @@ class Job:
         with fetch_copy(self.address, LARGEST_MESH_FILE_BYTES) as file:
             yield file
 
-    def source(self, folder: Path) -> Source:
+    def source(self, folder: Path) -> File:
         """Return what results in `folder` say of where the scan is, without reading it."""
-        return Source(self.scan.name, "", self.address) if self.address else Source.of_file(self.scan, "", folder)
+        return File(name=self.scan.name, path=self.address) if self.address else source_of(self.scan, "", folder)
 
-    def read_source(self, file: Path, folder: Path) -> Source:
+    def read_source(self, file: Path, folder: Path) -> File:
         """Return the same, with what the scan is known again by; `file` is that of `readable`.
 
         Raises:
             FileError: it cannot be read.
         """
         if not self.address:
-            return Source.hashed(file, folder)
-        return replace(self.source(folder), content_hash=sha256_of_file(file), remote_version=version_of(self.address))
+            return hashed_source(file, folder)
+        version = version_of(self.address)
+        return structs.replace(self.source(folder), hash=sha256_of_file(file), remote_version=version)
 
 
 def fit_file(
@@ -202,7 +208,7 @@ class FitWork:
             if earlier is not None:
                 return earlier
         job, model = task.job, _model.get(self.model_hash, self._load)
-        model_source = Source.of_file(self.model_file, self.model_hash, self.folder)
+        model_source = source_of(self.model_file, self.model_hash, self.folder)
         scan_source, marks_source = job.source(self.folder), None
         try:
             with job.readable() as file:
@@ -210,7 +216,7 @@ class FitWork:
                 scan = read_mesh(file)
             landmarks: Mapping[str, FloatArray] | None = None
             if job.landmarks is not None:
-                marks_source = Source(job.landmarks.name, sha256_of_file(job.landmarks))
+                marks_source = File(name=job.landmarks.name, hash=sha256_of_file(job.landmarks))
                 landmarks = read_landmarks(job.landmarks)
             result = fit_scan(model, scan, task.config, landmarks=landmarks, on_state=self.on_state)
         except (MemoryError, ShapespaceError) as error:
@@ -224,11 +230,11 @@ class FitWork:
 
     def give_up(self, task: FitTask, reason: str) -> FitRecord:
         """Write and return the record of a scan whose workers were lost."""
-        model = Source.of_file(self.model_file, self.model_hash, self.folder)
+        model = source_of(self.model_file, self.model_hash, self.folder)
         scan = task.job.source(self.folder)
         if not task.job.address:
             with contextlib.suppress(ShapespaceError):
-                scan = Source.hashed(task.job.scan, self.folder)
+                scan = hashed_source(task.job.scan, self.folder)
         record = failed_record(scan, model, f"{task.job.label}: {reason}.", task.config.as_dict(), task.job.metadata)
         return _write_failed(structs.replace(record, given_up=self.run), task.job, self.folder)
 
@@ -268,11 +274,12 @@ def resumed(task: FitTask, model_hash: str, folder: Path, run: str = "") -> tupl
         return task, None
     try:
         record = read_record(files["record"])
-        if not _is_of(record, task, model_hash, folder):
-            return task, None
         if run and record.given_up == run:
             return task, record
-        dense = bool(record.config["dense"]) and is_surface_of(files["dense"], record)
+        dense = bool(record.config["dense"])
+        if not is_fit_of(record.id, record.scan, task, model_hash, folder, dense=dense):
+            return task, None
+        dense = dense and is_surface_of(files["dense"], record)
         staged = files["stages"].is_file()
         enough = is_surface_of(files["fitted"], record) and dense >= task.config.dense and staged >= task.stages
         complete = len(record.b) == len(record.z) == len(record.b_stddev)
@@ -284,24 +291,24 @@ def resumed(task: FitTask, model_hash: str, folder: Path, run: str = "") -> tupl
     return replace(task, config=also, stages=task.stages or staged), None
 
 
-def _is_of(record: FitRecord, task: FitTask, model_hash: str, folder: Path) -> bool:
-    """Return whether `record` is of the same scan, model, start and settings, with a dense surface or without."""
-    job, settings = task.job, _asked(task.config)
-    marks = Source(job.landmarks.name, sha256_of_file(job.landmarks)).to_file() if job.landmarks else None
-    return bool(
-        record.model.hash == model_hash
-        and record.landmarks == marks
-        and all(record.config.get(key) == settings.get(key) for key in {*settings, *OPTIONS})
-        and is_same_scan(record.scan, job, folder)
-    )
+def is_fit_of(identity: str, recorded: File, task: FitTask, model_hash: str, folder: Path, *, dense: bool) -> bool:
+    """Return whether a result in `folder` is of the scan, model, landmarks and settings of a task.
 
+    Args:
+        identity: of the result; empty if it is no fit.
+        recorded: the scan in its record.
+        task: the task.
+        model_hash: content hash of the model.
+        folder: of the results.
+        dense: whether the result has a dense surface, which the task need not ask for.
 
-@lru_cache(maxsize=4)
-def _asked(config: FitConfig) -> dict[str, Any]:
-    """Return the settings as a record of such a fit has them, without the dense stage."""
-    settings: dict[str, Any] = json.loads(json.dumps(config.as_dict()))
-    del settings["dense"]
-    return settings | {"version": __version__}
+    Raises:
+        FileError: the scan or its landmarks cannot be read or reached.
+    """
+    marks = sha256_of_file(task.job.landmarks) if task.job.landmarks else ""
+    settings = replace(task.config, dense=dense).as_dict()
+    wanted = fit_identity(recorded.hash, model_hash, settings, marks)
+    return identity == wanted and is_same_scan(recorded, task.job, folder)
 
 
 def is_same_scan(recorded: File, job: Job, folder: Path) -> bool:
@@ -321,7 +328,64 @@ def is_same_scan(recorded: File, job: Job, folder: Path) -> bool:
         return recorded.path == job.address and recorded.remote_version == version_of(job.address)
     with contextlib.suppress(OSError):
         there = job.scan.stat()
-        now = (there.st_size, there.st_mtime_ns, Source.of_file(job.scan, "", folder).path)
+        now = (there.st_size, there.st_mtime_ns, source_of(job.scan, "", folder).path)
         if (recorded.size_bytes, recorded.modified_ns, recorded.path) == now:
             return True
     return recorded.hash == sha256_of_file(job.scan)
+
+
+_FORBIDDEN = re.compile(r'[<>:"/\\|?*\x00-\x1f]')
+"""Characters that file names cannot contain on some systems."""
+_HASH_CHARACTERS = 12  # hexadecimal digits, 48 bits: no two of a million scans share them by chance
+
+
+def save_fit(result: FitResult, folder: Path, name: str, *, stages: bool) -> Path:
+    """Implement `FitResult.save`."""
+    if name and (_FORBIDDEN.search(name) or name in (".", "..")):
+        raise InputError(f"{name!r} cannot be the name of files; leave out slashes, colons and the like.")
+    make_folder(folder)
+    with only_writer(folder):
+        scan = _scan_source(result, folder)
+        if not name and "scan" in result.files:
+            [name] = names_for([result.files["scan"]], folder)
+        name = name or _free_name(scan, folder)
+        record = fit_record(result, scan, _model_source(result, folder), _landmarks_source(result))
+        publish(result, record, name, folder, stages=stages)
+        table = CoefficientTable(folder, [name], result.model.n_modes)
+        table.add(name, record)
+        table.save()
+    return folder / f"{name}{RECORD}"
+
+
+def _scan_source(result: FitResult, folder: Path) -> File:
+    if "scan" in result.files:
+        return hashed_source(result.files["scan"], folder)
+    return File(name=result.scan_name, hash=_hash_of(result.scan))
+
+
+def _hash_of(mesh: Mesh) -> str:
+    content = hashlib.sha256(mesh.vertices.astype("<f8").tobytes())
+    if mesh.faces is not None:
+        content.update(mesh.faces.astype("<i4").tobytes())
+    return content.hexdigest()
+
+
+def _model_source(result: FitResult, folder: Path) -> File:
+    file = result.files.get("model") or result.model.file
+    return source_of(file, result.model_hash, folder) if file else File(hash=result.model_hash)
+
+
+def _landmarks_source(result: FitResult) -> File | None:
+    file = result.files.get("landmarks")
+    return File(name=file.name, hash=sha256_of_file(file)) if file else None
+
+
+def _free_name(scan: File, folder: Path) -> str:
+    """Return NAME for a scan without a file: its own name, unless another scan has results of that name."""
+    stem = _FORBIDDEN.sub("_", Path(scan.name).stem).strip(". ") or "scan"
+    results = Results(folder)
+    try:
+        free = stem not in results or results.fit(stem).scan.hash == scan.hash
+    except ShapespaceError:
+        free = False
+    return stem if free else f"{stem}_{scan.hash[:_HASH_CHARACTERS]}"

@@ -10,9 +10,7 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.batch.execution import ExecutionConfig
-from shapespace.batch.executors import Serial
-from shapespace.correspondence.harmonics import Harmonics
+from shapespace.batch.executors import ExecutionConfig, Shared
 from shapespace.correspondence.registration import (
     PoseScores,
     RegistrationTask,
@@ -25,9 +23,7 @@ from shapespace.io.containers.archives import read_arrays
 from shapespace.io.containers.arrays import write_arrays
 from shapespace.io.containers.hdf5 import content_hash
 from shapespace.io.files import make_folder
-from shapespace.io.memory_cache import LatestValue
-from shapespace.model.shape_model import ShapeModel
-from shapespace.types import Mesh, Similarity
+from shapespace.types import Similarity
 from shapespace.version import __version__
 
 Arrays = dict[str, npt.NDArray[Any]]
@@ -57,10 +53,10 @@ class RoundRunner:
             FitError: no workers are left, or none can start.
         """
         make_folder(self.folder)
-        shared = [_shared_hash(context, pose_model) for pose_model in context.pose_models]
+        shared_hashes = [_shared_hash(context, pose_model) for pose_model in context.pose_models]
         remaining: list[_FileTask] = []
         for task in tasks:
-            file_task = _FileTask(self.folder / f"{_key(task, shared[task.pose_model])}.npz", task)
+            file_task = _FileTask(self.folder / f"{_key(task, shared_hashes[task.pose_model])}.npz", task)
             placed = _read(file_task.file, task.index)
             if placed is None:
                 remaining.append(file_task)
@@ -70,11 +66,10 @@ class RoundRunner:
         if not remaining:
             return
         executor = self.execution.executor(len(remaining), quiet=self.quiet)
-        work = RoundWork(self.folder / f"{content_hash({}, {'shared': ' '.join(shared)})}.context.npz", context.seed)
-        _context.set(work.file, context)
-        if not isinstance(executor, Serial):
-            work.save(context)
-        with executor.run(work, remaining) as results:
+        with (
+            Shared.by(executor, context, self.folder) as shared,
+            executor.run(RoundWork(shared), remaining) as results,
+        ):
             for task, _ in results:
                 self.on_done()
                 yield _read_again(task)
@@ -100,12 +95,10 @@ class RoundWork:
     """Registers scans in one round context, for an executor.
 
     Args:
-        file: of the round context, which each worker reads once.
-        seed: of the round context.
+        context: of the round.
     """
 
-    file: Path
-    seed: int
+    context: Shared[RoundContext]
 
     def do(self, task: _FileTask) -> None:
         """Register a scan and write the result, unless it is there already.
@@ -114,7 +107,7 @@ class RoundWork:
             FileError: it cannot be written.
         """
         if _read(task.file, task.registration.index) is None:
-            _write(task.file, _context.get(self.file, self._load).register(task.registration))
+            _write(task.file, self.context.value().register(task.registration))
 
     def give_up(self, task: _FileTask, reason: str) -> None:
         """Write the result that excludes a scan whose workers were lost.
@@ -122,68 +115,12 @@ class RoundWork:
         Raises:
             FileError: it cannot be written.
         """
-        _write(task.file, _context.get(self.file, self._load).failed(task.registration.index, reason))
-
-    def save(self, context: RoundContext) -> None:
-        """Write the round context for other processes, if an earlier run has not.
-
-        Raises:
-            FileError: it cannot be written.
-        """
-        if self.file.is_file():
-            return
-        models = {f"pose_model_{number}": one.model for number, one in enumerate(context.pose_models)}
-        models |= {} if context.guide is None else {"guide": context.guide}
-        parts = {"context": _context_arrays(context)} | {name: _model_arrays(model) for name, model in models.items()}
-        arrays = {f"{part}.{name}": array for part, content in parts.items() for name, array in content.items()}
-        write_arrays(self.file, arrays)
-
-    def _load(self) -> RoundContext:
-        parts: dict[str, Arrays] = {}
-        for key, array in read_arrays(self.file, "remove it and run again").items():
-            part, _, name = key.partition(".")
-            parts.setdefault(part, {})[name] = array
-        arrays = parts.pop("context")
-        guide = parts.pop("guide", None)
-        mesh = Mesh(arrays["vertices"], arrays["faces"], colours=arrays.get("colours"))
-        harmonics = Harmonics(arrays["functions"], arrays["squared_frequency"], arrays["area"])
-        pose_models = tuple(PoseModel(_model_of(parts[f"pose_model_{number}"])) for number in range(len(parts)))
-        return RoundContext(mesh, harmonics, pose_models, self.seed, None if guide is None else _model_of(guide))
-
-
-_context = LatestValue[RoundContext]()
-"""The round context that this process uses, by its file."""
-
-
-def _model_arrays(m: ShapeModel) -> Arrays:
-    return {
-        "mean": m.mean, "basis": m.basis, "stddev": m.stddev, "faces": np.array(m.faces),
-        "statistics": np.array([m.total_variance, m.n_training]),
-    }  # fmt: skip
-
-
-def _model_of(arrays: Arrays) -> ShapeModel:
-    variance, samples = arrays["statistics"]
-    return ShapeModel(
-        arrays["mean"], arrays["basis"], arrays["stddev"], float(variance), int(samples), faces=arrays["faces"]
-    )
-
-
-def _context_arrays(context: RoundContext) -> Arrays:
-    h, mesh = context.harmonics, context.mesh
-    colours: Arrays = {} if mesh.colours is None else {"colours": mesh.colours}
-    return colours | {
-        "vertices": np.array(mesh.vertices), "faces": np.array(mesh.faces), "functions": h.functions,
-        "squared_frequency": h.squared_frequency, "area": h.area,
-    }  # fmt: skip
+        _write(task.file, self.context.value().failed(task.registration.index, reason))
 
 
 def _shared_hash(context: RoundContext, pose_model: PoseModel) -> str:
     """Return the hash of what the tasks that use `pose_model` share."""
-    guide = "" if context.guide is None else context.guide.content_hash
-    return content_hash(
-        _model_arrays(pose_model.model) | _context_arrays(context), {"seed": context.seed, "guide": guide}
-    )
+    return content_hash(dict(_flat(replace(context, pose_models=(pose_model,)), "context")), {})
 
 
 def _key(task: RegistrationTask, shared: str) -> str:

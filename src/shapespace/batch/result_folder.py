@@ -1,4 +1,4 @@
-"""A folder of results: names of the results of scans, and the table of all records."""
+"""A folder of results: names of the results of scans, the table of all records, and one run at a time that writes."""
 
 from __future__ import annotations
 
@@ -6,20 +6,75 @@ import contextlib
 import hashlib
 import os
 from collections import Counter
-from collections.abc import Container, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Container, Generator, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeAlias
 
 import msgspec
+from filelock import lock_descriptor
 
-from shapespace.batch.fit_records import Source, coefficient_row, read_record, write_coefficients
+from shapespace.batch.fit_records import coefficient_row, read_record, source_of, write_coefficients
 from shapespace.errors import FileError, ShapespaceError
 from shapespace.io.containers.json_files import LARGEST_BYTES, check_file
-from shapespace.io.files import sha256_of_file
+from shapespace.io.files import sha256_of_file, sweep, write_error
 from shapespace.io.meshes.mesh_io import stem_of
 from shapespace.schemas import FIT_AGAIN, File, FitRecord
 from shapespace.store.results import results_at
+
+LOCK = ".shapespace.lock"
+"""Is there while a run writes: the system holds the lock, and lets go of it whatever ends the process."""
+
+
+@contextlib.contextmanager
+def only_writer(folder: Path) -> Generator[None]:
+    """Keep other runs from writing into `folder` during the block, and remove what killed ones left half written.
+
+    Raises:
+        FileError: another run writes into it, or it cannot be written.
+    """
+    path = folder / LOCK
+    try:
+        descriptor = _locked(path)
+    except OSError as error:
+        raise write_error(path, error) from error
+    try:
+        sweep(folder)
+        yield
+    finally:
+        sweep(folder)
+        # While it is held; Windows alone removes no file that is open.
+        if os.name == "nt":
+            os.close(descriptor)
+        with contextlib.suppress(OSError):
+            path.unlink()
+        if os.name != "nt":
+            os.close(descriptor)
+
+
+def _locked(path: Path) -> int:
+    while True:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            if not lock_descriptor(descriptor, blocking=False):
+                raise FileError(
+                    f"{path.parent} is being written by another run of shapespace; wait for its end, or give another "
+                    "folder."
+                )
+            if _is_open_as(path, descriptor):
+                return descriptor
+        except BaseException:
+            os.close(descriptor)
+            raise
+        os.close(descriptor)
+
+
+def _is_open_as(path: Path, descriptor: int) -> bool:
+    """Return whether `path` is still the file that is open, and not removed by the run that held it."""
+    try:
+        return os.path.samestat(path.stat(), os.fstat(descriptor))
+    except FileNotFoundError:
+        return False
+
 
 COEFFICIENTS = "coefficients.csv"
 RECORD = ".fit.json"
@@ -38,21 +93,8 @@ def records_in(folder: Path, without: Container[str] = ()) -> Iterator[tuple[str
             continue  # a report names it
 
 
-@dataclass(frozen=True)
-class _Scan:
-    """Where a scan is; two are the same if these are.
-
-    Args:
-        name: of the file.
-        path: as records of the folder have it.
-    """
-
-    name: str
-    path: str
-
-    @staticmethod
-    def of(source: Mapping[str, Any]) -> _Scan:
-        return _Scan(str(source.get("name", "")), str(source.get("path", "")))
+_Scan: TypeAlias = tuple[str, str]
+"""Name of the file of a scan, and its path as records of the folder have it; two are the same if these are."""
 
 
 def names_for(
@@ -68,13 +110,8 @@ def names_for(
         folder: where results go; None if nothing can be there.
         addresses: of scans that lie elsewhere, by what their paths would be.
     """
-    taken: dict[str, _Scan] = {}
-    hashes: dict[str, str] = {}
-    for name, content in _sources_in(folder) if folder is not None else ():
-        if isinstance(content, dict):
-            source = cast(dict[str, Any], content)
-            taken[name] = _Scan.of(source)
-            hashes[name] = str(source.get("hash", ""))
+    sources = dict(_sources_in(folder)) if folder is not None else {}
+    taken: dict[str, _Scan] = {name: (source.name, source.path) for name, source in sources.items()}
     own = {scan: name for name, scan in reversed(taken.items())}
     keys = {scan: _key(scan, folder, (addresses or {}).get(scan, "")) for scan in scans}
     names = {key: own[key] for key in keys.values() if key in own}
@@ -87,7 +124,7 @@ def names_for(
     for _, group in sorted(groups.items(), key=lambda item: (len(item[1]) > 1, item[0])):
         (key, scan), *others = group.items()
         stem = _stem(scan)
-        if not others and (stem.casefold() not in used or _is_same(scan, taken.get(stem), hashes.get(stem), folder)):
+        if not others and (stem.casefold() not in used or _is_same(scan, sources.get(stem), folder)):
             new = {key: stem}
         else:
             new = _distinct_names(group, used)
@@ -96,18 +133,17 @@ def names_for(
     return [names[keys[scan]] for scan in scans]
 
 
-def _sources_in(folder: Path) -> Iterator[tuple[str, object]]:
+def _sources_in(folder: Path) -> Iterator[tuple[str, File]]:
     """Yield NAME of each result in `folder`, of a store too, and the scan in its record."""
     if (results := results_at(folder)) is not None:
         for rows in results.iter_rows(_SCAN_COLUMNS):
             for name, scan_name, path, content_hash in zip(*(rows[column] for column in _SCAN_COLUMNS), strict=True):
-                yield name, {"name": scan_name, "path": path, "hash": content_hash}
+                yield name, File(name=scan_name or "", path=path or "", hash=content_hash or "")
     else:
         for file in sorted(folder.glob(f"*{RECORD}")):
             with contextlib.suppress(ShapespaceError, msgspec.MsgspecError, ValueError):  # a report names it
                 check_file(file, LARGEST_BYTES, FIT_AGAIN)
-                scan = msgspec.json.decode(file.read_bytes(), type=_ScanOnly).scan
-                yield file.name.removesuffix(RECORD), {"name": scan.name, "path": scan.path, "hash": scan.hash}
+                yield file.name.removesuffix(RECORD), msgspec.json.decode(file.read_bytes(), type=_ScanOnly).scan
 
 
 class _ScanOnly(msgspec.Struct, frozen=True):
@@ -118,24 +154,24 @@ class _ScanOnly(msgspec.Struct, frozen=True):
 
 def _key(scan: Path, folder: Path | None, address: str) -> _Scan:
     if address:
-        return _Scan(scan.name, address)
+        return scan.name, address
     if folder is None:
-        return _Scan(scan.name, str(scan.parent.resolve()))
-    return _Scan(scan.name, Source.of_file(scan, "", folder).path)
+        return scan.name, str(scan.parent.resolve())
+    return scan.name, source_of(scan, "", folder).path
 
 
 def _stem(scan: Path) -> str:
     return _shortened(stem_of(scan) or scan.name)
 
 
-def _is_same(scan: Path, of_record: _Scan | None, content_hash: str | None, folder: Path | None) -> bool:
+def _is_same(scan: Path, source: File | None, folder: Path | None) -> bool:
     """Return whether results of the same name are of `scan`, which has moved since, or do not say of what they are."""
-    if of_record is None or folder is None:
+    if source is None or folder is None:
         return False
-    if not of_record.path:
-        return of_record.name == scan.name
+    if not source.path:
+        return source.name == scan.name
     try:
-        return not (folder / of_record.path).exists() and sha256_of_file(scan) == content_hash
+        return not (folder / source.path).exists() and sha256_of_file(scan) == source.hash
     except FileError:
         return False
 

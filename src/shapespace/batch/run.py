@@ -1,22 +1,198 @@
-"""Fit many scans: a scan that cannot be fitted becomes a failed record, and an interruption loses no finished fit."""
+"""Fit many scans: a scan that cannot be fitted becomes a failed record, and an interruption loses no finished fit.
+
+Results go to a sink: single files in a folder, or a store. It finds the results of earlier runs that are still valid,
+takes each record as it comes, and leaves a complete folder however the run ends. `fit_many` holds the lock of the
+folder while the sink is in use.
+"""
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TypeAlias
+
+from msgspec import structs
 
 from shapespace.batch.executors import Executor, Serial
-from shapespace.batch.fit_work import FitTask, FitWork, Job
-from shapespace.batch.lock import only_writer
-from shapespace.batch.result_folder import names_for
-from shapespace.batch.sinks import Sink
+from shapespace.batch.fit_records import write_record
+from shapespace.batch.fit_work import FitTask, FitWork, Job, has_surface, is_fit_of, resumed
+from shapespace.batch.result_folder import RECORD, CoefficientTable, names_for, only_writer
+from shapespace.batch.store import Store
+from shapespace.errors import FileError
 from shapespace.fit.fit_scan import FitConfig
 from shapespace.fit.iteration_state import IcpState
 from shapespace.io.files import make_folder
 from shapespace.model.shape_model import ShapeModel
-from shapespace.schemas import FitRecord
+from shapespace.schemas import File, FitRecord
+from shapespace.store.results import Results
+
+STORE_FROM = 10_000
+"""Number of scans from which on a store is the default."""
+ROWS = 1000
+"""Number of fits that are moved into a store at a time."""
+_SAVE_INTERVAL_S = 5.0  # seconds; least time between two saves of the tables
+_SAVE_COST_RATIO = 20.0
+"""The next save of the table is at least this many times as far away as the last one took."""
+_SCAN = {
+    "path": "path",
+    "hash": "scan_hash",
+    "size_bytes": "scan_size_bytes",
+    "modified_ns": "scan_modified_ns",
+    "remote_version": "scan_version",
+}
+"""Fields of a record's scan -> columns of a store."""
+_COLUMNS = ("scan", "id", "status", "stages", *_SCAN.values())
+
+
+@dataclass
+class FolderSink:
+    """Single files, and coefficients.csv with the records of all runs, those of this run last.
+
+    Args:
+        folder: of the results.
+        records: of this run by the names of the jobs, also of valid earlier results.
+    """
+
+    folder: Path
+    records: dict[str, FitRecord] = field(default_factory=dict[str, FitRecord], init=False)
+
+    def open(self, names: Sequence[str], model: ShapeModel, *, reuse: bool) -> None:
+        """Read the results of earlier runs.
+
+        Args:
+            names: of the jobs of this run.
+            model: that is fitted.
+            reuse: whether valid earlier results are reused.
+        """
+        self._reuse, self._model_hash, self._started = reuse, model.content_hash, tuple[str, ...]()
+        self._table = CoefficientTable(self.folder, names, model.n_modes)
+        self._next_save = time.monotonic() + _SAVE_INTERVAL_S
+
+    def find_valid(self, task: FitTask) -> tuple[FitTask, FitRecord | None]:
+        """Return the task that remains, and the record of a valid earlier result, or None."""
+        if not self._reuse:
+            return task, None
+        remaining, record = resumed(task, self._model_hash, self.folder)
+        if record is None:
+            return remaining, None
+        try:
+            self.add(task.job.name, self._with_metadata(record, task.job))
+        except ValueError:  # damaged
+            return replace(task, resume=False), None
+        return task, self.records[task.job.name]
+
+    def has_result(self, job: Job) -> bool:
+        """Return whether there is a surface of an earlier fit of the scan."""
+        return has_surface(job, self.folder)
+
+    def start(self, names: Sequence[str]) -> None:
+        """Prepare for the fits of the jobs `names`."""
+        self._started = tuple(names)
+        self._table.catch_up(names)
+
+    def add(self, name: str, record: FitRecord) -> None:
+        """Take the record of a job, whose files are written; the table is saved at intervals."""
+        self._table.add(name, record)
+        self.records[name] = record
+        if (now := time.monotonic()) > self._next_save:
+            self._table.save()
+            self._next_save = time.monotonic() + max(_SAVE_INTERVAL_S, _SAVE_COST_RATIO * (time.monotonic() - now))
+
+    def close(self) -> None:
+        """Leave the folder complete, also with results that were written and not added, after an interruption."""
+        self._table.catch_up([name for name in self._started if name not in self.records])
+        self._table.save()
+
+    def _with_metadata(self, record: FitRecord, job: Job) -> FitRecord:
+        if not job.metadata or record.metadata == job.metadata:
+            return record
+        record = structs.replace(record, metadata=dict(job.metadata))
+        write_record(self.folder / f"{job.name}{RECORD}", record)
+        return record
+
+
+_Stored: TypeAlias = tuple[FitRecord, bool]
+"""A fit in a store: of its record id, status and scan alone, and whether its stages are kept."""
+
+
+@dataclass
+class StoreSink:
+    """A store, into which finished results are moved `ROWS` at a time; no records are held in memory.
+
+    Args:
+        folder: of the store.
+    """
+
+    folder: Path
+    records: Mapping[str, FitRecord] = field(default_factory=dict[str, FitRecord], init=False)
+
+    def open(self, names: Sequence[str], model: ShapeModel, *, reuse: bool) -> None:
+        """Read the results of earlier runs.
+
+        Args:
+            names: of the jobs of this run.
+            model: that is fitted.
+            reuse: whether valid earlier results are reused.
+
+        Raises:
+            ShapespaceError: the extra `store` is not installed.
+        """
+        self._model_hash, self._finished = model.content_hash, list[str]()
+        self._store = Store(self.folder)
+        self._store.compact()
+        self._stored = dict(self._read_stored()) if reuse else {}
+
+    def find_valid(self, task: FitTask) -> tuple[FitTask, FitRecord | None]:
+        """Return the task that remains, and the record of a valid earlier result, or None."""
+        stored = self._stored.get(task.job.name)
+        valid = stored is not None and self._is_valid(stored, task)
+        return task, stored[0] if valid and stored is not None else None
+
+    def has_result(self, job: Job) -> bool:
+        """Return whether there is a surface of an earlier fit of the scan."""
+        stored = self._stored.get(job.name)
+        return stored is not None and stored[0].is_fitted
+
+    def start(self, names: Sequence[str]) -> None:
+        """Prepare for the fits of the jobs `names`: free the memory of stored results."""
+        self._stored.clear()
+
+    def add(self, name: str, record: FitRecord) -> None:
+        """Take the record of a job, whose files are written."""
+        self._finished.append(name)
+        if len(self._finished) >= ROWS:
+            self._store.compact(self._finished)
+            self._finished.clear()
+
+    def close(self) -> None:
+        """Leave the folder complete, also with results that were written and not added, after an interruption."""
+        self._store.compact()
+
+    def _read_stored(self) -> Iterator[tuple[str, _Stored]]:
+        for rows in Results(self.folder).iter_rows(_COLUMNS):
+            for name, identity, status, stages, *scan in zip(*(rows[column] for column in _COLUMNS), strict=True):
+                known = {key: value for key, value in zip(_SCAN, scan, strict=True) if value is not None}
+                yield name, (FitRecord(id=identity or "", status=status, scan=File(**known)), bool(stages))
+
+    def _is_valid(self, stored: _Stored, task: FitTask) -> bool:
+        """Return whether a stored fit has what the task asks for, or more: a dense surface, or stages."""
+        record, staged = stored
+        if not record.is_fitted or (task.stages and not staged):
+            return False
+        try:
+            return any(
+                is_fit_of(record.id, record.scan, task, self._model_hash, self.folder, dense=dense)
+                for dense in {task.config.dense, True}
+            )
+        except FileError:
+            return False  # the fit reports it
+
+
+Sink: TypeAlias = FolderSink | StoreSink
+"""Takes the results of a batch of fits; used once."""
 
 
 def make_jobs(
@@ -99,7 +275,7 @@ def fit_many(
         jobs: the scans; those with the same name are fitted once.
         config: what the fits have in common.
         executor: see `batch.executors`.
-        sink: where results go, see `batch.sinks`; its folder is made if absent, and no other run may write into it.
+        sink: where results go, see `Sink`; its folder is made if absent, and no other run may write into it.
         on_plan: called once with the numbers of valid, repeated and new fits.
         on_done: called with each job and its record; the record of a valid result in a store has no `reason`.
         on_state: called with each state of the loop by the serial executor.

@@ -1,16 +1,18 @@
 """Loads the code of a fit, or compiles it on a machine that has none yet.
 
-A small fit does it, since machine code is made for the arrays that it meets.
+A small fit does it, since machine code is made for the arrays that it meets. The server of `workers` does it when it
+imports this module.
 """
 
 from __future__ import annotations
 
 import contextlib
+import os
 import sys
 
 import numpy as np
 
-from shapespace.batch.messages import is_first
+from shapespace.batch.workers import WARM_UP, is_first
 from shapespace.compiled import notify_compilation
 from shapespace.errors import ShapespaceError
 from shapespace.fit.dense.residual_modes import residual_modes
@@ -57,3 +59,9 @@ def _hill(side: int, seed: int) -> Mesh:
     p, q, r, s = (corner.ravel() for corner in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
     faces = np.concatenate([np.stack([p, q, r], axis=1), np.stack([p, r, s], axis=1)]).astype(np.int32)
     return Mesh(np.stack([50 * u, 50 * v, z], axis=2).reshape(-1, 3), faces)
+
+
+if how := os.environ.get(WARM_UP):
+    # In the server of `workers` alone, so that its copies are warm. The fits to come report what fails.
+    with contextlib.suppress(Exception):
+        warm_up(notify=how == "notify")

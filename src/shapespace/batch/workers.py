@@ -1,21 +1,62 @@
 """Worker processes: one server loads the code once, and each worker is a copy of it that ends with its parent.
 
 This module imports nothing heavy, so that the server can start before the rest of the program is loaded.
+
+The processes of a command print some messages only once together: that code is being compiled.
 """
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import multiprocessing
 import os
+import shutil
 import signal
 import sys
+import tempfile
 import threading
 from collections.abc import Callable, Generator, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from shapespace.batch import messages
 from shapespace.errors import FitError
+
+MARK = "SHAPESPACE_MESSAGE_MARK"
+"""Environment variable of the server of the workers alone: a folder that the first process to print creates."""
+
+
+class _Mark:
+    path: str = os.environ.get(MARK, "")
+
+
+def share_mark() -> str:
+    """Return the mark that this process shares with the server that it starts."""
+    if not _Mark.path:
+        folder = Path(tempfile.mkdtemp(prefix="shapespace-"))
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        _Mark.path = str(folder / "printed")
+    return _Mark.path
+
+
+def remove_mark() -> str:
+    """Let this process print whatever others print; return that it has no mark."""
+    _Mark.path = ""
+    return ""
+
+
+def is_first() -> bool:
+    """Return whether this process is the first to print, of those that share its mark; the next call returns False."""
+    if not _Mark.path:
+        return True
+    try:
+        Path(_Mark.path).mkdir()
+    except FileExistsError:
+        return False
+    except OSError:  # the folder is gone, or cannot be written: better twice than never
+        return True
+    return True
+
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -44,13 +85,13 @@ def start_loading(*, notify: bool) -> None:
     Args:
         notify: whether a line on standard error may state that the code is being compiled.
     """
-    mark = messages.share_mark() if notify else messages.remove_mark()
+    mark = share_mark() if notify else remove_mark()
     if not COPIED:
         from shapespace.batch.warm import warm_up
 
         warm_up(notify=notify)
         return
-    preload(("shapespace.batch.warm_server",), {WARM_UP: "notify" if notify else "quiet", messages.MARK: mark})
+    preload(("shapespace.batch.warm",), {WARM_UP: "notify" if notify else "quiet", MARK: mark})
 
 
 def preload(modules: Sequence[str], environment: Mapping[str, str] | None = None) -> None:

@@ -26,9 +26,8 @@ from shapespace.io.files import read_bytes, write_text
 from shapespace.io.landmarks.landmark_io import read_surface_landmarks
 from shapespace.model.additive import AdditiveModel, load_model
 from shapespace.model.shape_model import ShapeModel
-from shapespace.store.corresponding import SURFACE, SurfaceFiles, surface_files, surface_stem
+from shapespace.store.corresponding import SURFACE, SurfaceFiles, review_summary, surface_files, surface_stem
 from shapespace.store.results import Results, modes_of
-from shapespace.store.review_text import review_summary
 from shapespace.store.rows import META
 from shapespace.types import FloatArray, Mesh, SurfaceLandmarks, read_only
 

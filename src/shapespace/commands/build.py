@@ -12,23 +12,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from shapespace.batch.fit_records import read_record
-from shapespace.batch.fit_work import naming
 from shapespace.batch.progress import progress, waiting
 from shapespace.batch.result_folder import RECORD
 from shapespace.cohort.labels import read_labels
 from shapespace.cohort.table import names_of_file
+from shapespace.commands.inputs import SurfacesOnDisk
 from shapespace.commands.look import model_facts, training_shapes_note
 from shapespace.commands.outcome import Outcome
 from shapespace.datasets.about import ABOUT, read_about
-from shapespace.errors import InputError, MeshError, ShapespaceError
+from shapespace.errors import InputError, ShapespaceError
 from shapespace.geometry.landmark_placement import far_landmarks, landmarks_in_frame_of, place_landmarks
-from shapespace.geometry.normals import without_estimates
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.files import make_folder, read_error
 from shapespace.io.landmarks.landmark_io import is_of_vertices, read_landmarks, read_surface_landmarks
 from shapespace.io.meshes.region_files import read_region
-from shapespace.model.build_config import BuildConfig
-from shapespace.model.build_model import build_model, extend_model
+from shapespace.model.build_model import BuildConfig, build_model, extend_model
 from shapespace.model.missing import MIN_SEEN, ObservedMeshes
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel, odd_size_notes, region_vertices
@@ -36,9 +34,8 @@ from shapespace.model.streamed import Scratch, streaming_note
 from shapespace.recognise.labelled_scans import NEUTRAL
 from shapespace.reprs import first_names
 from shapespace.schemas import FitRecord
-from shapespace.store.corresponding import SurfaceFiles, surface_files
+from shapespace.store.corresponding import provenance_with_review, review_summary, reviewed_surfaces
 from shapespace.store.results import is_result
-from shapespace.store.review_text import provenance_with_review, review_summary
 from shapespace.types import MM_PER_UNIT, Mesh, SurfaceLandmarks
 from shapespace.version import __version__
 
@@ -152,9 +149,9 @@ def build(
     """
     if output.suffix.lower() not in (".h5", ".hdf5"):
         raise InputError(f"{output}: a model file is HDF5, so give it a name that ends in .h5.")
-    listed = surface_files(meshes, recursive=config.recursive)
-    review = listed.review(listed.files, "--with-doubtful", accept=config.with_doubtful)
-    listed = listed if config.with_doubtful else listed.without_doubtful("--with-doubtful")
+    listed, review = reviewed_surfaces(
+        meshes, "--with-doubtful", recursive=config.recursive, with_doubtful=config.with_doubtful
+    )
     notes = [*([f"{summary}."] if (summary := review_summary(review)) else []), *listed.notes]
     parent = None if config.add is None else _parent(config.add, output)
     gauge = parent.gauge if parent is not None else config.gauge or "shape"
@@ -162,9 +159,9 @@ def build(
         listed.refuse_mixed_units()
     files, records = _trusted(listed.files, notes, with_doubtful=config.with_doubtful)
     make_folder(output.absolute().parent)
-    on_disk = _OnDisk(files, config.unit, listed)
+    on_disk = SurfacesOnDisk(files, listed, config.unit, ", so no shape model can be made of it; leave it out")
     streamed = config.streams or (config.of_vertices and bool(streaming_note(on_disk, config.model)))
-    loaded = [] if streamed else _read(on_disk, quiet=quiet)
+    loaded = [] if streamed else on_disk.read(quiet=quiet)
     first = on_disk[0] if streamed else loaded[0]
     if listed.unit_ratios:
         notes.append(listed.unit_note(config.unit))
@@ -269,7 +266,7 @@ def _parent(path: Path, output: Path) -> ShapeModel:
 
 
 def _streamed(
-    meshes: _OnDisk, output: Path, config: BuildFilesConfig, parent: ShapeModel | None, *, quiet: bool
+    meshes: SurfacesOnDisk, output: Path, config: BuildFilesConfig, parent: ShapeModel | None, *, quiet: bool
 ) -> ShapeModel:
     """Build a model of meshes that are not held in memory."""
     scratch = Scratch(output.with_name(f"{output.name}.build"), _identity(meshes, config, parent))
@@ -292,7 +289,7 @@ def _joined(old: str, new: str) -> str:
     return old if new in ("", old) else f"{old}; {new}" if old else new
 
 
-def _identity(meshes: _OnDisk, config: BuildFilesConfig, parent: ShapeModel | None) -> str:
+def _identity(meshes: SurfacesOnDisk, config: BuildFilesConfig, parent: ShapeModel | None) -> str:
     """Return a hash of all that decides what a streamed build comes to."""
     digest = hashlib.sha256(
         repr((__version__, replace(config, model=replace(config.model, provenance="", licence="")))).encode()
@@ -305,28 +302,6 @@ def _identity(meshes: _OnDisk, config: BuildFilesConfig, parent: ShapeModel | No
             raise read_error(file, error) from error
         digest.update(repr((str(file.absolute()), about.st_size, about.st_mtime_ns)).encode())
     return digest.hexdigest()
-
-
-@dataclass(frozen=True)
-class _OnDisk:
-    """Meshes in mm, on one side, each read when it is asked for.
-
-    Args:
-        files: of the meshes.
-        unit: of most.
-        listed: reads them.
-    """
-
-    files: Sequence[Path]
-    unit: str
-    listed: SurfaceFiles
-
-    def __len__(self) -> int:
-        return len(self.files)
-
-    def __getitem__(self, index: int, /) -> Mesh:
-        mesh, mm = _training_mesh(self.listed, self.files[index]), MM_PER_UNIT[self.unit]
-        return mesh if mm == 1.0 else mesh.with_vertices(mesh.vertices * mm)
 
 
 def _trusted(
@@ -356,25 +331,6 @@ def _trusted(
         )
     notes.append(f"{count_text} left out ({named}); --with-doubtful takes them too.")
     return left, {file: records[file] for file in left if file in records}
-
-
-def _read(meshes: _OnDisk, *, quiet: bool) -> list[Mesh]:
-    loaded: list[Mesh] = []
-    with progress(len(meshes), "reading", "mesh", quiet=quiet) as bar:
-        for index in range(len(meshes)):
-            loaded.append(meshes[index])
-            bar.update()
-    return loaded
-
-
-def _training_mesh(listed: SurfaceFiles, path: Path) -> Mesh:
-    try:
-        mesh = without_estimates(listed.mesh(path))
-    except MeshError as error:
-        raise MeshError(naming(path, str(error))) from error
-    if not len(mesh.vertices):
-        raise MeshError(f"{path}: it has no vertices, so no shape model can be made of it; leave it out.")
-    return mesh
 
 
 def _landmarks(

@@ -18,7 +18,7 @@ from shapespace.io.containers.arrays import write_arrays
 from shapespace.io.files import make_folder, remove_file
 from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
-from shapespace.store.review_text import review_of_provenance
+from shapespace.store.corresponding import review_of_provenance
 
 
 @dataclass(frozen=True)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TypeAlias
@@ -13,12 +14,11 @@ from typing import TypeAlias
 import numpy as np
 from msgspec import structs
 
-from shapespace.batch.execution import ExecutionConfig
+from shapespace.batch.executors import ExecutionConfig
 from shapespace.batch.fit_work import Job
-from shapespace.batch.lock import only_writer
 from shapespace.batch.parallel_rounds import RoundRunner
 from shapespace.batch.progress import progress, telling_of_compiling, waiting
-from shapespace.batch.result_folder import names_for
+from shapespace.batch.result_folder import names_for, only_writer
 from shapespace.commands.inputs import LandmarkFiles, given_scans, with_ids
 from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
 from shapespace.correspondence.first_template import first_template, usable_scan
@@ -94,10 +94,40 @@ def correspond_files(
         InputError: fewer than two scans, or too few that can be reached.
     """
     jobs = find_jobs(files, folder, say)
-    make_folder(folder)
-    with only_writer(folder):
-        complete_change(folder)
-        return _corresponding(jobs, files, folder, config, quiet=quiet, say=say)
+    with CorrespondenceFolder(make_folder(folder)).writing() as results:
+        marks = LandmarkFiles.of(files.landmarks)
+        marks.refuse_shared([job.scan for job in jobs if job.landmarks is None])
+        subjects = _subjects_of(jobs, files.subjects)
+        inputs_hash = inputs_hash_of(jobs, marks, files, config)
+        if (finished := results.finished(inputs_hash, [job.name for job in jobs])) is not None:
+            say(f"{results.path} already contains the results of these scans and settings; nothing is computed.")
+            return finished
+        template = None if files.template is None else marks.onto(read_mesh(files.template), files.template)
+        model = None if files.model is None else ShapeModel.load(files.model)
+        read = read_scans(jobs, marks, strict=files.strict, outer=config.outer, quiet=quiet, say=say)
+        without_inner = replace(config, outer=False)  # the scans that are read are without inner surfaces
+
+        def make(rounds: RoundsWithProgress) -> Correspondence:
+            scans = list(read.scans.values())
+            with waiting("choosing the template", quiet=quiet):
+                first = first_template(scans, template, without_inner, model)
+            of_scans = [subjects[name] for name in read.scans] if subjects else []
+            return correspond(
+                scans, without_inner, template=template, model=model, first=first, subjects=of_scans, run=rounds
+            )
+
+        made, records = bring(jobs, read, marks, files, results, make, quiet=quiet, say=say)
+        # Until all is written the folder is none that build takes.
+        remove_file(results.path / SUMMARY)
+        summary = CorrespondenceRecord(
+            template=made.why, vertices=len(made.template.vertices), rounds=list(made.moved), corresponding=[],
+            set_aside={}, settings=asdict(config), version=__version__, sides_decided=made.sides_decided,
+            groups=[list(group) for group in made.groups], inputs_hash=inputs_hash,
+        )  # fmt: skip
+        # Surfaces of an earlier run are on another template.
+        if old := results.forget_others({record.name for record in records}):
+            say(f"Results of {old} scans that are not among those given were removed from {results.path}.")
+        return results.publish(made, records, with_scans(summary, records), with_mean=True), records
 
 
 def correspond_groups(
@@ -138,59 +168,25 @@ def find_jobs(files: CorrespondFiles, folder: Path, say: Say) -> list[Job]:
     )
 
 
-def _corresponding(
-    jobs: Sequence[Job], files: CorrespondFiles, folder: Path, config: CorrespondConfig, *, quiet: bool, say: Say
-) -> tuple[CorrespondenceRecord, list[CorrespondRecord]]:
-    marks = LandmarkFiles.of(files.landmarks)
-    marks.refuse_shared([job.scan for job in jobs if job.landmarks is None])
-    subjects = _subjects_of(jobs, files.subjects)
-    inputs_hash = inputs_hash_of(jobs, marks, files, config)
-    if (finished := _finished(jobs, folder, inputs_hash)) is not None:
-        say(f"{folder} already contains the results of these scans and settings; nothing is computed.")
-        return finished
-    template = None if files.template is None else marks.onto(read_mesh(files.template), files.template)
-    model = None if files.model is None else ShapeModel.load(files.model)
-    read = read_scans(jobs, marks, strict=files.strict, outer=config.outer, quiet=quiet, say=say)
-    without_inner = replace(config, outer=False)  # the scans that are read are without inner surfaces
-
-    def make(rounds: RoundsWithProgress) -> Correspondence:
-        scans = list(read.scans.values())
-        with waiting("choosing the template", quiet=quiet):
-            first = first_template(scans, template, without_inner, model)
-        of_scans = [subjects[name] for name in read.scans] if subjects else []
-        return correspond(
-            scans, without_inner, template=template, model=model, first=first, subjects=of_scans, run=rounds
-        )
-
-    made, records = bring(jobs, read, marks, files, folder, make, quiet=quiet, say=say)
-    # Until all is written the folder is none that build takes.
-    remove_file(folder / SUMMARY)
-    summary = CorrespondenceRecord(
-        template=made.why, vertices=len(made.template.vertices), rounds=list(made.moved), corresponding=[],
-        set_aside={}, settings=asdict(config), version=__version__, sides_decided=made.sides_decided,
-        groups=[list(group) for group in made.groups], inputs_hash=inputs_hash,
-    )  # fmt: skip
-    # Surfaces of an earlier run are on another template.
-    if old := _forget_others({record.name for record in records}, folder):
-        say(f"Results of {old} scans that are not among those given were removed from {folder}.")
-    return publish(made, records, with_scans(summary, records), folder, with_mean=True), records
-
-
 def bring(
     jobs: Sequence[Job],
     read: ScansRead,
     marks: LandmarkFiles,
     files: CorrespondFiles,
-    folder: Path,
+    results: CorrespondenceFolder,
     make: Callable[[RoundsWithProgress], Correspondence],
     *,
     quiet: bool,
     say: Say,
 ) -> tuple[Correspondence, list[CorrespondRecord]]:
     """Bring the scans of `jobs` that are read into correspondence by `make`, and say what a user should know of it."""
-    say_excluded(read.unread, len(jobs), say)
+    for name, reason in read.unread.items():
+        say(f"{name} is excluded: {reason.removeprefix(_BROKEN)}")
+    if read.unread:
+        were = "scan is" if len(jobs) == 1 else "scans are"
+        say(f"{len(read.unread)} of {len(jobs)} {were} excluded before the first round.")
     marks.report_unused(say)
-    rounds = RoundsWithProgress(folder / ROUNDS_FOLDER, files.execution, quiet=quiet)
+    rounds = RoundsWithProgress(results.path / ROUNDS_FOLDER, files.execution, quiet=quiet)
     with telling_of_compiling(quiet=quiet):
         made = make(rounds)
     came = {scan.name: scan for scan in made.scans}
@@ -199,7 +195,7 @@ def bring(
     noted = [replace(scan, notes=tuple(read.notes.get(scan.name, ()))).noting(*scan.notes) for scan in scans]
     made = replace(made, scans=tuple(noted))
     size = rms_size(made.template.vertices)
-    records = [_record(job, scan, read, folder, size) for job, scan in zip(jobs, made.scans, strict=True)]
+    records = [_record(job, scan, read, results.path, size) for job, scan in zip(jobs, made.scans, strict=True)]
     for sentence in made.notes:
         say(sentence)
     report_landmarks(records, read, say)
@@ -287,48 +283,6 @@ def file_hash(file: Path) -> str:
     return hashlib.sha256(b"".join(parts)).hexdigest()
 
 
-def results_hash_of(summary: CorrespondenceRecord, *folders: Path) -> str:
-    """Return the SHA-256 of the names and contents of all files of a correspondence, except its summary.
-
-    Each file is that of the first of `folders` that has it.
-    """
-    every = sorted([*summary.corresponding, *summary.set_aside])
-    records = [[f"{name}{RECORD}", *([f"{name}{SURFACE}"] * (name in summary.corresponding))] for name in every]
-    digest = hashlib.sha256()
-    for name in (MEAN, LANDMARKS, *(file for files in records for file in files)):
-        # A mean has landmarks of its own, or none.
-        places = folders[:1] if name == LANDMARKS and (folders[0] / MEAN).is_file() else folders
-        file = next((folder / name for folder in places if (folder / name).is_file()), None)
-        if file is not None:
-            digest.update(f"{name} {sha256_of_file(file)}\n".encode())
-    return digest.hexdigest()
-
-
-def _finished(
-    jobs: Sequence[Job], folder: Path, inputs_hash: str
-) -> tuple[CorrespondenceRecord, list[CorrespondRecord]] | None:
-    """Return the summary and records of a finished run with the same inputs whose files are whole; else None."""
-    try:
-        summary, records = read_finished(folder)
-        is_same = summary.inputs_hash == inputs_hash and summary.results_hash == results_hash_of(summary, folder)
-        return (summary, [records[job.name] for job in jobs]) if is_same else None
-    except (ShapespaceError, KeyError):
-        return None
-
-
-def read_finished(folder: Path) -> tuple[CorrespondenceRecord, dict[str, CorrespondRecord]]:
-    """Return the summary of the correspondence in `folder`, and all records by name, those in correspondence first.
-
-    Raises:
-        FileError, FileFormatError: a file cannot be read, or is damaged.
-    """
-    summary = CorrespondenceRecord.from_json(json_of(folder / SUMMARY), str(folder / SUMMARY))
-    files = {name: folder / f"{name}{RECORD}" for name in (*summary.corresponding, *summary.set_aside)}
-    return summary, {
-        name: read(CorrespondRecord, json_of(file), str(file), CORRESPOND_AGAIN) for name, file in files.items()
-    }
-
-
 class RoundsWithProgress:
     """Runs rounds with a bar for each."""
 
@@ -357,14 +311,6 @@ class ScansRead:
     hashes: dict[str, str] = field(default_factory=dict[str, str])
     unread: dict[str, str] = field(default_factory=dict[str, str])
     landmark_distances: dict[str, dict[str, float]] = field(default_factory=dict[str, dict[str, float]])
-
-
-def say_excluded(reasons: Mapping[str, str], scans: int, say: Say) -> None:
-    """Print the excluded scans, with the reason, before the first round."""
-    for name, reason in reasons.items():
-        say(f"{name} is excluded: {reason.removeprefix(_BROKEN)}")
-    if reasons:
-        say(f"{len(reasons)} of {scans} {'scan is' if scans == 1 else 'scans are'} excluded before the first round.")
 
 
 def read_scans(
@@ -442,69 +388,128 @@ def _record(job: Job, scan: Corresponding, read: ScansRead, folder: Path, mean_s
     )  # fmt: skip
 
 
-def publish(
-    made: Correspondence,
-    records: Sequence[CorrespondRecord],
-    summary: CorrespondenceRecord,
-    folder: Path,
-    *,
-    with_mean: bool,
-) -> CorrespondenceRecord:
-    """Write results apart, the summary last, then move them into `folder`; return the summary with their hash.
+@dataclass(frozen=True)
+class CorrespondenceFolder:
+    """The output folder of a correspondence: what is in it, and what a run writes into it, all or nothing.
 
-    Raises:
-        FileError: they cannot be written.
+    Args:
+        path: of the folder.
     """
-    change = make_folder(folder / CHANGE_FOLDER)
-    surfaces = {mesh.name: replace(mesh, landmarks={}) for mesh in made.meshes()}
-    for record in records:
-        if not record.reason:
-            surface = surfaces[record.name]
-            write_mesh(change / f"{record.name}{SURFACE}", mirror_image(surface) if record.mirrored else surface)
-        write_text(change / f"{record.name}{RECORD}", json_text(record))
-    if with_mean:
-        make_folder((change / MEAN).parent)
-        write_mesh(change / MEAN, made.template)
-        if made.landmarks:
-            write_surface_landmarks(change / LANDMARKS, made.landmarks)
-    summary = structs.replace(summary, results_hash=results_hash_of(summary, change, folder))
-    write_text(change / SUMMARY, json_text(summary))
-    complete_change(folder)
-    shutil.rmtree(folder / ROUNDS_FOLDER, ignore_errors=True)
-    return summary
 
+    path: Path
 
-def complete_change(folder: Path) -> None:
-    """Move the files of a change into `folder` if all are written; otherwise remove what was written of them.
+    @contextlib.contextmanager
+    def writing(self) -> Generator[CorrespondenceFolder]:
+        """Yield the folder, into which no other run writes during the block, and in which no change is incomplete.
 
-    A folder that is left in between has no summary, so that nothing takes it; this function then completes it.
+        Raises:
+            FileError: another run writes into the folder, or files cannot be moved.
+        """
+        with only_writer(self.path):
+            self._complete_change()
+            yield self
 
-    Raises:
-        FileError: they cannot be moved.
-    """
-    change = folder / CHANGE_FOLDER
-    if (change / SUMMARY).is_file():
-        summary = CorrespondenceRecord.from_json(read_json(change / SUMMARY, CORRESPOND_AGAIN))
-        remove_file(folder / SUMMARY)
-        for name in summary.set_aside:
-            remove_file(folder / f"{name}{SURFACE}")
-        if (change / MEAN).is_file():
-            make_folder((folder / MEAN).parent)
-            if not (change / LANDMARKS).is_file():
-                remove_file(folder / LANDMARKS)
-        results = (file for pattern in (RECORD, SURFACE) for file in sorted(change.glob(f"*{pattern}")))
-        for file in (*results, change / MEAN, change / LANDMARKS):
-            if file.is_file():
-                move_file(file, folder / file.relative_to(change))
-        _forget_others({*summary.corresponding, *summary.set_aside}, folder)
-        move_file(change / SUMMARY, folder / SUMMARY)
-    shutil.rmtree(change, ignore_errors=True)
+    def read(self) -> tuple[CorrespondenceRecord, dict[str, CorrespondRecord]]:
+        """Return the summary, and all records by name, those in correspondence first.
 
+        Raises:
+            FileError, FileFormatError: a file cannot be read, or is damaged.
+        """
+        summary = CorrespondenceRecord.from_json(json_of(self.path / SUMMARY), str(self.path / SUMMARY))
+        files = {name: self.path / f"{name}{RECORD}" for name in (*summary.corresponding, *summary.set_aside)}
+        return summary, {
+            name: read(CorrespondRecord, json_of(file), str(file), CORRESPOND_AGAIN) for name, file in files.items()
+        }
 
-def _forget_others(names: set[str], folder: Path) -> int:
-    """Remove the results of scans other than `names`, and return of how many."""
-    old = [file for file in sorted(folder.glob(f"*{RECORD}")) if file.name.removesuffix(RECORD) not in names]
-    for file in old:
-        remove_file(folder / (file.name.removesuffix(RECORD) + SURFACE))
-        remove_file(file)
-    return len(old)
+    def finished(
+        self, inputs_hash: str, names: Sequence[str]
+    ) -> tuple[CorrespondenceRecord, list[CorrespondRecord]] | None:
+        """Return summary and records of a finished run with the same inputs whose files are whole; else None."""
+        try:
+            summary, records = self.read()
+            is_same = summary.inputs_hash == inputs_hash and summary.results_hash == self.hash_of(summary)
+            return (summary, [records[name] for name in names]) if is_same else None
+        except (ShapespaceError, KeyError):
+            return None
+
+    def hash_of(self, summary: CorrespondenceRecord, change: Path | None = None) -> str:
+        """Return the SHA-256 of the names and contents of all files of a correspondence, except its summary.
+
+        Each file is that of the folder `change` where it has it.
+        """
+        every = sorted([*summary.corresponding, *summary.set_aside])
+        records = [[f"{name}{RECORD}", *([f"{name}{SURFACE}"] * (name in summary.corresponding))] for name in every]
+        folders, digest = [self.path] if change is None else [change, self.path], hashlib.sha256()
+        for name in (MEAN, LANDMARKS, *(file for files in records for file in files)):
+            # A mean has landmarks of its own, or none.
+            places = folders[:1] if name == LANDMARKS and (folders[0] / MEAN).is_file() else folders
+            file = next((folder / name for folder in places if (folder / name).is_file()), None)
+            if file is not None:
+                digest.update(f"{name} {sha256_of_file(file)}\n".encode())
+        return digest.hexdigest()
+
+    def publish(
+        self,
+        made: Correspondence,
+        records: Sequence[CorrespondRecord],
+        summary: CorrespondenceRecord,
+        *,
+        with_mean: bool,
+    ) -> CorrespondenceRecord:
+        """Write results apart, the summary last, then move them into the folder; return the summary with their hash.
+
+        Raises:
+            FileError: they cannot be written.
+        """
+        change = make_folder(self.path / CHANGE_FOLDER)
+        surfaces = {mesh.name: replace(mesh, landmarks={}) for mesh in made.meshes()}
+        for record in records:
+            if not record.reason:
+                surface = surfaces[record.name]
+                write_mesh(change / f"{record.name}{SURFACE}", mirror_image(surface) if record.mirrored else surface)
+            write_text(change / f"{record.name}{RECORD}", json_text(record))
+        if with_mean:
+            make_folder((change / MEAN).parent)
+            write_mesh(change / MEAN, made.template)
+            if made.landmarks:
+                write_surface_landmarks(change / LANDMARKS, made.landmarks)
+        summary = structs.replace(summary, results_hash=self.hash_of(summary, change))
+        write_text(change / SUMMARY, json_text(summary))
+        self._complete_change()
+        shutil.rmtree(self.path / ROUNDS_FOLDER, ignore_errors=True)
+        return summary
+
+    def _complete_change(self) -> None:
+        """Move the files of a change into the folder if all are written; otherwise remove what was written of them.
+
+        A folder that is left in between has no summary, so that nothing takes it; this function then completes it.
+
+        Raises:
+            FileError: they cannot be moved.
+        """
+        folder, change = self.path, self.path / CHANGE_FOLDER
+        if (change / SUMMARY).is_file():
+            summary = CorrespondenceRecord.from_json(read_json(change / SUMMARY, CORRESPOND_AGAIN))
+            remove_file(folder / SUMMARY)
+            for name in summary.set_aside:
+                remove_file(folder / f"{name}{SURFACE}")
+            if (change / MEAN).is_file():
+                make_folder((folder / MEAN).parent)
+                if not (change / LANDMARKS).is_file():
+                    remove_file(folder / LANDMARKS)
+            results = (file for pattern in (RECORD, SURFACE) for file in sorted(change.glob(f"*{pattern}")))
+            for file in (*results, change / MEAN, change / LANDMARKS):
+                if file.is_file():
+                    move_file(file, folder / file.relative_to(change))
+            self.forget_others({*summary.corresponding, *summary.set_aside})
+            move_file(change / SUMMARY, folder / SUMMARY)
+        shutil.rmtree(change, ignore_errors=True)
+
+    def forget_others(self, names: set[str]) -> int:
+        """Remove the results of scans other than `names`, and return of how many."""
+        files = sorted(self.path.glob(f"*{RECORD}"))
+        old = [file for file in files if file.name.removesuffix(RECORD) not in names]
+        for file in old:
+            remove_file(self.path / (file.name.removesuffix(RECORD) + SURFACE))
+            remove_file(file)
+        return len(old)

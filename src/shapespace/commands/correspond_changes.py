@@ -13,26 +13,22 @@ from pathlib import Path
 import numpy as np
 from msgspec import structs
 
-from shapespace.batch.execution import ExecutionConfig
+from shapespace.batch.executors import ExecutionConfig
 from shapespace.batch.fit_work import Job
-from shapespace.batch.lock import only_writer
 from shapespace.commands.correspond import (
     CHANGE_FOLDER,
+    CorrespondenceFolder,
     CorrespondFiles,
     RoundsWithProgress,
     Say,
     ScansRead,
     bring,
-    complete_change,
     content_hash_of,
     correspond_files,
     correspond_groups,
     find_jobs,
     inputs_hash_of,
-    publish,
-    read_finished,
     read_scans,
-    results_hash_of,
     with_scans,
 )
 from shapespace.commands.inputs import Given, LandmarkFiles
@@ -50,8 +46,7 @@ from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.io.remote import is_address
 from shapespace.reprs import first_names
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, SurfaceReview, read, to_json
-from shapespace.store.corresponding import LANDMARKS, MEAN, SUMMARY, SURFACE
-from shapespace.store.review_text import describe_review, review_summary
+from shapespace.store.corresponding import LANDMARKS, MEAN, SUMMARY, SURFACE, describe_review, review_summary
 from shapespace.types import Mesh, SurfaceLandmarks
 
 _OPTIONS = {
@@ -93,28 +88,28 @@ class _Finished:
     """A finished correspondence in a folder.
 
     Args:
-        folder: with its files.
+        results: the folder.
         summary: of the run.
         records: of all scans by name, those in correspondence first.
         mean: its mean shape.
         surfaces: of the scans in correspondence, by name; those of mirrored scans are reflected.
     """
 
-    folder: Path
+    results: CorrespondenceFolder
     summary: CorrespondenceRecord
     records: dict[str, CorrespondRecord]
     mean: Mesh
     surfaces: dict[str, Mesh]
 
     @staticmethod
-    def of(folder: Path) -> _Finished:
-        """Read all files of the correspondence in `folder`.
+    def of(results: CorrespondenceFolder) -> _Finished:
+        """Read all files of a correspondence.
 
         Raises:
             InputError: its files do not belong together.
             FileError, FileFormatError: a file cannot be read, or is damaged.
         """
-        summary, records = read_finished(folder)
+        folder, (summary, records) = results.path, results.read()
         mean = read_mesh(folder / MEAN)
         files = {name: read_mesh(folder / f"{name}{SURFACE}") for name in summary.corresponding}
         surfaces = {name: mirror_image(one) if name in summary.mirrored else one for name, one in files.items()}
@@ -123,11 +118,11 @@ class _Finished:
             fault = f"{MEAN} has {len(mean.vertices)} vertices, and the correspondence {summary.vertices}"
         elif other := [name for name, one in surfaces.items() if not np.array_equal(faces_of(one), faces_of(mean))]:
             fault = f"{other[0]}{SURFACE} and {MEAN} have different triangles, so one of them was changed"
-        elif summary.results_hash not in ("", results_hash_of(summary, folder)):
+        elif summary.results_hash not in ("", results.hash_of(summary)):
             fault = "its files were changed after the correspondence"
         if fault:
             raise InputError(f"{folder}: {fault}; {CORRESPOND_AGAIN}.")
-        return _Finished(folder, summary, records, mean, surfaces)
+        return _Finished(results, summary, records, mean, surfaces)
 
     def config(self, files: CorrespondFiles, asked: CorrespondConfig) -> CorrespondConfig:
         """Return the settings of the correspondence, which `asked` must not contradict.
@@ -135,10 +130,10 @@ class _Finished:
         Raises:
             InputError: options ask for something else.
         """
-        config = read(CorrespondConfig, self.summary.settings, str(self.folder / SUMMARY), CORRESPOND_AGAIN)
+        config = read(CorrespondConfig, self.summary.settings, str(self.results.path / SUMMARY), CORRESPOND_AGAIN)
         if self.summary.settings.get("symmetric"):
             raise InputError(
-                f"{self.folder} was computed with the setting symmetric, which was removed; {CORRESPOND_AGAIN}."
+                f"{self.results.path} was computed with the setting symmetric, which was removed; {CORRESPOND_AGAIN}."
             )
         for option, file in (("--template", files.template), ("--model", files.model)):
             if file is not None:
@@ -148,7 +143,9 @@ class _Finished:
             own = getattr(config, name)
             if getattr(asked, name) not in (own, getattr(usual, name)):
                 value = f"without {option}" if own is False else f"with {option} {own}"
-                raise InputError(f"{self.folder} was computed {value}, and a change keeps that; leave {option} out.")
+                raise InputError(
+                    f"{self.results.path} was computed {value}, and a change keeps that; leave {option} out."
+                )
         return config
 
     def refuse_unknown(self, names: Sequence[str], option: str) -> None:
@@ -156,7 +153,7 @@ class _Finished:
         for name in names:
             if name not in self.records:
                 known = first_names(list(self.records), _LISTED)
-                raise InputError(f"{option} {name}: {self.folder} has no scan of that name; it has {known}.")
+                raise InputError(f"{option} {name}: {self.results.path} has no scan of that name; it has {known}.")
 
     def job(self, name: str) -> Job:
         """Return the job of a scan, from where it was."""
@@ -164,7 +161,7 @@ class _Finished:
         known = {key: str(value) for key, value in record.metadata.items() if value is not None}
         if is_address(record.path):
             return Job(name, Given(record.path).path, metadata=known, address=record.path)
-        return Job(name, Path(os.path.normpath(self.folder / record.path)), metadata=known)
+        return Job(name, Path(os.path.normpath(self.results.path / record.path)), metadata=known)
 
 
 def change_correspondence(
@@ -183,59 +180,52 @@ def change_correspondence(
             f"{folder} contains no finished correspondence, and {change.option} needs one; run shapespace correspond "
             f"without {change.option} first."
         )
-    with only_writer(folder):
-        complete_change(folder)
-        finished = _Finished.of(folder)
-        return _changed(finished, change, files, finished.config(files, config), quiet=quiet, say=say)
+    with CorrespondenceFolder(folder).writing() as results:
+        finished = _Finished.of(results)
+        config, summary = finished.config(files, config), finished.summary
+        marks = LandmarkFiles.of(files.landmarks)
+        for record in finished.records.values():
+            marks.of_scan(Path(record.path))  # so that it is not said to belong to no scan
+        given = find_jobs(files, folder, say) if files.scans else []
+        new = _new_jobs(finished, change, given)
+        kept = [name for name in summary.corresponding if name not in (*change.redo, *change.remove)]
+        old = _old_jobs(finished, change, given) if change.update else []
+        jobs = list({job.name: job for job in (*old, *new)}.values())
+        marks.refuse_shared([job.scan for job in jobs if job.landmarks is None])
+        what = [change.option, sorted({*change.redo, *change.remove}), change.update]
+        inputs_hash = inputs_hash_of(sorted(jobs, key=lambda job: job.name), marks, files, config, what)
+        if inputs_hash == summary.inputs_hash or not (new or change.remove or change.update):
+            say(f"{folder} already contains the results of this command; nothing is computed.")
+            return summary, list(finished.records.values())
+        finished.refuse_unknown(change.remove, "--remove")
+        if len(kept) < (1 if new else FEWEST):
+            raise InputError(
+                f"{change.option} leaves {len(kept)} of the scans in {folder} as they are, which are too few; run "
+                "shapespace correspond on all scans instead."
+            )
+        read = read_scans(jobs, marks, strict=files.strict, outer=config.outer, quiet=quiet, say=say)
+        _refuse_changed(finished, read, files, kept if change.update else [])
+        first = {finished.records[name].hash: name for name in kept if name not in read.scans}
+        for name, content_hash in read.hashes.items():
+            if name in read.notes and content_hash in first:
+                read.notes[name].append(f"It is {first[content_hash]} again; leave one of them out.")
 
+        def make(rounds: RoundsWithProgress) -> Correspondence:
+            return _registered(finished, kept, read, marks, replace(config, outer=False), rounds, update=change.update)
 
-def _changed(
-    finished: _Finished, change: Change, files: CorrespondFiles, config: CorrespondConfig, *, quiet: bool, say: Say
-) -> tuple[CorrespondenceRecord, list[CorrespondRecord]]:
-    folder, summary = finished.folder, finished.summary
-    marks = LandmarkFiles.of(files.landmarks)
-    for record in finished.records.values():
-        marks.of_scan(Path(record.path))  # so that it is not said to belong to no scan
-    given = find_jobs(files, folder, say) if files.scans else []
-    new = _new_jobs(finished, change, given)
-    kept = [name for name in summary.corresponding if name not in (*change.redo, *change.remove)]
-    old = _old_jobs(finished, change, given) if change.update else []
-    jobs = list({job.name: job for job in (*old, *new)}.values())
-    marks.refuse_shared([job.scan for job in jobs if job.landmarks is None])
-    what = [change.option, sorted({*change.redo, *change.remove}), change.update]
-    inputs_hash = inputs_hash_of(sorted(jobs, key=lambda job: job.name), marks, files, config, what)
-    if inputs_hash == summary.inputs_hash or not (new or change.remove or change.update):
-        say(f"{folder} already contains the results of this command; nothing is computed.")
-        return summary, list(finished.records.values())
-    finished.refuse_unknown(change.remove, "--remove")
-    if len(kept) < (1 if new else FEWEST):
-        raise InputError(
-            f"{change.option} leaves {len(kept)} of the scans in {folder} as they are, which are too few; run "
-            "shapespace correspond on all scans instead."
-        )
-    read = read_scans(jobs, marks, strict=files.strict, outer=config.outer, quiet=quiet, say=say)
-    _refuse_changed(finished, read, files, kept if change.update else [])
-    first = {finished.records[name].hash: name for name in kept if name not in read.scans}
-    for name, content_hash in read.hashes.items():
-        if name in read.notes and content_hash in first:
-            read.notes[name].append(f"It is {first[content_hash]} again; leave one of them out.")
-
-    def make(rounds: RoundsWithProgress) -> Correspondence:
-        return _registered(finished, kept, read, marks, replace(config, outer=False), rounds, update=change.update)
-
-    made, records = bring(jobs, read, marks, files, folder, make, quiet=quiet, say=say)
-    every = {name: record for name, record in finished.records.items() if name not in change.remove}
-    every |= {record.name: record for record in records}
-    summary = structs.replace(_summary(finished, change, records, every), inputs_hash=inputs_hash)
-    if change.update:
-        summary = structs.replace(summary, rounds=[*summary.rounds, *made.moved])
-    else:
-        done = "removed from" if change.remove else "registered to the mean in"
-        count = len(set(change.remove)) or sum(not record.reason for record in records)
-        were = "scan was" if count == 1 else "scans were"
-        say(f"{count} {were} {done} {folder}; the other {len(kept)} are unchanged.")
-    summary = publish(made, records, summary, folder, with_mean=change.update)
-    return summary, list(every.values())
+        made, records = bring(jobs, read, marks, files, finished.results, make, quiet=quiet, say=say)
+        every = {name: record for name, record in finished.records.items() if name not in change.remove}
+        every |= {record.name: record for record in records}
+        summary = structs.replace(_summary(finished, change, records, every), inputs_hash=inputs_hash)
+        if change.update:
+            summary = structs.replace(summary, rounds=[*summary.rounds, *made.moved])
+        else:
+            done = "removed from" if change.remove else "registered to the mean in"
+            count = len(set(change.remove)) or sum(not record.reason for record in records)
+            were = "scan was" if count == 1 else "scans were"
+            say(f"{count} {were} {done} {folder}; the other {len(kept)} are unchanged.")
+        summary = finished.results.publish(made, records, summary, with_mean=change.update)
+        return summary, list(every.values())
 
 
 # Which scans
@@ -262,8 +252,8 @@ def _not_there(finished: _Finished, given: Sequence[Job]) -> list[Job]:
         record = finished.records.get(job.name)
         if record is not None and record.hash and record.hash != content_hash_of(job):
             raise InputError(
-                f"{job.label} differs from the scan {job.name} in {finished.folder}; register it again with --redo "
-                f"{job.name}, or rename its file."
+                f"{job.label} differs from the scan {job.name} in {finished.results.path}; register it again with "
+                f"--redo {job.name}, or rename its file."
             )
     return [job for job in given if job.name not in finished.records]
 
@@ -307,7 +297,7 @@ def _registered(
         return Correspondence(finished.mean, (), "", ())
     added = [scan for name, scan in read.scans.items() if not update or name not in kept]
     raw = [read.scans[name] for name in kept] if update else []
-    file = finished.folder / LANDMARKS
+    file = finished.results.path / LANDMARKS
     landmarks = read_surface_landmarks(file) if file.is_file() else SurfaceLandmarks()
     surfaces = [replace(finished.surfaces[name], name=name) for name in kept]
     if not landmarks and not raw:  # the landmarks of scans that stay determine where the mean has them
@@ -414,10 +404,6 @@ def correspond(
     return Outcome(facts, _lines(summary, records, output), exit_code=int(bool(summary.set_aside)))
 
 
-def _needs_review(record: CorrespondRecord) -> list[str]:
-    return [f"{record.name} needs review: {'; '.join(describe_review(record))}"]
-
-
 def _lines(summary: CorrespondenceRecord, records: Sequence[CorrespondRecord], folder: Path) -> list[str]:
     rounds = [
         f"round {number}: vertices moved by {100 * moved:.2f} % of the size (RMS)"
@@ -430,7 +416,11 @@ def _lines(summary: CorrespondenceRecord, records: Sequence[CorrespondRecord], f
     ]
     there = [record for record in records if not record.reason]
     unusual = [record for record in there if record.review and not record.doubt]
-    warnings += first_lines(unusual, _needs_review, "more surfaces need review")
+    warnings += first_lines(
+        unusual,
+        lambda record: [f"{record.name} needs review: {'; '.join(describe_review(record))}"],
+        "more surfaces need review",
+    )
     seen = sum(record.seen_share or 0.0 for record in there) / len(there)
     doubtful = sum(bool(record.doubt) for record in there)
     total = (

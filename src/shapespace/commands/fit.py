@@ -13,14 +13,12 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from shapespace.batch.execution import ExecutionConfig
-from shapespace.batch.executors import Serial
-from shapespace.batch.fit_records import Source
+from shapespace.batch.executors import ExecutionConfig, Serial
+from shapespace.batch.fit_records import source_of
 from shapespace.batch.fit_work import Job
 from shapespace.batch.progress import progress, telling_of_compiling
 from shapespace.batch.result_folder import RECORD
-from shapespace.batch.run import BatchConfig, Plan, fit_many, make_jobs
-from shapespace.batch.sinks import STORE_FROM, FolderSink, StoreSink
+from shapespace.batch.run import STORE_FROM, BatchConfig, FolderSink, Plan, StoreSink, fit_many, make_jobs
 from shapespace.commands.inputs import Given, LandmarkFiles, given_scans, is_of_fit, with_ids
 from shapespace.commands.outcome import LISTED, Outcome, exit_code_of, first_lines
 from shapespace.errors import InputError, ShapespaceError
@@ -202,9 +200,9 @@ def _write_list(folder: Path, jobs: Sequence[Job]) -> None:
         known = [dict(zip(header, row, strict=True)) for row in earlier]
         rows = {row["id"]: row for row in known if is_store or (folder / f"{row['id']}{RECORD}").is_file()}
     for job in jobs:
-        places = {"scan": job.address or Source.of_file(job.scan, "", folder).path}
+        places = {"scan": job.address or source_of(job.scan, "", folder).path}
         if job.landmarks is not None:
-            places["landmarks"] = Source.of_file(job.landmarks, "", folder).path
+            places["landmarks"] = source_of(job.landmarks, "", folder).path
         rows[job.name] = {**job.metadata, "id": job.name, **places}
     columns = list(dict.fromkeys(["id", "scan", *(column for row in rows.values() for column in row)]))
     if len(rows) == 1 and len(columns) == 2 and not file.exists():

@@ -8,10 +8,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from shapespace.batch.fit_work import Job
+from shapespace.batch.fit_work import Job, naming
+from shapespace.batch.progress import progress
 from shapespace.batch.result_folder import RECORD
 from shapespace.cohort.table import fold_name, refuse_repeated
-from shapespace.errors import FileError, InputError, ShapespaceError
+from shapespace.errors import FileError, InputError, MeshError, ShapespaceError
+from shapespace.geometry.normals import without_estimates
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import read_bytes
 from shapespace.io.landmarks.fiducials import FIDUCIAL_ENDINGS
@@ -21,7 +23,8 @@ from shapespace.io.meshes.mesh_io import MESH_FILE_ENDINGS, stem_of
 from shapespace.io.remote import addresses, is_address
 from shapespace.io.tables.table_io import decoded_text, key_column, table_rows
 from shapespace.reprs import first_names
-from shapespace.types import Mesh
+from shapespace.store.corresponding import SurfaceFiles
+from shapespace.types import MM_PER_UNIT, Mesh
 
 _LISTS = (".csv", ".tsv", ".txt", ".xlsx")
 _PLACES = ("scan", "file", "path", "specimen", "name", "id")
@@ -306,3 +309,47 @@ class LandmarkFiles:
             say(sentence)
         if left := sorted(set(self.files) - self.used):
             say(f"{len(left)} files of landmarks belong to no scan that is given: {first_names(left, _FILES_LISTED)}.")
+
+
+@dataclass(frozen=True)
+class SurfacesOnDisk:
+    """Meshes in correspondence, in mm, on one side, without estimates, each read when it is asked for.
+
+    Args:
+        files: of the meshes.
+        listed: reads them.
+        unit: of most.
+        without_vertices: what to do about a mesh that has none, for a message.
+    """
+
+    files: Sequence[Path]
+    listed: SurfaceFiles
+    unit: str = "mm"
+    without_vertices: str = "; leave it out"
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def __getitem__(self, index: int, /) -> Mesh:
+        file, mm = self.files[index], MM_PER_UNIT[self.unit]
+        try:
+            mesh = without_estimates(self.listed.mesh(file))
+        except MeshError as error:
+            raise MeshError(naming(file, str(error))) from error
+        if not len(mesh.vertices):
+            raise MeshError(f"{file}: it has no vertices{self.without_vertices}.")
+        return mesh if mm == 1.0 else mesh.with_vertices(mesh.vertices * mm)
+
+    def read(self, *, quiet: bool) -> list[Mesh]:
+        """Return all meshes.
+
+        Raises:
+            FileError: one cannot be read.
+            MeshError: one is damaged, or has no vertices.
+        """
+        with progress(len(self), "reading", "mesh", quiet=quiet) as bar:
+            meshes: list[Mesh] = []
+            for index in range(len(self)):
+                meshes.append(self[index])
+                bar.update()
+        return meshes

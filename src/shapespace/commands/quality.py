@@ -3,31 +3,29 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from msgspec import structs
 
-from shapespace.batch.execution import ExecutionConfig
-from shapespace.batch.fit_work import naming
+from shapespace.batch.executors import ExecutionConfig, Serial, Shared
 from shapespace.batch.progress import progress, steps, waiting
-from shapespace.batch.quality_work import QualityRunner
+from shapespace.commands.inputs import SurfacesOnDisk
 from shapespace.commands.outcome import Outcome
-from shapespace.errors import InputError, MeshError
+from shapespace.errors import FitError, InputError, MeshError
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.files import make_folder, write_text
 from shapespace.io.meshes.mesh_folders import mesh_files
 from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.model.foreign import looks_like_model
-from shapespace.model.model_quality import Curve, ModelQuality, QualityConfig, Runner, measure_quality
+from shapespace.model.model_quality import Curve, ModelQuality, Part, QualityConfig, Runner, Shapes, measure_quality
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import BySize, Measured, Quality, json_text, to_json
-from shapespace.store.corresponding import SURFACE, surface_files, surface_stem
-from shapespace.store.review_text import review_summary
-from shapespace.types import Mesh
+from shapespace.store.corresponding import SURFACE, review_summary, reviewed_surfaces, surface_stem
+from shapespace.types import FloatArray, Mesh
 
 _SURFACES = (".dense.ply", ".fitted.ply", SURFACE)
 _UNITS = {
@@ -41,6 +39,10 @@ _UNITS = {
 }
 """Measures, and what their numbers are."""
 _MOST_TARGETS = 2  # differences are computed between two targets
+
+
+_FEW_VERTICES = 200_000
+"""Of all shapes together: below it, a measurement takes less time than workers to start."""
 
 
 @dataclass(frozen=True)
@@ -197,10 +199,9 @@ def _meshes(
     folder: Path, notes: list[str], gauge: Gauge, options: QualityOptions, *, quiet: bool
 ) -> tuple[list[Mesh], dict[str, float]]:
     """Return the meshes of a folder in the unit of most of them, and the ratios of those that were in another."""
-    listed = surface_files([folder])
-    if review := review_summary(listed.review(listed.files, "--with-doubtful", accept=options.with_doubtful)):
-        notes.append(f"{folder}: {review}.")
-    listed = listed if options.with_doubtful else listed.without_doubtful("--with-doubtful")
+    listed, review = reviewed_surfaces([folder], "--with-doubtful", with_doubtful=options.with_doubtful)
+    if summary := review_summary(review):
+        notes.append(f"{folder}: {summary}.")
     notes += listed.notes
     if gauge == "form":
         listed.refuse_mixed_units()
@@ -213,18 +214,8 @@ def _meshes(
                 notes.append(f"{folder}: of {len(files)} meshes the {len(surfaces)} that end in {ending} are taken.")
             files = surfaces
             break
-    out: list[Mesh] = []
-    with progress(len(files), "reading", "mesh", quiet=quiet) as bar:
-        for file in files:
-            try:
-                mesh = listed.mesh(file)
-            except MeshError as error:
-                raise MeshError(naming(file, str(error))) from error
-            if not len(mesh.vertices):
-                raise MeshError(f"{file}: it has no vertices; leave it out.")
-            out.append(replace(mesh, name=file.name))
-            bar.update()
-    return out, {surface_stem(file): ratio for file, ratio in listed.unit_ratios.items()}
+    meshes = SurfacesOnDisk(files, listed).read(quiet=quiet)
+    return meshes, {surface_stem(file): ratio for file, ratio in listed.unit_ratios.items()}
 
 
 def _scans(target: _Target, folder: Path | None, *, quiet: bool) -> list[Mesh] | None:
@@ -318,3 +309,60 @@ def _draw(result: Quality, output: Path, notes: list[str]) -> None:
     from shapespace.report import figures
 
     figures.save_figure(figures.quality_figure(result), output / "quality", ("png", "svg"))
+
+
+@dataclass(frozen=True)
+class QualityRunner:
+    """Runs the parts of a measurement by an executor.
+
+    Args:
+        execution: where they run; a small measurement runs in this process unless something else is asked for.
+        folder: that all workers see, for a file with the shapes during the measurement; made if absent.
+        quiet: whether workers do not report that code is compiled.
+    """
+
+    execution: ExecutionConfig
+    folder: Path
+    quiet: bool
+
+    def __call__(self, shapes: Shapes, parts: Sequence[Part]) -> Iterator[tuple[Part, FloatArray]]:
+        """Yield each of `parts` with its errors, in any order.
+
+        Raises:
+            FileError: the shapes cannot be written.
+            FitError: no workers are left, or a part was given up.
+        """
+        small = sum(len(mesh.vertices) for mesh in shapes.meshes) < _FEW_VERTICES
+        serial = small and self.execution.kind == "local" and not self.execution.jobs
+        executor = Serial() if serial else self.execution.executor(len(parts), quiet=self.quiet)
+        with (
+            Shared.by(executor, shapes, self.folder) as shared,
+            executor.run(QualityWork(shared), parts) as results,
+        ):
+            for part, (errors, reason) in results:
+                if errors is None:
+                    raise FitError(f"A part of the measurement could not be done: {reason}; run it with fewer --jobs.")
+                yield part, errors
+
+
+@dataclass(frozen=True)
+class QualityWork:
+    """Measures parts, for an executor.
+
+    Args:
+        shapes: what all parts share.
+    """
+
+    shapes: Shared[Shapes]
+
+    def do(self, part: Part) -> tuple[FloatArray | None, str]:
+        """Return the errors of one part.
+
+        Raises:
+            InputError: the scans do not belong to the surfaces.
+        """
+        return self.shapes.value().do(part), ""
+
+    def give_up(self, _part: Part, reason: str) -> tuple[FloatArray | None, str]:
+        """Return no errors and the reason."""
+        return None, reason

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from shapespace.batch.execution import ExecutionConfig
+from shapespace.batch.executors import ExecutionConfig
 from shapespace.batch.fit_records import read_record
 from shapespace.batch.progress import telling_of_compiling
 from shapespace.batch.result_folder import RECORD

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from shapespace.correspondence.correspondence_result import copies
 from shapespace.correspondence.landmark_guide import contradicts_most, with_own_landmarks
-from shapespace.correspondence.scan_set import copies
 from shapespace.correspondence.settings import FEWEST, SIZE, CorrespondConfig
 from shapespace.correspondence.symmetric_template import symmetrise
 from shapespace.correspondence.template import check_template, choose_template, clean_scan, resample

@@ -18,13 +18,17 @@ from typing import TypeAlias
 import numpy as np
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
-from shapespace.correspondence.collection_notes import judge_collection
-from shapespace.correspondence.correspondence_result import ANOTHER_SHAPE, Correspondence, Corresponding
+from shapespace.correspondence.correspondence_result import (
+    ANOTHER_SHAPE,
+    Correspondence,
+    Corresponding,
+    judge_collection,
+    unit_ratios,
+)
 from shapespace.correspondence.first_template import FirstTemplate, first_template, repaired_scans
-from shapespace.correspondence.guide import ShapePredictor, predict_leave_one_out
-from shapespace.correspondence.harmonics import Harmonics
+from shapespace.correspondence.harmonics import Harmonics, Reliefs, agreement, relief
 from shapespace.correspondence.isometry import common_symmetries
-from shapespace.correspondence.kinds import Collection, find_kinds, is_outlier
+from shapespace.correspondence.kinds import Collection, ShapePredictor, find_kinds, is_outlier, predict_leave_one_out
 from shapespace.correspondence.landmark_guide import ScanLandmarks, consensus_landmarks
 from shapespace.correspondence.pose_consensus import SAME_POSE_DEG, TEMPLATE, PoseComparison, angle_deg, consensus_poses
 from shapespace.correspondence.registration import (
@@ -34,8 +38,6 @@ from shapespace.correspondence.registration import (
     RoundContext,
     ScanRegistration,
 )
-from shapespace.correspondence.relief import Reliefs, agreement, relief
-from shapespace.correspondence.scan_set import unit_ratios
 from shapespace.correspondence.scan_status import (
     MOST_FOLDED,
     Judgement,

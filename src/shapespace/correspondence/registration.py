@@ -15,15 +15,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 
-from shapespace.correspondence.generic import generic_model
-from shapespace.correspondence.harmonics import Harmonics
+from shapespace.correspondence.harmonics import Harmonics, agreement, relief
 from shapespace.correspondence.isometry import IntrinsicShape, bent_shapes, distinct, is_apart
 from shapespace.correspondence.landmark_guide import MirroredLandmarksError, ScanLandmarks
 from shapespace.correspondence.pose_consensus import angle_deg
 from shapespace.correspondence.register import ElasticSettings, Template, register
-from shapespace.correspondence.relief import agreement, relief
 from shapespace.correspondence.settings import PoseRange
-from shapespace.correspondence.template import PoseModel
+from shapespace.correspondence.template import PoseModel, generic_model
 from shapespace.errors import FitError, InputError, ShapespaceError
 from shapespace.fit.dense.dense_fit import DenseSurface, dense_surface
 from shapespace.fit.fit_scan import FitConfig, fit_scan

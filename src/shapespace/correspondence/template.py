@@ -1,4 +1,7 @@
-"""The first template: the scan that is nearest to all others, whole and evenly meshed."""
+"""The first template: the scan that is nearest to all others, whole and evenly meshed.
+
+Before other shapes are known, its shape model has the modes of a smooth Gaussian process on it (C2).
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from threadpoolctl import threadpool_limits
 
-from shapespace.correspondence.generic import generic_model
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.kinds import SAME_KIND
 from shapespace.correspondence.settings import LARGEST_ROTATION_DEG, PoseRange
@@ -20,8 +23,43 @@ from shapespace.geometry import remesh
 from shapespace.geometry.doctor import repair
 from shapespace.geometry.normals import boundary_edges, face_areas, faces_of, rms_size, without_vertices
 from shapespace.geometry.outer_surface import hidden_share, outer_surface
+from shapespace.geometry.similarity import small_poses
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity
+
+MODES = 60  # slowest harmonics, three coordinates each
+RANGE_SHARE = 0.4  # share of the size; range of the smooth deformations (C2)
+AMPLITUDE_SHARE = 0.1
+"""Of the Gaussian process, as shares of the shape's size: how far it reaches along the surface, how much it moves."""
+
+
+def generic_model(mesh: Mesh, harmonics: Harmonics, shapes: FloatArray | None = None) -> ShapeModel:
+    """Return `mesh` as the mean of a model whose modes are those of a smooth Gaussian process on it (C2).
+
+    The process diffuses white noise over the surface, alike in all directions (Luthi, Gerig, Jud and Vetter 2018); its
+    part that is a similarity transform is removed.
+
+    Args:
+        mesh: the mean, mm.
+        harmonics: of it.
+        shapes: (N, V, 3) aligned shapes; their variation joins the modes, and the process keeps a quarter of its
+            variance.
+    """
+    size = rms_size(mesh.vertices)
+    slow, vertices = harmonics.slowest(MODES), len(mesh.vertices)
+    columns = np.kron(slow.functions * slow.attenuation(RANGE_SHARE * size), np.eye(3))  # C2
+    columns *= AMPLITUDE_SHARE * size * np.sqrt(vertices / float((columns**2).sum()))
+    if shapes is not None:
+        of_shapes = (shapes - shapes.mean(axis=0)).reshape(len(shapes), -1).T / np.sqrt(max(len(shapes) - 1, 1))
+        columns = np.column_stack([of_shapes, 0.5 * columns])
+    pose = np.linalg.qr(small_poses(mesh.vertices - mesh.vertices.mean(axis=0)))[0]
+    columns -= pose @ (pose.T @ columns)
+    with threadpool_limits(limits=1, user_api="blas"):  # threads take up to 50 times as long on a busy machine
+        basis, stddev, _ = np.linalg.svd(columns, full_matrices=False)
+    significant = stddev > 1e-3 * stddev[0]
+    basis, stddev = basis[:, significant], stddev[significant]
+    return ShapeModel(mesh.vertices.ravel(), basis, stddev, float((stddev**2).sum()), 1, faces=mesh.faces)
+
 
 _POSE_VERTICES = 1500  # vertices of the coarse mesh for poses, which need no detail; time grows with them
 _POSE_HARMONICS = 40  # harmonics on the coarse mesh of the pose model

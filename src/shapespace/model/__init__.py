@@ -10,7 +10,7 @@ from shapespace.lazy import lazy_names
 
 if TYPE_CHECKING:
     from shapespace.model.additive import AdditiveModel
-    from shapespace.model.build_config import BuildConfig
+    from shapespace.model.build_model import BuildConfig
     from shapespace.model.model_quality import Curve, ModelQuality, QualityConfig, measure_quality
     from shapespace.model.shape_model import ShapeModel
 
@@ -27,7 +27,7 @@ __getattr__, __dir__ = lazy_names(
     __name__,
     {
         "model.additive": ("AdditiveModel",),
-        "model.build_config": ("BuildConfig",),
+        "model.build_model": ("BuildConfig",),
         "model.model_quality": ("Curve", "ModelQuality", "QualityConfig", "measure_quality"),
         "model.shape_model": ("ShapeModel",),
     },

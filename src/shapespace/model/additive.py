@@ -29,10 +29,10 @@ from shapespace.lazy import lazy_import
 from shapespace.model import model_file
 from shapespace.model.choose_modes import modes_notes
 from shapespace.model.foreign import Foreign, is_foreign, load_foreign, parted
-from shapespace.model.held_out import held_out_shapes
+from shapespace.model.krylov import largest_eigenpairs
 from shapespace.model.local_modes import local_modes
-from shapespace.model.new_shapes import HeldOut, variances_of_new_shapes
-from shapespace.model.pca import modes_for_variance, plain_modes, principal_components
+from shapespace.model.new_shapes import HeldOut, held_out_shapes, variances_of_new_shapes
+from shapespace.model.pca import modes_for_variance, plain_modes, principal_components, varying
 from shapespace.model.shape_model import ShapeModel, odd_size_notes
 from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks, common_faces, read_only
@@ -447,12 +447,11 @@ def _modes_through_zero(
 
     About zero and not the mean: neutral is zero, and an expression runs along a line through it.
     """
-    values, vectors = eigh(gram / len(data))
-    values, vectors = values[::-1], vectors[:, ::-1]
+    values, vectors = largest_eigenpairs(gram / len(data))
     total = float(values.sum())
     if total <= data.shape[1] * _NO_MOTION_MM**2:
         raise InputError("No expression differs from its neutral face, so there is nothing to model.")
-    count = int((values > _NO_VARIANCE * values[0]).sum())
+    count = len(varying(values))
     if isinstance(wanted, float):
         count = min(count, modes_for_variance(values, wanted))
     elif wanted is not None:
@@ -465,8 +464,7 @@ def _modes_through_zero(
 
 def _of_new_people(gram: FloatArray, n_shapes: int, held_out: HeldOut) -> FloatArray:
     """Return variances (K,) of people who took no part in the modes, by the whole spectrum of `gram` (N, N)."""
-    spectrum = eigh(gram, eigvals_only=True)[::-1]
-    spectrum = spectrum[spectrum > _NO_VARIANCE * spectrum[0]]
+    spectrum = varying(eigh(gram, eigvals_only=True)[::-1])
     return variances_of_new_shapes(spectrum, float(spectrum.sum()), n_shapes, held_out)
 
 

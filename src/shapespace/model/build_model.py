@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from numbers import Real
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -17,15 +18,12 @@ from shapespace.geometry.flatten import disc_map
 from shapespace.geometry.mirror_plane import mirrored_note
 from shapespace.geometry.normals import without_estimates
 from shapespace.geometry.procrustes import Gauge, align_shapes, centroid_size
-from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.interop import MeshLike, as_meshes
-from shapespace.model.build_config import BuildConfig
-from shapespace.model.choose_modes import modes_notes, number_of_modes
-from shapespace.model.missing import CompletedShapes, ObservedMeshes, complete, missing_notes
-from shapespace.model.pca import Modes, PrincipalComponents, principal_components
+from shapespace.model.choose_modes import below_precision, made_by_alignment, modes_notes, number_of_modes, rounding_mm
+from shapespace.model.missing import MIN_SEEN, CompletedShapes, ObservedMeshes, complete, missing_notes, pose_on_shared
+from shapespace.model.pca import Modes, PrincipalComponents, plain_modes, principal_components
 from shapespace.model.representation import Representation, Vertices, representation_named
 from shapespace.model.shape_model import ShapeModel, odd_size_notes
-from shapespace.model.spurious import below_precision, made_by_alignment, rounding_mm
 from shapespace.model.streamed import (
     Aligned,
     KeptShapes,
@@ -37,7 +35,79 @@ from shapespace.model.streamed import (
     streaming_note,
 )
 from shapespace.model.training_shapes import TrainingShapes
-from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity, SurfaceLandmarks, common_faces, require
+from shapespace.types import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Mesh,
+    SurfaceLandmarks,
+    common_faces,
+    generator_of,
+    require,
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BuildConfig:
+    """Options of a shape model.
+
+    Args:
+        modes: number of modes (in Python also a float below 1, a share of the variance), fewer if the meshes determine
+            fewer; `all`; `auto`: cross-validation on held-out vertices, of a random sample of 2,000 meshes if there are
+            more, and `all` of fewer than four.
+        gauge: `form`: size is part of the modes, and fits are rigid; `shape`: size is divided out, and fits have a free
+            scale.
+        align: whether to align the meshes.
+        alignment_vertices: indices of the vertices that determine the alignment, such as forehead and nose where
+            expressions vary; None for all.
+        landmarks: landmarks of the model: named points on the surface (`place_landmarks`), or name -> vertex.
+        representation: what the modes move: `vertices`; `bspline`, control points of a smooth surface;
+            `bspline-detail`, the same with the detail of the mean that the B-spline cannot represent.
+        control_points: control points of a B-spline along each side, 4 to 64 (default 24x24).
+        min_seen: remove vertices that fewer than this share of the meshes show, with their triangles and landmarks,
+            from a model of vertices.
+        provenance: description of the meshes, kept in the model file.
+        licence: licence of the meshes, kept in the model file.
+        seed: seed of the cross-validation, and of the first directions of streamed modes.
+        out_of_core: stream the meshes, each loaded once and not held, through a file of single precision as large as
+            they are: the same model but for that rounding, with `ShapeModel.residuals`. None does so where a model of
+            vertices would need more than four fifths of the free memory.
+        without_training_shapes: omit the training shapes, from which their surfaces can be reconstructed, from the
+            model, for example before you share a model of people; its results are then not calibrated.
+
+    Example:
+        >>> ss.build_model(meshes, ss.BuildConfig(modes=0.9, gauge="form")).gauge
+        'form'
+    """
+
+    modes: Modes = "all"
+    gauge: Gauge = "shape"
+    align: bool = True
+    alignment_vertices: IntArray | None = None
+    landmarks: Mapping[str, int] | None = None
+    representation: str = "vertices"
+    control_points: tuple[int, int] | None = None
+    min_seen: float = MIN_SEEN
+    provenance: str = ""
+    licence: str = ""
+    seed: int = 0
+    out_of_core: bool | None = None
+    without_training_shapes: bool = False
+
+    def __post_init__(self) -> None:
+        """Check each option.
+
+        Raises:
+            InputError: an option cannot be.
+        """
+        if self.modes != "auto":
+            object.__setattr__(self, "modes", plain_modes(self.modes) or "all")
+        if self.gauge not in get_args(Gauge):
+            raise InputError(f"There is no gauge {self.gauge!r}; choose form (rigid) or shape (with scale).")
+        representation_named(self.representation, self.control_points)
+        if not isinstance(self.min_seen, Real) or not 0 <= self.min_seen <= 1:
+            raise InputError(f"min_seen is a share of the meshes from 0 to 1, not {self.min_seen!r}.")
+        generator_of(self.seed, "BuildConfig.seed")
 
 
 def build_model(
@@ -401,7 +471,9 @@ def fill_holes(shapes: FloatArray, faces: IntArray | None, names: Sequence[str])
             f"Vertex {nowhere[0]} is missing in every mesh, so nothing is known of it; take it out of all."
         )
     first = int(seen.sum(axis=1).argmax())
-    T_mean_shape = [_pose(shapes[i], shapes[first], seen[i] & seen[first], names[i]) for i in range(len(shapes))]
+    T_mean_shape = [
+        pose_on_shared(shapes[i], shapes[first], seen[i] & seen[first], names[i]) for i in range(len(shapes))
+    ]
     mean = np.zeros_like(shapes[0])
     for shape, there, T in zip(shapes, seen, T_mean_shape, strict=True):
         mean[there] += T.apply(shape[there])
@@ -410,7 +482,7 @@ def fill_holes(shapes: FloatArray, faces: IntArray | None, names: Sequence[str])
     for _ in range(_ROUNDS):
         previous, mean = mean, np.zeros_like(mean)
         for i, (shape, there) in enumerate(zip(shapes, seen, strict=True)):
-            T = _pose(shape, previous, there, names[i])
+            T = pose_on_shared(shape, previous, there, names[i])
             change = np.zeros_like(mean)
             change[there] = T.apply(shape[there]) - previous[there]
             if not there.all():
@@ -418,12 +490,3 @@ def fill_holes(shapes: FloatArray, faces: IntArray | None, names: Sequence[str])
                 change[~there] = moved[~there]
                 shape[~there] = T.inverse().apply(previous[~there] + moved[~there])
             mean += (previous + change) / len(shapes)
-
-
-def _pose(shape: FloatArray, mean: FloatArray, shared: BoolArray, name: str) -> Similarity:
-    try:
-        return fit_similarity(shape[shared], mean[shared])
-    except InputError as error:
-        raise InputError(
-            f"{name}: too little of it is there to be aligned with the other meshes; leave it out."
-        ) from error

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,48 +21,18 @@ _DEPENDENT = 1e-13
 """New directions shorter than this share of the first eigenvalue are rounding."""
 
 
-@dataclass(frozen=True, eq=False)
-class Leading:
+class Leading(NamedTuple):
     """Eigenvalues and eigenvectors.
 
     Args:
         values: (K,), falling.
         vectors: (D, K), orthonormal.
         residuals: (K,) |C v - lambda v| of each, as found by a product with them.
-        passes: products that were taken, this and former runs together.
     """
 
     values: FloatArray
     vectors: FloatArray
     residuals: FloatArray
-    passes: int
-
-
-@dataclass(frozen=True)
-class KeptPasses:
-    """Where the blocks of a run are kept, so that one that is killed goes on with the pass it was in.
-
-    Args:
-        folder: it must belong to this matrix, these modes and this seed alone.
-    """
-
-    folder: Path
-
-    def _file(self, step: int) -> Path:
-        return self.folder / f"pass-{step:03d}.npz"
-
-    def recall(self, step: int) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-        """Return what `keep` was given; None where there is nothing whole."""
-        stored = read_arrays(self._file(step))
-        return None if stored is None else (stored["block"], stored["products"], stored["beyond"])
-
-    def keep(self, step: int, block: FloatArray, products: FloatArray, beyond: FloatArray) -> None:
-        """Keep the next block (D, b), the products of the basis (m, b) and what leads beyond it (b, b).
-
-        Raises:
-            FileError: the disk is full.
-        """
-        write_arrays(self._file(step), {"block": block, "products": products, "beyond": beyond})
 
 
 @dataclass(frozen=True)
@@ -95,7 +66,7 @@ def leading(
     most_columns: int,
     stop: Stop,
     seed: int = 0,
-    passes: KeptPasses | None = None,
+    passes: Path | None = None,
     on_pass: Callable[[int, float], None] | None = None,
 ) -> Leading | None:
     """Return the leading eigenvectors of C (D, D); None where a basis of `most_columns` does not hold them.
@@ -109,7 +80,8 @@ def leading(
         most_columns: of the basis.
         stop: when to.
         seed: of the first block.
-        passes: where to keep each pass; None keeps nothing.
+        passes: the folder of this matrix, these modes and this seed alone where each pass is kept, so that a run that
+            is killed goes on with the pass it was in; None keeps nothing.
         on_pass: called with the number of a pass and the largest residual after it as a share of the first eigenvalue.
     """
     Q = np.linalg.qr(np.random.default_rng(seed).standard_normal((size, min(block, size))))[0]
@@ -118,26 +90,31 @@ def leading(
     while True:
         basis.append(Q)
         step = len(basis)
-        recalled = passes.recall(step) if passes is not None else None
-        if recalled is None:
+        file = None if passes is None else passes / f"pass-{step:03d}.npz"
+        kept = None if file is None else read_arrays(file)
+        if kept is None:
             W = apply(Q)
             products = _taken_off(W, basis)
             products += _taken_off(W, basis)
-            Q, beyond = _orthonormal(W, basis, _DEPENDENT * float(np.abs(T).max(initial=np.abs(products).max())))
-            if passes is not None:
-                passes.keep(step, Q, products, beyond)
+            least = _DEPENDENT * float(np.abs(T).max(initial=np.abs(products).max()))
+            Q, beyond = _orthonormal(W, basis, least)
+            if file is not None:
+                write_arrays(file, {"block": Q, "products": products, "beyond": beyond})
         else:
-            Q, products, beyond = recalled
-        T = _bordered(T, products)
+            Q, products, beyond = kept["block"], kept["products"], kept["beyond"]
+        m = len(T)
+        own = (products[m:] + products[m:].T) / 2
+        T = np.block([[T, products[:m]], [products[:m].T, own]])
         full, exhausted = len(T) + Q.shape[1] > most_columns, not Q.shape[1]
-        wanted = _wanted(T, modes, total)
-        if wanted is not None or exhausted:
-            count = len(T) if wanted is None else wanted
-            values, S = _first(T, count + 1)
+        values, S = largest_eigenpairs(T)
+        count = _wanted(values, modes, total)
+        if count is not None or exhausted:
+            count = count or len(T)
             residuals = np.linalg.norm(beyond @ S[len(S) - beyond.shape[1] :, :count], axis=0)
             if on_pass is not None:
                 on_pass(step, float(residuals.max() / values[0]))
-            if exhausted or stop.reached(values, residuals) or (full and residuals.max() <= stop.enough * values[0]):
+            reached = stop.reached(np.append(values, 0.0)[: count + 1], residuals)
+            if exhausted or reached or (full and residuals.max() <= stop.enough * values[0]):
                 ritz = _refined(apply, basis, S[:, :count])
                 if exhausted or ritz.residuals.max() <= stop.enough * ritz.values[0]:
                     return ritz
@@ -145,21 +122,30 @@ def leading(
             return None
 
 
-def _wanted(T: FloatArray, modes: int | float, total: float) -> int | None:
+def largest_eigenpairs(
+    matrix: FloatArray, count: int | None = None, *, overwrite: bool = False
+) -> tuple[FloatArray, FloatArray]:
+    """Return the `count` largest eigenvalues of a symmetric matrix, falling, and their vectors as columns.
+
+    Args:
+        matrix: (N, N), of which the lower triangle is read.
+        count: K; None, or more than N, for all.
+        overwrite: whether the matrix may be destroyed, which saves its memory.
+    """
+    from scipy.linalg import eigh  # takes a moment, which whoever only reads models need not wait for
+
+    n = len(matrix)
+    wanted = (max(n - (count or n), 0), n - 1)
+    values, vectors = eigh(matrix, subset_by_index=wanted, check_finite=False, overwrite_a=overwrite)
+    return np.asarray(values[::-1], dtype=np.float64), np.asarray(vectors[:, ::-1], dtype=np.float64)
+
+
+def _wanted(values: FloatArray, modes: int | float, total: float) -> int | None:
     """Return how many modes to look for, or None where the basis is yet too small for them and one more."""
     if isinstance(modes, int):
-        return modes if len(T) > modes else None
-    held = np.cumsum(np.linalg.eigvalsh(T)[::-1]) >= modes * total
+        return modes if len(values) > modes else None
+    held = np.cumsum(values) >= modes * total
     return int(held.argmax()) + 1 if held[:-1].any() else None
-
-
-def _first(T: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
-    """Return the first `count` eigenvalues, falling, and vectors; a last value of 0 where `T` has fewer."""
-    from scipy.linalg import eigh
-
-    m = len(T)
-    values, S = eigh(T, subset_by_index=(max(m - count, 0), m - 1), check_finite=False)
-    return np.append(values[::-1], np.zeros(max(count - m, 0))), np.asarray(S[:, ::-1])
 
 
 def _taken_off(W: FloatArray, basis: list[FloatArray]) -> FloatArray:
@@ -182,16 +168,6 @@ def _orthonormal(W: FloatArray, basis: list[FloatArray], least: float) -> tuple[
     return Q, R @ (lengths[there, None] * Vt[there])
 
 
-def _bordered(T: FloatArray, products: FloatArray) -> FloatArray:
-    m = len(T)
-    out = np.empty((len(products), len(products)))
-    out[:m, :m] = T
-    out[:, m:] = products
-    out[m:, :m] = products[:m].T
-    out[m:, m:] = (products[m:] + products[m:].T) / 2
-    return out
-
-
 def _refined(apply: Callable[[FloatArray], FloatArray], basis: list[FloatArray], S: FloatArray) -> Leading:
     """Return the eigenvectors within the span of the sums `S` (m, K) of the basis, and what a product says of them."""
     V, column = np.zeros((len(basis[0]), S.shape[1])), 0
@@ -200,7 +176,6 @@ def _refined(apply: Callable[[FloatArray], FloatArray], basis: list[FloatArray],
         column += Q.shape[1]
     CV = apply(V)
     small = V.T @ CV
-    values, R = np.linalg.eigh((small + small.T) / 2)
-    values, R = values[::-1].copy(), R[:, ::-1]
+    values, R = largest_eigenpairs((small + small.T) / 2)
     V, CV = V @ R, CV @ R
-    return Leading(values, V, np.linalg.norm(CV - V * values, axis=0), len(basis) + 1)
+    return Leading(values, V, np.linalg.norm(CV - V * values, axis=0))

@@ -7,9 +7,9 @@ and Ehrhardt, Medical Image Analysis 38, 2017). Its total variance is measured o
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import eigh
 
 from shapespace.geometry.normals import rms_size
+from shapespace.model.krylov import largest_eigenpairs
 from shapespace.types import FloatArray, IntArray
 
 _CENTRES = 40  # centres of the smooth fields, spread evenly over the mean
@@ -66,12 +66,6 @@ def local_modes(
 def vertex_blocks(count: int) -> list[slice]:
     """Return slices that cover `count` vertices, block by block."""
     return [slice(start, start + _BLOCK) for start in range(0, count, _BLOCK)]
-
-
-def largest_eigenpairs(gram: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
-    """Return the `count` largest eigenvalues of a symmetric matrix, falling, and their vectors as columns."""
-    value, vector = eigh(gram, subset_by_index=(max(0, len(gram) - count), len(gram) - 1))
-    return value[::-1], vector[:, ::-1]
 
 
 def strongest_products(stddev: FloatArray, size: FloatArray, count: int) -> tuple[IntArray, IntArray]:

@@ -13,7 +13,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import eigh
 
 from shapespace.errors import InputError
 from shapespace.geometry.mirror_plane import pairs_of_triangles
@@ -21,6 +20,7 @@ from shapespace.geometry.normals import part_of
 from shapespace.geometry.procrustes import Gauge, align_shapes, centroid_size
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.choose_modes import number_of_modes
+from shapespace.model.krylov import largest_eigenpairs
 from shapespace.model.pca import (
     Modes,
     PrincipalComponents,
@@ -161,8 +161,7 @@ class CompletedShapes:
         modes = checked_modes(number_of_modes(modes, data, seed, self.observed), n)
         components = principal_components(data)
         conditional, total = self._conditional_covariance(components.basis)
-        values, vectors = eigh(np.diag(components.variance) + conditional / (n - 1))  # C29
-        variance, vectors = values[::-1].copy(), vectors[:, ::-1]
+        variance, vectors = largest_eigenpairs(np.diag(components.variance) + conditional / (n - 1))  # C29
         count = len(variance)
         if modes is not None:
             count = min(modes, count) if isinstance(modes, int) else modes_for_variance(variance, modes)
@@ -254,7 +253,7 @@ def _mean_filled(shapes: FloatArray, observed: BoolArray, names: Sequence[str], 
     mean, shared, size = shapes[first], observed & observed[first], 0.0
     poses: list[Similarity] = []
     for _ in range(_MEAN_ROUNDS):
-        poses = [_pose(x, mean, own, name, gauge) for x, own, name in zip(shapes, shared, names, strict=True)]
+        poses = [pose_on_shared(x, mean, own, name, gauge) for x, own, name in zip(shapes, shared, names, strict=True)]
         previous, mean = mean, _mean_of(np.stack([T.apply(x) for T, x in zip(poses, shapes, strict=True)]), observed)
         size = size or centroid_size(mean)
         mean = mean * (size / centroid_size(mean))
@@ -283,7 +282,14 @@ def _in_own_pose(shapes: FloatArray, observed: BoolArray, posed: FloatArray, fit
     return out
 
 
-def _pose(shape: FloatArray, mean: FloatArray, shared: BoolArray, name: str, gauge: Gauge) -> Similarity:
+def pose_on_shared(
+    shape: FloatArray, mean: FloatArray, shared: BoolArray, name: str, gauge: Gauge = "shape"
+) -> Similarity:
+    """Return the pose of a shape (V, 3) on a mean by their `shared` vertices (V,), with scale unless the gauge is form.
+
+    Raises:
+        InputError: they are too few.
+    """
     try:
         return fit_similarity(shape[shared], mean[shared], with_scale=gauge == "shape")
     except InputError as error:

@@ -6,7 +6,8 @@ modes in its best pose. Specificity is the distance of random shapes of the mode
 Davies, Twining, Cootes, Waterton and Taylor, TMI 21(5), 2002; Styner et al., IPMI 2003. Distances are given twice and
 never mixed: `vertices`, from each vertex to the one that corresponds, and `surface`, from vertices to the nearest point
 of the other surface, the mean of both directions: the first flatters shapes whose vertices slid (Ericsson and Karlsson,
-2007), the second does not see it at all.
+2007), the second does not see it at all. `floor_mm` is the error that a model leaves where every correspondence is
+known: what no fit can do better than.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from shapespace.errors import CorrespondenceError, InputError
 from shapespace.geometry.closest import ClosestPointEngine, build_engine, on_boundary
@@ -546,7 +548,10 @@ def _unseen(
 ) -> tuple[Curve, Curve] | tuple[None, None]:
     if not unseen:
         return None, None
-    errors = _over_shapes(space, [_Target.of(m, None) for m in unseen], counts, steps)
+    errors = np.zeros((len(unseen), len(counts), 2))
+    for row, mesh in enumerate(unseen):
+        errors[row] = _errors_by_modes(space, _Target.of(mesh, None).cut_to(space), counts)
+        steps.add()
     return _curves(errors, counts, config.seed)
 
 
@@ -570,14 +575,6 @@ def _spread(vertices: int) -> IntArray:
     return np.unique(np.linspace(0, vertices - 1, _points(vertices)).round().astype(np.int32))
 
 
-def _over_shapes(space: ShapeModel, targets: Sequence[_Target], counts: IntArray, steps: StepCounter) -> FloatArray:
-    out = np.zeros((len(targets), len(counts), 2))
-    for row, target in enumerate(targets):
-        out[row] = _errors_by_modes(space, target.cut_to(space), counts)
-        steps.add()
-    return out
-
-
 def _errors_by_modes(model: ShapeModel, target: _Target, counts: IntArray, *, surface: bool = True) -> FloatArray:
     """Return how far (n, 2), mm, a shape lies from what the first modes tell of it: its vertices, and its surface."""
     there, out = target.shape.vertices[target.seen], np.zeros((len(counts), 2))
@@ -599,23 +596,14 @@ def _onto_mean(model: ShapeModel, target: _Target) -> Similarity:
 def _in_best_pose(model: ShapeModel, target: _Target, k: int, T: Similarity) -> tuple[FloatArray, Similarity]:
     """Return the shape (V, 3) that the first `k` modes tell by what is seen, and T_model_target, from `T` on.
 
-    Where all is seen that is the nearest one; else the likeliest, b = (P^T P + s / variance)^-1 P^T y, with the noise
-    s that the modes leave over, as what they do to unseen vertices alone could be anything.
+    The noise of shapes of which a part is missing is the variance that these modes leave over.
     """
-    seen, mean, modes = target.seen, model.mean_vertices, np.ascontiguousarray(model.vertex_basis.T)[:k]
-    there, heard, precision = target.shape.vertices[seen], modes, None
-    if len(seen) < len(mean):
-        heard = modes.reshape(len(modes), -1, 3)[:, seen].reshape(len(modes), -1)
-        variance = model.stddev[:k] ** 2
-        left = max(model.total_variance - float(variance.sum()), _LEAST_NOISE * model.total_variance)
-        precision = heard @ heard.T + np.diag(left / (3 * len(mean)) / variance)
-    reconstructed = mean
+    shape, seen, total = target.shape.vertices, target.seen, model.total_variance
+    left = max(total - float((model.stddev[:k] ** 2).sum()), _LEAST_NOISE * total)
+    reconstructed = model.mean_vertices
     for _ in range(_POSE_ROUNDS):
-        b = heard @ (T.apply(there) - mean[seen]).reshape(-1)
-        if precision is not None:
-            b = np.asarray(np.linalg.solve(precision, b))
-        reconstructed = mean + (b @ modes).reshape(-1, 3)
-        T = fit_similarity(there, reconstructed[seen], with_scale=model.gauge == "shape")
+        reconstructed = model.reconstruct(model.nearest(T.apply(shape), k, left / shape.size))
+        T = fit_similarity(shape[seen], reconstructed[seen], with_scale=model.gauge == "shape")
     return reconstructed, T
 
 
@@ -663,13 +651,9 @@ class _Nearest:
 
 def _posed(model: ShapeModel, targets: Sequence[_Target], config: QualityConfig) -> list[Mesh]:
     """Return the shapes in the pose and size of the model, by what is seen of them."""
-    out: list[Mesh] = []
-    for target in targets:
-        shape = target.shape
-        if config.align:
-            shape = shape.with_vertices(_onto_mean(model, target).apply(shape.vertices))
-        out.append(shape)
-    return out
+    if not config.align:
+        return [target.shape for target in targets]
+    return [one.shape.with_vertices(_onto_mean(model, one).apply(one.shape.vertices)) for one in targets]
 
 
 def _compactness(model: ShapeModel, targets: Sequence[_Target], counts: IntArray, config: QualityConfig) -> Curve:
@@ -714,3 +698,32 @@ def _more_shapes(by_shapes: Curve, seed: int) -> str:
     return sentence + (
         "so more shapes would help little." if high < 10 else "so these shapes do not show whether more would help."
     )
+
+
+_STEPS, _REACHED_MM = 20, 1e-4  # limit of Gauss-Newton steps, and the vertex motion in mm that ends them
+
+
+def floor_mm(model: ShapeModel, truth: FloatArray) -> float:
+    """Return the mean error, mm, of the shape of `model` and the pose that come nearest to `truth` (V, 3).
+
+    Pose and coefficients are solved for together: in turn they crawl where modes hold pose or size.
+    """
+    b, T = model.project(truth, align=False), Similarity.identity()
+    modes = model.vertex_basis.reshape(-1, 3, model.n_modes)
+    for _ in range(_STEPS):
+        shape = T.apply(model.reconstruct(b))
+        arm = shape - T.translation
+        turn = np.cross(np.eye(3), arm[:, None]).transpose(0, 2, 1)
+        move = np.broadcast_to(np.eye(3), turn.shape)
+        reach = T.scale * (T.rotation @ modes)
+        J = np.concatenate([turn, move, arm[:, :, None], reach], axis=2).reshape(-1, 7 + model.n_modes)
+        # A touch of damping, since modes may hold all of a pose.
+        H = J.T @ J
+        H[np.diag_indices_from(H)] *= 1.0 + 1e-9
+        step = np.linalg.solve(H, J.T @ (truth - shape).ravel())
+        turned = Rotation.from_rotvec(step[:3]).as_matrix() @ T.rotation
+        T = Similarity(T.scale * np.exp(step[6]), turned, T.translation + step[3:6])
+        b = b + step[7:]
+        if np.abs(J @ step).max() < _REACHED_MM:
+            break
+    return float(np.linalg.norm(T.apply(model.reconstruct(b)) - truth, axis=1).mean())

@@ -1,30 +1,76 @@
-"""Principal components by the Gram trick: equations 1 to 5 of the paper, divisor N - 1.
+"""Principal components of shapes in memory or on a disk: equations 1 to 5 of the paper, divisor N - 1.
 
-The (3V, 3V) covariance is never formed. The (N, N) Gram matrix of the centred shapes has the same non-zero
-eigenvalues, and costs one symmetric rank-k product. The shapes are centred in the Gram matrix rather than one by
-one, so that nothing as large as the data is ever copied. Alignment is not done here.
+The (3V, 3V) covariance is never formed. The (N, N) Gram matrix of the centred shapes has the same non-zero eigenvalues;
+it is accumulated over blocks of coordinates, which are centred one by one, so that nothing as large as the data is ever
+copied. Of more than `EXACT` shapes on a disk the modes are found by block Krylov over blocks of rows. Shapes stand in
+their file as differences from a template near their mean, in single precision; all sums are in double precision, in one
+order. Alignment is not done here.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias, cast
+from pathlib import Path
+from typing import Any, Literal, Protocol, TypeAlias, cast
 
 import numpy as np
 
 from shapespace.errors import InputError
+from shapespace.io.memory_cache import available_bytes
+from shapespace.model.krylov import Leading, Stop, largest_eigenpairs, leading
 from shapespace.types import FloatArray
 
 Modes: TypeAlias = int | float | Literal["auto", "all"] | None
 """Modes to keep: a number, a share of the variance below 1, `auto` (`choose_modes`), or `all`, which None is too."""
+EXACT = 15_000
+"""Shapes on a disk of which the Gram matrix is made: 1.8 GB."""
+_WHOLE, _FEW = 1000, 8
+"""Shapes of which all eigenvectors are found at once, which is then as quick as to find the first; of more shapes more
+than an eighth of the modes are."""
+_BASIS_BYTES = 768 << 20  # bytes of the Krylov basis in memory
+# vectors in a block: products of a few columns are slow, many cost memory
+_LEAST_BLOCK, _MOST_BLOCK = 32, 128
+_TO_ROUNDING = Stop(radians=1e-8, least_gap=1e-5, enough=1e-12)
 _BLOCK = 1024  # coordinates at a time, so that no centred copy of all data is in memory
-_CANCELLATION = 1e4
-"""Beyond this ratio of raw to centred sum of squares, centring the Gram matrix would cost too many digits."""
 _NO_VARIANCE = 1e-10
 """Modes with less than this share of the first mode's variance are rounding, not shape (erratum to P4)."""
+_ROUNDING, _NO_VARIATION = 64 * float(np.finfo(float).eps), 1e-12
+"""Coordinates of equal shapes differ by less than this share of their size; the share of the sum of squares of shapes
+on a disk that is rounding."""
 ALL_EQUAL = "The training shapes are all equal, so there is no variation to model; give different ones."
 _TIED = 1.0 - 1e-6
 """Entries this close to a mode's largest tie with it, as left and right do in symmetric shapes."""
+
+
+class Table(Protocol):
+    """N rows of D numbers, one shape a row, in memory or in a file (`Spill`)."""
+
+    rows: int
+    columns: int
+
+    def row_blocks(self) -> Iterator[tuple[int, FloatArray]]:
+        """Yield the number of the first row, and rows, of the whole table in order."""
+        ...
+
+    def column_blocks(self) -> Iterator[FloatArray]:
+        """Yield copies of some columns, of the whole table in order."""
+        ...
+
+
+class _InMemory:
+    """An array (N, D) as a table."""
+
+    def __init__(self, data: FloatArray) -> None:
+        self.data = np.ascontiguousarray(data)
+        self.rows, self.columns = data.shape
+
+    def row_blocks(self) -> Iterator[tuple[int, FloatArray]]:
+        yield 0, self.data
+
+    def column_blocks(self) -> Iterator[FloatArray]:
+        for start in range(0, self.columns, _BLOCK):
+            yield self.data[:, start : start + _BLOCK].copy()
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +83,8 @@ class PrincipalComponents:
         variance: (K,) of the coefficients, mm^2, divisor N - 1.
         total_variance: of all modes together, kept or not, mm^2.
         n_samples: N.
-        residuals: (K,) mm^2, |C v - lambda v| of each mode by a product with the covariance; None where none was taken.
+        residuals: (K,) mm^2, |C v - lambda v| of each mode by a product with the covariance; None of shapes in
+            memory, whose modes are exact to rounding.
     """
 
     mean: FloatArray
@@ -74,35 +121,52 @@ def modes_for_variance(variance: FloatArray, share: float, total: float | None =
     return int(min(np.searchsorted(cumulative, share * (1 - 1e-12)) + 1, len(variance)))
 
 
-def principal_components(data: FloatArray, modes: Modes = "all") -> PrincipalComponents:
-    """Return the exact principal components of `data`.
+def principal_components(
+    shapes: FloatArray | Table,
+    modes: Modes = "all",
+    *,
+    seed: int = 0,
+    passes: Path | None = None,
+    on_pass: Callable[[int, float], None] | None = None,
+) -> PrincipalComponents:
+    """Return the principal components of `shapes`: those of shapes in memory, and few on a disk, are exact.
 
     Args:
-        data: (N, D) float64, one shape a row; C order avoids a copy.
+        shapes: (N, D) float64, one shape a row; C order avoids a copy. Or a table on a disk, mm, about a template; the
+            mean is returned about it too.
         modes: how many, fewer if the samples determine fewer; a float below 1 for a share of the variance; `all`.
+        seed: of the first block of directions where there are many shapes.
+        passes: the folder where the passes over many shapes are kept; None keeps nothing.
+        on_pass: called with the number of a pass and the largest residual after it as a share of the first variance.
 
     Raises:
-        InputError: fewer than two samples, values that are not finite, or no variation at all.
+        InputError: fewer than two samples, values that are not finite, no variation at all, or more modes than memory
+            holds.
+        FileError: the file cannot be read, or a pass not kept.
     """
-    n, d = data.shape
-    from scipy.linalg import eigh  # takes a moment, which whoever only reads models need not wait for
-
-    modes = checked_modes(modes, n)
-    data = np.ascontiguousarray(data)
-    gram = _centred_gram(data)
-    total = float(gram.trace())
-    if total <= n * d * (64 * np.finfo(float).eps * float(np.abs(data[0]).max())) ** 2:
-        raise InputError(ALL_EQUAL)
-
-    wanted = modes if isinstance(modes, int) else n - 1
-    values, vectors = eigh(gram, lower=True, subset_by_index=(n - wanted, n - 1), check_finite=False, overwrite_a=True)
-    variance = values[::-1] / (n - 1)  # P4
-    variance = varying(variance)
-    if isinstance(modes, float):
-        variance = variance[: modes_for_variance(variance, modes)]
-    weights = vectors[:, ::-1][:, : len(variance)] / np.sqrt(variance * (n - 1))
-    mean, basis = _mean_and_basis(data, weights)
-    return PrincipalComponents(mean, basis, variance.copy(), total / (n - 1), n)
+    table = _InMemory(shapes) if isinstance(shapes, np.ndarray) else shapes
+    n, d, in_memory = table.rows, table.columns, isinstance(table, _InMemory)
+    modes = checked_modes(modes, n) if in_memory else checked_large_modes(modes, n, d)
+    covariance = Covariance.of(table)
+    if in_memory or n <= EXACT:
+        variance, rows, total = _by_gram(covariance, modes, seed, exact=in_memory)
+        residuals = None
+        if not in_memory:
+            residuals = np.linalg.norm(covariance(rows.T) - rows.T * variance, axis=0)
+    else:
+        # All modes of so many shapes were refused.
+        total = covariance.total()
+        found = _leading(covariance, d, cast(int | float, modes), total, Stop(), seed, passes=passes, on_pass=on_pass)
+        if found is None:
+            raise InputError(
+                f"The modes asked for cannot be separated from the next ones in {_columns(d)} directions, the number "
+                "that memory is reserved for; ask for fewer modes."
+            )
+        variance = varying(found.values)
+        rows = np.ascontiguousarray(found.vectors.T[: len(variance)])
+        fix_signs(rows)
+        residuals = found.residuals[: len(variance)]
+    return PrincipalComponents(covariance.mean, rows.T, variance.copy(), total, n, residuals)
 
 
 def plain_modes(modes: object) -> int | float | None:
@@ -136,6 +200,28 @@ def checked_modes(modes: Modes, n: int) -> int | float | None:
     return min(modes, n - 1) if isinstance(modes, int) else modes
 
 
+def checked_large_modes(modes: Modes, n: int, d: int) -> int | float | None:
+    """Return `modes` as asked for of n shapes of d numbers on a disk, before they are looked at.
+
+    Raises:
+        InputError: more modes than memory holds.
+    """
+    modes = checked_modes(modes, n)
+    count = n - 1 if modes is None else modes if isinstance(modes, int) else 1
+    if modes is None and n > EXACT:
+        raise InputError(
+            f"All modes of {n} shapes cannot be found; ask for a number of them or auto (--modes), or a share of the "
+            "variance (--variance)."
+        )
+    free = available_bytes()
+    if free is not None and 3 * 8 * count * d > free:
+        raise InputError(
+            f"{count} modes of {d // 3} vertices take {3 * 8 * count * d / 1e9:.1f} GB while they are found, of which "
+            f"{free / 1e9:.1f} are free; ask for fewer modes."
+        )
+    return modes
+
+
 def varying(variance: FloatArray) -> FloatArray:
     """Return those of the falling variances (K,) that are shape and not rounding."""
     return variance[variance > _NO_VARIANCE * variance[0]]
@@ -160,44 +246,128 @@ def syrk(block: FloatArray, onto: FloatArray | None = None) -> FloatArray:
     return dsyrk(1.0, block.T, beta=1.0, c=onto, trans=1, lower=1, overwrite_c=1)
 
 
-def _centred_gram(data: FloatArray) -> FloatArray:
-    """Return the lower triangle of X^T X (N, N), X the centred shapes (P1, P2, P3)."""
-    n = len(data)
-    raw = syrk(data)
-    if not np.isfinite(raw.diagonal()).all():
-        raise InputError("The training shapes hold values that are not finite.")
-    raw_trace = raw.trace()
-    lower = np.tril(raw, -1)
-    row_mean = (raw.diagonal() + lower.sum(axis=0) + lower.sum(axis=1)) / n
-    raw -= row_mean[:, None]
-    raw -= row_mean[None, :]
-    raw += row_mean.mean()
-    if raw.trace() * _CANCELLATION < raw_trace:
-        return _centred_gram_by_blocks(data)
-    return raw
+@dataclass(frozen=True, eq=False)
+class Covariance:
+    """The covariance C of the rows of a table, by its products.
+
+    Args:
+        table: N rows of D numbers.
+        mean: (D,) of the rows.
+        squares: sum of all squares.
+    """
+
+    table: Table
+    mean: FloatArray
+    squares: float
+
+    @staticmethod
+    def of(table: Table) -> Covariance:
+        """Find mean and squares by one pass over the rows.
+
+        Raises:
+            InputError: values that are not finite.
+        """
+        mean, squares = np.zeros(table.columns), 0.0
+        for _, block in table.row_blocks():
+            mean += block.sum(axis=0)
+            squares += float(np.vdot(block, block))
+        mean /= table.rows
+        if not (np.isfinite(squares) and np.isfinite(mean).all()):
+            raise InputError("The training shapes hold values that are not finite.")
+        return Covariance(table, mean, squares)
+
+    def total(self) -> float:
+        """Return the trace of C.
+
+        Raises:
+            InputError: it is rounding.
+        """
+        n = self.table.rows
+        centred = self.squares - n * float(self.mean @ self.mean)
+        if centred <= _NO_VARIATION * self.squares:
+            raise InputError(ALL_EQUAL)
+        return centred / (n - 1)
+
+    def gram(self) -> FloatArray:
+        """Return the lower triangle of the products (N, N) of the centred rows (P1, P2, P3).
+
+        Raises:
+            InputError: all rows are equal.
+        """
+        n, start = self.table.rows, 0
+        gram = np.zeros((n, n), order="F")
+        for block in self.table.column_blocks():
+            block -= self.mean[start : start + block.shape[1]]
+            start += block.shape[1]
+            gram = syrk(block, onto=gram)
+        if float(gram.trace()) <= _ROUNDING**2 * self.squares:
+            raise InputError(ALL_EQUAL)
+        return gram
+
+    def __call__(self, Q: FloatArray) -> FloatArray:
+        """Return C Q by one pass over the rows, centred by the rank-one term."""
+        from scipy.linalg import blas
+
+        n = self.table.rows
+        onto = np.zeros(Q.shape, order="F")
+        dgemm = cast(Any, blas).dgemm
+        for _, block in self.table.row_blocks():
+            onto = dgemm(1.0, block.T, block @ Q, beta=1.0, c=onto, overwrite_c=1)
+        onto -= np.outer(self.mean, n * (self.mean @ Q))
+        onto /= n - 1
+        return onto
 
 
-def _centred_gram_by_blocks(data: FloatArray) -> FloatArray:
-    """Do the same to full precision for shapes far from the origin, centring a block of coordinates at a time."""
-    n, d = data.shape
-    gram = np.zeros((n, n), order="F")
-    for start in range(0, d, _BLOCK):
-        block = data[:, start : start + _BLOCK] - data[0, start : start + _BLOCK]
-        block -= block.mean(axis=0)
-        gram = syrk(block, onto=gram)
-    return gram
+def _columns(d: int) -> int:
+    return _BASIS_BYTES // (8 * d)
 
 
-def _mean_and_basis(data: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the mean (D,) and P = X weights (D, K) (P5), orthonormal to rounding, with deterministic signs."""
-    n, k = weights.shape
-    combined = np.vstack([weights.T, np.full((1, n), 1.0 / n)]) @ data  # one pass over the data for both
-    mean, rows = combined[k].copy(), combined[:k]
-    column_sums = weights.sum(axis=0)
-    for row, column_sum in zip(rows, column_sums, strict=True):
-        row -= column_sum * mean
+def _leading(
+    apply: Callable[[FloatArray], FloatArray],
+    size: int,
+    modes: int | float,
+    total: float,
+    stop: Stop,
+    seed: int,
+    passes: Path | None = None,
+    on_pass: Callable[[int, float], None] | None = None,
+) -> Leading | None:
+    half = -(-modes // 2) if isinstance(modes, int) else 0
+    block = min(max(half, _LEAST_BLOCK), _MOST_BLOCK)
+    most = max(_columns(size), modes + 4 * block if isinstance(modes, int) else 0)
+    return leading(
+        apply, size, modes, total, block=block, most_columns=most, stop=stop, seed=seed, passes=passes, on_pass=on_pass
+    )
+
+
+def _by_gram(
+    covariance: Covariance, modes: int | float | None, seed: int, *, exact: bool
+) -> tuple[FloatArray, FloatArray, float]:
+    """Return variances (K,), modes (K, D) and the total variance, by the eigenvectors of the Gram matrix (P4, P5).
+
+    Unless `exact`, the first eigenvectors of a large one are found by block Krylov.
+    """
+    table, gram = covariance.table, covariance.gram()
+    n, trace = table.rows, float(gram.trace())
+    pairs = None
+    if not exact and modes is not None and n > _WHOLE and (isinstance(modes, float) or modes <= n // _FEW):
+        from scipy.linalg import blas
+
+        dsymm = cast(Any, blas).dsymm
+        pairs = _leading(lambda Y: dsymm(1.0, gram, Y, lower=1), n, modes, trace, _TO_ROUNDING, seed)
+    if pairs is None:
+        pairs = largest_eigenpairs(gram, modes if isinstance(modes, int) else n - 1, overwrite=True)
+    values, vectors = pairs[:2]
+    variance = varying(values / (n - 1))
+    if isinstance(modes, float):
+        variance = variance[: modes_for_variance(variance, modes, trace / (n - 1))]
+    weights = vectors[:, : len(variance)] / np.sqrt(variance * (n - 1))
+    rows = np.zeros((len(variance), table.columns))
+    for start, block in table.row_blocks():
+        rows += weights[start : start + len(block)].T @ block
+    rows -= np.outer(weights.sum(axis=0), covariance.mean)
     orthonormal_rows(rows)
-    return mean, rows.T
+    return variance, rows, trace / (n - 1)
 
 
 def orthonormal_rows(rows: FloatArray) -> None:

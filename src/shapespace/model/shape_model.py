@@ -22,7 +22,6 @@ from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.interop import MeshLike
 from shapespace.lazy import OpenViewer, lazy_import
 from shapespace.model import model_file
-from shapespace.model.build_config import BuildConfig
 from shapespace.model.foreign import Foreign, as_linear, is_foreign, load_foreign
 from shapespace.model.missing import MIN_SEEN
 from shapespace.model.pca import Modes
@@ -222,6 +221,8 @@ class ShapeModel:
 
         The arguments are those of `build_model` and the fields of `BuildConfig`.
         """
+        from shapespace.model.build_model import BuildConfig, build_model  # imports this module
+
         config = BuildConfig(
             modes=modes,
             gauge=gauge,
@@ -237,7 +238,7 @@ class ShapeModel:
             out_of_core=out_of_core,
             without_training_shapes=without_training_shapes,
         )
-        return lazy_import("build_model")(meshes, config, scratch=scratch, keep_shapes=keep_shapes, log=tell)
+        return build_model(meshes, config, scratch=scratch, keep_shapes=keep_shapes, log=tell)
 
     def with_more(
         self,
@@ -253,10 +254,10 @@ class ShapeModel:
         tell: Tell | None = None,
     ) -> ShapeModel:
         """Return the model of the shapes that this one was made of and of `meshes`; see `build_model.extend_model`."""
+        from shapespace.model.build_model import BuildConfig, extend_model  # imports this module
+
         config = BuildConfig(modes=modes, provenance=provenance, licence=licence, seed=seed)
-        return lazy_import("extend_model")(
-            self, meshes, shapes, config, scratch=scratch, keep_shapes=keep_shapes, log=tell
-        )
+        return extend_model(self, meshes, shapes, config, scratch=scratch, keep_shapes=keep_shapes, log=tell)
 
     @property
     def _vector(self) -> FloatArray:
@@ -377,30 +378,37 @@ class ShapeModel:
         is_observed: BoolArray = ~np.logical_or.reduce(np.isnan(vertices), axis=1)
         if np.isinf(vertices).any() or is_observed.sum() < _FEWEST_OBSERVED:
             raise InputError("A shape to be projected must be finite, but for missing vertices (nan).")
-        b = np.zeros(self.n_modes)
         if not align:
-            return self._nearest(vertices, is_observed)
-        Q = self.mean_vertices
+            return self.nearest(vertices)
+        b, Q = np.zeros(self.n_modes), self.mean_vertices
         for _ in range(_PROJECTION_ITERATIONS):
             # Phase 2 with known matches: pose and coefficients in turn, since modes may hold a little pose.
             T_shape_model = fit_similarity(Q[is_observed], vertices[is_observed], with_scale=self.gauge == "shape")
-            Q_matched = T_shape_model.inverse().apply(vertices)
-            before, b = b, self._nearest(Q_matched, is_observed)
+            before, b = b, self.nearest(T_shape_model.inverse().apply(vertices))
             if np.abs(b - before).max() <= _PROJECTION_TOLERANCE * self.stddev[0]:
                 break
             Q = self.reconstruct(b)
         return b
 
-    def _nearest(self, vertices: FloatArray, is_observed: BoolArray) -> FloatArray:
-        """Return the coefficients (K,) of the shape nearest to `vertices` (V, 3) in the model's frame; the likeliest
-        where only some are observed (V,), whose nearest shape could have anything elsewhere."""
-        off = vertices - self.mean_vertices
+    def nearest(self, vertices: FloatArray, modes: int | None = None, noise: float | None = None) -> FloatArray:
+        """Return the coefficients (k,), mm, of the shape of the first modes that is nearest to vertices (V, 3).
+
+        Where some are missing, they are the likeliest by the others, b = (P^T P + s / variance)^-1 P^T y, since the
+        nearest shape could have anything elsewhere.
+
+        Args:
+            vertices: in the model's frame, mm; not-a-number where missing.
+            modes: k; None for all.
+            noise: s, mm^2, the variance of a coordinate that the modes leave over; None for `noise_variance`.
+        """
+        off, modes_used = vertices - self.mean_vertices, self._vertex_modes[:modes]
+        is_observed: BoolArray = ~np.logical_or.reduce(np.isnan(vertices), axis=1)
         if is_observed.all():
-            return self._vertex_modes @ off.reshape(-1)
-        modes = self._vertex_modes.reshape(self.n_modes, -1, 3)[:, is_observed].reshape(self.n_modes, -1)
-        noise = max(self.noise_variance, _LEAST_NOISE * self.stddev[0] ** 2)
-        precision = modes @ modes.T + np.diag(noise / self.stddev**2)
-        return np.asarray(np.linalg.solve(precision, modes @ off[is_observed].reshape(-1)), dtype=np.float64)
+            return modes_used @ off.reshape(-1)
+        seen = modes_used.reshape(len(modes_used), -1, 3)[:, is_observed].reshape(len(modes_used), -1)
+        noise = max(self.noise_variance, _LEAST_NOISE * self.stddev[0] ** 2) if noise is None else noise
+        precision = seen @ seen.T + np.diag(noise / self.stddev[:modes] ** 2)
+        return np.asarray(np.linalg.solve(precision, seen @ off[is_observed].reshape(-1)), dtype=np.float64)
 
     def to_z(self, b: npt.ArrayLike) -> FloatArray:
         """Return coefficients z (..., k), in standard deviations, of `b` (..., k) in mm; k is at most K."""

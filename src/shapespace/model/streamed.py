@@ -9,15 +9,17 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import shutil
 import tempfile
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
+from filelock import lock_descriptor
 
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.geometry.normals import without_estimates
@@ -35,14 +37,13 @@ from shapespace.io.containers.arrays import read_arrays, write_arrays
 from shapespace.io.containers.row_spill import Spill
 from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_error, write_text
 from shapespace.io.memory_cache import available_bytes
-from shapespace.model.build_config import BuildConfig
-from shapespace.model.choose_modes import drawn, number_of_modes
-from shapespace.model.krylov import KeptPasses
-from shapespace.model.large_pca import checked_large_modes, large_components
-from shapespace.model.pca import ALL_EQUAL, Modes, PrincipalComponents
-from shapespace.model.spurious import rounding_mm
+from shapespace.model.choose_modes import drawn, number_of_modes, rounding_mm
+from shapespace.model.pca import ALL_EQUAL, Modes, PrincipalComponents, checked_large_modes, principal_components
 from shapespace.model.training_shapes import TrainingShapes
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, common_faces
+
+if TYPE_CHECKING:
+    from shapespace.model.build_model import BuildConfig
 
 Tell: TypeAlias = Callable[[str], None]
 _SHAPES, _START, _POSES, _ALIGNED = "shapes.f32", "start.npz", "poses.npz", "aligned"
@@ -186,31 +187,30 @@ class Aligned:
     Args:
         shapes: N rows of 3V numbers about `training.template`.
         training: the other data of the shapes; its folder and model are not yet set.
-        passes: where those of the PCA are kept; None keeps nothing.
+        passes: folder where those of the PCA are kept; None keeps nothing.
     """
 
     shapes: Spill
     training: KeptShapes
-    passes: KeptPasses | None
+    passes: Path | None
 
     def components(self, modes: Modes, seed: int, tell: Tell) -> PrincipalComponents:
         """Return mean and modes, as `principal_components` does of shapes in memory.
 
         Raises:
-            InputError: as `large_components`, or too few shapes to choose the number of modes.
+            InputError: as `principal_components`, or too few shapes to choose the number of modes.
         """
         if modes == "auto":
             tell("choosing the number of modes")
             modes = number_of_modes(modes, _sample(self.shapes, seed), seed)
-        pc = large_components(
+        pc = principal_components(
             self.shapes,
             modes,
             seed=seed,
             passes=self.passes,
             on_pass=lambda n, share: tell(f"finding the modes, pass {n} (residual {share:.0e} of the first)"),
         )
-        mean = pc.mean + self.training.template.reshape(-1)
-        return PrincipalComponents(mean, pc.basis, pc.variance, pc.total_variance, pc.n_samples, pc.residuals)
+        return replace(pc, mean=pc.mean + self.training.template.reshape(-1))
 
     def shape(self, index: int) -> FloatArray:
         """Return the vertices (V, 3), mm, of one aligned shape."""
@@ -303,9 +303,8 @@ def aligned_on_disk(
             checked_large_modes(modes, work.count, work.first.vertices.size)
         path = folder / _SHAPES
         try:
-            with work.aligned() as shapes:
-                passes = None if scratch is None else KeptPasses(folder)
-                yield Aligned(shapes, work.kept_shapes(), passes)
+            with work.aligned() as (shapes, training):
+                yield Aligned(shapes, training, None if scratch is None else folder)
         finally:
             path.unlink(missing_ok=True)
 
@@ -351,20 +350,15 @@ def _empty(folder: Path) -> None:
 @contextlib.contextmanager
 def _only_one(folder: Path) -> Generator[None]:
     """Hold the folder for this process; the system lets go of it whatever ends the process."""
-    try:
-        import fcntl
-    except ImportError:  # Windows refuses to remove open files, which does as well
+    if os.name == "nt":  # Windows refuses to remove open files, which does as well
         yield
         return
     with (folder / _LOCK).open("w") as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise FileError(
-                f"Another build is at work in {folder}; wait for it, or give another name for the model."
-            ) from error
-        except OSError:
-            pass  # a file system without locks
+        is_free = True
+        with contextlib.suppress(OSError):  # a file system without locks
+            is_free = lock_descriptor(stream.fileno(), blocking=False)
+        if not is_free:
+            raise FileError(f"Another build is at work in {folder}; wait for it, or give another name for the model.")
         yield
 
 
@@ -385,46 +379,28 @@ class _Work:
             raise InputError(
                 f"A shape model needs at least two meshes, not {len(meshes)}; with one there is nothing that varies."
             )
-        self.folder, self.meshes, self.align, self.onto, self.tell = folder, meshes, align, onto, tell
-        self.gauge: Gauge = gauge
-        self.alignment_vertices = alignment_vertices
+        self.folder, self.meshes, self.onto, self.tell = folder, meshes, onto, tell
         self.before = 0 if onto is None else len(onto.sizes)
         self.count = self.before + len(meshes)
         self.first = meshes[0] if onto is None else Mesh(onto.template, onto.faces, name="the model")
-        self.chosen = check_alignment(gauge, alignment_vertices, len(self.first.vertices))
-        self.template: FloatArray = np.empty((0, 3))
-        self.sizes: FloatArray = np.empty(0)
-
-    def kept_shapes(self) -> KeptShapes:
-        if self.onto is not None:
-            reference, rounding = self.onto.reference, self.onto.rounding
-        else:
-            reference, rounding = self.first.vertices, rounding_mm(self.first.vertices)
-        return KeptShapes(
-            folder=self.folder,
-            model_hash="",
-            digest="",
-            faces=self.first.faces,
-            template=self.template,
-            reference=reference,
-            sizes=self.sizes,
-            gauge=self.gauge,
-            align=self.align,
-            alignment_vertices=self.alignment_vertices,
-            rounding=rounding,
-        )
+        x = self.first.vertices
+        rounding = rounding_mm(np.nan_to_num(x, posinf=0.0, neginf=0.0))
+        self.training = onto or KeptShapes(
+            folder, "", "", self.first.faces, template=np.empty((0, 3)), reference=x, sizes=np.empty(0), gauge=gauge,
+            align=align, alignment_vertices=alignment_vertices, rounding=rounding,
+        )  # fmt: skip
+        self.chosen = check_alignment(gauge, alignment_vertices, len(x))
 
     @contextlib.contextmanager
-    def aligned(self) -> Generator[Spill]:
-        """Yield the file of aligned shapes: as a build that was killed left it, or made anew."""
+    def aligned(self) -> Generator[tuple[Spill, KeptShapes]]:
+        """Yield the file of aligned shapes, and the data of the shapes: as a killed build left it, or made anew."""
         path, start, done = (self.folder / name for name in (_SHAPES, _START, _ALIGNED))
         poses = read_arrays(self.folder / _POSES)
         complete = path.is_file() and path.stat().st_size == 4 * self.count * self.first.vertices.size
         near = read_arrays(start) if complete else None
         if complete and done.is_file() and poses is not None:
-            self.template, self.sizes = poses["template"], poses["sizes"]
-            with Spill(path, self.count, self.template.size, new=False) as shapes:
-                yield shapes
+            with Spill(path, self.count, self.first.vertices.size, new=False) as shapes:
+                yield shapes, self._about(poses)
             return
         remove_file(done)
         with Spill(path, self.count, self.first.vertices.size, new=near is None) as shapes:
@@ -436,18 +412,24 @@ class _Work:
             if poses is None:
                 poses = self._posed(shapes, near)
                 write_arrays(self.folder / _POSES, poses)
-            self.template, self.sizes = poses["template"], poses["sizes"]
             # From here on the file is neither as read nor aligned, until it is.
             remove_file(start)
-            self._move(shapes, near["template"], Poses(poses["linear"], poses["offset"]))
+            self._move(shapes, near["template"], poses)
             shapes.to_disk()
             write_text(done, "")
-            yield shapes
+            yield shapes, self._about(poses)
+
+    def _about(self, poses: dict[str, npt.NDArray[Any]]) -> KeptShapes:
+        return replace(
+            self.training, folder=self.folder, model_hash="", digest="", template=poses["template"],
+            sizes=poses["sizes"],
+        )  # fmt: skip
 
     def _read(self, shapes: Spill) -> dict[str, npt.NDArray[Any]]:
         """Fill the file with shapes in poses near the template's, and return what is known of them."""
         if self.onto is None:
-            template = self.first.vertices - (self.first.vertices[self.chosen].mean(axis=0) if self.align else 0.0)
+            x = self.first.vertices
+            template = x - x[self.chosen].mean(axis=0) if self.training.align else x
         else:
             template = self.onto.template
         sizes, posed, bounds = np.empty(self.count), np.empty(self.count), list[FloatArray]()
@@ -457,8 +439,8 @@ class _Work:
             if index >= self.before:
                 low, high = bounds or (vertices, vertices)
                 bounds[:] = np.minimum(low, vertices), np.maximum(high, vertices)
-                if self.align:
-                    with_scale = self.gauge == "shape"
+                if self.training.align:
+                    with_scale = self.training.gauge == "shape"
                     T = fit_similarity(vertices[self.chosen], template[self.chosen], with_scale=with_scale)
                     vertices = T.apply(vertices)
             posed[index] = centroid_size(vertices[self.chosen])
@@ -492,7 +474,7 @@ class _Work:
             mesh = without_estimates(self.meshes[index - self.before])
             common_faces((self.first, mesh))
             _refuse_holes(mesh)
-            if self.align:
+            if self.training.align:
                 refuse_without_extent(mesh.vertices, mesh.name)
             yield index, mesh.vertices
 
@@ -500,18 +482,18 @@ class _Work:
         """Return the poses of the shapes in the file, and their mean."""
         template: FloatArray = near["template"]
         poses = Poses(np.broadcast_to(np.eye(3), (self.count, 3, 3)).copy(), np.zeros((self.count, 3)))
-        if self.align:
+        if self.training.align:
             source = Streamed(shapes.row_blocks, self.count, template, near["posed"])
             alignment, poses = align_streamed(
                 source,
-                self.gauge,
+                self.training.gauge,
                 size=float(near["sizes"].mean()),
-                reference=self.first.vertices if self.onto is None else self.onto.reference,
-                alignment_vertices=self.alignment_vertices,
+                reference=self.training.reference,
+                alignment_vertices=self.training.alignment_vertices,
                 on_iteration=lambda n, moved: self.tell(f"aligning, round {n} (the mean moved by {moved:.1e} mm)"),
             )
             mean = alignment.mean
-            if self.gauge == "shape" and self.alignment_vertices is None:
+            if self.training.gauge == "shape" and self.training.alignment_vertices is None:
                 self.tell("scaling to the tangent")
                 mean = scale_to_tangent_streamed(source, mean, poses)
         else:
@@ -521,11 +503,12 @@ class _Work:
             mean = template + summed.reshape(-1, 3) / self.count
         return {"template": mean, "sizes": near["sizes"], "linear": poses.linear, "offset": poses.offset}
 
-    def _move(self, shapes: Spill, template: FloatArray, poses: Poses) -> None:
-        """Turn differences from `template` in the file into those of the posed shapes from their mean."""
+    def _move(self, shapes: Spill, near: FloatArray, poses: dict[str, npt.NDArray[Any]]) -> None:
+        """Turn differences from the template `near` in the file into those of the posed shapes from their mean."""
+        T = Poses(poses["linear"], poses["offset"])
         for start, block in shapes.row_blocks():
-            vertices = block.reshape(len(block), -1, 3) + template
-            shapes.write_rows(start, (poses.apply(start, vertices) - self.template).reshape(len(block), -1))
+            vertices = block.reshape(len(block), -1, 3) + near
+            shapes.write_rows(start, (T.apply(start, vertices) - poses["template"]).reshape(len(block), -1))
 
 
 def refuse_without_extent(vertices: FloatArray, name: str) -> None:

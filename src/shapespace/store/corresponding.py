@@ -1,9 +1,10 @@
-"""Output folders of `correspond`: their surfaces and their unit."""
+"""Output folders of `correspond`: their surfaces, their unit, and reasons to review surfaces in English."""
 
 from __future__ import annotations
 
+import re
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -13,10 +14,72 @@ from shapespace.io.containers.json_files import read_json
 from shapespace.io.meshes.mesh_folders import mesh_files
 from shapespace.io.meshes.mesh_io import stem_of
 from shapespace.reprs import first_names
-from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, ReviewCode, SurfaceReview
+from shapespace.schemas import (
+    CORRESPOND_AGAIN,
+    CorrespondenceRecord,
+    CorrespondRecord,
+    ReviewCode,
+    ReviewReason,
+    SurfaceReview,
+)
 from shapespace.store.results import ENDINGS, mesh_at, results_at, surfaces_of
-from shapespace.store.review_text import review_summary
 from shapespace.types import Mesh
+
+_OF_PROVENANCE = re.compile(r"; (\d+ of \d+ surfaces needs? review in the correspondence \([^()]*\))$")
+
+_COUNTED: Mapping[ReviewCode, str] = {
+    "doubtful": "doubtful",
+    "folded": "with folded triangles",
+    "not_settled": "not settled",
+    "missing": "with missing parts",
+    "unreached": "that do not reach parts of the scan",
+    "distance": "far from the scan",
+    "area_change": "with large changes of area",
+}
+"""Each reason after a number of surfaces."""
+
+
+def _percent(share: float) -> str:
+    return f"{float(f'{100 * share:.2g}'):g} %"
+
+
+_DESCRIBED: Mapping[ReviewCode, Callable[[ReviewReason], str]] = {
+    "distance": lambda r: (
+        f"1 % of its points lie farther off than {_percent(r.value)} of its size, where {_percent(r.usual)} is usual"
+    ),
+    "folded": lambda r: f"{_percent(r.value)} of its triangles are folded over",
+    "missing": lambda r: f"it shows only {100 * (1 - r.value):.0f} % of the mean shape",
+    "unreached": lambda r: f"only {100 * (1 - r.value):.0f} % of its points are reached",
+    "area_change": lambda r: f"its triangles grow or shrink up to {r.value:.1f} times, where {r.usual:.1f} is usual",
+    "not_settled": lambda r: f"its vertices still moved by {_percent(r.value)} of its size in the last round",
+}
+
+
+def describe_review(record: CorrespondRecord) -> tuple[str, ...]:
+    """Return the reasons to review a surface as clauses, the doubt about its correspondence first."""
+    doubt = (record.doubt,) if record.doubt else ()
+    return (*doubt, *(_DESCRIBED[reason.code](reason) for reason in record.review))
+
+
+def review_summary(review: SurfaceReview) -> str:
+    """Return how many surfaces need review and why, as a clause; empty if none needs review."""
+    if not review.needs_review:
+        return ""
+    reasons = ", ".join(f"{count} {_COUNTED[code]}" for code, count in review.reasons.items())
+    verb = "needs" if review.needs_review == 1 else "need"
+    return f"{review.needs_review} of {review.surfaces} surfaces {verb} review in the correspondence ({reasons})"
+
+
+def provenance_with_review(provenance: str, review: SurfaceReview) -> str:
+    """Return the provenance of a model, with the number of its training surfaces that need review."""
+    return f"{provenance}; {summary}" if (summary := review_summary(review)) else provenance
+
+
+def review_of_provenance(provenance: str) -> str:
+    """Return the clause that `provenance_with_review` has added; empty if there is none."""
+    found = _OF_PROVENANCE.search(provenance)
+    return found[1] if found else ""
+
 
 SURFACE, RECORD = CorrespondRecord.SURFACE, CorrespondRecord.ENDING
 SUMMARY, MEAN = CorrespondenceRecord.FILE, CorrespondenceRecord.MEAN
@@ -179,15 +242,32 @@ def surface_files(paths: Sequence[Path], *, recursive: bool = False) -> SurfaceF
     return SurfaceFiles(tuple(files), ratios, frozenset(mirrored), frozenset(doubtful), tuple(notes), needs_review)
 
 
+def reviewed_surfaces(
+    paths: Sequence[Path], option: str = "", *, recursive: bool = False, with_doubtful: bool = False
+) -> tuple[SurfaceFiles, SurfaceReview]:
+    """Return the surfaces of `surface_files` without doubtful ones, and how many of all need review.
+
+    Args:
+        paths: files and folders.
+        option: of the command, which is given as `with_doubtful`; empty where there is none.
+        recursive: also search subfolders.
+        with_doubtful: include doubtful surfaces, and accept that more than half need review.
+
+    Raises:
+        InputError: as `surface_files`; all are doubtful, or more than half need review.
+    """
+    listing = surface_files(paths, recursive=recursive)
+    review = listing.review(listing.files, option, accept=with_doubtful)
+    return listing if with_doubtful else listing.without_doubtful(option), review
+
+
 def trusted_surfaces(folder: Path) -> SurfaceFiles:
     """Return the surfaces of a folder that `build` takes, with its notes as warnings.
 
     Raises:
         InputError: as `surface_files`; all are doubtful, or more than half need review.
     """
-    listing = surface_files([folder])
-    listing.review(listing.files, accept=False)
-    listing = listing.without_doubtful()
+    listing, _ = reviewed_surfaces([folder])
     for note in listing.notes:
         warnings.warn(note, stacklevel=4)
     return listing

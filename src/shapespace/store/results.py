@@ -484,17 +484,13 @@ def mesh_at(path: Path) -> Mesh:
     return read_mesh(path)
 
 
-def bytes_at(path: Path) -> bytes:
-    """Return the content of a file, or of a record or stages of a store that such a file would hold.
-
-    Raises:
-        FileError: it cannot be read.
-        FileFormatError: the store is damaged.
-    """
-    if stored := _stored_at(path):
-        results, name, kind = stored
-        return results.stages(name) if kind == "stages" else results.record_bytes(name)
-    return read_bytes(path)
+def _stored_bytes(path: Path) -> bytes | None:
+    """Return the record or stages of a store that a file would hold; None where there is a file, or no store."""
+    stored = _stored_at(path)
+    if stored is None:
+        return None
+    results, name, kind = stored
+    return results.stages(name) if kind == "stages" else results.record_bytes(name)
 
 
 def json_at(path: Path, remedy: str, most_bytes: int = LARGEST_BYTES) -> Any:
@@ -509,9 +505,9 @@ def json_at(path: Path, remedy: str, most_bytes: int = LARGEST_BYTES) -> Any:
         FileError: it cannot be read.
         FileFormatError: it is too large, or not plain JSON.
     """
-    if _stored_at(path) is None:
+    content = _stored_bytes(path)
+    if content is None:
         return read_json(path, remedy, most_bytes)
-    content = bytes_at(path)
     if len(content) > most_bytes:
         raise FileFormatError(f"{path} is larger ({len(content) / 2**20:.0f} MiB) than such a file can be; {remedy}.")
     return parse_json(content, path, remedy)
@@ -524,9 +520,9 @@ def arrays_at(path: Path, remedy: str) -> dict[str, npt.NDArray[Any]]:
         FileError: it cannot be read.
         FileFormatError: it is damaged, or holds other things than arrays.
     """
-    if _stored_at(path) is None:
+    content = _stored_bytes(path)
+    if content is None:
         return read_arrays(path, remedy)
-    content = bytes_at(path)
     try:
         return arrays_in(io.BytesIO(content), len(content))
     except ValueError as error:

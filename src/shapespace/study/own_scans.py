@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.batch.execution import ExecutionConfig
+from shapespace.batch.executors import ExecutionConfig
 from shapespace.batch.fit_work import Job
 from shapespace.batch.progress import progress
-from shapespace.batch.run import BatchConfig, fit_many, make_jobs
-from shapespace.batch.sinks import FolderSink
+from shapespace.batch.run import BatchConfig, FolderSink, fit_many, make_jobs
 from shapespace.datasets.expression_sets import ScanEntry, scan_set
 from shapespace.errors import InputError
 from shapespace.io.files import make_folder, write_text

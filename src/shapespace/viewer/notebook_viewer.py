@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from shapespace.batch.save import save_fit
+from shapespace.batch.fit_work import save_fit
 from shapespace.viewer.serve import listen, make_server, page_address, require_view_extra
 
 if TYPE_CHECKING:

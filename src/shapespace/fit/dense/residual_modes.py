@@ -22,9 +22,9 @@ from shapespace.geometry.mirror_plane import find_mirror
 from shapespace.geometry.normals import rms_size
 from shapespace.io import disk_cache
 from shapespace.io.memory_cache import cached_with_owner
+from shapespace.model.krylov import largest_eigenpairs
 from shapespace.model.local_modes import (
     MOST_PRODUCTS,
-    largest_eigenpairs,
     smooth_fields,
     strongest_products,
     vertex_blocks,

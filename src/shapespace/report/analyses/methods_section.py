@@ -18,7 +18,7 @@ from shapespace.schemas import (
 )
 from shapespace.statistics.dispersion import FEWEST_OF_GROUP, FEWEST_PATTERNS
 from shapespace.statistics.methods import REDUCED_OF_EACH_TERM, SCAN_OF_SUBJECT
-from shapespace.store.review_text import review_summary
+from shapespace.store.corresponding import review_summary
 
 _SOURCES = {
     "coefficients": "coefficients of the model of the fits",

@@ -29,7 +29,7 @@ from shapespace.report.blocks.wording import known, printable, sentence, without
 from shapespace.report.inputs.saved_fits import Folder
 from shapespace.report.inputs.staged_fit import nice_ceiling
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, read
-from shapespace.store.review_text import describe_review
+from shapespace.store.corresponding import describe_review
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity, are_same_triangles
 
 _FEWEST_VERTICES = 3  # a triangle

@@ -15,7 +15,7 @@ from shapespace.report.notebook.notebook_fits import Drawn, notebook_html
 from shapespace.report.pages.page import Page
 from shapespace.report.pages.study_page import ANALYSIS, TITLES, StudyParts
 from shapespace.schemas import SurfaceReview, TablePart, read_part, to_json
-from shapespace.store.review_text import review_summary
+from shapespace.store.corresponding import review_summary
 from shapespace.types import Mesh
 
 if TYPE_CHECKING:

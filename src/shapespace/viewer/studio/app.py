@@ -19,7 +19,7 @@ from starlette.responses import FileResponse, PlainTextResponse, Response, Strea
 from starlette.routing import Mount, Route
 from starlette.types import ASGIApp
 
-from shapespace.batch.lock import LOCK, only_writer
+from shapespace.batch.result_folder import LOCK, only_writer
 from shapespace.errors import FileError, InputError
 from shapespace.io.containers.json_files import plain_json
 from shapespace.io.files import atomic_path
