@@ -14,8 +14,7 @@ import numpy.typing as npt
 from shapespace.batch.execution import ExecutionConfig
 from shapespace.batch.executors import Serial
 from shapespace.errors import FitError
-from shapespace.io.containers.archives import read_arrays
-from shapespace.io.containers.arrays import write_arrays
+from shapespace.io.containers.archives import read_arrays, write_arrays
 from shapespace.io.files import make_folder, temporary_folder
 from shapespace.io.memory_cache import LatestValue
 from shapespace.model.model_quality import Part, QualityConfig, Shapes

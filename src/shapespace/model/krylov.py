@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shapespace.io.containers.arrays import read_arrays, write_arrays
+from shapespace.io.containers.archives import kept_arrays, write_arrays
 from shapespace.types import FloatArray
 
 _DEPENDENT = 1e-13
@@ -52,7 +52,7 @@ class KeptPasses:
 
     def recall(self, step: int) -> tuple[FloatArray, FloatArray, FloatArray] | None:
         """Return what `keep` was given; None where there is nothing whole."""
-        stored = read_arrays(self._file(step))
+        stored = kept_arrays(self._file(step))
         return None if stored is None else (stored["block"], stored["products"], stored["beyond"])
 
     def keep(self, step: int, block: FloatArray, products: FloatArray, beyond: FloatArray) -> None:

@@ -31,7 +31,7 @@ from shapespace.geometry.procrustes import (
     scale_to_tangent_streamed,
 )
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.io.containers.arrays import read_arrays, write_arrays
+from shapespace.io.containers.archives import kept_arrays, write_arrays
 from shapespace.io.containers.row_spill import Spill
 from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_error, write_text
 from shapespace.io.memory_cache import available_bytes
@@ -121,7 +121,7 @@ class KeptShapes:
                 "--keep-shapes (keep_shapes), which keeps them there."
             )
         try:
-            arrays = read_arrays(path) or {}
+            arrays = kept_arrays(path) or {}
             header = json.loads(str(arrays["header"]))
             shape = arrays["template"].shape
             if len(shape) != 2 or shape[1] != 3 or arrays["reference"].shape != shape or arrays["sizes"].ndim != 1:
@@ -418,9 +418,9 @@ class _Work:
     def aligned(self) -> Generator[Spill]:
         """Yield the file of aligned shapes: as a build that was killed left it, or made anew."""
         path, start, done = (self.folder / name for name in (_SHAPES, _START, _ALIGNED))
-        poses = read_arrays(self.folder / _POSES)
+        poses = kept_arrays(self.folder / _POSES)
         complete = path.is_file() and path.stat().st_size == 4 * self.count * self.first.vertices.size
-        near = read_arrays(start) if complete else None
+        near = kept_arrays(start) if complete else None
         if complete and done.is_file() and poses is not None:
             self.template, self.sizes = poses["template"], poses["sizes"]
             with Spill(path, self.count, self.template.size, new=False) as shapes:

@@ -12,7 +12,7 @@ from typing import TypeAlias
 import numpy as np
 
 from shapespace.errors import FileFormatError
-from shapespace.io.containers.gzip_files import GZIP, unpack_gzip
+from shapespace.io.containers.archives import GZIP, unpack_gzip
 from shapespace.io.files import open_file, read_bytes, read_error, write_bytes
 from shapespace.io.meshes.bnt import read_bnt
 from shapespace.io.meshes.gltf_mesh import read_gltf, write_glb, write_gltf
