@@ -19,12 +19,11 @@ from shapespace.io.meshes.gltf_mesh import read_gltf, write_glb, write_gltf
 from shapespace.io.meshes.mat_mesh import read_mat_mesh
 from shapespace.io.meshes.obj import read_obj, write_obj
 from shapespace.io.meshes.off import read_off, write_off
-from shapespace.io.meshes.pcd import read_pcd
 from shapespace.io.meshes.ply import probe_ply, read_ply, write_ply
+from shapespace.io.meshes.point_clouds import read_pcd, read_xyz
 from shapespace.io.meshes.stl import probe_stl, read_stl, write_stl
 from shapespace.io.meshes.vrml import read_vrml
 from shapespace.io.meshes.vtk import read_vtk, write_vtk, write_vtp
-from shapespace.io.meshes.xyz import read_xyz
 from shapespace.io.read_limits import LARGEST_MESH_FILE_BYTES
 from shapespace.types import Mesh, require
 
