@@ -20,7 +20,7 @@ from shapespace.io.landmarks.tps_nts import tps_specimens
 from shapespace.io.parsing import CUT_SHORT, damage_error, is_number, json_value, numeric_text, xml_root
 from shapespace.io.read_limits import LARGEST_LANDMARK_FILE_BYTES
 from shapespace.io.tables.table_io import MISSING, csv_lines, rows_text, unescape_formula
-from shapespace.io.volumes.volume_io import MM_OF_UNITS
+from shapespace.io.volume_io import MM_OF_UNITS
 from shapespace.types import RAS_TO_LPS, FloatArray, SurfaceLandmarks
 
 Pairs = list[tuple[str, FloatArray | None]]
