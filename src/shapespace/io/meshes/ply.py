@@ -266,9 +266,9 @@ def _ascii_lists(
                 if i == list_index:
                     sizes.append(size)
                     corners.extend(map(int, part))
+    except FileFormatError:
+        raise
     except (ValueError, OverflowError) as error:
-        if isinstance(error, FileFormatError):
-            raise
         raise damage_error(cursor.path, f"a list has no whole number where one should be; {CUT_SHORT}") from error
     return np.array(sizes, dtype=np.int64), np.array(corners, dtype=np.int64)
 
