@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from shapespace.errors import InputError, ShapespaceError
-from shapespace.formats.gias import Gias
-from shapespace.formats.monai import Monai
+from shapespace.formats.gias_monai import Gias, Monai
 from shapespace.formats.registry import READ_ONLY_MODELS, format_to_write, is_known, read_linear
 from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.model.shape_model import ShapeModel

@@ -33,7 +33,7 @@ from shapespace.batch.fit_records import (
 from shapespace.errors import FileFormatError, ModelFileError, ShapespaceError
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.formats.flame import Flame
-from shapespace.formats.gias import Gias
+from shapespace.formats.gias_monai import Gias
 from shapespace.model.shape_model import ShapeModel
 from shapespace.recognise.classifier_file import FACTS, SavedClassifier, load_classifier, software_versions
 from shapespace.recognise.classifiers import CLASSIFIERS

@@ -106,18 +106,14 @@ def read_blendshapes(path: Path) -> Modes:
     archive = _Archive(read_bytes(path))
     try:
         with np.errstate(invalid="ignore"):
-            blendshapes = archive.many(lambda: (archive.text(), archive.matrix().ravel()), 16)
+            names, displacements = archive.blendshapes()
         if not archive.at_end:
             raise _DamagedError("there is more in it than blendshapes")
-        if not blendshapes or any(
-            len(displacements) != len(blendshapes[0][1]) or len(displacements) % 3 for _, displacements in blendshapes
-        ):
+        if len(set(map(len, displacements))) != 1 or len(displacements[0]) % 3:
             raise _DamagedError("they have different numbers of vertices")
     except (_DamagedError, ValueError, OverflowError) as error:
         raise ModelFileError(f"{path} holds no blendshapes of eos: {error}; {_BLENDSHAPES_AGAIN}.") from error
-    return Modes(
-        np.stack([displacements for _, displacements in blendshapes], axis=1), tuple(name for name, _ in blendshapes)
-    )
+    return Modes(np.stack(displacements, axis=1), names)
 
 
 def _are_blendshapes(head: bytes) -> bool:
@@ -169,6 +165,11 @@ class _Archive:
         if count * least_bytes > len(self._data) - self._at:
             raise _DamagedError("it is cut short")
         return [read_item() for _ in range(count)]
+
+    def blendshapes(self) -> tuple[tuple[str, ...], list[FloatArray]]:
+        """Return their names and displacements (D,)."""
+        pairs = self.many(lambda: (self.text(), self.matrix().ravel()), 16)
+        return tuple(name for name, _ in pairs), [displacements for _, displacements in pairs]
 
     def _take(self, size: int) -> bytes:
         if size > len(self._data) - self._at:
@@ -231,12 +232,10 @@ def _expression(archive: _Archive, size: int) -> tuple[Modes, FloatArray]:
         return Modes(displacements), mean_displacement
     if kind != _BLENDSHAPES:
         raise _DamagedError(f"there is no kind {kind} of expressions")
-    blendshapes = archive.many(lambda: (archive.text(), archive.matrix().ravel()), 16)
-    if not blendshapes or any(len(displacements) != size for _, displacements in blendshapes):
+    names, blendshapes = archive.blendshapes()
+    if not blendshapes or any(len(displacements) != size for displacements in blendshapes):
         raise _DamagedError("blendshapes have another number of vertices")
-    return Modes(
-        np.stack([displacements for _, displacements in blendshapes], axis=1), tuple(name for name, _ in blendshapes)
-    ), np.zeros(size)
+    return Modes(np.stack(blendshapes, axis=1), names), np.zeros(size)
 
 
 def _pca_bytes(mean: FloatArray, displacements: FloatArray, model: LinearModel | None) -> bytes:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import mmap
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -11,12 +10,11 @@ from typing import Any, Final
 import numpy as np
 
 from shapespace.errors import InputError
-from shapespace.formats.facts import KEY, facts_of, json_object, with_facts
-from shapespace.formats.model_parts import LinearModel, Modes
+from shapespace.formats.model_parts import IDENTITY, KEY, LinearModel, facts_of, json_object, split_modes, with_facts
 from shapespace.geometry.normals import vertex_normals
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import read_bytes, write_bytes
-from shapespace.io.meshes.gltf_mesh import GltfBuffer, Morphs, centre_if_far, glb_bytes, gltf_bytes, read_morphs
+from shapespace.io.meshes.gltf_mesh import GltfBuffer, centre_if_far, glb_bytes, gltf_bytes, read_morphs
 from shapespace.io.read_limits import LARGEST_MESH_FILE_BYTES
 from shapespace.types import FloatArray, IntArray, Mesh
 
@@ -25,7 +23,6 @@ _MM: Final = 1000.0
 _AGAIN = "export it again"
 _TARGETS = b'"targets"'
 _POINT_CLOUD, _SURFACE = 0, 4  # glTF 2.0 primitive.mode: POINTS, TRIANGLES
-_IDENTITY = re.compile(r"identity[ _.-]?\d+", re.IGNORECASE)
 
 
 class Gltf:
@@ -65,7 +62,11 @@ class Gltf:
             notes.append("Its weights are not zero; the mean is the shape without them.")
         if not facts:
             notes.append("A weight of one is taken as one standard deviation.")
-        shape, expression = _split_identity(displacements, morphs, facts.get("n_identity"))
+        n_identity = facts.get("n_identity")
+        is_identity = [bool(IDENTITY.fullmatch(name)) for name in morphs.names]
+        if not morphs.names and isinstance(n_identity, int):
+            is_identity = [k < n_identity for k in range(displacements.shape[1])]
+        shape, expression = split_modes(displacements, morphs.names, is_identity)
         return with_facts(
             LinearModel(
                 mean=mean,
@@ -118,19 +119,6 @@ def _without_seams(
     return mean[kept_rows], columns, joined_faces[~flat], n - len(kept_rows)
 
 
-def _split_identity(displacements: FloatArray, morphs: Morphs, n_identity: object) -> tuple[Modes, Modes | None]:
-    """Return the modes of identity and of expression, or all of them and None."""
-    k = displacements.shape[1]
-    identity = [bool(_IDENTITY.fullmatch(name)) for name in morphs.names]
-    if not identity and isinstance(n_identity, int):
-        identity = [number < n_identity for number in range(k)]
-    if not 0 < sum(identity) < k:
-        return Modes(displacements, morphs.names), None
-    chosen = [[number for number in range(k) if identity[number] is part] for part in (True, False)]
-    names = [tuple(morphs.names[number] for number in part) if morphs.names else () for part in chosen]
-    return Modes(displacements[:, chosen[0]], names[0]), Modes(displacements[:, chosen[1]], names[1])
-
-
 def target_names(model: LinearModel) -> list[str]:
     """Return a name for each mode, those of identity before those of expression."""
     if model.expression is None:
@@ -143,11 +131,9 @@ def target_names(model: LinearModel) -> list[str]:
 def _content(model: LinearModel, path: Path) -> tuple[dict[str, Any], bytes]:
     scale = (model.mm or 1.0) / _MM
     mean = model.mean * scale
-    blocks = [model.shape] if model.expression is None else [model.shape, model.expression]
-    displacements = np.concatenate([block.moved for block in blocks], axis=1) * scale
     centre, buffer = centre_if_far(mean), GltfBuffer()
     attributes = {"POSITION": buffer.vectors(mean - centre)}
-    steps = [column.reshape(-1, 3) for column in displacements.T]
+    steps = [column.reshape(-1, 3) for column in (model.moved * scale).T]
     targets = [{"POSITION": buffer.vectors(step)} for step in steps]
     primitive: dict[str, Any] = {"attributes": attributes, "targets": targets, "mode": _POINT_CLOUD}
     if model.faces is not None:

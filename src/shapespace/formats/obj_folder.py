@@ -11,8 +11,16 @@ from typing import Final
 import numpy as np
 
 from shapespace.errors import ModelFileError, ShapespaceError
-from shapespace.formats.facts import KEY, facts_of, json_object, with_facts, write_folder
-from shapespace.formats.model_parts import LinearModel, Modes
+from shapespace.formats.model_parts import (
+    IDENTITY,
+    KEY,
+    LinearModel,
+    facts_of,
+    json_object,
+    split_modes,
+    with_facts,
+    write_folder,
+)
 from shapespace.io.containers.json_files import read_json
 from shapespace.io.files import read_bytes
 from shapespace.io.meshes.mesh_io import read_mesh
@@ -23,7 +31,6 @@ _ICT: Final = "generic_neutral_mesh"
 _ICT_MM = 10.0
 """ICT-FaceKit is in cm."""
 _NEUTRALS: Final = (_ICT, "neutral", "neutral_mesh")
-_IDENTITY = re.compile(r"identity[ _.-]?\d+", re.IGNORECASE)
 _FACTS = f"{KEY}.json"
 _LICENCES = ("LICENSE", "LICENSE.txt", "LICENSE.md", "LICENCE", "LICENCE.txt")
 _MOST_LICENCE_BYTES = 2**16  # 64 KiB
@@ -70,7 +77,8 @@ class ObjFolder:
                 )
             steps.append((shape.vertices - neutral_mesh.vertices).ravel())
         names = [file.stem for file in mode_files]
-        shape, expression = _split_modes(np.stack(steps), names)
+        is_identity = [bool(IDENTITY.fullmatch(name)) for name in names]
+        shape, expression = split_modes(np.stack(steps, axis=1), names, is_identity)
         facts = json_object(read_json(path / _FACTS, "remove it") if (path / _FACTS).is_file() else None)
         notes: list[str] = []
         if not facts:
@@ -125,17 +133,6 @@ def _counts(path: Path) -> tuple[int, int]:
     return content.count(b"\nv "), content.count(b"\nf ")
 
 
-def _split_modes(steps: FloatArray, names: list[str]) -> tuple[Modes, Modes | None]:
-    identity = np.array([bool(_IDENTITY.fullmatch(name)) for name in names])
-    if not 0 < identity.sum() < len(names):
-        return Modes(steps.T, tuple(names)), None
-    parts = [
-        Modes(steps[chosen].T, tuple(name for name, is_chosen in zip(names, chosen, strict=True) if is_chosen))
-        for chosen in (identity, ~identity)
-    ]
-    return parts[0], parts[1]
-
-
 def _licence(folder: Path) -> str:
     file = next((folder / name for name in _LICENCES if (folder / name).is_file()), None)
     if file is None:
@@ -145,6 +142,6 @@ def _licence(folder: Path) -> str:
 
 
 def _are_file_names(names: Sequence[str]) -> bool:
-    plain = all(re.fullmatch(r"\w[\w .-]{0,80}", name) and not _IDENTITY.fullmatch(name) for name in names)
+    plain = all(re.fullmatch(r"\w[\w .-]{0,80}", name) and not IDENTITY.fullmatch(name) for name in names)
     lowered = {name.lower() for name in names}
     return bool(names) and plain and len(lowered) == len(names) and not lowered & set(_NEUTRALS)

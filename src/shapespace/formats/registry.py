@@ -11,11 +11,10 @@ from threadpoolctl import threadpool_limits
 from shapespace.errors import InputError, ModelFileError
 from shapespace.formats.eos import Eos
 from shapespace.formats.flame import Flame
-from shapespace.formats.gias import Gias
+from shapespace.formats.gias_monai import Gias, Monai
 from shapespace.formats.gltf_model import Gltf
 from shapespace.formats.matlab import Matlab
 from shapespace.formats.model_parts import LinearModel, ModelFormat, ModelReader
-from shapespace.formats.monai import Monai
 from shapespace.formats.obj_folder import ObjFolder
 from shapespace.formats.scalismo_json import ScalismoJson
 from shapespace.formats.shapeworks import ShapeWorks

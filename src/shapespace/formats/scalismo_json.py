@@ -15,8 +15,7 @@ import numpy.typing as npt
 
 from shapespace.errors import ModelFileError
 from shapespace.formats.model_parts import LinearModel
-from shapespace.formats.statismo import model_of
-from shapespace.formats.statismo_tree import tree_of
+from shapespace.formats.statismo import model_of, tree_of
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import atomic_path, read_bytes
 from shapespace.io.sandbox import SandboxError, Tree
@@ -145,9 +144,7 @@ def _attributes(entries: Sequence[_Attribute]) -> dict[str, Any]:
     """Return numbers and texts by name; converters of HDF5 files write single ones as lists of one."""
     values: dict[str, Any] = {}
     for entry in entries:
-        value = entry.value
-        while isinstance(value, list) and len(cast(list[Any], value)) == 1:
-            value = cast(list[Any], value)[0]
+        value = _single(entry.value)
         if isinstance(value, str | int | float):
             values[entry.name] = value.rstrip("\0") if isinstance(value, str) else value
     return values
@@ -158,9 +155,7 @@ def _value(dataset: _Dataset, path: str) -> npt.NDArray[Any] | str | None:
     kind = str(_of(dataset.type, "class"))
     base = str(_of(dataset.type, "base"))
     if kind == "H5T_STRING":
-        value = msgspec.json.decode(dataset.value)
-        while isinstance(value, list) and len(cast(list[Any], value)) == 1:
-            value = cast(list[Any], value)[0]
+        value = _single(msgspec.json.decode(dataset.value))
         return value.rstrip("\0") if isinstance(value, str) else None
     if kind not in ("H5T_FLOAT", "H5T_INTEGER"):
         return None
@@ -177,6 +172,13 @@ def _value(dataset: _Dataset, path: str) -> npt.NDArray[Any] | str | None:
         raise SandboxError(f"{path} is cut short, or not of the shape {shape} that it says")
     # Characters of legacy VTK files are such numbers.
     return array.astype(np.uint8) if base.endswith(("I8LE", "U8LE", "I8BE", "U8BE")) else array
+
+
+def _single(value: Any) -> Any:
+    """Return what lists of one hold."""
+    while isinstance(value, list) and len(cast(list[Any], value)) == 1:
+        value = cast(list[Any], value)[0]
+    return value
 
 
 def _of(value: Any, key: str) -> Any:

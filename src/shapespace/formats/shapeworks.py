@@ -20,8 +20,7 @@ from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
 from shapespace.errors import InputError, ModelFileError, ShapespaceError
-from shapespace.formats.facts import KEY, facts_of, json_object, with_facts, write_folder
-from shapespace.formats.model_parts import LinearModel, Modes
+from shapespace.formats.model_parts import KEY, LinearModel, Modes, facts_of, json_object, with_facts, write_folder
 from shapespace.geometry.procrustes import align_in_place
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.containers.json_files import check_file, parse_json
@@ -86,8 +85,7 @@ class ShapeWorks:
         """
         if path.suffix.lower() == ".xlsx":
             raise InputError(f"{path} cannot be written: workbooks are only read; give a name that ends in .swproj.")
-        blocks = [model.shape] if model.expression is None else [model.shape, model.expression]
-        displacements = np.concatenate([block.moved for block in blocks], axis=1) * (model.mm or 1.0)
+        displacements = model.moved * (model.mm or 1.0)
         mean = model.mean * (model.mm or 1.0)
         count = displacements.shape[1] + 1
         z = np.asarray(dct(np.eye(count), norm="ortho", axis=0), dtype=np.float64)[1:] * np.sqrt(count - 1)

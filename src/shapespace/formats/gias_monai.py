@@ -1,4 +1,7 @@
-"""GIAS2: principal components in `NAME.pc.npz`, and the mean surface in `NAME_mean.*` beside them."""
+"""Principal components with the mean surface beside them: GIAS2 and MONAI-Physio.
+
+GIAS2 has `NAME.pc.npz` and `NAME_mean.*`, MONAI-Physio (PhysioTwin4D) `pca_model.json` and `pca_mean_surface.vtp`.
+"""
 
 from __future__ import annotations
 
@@ -9,18 +12,23 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from shapespace.errors import FileError, ModelFileError
-from shapespace.formats.model_parts import LinearModel, Modes, scale_columns
+from shapespace.errors import FileError, FileFormatError, ModelFileError
+from shapespace.formats.model_parts import LinearModel, Modes, json_object, scale_columns
 from shapespace.io.containers.archives import LARGEST_BYTES, npy_array, zip_members
 from shapespace.io.containers.json_files import check_file
-from shapespace.io.files import open_file
+from shapespace.io.files import open_file, read_bytes
 from shapespace.io.meshes.mesh_io import MESH_ENDINGS, read_mesh
+from shapespace.io.parsing import json_value
 from shapespace.types import FloatArray, IntArray
 
 _AGAIN = "save the principal components again"
 _NEEDED = ("mean", "weights", "modes")
 _FIRST_MEMBERS = (b"mean.npy", b"weights.npy", b"modes.npy")
 _SAME = 1e-4  # share of the extent: single precision and rounding in text
+_MONAI_MODEL, _MONAI_SURFACE = "pca_model.json", "pca_mean_surface.vtp"
+_LARGEST_JSON_BYTES = 2**29  # 512 MiB
+_EXPORT_AGAIN = "export the model again"
+_MONAI_KEYS = (b'"eigenvalues"', b'"explained_variance_ratio"')
 
 
 class Gias:
@@ -116,3 +124,53 @@ def _fitting(surface: Path, mean: FloatArray, path: Path) -> tuple[FloatArray, I
         if mesh.faces is not None and np.abs(points[nearest] - mesh.vertices).max() <= _SAME * size:
             return points, nearest[mesh.faces], blocked
     raise ModelFileError(f"{path} has another mean than {surface.name} beside it; remove or rename that surface.")
+
+
+class Monai:
+    """Mean surface and principal components, as a folder, or as the JSON in it."""
+
+    name = "monai-physio"
+    title = "MONAI-Physio"
+    suffixes: Sequence[str] = ()
+
+    def recognises(self, path: Path, head: bytes) -> bool:
+        """Whether it is, or holds, a `pca_model.json`, or JSON that begins with what such a file does."""
+        if path.is_dir():
+            return (path / _MONAI_MODEL).is_file() and (path / _MONAI_SURFACE).is_file()
+        if path.suffix.lower() != ".json":
+            return False
+        return path.name == _MONAI_MODEL or (head.lstrip()[:1] == b"{" and any(key in head for key in _MONAI_KEYS))
+
+    def read(self, path: Path) -> LinearModel:
+        """As `ModelReader.read`."""
+        file = path / _MONAI_MODEL if path.is_dir() else path
+        check_file(file, _LARGEST_JSON_BYTES, _EXPORT_AGAIN)
+        surface = file.with_name(_MONAI_SURFACE)
+        if not surface.is_file():
+            raise ModelFileError(f"{file} needs the surface {_MONAI_SURFACE} beside it; copy it there.")
+        mean = read_mesh(surface)
+        tree = json_object(json_value(read_bytes(file), file))
+        try:
+            components = np.array(tree["components"], dtype=np.float64)
+            variance = np.array(tree["eigenvalues"], dtype=np.float64)
+            ratio = np.array(tree.get("explained_variance_ratio", ()), dtype=np.float64)
+        except (KeyError, ValueError, TypeError, OverflowError) as error:
+            raise FileFormatError(f"{file} has no components and eigenvalues of numbers; {_EXPORT_AGAIN}.") from error
+        if components.ndim != 2 or components.shape != (variance.size, mean.vertices.size) or (variance < 0).any():
+            raise ModelFileError(
+                f"{file} has components of the shape {components.shape} and {variance.size} eigenvalues, which do not "
+                f"belong to the {len(mean.vertices)} points of {_MONAI_SURFACE}; {_EXPORT_AGAIN}."
+            )
+        return LinearModel(
+            mean=mean.vertices,
+            shape=Modes(scale_columns(components.T, np.sqrt(variance)), total_variance=_total(variance, ratio)),
+            faces=mean.faces,
+            provenance=f"MONAI-Physio model in {file.parent.name}",
+        )
+
+
+def _total(variance: FloatArray, ratio: npt.NDArray[np.float64]) -> float | None:
+    """Return the variance of all modes, those that were cut off too, by the share that the first has."""
+    if ratio.shape != variance.shape or not variance.size or not 0 < ratio[0] <= 1:
+        return None
+    return float(variance[0] / ratio[0])
