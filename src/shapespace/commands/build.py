@@ -25,8 +25,7 @@ from shapespace.geometry.landmark_placement import far_landmarks, landmarks_in_f
 from shapespace.geometry.normals import without_estimates
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.files import make_folder, read_error
-from shapespace.io.landmarks.landmark_io import is_of_vertices, read_landmarks, read_surface_landmarks
-from shapespace.io.meshes.region_files import read_region
+from shapespace.io.landmarks.landmark_io import is_of_vertices, read_landmarks, read_region, read_surface_landmarks
 from shapespace.model.build_config import BuildConfig
 from shapespace.model.build_model import build_model, extend_model
 from shapespace.model.missing import MIN_SEEN, ObservedMeshes

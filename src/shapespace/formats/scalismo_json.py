@@ -178,7 +178,7 @@ def _single(value: Any) -> Any:
     """Return what lists of one hold."""
     while isinstance(value, list) and len(cast(list[Any], value)) == 1:
         value = cast(list[Any], value)[0]
-    return value
+    return cast(Any, value)
 
 
 def _of(value: Any, key: str) -> Any:

@@ -1,4 +1,4 @@
-"""Readers and writers of landmark files."""
+"""Readers and writers of landmark files, of landmarks and regions by numbers of vertices, and of fitted landmarks."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import csv
 import json
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -27,6 +27,9 @@ Pairs = list[tuple[str, FloatArray | None]]
 """Names and points (3,) in the order of a file; None for a landmark that is marked as absent."""
 # A label names each of its points, so a long one would be there as often as it has points.
 _LONGEST_LABEL = 256
+_VERTEX = "vertex"
+"""Column of regions."""
+_DIGITS = 10  # of the number of a vertex, which fits into int32
 
 
 @dataclass(frozen=True)
@@ -137,6 +140,30 @@ def read_landmark_indices(path: Path | str) -> dict[str, int]:
             raise damage_error(path, f"it has the name '{row[0][:60]}' twice or empty, so rename it")
         indices[row[0]] = int(row[1])
     return indices
+
+
+def read_region(path: Path | str) -> tuple[int, ...]:
+    """Read vertices, counted from 0: a CSV table with a column `vertex`, or one number in each line; `#` for comments.
+
+    Raises:
+        FileError: it does not exist or cannot be read.
+        FileFormatError: it holds something else, or nothing.
+    """
+    path = Path(path)
+    remedy = "give one vertex number in each line, or a column named vertex"
+    data = read_bytes(path, LARGEST_LANDMARK_FILE_BYTES)
+    try:
+        rows = csv_rows(data, path)
+    except FileFormatError as error:
+        raise FileFormatError(f"{path} is no list of vertices; {remedy}.") from error
+    header = [cell.lower() for cell in rows[0]] if rows else []
+    column = header.index(_VERTEX) if _VERTEX in header else 0
+    cells = [row[column] if column < len(row) else "" for row in (rows[1:] if _VERTEX in header else rows)]
+    wrong = next((cell for cell in cells if not (cell.isascii() and cell.isdecimal() and len(cell) < _DIGITS)), None)
+    if wrong is not None or not cells:
+        problem = "it is empty" if not cells else f"{wrong[:40]!r} is no vertex number" if wrong else "a row has none"
+        raise FileFormatError(f"{path} is no list of vertices ({problem}); {remedy}.")
+    return tuple(int(cell) for cell in cells)
 
 
 _CORNER_COLUMNS = (("vertex", "weight"), ("vertex_2", "weight_2"), ("vertex_3", "weight_3"))
@@ -308,10 +335,8 @@ def _ljson_1(value: Any, path: Path) -> Pairs:
     out: Pairs = []
     for group in value["groups"]:
         points = [entry["point"] for entry in group["landmarks"]]
-        label = _label(group["label"], path)
-        for i, point in enumerate(points):
-            name = label if len(points) == 1 else f"{label}_{i}"
-            out.append((name, None if _is_missing(point) else _point(point, f"landmark '{name[:60]}'", path)))
+        labels = [{"label": group["label"], "mask": range(len(points))}]
+        out += _ljson_group({"landmarks": {"points": points}, "labels": labels}, "", path)
     return out
 
 
@@ -391,10 +416,12 @@ def slicer_curves(data: bytes, path: Path) -> list[tuple[list[str], bool]]:
     ]
 
 
-def _write_slicer(landmarks: Mapping[str, FloatArray]) -> str:
+def markups_text(landmarks: Mapping[str, FloatArray], descriptions: Mapping[str, str] = MappingProxyType({})) -> str:
+    """Return landmarks in LPS and mm as the text of a file of 3D Slicer, with descriptions by name."""
     points = [
         {"id": str(i), "label": name, "position": _numbers(np.nan_to_num(point)),
-         "positionStatus": "undefined" if np.isnan(point).any() else "defined"}
+         "positionStatus": "undefined" if np.isnan(point).any() else "defined",
+         **({"description": descriptions[name]} if descriptions else {})}
         for i, (name, point) in enumerate(landmarks.items(), start=1)
     ]  # fmt: skip
     schema = (
@@ -638,7 +665,7 @@ LANDMARK_FORMATS: Mapping[str, LandmarkFormat] = MappingProxyType(
     {
         ".ljson": LandmarkFormat("menpo LJSON", _from_json(_ljson), _write_ljson),
         ".pp": LandmarkFormat("MeshLab picked points", _read_pp, _write_pp),
-        ".mrk.json": LandmarkFormat("3D Slicer markups", _from_json(_slicer), _write_slicer),
+        ".mrk.json": LandmarkFormat("3D Slicer markups", _from_json(_slicer), markups_text),
         ".json": LandmarkFormat("scalismo", _from_json(_any_json), _write_scalismo),
         ".csv": LandmarkFormat("CSV", _read_csv, _write_csv),
         ".fcsv": LandmarkFormat("3D Slicer fiducials", _read_fcsv, fcsv_text),
@@ -658,3 +685,41 @@ READ_ONLY_LANDMARKS: Mapping[str, Callable[[bytes, Path], Pairs]] = MappingProxy
     }
 )
 """File name ending -> reader (content, path) -> names and points, for formats that are not written."""
+
+FIDUCIAL_ENDINGS = (".landmarks.csv", ".landmarks.mrk.json", ".landmarks.fcsv")
+"""Of the files that hold the landmarks of a fit, after NAME."""
+
+Found = Mapping[str, Mapping[str, Any]]
+"""Name -> `at` (x, y, z) in the scan's frame and unit, and `stddev_mm` along its axes, None where it is not known."""
+
+
+def fiducial_texts(fiducials: Found) -> dict[str, str]:
+    """Return ending -> text of each file: a table, and 3D Slicer's two formats, all in the scan's frame and unit.
+
+    Slicer takes the coordinates of a mesh as they are, for LPS and mm, so it shows the points on the scan.
+    """
+    points = {name: np.array(fiducial["at"], dtype=np.float64) for name, fiducial in fiducials.items()}
+    descriptions = {name: _describe(fiducial["stddev_mm"]) for name, fiducial in fiducials.items()}
+    return point_texts(points, descriptions, _table(fiducials))
+
+
+def point_texts(points: Mapping[str, FloatArray], descriptions: Mapping[str, str], table: str) -> dict[str, str]:
+    """Return ending -> text of each file: `table`, and 3D Slicer's two formats of `points` with `descriptions`."""
+    texts = table, markups_text(points, descriptions), fcsv_text(points, descriptions)
+    return dict(zip(FIDUCIAL_ENDINGS, texts, strict=True))
+
+
+def _table(fiducials: Found) -> str:
+    rows = (
+        [name, *_format_numbers(fiducial["at"]), *_format_numbers(fiducial["stddev_mm"])]
+        for name, fiducial in fiducials.items()
+    )
+    return rows_text([["name", *"xyz", *(f"stddev_{axis}_mm" for axis in "xyz")], *rows])
+
+
+def _format_numbers(numbers: Sequence[float] | None) -> list[str]:
+    return [""] * 3 if numbers is None else [repr(float(number)) for number in numbers]
+
+
+def _describe(stddev_mm: Sequence[float] | None) -> str:
+    return "" if stddev_mm is None else f"standard deviation {' '.join(f'{mm:.2f}' for mm in stddev_mm)} mm"

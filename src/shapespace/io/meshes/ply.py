@@ -229,7 +229,7 @@ def _binary_columns(
 
 
 def _ascii_columns(
-    cursor: WordCursor, element: _Element, _: str, places: Mapping[str, int]
+    cursor: WordCursor, element: _Element, _order: str, places: Mapping[str, int]
 ) -> dict[str, npt.NDArray[Any]]:
     width, n_read = len(element.properties), 0
     columns: dict[str, list[FloatArray]] = {name: [] for name in places}
@@ -248,7 +248,7 @@ def _truncation_error(element: _Element, path: Path) -> FileFormatError:
 
 
 def _ascii_lists(
-    cursor: WordCursor, element: _Element, _: str, list_index: int | None
+    cursor: WordCursor, element: _Element, _order: str, list_index: int | None
 ) -> tuple[IndexArray, IndexArray]:
     if len(element.properties) == 1 and element.count and list_index == 0:
         table = _read_equal_lists(cursor, element.count)
