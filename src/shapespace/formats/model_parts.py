@@ -22,7 +22,7 @@ from scipy.linalg import qr, svd
 from threadpoolctl import threadpool_limits
 
 from shapespace.errors import InputError, ModelFileError
-from shapespace.io.files import temporary_folder, write_error
+from shapespace.io.files import temporary_folder, writing
 from shapespace.types import FloatArray, IntArray, SurfaceLandmarks, read_only
 
 ORTHOGONAL: Final = 1e-3  # largest |U^T U - I|; single precision stays below
@@ -296,7 +296,7 @@ def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
         InputError: there is such a folder, and something in it.
         FileError: it cannot be made, or the disk is full.
     """
-    try:
+    with writing(path):
         if path.exists() and (not path.is_dir() or any(path.iterdir())):
             raise InputError(f"{path} is there already; give the name of a new folder.")
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -309,8 +309,6 @@ def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
             if path.exists():
                 path.rmdir()
             shutil.move(complete, path)
-    except OSError as error:
-        raise write_error(path, error) from error
 
 
 class ModelReader(Protocol):

@@ -14,7 +14,7 @@ import numpy as np
 
 from shapespace.errors import FileFormatError, InputError
 from shapespace.io.containers.archives import GZIP, unpack_gzip
-from shapespace.io.files import open_file, read_bytes, read_error, write_bytes
+from shapespace.io.files import open_file, read_bytes, reading, write_bytes
 from shapespace.io.meshes.bnt import read_bnt
 from shapespace.io.meshes.gltf_mesh import read_gltf, write_glb, write_gltf
 from shapespace.io.meshes.mat_mesh import read_mat_mesh
@@ -115,11 +115,8 @@ def probe_mesh(path: Path) -> None:
     ending = ending_of(path)
     if ending not in READ_ONLY_FORMATS and ending not in NAMED_FORMATS:
         _format(path, "read")
-    with open_file(path) as stream:
-        try:
-            size, head = os.fstat(stream.fileno()).st_size, stream.read(_PROBED_BYTES)
-        except OSError as error:
-            raise read_error(path, error) from error
+    with open_file(path) as stream, reading(path):
+        size, head = os.fstat(stream.fileno()).st_size, stream.read(_PROBED_BYTES)
     if size > LARGEST_MESH_FILE_BYTES:
         read_bytes(path, LARGEST_MESH_FILE_BYTES)  # refuses it
     if not head.strip():
@@ -244,7 +241,9 @@ def mesh_files(
     files: list[Path] = []
     left_out: list[str] = []
     for path in paths:
-        if not _is_folder(path):
+        with reading(path):
+            is_folder = path.is_dir()
+        if not is_folder:
             files.append(path)
             continue
         found: dict[str, list[Path]] = defaultdict(list)
@@ -265,19 +264,12 @@ def mesh_files(
     return MeshFiles(tuple(files), tuple(left_out))
 
 
-def _is_folder(path: Path) -> bool:
-    try:
-        return path.is_dir()
-    except OSError as error:
-        raise read_error(path, error) from error
-
-
 def _entries(
     folder: Path, endings: tuple[str, ...], recursive: bool, apart_from: Path | None
 ) -> Iterator[tuple[str, Path]]:
     """Yield the files to take from a folder, as `file`, and what is left out, as a kind of `_LEFT_OUT`, by name."""
     packed_endings = tuple(f"{ending}{_PACKED}" for ending in endings)
-    try:
+    with reading(folder):
         for path in sorted(p for p in folder.iterdir() if not p.name.startswith(".")):
             is_of_kind = path.name.lower().endswith(endings)
             if path.is_dir():
@@ -293,5 +285,3 @@ def _entries(
                 yield "packed", path
             elif path.is_symlink() and not path.exists() and (is_of_kind or not path.suffix):
                 yield "broken", path
-    except OSError as error:
-        raise read_error(folder, error) from error
