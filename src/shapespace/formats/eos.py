@@ -28,59 +28,53 @@ _SFM_LICENCE = "Surrey Face Model (3448): non-commercial use only, see its READM
 Item = TypeVar("Item")
 
 
-class Eos:
-    """`eos.morphablemodel`: shape, colour, expressions of PCA or blendshapes; versions 1 to 4."""
+def is_eos(path: Path, head: bytes) -> bool:
+    """Whether it begins with a version of eos and a mean of one column."""
+    if path.suffix.lower() != ".bin" or len(head) < 12:
+        return False
+    version, rows, columns = struct.unpack_from("<Iii", head)
+    if 1 <= version <= _NEWEST and rows > 0 and rows % 3 == 0 and columns == 1:
+        return True
+    return _are_blendshapes(head)
 
-    name = "eos"
-    title = "eos .bin"
-    suffixes: Sequence[str] = (".bin",)
 
-    def recognises(self, path: Path, head: bytes) -> bool:
-        """Whether it begins with a version of eos and a mean of one column."""
-        if path.suffix.lower() != ".bin" or len(head) < 12:
-            return False
-        version, rows, columns = struct.unpack_from("<Iii", head)
-        if 1 <= version <= _NEWEST and rows > 0 and rows % 3 == 0 and columns == 1:
-            return True
-        return _are_blendshapes(head)
+def read_eos(path: Path) -> LinearModel:
+    """Read `eos.morphablemodel`: shape, colour, expressions of PCA or blendshapes; versions 1 to 4."""
+    check_file(path, _LARGEST_BYTES, _AGAIN)
+    data = read_bytes(path)
+    if _are_blendshapes(data[:16]):
+        raise ModelFileError(
+            f"{path} holds the blendshapes of an eos model, without the model; give that, and this with --expressions."
+        )
+    try:
+        return _model(_Archive(data))
+    except (_DamagedError, ValueError, OverflowError) as error:
+        raise ModelFileError(f"{path} is damaged, or no model of eos: {error}; {_AGAIN}.") from error
 
-    def read(self, path: Path) -> LinearModel:
-        """As `ModelReader.read`."""
-        check_file(path, _LARGEST_BYTES, _AGAIN)
-        data = read_bytes(path)
-        if _are_blendshapes(data[:16]):
-            raise ModelFileError(
-                f"{path} holds the blendshapes of an eos model, without the model; give that, and this with "
-                "--expressions."
-            )
-        try:
-            return _model(_Archive(data))
-        except (_DamagedError, ValueError, OverflowError) as error:
-            raise ModelFileError(f"{path} is damaged, or no model of eos: {error}; {_AGAIN}.") from error
 
-    def write(self, model: LinearModel, path: Path) -> Sequence[str]:
-        """As `ModelFormat.write`; single precision, version 4."""
-        out = bytearray(struct.pack("<I", _NEWEST))
-        out += _pca_bytes(model.mean.ravel(), model.shape.moved, model)
-        out += _pca_bytes(_NOTHING, _NOTHING, None)
-        if model.expression is None:
-            out += struct.pack("<B", 1)
-        else:
-            zero = np.zeros(model.mean.size)
-            out += struct.pack("<Bi", 0, _PCA) + _pca_bytes(zero, model.expression.moved, model)
-        if model.landmarks:
-            out += struct.pack("<BQ", 0, len(model.landmarks))
-            for name in sorted(model.landmarks):
-                text = name.encode()
-                out += struct.pack("<Q", len(text)) + text + struct.pack("<i", model.landmarks[name])
-        else:
-            out += struct.pack("<B", 1)
-        out += struct.pack("<QQ", 0, 0)
-        write_bytes(path, bytes(out))
-        notes = ["Numbers are in single precision.", *_moved_landmarks(model)]
-        if model.provenance or model.licence:
-            notes.append("Provenance and licence are left out: eos has no place for them.")
-        return notes
+def write_eos(model: LinearModel, path: Path) -> Sequence[str]:
+    """As `ModelFormat.write`; single precision, version 4."""
+    out = bytearray(struct.pack("<I", _NEWEST))
+    out += _pca_bytes(model.mean.ravel(), model.shape.moved, model)
+    out += _pca_bytes(_NOTHING, _NOTHING, None)
+    if model.expression is None:
+        out += struct.pack("<B", 1)
+    else:
+        zero = np.zeros(model.mean.size)
+        out += struct.pack("<Bi", 0, _PCA) + _pca_bytes(zero, model.expression.moved, model)
+    if model.landmarks:
+        out += struct.pack("<BQ", 0, len(model.landmarks))
+        for name in sorted(model.landmarks):
+            text = name.encode()
+            out += struct.pack("<Q", len(text)) + text + struct.pack("<i", model.landmarks[name])
+    else:
+        out += struct.pack("<B", 1)
+    out += struct.pack("<QQ", 0, 0)
+    write_bytes(path, bytes(out))
+    notes = ["Numbers are in single precision.", *_moved_landmarks(model)]
+    if model.provenance or model.licence:
+        notes.append("Provenance and licence are left out: eos has no place for them.")
+    return notes
 
 
 def _moved_landmarks(model: LinearModel) -> list[str]:

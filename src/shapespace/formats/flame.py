@@ -30,61 +30,50 @@ _IDENTITY: Final = {150: 100, 20: 10}
 _MOST_IDENTITY = 300  # FLAME: shapedirs has 300 identity modes before the expression modes
 
 
-class Flame:
-    """FLAME, SMPL, SMPL+H, SMPL-X and MANO, without their poses."""
+def is_flame(path: Path, head: bytes) -> bool:
+    """Whether it is named as a pickle, or an .npz with a template and its modes in it."""
+    if path.suffix.lower() == ".pkl":
+        return True
+    return path.suffix.lower() == ".npz" and head.startswith(b"PK") and _has_template(path)
 
-    name = "flame"
-    title = "FLAME/SMPL .npz and .pkl"
-    suffixes: Sequence[str] = (".npz", ".pkl")
 
-    def recognises(self, path: Path, head: bytes) -> bool:
-        """Whether it is named as a pickle, or an .npz with a template and its modes in it."""
-        if path.suffix.lower() == ".pkl":
-            return True
-        return path.suffix.lower() == ".npz" and head.startswith(b"PK") and _has_template(path)
-
-    def read(self, path: Path) -> LinearModel:
-        """As `ModelReader.read`."""
-        check_file(path, _LARGEST_BYTES, _AGAIN)
-        array_names = [name for names in (*_KEYS.values(), _JOINTS) for name in names]
-        if path.suffix.lower() == ".npz":
-            arrays: Mapping[str, npt.NDArray[Any]] = read_arrays(path, _AGAIN, array_names)
-        else:
-            arrays = _unpickled(path, array_names)
-        members = {
-            role: next((arrays[name] for name in names if name in arrays), None) for role, names in _KEYS.items()
-        }
-        template, modes, faces = (members[role] for role in _KEYS)
-        if template is None or modes is None:
-            raise ModelFileError(
-                f"{path} holds no v_template and shapedirs, as models of the SMPL family do; {_AGAIN}."
-            )
-        n = len(template) if template.ndim == 2 else 0
-        if not n or template.shape[1] != 3 or modes.shape[:2] != template.shape or modes.ndim != 3:
-            raise ModelFileError(
-                f"{path} is damaged: its template and modes have the shapes {template.shape} and {modes.shape}; "
-                f"{_AGAIN}."
-            )
-        if any(array.dtype.kind not in "iuf" for array in (template, modes, *([] if faces is None else [faces]))):
-            raise ModelFileError(f"{path} is damaged: its arrays are not of numbers; {_AGAIN}.")
-        family = _family(arrays, n)
-        displacements = np.asarray(modes, dtype=np.float64).reshape(3 * n, -1)
-        n_identity = None
-        if family in (*_WITH_EXPRESSION, ""):
-            n_modes = displacements.shape[1]
-            n_identity = _MOST_IDENTITY if n_modes > _MOST_IDENTITY else _IDENTITY.get(n_modes)
-        return LinearModel(
-            mean=np.asarray(template, dtype=np.float64),
-            shape=Modes(displacements[:, :n_identity]),
-            expression=None if n_identity is None else Modes(displacements[:, n_identity:]),
-            faces=None if faces is None else faces.astype(np.int32),
-            mm=_MM,
-            provenance=f"{family or 'SMPL family'} model {path.name}",
-            licence=f"{family or 'SMPL family'}: non-commercial research only, unless its own licence allows more",
-            notes=(
-                "Its pose rig (joints, skinning weights, corrections by pose) is left out; the pose is the template's.",
-            ),
+def read_flame(path: Path) -> LinearModel:
+    """Read FLAME, SMPL, SMPL+H, SMPL-X or MANO, without the poses."""
+    check_file(path, _LARGEST_BYTES, _AGAIN)
+    array_names = [name for names in (*_KEYS.values(), _JOINTS) for name in names]
+    if path.suffix.lower() == ".npz":
+        arrays: Mapping[str, npt.NDArray[Any]] = read_arrays(path, _AGAIN, array_names)
+    else:
+        arrays = _unpickled(path, array_names)
+    members = {role: next((arrays[name] for name in names if name in arrays), None) for role, names in _KEYS.items()}
+    template, modes, faces = (members[role] for role in _KEYS)
+    if template is None or modes is None:
+        raise ModelFileError(f"{path} holds no v_template and shapedirs, as models of the SMPL family do; {_AGAIN}.")
+    n = len(template) if template.ndim == 2 else 0
+    if not n or template.shape[1] != 3 or modes.shape[:2] != template.shape or modes.ndim != 3:
+        raise ModelFileError(
+            f"{path} is damaged: its template and modes have the shapes {template.shape} and {modes.shape}; {_AGAIN}."
         )
+    if any(array.dtype.kind not in "iuf" for array in (template, modes, *([] if faces is None else [faces]))):
+        raise ModelFileError(f"{path} is damaged: its arrays are not of numbers; {_AGAIN}.")
+    family = _family(arrays, n)
+    displacements = np.asarray(modes, dtype=np.float64).reshape(3 * n, -1)
+    n_identity = None
+    if family in (*_WITH_EXPRESSION, ""):
+        n_modes = displacements.shape[1]
+        n_identity = _MOST_IDENTITY if n_modes > _MOST_IDENTITY else _IDENTITY.get(n_modes)
+    return LinearModel(
+        mean=np.asarray(template, dtype=np.float64),
+        shape=Modes(displacements[:, :n_identity]),
+        expression=None if n_identity is None else Modes(displacements[:, n_identity:]),
+        faces=None if faces is None else faces.astype(np.int32),
+        mm=_MM,
+        provenance=f"{family or 'SMPL family'} model {path.name}",
+        licence=f"{family or 'SMPL family'}: non-commercial research only, unless its own licence allows more",
+        notes=(
+            "Its pose rig (joints, skinning weights, corrections by pose) is left out; the pose is the template's.",
+        ),
+    )
 
 
 def _family(arrays: Mapping[str, npt.NDArray[Any]], n: int) -> str:

@@ -20,77 +20,73 @@ from shapespace.types import FloatArray, IntArray, Mesh
 
 _MM: Final = 1000.0
 """In one unit of glTF, which is a metre."""
+_SUFFIXES = (".glb", ".gltf")
 _AGAIN = "export it again"
 _TARGETS = b'"targets"'
 _POINT_CLOUD, _SURFACE = 0, 4  # glTF 2.0 primitive.mode: POINTS, TRIANGLES
 
 
-class Gltf:
-    """A mesh with morph targets, `.glb` or `.gltf`: a weight of one is one standard deviation."""
+def is_gltf_model(path: Path, head: bytes) -> bool:
+    """Whether it is glTF and speaks of morph targets."""
+    if path.suffix.lower() not in _SUFFIXES or not path.is_file():
+        return False
+    try:
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            if head[:4] == b"glTF":
+                return content.find(_TARGETS, 20, 20 + int.from_bytes(head[12:16], "little")) >= 0
+            return content.find(_TARGETS) >= 0
+    except (OSError, ValueError):
+        return False
 
-    name = "gltf"
-    title = "glTF morph targets"
-    suffixes: Sequence[str] = (".glb", ".gltf")
 
-    def recognises(self, path: Path, head: bytes) -> bool:
-        """Whether it is glTF and speaks of morph targets."""
-        if path.suffix.lower() not in self.suffixes or not path.is_file():
-            return False
-        try:
-            with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-                if head[:4] == b"glTF":
-                    return content.find(_TARGETS, 20, 20 + int.from_bytes(head[12:16], "little")) >= 0
-                return content.find(_TARGETS) >= 0
-        except (OSError, ValueError):
-            return False
+def read_gltf_model(path: Path) -> LinearModel:
+    """Read a mesh with morph targets, `.glb` or `.gltf`: a weight of one is one standard deviation."""
+    check_file(path, LARGEST_MESH_FILE_BYTES, _AGAIN)
+    morphs = read_morphs(read_bytes(path, LARGEST_MESH_FILE_BYTES), path)
+    facts = json_object(json_object(morphs.extras).get(KEY))
+    mean, faces = morphs.vertices, None if morphs.faces is None else morphs.faces.astype(np.int32)
+    displacements = morphs.targets.reshape(len(morphs.targets), -1).T
+    notes: list[str] = []
+    if facts.get("vertices") != len(mean):
+        mean, displacements, faces, merged = _without_seams(mean, displacements, faces)
+        if merged:
+            notes.append(f"{merged} vertices that lie and move with another, as seams have them, are joined to it.")
+    if morphs.n_others:
+        notes.append(f"{morphs.n_others} more meshes of the scene are left out.")
+    if any(morphs.weights):
+        notes.append("Its weights are not zero; the mean is the shape without them.")
+    if not facts:
+        notes.append("A weight of one is taken as one standard deviation.")
+    n_identity = facts.get("n_identity")
+    is_identity = [bool(IDENTITY.fullmatch(name)) for name in morphs.names]
+    if not morphs.names and isinstance(n_identity, int):
+        is_identity = [k < n_identity for k in range(displacements.shape[1])]
+    shape, expression = split_modes(displacements, morphs.names, is_identity)
+    return with_facts(
+        LinearModel(
+            mean=mean,
+            shape=shape,
+            expression=expression,
+            faces=faces,
+            mm=_MM,
+            licence=morphs.copyright,
+            notes=tuple(notes),
+        ),
+        facts,
+    )
 
-    def read(self, path: Path) -> LinearModel:
-        """As `ModelReader.read`."""
-        check_file(path, LARGEST_MESH_FILE_BYTES, _AGAIN)
-        morphs = read_morphs(read_bytes(path, LARGEST_MESH_FILE_BYTES), path)
-        facts = json_object(json_object(morphs.extras).get(KEY))
-        mean, faces = morphs.vertices, None if morphs.faces is None else morphs.faces.astype(np.int32)
-        displacements = morphs.targets.reshape(len(morphs.targets), -1).T
-        notes: list[str] = []
-        if facts.get("vertices") != len(mean):
-            mean, displacements, faces, merged = _without_seams(mean, displacements, faces)
-            if merged:
-                notes.append(f"{merged} vertices that lie and move with another, as seams have them, are joined to it.")
-        if morphs.n_others:
-            notes.append(f"{morphs.n_others} more meshes of the scene are left out.")
-        if any(morphs.weights):
-            notes.append("Its weights are not zero; the mean is the shape without them.")
-        if not facts:
-            notes.append("A weight of one is taken as one standard deviation.")
-        n_identity = facts.get("n_identity")
-        is_identity = [bool(IDENTITY.fullmatch(name)) for name in morphs.names]
-        if not morphs.names and isinstance(n_identity, int):
-            is_identity = [k < n_identity for k in range(displacements.shape[1])]
-        shape, expression = split_modes(displacements, morphs.names, is_identity)
-        return with_facts(
-            LinearModel(
-                mean=mean,
-                shape=shape,
-                expression=expression,
-                faces=faces,
-                mm=_MM,
-                licence=morphs.copyright,
-                notes=tuple(notes),
-            ),
-            facts,
-        )
 
-    def write(self, model: LinearModel, path: Path) -> Sequence[str]:
-        """As `ModelFormat.write`; single precision, metres, normals of mean and targets."""
-        tree, binary = _content(model, path)
-        write_bytes(path, (gltf_bytes if path.suffix.lower() == ".gltf" else glb_bytes)(tree, binary))
-        notes = [
-            "Lengths are in metres, as glTF demands, and numbers in single precision.",
-            "A weight of one is one standard deviation; weights run both ways, so widen the sliders to -3 to 3.",
-        ]
-        if model.faces is None:
-            notes.append("It is a point model, so there are no normals.")
-        return notes
+def write_gltf_model(model: LinearModel, path: Path) -> Sequence[str]:
+    """As `ModelFormat.write`; single precision, metres, normals of mean and targets."""
+    tree, binary = _content(model, path)
+    write_bytes(path, (gltf_bytes if path.suffix.lower() == ".gltf" else glb_bytes)(tree, binary))
+    notes = [
+        "Lengths are in metres, as glTF demands, and numbers in single precision.",
+        "A weight of one is one standard deviation; weights run both ways, so widen the sliders to -3 to 3.",
+    ]
+    if model.faces is None:
+        notes.append("It is a point model, so there are no normals.")
+    return notes
 
 
 def _without_seams(

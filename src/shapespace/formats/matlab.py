@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -70,36 +69,30 @@ _WANTED = ("shapeMU", "shapePC", "shapeEV", "tl", "shp", "tri", "mean", "compone
            "trilist", "n_training_samples")  # fmt: skip
 
 
-class Matlab:
-    """`.mat` files of face models."""
+def is_matlab(path: Path, head: bytes) -> bool:
+    """Whether it is named as a file of MATLAB."""
+    return path.suffix.lower() == ".mat" and bool(head)
 
-    name = "mat"
-    title = "BFM 2009, LSFM and LYHM .mat"
-    suffixes: Sequence[str] = (".mat",)
 
-    def recognises(self, path: Path, head: bytes) -> bool:
-        """Whether it is named as a file of MATLAB."""
-        return path.suffix.lower() == ".mat" and bool(head)
-
-    def read(self, path: Path) -> LinearModel:
-        """As `ModelReader.read`."""
-        check_file(path, _LARGEST_BYTES, _AGAIN)
-        try:
-            tree = _tree(path)
-            layout = next(
-                (
-                    candidate
-                    for candidate in _LAYOUTS
-                    if {candidate.mean, candidate.basis, candidate.spread} <= tree.arrays.keys()
-                ),
-                None,
-            )
-            if layout is None:
-                known = ", ".join(candidate.title for candidate in _LAYOUTS)
-                raise ModelFileError(f"{path} holds no shape model of a kind that is known ({known}).")
-            return _model(tree, layout)
-        except SandboxError as error:
-            raise ModelFileError(f"{path} is damaged or cut short: {error}; {_AGAIN}.") from error
+def read_matlab(path: Path) -> LinearModel:
+    """Read a `.mat` file of a face model."""
+    check_file(path, _LARGEST_BYTES, _AGAIN)
+    try:
+        tree = _tree(path)
+        layout = next(
+            (
+                candidate
+                for candidate in _LAYOUTS
+                if {candidate.mean, candidate.basis, candidate.spread} <= tree.arrays.keys()
+            ),
+            None,
+        )
+        if layout is None:
+            known = ", ".join(candidate.title for candidate in _LAYOUTS)
+            raise ModelFileError(f"{path} holds no shape model of a kind that is known ({known}).")
+        return _model(tree, layout)
+    except SandboxError as error:
+        raise ModelFileError(f"{path} is damaged or cut short: {error}; {_AGAIN}.") from error
 
 
 def _tree(path: Path) -> Tree:

@@ -1,4 +1,4 @@
-"""Linear models as files of other tools store them, their metadata as JSON, and the protocols of readers and writers.
+"""Linear models as files of other tools store them, their metadata as JSON, and what readers and writers are.
 
 Modes are held as what one standard deviation of each does, U sqrt(lambda), in the unit of the file: every convention of
 basis and spread is that product, and a basis that is not orthonormal loses nothing by it. Formats with a free text
@@ -10,11 +10,11 @@ from __future__ import annotations
 import math
 import re
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import compress
 from pathlib import Path
-from typing import Any, Final, Protocol, cast
+from typing import Any, Final, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -311,38 +311,36 @@ def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
             shutil.move(complete, path)
 
 
-class ModelReader(Protocol):
-    """A reader of one model format: one module, one class, one entry in `MODEL_FORMATS` or `READ_ONLY_MODELS`."""
+@dataclass(frozen=True)
+class ModelReader:
+    """A model format that is read.
+
+    Args:
+        name: by which `shapespace convert --to` asks for it.
+        title: in words, for messages.
+        suffixes: ends of names, lower case, the one that is written first; a folder's format has none that another
+            takes.
+        recognises: (path, head) -> whether the path, which begins with `head` (empty for a folder), looks like it;
+            cheap, never raises.
+        read: path -> the model in it. It raises FileError where it cannot be read, and ModelFileError where it is
+            damaged, made to harm, or another thing.
+    """
 
     name: str
-    """By which `shapespace convert --to` asks for it."""
     title: str
-    """In words, for messages."""
-    suffixes: Sequence[str]
-    """Ends of names, lower case, the one that is written first; a folder's format has none that another takes."""
-
-    def recognises(self, path: Path, head: bytes) -> bool:
-        """Whether `path`, which begins with `head` (empty for a folder), looks like it; cheap, never raises."""
-        ...
-
-    def read(self, path: Path) -> LinearModel:
-        """Return the model in `path`.
-
-        Raises:
-            FileError: it cannot be read.
-            ModelFileError: it is damaged, made to harm, or another thing.
-        """
-        ...
+    suffixes: tuple[str, ...]
+    recognises: Callable[[Path, bytes], bool]
+    read: Callable[[Path], LinearModel]
 
 
-class ModelFormat(ModelReader, Protocol):
-    """A model format with a writer."""
+@dataclass(frozen=True)
+class ModelFormat(ModelReader):
+    """A model format that is read and written.
 
-    def write(self, model: LinearModel, path: Path) -> Sequence[str]:
-        """Write `model` to `path`, whole or not at all, and return sentences on what was changed or left out.
+    Args:
+        name, title, suffixes, recognises, read: of `ModelReader`.
+        write: (model, path) -> sentences on what was changed or left out; it writes a whole file or none. It raises
+            FileError where it cannot be written, and InputError where the format cannot hold such a model.
+    """
 
-        Raises:
-            FileError: it cannot be written.
-            InputError: the format cannot hold such a model.
-        """
-        ...
+    write: Callable[[LinearModel, Path], Sequence[str]]

@@ -37,36 +37,31 @@ _TEXT: Final = {
 _SCALAR: Final = {"class": "H5S_SCALAR"}
 
 
-class ScalismoJson:
-    """HDF5/JSON, the one format that scalismo writes from 0.92 on, whether the file is named `.json` or `.h5`."""
+def is_scalismo_json(path: Path, head: bytes) -> bool:
+    """Whether it begins as JSON, and is named as scalismo names it or begins as HDF5/JSON does."""
+    start = head.lstrip()
+    if not start.startswith(b"{"):
+        return False
+    return path.name.lower().endswith((".h5.json", ".h5")) or any(mark in head for mark in _MARKS)
 
-    name = "scalismo-json"
-    title = "scalismo .h5.json"
-    suffixes: Sequence[str] = (".h5.json",)
 
-    def recognises(self, path: Path, head: bytes) -> bool:
-        """Whether it begins as JSON, and is named as scalismo names it or begins as HDF5/JSON does."""
-        start = head.lstrip()
-        if not start.startswith(b"{"):
-            return False
-        return path.name.lower().endswith((".h5.json", ".h5")) or any(mark in head for mark in _MARKS)
+def read_scalismo_json(path: Path) -> LinearModel:
+    """Read HDF5/JSON, the one format that scalismo writes from 0.92 on, whether named `.json` or `.h5`."""
+    check_file(path, _LARGEST_BYTES, _AGAIN)
+    try:
+        tree = _tree(read_bytes(path))
+    except (ValueError, OverflowError, RecursionError, MemoryError) as error:
+        message = " ".join(str(error).split())[:120].rstrip(".")
+        raise ModelFileError(f"{path} is damaged, or no HDF5/JSON: {message}; {_AGAIN}.") from error
+    return model_of(tree, path)
 
-    def read(self, path: Path) -> LinearModel:
-        """As `ModelReader.read`."""
-        check_file(path, _LARGEST_BYTES, _AGAIN)
-        try:
-            tree = _tree(read_bytes(path))
-        except (ValueError, OverflowError, RecursionError, MemoryError) as error:
-            message = " ".join(str(error).split())[:120].rstrip(".")
-            raise ModelFileError(f"{path} is damaged, or no HDF5/JSON: {message}; {_AGAIN}.") from error
-        return model_of(tree, path)
 
-    def write(self, model: LinearModel, path: Path) -> Sequence[str]:
-        """As `ModelFormat.write`."""
-        tree, notes = tree_of(model)
-        with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as out:
-            out.writelines(_text_of(tree))
-        return notes
+def write_scalismo_json(model: LinearModel, path: Path) -> Sequence[str]:
+    """As `ModelFormat.write`."""
+    tree, notes = tree_of(model)
+    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as out:
+        out.writelines(_text_of(tree))
+    return notes
 
 
 class _Link(msgspec.Struct):

@@ -54,30 +54,25 @@ _GREY = 0.5  # mean colour of a model without colours, of 0 to 1
 _LEFT_OUT = 1e-6  # relative; rounding in single precision
 
 
-class Statismo:
-    """HDF5 as statismo, scalismo up to 0.91, gravis and the Basel Face Model write it."""
+def is_statismo(path: Path, head: bytes) -> bool:
+    """Whether it begins as HDF5."""
+    return head.startswith(HDF5_SIGNATURE)
 
-    name = "statismo"
-    title = "statismo/scalismo HDF5"
-    suffixes: Sequence[str] = (".statismo.h5",)
 
-    def recognises(self, path: Path, head: bytes) -> bool:
-        """Whether it begins as HDF5."""
-        return head.startswith(HDF5_SIGNATURE)
+def read_statismo(path: Path) -> LinearModel:
+    """Read HDF5 as statismo, scalismo up to 0.91, gravis and the Basel Face Model write it."""
+    check_file(path, _LARGEST_BYTES, _AGAIN)
+    try:
+        return model_of(read_hdf5_sandboxed(path, leave=("/color",)), path)
+    except SandboxError as error:
+        raise ModelFileError(f"{path} is damaged or cut short: {error}; {_AGAIN}.") from error
 
-    def read(self, path: Path) -> LinearModel:
-        """As `ModelReader.read`."""
-        check_file(path, _LARGEST_BYTES, _AGAIN)
-        try:
-            return model_of(read_hdf5_sandboxed(path, leave=("/color",)), path)
-        except SandboxError as error:
-            raise ModelFileError(f"{path} is damaged or cut short: {error}; {_AGAIN}.") from error
 
-    def write(self, model: LinearModel, path: Path) -> Sequence[str]:
-        """As `ModelFormat.write`; version 0.9, single precision, a Morphable Model where there are expressions."""
-        tree, notes = tree_of(model)
-        write_bytes(path, _hdf5_of(tree))
-        return notes
+def write_statismo(model: LinearModel, path: Path) -> Sequence[str]:
+    """As `ModelFormat.write`; version 0.9, single precision, a Morphable Model where there are expressions."""
+    tree, notes = tree_of(model)
+    write_bytes(path, _hdf5_of(tree))
+    return notes
 
 
 def model_of(tree: Tree, path: Path) -> LinearModel:
