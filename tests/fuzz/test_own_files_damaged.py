@@ -32,7 +32,7 @@ from shapespace.batch.fit_records import (
 )
 from shapespace.errors import FileFormatError, ModelFileError, ShapespaceError
 from shapespace.fit.fit_scan import FitConfig, fit_scan
-from shapespace.formats.flame import read_flame
+from shapespace.formats.face_models import read_flame
 from shapespace.formats.gias_monai import read_gias
 from shapespace.model.shape_model import ShapeModel
 from shapespace.recognise.classifier_file import FACTS, SavedClassifier, load_classifier, software_versions

@@ -10,10 +10,9 @@ from threadpoolctl import threadpool_limits
 
 from shapespace.errors import InputError, ModelFileError
 from shapespace.formats.eos import is_eos, read_eos, write_eos
-from shapespace.formats.flame import is_flame, read_flame
+from shapespace.formats.face_models import is_flame, is_matlab, read_flame, read_matlab
 from shapespace.formats.gias_monai import is_gias, is_monai, read_gias, read_monai
 from shapespace.formats.gltf_model import is_gltf_model, read_gltf_model, write_gltf_model
-from shapespace.formats.matlab import is_matlab, read_matlab
 from shapespace.formats.model_parts import LinearModel, ModelFormat, ModelReader
 from shapespace.formats.obj_folder import is_obj_folder, read_obj_folder, write_obj_folder
 from shapespace.formats.scalismo_json import is_scalismo_json, read_scalismo_json, write_scalismo_json
