@@ -39,7 +39,6 @@ _CONVERT: Mapping[str, str] = {
     ".raw": "convert a mesh to PLY, a volume to NRRD or NIfTI",
 }
 """File name ending -> what to do with a file that is not read."""
-_NAMED = 3  # names in a message before the rest is only counted
 _LEFT_OUT: Mapping[str, tuple[str, str, str, str]] = {
     "folder": ("folder", "folders", "looked into", "--recursive takes the {} there"),
     "linked": ("link to a folder", "links to folders", "followed", "give that folder too"),
@@ -259,7 +258,7 @@ def mesh_files(
         for kind, (singular, plural, verb, advice) in _LEFT_OUT.items():
             if names := [entry.relative_to(path).as_posix() for entry in found[kind]]:
                 count_words = f"1 {singular} is" if len(names) == 1 else f"{len(names)} {plural} are"
-                shown = f"({first_names(names, _NAMED)}); {advice.format(kind_name)}"
+                shown = f"({first_names(names)}); {advice.format(kind_name)}"
                 left_out.append(f"{path}: {count_words} not {verb} {shown}.")
     return MeshFiles(tuple(files), tuple(left_out))
 
