@@ -455,7 +455,9 @@ def _read_xml(data: bytes, path: Path) -> tuple[Mesh, list[Cells]]:
                 lines.append((counts, corners + n_vertices))
                 continue
             # Checked piece by piece: joined, an index past one piece would point into the next.
-            faces.append(_faces_of(mesh_of(vertices, cut(counts, corners), path)) + n_vertices)
+            triangles = cut(counts, corners)
+            mesh_of(vertices, triangles, path)
+            faces.append(triangles + n_vertices)
         points.append(vertices)
         colours.append(_piece_colours(piece, len(vertices), xml))
         n_vertices += len(vertices)
@@ -468,10 +470,6 @@ def _read_xml(data: bytes, path: Path) -> tuple[Mesh, list[Cells]]:
         (LINE_NOTE,) if lines else (),
         header=b"".join(b" SPACE=" + codes.tobytes() for codes in spaces),
     ), lines  # fmt: skip
-
-
-def _faces_of(mesh: Mesh) -> IndexArray:
-    return np.zeros((0, 3), dtype=np.int64) if mesh.faces is None else mesh.faces.astype(np.int64)
 
 
 def _piece_points(piece: ET.Element, xml: _Xml) -> FloatArray:
